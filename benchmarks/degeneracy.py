@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.base.text_files import write_texts
-from icalib.tools.montecarlo import Plan, Record, run_study
+from icalib.tools.montecarlo import RunRecord, StudyPlan, run_study
 from icalib.tools.montecarlo.study import scenario_digest
 from icalib.tools.simulation import Scenario, load_scenario
 
@@ -65,13 +65,13 @@ def variant(motion: str, noise: float) -> Scenario:
     )
 
 
-def entries(record: Record) -> Iterator[tuple[str, str, float]]:
+def entries(record: RunRecord) -> Iterator[tuple[str, str, float]]:
     """Name, verdict, and error in standard deviations of every number that was estimated."""
     for block, label, verdict, z in record.errors():
         yield f"{block.key} {label}", verdict, z
 
 
-def combinations(record: Record, verdicts: Sequence[str]) -> np.ndarray:
+def combinations(record: RunRecord, verdicts: Sequence[str]) -> np.ndarray:
     """(n,) errors in standard deviations along the principal axes of the correlations among entries so judged."""
     k = np.array([v in verdicts for _, v, _ in entries(record)], dtype=bool)
     sigma = np.sqrt(np.diag(record.covariance)[k])
@@ -79,7 +79,7 @@ def combinations(record: Record, verdicts: Sequence[str]) -> np.ndarray:
     return vectors.T @ (record.error[k] / sigma) / np.sqrt(np.maximum(values, 1e-12))
 
 
-def summary(motion: str, imu: str, records: Sequence[Record]) -> dict:
+def summary(motion: str, imu: str, records: Sequence[RunRecord]) -> dict:
     """What was found over all runs of one motion and one IMU."""
     good = [r for r in records if not r.failure]
     verdicts: dict[str, Counter[str]] = {}
@@ -146,7 +146,7 @@ def main() -> None:
     given = parser.parse_args()
     for motion in given.motion or MOTIONS:
         for imu, noise in IMUS.items():
-            plan = Plan(given.runs, 1, "drawn", workers=given.workers)
+            plan = StudyPlan(given.runs, 1, "drawn", workers=given.workers)
             name = f"{motion}, {imu}"
             size = f"{SECONDS} {AZIMUTH_STEPS} {PER_IMAGE}"
             scenario = variant(motion, noise)

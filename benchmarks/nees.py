@@ -18,7 +18,7 @@ import numpy as np
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.tools.montecarlo.one_run import compare
-from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.statistics import Nees, Sample, nees
 from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, handheld, load_scenario, rig_for, simulate
 
@@ -142,7 +142,7 @@ def judge(case: Case, first_seed: int) -> list[Judged]:
     return [_judged(kind, runs) for kind in (TOGETHER, *case.kinds)]
 
 
-def _run(case: Case, seed: int) -> tuple[Record, np.ndarray]:
+def _run(case: Case, seed: int) -> tuple[RunRecord, np.ndarray]:
     """Errors and covariance of one recording; and the standard deviations that are printed, of the same numbers."""
     simulation = simulate(case.scenario, seed)
     result = calibrate_measurements(case.rig, simulation.measurements)
@@ -150,7 +150,7 @@ def _run(case: Case, seed: int) -> tuple[Record, np.ndarray]:
     return record, np.concatenate([result.group(b.sensor, b.name).std for b in record.blocks])
 
 
-def _judged(kind: str, runs: list[tuple[Record, np.ndarray]]) -> Judged:
+def _judged(kind: str, runs: list[tuple[RunRecord, np.ndarray]]) -> Judged:
     by_covariance, by_printed = [], []
     for record, printed in runs:
         own = [b for b in record.blocks if kind in (TOGETHER, b.sensor.rstrip("0123456789"))]

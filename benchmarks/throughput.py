@@ -22,7 +22,7 @@ from icalib.detection.primitives.corners import ImageCorners
 from icalib.detection.primitives.prediction import MOTION_IMAGES
 from icalib.detection.streams import IN_TURN
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
-from icalib.tools.simulation import Motion, film, handheld, tag_map
+from icalib.tools.simulation import HandheldMotion, film, handheld, tag_map
 
 TARGETS: tuple[Target, ...] = (
     AprilGrid(6, 6, 0.088, 0.3),
@@ -79,7 +79,7 @@ def rendered(target: Target, count: int) -> list[np.ndarray]:
     """Images of the scenario's cam0."""
     duration_s = count / RATE_HZ + 0.3
     base = handheld(duration_s)
-    motion = Motion(rotation_scale=LESS_MOTION, translation_scale=LESS_MOTION, seed=0)
+    motion = HandheldMotion(rotation_scale=LESS_MOTION, translation_scale=LESS_MOTION, seed=0)
     scenario = (
         dataclasses.replace(base, target=target, motion=motion)
         if len(target.bodies) == 1

@@ -19,7 +19,7 @@ from icalib.errors import EstimationError, RecordingError
 from icalib.rig.file import load_rig
 from icalib.tools.allan import allan_deviation, study_imu, study_recording, write_study
 from icalib.tools.allan.deviation import allan_deviation_of_all, model_variance
-from icalib.tools.allan.fit import NoiseFit, _most_likely, _std, bands_of, bands_of_all, fit_noise, pooled
+from icalib.tools.allan.fit import AllanFit, _most_likely, _std, bands_of, bands_of_all, fit_noise, pooled
 from icalib.tools.allan.sampling import still_readings
 from icalib.tools.simulation import handheld
 from icalib.tools.simulation.bag_writer import IMU, BagForm, BagWriter
@@ -485,7 +485,7 @@ def test_a_fit_is_plain_numbers():
     assert all(isinstance(v, float | bool) for v in dataclasses.astuple(_fit()))
 
 
-def _fit() -> NoiseFit:
+def _fit() -> AllanFit:
     return fit_noise(bands_of(noise(2_000, 0.01, 1e-3, 1e-3, np.random.default_rng(0)), 0.01), 0.01)
 
 

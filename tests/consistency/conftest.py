@@ -14,7 +14,7 @@ from icalib.geometry.targets import AprilGrid, NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.tools.montecarlo.one_run import compare
-from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.statistics import Nees, Sample, nees
 from icalib.tools.simulation import Scenario, load_scenario, simulate
 
@@ -43,14 +43,14 @@ def mean_nees(
     return {name: nees([_together(r, name) for r in records], probability) for name in blocks}
 
 
-def _record(scenario: Scenario, rig: Rig, seed: int, seen: Callable[[Measurements], Measurements]) -> Record:
+def _record(scenario: Scenario, rig: Rig, seed: int, seen: Callable[[Measurements], Measurements]) -> RunRecord:
     simulation = simulate(scenario, seed)
     result = calibrate_measurements(rig, seen(simulation.measurements))
     assert result.converged, f"seed {seed}: {result.status}"
     return compare(seed, result, simulation.truth, [], 0.0)
 
 
-def _together(record: Record, name: str) -> Sample:
+def _together(record: RunRecord, name: str) -> Sample:
     """The block `name` of all sensors, all else marginalised; every entry counts, whatever its verdict."""
     k = np.concatenate([record.columns(b.key) for b in record.blocks if b.name == name])
     return Sample(record.seed, record.error[k], record.covariance[np.ix_(k, k)])

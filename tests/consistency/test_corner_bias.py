@@ -11,7 +11,7 @@ from icalib.detection.boards.detectors import detector_of
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 from icalib.sensors.camera.edge_curvature import predicted_curvature
-from icalib.tools.simulation import Motion, film, handheld
+from icalib.tools.simulation import HandheldMotion, film, handheld
 from icalib.tools.simulation.images.rendering import Imaging, exposure_poses
 
 pytest.importorskip("cv2")
@@ -34,7 +34,7 @@ def filmed(target, distance_m):
         intrinsics=(230.0, 229.5, 372.2, 241.4),
         distortion=(0.0035, 0.0007, -0.0021, 0.0002),
     )
-    motion = Motion(rotation_scale=0.4, translation_scale=0.4, distance_m=distance_m, seed=3)
+    motion = HandheldMotion(rotation_scale=0.4, translation_scale=0.4, distance_m=distance_m, seed=3)
     return film(replace(base, cameras=(fisheye,), target=target, motion=motion), 0, Imaging(blur_px=0.6, noise=0.5))
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.initialize.start import start
-from icalib.tools.montecarlo.one_run import Task, run
+from icalib.tools.montecarlo.one_run import RunTask, run
 from icalib.tools.montecarlo.statistics import Sample, nees
 from icalib.tools.simulation import Scenario, SimPoses, load_scenario, rig_for, simulate
 
@@ -24,7 +24,7 @@ PAPER = Path(__file__).parents[2] / "examples" / "paper"
 
 def check(scenario: Scenario, seed: int, flat: bool) -> None:
     """All but heights over a flat floor is known, and as well as it is said to be."""
-    record = run(Task(scenario, seed, planes="found"))
+    record = run(RunTask(scenario, seed, planes="found"))
     assert not record.failure
     assert bool(record.undetermined) == flat
     assert all("translation z" in words for words in record.undetermined)

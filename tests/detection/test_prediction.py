@@ -12,9 +12,9 @@ from icalib.detection.boards.detectors import _Detector, _Follower, detector_of
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.detection.primitives.decoding import mapped
 from icalib.detection.primitives.prediction import PredictedCorners, predict_corners, predict_nodes
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles
-from icalib.tools.simulation import Motion, film, handheld
+from icalib.tools.simulation import HandheldMotion, film, handheld
 
 pytest.importorskip("cv2")
 
@@ -74,7 +74,7 @@ def test_nodes_that_were_not_seen_lie_on_the_board():
 
 def filmed(target, count):
     base = handheld(count / 20.0 + 0.3)
-    motion = Motion(rotation_scale=0.5, translation_scale=0.5, seed=1)
+    motion = HandheldMotion(rotation_scale=0.5, translation_scale=0.5, seed=1)
     run = film(replace(base, target=target, motion=motion, cameras=(base.cameras[0],)), 0)
     return [shot.pixels for shot in run.shots()][:count]
 
@@ -122,4 +122,4 @@ def test_a_board_is_not_taken_for_one_that_is_some_squares_away(name, squares):
     ]
     expected = PredictedCorners(np.arange(rows * cols), shifted.reshape(-1, 2))
     finder = instance(instance(detector, _Detector).finder, _Follower)
-    assert finder.find_near(View(image), expected) is None
+    assert finder.find_near(ImageWithQuads(image), expected) is None

@@ -13,7 +13,7 @@ from icalib.geometry.targets import Checkerboard, Circles, Target
 from icalib.initialize.boards.board_turns import number_alike
 from icalib.initialize.start import start
 from icalib.rig import Rig
-from icalib.tools.simulation import Motion, Simulation, handheld, rig_for, simulate
+from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +30,7 @@ def simulation(request) -> Simulation:
     """A rig that is turned by up to 180 degrees in front of the board."""
     scenario = handheld(20.0)
     cameras = tuple(replace(c, time_offset_s=0.004) for c in scenario.cameras)  # images taken together have one stamp
-    motion = Motion(rotation_scale=3.0)
+    motion = HandheldMotion(rotation_scale=3.0)
     return simulate(replace(scenario, cameras=cameras, target=BOARDS[request.param], motion=motion), 1)
 
 

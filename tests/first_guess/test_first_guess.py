@@ -16,7 +16,7 @@ from icalib.initialize import initial_guess, initial_trajectory
 from icalib.initialize.boards.intrinsics import guess_intrinsics
 from icalib.initialize.steps.target_poses import Flat, target_poses
 from icalib.rig import Parameter, Rig
-from icalib.tools.simulation import Motion, Simulation, handheld, rig_for, simulate
+from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 
@@ -218,12 +218,12 @@ def test_a_wrong_tag_size_is_recognised(simulation: Simulation):
 
 
 def test_a_motionless_recording_is_refused():
-    simulation = simulate(dataclasses.replace(handheld(10.0), motion=Motion("motionless")), 0)
+    simulation = simulate(dataclasses.replace(handheld(10.0), motion=HandheldMotion("motionless")), 0)
     assert "motionless" in failure(rig_for(simulation.scenario), simulation.measurements)
 
 
 def test_an_imu_of_another_motion_is_refused(simulation: Simulation):
-    other = simulate(dataclasses.replace(handheld(20.0), motion=Motion(seed=99)), 4)
+    other = simulate(dataclasses.replace(handheld(20.0), motion=HandheldMotion(seed=99)), 4)
     mixed = dataclasses.replace(simulation.measurements, imu=other.measurements.imu)
     assert "does not match" in failure(rig_for(simulation.scenario), mixed)
 
@@ -281,7 +281,7 @@ def test_a_few_gross_outliers_cost_hardly_a_pose(simulation: Simulation):
 
 def test_one_axis_of_rotation_is_not_enough_and_said():
     simulation = simulate(
-        dataclasses.replace(handheld(15.0, exact=False), motion=Motion("single_axis", exact=False)), 0
+        dataclasses.replace(handheld(15.0, exact=False), motion=HandheldMotion("single_axis", exact=False)), 0
     )
     assert "one axis" in failure(rig_for(simulation.scenario), simulation.measurements)
     initial_guess(rig_for(simulation.scenario, rotation="fixed"), simulation.measurements)

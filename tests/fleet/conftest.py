@@ -16,8 +16,8 @@ from icalib.pipeline import calibrate
 from icalib.result import Calibration
 from icalib.rig.file import rig_to_dict
 from icalib.tools.fleet import run as run_module
-from icalib.tools.fleet.one_job import Outcome, Task
-from icalib.tools.fleet.record import Record
+from icalib.tools.fleet.one_job import JobOutcome, JobTask
+from icalib.tools.fleet.record import JobRecord
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_tables
 
 # Of cam1 about its x axis: ten times the standard deviation of the difference of two calibrations from 6 s.
@@ -79,21 +79,21 @@ class Workshop:
     interrupt: int | None = None
     change: Callable[[str, Calibration], Calibration] = lambda job, c: c
 
-    def run_all(self, work: object, tasks: list[Task], crew: object) -> Iterator[tuple[Task, object]]:
+    def run_all(self, work: object, tasks: list[JobTask], crew: object) -> Iterator[tuple[JobTask, object]]:
         for k, task in enumerate(tasks):
             if k == self.interrupt:
                 raise KeyboardInterrupt
             self.done.append(task.job.name)
             yield task, self.outcome(task)
 
-    def outcome(self, task: Task) -> Outcome:
+    def outcome(self, task: JobTask) -> JobOutcome:
         result = self.results.get(task.job.recordings[0].name)
         if result is None:
             sentence = f"{task.job.recordings[0].name} is cut off; record <again>."
-            return Outcome(Record(task.job.name, sentence, 0.1, task.inputs), {})
+            return JobOutcome(JobRecord(task.job.name, sentence, 0.1, task.inputs), {})
         changed = self.change(task.job.name, result)
         files = self._files(result) if changed is result else output_files(changed)
-        return Outcome(Record.of(task.job.name, changed, 1.0, task.inputs), files)
+        return JobOutcome(JobRecord.of(task.job.name, changed, 1.0, task.inputs), files)
 
     def _files(self, result: Calibration) -> dict[str, bytes]:
         """Of one of `results`, made once: a report takes its time."""

@@ -12,27 +12,29 @@ from scipy.spatial.transform import Rotation
 
 from icalib.tools.fleet.figures import over_time, sensors
 from icalib.tools.fleet.jobs import Job
-from icalib.tools.fleet.record import Block, Record
+from icalib.tools.fleet.record import GroupRecord, JobRecord
 from icalib.tools.fleet.result import JobResult
 
 R0 = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 XYZ = ("x", "y", "z")
 
 
-def result(day: int, *blocks: Block, dated: bool = True) -> JobResult:
+def result(day: int, *blocks: GroupRecord, dated: bool = True) -> JobResult:
     time = datetime(2026, 11, day, tzinfo=UTC) if dated else None
     job = Job(f"job{day}", "anton", Path("rig.yaml"), (Path("r"),), time)
-    return JobResult(job, Record(job.name, "", 1.0, None, blocks=blocks))
+    return JobResult(job, JobRecord(job.name, "", 1.0, None, blocks=blocks))
 
 
-def rotation(turn: list[float], verdict: str = "determined") -> Block:
+def rotation(turn: list[float], verdict: str = "determined") -> GroupRecord:
     R = R0 @ Rotation.from_rotvec(turn).as_matrix()
-    return Block("cam0", "rotation", XYZ, "rad", R, np.deg2rad([0.1, 0.2, 0.3]), (verdict, "determined", "weak"))
+    return GroupRecord("cam0", "rotation", XYZ, "rad", R, np.deg2rad([0.1, 0.2, 0.3]), (verdict, "determined", "weak"))
 
 
-def numbers(sensor: str, name: str, labels: tuple[str, ...], value: list[float], verdict: str = "determined") -> Block:
+def numbers(
+    sensor: str, name: str, labels: tuple[str, ...], value: list[float], verdict: str = "determined"
+) -> GroupRecord:
     n = len(value)
-    return Block(sensor, name, labels, "px", np.array(value), np.full(n, 0.5), (verdict,) * n)
+    return GroupRecord(sensor, name, labels, "px", np.array(value), np.full(n, 0.5), (verdict,) * n)
 
 
 def test_rotations_are_turns_about_the_sensors_axes_since_the_first():
@@ -55,8 +57,8 @@ def test_what_is_undetermined_is_hollow_and_has_no_bar():
 def test_each_block_has_a_panel_and_each_name_one_place_in_the_legend():
     blocks = [
         rotation([0, 0, 0]),
-        Block("cam0", "translation", XYZ, "m", np.zeros(3), np.full(3, 1e-3), ("determined",) * 3),
-        Block("cam0", "time_offset", ("time_offset",), "s", np.zeros(1), np.full(1, 1e-3), ("determined",)),
+        GroupRecord("cam0", "translation", XYZ, "m", np.zeros(3), np.full(3, 1e-3), ("determined",) * 3),
+        GroupRecord("cam0", "time_offset", ("time_offset",), "s", np.zeros(1), np.full(1, 1e-3), ("determined",)),
         numbers("cam0", "distortion", ("k1",), [0.1], "fixed"),
         numbers("cam1", "intrinsics", ("fx", "fy"), [1.0, 2.0]),
     ]

@@ -14,7 +14,7 @@ from icalib.cli import main
 from icalib.tools.batch import program
 from icalib.tools.montecarlo import study as study_module
 from icalib.tools.montecarlo.console import table
-from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.reproduce import FOLDER, MOTIONS
 from icalib.tools.montecarlo.summary import summarise
 from icalib.tools.montecarlo.words import block_row
@@ -31,7 +31,7 @@ def runs(monkeypatch, record):
     def make(tasks, workers, scheduler):
         for task in tasks:
             one = replace(record(task.seed), program=program())
-            yield one if task.seed % 3 != 2 else Record(task.seed, "no camera saw the target.", 1.0, program())
+            yield one if task.seed % 3 != 2 else RunRecord(task.seed, "no camera saw the target.", 1.0, program())
 
     monkeypatch.setattr(study_module, "run_all", make)
 
@@ -47,7 +47,7 @@ def test_montecarlo_prints_the_table_and_the_failed_runs(runs, tmp_path: Path, c
 
 
 def test_the_table_is_whole_in_80_columns(record):
-    def as_wide_as_table_2(found: Record) -> Record:
+    def as_wide_as_table_2(found: RunRecord) -> RunRecord:
         """The longest names, and distortions known to 1e-5."""
         blocks = tuple(replace(b, sensor=b.sensor.replace("cam0", "wheel0")) for b in found.blocks)
         return replace(found, blocks=blocks, error=found.error / 30.0, covariance=found.covariance / 900.0)
@@ -73,7 +73,7 @@ def test_reproduce_leaves_figures_and_tables(runs, tmp_path: Path, capsys):
 
 
 def test_reproduce_without_any_good_run_still_reports(tmp_path: Path, monkeypatch, capsys):
-    failed = [Record(0, "no camera saw the target.", 1.0, program())]
+    failed = [RunRecord(0, "no camera saw the target.", 1.0, program())]
     monkeypatch.setattr(study_module, "run_all", lambda *_: (r for r in failed))
     assert main(["reproduce", "--runs", "1", "--output", str(tmp_path)]) == 0
     assert "no camera saw the target." in (tmp_path / "reproduce.html").read_text()

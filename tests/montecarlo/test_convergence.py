@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icalib.tools.montecarlo.convergence import plotly_figure, png, rows
-from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.record import RunRecord
 
 
 def test_curves_are_the_errors_of_the_path_in_shown_units(record):
@@ -25,7 +25,7 @@ def test_first_six_good_runs_of_all_sensors_but_further_cameras(record):
     found = rows(runs)
     assert [r.key for r in found] == ["cam0.rotation", "cam0.time_offset", "cam0.distortion", "wheel0.radii"]
     assert [c.seed for c in found[0].panels[0].curves] == [2, 3, 4, 5, 6, 7]
-    assert rows([Record(0, "it broke.", 1.0, "digest")]) == ()
+    assert rows([RunRecord(0, "it broke.", 1.0, "digest")]) == ()
 
 
 def test_what_is_undetermined_has_the_bound_of_the_result(record, judged):

@@ -14,11 +14,19 @@ from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, CornerResiduals, LidarResiduals, Visited, WheelResiduals
 from icalib.tools.montecarlo import one_run
-from icalib.tools.montecarlo.one_run import PlanesKind, Task, compare, run
-from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.one_run import PlanesKind, RunTask, compare, run
+from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.montecarlo.whiteness import whiteness
-from icalib.tools.simulation import Motion, Simulation, handheld, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.tools.simulation import (
+    HandheldMotion,
+    Simulation,
+    handheld,
+    load_scenario,
+    rig_for,
+    simulate,
+    with_drawn_guess,
+)
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 SCENARIO = handheld(6.0)
@@ -41,7 +49,7 @@ def result(simulation: Simulation, visits: list[Visited]) -> Calibration:
 
 
 @pytest.fixture(scope="module")
-def record(result: Calibration, simulation: Simulation, visits: list[Visited]) -> Record:
+def record(result: Calibration, simulation: Simulation, visits: list[Visited]) -> RunRecord:
     return compare(1, result, simulation.truth, visits, 1.0)
 
 
@@ -137,14 +145,14 @@ def _persistent(r: CornerResiduals) -> CornerResiduals:
 
 
 def test_the_same_task_gives_the_same_record():
-    a, b = (run(Task(SCENARIO, 3)) for _ in range(2))
+    a, b = (run(RunTask(SCENARIO, 3)) for _ in range(2))
     assert a.failure == "" and a.error.tolist() == b.error.tolist()
     assert a.covariance.tolist() == b.covariance.tolist()
 
 
 def test_a_run_that_fails_says_why():
-    still = replace(SCENARIO, motion=Motion(kind="motionless"))
-    failed = run(Task(still, 0))
+    still = replace(SCENARIO, motion=HandheldMotion(kind="motionless"))
+    failed = run(RunTask(still, 0))
     assert failed.failure.endswith(".") and "\n" not in failed.failure
     assert (failed.seed, failed.blocks) == (0, ())
 
@@ -159,7 +167,7 @@ def test_planes_are_told_or_not(monkeypatch, planes: PlanesKind, told: bool):
 
     monkeypatch.setattr(one_run, "calibrate_measurements", look)
     room = replace(load_scenario(PAPER / "table2-ramp.yaml"), duration_s=3.0, cameras=(), features=None)
-    assert run(Task(room, 1, planes=planes)).failure == "seen."
+    assert run(RunTask(room, 1, planes=planes)).failure == "seen."
     (lidar,) = seen[0].lidars
     assert (lidar.plane >= 0).any() == told and len(lidar.xyz) > 1000
 
@@ -179,7 +187,7 @@ def test_errors_of_all_kinds_become_records(monkeypatch, raised: Exception, sent
         raise raised
 
     monkeypatch.setattr(one_run, "calibrate_measurements", fail)
-    assert run(Task(SCENARIO, 5)).failure == sentence
+    assert run(RunTask(SCENARIO, 5)).failure == sentence
 
 
 def test_a_solver_that_did_not_converge_is_a_failed_run_with_its_errors(result, simulation):

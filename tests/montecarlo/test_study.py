@@ -16,9 +16,9 @@ import pytest
 
 from icalib.base.extras import load_distributed
 from icalib.errors import CalibrationError
-from icalib.tools.montecarlo import Plan, Record, Study, Task, run_study
+from icalib.tools.montecarlo import RunRecord, RunTask, Study, StudyPlan, run_study
 from icalib.tools.montecarlo import study as study_module
-from icalib.tools.montecarlo.store import Identity, Store
+from icalib.tools.montecarlo.store import Identity, RunStore
 from icalib.tools.montecarlo.workers import run_all
 from icalib.tools.simulation import Scenario, handheld
 
@@ -37,7 +37,7 @@ if __name__ == "__main__":
 
 
 def study(folder: Path, runs: int = RUNS, digest: str = "digest", **plan) -> Study:
-    return run_study(handheld(6.0), "handheld", digest, folder, Plan(runs, **plan))
+    return run_study(handheld(6.0), "handheld", digest, folder, StudyPlan(runs, **plan))
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_a_study_that_was_killed_goes_on_and_repeats_nothing(alone: Path, tmp_pa
 
 
 def test_the_run_of_a_killed_worker_is_made_again():
-    records = run_all([Task(handheld(6.0), seed) for seed in range(4)], workers=2)
+    records = run_all([RunTask(handheld(6.0), seed) for seed in range(4)], workers=2)
     found = [next(records)]
     workers = [p for p in psutil.Process().children(recursive=True) if any("spawn_main" in a for a in p.cmdline())]
     assert len(workers) == 2
@@ -154,12 +154,12 @@ def test_another_icalib_is_another_study(alone: Path, tmp_path: Path, monkeypatc
     monkeypatch.setattr("icalib.tools.montecarlo.store.program", lambda: "another")
     with pytest.raises(CalibrationError, match="icalib changed"):
         study(alone)
-    store = Store(tmp_path, Identity.of("handheld", "digest", "none", "known"))
+    store = RunStore(tmp_path, Identity.of("handheld", "digest", "none", "known"))
     with pytest.raises(CalibrationError, match="a worker of the cluster runs another version of icalib"):
-        store.add(Record(0, "", 1.0, "yet another"))
+        store.add(RunRecord(0, "", 1.0, "yet another"))
 
 
-def fill(folder: Path, records: list[Record], monkeypatch, interrupt: bool = False) -> Study:
+def fill(folder: Path, records: list[RunRecord], monkeypatch, interrupt: bool = False) -> Study:
     """A study whose runs come from `records`; Ctrl-C after them."""
 
     def give(*_):
@@ -172,8 +172,8 @@ def fill(folder: Path, records: list[Record], monkeypatch, interrupt: bool = Fal
 
 
 def test_failed_runs_are_kept_and_reported(tmp_path: Path, monkeypatch):
-    good = Record(0, "", 1.0, Identity.of("", "", "none", "known").program)
-    bad = Record(1, "no camera saw the <target>.", 1.0, good.program)
+    good = RunRecord(0, "", 1.0, Identity.of("", "", "none", "known").program)
+    bad = RunRecord(1, "no camera saw the <target>.", 1.0, good.program)
     found = fill(tmp_path, [bad, good], monkeypatch)
     assert [f.sentence for f in found.consistency.failures] == [bad.failure]
     assert len(written(tmp_path)) == 2
@@ -181,15 +181,15 @@ def test_failed_runs_are_kept_and_reported(tmp_path: Path, monkeypatch):
 
 
 def test_a_run_that_killed_its_workers_is_reported_and_tried_again_the_next_time(tmp_path: Path, monkeypatch):
-    good = Record(0, "", 1.0, Identity.of("", "", "none", "known").program)
-    lost = Record(1, "its worker died again and again.", 0.0, "")
+    good = RunRecord(0, "", 1.0, Identity.of("", "", "none", "known").program)
+    lost = RunRecord(1, "its worker died again and again.", 0.0, "")
     assert fill(tmp_path, [good, lost], monkeypatch).consistency.failures[0].seed == 1
     assert list(written(tmp_path)) == ["000000.json"]
-    assert fill(tmp_path, [Record(1, "", 1.0, good.program), good], monkeypatch).consistency.failures == ()
+    assert fill(tmp_path, [RunRecord(1, "", 1.0, good.program), good], monkeypatch).consistency.failures == ()
 
 
 def test_an_interrupted_study_says_what_is_there(tmp_path: Path, monkeypatch):
-    good = Record(0, "", 1.0, Identity.of("", "", "none", "known").program)
+    good = RunRecord(0, "", 1.0, Identity.of("", "", "none", "known").program)
     with pytest.raises(KeyboardInterrupt, match="1 of 2 runs are in .*; the same command resumes"):
         fill(tmp_path, [good], monkeypatch, interrupt=True)
     assert list(written(tmp_path)) == ["000000.json"]
@@ -217,7 +217,7 @@ def test_damaged_files_are_named(alone: Path, tmp_path: Path):
 )
 def test_plans_that_make_no_sense(plan: dict, sentence: str):
     with pytest.raises(CalibrationError, match=sentence):
-        Plan(**plan)
+        StudyPlan(**plan)
 
 
 def test_a_recorded_motion_is_part_of_the_scenario(tmp_path: Path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from icalib.tools.montecarlo.page import study_html
-from icalib.tools.montecarlo.record import Record, Size, from_json, to_json
+from icalib.tools.montecarlo.record import RunRecord, Size, from_json, to_json
 from icalib.tools.montecarlo.store import Identity
 from icalib.tools.montecarlo.summary import Consistency, consistency_json, summarise
 from icalib.tools.montecarlo.words import answer, largest_words, undetermined_words, verdict_words
@@ -29,7 +29,7 @@ def test_records_come_back_bit_for_bit(record):
     np.testing.assert_array_equal(again.covariance, one.covariance)
     np.testing.assert_array_equal(again.path[1].std, one.path[1].std)
     assert again.blocks == one.blocks and again.sizes == one.sizes and again.whiteness == one.whiteness
-    failed = Record(4, "it broke.", 1.0, "digest")
+    failed = RunRecord(4, "it broke.", 1.0, "digest")
     assert to_json(from_json(to_json(failed))) == to_json(failed)
 
 
@@ -65,7 +65,7 @@ def test_order_of_records_does_not_matter(record):
     assert consistency_json(summarise(runs[::-1]), {}) == consistency_json(summarise(runs), {})
 
 
-def test_undetermined_entries_stay_out(record: Callable[..., Record], judged):
+def test_undetermined_entries_stay_out(record: Callable[..., RunRecord], judged):
     runs = [record(seed) for seed in range(30)]
     spoilt = [replace(r, error=r.error * np.r_[np.ones(11), 1e6, 1.0]) for r in runs]
     found = summarise([judged(r, "wheel0.radii", ("undetermined", "weak")) for r in spoilt])
@@ -94,7 +94,7 @@ def test_a_block_may_be_undetermined_in_some_runs_or_all(record, judged):
 def test_failed_runs_are_listed_and_do_not_count(record):
     runs = [record(seed) for seed in range(5)]
     far = replace(record(7), failure="the solver did not converge: it stopped.", error=np.full(13, 1e3))
-    failed = Record(6, "no camera saw the target.", 1.0, "digest")
+    failed = RunRecord(6, "no camera saw the target.", 1.0, "digest")
     found = summarise([far, *runs, failed])
     assert [(f.seed, f.sentence) for f in found.failures] == [
         (6, "no camera saw the target."),
@@ -105,7 +105,7 @@ def test_failed_runs_are_listed_and_do_not_count(record):
 
 
 def test_a_study_may_fail_altogether():
-    found = summarise([Record(0, "no camera saw the target.", 1.0, "digest")])
+    found = summarise([RunRecord(0, "no camera saw the target.", 1.0, "digest")])
     assert (found.whole, found.blocks) == (None, ())
     assert answer(found) == "No run reached a result."
 
@@ -131,7 +131,7 @@ def test_the_largest_error_is_of_what_counts(record, judged):
     z = np.array([r.error / np.sqrt(np.diag(r.covariance)) for r in runs])
     spoilt = [replace(r, error=r.error * np.r_[np.ones(11), 1e6, 1.0]) for r in runs]
     open_left = [judged(r, "wheel0.radii", ("undetermined", "determined")) for r in spoilt]
-    found = summarise([*open_left, Record(99, "it broke.", 1.0, "digest")])
+    found = summarise([*open_left, RunRecord(99, "it broke.", 1.0, "digest")])
     counted = np.abs(np.delete(z, 11, axis=1))
     assert found.largest is not None and found.largest.sigmas == pytest.approx(counted.max())
     assert (found.largest.seed, found.largest.numbers) == (int(counted.max(axis=1).argmax()), 20 * 12)

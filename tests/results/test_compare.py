@@ -19,7 +19,7 @@ from icalib.export.formats import export
 from icalib.result import Calibration, Verdict, relative_pose
 from icalib.rig.file.parameters import parameter_to_plain
 from icalib.rig.parameter import fixed
-from icalib.tools.comparison.compare import Comparison, Difference, Tolerances, compare_sides
+from icalib.tools.comparison.compare import Comparison, ComparisonTolerances, Difference, compare_sides
 from icalib.tools.comparison.reading import compare_files
 from icalib.tools.comparison.results import side_of_result
 from icalib.tools.comparison.significance import chi2_above, sigmas
@@ -161,8 +161,10 @@ def test_what_counts_is_a_matter_of_tolerance_and_sigma(robot: Calibration):
     other = changed(robot, {("cam1", "rotation"): np.deg2rad([0.2, 0.0, 0.0])})
     turned = only(compared(robot, other), "cam1", "rotation", "imu0")
     assert turned.sigmas is not None and turned.sigmas > 3.0 and turned.differs and turned.given_by == "both"
-    assert not only(compared(robot, other, tolerances=Tolerances(deg=0.25)), "cam1", "rotation", "imu0").differs
-    assert only(compared(robot, other, tolerances=Tolerances(deg=0.15)), "cam1", "rotation", "imu0").differs
+    assert not only(
+        compared(robot, other, tolerances=ComparisonTolerances(deg=0.25)), "cam1", "rotation", "imu0"
+    ).differs
+    assert only(compared(robot, other, tolerances=ComparisonTolerances(deg=0.15)), "cam1", "rotation", "imu0").differs
     assert not only(compared(robot, other, limit=turned.sigmas + 0.1), "cam1", "rotation", "imu0").differs
 
 

@@ -16,7 +16,7 @@ from icalib.export.formats import export
 from icalib.export.outputs import write_outputs
 from icalib.result import Calibration, load_calibration
 from icalib.tools.allan import study_imu, write_study
-from icalib.tools.fleet.inputs import Inputs
+from icalib.tools.fleet.inputs import InputHashes
 from icalib.tools.fleet.jobs import Job
 
 ODD = os.fsdecode(b"B\xfcro")
@@ -56,7 +56,7 @@ def test_exports_are_utf8(odd: Calibration, tmp_path: Path):
 def test_a_fleet_knows_recordings_of_odd_names(tmp_path: Path):
     (tmp_path / ODD).mkdir()
     (tmp_path / ODD / f"{ODD}.csv").write_text("1")
-    found = Inputs.of(Job("a", "robot", tmp_path / "rig.yaml", (tmp_path / ODD,), None))
+    found = InputHashes.of(Job("a", "robot", tmp_path / "rig.yaml", (tmp_path / ODD,), None))
     assert found.recordings[0] != "absent"
 
 

@@ -9,9 +9,9 @@ import pytest
 from tests.typed import not_none
 
 from icalib.tools.simulation import (
-    Block,
     Drive,
     Features,
+    Obstacle,
     Room,
     Scenario,
     SimCamera,
@@ -93,9 +93,9 @@ def robot() -> Scenario:
         reports="poses",
     )
     blocks = (
-        Block((4.6, 3.6), (1.6, 1.2, 1.6), 0.3),
-        Block((-4.7, -3.6), (1.4, 1.0, 1.1), -0.5),
-        Block((-4.4, 3.4), (2.2, 1.2, 0.7), 0.2, ramp=True),
+        Obstacle((4.6, 3.6), (1.6, 1.2, 1.6), 0.3),
+        Obstacle((-4.7, -3.6), (1.4, 1.0, 1.1), -0.5),
+        Obstacle((-4.4, 3.4), (2.2, 1.2, 0.7), 0.2, ramp=True),
     )
     return Scenario(
         cameras,

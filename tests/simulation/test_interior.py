@@ -9,10 +9,10 @@ import pytest
 
 from icalib.errors import RigError
 from icalib.tools.simulation import (
-    Block,
     Drive,
     ImageFaults,
     Imaging,
+    Obstacle,
     Room,
     Scenario,
     SimCamera,
@@ -32,7 +32,7 @@ from .conftest import DISTORTED
 
 TEXEL_M = 0.004
 SIZE = (4.0, 3.0, 2.5)
-BLOCKS = (Block((0.9, 0.6), (0.5, 0.4, 1.2), 0.4), Block((0.6, -0.4), (0.8, 0.6, 0.7), -0.3, ramp=True))
+BLOCKS = (Obstacle((0.9, 0.6), (0.5, 0.4, 1.2), 0.4), Obstacle((0.6, -0.4), (0.8, 0.6, 0.7), -0.3, ramp=True))
 WHITE = Imaging(white=1.0, black=0.0, background=0.5, blur_px=0.8)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.tools.view.colors import by_value
-from icalib.tools.view.path import Path
+from icalib.tools.view.path import CubicPath
 
 
 def _pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -30,7 +30,7 @@ def nodes(shown):
         path = dataclasses.replace(
             c.trajectory, seconds=seconds, rotation=R, position=p, velocity=zeros, gyro_bias=zeros, accel_bias=zeros
         )
-        return Path.of(dataclasses.replace(c, trajectory=path, recordings=recordings))
+        return CubicPath.of(dataclasses.replace(c, trajectory=path, recordings=recordings))
 
     return make
 

@@ -247,10 +247,10 @@ def _simulate(options: argparse.Namespace) -> None:
 
 def _montecarlo(options: argparse.Namespace) -> None:
     from icalib.cli.console import progress_bar
-    from icalib.tools.montecarlo import Plan, run_file
+    from icalib.tools.montecarlo import StudyPlan, run_file
     from icalib.tools.montecarlo.console import print_study
 
-    plan = Plan(options.runs, options.seed, options.guess, options.planes, options.workers, options.scheduler)
+    plan = StudyPlan(options.runs, options.seed, options.guess, options.planes, options.workers, options.scheduler)
     with progress_bar(options.quiet) as progress:
         study = run_file(options.scenario, options.output, plan, progress)
     if not options.quiet:
@@ -259,11 +259,11 @@ def _montecarlo(options: argparse.Namespace) -> None:
 
 def _reproduce(options: argparse.Namespace) -> None:
     from icalib.cli.console import progress_bar
-    from icalib.tools.montecarlo import Plan
+    from icalib.tools.montecarlo import StudyPlan
     from icalib.tools.montecarlo.console import print_study
     from icalib.tools.montecarlo.reproduce import reproduce
 
-    plan = Plan(options.runs, guess="drawn", workers=options.workers, scheduler=options.scheduler)
+    plan = StudyPlan(options.runs, guess="drawn", workers=options.workers, scheduler=options.scheduler)
     with progress_bar(options.quiet) as progress:
         studies = reproduce(options.output, plan, progress)
     if not options.quiet:

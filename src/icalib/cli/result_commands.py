@@ -224,14 +224,14 @@ def _compare(options: argparse.Namespace) -> int:
     from icalib.base.own_files import refuse_foreign
     from icalib.base.result_files import set_of
     from icalib.base.text_files import write_sealed
-    from icalib.tools.comparison.compare import Tolerances
+    from icalib.tools.comparison.compare import ComparisonTolerances
     from icalib.tools.comparison.reading import compare_files
     from icalib.tools.comparison.words import comparison_json, lines
 
     if options.json:
         inputs = [p for side in (options.a, options.b) for p in (side, *set_of(side))]
         refuse_foreign([options.json], inputs, "choose another place")
-    tolerances = Tolerances(**dict(options.tolerance))
+    tolerances = ComparisonTolerances(**dict(options.tolerance))
     found = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
     if options.json:
         write_sealed(options.json, comparison_json(found))

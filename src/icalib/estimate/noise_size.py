@@ -75,7 +75,7 @@ def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
     scales: dict[str, float] = dict.fromkeys([*KINDS, *cameras], 1.0)
     outcome, settled = found.outcome, False
     for _ in range(ROUNDS):
-        shown = _Shown.of(outcome)
+        shown = _ImuDraws.of(outcome)
         sizes = {kind: shown.size(kind) for kind in KINDS} | _corner_sizes(outcome)
         steps = {key: float(np.clip(size, 1.0 / LARGEST_STEP, LARGEST_STEP)) for key, size in sizes.items()}
         settled = all(abs(np.log(step)) < SETTLED for step in steps.values())
@@ -88,7 +88,7 @@ def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
             outcome = _solved(inputs, found, scales)
         except EstimationError:
             return None
-    shown = _Shown.of(outcome)
+    shown = _ImuDraws.of(outcome)
     correlation = max(shown.correlation(kind) for kind in KINDS)
     own = {kind: scales[kind] for kind in KINDS}
     return NoiseFit(_scaled(inputs, scales), own, settled, correlation, max(map(shown.variation, KINDS)))
@@ -123,7 +123,7 @@ def _corner_sizes(outcome: Outcome) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class _Shown:
+class _ImuDraws:
     """Whitened residuals (K - 1, 15) of the IMU, and J x (K - 1, 15) of some draws x from the posterior."""
 
     rows: dict[str, slice]
@@ -131,7 +131,7 @@ class _Shown:
     along: tuple[np.ndarray, ...]
 
     @classmethod
-    def of(cls, outcome: Outcome) -> _Shown:
+    def of(cls, outcome: Outcome) -> _ImuDraws:
         problem, state, base = outcome.problem, outcome.state, outcome.residuals
         assert outcome.draws is not None
         along = []

@@ -8,7 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from icalib.export.common import Export, Lens, guesses, inverse, lens_of, need, no_place_for, quaternion, time_offsets
+from icalib.export.common import (
+    CameraParameters,
+    Export,
+    guesses,
+    inverse,
+    lens_of,
+    need,
+    no_place_for,
+    quaternion,
+    time_offsets,
+)
 from icalib.result import Calibration
 
 # COLMAP's name of a camera model of ours, and how many coefficients it has; those that we do not have are 0.
@@ -51,7 +61,7 @@ def colmap(c: Calibration) -> Export:
     return Export(files, sentences)
 
 
-def _params(lens: Lens) -> list[float]:
+def _params(lens: CameraParameters) -> list[float]:
     fx, fy, cx, cy = lens.intrinsics
     count = _MODELS[lens.model][1]
     return [fx, fy, cx + _CORNER, cy + _CORNER, *lens.distortion, *[0.0] * (count - len(lens.distortion))]
@@ -64,7 +74,7 @@ def _rig(poses: Sequence[np.ndarray]) -> list[Any]:
     return row
 
 
-def _config(c: Calibration, lenses: Sequence[Lens], poses: Sequence[np.ndarray]) -> list[dict[str, Any]]:
+def _config(c: Calibration, lenses: Sequence[CameraParameters], poses: Sequence[np.ndarray]) -> list[dict[str, Any]]:
     entries = []
     for i, (name, lens, T) in enumerate(zip(c.cameras, lenses, poses, strict=True)):
         pose = {"cam_from_rig_rotation": _wxyz(T), "cam_from_rig_translation": T[:3, 3].tolist()}

@@ -25,7 +25,7 @@ class Export:
 
 
 @dataclass(frozen=True)
-class Lens:
+class CameraParameters:
     """A camera's model with fx, fy, cx, cy [px] and distortion; sentence: where they are a fit to another model."""
 
     model: str
@@ -35,7 +35,7 @@ class Lens:
     sentence: str
 
 
-def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> Lens:
+def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> CameraParameters:
     """The lens of camera `name` in one of the models that `program` has (`held`): its own, or the last that can follow
     it, pinhole-radtan for narrow lenses and pinhole-equidistant for wide ones."""
     sensor = c.rig["sensors"][name]
@@ -50,7 +50,7 @@ def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> Len
             f"{rms:.2f} px RMS over the image, {most:.1f} px at most."
         )
         model = target.name
-    return Lens(model, params[:4].tolist(), params[4:].tolist(), (width, height), sentence)
+    return CameraParameters(model, params[:4].tolist(), params[4:].tolist(), (width, height), sentence)
 
 
 def body_frame(c: Calibration) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from icalib.export.common import (
+    CameraParameters,
     Export,
-    Lens,
     guesses,
     imu_intrinsics,
     inverse,
@@ -118,7 +118,7 @@ def _extrinsics(c: Calibration, name: str) -> dict[str, Any]:
     return {"extrinsic_T": T[:3, 3].tolist(), "extrinsic_R": T[:3, :3].ravel().tolist()}
 
 
-def _vikit(lens: Lens) -> dict[str, Any]:
+def _vikit(lens: CameraParameters) -> dict[str, Any]:
     """As rpg_vikit's camera loader reads it."""
     model, names = _LENSES[lens.model]
     width, height = lens.resolution

@@ -6,8 +6,8 @@ import numpy as np
 
 from icalib.errors import CalibrationError
 from icalib.export.common import (
+    CameraParameters,
     Export,
-    Lens,
     guesses,
     imu_intrinsics,
     inverse,
@@ -56,13 +56,13 @@ def orb_slam3(c: Calibration) -> Export:
     return Export({"orb_slam3.yaml": "\n".join(lines) + "\n"}, sentences)
 
 
-def _alike(lenses: list[Lens]) -> list[Lens]:
+def _alike(lenses: list[CameraParameters]) -> list[CameraParameters]:
     """Those that one file can hold: of the first's type, and of its size."""
     first = lenses[0]
     return [x for x in lenses if (_TYPES[x.model], x.resolution) == (_TYPES[first.model], first.resolution)]
 
 
-def _cameras(c: Calibration, names: tuple[str, ...], lenses: list[Lens]) -> list[str]:
+def _cameras(c: Calibration, names: tuple[str, ...], lenses: list[CameraParameters]) -> list[str]:
     width, height = lenses[0].resolution
     lines = []
     for i, lens in enumerate(lenses, 1):

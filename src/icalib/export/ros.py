@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from icalib.export.common import (
+    CameraParameters,
     Export,
-    Lens,
     drives,
     guesses,
     imu_intrinsics,
@@ -88,7 +88,7 @@ def camera_info(c: Calibration) -> Export:
     return Export({f"{name}.yaml": _info(name, lens, sentences) for name, lens in lenses.items()}, sentences)
 
 
-def _info(name: str, lens: Lens, sentences: tuple[str, ...]) -> str:
+def _info(name: str, lens: CameraParameters, sentences: tuple[str, ...]) -> str:
     fx, fy, cx, cy = lens.intrinsics
     D = lens.distortion + ([0.0] if lens.model == "pinhole-radtan" else [])
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -6,8 +6,8 @@ from math import sqrt
 
 from icalib.errors import CalibrationError
 from icalib.export.common import (
+    CameraParameters,
     Export,
-    Lens,
     guesses,
     imu_intrinsics,
     lens_of,
@@ -51,7 +51,9 @@ def _offset(c: Calibration, names: tuple[str, ...]) -> tuple[str, ...]:
     )
 
 
-def _main(c: Calibration, imu: str, names: tuple[str, ...], lenses: list[Lens], sentences: tuple[str, ...]) -> str:
+def _main(
+    c: Calibration, imu: str, names: tuple[str, ...], lenses: list[CameraParameters], sentences: tuple[str, ...]
+) -> str:
     width, height = lenses[0].resolution
     lines = ["%YAML:1.0", "# For VINS-Fusion, by icalib: copy its other settings (feature tracking, solver) in here."]
     lines.append("# body_T_cam takes coordinates in the camera frame to the imu frame: p_imu = body_T_cam p_cam.")
@@ -78,7 +80,7 @@ def _noise(c: Calibration, imu: str) -> list[str]:
     return [head, *(f"{theirs}: {float(noise[ours]) * root!r}" for theirs, ours in names.items())]
 
 
-def _camera(name: str, lens: Lens) -> str:
+def _camera(name: str, lens: CameraParameters) -> str:
     """As camodocal's models write themselves."""
     fx, fy, cx, cy = lens.intrinsics
     d = lens.distortion

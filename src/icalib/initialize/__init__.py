@@ -49,7 +49,7 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
     if imu is None:
         return guess_without_imu(rig, measurements, params, poses, scene.values)
     assert rig.imu is not None
-    seen = _Seen(rig, measurements, params, poses, scene.values)
+    seen = _TargetViews(rig, measurements, params, poses, scene.values)
     try:
         guess, unlike = seen.guess(imu)
     except EstimationError as error:
@@ -61,7 +61,7 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _TargetViews:
     """What cameras saw of the target: params (P,) and poses of each; scene: poses of the target's bodies."""
 
     rig: Rig

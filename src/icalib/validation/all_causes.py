@@ -31,7 +31,7 @@ WHEEL_LENGTHS = tuple(drive[0].name for drive in DRIVES.values())
 
 
 @dataclass(frozen=True)
-class Judged:
+class AssessedEstimate:
     """An estimate, and what is known of it. factor: the largest empirical one, times which formal standard deviations
     count."""
 
@@ -49,7 +49,7 @@ class Judged:
         return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in self.fits)])))
 
 
-def all_causes(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+def all_causes(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
     """The grave ones first, each kind by its gain; and notes on the size of the target. `against`: what the rig file
     states and the data contradict so much that nothing else that is wrong with the estimate is news."""
     inputs, found = judged.inputs, judged.found
@@ -66,7 +66,7 @@ def all_causes(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[C
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
 
-def _stated(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
     inputs, factor = judged.inputs, judged.factor
     size = None if inputs.rig.assumes_motion else felt_size(judged.found, factor)
     wrong_size, notes = ((), ()) if against else size_words(inputs, size)
@@ -94,7 +94,7 @@ def _stated(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Caus
 
 
 def _contradicted(
-    judged: Judged, against: Sequence[Contradiction], scale: float, grave: bool, stated: Relaxed | None
+    judged: AssessedEstimate, against: Sequence[Contradiction], scale: float, grave: bool, stated: Relaxed | None
 ) -> Iterator[Cause]:
     for c in against:
         gain = np.inf if stated is None else float(((c.off / (c.sigma / scale)) ** 2).max())
@@ -103,7 +103,7 @@ def _contradicted(
     yield from (Cause(s, 0.0, grave) for s in absurd_wheels(judged.inputs, against, judged.groups))
 
 
-def _moves_others(judged: Judged, stated: Relaxed, key: Key) -> bool:
+def _moves_others(judged: AssessedEstimate, stated: Relaxed, key: Key) -> bool:
     """Whether any other parameter of a sensor moves by more than four printed standard deviations where that group is
     neither fixed nor has its prior: then what is stated makes the result wrong."""
     step, _ = stated.step([key])

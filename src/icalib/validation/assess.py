@@ -42,7 +42,7 @@ from icalib.result.verdict import by_size
 from icalib.rig import drive_names
 from icalib.rig.file import rig_to_dict
 from icalib.rig.pose import SCALE
-from icalib.validation.all_causes import Judged, all_causes
+from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.cameras import plane_warnings
 from icalib.validation.guesses import guess_notes
 from icalib.validation.held_out import held_out
@@ -75,7 +75,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     axes = hardly_turned(state.seconds, state.rotation, inputs.rig.body)
     seen = observe(determined, names, [w.name for w in inputs.rig.wheels], tracking, axes)
     parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
-    noise = _Noise.of(determined, seen.covariance, parts)
+    noise = _NoiseShare.of(determined, seen.covariance, parts)
     groups = _groups(inputs, determined, seen, noise)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
@@ -83,7 +83,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     factors = _factors(inputs, groups)
     factor = factors.max(initial=1.0)
     trajectory, poses = _trajectory(inputs, state, timeline), pose_residuals(inputs, found, timeline)
-    causes, size_notes = all_causes(Judged(inputs, found, groups, judged, factor, parts, timeline), against)
+    causes, size_notes = all_causes(AssessedEstimate(inputs, found, groups, judged, factor, parts, timeline), against)
     wrong = tuple(c.sentence for c in causes if c.grave)
     warnings = (
         *wrong,
@@ -171,7 +171,7 @@ def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
     return value
 
 
-class _Noise(NamedTuple):
+class _NoiseShare(NamedTuple):
     """share (B,): of the formal variances that noise of the measurements contributes; ratio (B,): standard deviation
     that the recording shows over this part. weight: the root of how many times priors on nuisance parameters count;
     their errors contribute the rest, the same in all parts of a recording."""
@@ -181,7 +181,7 @@ class _Noise(NamedTuple):
     weight: float
 
     @classmethod
-    def of(cls, determined: Determined, covariance: np.ndarray, parts: Parts | None) -> _Noise:
+    def of(cls, determined: Determined, covariance: np.ndarray, parts: Parts | None) -> _NoiseShare:
         """covariance (B, B): formal."""
         found = determined.estimate
         white = white_variance(found.problem, found.outcome, covariance)
@@ -195,7 +195,9 @@ class _Noise(NamedTuple):
         return np.sqrt(own**2 * share + self.weight**2 * (1.0 - share))
 
 
-def _groups(inputs: Inputs, determined: Determined, seen: Observability, noise: _Noise) -> tuple[ParameterGroup, ...]:
+def _groups(
+    inputs: Inputs, determined: Determined, seen: Observability, noise: _NoiseShare
+) -> tuple[ParameterGroup, ...]:
     formal, found = np.sqrt(np.diag(seen.covariance)), determined.estimate
     own = calibration_columns(inputs)
     overall = float(np.sqrt(np.mean(noise.ratio[own] ** 2))) if len(own) else 1.0

@@ -25,7 +25,7 @@ _GAP_STEPS = 2.0  # a longer step is a gap, over which the motion may have chang
 
 
 @dataclass(frozen=True)
-class Path:
+class ContinuousPoses:
     """on (N,): the poses of the path; jumps (M,) first pose after each; size_m, size_rad: of the largest; lasting_m:
     how far the jumps that stay in the path add up; longest_s: between poses of the path, of time left out."""
 
@@ -79,13 +79,13 @@ def _same_before(rows: np.ndarray) -> np.ndarray:
     return before
 
 
-def path_of(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Path:
+def path_of(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> ContinuousPoses:
     """The path of poses (N,), and where they jump."""
     step, n = np.diff(seconds), len(seconds)
     way, turn = _Steps.of(np.diff(position, axis=0), step, _JUMP_M), _Steps.of(_turns(rotation), step, _JUMP_RAD)
     jump = way.jump | turn.jump
     if not jump.any():
-        return Path(np.ones(n, dtype=bool), np.empty(0, np.int64), 0.0, 0.0, 0.0, 0.0)
+        return ContinuousPoses(np.ones(n, dtype=bool), np.empty(0, np.int64), 0.0, 0.0, 0.0, 0.0)
 
     def moved(i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return way.left(seconds[j] - seconds[i], position[j] - position[i], i, j)
@@ -103,7 +103,7 @@ def path_of(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> 
     own = np.flatnonzero(on)
     ends = np.concatenate([[0], own, [n - 1]])
     missing = np.diff(seconds[ends])[np.diff(ends) > 1]
-    return Path(
+    return ContinuousPoses(
         on,
         np.flatnonzero(jump) + 1,
         float(way.size[jump].max()),

@@ -8,7 +8,15 @@ from itertools import chain, islice
 
 import numpy as np
 
-from icalib.data.images.images import NO_PICTURE, DamagedImageError, Frame, Payload, decode, is_known, unknown_encoding
+from icalib.data.images.images import (
+    NO_PICTURE,
+    DamagedImageError,
+    DecodedImage,
+    Payload,
+    decode,
+    is_known,
+    unknown_encoding,
+)
 from icalib.errors import RecordingError
 
 Note = Callable[[str], None]
@@ -66,7 +74,7 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
     dropped.note(where, note)
 
 
-def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Frame]:
+def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[DecodedImage]:
     """The decoded images; those that are damaged are left out, with a note at the end.
 
     Raises RecordingError if all are damaged.
@@ -80,7 +88,7 @@ def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Fram
             dropped.add("are damaged", payload, str(error))
             continue
         kept += 1
-        yield Frame(payload.stamp_ns, image)
+        yield DecodedImage(payload.stamp_ns, image)
     if not kept and dropped.first_error:
         raise RecordingError(dropped.first_error)
     dropped.note(where, note)

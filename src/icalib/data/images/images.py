@@ -26,7 +26,7 @@ class DamagedImageError(RecordingError):
 
 
 @dataclass(frozen=True)
-class Frame:
+class DecodedImage:
     """One image: stamp_ns on the camera's clock, image (height, width) uint8 grey."""
 
     stamp_ns: int

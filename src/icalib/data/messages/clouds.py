@@ -13,7 +13,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.data.messages.lidar_checks import Sieve
 from icalib.data.messages.point_times import PointTimes, clock_note, find_point_times, likely_fields
-from icalib.data.messages.sweeps import Sweep, find_sweep, sweep_share
+from icalib.data.messages.sweeps import SweepOrder, find_sweep, sweep_share
 from icalib.errors import RecordingError
 from icalib.rig import Lidar, TimeUnit
 
@@ -175,7 +175,7 @@ def _at_the_stamp(cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
     return cloud.stamp_ns, np.zeros(len(xyz), np.float32)
 
 
-def _by_azimuth(sweep: Sweep, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
+def _by_azimuth(sweep: SweepOrder, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
     """Times in turns."""
     return cloud.stamp_ns, sweep_share(sweep, xyz, cloud.height).astype(np.float32)
 

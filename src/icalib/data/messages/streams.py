@@ -33,7 +33,7 @@ class CameraInfo:
 
 
 @dataclass(frozen=True)
-class PoseStream:
+class PoseMessages:
     """Poses T_frame_body: stamps_ns (N,) int64, position (N, 3) m, rotation (N, 3, 3), NaN where there is no unit
     quaternion."""
 
@@ -57,7 +57,7 @@ class TwistStream:
 class OdometryStream:
     """Poses of the body in the odometry's frame, and its velocities in its own axes, at the same instants."""
 
-    pose: PoseStream
+    pose: PoseMessages
     twist: TwistStream
 
 
@@ -79,7 +79,7 @@ def read_camera_info(bag: HasMessages, topic: str) -> CameraInfo:
     return CameraInfo((m.width, m.height), m.distortion_model, np.array(d), np.array(k).reshape(3, 3))
 
 
-def read_poses(bag: HasMessages, topic: str) -> PoseStream:
+def read_poses(bag: HasMessages, topic: str) -> PoseMessages:
     """All PoseStamped, PoseWithCovarianceStamped or TransformStamped of `topic`. Raises RecordingError as
     `BagRecording.messages`, and for a frame that changes."""
     stamps_ns, found = _all(bag, topic, "pose")
@@ -198,7 +198,7 @@ def _frame(
     return frames[0] if frames else ""
 
 
-def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, poses: list[Any]) -> PoseStream:
+def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, poses: list[Any]) -> PoseMessages:
     position = np.array([_xyz(p.position) for p in poses]).reshape(-1, 3)
     xyzw = np.array([(*_xyz(p.orientation), p.orientation.w) for p in poses]).reshape(-1, 4)
     good = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < 1e-3
@@ -207,7 +207,7 @@ def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, pose
             f"{bag.root} {topic}: the orientation at {stamps_ns[np.argmin(good)]} ns is not a unit quaternion, "
             "nor are most others; correct the publisher."
         )
-    return PoseStream(frame, stamps_ns, position, unit_rotations(xyzw, good))
+    return PoseMessages(frame, stamps_ns, position, unit_rotations(xyzw, good))
 
 
 def unit_rotations(xyzw: np.ndarray, good: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ _EDGE = 0.25  # of a turn
 
 
 @dataclass(frozen=True)
-class Sweep:
+class SweepOrder:
     """direction: 1 against the clock seen from above, -1 with it. by_rows: rings follow one another in the message,
     each a whole turn; else columns do."""
 
@@ -22,16 +22,16 @@ class Sweep:
     by_rows: bool
 
 
-def find_sweep(scans: Sequence[np.ndarray]) -> Sweep | None:
+def find_sweep(scans: Sequence[np.ndarray]) -> SweepOrder | None:
     """How the LiDAR turns, from the points (N, 3) of some scans in the order of the message; None if it does not."""
     turned = np.array([_turned(xyz) for xyz in scans])
     middle = float(np.median(turned))
     if abs(middle) < _LEAST_TURNED:
         return None
-    return Sweep(1 if middle > 0 else -1, abs(middle) > _ROWS)
+    return SweepOrder(1 if middle > 0 else -1, abs(middle) > _ROWS)
 
 
-def sweep_share(sweep: Sweep, xyz: np.ndarray, height: int) -> np.ndarray:
+def sweep_share(sweep: SweepOrder, xyz: np.ndarray, height: int) -> np.ndarray:
     """(N,) share of the turn that had passed when each point (N, 3) was measured, from the scan's first column on; NaN
     of points at zero or without numbers. height: rows of an organised message.
 

@@ -1,6 +1,6 @@
 """Recordings: what was recorded -> images, and checked measurements."""
 
-from icalib.data.images.images import DamagedImageError, Frame, Payload, decode
+from icalib.data.images.images import DamagedImageError, DecodedImage, Payload, decode
 from icalib.data.images.topics import TopicInfo, image_topics
 from icalib.data.recordings.bag import BagRecording
 from icalib.data.recordings.base import Recording
@@ -13,7 +13,7 @@ __all__ = [
     "BagRecording",
     "DamagedImageError",
     "FolderRecording",
-    "Frame",
+    "DecodedImage",
     "Payload",
     "PictureFolder",
     "Recording",

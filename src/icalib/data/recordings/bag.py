@@ -17,7 +17,7 @@ from icalib.data.bags.opening import ZSTD_MAGIC, open_storages
 from icalib.data.bags.storage import Tally
 from icalib.data.checks.imu_halves import ImuHalves, imu_source, values_of
 from icalib.data.images.image_checks import checked_payloads, frames
-from icalib.data.images.images import Frame, Payload, file_payload
+from icalib.data.images.images import DecodedImage, Payload, file_payload
 from icalib.data.images.topics import KINDS, TopicInfo, choose_topic, find_topic
 from icalib.data.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
 from icalib.data.messages import livox
@@ -91,7 +91,7 @@ class BagRecording:
         found = (_payload(stamp, where, message) for stamp, message in self.messages(topic, "image"))
         return checked_payloads(found, where, self._note)
 
-    def images(self, topic: str) -> Iterator[Frame]:
+    def images(self, topic: str) -> Iterator[DecodedImage]:
         return frames(self.payloads(topic), f"{self.root} {topic}", self._note)
 
     def imu(self, sensor: ImuSensor) -> ImuStream | ImuHalves:

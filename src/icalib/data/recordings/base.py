@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from icalib.data.checks.imu_halves import ImuHalves
-from icalib.data.images.images import Frame, Payload
+from icalib.data.images.images import DecodedImage, Payload
 from icalib.data.images.topics import TopicInfo
 from icalib.data.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
 from icalib.data.tables.poses import PoseReadings
@@ -52,7 +52,7 @@ class Recording(Protocol):
         """
         ...
 
-    def images(self, topic: str) -> Iterator[Frame]:
+    def images(self, topic: str) -> Iterator[DecodedImage]:
         """The decoded images of `topic`, as `payloads`; damaged ones are left out, too, with a note."""
         ...
 

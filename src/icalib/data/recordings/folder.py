@@ -12,7 +12,7 @@ import numpy as np
 from icalib.data.checks.imu_halves import ImuHalves
 from icalib.data.images.euroc_images import file_payloads, image_files
 from icalib.data.images.image_checks import Note, checked_payloads, frames, ignore
-from icalib.data.images.images import Frame, Payload
+from icalib.data.images.images import DecodedImage, Payload
 from icalib.data.images.topics import TopicInfo, choose_topic, find_topic
 from icalib.data.images.unreadable import VIDEO_FILE
 from icalib.data.images.videos import video_payloads, video_stamps, video_topic, videos_in
@@ -137,7 +137,7 @@ class FolderRecording:
             found = (p for p in found if p.stamp_ns in used)
         return checked_payloads(found, str(video), self._note)
 
-    def images(self, topic: str) -> Iterator[Frame]:
+    def images(self, topic: str) -> Iterator[DecodedImage]:
         return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
 
     def imu(self, sensor: ImuSensor) -> ImuStream | ImuHalves:

@@ -15,7 +15,7 @@ import numpy as np
 
 from icalib.data.images.euroc_images import SUFFIXES, file_payloads, pictures_in, stamped_by_name
 from icalib.data.images.image_checks import checked_payloads, frames
-from icalib.data.images.images import Frame, Payload
+from icalib.data.images.images import DecodedImage, Payload
 from icalib.data.images.topics import TopicInfo, choose_topic
 from icalib.data.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
 from icalib.data.stamps.window import WHOLE, Window, stamps_inside
@@ -73,7 +73,7 @@ class PictureFolder:
         self._read += [path for _, path in files if path not in self._read]
         return checked_payloads(file_payloads(files, where, self._note), where, self._note)
 
-    def images(self, topic: str) -> Iterator[Frame]:
+    def images(self, topic: str) -> Iterator[DecodedImage]:
         return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
 
     def imu(self, sensor: ImuSensor) -> ImuStream:

@@ -64,7 +64,7 @@ class Edge:
 
 
 @dataclass(frozen=True)
-class _Step:
+class _TransformEdge:
     """An edge of a chain; inverted: it is gone from child to parent."""
 
     edge: Edge
@@ -188,7 +188,7 @@ def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, whe
     return Edge(*pair, stamps_ns, rotation, rows[:, :3].copy(), static)
 
 
-def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[_Step]:
+def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[_TransformEdge]:
     """The fewest edges from `parent` to `child`, whichever way each was published."""
     frames = sorted({frame for pair in edges for frame in pair})
     for frame in (parent, child):
@@ -198,13 +198,13 @@ def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[
                 f"{what}: there is no frame {frame}; there are {', '.join(frames[:_MOST_LISTED])}{more}; correct "
                 "`frames`."
             )
-    steps_to: dict[str, list[_Step]] = {parent: []}
+    steps_to: dict[str, list[_TransformEdge]] = {parent: []}
     queue = [parent]
     for frame in queue:
         for (a, b), edge in edges.items():
             for here, there, inverted in ((a, b, False), (b, a, True)):
                 if here == frame and there not in steps_to:
-                    steps_to[there] = [*steps_to[frame], _Step(edge, inverted)]
+                    steps_to[there] = [*steps_to[frame], _TransformEdge(edge, inverted)]
                     queue.append(there)
     if child not in steps_to:
         raise RecordingError(
@@ -215,7 +215,7 @@ def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[
     return steps_to[child]
 
 
-def _along(steps: Sequence[_Step], sensor: PoseSensor, where: str, note: Note) -> PoseReadings:
+def _along(steps: Sequence[_TransformEdge], sensor: PoseSensor, where: str, note: Note) -> PoseReadings:
     """The product of the transforms of all steps at the stamps of one that moves."""
     assert sensor.frames is not None
     what, shown = f"{where} ({sensor.name})", " -> ".join(sensor.frames)

@@ -13,7 +13,7 @@ from icalib.detection.primitives.corners import CROWDED, ImageCorners, judged, n
 from icalib.detection.primitives.families import Family, tag_family
 from icalib.detection.primitives.growth import confirm, grow
 from icalib.detection.primitives.prediction import PredictedCorners
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.refinement import refined_corners, refined_crossings
 from icalib.detection.primitives.tags import Tags, find_tags
 from icalib.errors import RecordingError
@@ -71,9 +71,9 @@ class AprilGridDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        return self.find(View(image))
+        return self.find(ImageWithQuads(image))
 
-    def find(self, view: View) -> ImageCorners:
+    def find(self, view: ImageWithQuads) -> ImageCorners:
         """As `detect`."""
         for window in view.windows:
             for separate in (True, False):
@@ -85,7 +85,7 @@ class AprilGridDetector:
                     return self._corners(view.image, known, quads)
         return no_corners()
 
-    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
+    def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, from where corners are expected; None where some that should be in the image are not there."""
         n = self.rows * self.cols
         uv, seen = np.zeros((4 * n, 2)), np.zeros(4 * n, dtype=bool)

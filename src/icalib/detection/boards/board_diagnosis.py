@@ -14,7 +14,7 @@ from icalib.detection.boards.checkerboard import CheckerboardDetector
 from icalib.detection.boards.markers import all_tags
 from icalib.detection.primitives.families import tag_family
 from icalib.detection.primitives.growth import homography_misfit
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.tags import find_tags
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 
@@ -84,7 +84,7 @@ def other_columns(images: Iterable[np.ndarray], board: AprilGrid | Charuco) -> s
     across, down = ("cols", "rows") if isinstance(board, AprilGrid) else ("squares_x", "squares_y")
     stated, other = getattr(board, across), getattr(board, down)
     tags = _number_of_tags(board)
-    seen = _enough(_tags_of(View(image), board, tags) for image in islice(images, _MOST_IMAGES))
+    seen = _enough(_tags_of(ImageWithQuads(image), board, tags) for image in islice(images, _MOST_IMAGES))
     misfit = {stated: _misfit_of_columns(seen, board, stated, tags)}
     if not seen or misfit[stated] <= _MOST_RIGHT:
         return ""
@@ -119,13 +119,13 @@ def _with_columns(board: AprilGrid | Charuco, n: int, tags: int) -> list[np.ndar
     return [charuco_tags(dark, ratio), charuco_tags(~dark, ratio)]
 
 
-def _tags_of(view: View, board: AprilGrid | Charuco, tags: int) -> tuple[np.ndarray, np.ndarray]:
+def _tags_of(view: ImageWithQuads, board: AprilGrid | Charuco, tags: int) -> tuple[np.ndarray, np.ndarray]:
     """Ids (m,), from the board's first on, of its `tags` tags that the image shows once; corners (m, 4, 2) px."""
     if isinstance(board, AprilGrid):
         found = find_tags(view, tag_family(board.family), board.border_bits, view.windows[0], board.squares)
         place = found.ids - board.first_id
     else:
-        view = View(255 - view.image) if board.inverted else view
+        view = ImageWithQuads(255 - view.image) if board.inverted else view
         found = all_tags(view, tag_family(board.dictionary), 1)
         place = found.ids
     _, index, count = np.unique(place, return_index=True, return_counts=True)

@@ -14,7 +14,7 @@ from icalib.detection.primitives.decoding import mapped
 from icalib.detection.primitives.families import Family, tag_family
 from icalib.detection.primitives.growth import fit_homography, homography_misfit, markers_there
 from icalib.detection.primitives.prediction import PredictedCorners, predict_nodes
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
 
@@ -68,9 +68,9 @@ class CharucoDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        return self.find(View(image))
+        return self.find(ImageWithQuads(image))
 
-    def find(self, view: View) -> ImageCorners:
+    def find(self, view: ImageWithQuads) -> ImageCorners:
         """As `detect`."""
         known, quads = self._seen(view)
         known = largest_group(known, quads, self.tag_corners / self.marker_ratio)
@@ -79,7 +79,7 @@ class CharucoDetector:
         expected = self._expected(self.tag_corners[known], quads[known])
         return square_corners(view.image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
 
-    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
+    def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, from where corners are expected; None where some that should be in the image are not there, or not
         half of the markers."""
         nodes = self._nodes(expected)
@@ -97,7 +97,7 @@ class CharucoDetector:
         at = np.stack(np.divmod(corners.point, self.cols - 1), axis=1) + 1
         return predict_nodes(at, corners.uv, self.rows + 1, self.cols + 1)
 
-    def misfit(self, view: View) -> float:
+    def misfit(self, view: ImageWithQuads) -> float:
         """How far the markers' corners are from where one homography puts them, over the markers' size: the median over
         the image, NaN where too few are seen to tell."""
         known, quads = self._seen(view)
@@ -105,7 +105,7 @@ class CharucoDetector:
             return float("nan")
         return homography_misfit(self.tag_corners[known], quads[known])
 
-    def _seen(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+    def _seen(self, view: ImageWithQuads) -> tuple[np.ndarray, np.ndarray]:
         """Which markers (n,) are seen once, and the corners (n, 4, 2) of these [px]."""
         n = len(self.tag_corners)
         known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))

@@ -12,7 +12,7 @@ from icalib.detection.primitives.corners import INCONSISTENT, ImageCorners, no_c
 from icalib.detection.primitives.crossings import continues_beyond, shows_grid
 from icalib.detection.primitives.decoding import nearest_greys
 from icalib.detection.primitives.prediction import PredictedCorners, predict_nodes
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
 
@@ -46,9 +46,9 @@ class CheckerboardDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        return self.find(View(image))
+        return self.find(ImageWithQuads(image))
 
-    def find(self, view: View) -> ImageCorners:
+    def find(self, view: ImageWithQuads) -> ImageCorners:
         """As `detect`."""
         for grid in self._proposed(view.image):
             found = self._corners(view.image, grid)
@@ -56,7 +56,7 @@ class CheckerboardDetector:
                 return found
         return no_corners()
 
-    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
+    def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, from where corners are expected; None where some that should be in the image are not there. What
         moved on by two squares looks the same but at its border."""
         at = np.stack(np.divmod(expected.point, self.cols), axis=1)

@@ -14,7 +14,7 @@ from icalib.detection.primitives.consistency import consistent_corners
 from icalib.detection.primitives.corners import ImageCorners, judged, no_corners
 from icalib.detection.primitives.ellipse_model import fit_ellipses
 from icalib.detection.primitives.prediction import PredictedCorners
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.geometry.targets import Circles
 
 _LEAST_FOUND = 0.5  # of the circles, with an ellipse at a consistent place: otherwise it is no grid
@@ -31,9 +31,9 @@ class CirclesDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        return self.find(View(image))
+        return self.find(ImageWithQuads(image))
 
-    def find(self, view: View) -> ImageCorners:
+    def find(self, view: ImageWithQuads) -> ImageCorners:
         """As `detect`."""
         for window in view.windows:
             grids = find_grids(self.target, dark_ellipses(view.image, window, step_of(self.target)))
@@ -44,7 +44,7 @@ class CirclesDetector:
                     return found
         return no_corners()
 
-    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
+    def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, from where all centres are expected; None where one is not there."""
         if len(expected.point) < len(self.target.points):
             return None

@@ -16,7 +16,7 @@ from icalib.detection.boards.circles import CirclesDetector
 from icalib.detection.boards.markers import MarkerDetector
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.detection.primitives.prediction import PredictedCorners, predict_corners
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 
@@ -33,14 +33,14 @@ class Detector(Protocol):
 
 
 class _Finder(Protocol):
-    def find(self, view: View) -> ImageCorners:
+    def find(self, view: ImageWithQuads) -> ImageCorners:
         """Corners in the whole image, indices into the target's points."""
         ...
 
 
 @runtime_checkable
 class _Follower(_Finder, Protocol):
-    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
+    def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, where corners are expected; None where the whole image is to be searched."""
         ...
 
@@ -57,7 +57,7 @@ class _Detector:
     finder: _Finder
 
     def detect(self, image: np.ndarray, before: Sequence[ImageCorners] = ()) -> ImageCorners:
-        view = View(image)
+        view = ImageWithQuads(image)
         expected = predict_corners(before) if isinstance(self.finder, _Follower) else None
         if expected is not None and isinstance(self.finder, _Follower):
             found = self.finder.find_near(view, expected)
@@ -103,7 +103,7 @@ class _SceneDetector:
     first: np.ndarray
     tagged: tuple[bool, ...]  # whether tags tell a member from others
 
-    def find(self, view: View) -> ImageCorners:
+    def find(self, view: ImageWithQuads) -> ImageCorners:
         found = [member.find(view) for member in self.members]
         of_tags = np.concatenate([np.zeros((0, 2))] + [f.uv for f, t in zip(found, self.tagged, strict=True) if t])
         found = [f if t or _apart(f.uv, of_tags) else no_corners() for f, t in zip(found, self.tagged, strict=True)]
@@ -118,11 +118,11 @@ class _Inverted:
 
     detector: CharucoDetector | _Renumbered
 
-    def find(self, view: View) -> ImageCorners:
-        return self.detector.find(View(255 - view.image))
+    def find(self, view: ImageWithQuads) -> ImageCorners:
+        return self.detector.find(ImageWithQuads(255 - view.image))
 
-    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
-        return self.detector.find_near(View(255 - view.image), expected)
+    def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
+        return self.detector.find_near(ImageWithQuads(255 - view.image), expected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +132,11 @@ class _Renumbered:
     detector: CheckerboardDetector
     number: np.ndarray
 
-    def find(self, view: View) -> ImageCorners:
+    def find(self, view: ImageWithQuads) -> ImageCorners:
         found = self.detector.find(view)
         return found.renumbered(self.number[found.point])
 
-    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
+    def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         found = self.detector.find_near(view, PredictedCorners(np.argsort(self.number)[expected.point], expected.uv))
         return None if found is None else found.renumbered(self.number[found.point])
 

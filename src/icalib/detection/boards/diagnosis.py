@@ -11,7 +11,7 @@ import numpy as np
 
 from icalib.detection.boards.detectors import charuco_detector
 from icalib.detection.primitives.families import tag_family
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.tags import tags_at
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
@@ -33,7 +33,7 @@ _HOWS: tuple[_How, ...] = ("", "mirrored", "inverted")
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _VisibleTags:
     family: str
     border_bits: int
     how: _How
@@ -48,7 +48,7 @@ def what_is_seen(
     `family`, `border_bits` and `ids` are those of the target, `field` is where a rig file names the family. Raises
     RecordingError for an image that is not grey.
     """
-    candidates = _candidates([View(image).image for image in islice(images, _MOST_IMAGES)])
+    candidates = _candidates([ImageWithQuads(image).image for image in islice(images, _MOST_IMAGES)])
     own_name = _largest(family)
     candidates.sort(key=lambda seen: (len(seen.ids), seen.family == own_name), reverse=True)
     if not candidates:
@@ -61,7 +61,7 @@ def what_is_seen(
 
 def tags_in(images: Sequence[np.ndarray]) -> str:
     """The tags of any known family that images (h, w) uint8 show, in words; "" for none."""
-    seen = max(_candidates([View(i).image for i in images]), key=lambda one: len(one.ids), default=None)
+    seen = max(_candidates([ImageWithQuads(i).image for i in images]), key=lambda one: len(one.ids), default=None)
     return "" if seen is None else _words(seen)
 
 
@@ -75,7 +75,7 @@ def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterab
     ids = sorted(set(tags.ids) - {i for other in others for i in swapped.shared_with(other)})
     found: dict[int, list[np.ndarray]] = {1: [], 2: []}
     for image in islice(images, _MOST_IMAGES):
-        view = View(image)
+        view = ImageWithQuads(image)
         quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for border, seen in found.items():
             read = tags_at(view.image, quads, tag_family(tags.family), border).ids
@@ -83,7 +83,7 @@ def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterab
     own, swap = (np.concatenate([np.zeros(0, np.int64), *found[t.border_bits]]) for t in (tags, swapped))
     if len(swap) < _MANY_MORE * max(len(own), 1):
         return ""
-    return _sentence(_Seen(tags.family, swapped.border_bits, "", swap), tags.family, tags.border_bits, tags.ids)
+    return _sentence(_VisibleTags(tags.family, swapped.border_bits, "", swap), tags.family, tags.border_bits, tags.ids)
 
 
 def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
@@ -93,7 +93,7 @@ def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
     if board.squares_y % 2:
         return ""  # both layouts are the same
     detectors = [charuco_detector(b) for b in (board, replace(board, legacy=not board.legacy))]
-    views = [View(255 - image if board.inverted else image) for image in islice(images, _MOST_IMAGES)]
+    views = [ImageWithQuads(255 - image if board.inverted else image) for image in islice(images, _MOST_IMAGES)]
     misfits = np.array([[d.misfit(view) for d in detectors] for view in views]).reshape(-1, 2)
     misfits = misfits[np.isfinite(misfits).all(axis=1)]
     if not len(misfits) or np.median(misfits[:, 1]) > _CLEARLY_BETTER * np.median(misfits[:, 0]):
@@ -106,21 +106,21 @@ def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
     )
 
 
-def _candidates(images: list[np.ndarray]) -> list[_Seen]:
+def _candidates(images: list[np.ndarray]) -> list[_VisibleTags]:
     """What each family and border finds, where it is more than chance."""
     found: dict[tuple[str, int, _How], list[np.ndarray]] = {}
     tried = [name for name in _TRIED if is_available(name)]
     for image, how in product(images, _HOWS):
-        view = View({"": image, "mirrored": image[:, ::-1], "inverted": 255 - image}[how])
+        view = ImageWithQuads({"": image, "mirrored": image[:, ::-1], "inverted": 255 - image}[how])
         quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for name, border in product(tried, _BORDERS):
             found.setdefault((name, border, how), []).append(tags_at(view.image, quads, tag_family(name), border).ids)
-    seen = [_Seen(*key, np.concatenate(ids)) for key, ids in found.items()]
+    seen = [_VisibleTags(*key, np.concatenate(ids)) for key, ids in found.items()]
     least = {name: _LEAST_TAGS.get(tag_family(name).bits, _LEAST_TAGS_USUALLY) for name in tried}
     return [one for one in seen if len(one.ids) >= least[one.family]]
 
 
-def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int], field: str = "family") -> str:
+def _sentence(seen: _VisibleTags, family: str, border_bits: int, ids: Sequence[int], field: str = "family") -> str:
     what = _words(seen)
     if seen.how == "inverted":
         return f"the images show {what}, white on black; set inverted: true of a ChArUco board."
@@ -140,7 +140,7 @@ def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int], fi
     return f"the images show {what}; check that rows, cols and spacing are those of the target."
 
 
-def _words(seen: _Seen) -> str:
+def _words(seen: _VisibleTags) -> str:
     return f"{len(seen.ids)} tags of {_smallest(seen)} (ids {seen.ids.min()} to {seen.ids.max()})"
 
 
@@ -149,7 +149,7 @@ def _largest(family: str) -> str:
     return next((name for name in _TRIED if name.split("_")[0] == family.split("_")[0] and "x" in family), family)
 
 
-def _smallest(seen: _Seen) -> str:
+def _smallest(seen: _VisibleTags) -> str:
     """The smallest of OpenCV's families with the ids that were seen."""
     start = seen.family.split("_")[0]
     fitting = (f"{start}_{size}" for size in _SIZES if size > seen.ids.max() and f"{start}_{size}" in FAMILIES)

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.detection.primitives.corners import CROWDED, ImageCorners, judged, no_corners
 from icalib.detection.primitives.families import Family, tag_family
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.refinement import refined_corners
 from icalib.detection.primitives.tags import Tags, tags_at
 from icalib.errors import RecordingError
@@ -20,7 +20,7 @@ APRILTAG_CORNER = np.array([1, 0, 3, 2])
 ARUCO_CORNER = np.array([3, 2, 1, 0])
 
 
-def all_tags(view: View, family: Family, border_bits: int) -> Tags:
+def all_tags(view: ImageWithQuads, family: Family, border_bits: int) -> Tags:
     """The tags that stand alone, large ones and small ones."""
     quads = np.concatenate([view.quads(window, False) for window in view.windows])
     return tags_at(view.image, quads, family, border_bits)
@@ -55,9 +55,9 @@ class MarkerDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        return self.find(View(image))
+        return self.find(ImageWithQuads(image))
 
-    def find(self, view: View) -> ImageCorners:
+    def find(self, view: ImageWithQuads) -> ImageCorners:
         """As `detect`."""
         tags = all_tags(view, self._family, self.border_bits)
         ids, count = np.unique(tags.ids, return_counts=True)

@@ -29,7 +29,7 @@ class Voxels(NamedTuple):
     flat: np.ndarray
 
 
-class Cells(NamedTuple):
+class OccupancyGrid(NamedTuple):
     """Where planes (P, 6) reach: squares of a grid along their axes (P, 2, 3) from `low` (P, 2), size (P, 2) of them;
     those of plane q begin at first[q] of `use`: OUTSIDE, NEAR (it may be there: no other may take the points), OWN."""
 

@@ -19,7 +19,7 @@ from icalib.detection.planes.plane_kernels import (
     NEAR,
     OUTSIDE,
     OWN,
-    Cells,
+    OccupancyGrid,
     Voxels,
     associate,
     fit,
@@ -67,7 +67,7 @@ class FoundPlanes:
     """cells: where planes are, the first `count` of them the planes found, the others surfaces that bend or are small
     and only keep points from their neighbours."""
 
-    cells: Cells
+    cells: OccupancyGrid
     count: int
 
     @property
@@ -221,11 +221,11 @@ def _patches(regions: list[_Region], voxels: Voxels, search: PlaneSearch) -> lis
     return patches
 
 
-def _packed(patches: list[_Patch], edge_m: float) -> Cells:
+def _packed(patches: list[_Patch], edge_m: float) -> OccupancyGrid:
     """Patches in the arrays of kernels, those that own cells first."""
     patches = sorted(patches, key=lambda p: -p.own)
     first = np.cumsum([0, *(p.use.size for p in patches)])[:-1].astype(np.int64)
-    return Cells(
+    return OccupancyGrid(
         np.array([p.plane for p in patches]).reshape(-1, 6),
         np.array([p.axes for p in patches]).reshape(-1, 2, 3),
         np.array([p.low for p in patches]).reshape(-1, 2),
@@ -237,7 +237,7 @@ def _packed(patches: list[_Patch], edge_m: float) -> Cells:
 
 
 def _associate(
-    cells: Cells, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
+    cells: OccupancyGrid, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     n = len(points)
     plane, cell, distance = np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n)
@@ -246,7 +246,7 @@ def _associate(
 
 
 def _associate_at_once(
-    cells: Cells, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
+    cells: OccupancyGrid, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `_associate`, on two threads."""
     halves = (slice(0, len(points) // 2), slice(len(points) // 2, None))

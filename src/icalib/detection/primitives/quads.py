@@ -17,7 +17,7 @@ _WINDOW_SHARES = (0.08, 0.03, 0.2)  # of the width of the image
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ImageWithQuads:
     """An image (h, w) uint8 and its dark quads: what one detector has worked out serves the next one.
 
     Raises RecordingError for an image that is not grey with 8 bits.

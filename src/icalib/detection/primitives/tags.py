@@ -10,7 +10,7 @@ from icalib.base.compiled import njit
 from icalib.detection.primitives.decoding import cell_greys, dark_in_ring, levels, lookup, read_cells, unit_homography
 from icalib.detection.primitives.edges import fit_quad
 from icalib.detection.primitives.families import Family
-from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.quads import ImageWithQuads
 
 LEAST_CONTRAST = 16.0  # grey levels between black and white of a tag
 _LEAST_RISE = 4.0  # grey levels over 2 px at an edge
@@ -30,7 +30,7 @@ class Tags:
     contrast: np.ndarray
 
 
-def find_tags(view: View, family: Family, border_bits: int, window: int, separate: bool) -> Tags:
+def find_tags(view: ImageWithQuads, family: Family, border_bits: int, window: int, separate: bool) -> Tags:
     """All tags of `family` with a black border of `border_bits` cells.
 
     An id may appear more than once, and a tag that was found as two quads appears once. `window` and `separate` are

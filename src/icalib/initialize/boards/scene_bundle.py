@@ -22,7 +22,7 @@ RIDGE = 1e-9  # keeps the blocks of images with few corners regular
 
 
 @dataclass(frozen=True)
-class Lens:
+class CameraIntrinsics:
     """A camera's parameters (P,); prior: Gaussian, mean and sigma (P,); free: (P,) bool."""
 
     model: CameraModel
@@ -41,7 +41,7 @@ class SceneState:
     p_image: np.ndarray
     R_body: np.ndarray
     p_body: np.ndarray
-    lenses: tuple[Lens, ...]
+    lenses: tuple[CameraIntrinsics, ...]
 
 
 @dataclass(frozen=True)

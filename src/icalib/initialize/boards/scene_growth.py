@@ -17,7 +17,7 @@ from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras.base import CameraModel
 from icalib.initialize.boards.scene import Placed, body_poses, poses_by_bodies
-from icalib.initialize.boards.scene_bundle import UNSEEN_PX, Lens, SceneState, SceneViews, adjust, errors
+from icalib.initialize.boards.scene_bundle import UNSEEN_PX, CameraIntrinsics, SceneState, SceneViews, adjust, errors
 from icalib.initialize.steps.target_poses import LARGEST_RMS_PX, MOST_CORNERS, TargetPoses
 from icalib.optim.state import Key
 from icalib.sensors.camera.bodies import Bodies
@@ -97,12 +97,12 @@ def place_bodies(
     return Placed(bodies, {key: value for key, value in values.items() if key[0] != reference}, params)
 
 
-def fixed_lens(model: CameraModel, params: np.ndarray) -> Lens:
+def fixed_lens(model: CameraModel, params: np.ndarray) -> CameraIntrinsics:
     """A lens with parameters (P,) that are not adjusted."""
-    return Lens(model, params, params, np.ones(len(params)), np.zeros(len(params), dtype=bool))
+    return CameraIntrinsics(model, params, params, np.ones(len(params)), np.zeros(len(params), dtype=bool))
 
 
-def grow(bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[Lens]) -> Grown:
+def grow(bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[CameraIntrinsics]) -> Grown:
     """The scene that images of all cameras show together, those that tell most. streams: corners of bodies in use only,
     body by body."""
     streams = [telling_images(s, bodies.target.body) for s in streams]
@@ -135,7 +135,7 @@ class _Growth:
     seed: int
 
     @classmethod
-    def begin(cls, bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[Lens]) -> _Growth:
+    def begin(cls, bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[CameraIntrinsics]) -> _Growth:
         begins = np.cumsum([0, *(len(s.stamps_ns) for s in streams)])
         views = _views(bodies, streams, begins)
         m, b = int(begins[-1]), len(bodies.target.bodies)

@@ -16,7 +16,7 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import Target
 from icalib.initialize.boards.intrinsics import camera_params
 from icalib.initialize.boards.scene import Placed
-from icalib.initialize.boards.scene_bundle import Lens
+from icalib.initialize.boards.scene_bundle import CameraIntrinsics
 from icalib.initialize.boards.scene_groups import place_groups
 from icalib.initialize.boards.scene_growth import grow, place_bodies
 from icalib.rig import Camera, Rig
@@ -76,7 +76,9 @@ def scene_params(target: Target, camera: Camera, stream: CornerStream) -> np.nda
     return params
 
 
-def _best(bodies: Bodies, camera: Camera, seen: CornerStream, starts: Iterator[Lens]) -> tuple[float, np.ndarray]:
+def _best(
+    bodies: Bodies, camera: Camera, seen: CornerStream, starts: Iterator[CameraIntrinsics]
+) -> tuple[float, np.ndarray]:
     """The median error [px] and the lens (P,) of the scene that fits best, or fits well; each start is followed anew
     from where it led, as long as that fits better: where bodies stand wrongly, a nearly right lens places them right.
     Infinite where no scene fits a lens that can be."""
@@ -114,7 +116,7 @@ def is_possible(model: CameraModel, params: np.ndarray, resolution: tuple[int, i
     return bool((~valid).mean() < UNSEEN_SHARE)
 
 
-def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[Lens]:
+def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[CameraIntrinsics]:
     """What each body by itself says, with what the rig gives, if that can be; then each kind of lens of the model at
     several focal lengths, whatever the guess."""
     model, width = camera_model(camera.model), camera.resolution[0]
@@ -123,12 +125,12 @@ def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[Le
     n = len(model.parameter_names)
     free = np.repeat([p.value is None or p.mode == "free" for p in given], [4, n - 4])
 
-    def lens(params: np.ndarray) -> Lens:
+    def lens(params: np.ndarray) -> CameraIntrinsics:
         mean = params.copy()
         if camera.intrinsics.value is None:
             mean[2:4] = middle
         sigma = np.concatenate([params[:2], np.full(2, CENTRE_SIGMA * width), np.full(n - 4, DISTORTION_SIGMA)])
-        return Lens(model, params, mean, sigma, free)
+        return CameraIntrinsics(model, params, mean, sigma, free)
 
     with suppress(EstimationError):
         params = camera_params(camera, stream, target)

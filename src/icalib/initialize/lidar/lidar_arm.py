@@ -41,7 +41,7 @@ ROUNDS = 5
 MIRRORED = 1.4  # times what was seen is left: 2 without noise, and 1 or less where axes are right-handed
 
 
-class Rows(NamedTuple):
+class LeverArmRows(NamedTuple):
     """A x = b with A (n, 3, m), b (n, 3); the first six of x are d and p_imu_lidar. seen (n, 3): what the LiDAR's path
     has part in b."""
 
@@ -50,11 +50,11 @@ class Rows(NamedTuple):
     seen: np.ndarray
 
 
-System = Callable[[np.ndarray, np.ndarray], Rows]  # of R_imu_lidar, and p_imu_lidar for the derivative by d
+System = Callable[[np.ndarray, np.ndarray], LeverArmRows]  # of R_imu_lidar, and p_imu_lidar for the derivative by d
 
 
 @dataclass(frozen=True)
-class Prior:
+class GaussianPrior:
     """Of x (m,): mean and sigma, in the units of a row's sigma; information (3, 3) of d from rates, likewise."""
 
     mean: np.ndarray
@@ -70,7 +70,7 @@ def arm_prior(others: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_
     mean = np.concatenate([np.zeros(3), np.zeros(3) if held is None else held, np.zeros(len(others))])
     w = rates - rates.mean(axis=0)
     information = (w**2).sum() * np.eye(3) - w.T @ w
-    return Prior(
+    return GaussianPrior(
         mean, np.concatenate([[d] * 3, [arm] * 3, others]) / row_sigma, information * (row_sigma / RATE_SIGMA) ** 2
     )
 
@@ -83,12 +83,12 @@ def against_motion(
     u = np.einsum("nji,nj->ni", rotation[i], position[j] - position[i])
     hat_u = so3.hat_many(u)
 
-    def rows(R_il: np.ndarray, p_il: np.ndarray) -> Rows:
+    def rows(R_il: np.ndarray, p_il: np.ndarray) -> LeverArmRows:
         del p_il
         R = R_imu[i] @ R_il
         A = np.concatenate([R @ hat_u, R_imu[j] - R_imu[i]], axis=2)
         way = np.einsum("nij,nj->ni", R, u)
-        return Rows(A, way - (p_imu[j] - p_imu[i]), way)
+        return LeverArmRows(A, way - (p_imu[j] - p_imu[i]), way)
 
     return rows
 
@@ -111,7 +111,7 @@ def against_readings(
 
     bend = second(position)
 
-    def rows(R_il: np.ndarray, p_il: np.ndarray) -> Rows:
+    def rows(R_il: np.ndarray, p_il: np.ndarray) -> LeverArmRows:
         at_scans = rotation @ R_il.T
         R = carry(at_scans)
         felt = np.einsum("nij,nj->ni", R, imu.accel)
@@ -124,12 +124,14 @@ def against_readings(
         A[:, :, 3:6] = second(at_scans)
         A[:, :, 6:9] = 0.5 * (h1 + h2)[:, :, None] * np.eye(3)
         A[:, :, 9:] = -second(D[:, 3:12].reshape(-1, 3, 3))
-        return Rows(A, bend - second(D[:, :3]), bend)
+        return LeverArmRows(A, bend - second(D[:, :3]), bend)
 
     return rows
 
 
-def solve(rows: System, prior: Prior, R_il: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def solve(
+    rows: System, prior: GaussianPrior, R_il: np.ndarray, rates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
     """R_imu_lidar and x (m,) that fit the rows best, from a rotation that fits rates (n, 3) of the LiDAR; None where
     rows are too few."""
     start = prior.mean[3:6]
@@ -161,12 +163,12 @@ def is_mirrored(rows: System, R_il: np.ndarray, x: np.ndarray) -> bool:
     return left_over(rows, R_il, x) > MIRRORED
 
 
-def _misfit(rows: Rows, prior: Prior) -> float:
+def _misfit(rows: LeverArmRows, prior: GaussianPrior) -> float:
     """RMS of what rows lack with d = 0."""
     return _fit(rows, prior, 3)[1]
 
 
-def _fit(rows: Rows, prior: Prior, without: int) -> tuple[np.ndarray, float]:
+def _fit(rows: LeverArmRows, prior: GaussianPrior, without: int) -> tuple[np.ndarray, float]:
     """Least squares for x without its first `without`, twice more without rows that stand far off; RMS of the rest."""
     A, free = rows.A[:, :, without:], slice(without, None)
     N0, mean = np.diag(prior.sigma[free] ** -2), prior.mean[free]

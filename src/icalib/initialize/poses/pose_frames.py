@@ -14,7 +14,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from icalib.initialize.lidar.lidar_arm import Rows
+from icalib.initialize.lidar.lidar_arm import LeverArmRows
 
 SQUARE = 0.35  # cosine with the next axes: turns within 20 degrees of these are meant to be about right angles
 EVEN = 0.5  # the least over the largest stretch of M: a turn has 1
@@ -22,7 +22,7 @@ FEWEST = 40  # rows
 UNTURNED = np.eye(3)
 
 
-def turn_of_positions(rows: Rows, R_world_frame: np.ndarray = UNTURNED) -> np.ndarray | None:
+def turn_of_positions(rows: LeverArmRows, R_world_frame: np.ndarray = UNTURNED) -> np.ndarray | None:
     """C (3, 3) that may turn positions into the frame of rotations; None where it is none, or the rows are few.
     R_world_frame (3, 3): how the frame of rotations stands in the world whose axes the rows have."""
     felt, n = rows.seen - rows.b, len(rows.b)

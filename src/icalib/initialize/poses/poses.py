@@ -28,7 +28,7 @@ from icalib.initialize.lidar.lidar import (
 )
 from icalib.initialize.lidar.lidar_arm import (
     WAY_SIGMA,
-    Rows,
+    LeverArmRows,
     against_motion,
     against_readings,
     arm_prior,
@@ -221,7 +221,7 @@ def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, fo
     with what it felt as one more column, as of a target in `lever_arm`."""
     gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
 
-    def rows_at(position: np.ndarray) -> Rows:
+    def rows_at(position: np.ndarray) -> LeverArmRows:
         carry = partial(gyro.carry, t, to=imu.seconds)
         return against_readings(imu, carry, t, path.rotation, position)(found.guess.rotation, found.guess.position)
 

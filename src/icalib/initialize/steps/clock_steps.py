@@ -18,7 +18,7 @@ Left = Callable[[CameraRates, float], float]
 
 
 @dataclass(frozen=True)
-class _Step:
+class _ClockStep:
     """Of whose clock, if a gap is one: its size [s]; where the rates before it end and those after it begin on their
     own clock, if the time offset at hand is that of the other side; and by how much the offset grows over it."""
 
@@ -46,14 +46,14 @@ def refuse_steps(imu: ImuData, name: str, rates: CameraRates, offset: float, une
                 )
 
 
-def _steps(imu: ImuData, name: str, rates: CameraRates, offset: float) -> list[_Step]:
+def _steps(imu: ImuData, name: str, rates: CameraRates, offset: float) -> list[_ClockStep]:
     """Gaps of the IMU and of the rates that may be steps of their clocks."""
     step = float(np.median(np.diff(imu.seconds)))
-    found = [_Step(imu.name, b - a - step, b - offset, a - offset, b - a - step) for a, b in imu.gaps]
+    found = [_ClockStep(imu.name, b - a - step, b - offset, a - offset, b - a - step) for a, b in imu.gaps]
     size = rates.start[1:] - np.maximum.accumulate(rates.end)[:-1] - float(np.median(np.diff(rates.start)))
     for k in np.flatnonzero(size > LEAST_STEP_S):
         begin = float(rates.start[k + 1])
-        found.append(_Step(name, float(size[k]), begin, begin, -float(size[k])))
+        found.append(_ClockStep(name, float(size[k]), begin, begin, -float(size[k])))
     return [x for x in found if x.size > LEAST_STEP_S]
 
 

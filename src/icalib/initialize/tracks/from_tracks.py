@@ -20,7 +20,7 @@ from icalib.initialize.steps.rate_shifts import telling_rates
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.initialize.tracks.track_alignment import align_together, pairs_of
 from icalib.initialize.tracks.track_lens import find_lens
-from icalib.initialize.tracks.track_motion import Motion, Rays, track_motion
+from icalib.initialize.tracks.track_motion import Rays, WindowMotion, track_motion
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
 
@@ -114,7 +114,7 @@ def _apart(stream: TrackStream) -> np.ndarray:
     return np.diff(np.floor((t - t[0]) / max(apart, 1e-3) + 1e-6), prepend=-1.0) > 0.0
 
 
-def _poses(motion: Motion, times: np.ndarray, R_imu_cam: np.ndarray, p_imu_cam: np.ndarray) -> TargetPoses:
+def _poses(motion: WindowMotion, times: np.ndarray, R_imu_cam: np.ndarray, p_imu_cam: np.ndarray) -> TargetPoses:
     """A camera's poses in the world at `times` (M,)."""
     imu = motion.gyro.imu
     R, p = motion.poses(times)

@@ -32,7 +32,7 @@ from icalib.initialize.steps.mean_rates import MeanRates
 from icalib.initialize.steps.rate_shifts import best_regressions, telling_rates
 from icalib.initialize.steps.track_rotation import track_rates, turns_information
 from icalib.initialize.tracks.track_alignment import gyro_turns
-from icalib.initialize.tracks.track_mount import Followed, lens_slopes
+from icalib.initialize.tracks.track_mount import ImagePairs, lens_slopes
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
 
@@ -150,7 +150,7 @@ def _turned(gyro: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray, np.n
 def _refined(stream: TrackStream, imu: ImuData, model: CameraModel, rough: _Fit, keep_offset: bool, bends: int) -> _Fit:
     """All together by Gauss-Newton, with the first `bends` coefficients of the distortion."""
     aligned, n = rough.aligned, 4 + bends
-    followed = Followed.of(stream, model, rough.lens, _directions(rough.lens, bends))
+    followed = ImagePairs.of(stream, model, rough.lens, _directions(rough.lens, bends))
     bent, sigma, cost = np.zeros(n), np.ones(7 + n), np.inf
     known = np.concatenate([np.zeros(7), PRIOR, np.full(bends, BENT)])
     known[7:] **= -2.0
@@ -179,7 +179,7 @@ def _directions(lens: np.ndarray, bends: int) -> np.ndarray:
 
 
 def _normal(
-    followed: Followed, imu: ImuData, bent: np.ndarray, aligned: Alignment
+    followed: ImagePairs, imu: ImuData, bent: np.ndarray, aligned: Alignment
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Normal matrix and right-hand side of rotation, time offset, bias of the gyroscope, and the lens (7 + L,); and
     minus the logarithm of the likelihood, where the noise of each pair of images is not known."""

@@ -43,7 +43,7 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Motion:
+class WindowMotion:
     """begins (W,) s: windows, each until the next begins; in the frame of the gyroscope's start velocity (W, 3) there,
     gravity (W, 3); accel_bias (3,); arms (C, 3) p_imu_cam."""
 
@@ -110,7 +110,7 @@ class _Integrals:
 
 def track_motion(
     gyro: GyroRotation, rays: Rays, R_imu_cam: list[np.ndarray], arms: list[np.ndarray | None], gravity: float
-) -> Motion:
+) -> WindowMotion:
     """The IMU's motion while `rays` were seen, by cameras of known rotation; `arms` where they are known; `gravity`
     m/s^2."""
     low, high = float(rays.times.min()), float(rays.times.max())
@@ -140,7 +140,7 @@ def track_motion(
         common = np.linalg.solve(N, r)
         own = np.array([np.linalg.solve(A[:OWN, :OWN], b[:OWN] - A[:OWN, OWN:] @ common) for A, b in reduced])
     arms_found = common[SHARED:].reshape(-1, 3)
-    return Motion(gyro, edges[:-1], own[:, :3], own[:, 3:] + common[:3], common[3:6], arms_found)
+    return WindowMotion(gyro, edges[:-1], own[:, :3], own[:, 3:] + common[:3], common[3:6], arms_found)
 
 
 @dataclass

@@ -49,7 +49,7 @@ UNITS = np.repeat([0.1, 0.1, 0.01], [3, 3, 1])  # rad, m, s: of what a mount is 
 
 
 @dataclass(frozen=True)
-class Mount:
+class CameraExtrinsics:
     """T_imu_cam; offset: t_imu - t_camera, both since their clock's first stamp [s]; bent (L,): by how much of each of
     the directions in which the lens is open it differs from the guess."""
 
@@ -58,14 +58,14 @@ class Mount:
     offset: float
     bent: np.ndarray
 
-    def moved(self, x: np.ndarray) -> Mount:
+    def moved(self, x: np.ndarray) -> CameraExtrinsics:
         """By (7 + L,): a turn in the camera's axes, metres, seconds, and how the lens is bent."""
         R, p = self.rotation @ so3.exp(x[:3].copy()), self.position + x[3:6]
-        return Mount(R, p, self.offset + float(x[6]), self.bent + x[7:])
+        return CameraExtrinsics(R, p, self.offset + float(x[6]), self.bent + x[7:])
 
 
 @dataclass(frozen=True)
-class Followed:
+class ImagePairs:
     """What one camera followed: pairs of images at times (m, 2) on its clock, and which of the observations uv (o, 2)
     are of points that they share, (n, 2), those of pair k at begin[k]..begin[k + 1]. lens (P,): a guess of its
     intrinsics and distortion; bends (L, P): directions in which it is open, each as long as it may be off."""
@@ -80,7 +80,7 @@ class Followed:
     bends: np.ndarray
 
     @classmethod
-    def of(cls, stream: TrackStream, model: CameraModel, lens: np.ndarray, directions: np.ndarray) -> Followed:
+    def of(cls, stream: TrackStream, model: CameraModel, lens: np.ndarray, directions: np.ndarray) -> ImagePairs:
         """`directions` (L, P): in which the lens is open. Raises EstimationError where hardly any images share enough
         points."""
         rays, valid = model.unproject(lens, stream.uv)
@@ -98,15 +98,15 @@ class Followed:
         uv, used = _used(stream.uv, np.concatenate(shared))
         return cls(stream.name, model, uv, times, used, begin, lens, LENS_SIGMA * directions / effect[:, None])
 
-    def lens_of(self, mount: Mount) -> np.ndarray:
+    def lens_of(self, mount: CameraExtrinsics) -> np.ndarray:
         """(P,)"""
         return self.lens + mount.bent @ self.bends
 
-    def every(self, n: int) -> Followed:
+    def every(self, n: int) -> ImagePairs:
         """One of `n` pairs."""
         return self.some(np.arange(len(self.times)) % n == 0)
 
-    def some(self, kept: np.ndarray) -> Followed:
+    def some(self, kept: np.ndarray) -> ImagePairs:
         """The pairs `kept` (m,) bool."""
         count = np.diff(self.begin)
         begin = np.cumsum([0, *count[kept]])
@@ -161,12 +161,12 @@ def _misses(f, h, f_by, h_by, bent, begin, R, b, e):
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _PairResiduals:
     """Pairs of images as the camera `at` sees them: the motion at both (m,), f and h (n, 3) rays of the first and the
     second image, and their slopes (L, n, 3) by the lens."""
 
-    followed: Followed
-    at: Mount
+    followed: ImagePairs
+    at: CameraExtrinsics
     first: Poses
     second: Poses
     f: np.ndarray
@@ -175,7 +175,7 @@ class _Seen:
     h_by: np.ndarray
 
     @classmethod
-    def of(cls, followed: Followed, motion: Motion, at: Mount) -> _Seen:
+    def of(cls, followed: ImagePairs, motion: Motion, at: CameraExtrinsics) -> _PairResiduals:
         t = followed.times + at.offset
         followed = followed.some(is_known(motion.state.seconds, t[:, 0]) & is_known(motion.state.seconds, t[:, 1]))
         t1, t2 = (followed.times + at.offset).T
@@ -203,7 +203,7 @@ class _Seen:
         """(n,) of all rays, the camera where it is."""
         return self.misses(np.zeros(MOUNTED + len(self.followed.bends)))
 
-    def sought(self, held: np.ndarray) -> tuple[Mount, OptimizeResult]:
+    def sought(self, held: np.ndarray) -> tuple[CameraExtrinsics, OptimizeResult]:
         """The best mount near by."""
         n, sigma = len(self.followed.bends), RAY_SIGMA * np.sqrt(ALIKE)
         units, free = np.append(UNITS, np.ones(n)), np.flatnonzero(~np.append(held, np.zeros(n, dtype=bool)))
@@ -240,8 +240,8 @@ def _after(poses: Poses, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def place_on_motion(
-    followed: Followed, motion: Motion, starts: Sequence[Mount], axis: np.ndarray | None, held: np.ndarray
-) -> Mount:
+    followed: ImagePairs, motion: Motion, starts: Sequence[CameraExtrinsics], axis: np.ndarray | None, held: np.ndarray
+) -> CameraExtrinsics:
     """The camera that fits best what it `followed`, sought from each of the `starts`, turned all round about `axis`
     (3,) of the IMU where there is one. held (7,): what is not sought, as in `Mount.moved`.
 
@@ -251,7 +251,7 @@ def place_on_motion(
     turns = [np.eye(3)] if axis is None else [so3.exp(a * axis) for a in angles]
     some = followed.every(EVERY)
     least = LEAST_SEEN * _in_common(some, motion) * len(some.times)
-    once = [s for s in (_Seen.of(some, motion, start) for start in starts) if len(s.followed.times) > least]
+    once = [s for s in (_PairResiduals.of(some, motion, start) for start in starts) if len(s.followed.times) > least]
     seen = [replace(s, at=replace(s.at, rotation=T @ s.at.rotation)) for s in once for T in turns]
     if not seen:
         raise EstimationError(
@@ -261,22 +261,22 @@ def place_on_motion(
     found = [(*s.sought(held), len(s.f)) for s in best]
     mount, result, _ = min(found, key=lambda x: x[1].cost / x[2])  # not all see the same rays
     for every in ROUNDS:
-        mount, result = _Seen.of(followed.every(every), motion, mount).sought(held)
-    _check(_Seen.of(followed, motion, mount), result, held)
+        mount, result = _PairResiduals.of(followed.every(every), motion, mount).sought(held)
+    _check(_PairResiduals.of(followed, motion, mount), result, held)
     return mount
 
 
-def _in_common(followed: Followed, motion: Motion) -> float:
+def _in_common(followed: ImagePairs, motion: Motion) -> float:
     """The share of its pairs of images that a camera can have made while the motion is known, wherever its clock is."""
     span, known = np.ptp(followed.times), np.ptp(motion.state.seconds)
     return min(1.0, float(known / span)) if span > 0.0 else 1.0
 
 
-def _cost(seen: _Seen) -> float:
+def _cost(seen: _PairResiduals) -> float:
     return float(np.log1p((seen.missed / (BENDS * RAY_SIGMA)) ** 2).mean())
 
 
-def _check(seen: _Seen, result: OptimizeResult, held: np.ndarray) -> None:
+def _check(seen: _PairResiduals, result: OptimizeResult, held: np.ndarray) -> None:
     name = seen.followed.name
     miss = float(np.quantile(np.abs(seen.missed), MOST_RAYS))
     if miss > LARGEST_MISS:

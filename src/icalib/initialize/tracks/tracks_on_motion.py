@@ -17,7 +17,7 @@ from icalib.initialize.steps.clocks import main_axis, rough_alignments
 from icalib.initialize.steps.guess import relative_offset
 from icalib.initialize.steps.rate_shifts import telling_rates
 from icalib.initialize.tracks.from_tracks import lens_start
-from icalib.initialize.tracks.track_mount import Followed, Mount, place_on_motion
+from icalib.initialize.tracks.track_mount import CameraExtrinsics, ImagePairs, place_on_motion
 from icalib.optim.arrowhead import THREADS
 from icalib.optim.state import Key, State
 from icalib.rig import Camera
@@ -75,8 +75,8 @@ def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict
 
 
 def _mount_in(
-    inputs: Inputs, state: State, number: int, lens: np.ndarray, recording: int, placed: Mount | None = None
-) -> tuple[Mount, np.ndarray]:
+    inputs: Inputs, state: State, number: int, lens: np.ndarray, recording: int, placed: CameraExtrinsics | None = None
+) -> tuple[CameraExtrinsics, np.ndarray]:
     """Mount and lens, as one recording shows them; `placed`: how the camera stands, where another has shown it."""
     own, camera = alone(inputs, recording), inputs.rig.cameras[number]
     assert own.imu is not None
@@ -86,10 +86,10 @@ def _mount_in(
         known |= {"rotation": placed.rotation, "translation": placed.position}
     offsets = [float(known["time_offset"][0])] if "time_offset" in known else None
     same_clock = relative_offset(np.zeros(1), own.measurements.cameras[number], own.measurements)
-    followed = Followed.of(stream, model, lens, _open(camera, lens))
+    followed = ImagePairs.of(stream, model, lens, _open(camera, lens))
     bent = np.zeros(len(followed.bends))
     starts = [
-        Mount(known.get("rotation", a.rotation), known.get("translation", np.zeros(3)), a.offset, bent)
+        CameraExtrinsics(known.get("rotation", a.rotation), known.get("translation", np.zeros(3)), a.offset, bent)
         for a in rough_alignments(
             own.imu, camera.name, telling_rates(own.imu, stream, model, lens), offsets, same_clock
         )

@@ -3,12 +3,12 @@
 from icalib.tools.allan.analysis import ImuNoiseStudy, SensorNoise, study_imu, study_recording
 from icalib.tools.allan.deviation import Deviation, allan_deviation
 from icalib.tools.allan.files import write_study
-from icalib.tools.allan.fit import NoiseFit
+from icalib.tools.allan.fit import AllanFit
 
 __all__ = [
     "Deviation",
     "ImuNoiseStudy",
-    "NoiseFit",
+    "AllanFit",
     "SensorNoise",
     "allan_deviation",
     "study_imu",

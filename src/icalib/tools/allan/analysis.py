@@ -18,7 +18,7 @@ from icalib.errors import RecordingError
 from icalib.rig import AccelUnit, GyroUnit, ImuSensor
 from icalib.rig.imu_classes import DEFAULT_CLASS, class_noise
 from icalib.tools.allan.deviation import Deviation, allan_deviation_of_all
-from icalib.tools.allan.fit import NoiseFit, bands_of_all, fit_noise, pooled
+from icalib.tools.allan.fit import AllanFit, bands_of_all, fit_noise, pooled
 from icalib.tools.allan.sampling import still_readings
 
 AXES = ("x", "y", "z")
@@ -40,8 +40,8 @@ class SensorNoise:
 
     kind: str
     unit: str
-    axes: tuple[NoiseFit, ...]
-    together: NoiseFit
+    axes: tuple[AllanFit, ...]
+    together: AllanFit
     deviation: Deviation
     instability: np.ndarray
     instability_tau: np.ndarray

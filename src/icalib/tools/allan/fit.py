@@ -37,7 +37,7 @@ class Bands:
 
 
 @dataclass(frozen=True)
-class NoiseFit:
+class AllanFit:
     """white: density N [unit/sqrt(Hz)]; walk: density K [unit s^-1/sqrt(Hz)], with standard deviations.
 
     resolved: whether there is a walk for certain. walk_upper: what K stays below with 95 %. misfit: relative standard
@@ -85,7 +85,7 @@ def pooled(axes: list[Bands]) -> Bands:
     return Bands(axes[0].frequency, axes[0].count * weight.sum() ** 2 / (weight**2).sum(), power.mean(0), axes[0].slope)
 
 
-def fit_noise(bands: Bands, period: float) -> NoiseFit:
+def fit_noise(bands: Bands, period: float) -> AllanFit:
     """N and K of readings one every `period` seconds."""
     misfit, weight = 0.0, 0.5 * bands.count
     ratio, a = _most_likely(bands, weight)
@@ -103,7 +103,7 @@ def fit_noise(bands: Bands, period: float) -> NoiseFit:
     known_c = c if resolved else upper * a
     relative = 0.5 * _std(bands, weight, a, known_c)[1] / known_c if known_c > 0 else np.inf
     walk = np.sqrt(c / period)
-    return NoiseFit(
+    return AllanFit(
         white=float(np.sqrt(a * period)),
         white_std=float(0.5 * std_a / a * np.sqrt(a * period)),
         walk=float(walk),

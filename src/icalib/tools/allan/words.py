@@ -13,7 +13,7 @@ from rich.text import Text
 
 from icalib.base.text_files import json_text
 from icalib.tools.allan.analysis import AXES, ImuNoiseStudy, SensorNoise
-from icalib.tools.allan.fit import NoiseFit
+from icalib.tools.allan.fit import AllanFit
 
 _UNITS = {"gyroscope": ("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)"), "accelerometer": ("m/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)")}
 _FIELDS = {"gyroscope": ("gyro", "gyro_walk"), "accelerometer": ("accel", "accel_walk")}
@@ -113,7 +113,7 @@ def _figures(sensor: SensorNoise) -> list[tuple[str, str, float, float]]:
     return [(name, unit, value, std) for name, unit, (value, std) in named]
 
 
-def _fit(fit: NoiseFit) -> dict[str, Any]:
+def _fit(fit: AllanFit) -> dict[str, Any]:
     return {
         "noise_density": fit.white,
         "noise_density_std": fit.white_std,

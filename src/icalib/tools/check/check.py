@@ -36,7 +36,7 @@ READING_SHARE, SOLVED_SHARE = 0.5, 0.8  # of the time: the end of reading, and o
 
 
 @dataclass(frozen=True)
-class Drift:
+class GroupDifference:
     """One group that both results estimate, new minus old.
 
     change (n,): rotations as a rotation vector about the sensor's axes; SI units. std (n,): of both results together.
@@ -70,7 +70,7 @@ class Check:
     unknown: tuple[str, ...]
     untested: tuple[str, ...]
     comparison: Comparison | None
-    drifts: tuple[Drift, ...]
+    drifts: tuple[GroupDifference, ...]
     fits: tuple[tuple[SensorFit, ...], tuple[SensorFit, ...], tuple[SensorFit, ...]]
     new: Calibration | None
 
@@ -174,7 +174,7 @@ def _block(c: Calibration, g: ParameterGroup) -> str:
     return f"{g.sensor} {'lens' if lens else g.name.replace('_', ' ')}"
 
 
-def _drifts(old: Calibration, new: Calibration) -> list[Drift]:
+def _drifts(old: Calibration, new: Calibration) -> list[GroupDifference]:
     found = []
     before = {(g.sensor, g.name): g for g in old.groups if g.columns is not None}
     for g in new.groups:
@@ -184,7 +184,7 @@ def _drifts(old: Calibration, new: Calibration) -> list[Drift]:
         change, total = so3.value_change(o.value, g.value), joint_covariance(old, [o]) + joint_covariance(new, [g])
         std = np.sqrt(np.diag(total))
         found.append(
-            Drift(
+            GroupDifference(
                 g.sensor, g.name, g.labels, g.unit, tuple(change.tolist()), tuple(std.tolist()), sigmas(change, total)
             )
         )

@@ -18,7 +18,7 @@ _GRID = (24, 18)  # pixels across and down on which lenses are compared
 
 
 @dataclass(frozen=True)
-class Tolerances:
+class ComparisonTolerances:
     """Differences up to these do not count. None: they count by their standard deviations alone, and up to the default
     where there are none."""
 
@@ -81,7 +81,7 @@ class _Pair:
 
     a: Side
     b: Side
-    tolerances: Tolerances
+    tolerances: ComparisonTolerances
     limit: float  # sigmas
 
     def difference(
@@ -118,7 +118,7 @@ class _Pair:
         )
 
 
-def compare_sides(a: Side, b: Side, tolerances: Tolerances | None = None, limit: float = 3.0) -> Comparison:
+def compare_sides(a: Side, b: Side, tolerances: ComparisonTolerances | None = None, limit: float = 3.0) -> Comparison:
     """All that both say. A block differs where it is off by more than its tolerance and, where standard deviations are
     known, by more than `limit` of them.
 
@@ -126,7 +126,7 @@ def compare_sides(a: Side, b: Side, tolerances: Tolerances | None = None, limit:
     """
     if a.has_imu and b.has_imu and a.body != b.body:
         b = b.renamed(b.body, a.body)
-    pair = _Pair(a, b, tolerances or Tolerances(), limit)
+    pair = _Pair(a, b, tolerances or ComparisonTolerances(), limit)
     shared = [name for name in a.poses if name in b.poses]
     reference = a.body if a.body == b.body else next(iter(shared), a.body)
     found = tuple(_poses(pair, reference, shared)) + tuple(_quantities(pair)) + tuple(_lenses(pair))

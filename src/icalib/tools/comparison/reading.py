@@ -9,7 +9,7 @@ from icalib.base.suggestion import suggestion
 from icalib.base.yaml_nodes import read_yaml
 from icalib.errors import CalibrationError, RigError
 from icalib.result import load_calibration
-from icalib.tools.comparison.compare import Comparison, Tolerances, compare_sides
+from icalib.tools.comparison.compare import Comparison, ComparisonTolerances, compare_sides
 from icalib.tools.comparison.other_files import is_kalibr, side_of_kalibr, side_of_urdf, side_of_urdf_alone
 from icalib.tools.comparison.results import side_of_result, side_of_rig
 from icalib.tools.comparison.sides import Side
@@ -21,7 +21,7 @@ def compare_files(
     a: Path,
     b: Path,
     frames: Mapping[str, str] | None = None,
-    tolerances: Tolerances | None = None,
+    tolerances: ComparisonTolerances | None = None,
     limit: float = 3.0,
 ) -> Comparison:
     """Each of a, b: the folder of a result, a Kalibr camchain or imu file, a URDF, or a rig file. frames: sensor of

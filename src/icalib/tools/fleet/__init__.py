@@ -1,9 +1,9 @@
 """Many recordings of many robots calibrated, resumed where they were left, and what changed over time."""
 
 from icalib.tools.batch import Crew
-from icalib.tools.fleet.drift import Change, Drift
+from icalib.tools.fleet.drift import Drift, GroupChange
 from icalib.tools.fleet.jobs import Job, load_jobs
 from icalib.tools.fleet.result import Fleet, JobResult
 from icalib.tools.fleet.run import run_fleet
 
-__all__ = ["Change", "Crew", "Drift", "Fleet", "Job", "JobResult", "load_jobs", "run_fleet"]
+__all__ = ["GroupChange", "Crew", "Drift", "Fleet", "Job", "JobResult", "load_jobs", "run_fleet"]

@@ -15,7 +15,7 @@ from icalib.tools.comparison.words import sentence
 
 
 @dataclass(frozen=True)
-class Change:
+class GroupChange:
     """A block that differs from the job `before` to the job `after`. at_its_sensor: seen from the body or from nothing,
     so that the change is the sensor's own. judged: both sides have determined it, with standard deviations."""
 
@@ -36,8 +36,8 @@ class Drift:
 
     robot: str
     jobs: tuple[str, ...]
-    changes: tuple[Change, ...] = ()
-    unsure: tuple[Change, ...] = ()
+    changes: tuple[GroupChange, ...] = ()
+    unsure: tuple[GroupChange, ...] = ()
     judged: int = 0
     notes: tuple[str, ...] = ()
 
@@ -49,10 +49,10 @@ class Drift:
 
 
 @dataclass(frozen=True)
-class _Step:
+class _Comparison:
     """One comparison: what differs, how many blocks were judged, and sentences."""
 
-    changes: tuple[Change, ...] = ()
+    changes: tuple[GroupChange, ...] = ()
     judged: int = 0
     notes: tuple[str, ...] = ()
 
@@ -60,7 +60,7 @@ class _Step:
 def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration], limit: float) -> Drift:
     """jobs: names in order of time. load: gives the result of a job; where it raises CalibrationError, its sentence is
     a note. No more than three results are in memory at a time."""
-    steps, notes, first, last = list[_Step](), list[str](), None, None
+    steps, notes, first, last = list[_Comparison](), list[str](), None, None
     for name in jobs:
         try:
             side = side_of_result(load(name), name)
@@ -73,7 +73,7 @@ def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration]
     seen = {_block(c) for s in steps for c in s.changes}
     if first is not None and last is not None and len(steps) > 1:
         slow = _step(first, last, limit)
-        steps.append(_Step(tuple(c for c in slow.changes if _block(c) not in seen), slow.judged))
+        steps.append(_Comparison(tuple(c for c in slow.changes if _block(c) not in seen), slow.judged))
     changes = [c for s in steps for c in s.changes]
     return Drift(
         robot,
@@ -90,23 +90,23 @@ def by_chance(judged: int, limit: float) -> float:
     return judged * erfc(limit / sqrt(2.0))
 
 
-def _step(a: Side, b: Side, limit: float) -> _Step:
+def _step(a: Side, b: Side, limit: float) -> _Comparison:
     try:
         found = compare_sides(a, b, limit=limit)
     except CalibrationError as error:
-        return _Step(notes=(str(error),))
+        return _Comparison(notes=(str(error),))
     changes = tuple(_change(d, found) for d in found.differences if d.differs)
-    return _Step(changes, sum(_judged(d) for d in found.differences), found.notes)
+    return _Comparison(changes, sum(_judged(d) for d in found.differences), found.notes)
 
 
-def _change(d: Difference, c: Comparison) -> Change:
+def _change(d: Difference, c: Comparison) -> GroupChange:
     own = d.frame in (c.reference, d.sensor, c.a.body)
-    return Change(c.a.path, c.b.path, d, sentence(d, c), own, _judged(d))
+    return GroupChange(c.a.path, c.b.path, d, sentence(d, c), own, _judged(d))
 
 
 def _judged(d: Difference) -> bool:
     return d.sigmas is not None and d.given_by == "both" and not d.open
 
 
-def _block(c: Change) -> tuple[str, str, str]:
+def _block(c: GroupChange) -> tuple[str, str, str]:
     return c.difference.sensor, c.difference.frame, c.difference.what

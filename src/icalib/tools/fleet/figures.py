@@ -10,7 +10,7 @@ from icalib.geometry import so3
 from icalib.report.plot import AXIS_COLORS, COLORS, Figure, figure, numbers, stacked_axes, y_of
 from icalib.report.tables import WORDS
 from icalib.result.units import SHOWN_UNITS
-from icalib.tools.fleet.record import Block
+from icalib.tools.fleet.record import GroupRecord
 from icalib.tools.fleet.result import JobResult
 
 _PANEL_PX, _EDGE_PX, _GAPS = 170, 90, 0.2
@@ -48,7 +48,7 @@ def _places(results: list[JobResult]) -> tuple[dict[str, str], bool]:
     return {r.job.name: r.job.name for r in results}, False
 
 
-def _traces(results: list[JobResult], places: dict[str, str], first: Block, panel: int) -> list[dict[str, Any]]:
+def _traces(results: list[JobResult], places: dict[str, str], first: GroupRecord, panel: int) -> list[dict[str, Any]]:
     """A trace for each entry of the block. Calibrations that do not have the same entries are left out."""
     at, blocks = [], []
     for r in results:
@@ -83,14 +83,14 @@ def _in_legend_once(traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [t | {"showlegend": t["showlegend"] and firsts[t["name"]] == k} for k, t in enumerate(traces)]
 
 
-def _bar(b: Block, entry: int) -> float:
+def _bar(b: GroupRecord, entry: int) -> float:
     return 0.0 if b.verdict[entry] == OPEN else float(b.std[entry])
 
 
-def _estimated(b: Block) -> bool:
+def _estimated(b: GroupRecord) -> bool:
     return any(v != "fixed" for v in b.verdict)
 
 
-def _unit_words(b: Block) -> str:
+def _unit_words(b: GroupRecord) -> str:
     unit = SHOWN_UNITS.get(b.unit, (b.unit, 1.0))[0]
     return f" [{unit}]" if unit else ""

@@ -13,7 +13,7 @@ from icalib.tools.fleet.jobs import Job
 
 
 @dataclass(frozen=True)
-class Inputs:
+class InputHashes:
     """rig: sha256 of the file. recordings: of the sizes and the times of change of all files of each, which may be
     larger than one likes to read; their names count, where they lie does not. program: digest of icalib's source."""
 
@@ -22,11 +22,11 @@ class Inputs:
     program: str
 
     @classmethod
-    def of(cls, job: Job) -> Inputs:
+    def of(cls, job: Job) -> InputHashes:
         """As they are now, with the program that runs now. What is not there is "absent"."""
         return cls(_content(job.rig), tuple(map(_sizes, job.recordings)), program())
 
-    def changed(self, now: Inputs) -> str:
+    def changed(self, now: InputHashes) -> str:
         """What is another one now, in words; empty where nothing is."""
         found = [words for name, words in _CHANGED.items() if getattr(self, name) != getattr(now, name)]
         return ", ".join(found)

@@ -11,14 +11,14 @@ from icalib.base.own_files import SEAL, sealed
 from icalib.result import Calibration, ParameterGroup
 from icalib.result.quantities import shown_groups
 from icalib.tools.batch import plain_record, record_json
-from icalib.tools.fleet.inputs import Inputs
+from icalib.tools.fleet.inputs import InputHashes
 
 FORMAT = 1
 WALL_CLOCK_NS = (10**18, 4 * 10**18)  # 2001 to 2096; clocks that start with the computer are far below
 
 
 @dataclass(frozen=True)
-class Block:
+class GroupRecord:
     """One group of parameters of one sensor, as in `ParameterGroup`. value: (n,), of a rotation (3, 3)."""
 
     sensor: str
@@ -31,7 +31,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Record:
+class JobRecord:
     """One job. failure: a sentence, or "" where the solver converged. status: how the solver ended, in a sentence.
 
     stamp_ns: the recording's first stamp where it is of a wall clock. undetermined, warnings: sentences. inputs: what
@@ -41,15 +41,15 @@ class Record:
     name: str
     failure: str
     seconds: float
-    inputs: Inputs | None
+    inputs: InputHashes | None
     status: str = ""
     stamp_ns: int | None = None
     undetermined: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[GroupRecord, ...] = ()
 
     @classmethod
-    def of(cls, name: str, result: Calibration, seconds: float, inputs: Inputs) -> Record:
+    def of(cls, name: str, result: Calibration, seconds: float, inputs: InputHashes) -> JobRecord:
         """Of a calibration that reached a result, whether it converged or not."""
         stamp = min((r.origin_ns for r in result.recordings), default=0)
         low, high = WALL_CLOCK_NS
@@ -60,28 +60,28 @@ class Record:
         )
 
 
-def _block(g: ParameterGroup) -> Block:
-    return Block(g.sensor, g.name, g.labels, g.unit, g.value, g.std, g.verdict)
+def _block(g: ParameterGroup) -> GroupRecord:
+    return GroupRecord(g.sensor, g.name, g.labels, g.unit, g.value, g.std, g.verdict)
 
 
-def to_json(record: Record) -> bytes:
+def to_json(record: JobRecord) -> bytes:
     """The record as JSON, numbers in full, with icalib's seal."""
     return sealed(record_json(record, FORMAT))
 
 
-def from_json(text: bytes) -> Record:
+def from_json(text: bytes) -> JobRecord:
     """The record that `to_json` was given. Raises ValueError, KeyError or TypeError where `text` is something else."""
     plain = plain_record(text, FORMAT)
     plain.pop(SEAL, None)
     inputs = plain["inputs"]
-    plain["inputs"] = Inputs(inputs["rig"], tuple(inputs["recordings"]), inputs["program"])
+    plain["inputs"] = InputHashes(inputs["rig"], tuple(inputs["recordings"]), inputs["program"])
     for name in ("undetermined", "warnings"):
         plain[name] = tuple(plain[name])
     plain["blocks"] = tuple(_block_of(b) for b in plain["blocks"])
-    return Record(**plain)
+    return JobRecord(**plain)
 
 
-def _block_of(plain: dict[str, Any]) -> Block:
+def _block_of(plain: dict[str, Any]) -> GroupRecord:
     value, std = (np.array(plain[name], dtype=np.float64) for name in ("value", "std"))
     labels, verdict = (tuple(plain[name]) for name in ("labels", "verdict"))
-    return Block(plain["sensor"], plain["name"], labels, plain["unit"], value, std, verdict)
+    return GroupRecord(plain["sensor"], plain["name"], labels, plain["unit"], value, std, verdict)

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from icalib.tools.fleet.drift import Drift, by_chance
 from icalib.tools.fleet.jobs import Job
-from icalib.tools.fleet.record import Record
+from icalib.tools.fleet.record import JobRecord
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class JobResult:
     """A job as the file gives it now, and what is known of it."""
 
     job: Job
-    record: Record
+    record: JobRecord
 
     @property
     def time(self) -> datetime | None:

@@ -13,13 +13,13 @@ from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
 from icalib.tools.batch import Crew, Lost, alone, run_all, write_whole
 from icalib.tools.fleet.drift import drift_of
-from icalib.tools.fleet.inputs import Inputs
+from icalib.tools.fleet.inputs import InputHashes
 from icalib.tools.fleet.jobs import Job, load_jobs
-from icalib.tools.fleet.one_job import Task, run
+from icalib.tools.fleet.one_job import JobTask, run
 from icalib.tools.fleet.page import fleet_html
-from icalib.tools.fleet.record import Record
+from icalib.tools.fleet.record import JobRecord
 from icalib.tools.fleet.result import Fleet, JobResult, by_robot
-from icalib.tools.fleet.store import Store, to_do
+from icalib.tools.fleet.store import JobStore, to_do
 from icalib.tools.fleet.table import write_table
 
 Progress = Callable[[str, float], None]
@@ -44,7 +44,7 @@ def run_fleet(
     """
     if not (isfinite(limit) and limit > 0.0):
         raise CalibrationError(f"the limit must be above 0 sigma, not {limit:g}; the usual limit is 3.")
-    jobs, store = load_jobs(path), Store(Path(output))
+    jobs, store = load_jobs(path), JobStore(Path(output))
     with alone(store.folder):
         refuse_foreign(store.folder / name for name in (TABLE, PAGE))
         fleet = _fleet(jobs, store, crew or Crew(), limit, progress, say)
@@ -54,14 +54,14 @@ def run_fleet(
 
 
 def _fleet(
-    jobs: tuple[Job, ...], store: Store, crew: Crew, limit: float, progress: Progress, say: Callable[[str], None]
+    jobs: tuple[Job, ...], store: JobStore, crew: Crew, limit: float, progress: Progress, say: Callable[[str], None]
 ) -> Fleet:
     """Jobs that are missing done, and all compared."""
-    inputs = {job.name: Inputs.of(job) for job in jobs}
+    inputs = {job.name: InputHashes.of(job) for job in jobs}
     done, again = to_do(store, inputs)
     for name, why in again.items():
         say(f"{name} is calibrated again: {why}.")
-    tasks = [Task(job, inputs[job.name]) for job in jobs if job.name not in done]
+    tasks = [JobTask(job, inputs[job.name]) for job in jobs if job.name not in done]
     for task in tasks:
         refuse_foreign_set(store.place(task.job.name), [task.job.rig, *task.job.recordings])
     records = done | _do(tasks, store, crew, len(jobs), progress)
@@ -71,9 +71,9 @@ def _fleet(
     return Fleet(results, drifts, limit, again)
 
 
-def _do(tasks: list[Task], store: Store, crew: Crew, total: int, progress: Progress) -> dict[str, Record]:
+def _do(tasks: list[JobTask], store: JobStore, crew: Crew, total: int, progress: Progress) -> dict[str, JobRecord]:
     """Records of the tasks; all are stored but those whose worker died, which will be tried again the next time."""
-    found: dict[str, Record] = {}
+    found: dict[str, JobRecord] = {}
     before = total - len(tasks)
     if not tasks:
         return found
@@ -83,7 +83,7 @@ def _do(tasks: list[Task], store: Store, crew: Crew, total: int, progress: Progr
             for task, outcome in outcomes:
                 name = task.job.name
                 if isinstance(outcome, Lost):
-                    found[name] = Record(name, outcome.sentence, 0.0, None)
+                    found[name] = JobRecord(name, outcome.sentence, 0.0, None)
                 else:
                     store.add(outcome)
                     found[name] = outcome.record

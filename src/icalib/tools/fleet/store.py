@@ -9,14 +9,14 @@ from icalib.base.result_files import check_writable, finish_writing, read_file, 
 from icalib.errors import CalibrationError
 from icalib.result import Calibration, load_calibration
 from icalib.tools.batch import check_worker, program
-from icalib.tools.fleet.inputs import Inputs
-from icalib.tools.fleet.one_job import Outcome
-from icalib.tools.fleet.record import Record, from_json, to_json
+from icalib.tools.fleet.inputs import InputHashes
+from icalib.tools.fleet.one_job import JobOutcome
+from icalib.tools.fleet.record import JobRecord, from_json, to_json
 
 JOBS, RECORD = "jobs", "fleet-job.json"
 
 
-class Store:
+class JobStore:
     """Records and results by the name of the job. Raises CalibrationError where the folder cannot be written."""
 
     def __init__(self, folder: Path) -> None:
@@ -27,7 +27,7 @@ class Store:
         """Where the job's files are."""
         return below(self.folder / JOBS, name)
 
-    def find(self, name: str) -> Record | None:
+    def find(self, name: str) -> JobRecord | None:
         """None where the job is not done, or its result was taken away.
 
         Raises CalibrationError where its record is damaged, or what a killed writer left cannot be put in place.
@@ -44,7 +44,7 @@ class Store:
             raise CalibrationError(f"{place / RECORD} is damaged; delete it to run the job again.") from error
         return record if not record.blocks or (place / "result.json").exists() else None
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, outcome: JobOutcome) -> None:
         """Raises CalibrationError where the worker ran another icalib, or the folder cannot be written."""
         inputs = outcome.record.inputs
         check_worker(inputs.program if inputs is not None else "", program())
@@ -55,10 +55,10 @@ class Store:
         return load_calibration(self.place(name))
 
 
-def to_do(store: Store, inputs: dict[str, Inputs]) -> tuple[dict[str, Record], dict[str, str]]:
+def to_do(store: JobStore, inputs: dict[str, InputHashes]) -> tuple[dict[str, JobRecord], dict[str, str]]:
     """Records of the jobs that are done, and of those whose inputs are others now what changed, in words. inputs: by
     the name of the job."""
-    done, changed = dict[str, Record](), dict[str, str]()
+    done, changed = dict[str, JobRecord](), dict[str, str]()
     for name, now in inputs.items():
         record = store.find(name)
         if record is None or record.inputs is None:

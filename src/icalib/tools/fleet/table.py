@@ -14,7 +14,7 @@ from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
 from icalib.result.quantities import rpy_deg
 from icalib.tools.batch import replacing
-from icalib.tools.fleet.record import Block
+from icalib.tools.fleet.record import GroupRecord
 from icalib.tools.fleet.result import JobResult
 
 _COLUMNS = (
@@ -69,5 +69,5 @@ def rows(one: JobResult) -> Iterator[tuple[object, ...]]:
             yield (*about, b.sensor, b.name, label or b.name, value, std, b.unit, verdict)
 
 
-def _values(b: Block) -> list[float]:
+def _values(b: GroupRecord) -> list[float]:
     return (np.deg2rad(rpy_deg(b.value)) if b.value.ndim == 2 else b.value).tolist()

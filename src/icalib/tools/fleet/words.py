@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from icalib.tools.comparison.words import digits
-from icalib.tools.fleet.drift import Change, Drift
+from icalib.tools.fleet.drift import Drift, GroupChange
 from icalib.tools.fleet.result import Fleet, JobResult
 
 
@@ -34,7 +34,7 @@ def chance_words(fleet: Fleet) -> str:
     )
 
 
-def change_words(robot: str, change: Change) -> str:
+def change_words(robot: str, change: GroupChange) -> str:
     return f"{robot}, {change.before} to {change.after}: {change.words}"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from icalib.base.extras import load_matplotlib
 from icalib.report.plot import COLORS, Figure, axis, figure, line
 from icalib.result.units import SHOWN_UNITS
-from icalib.tools.montecarlo.record import Block, Record
+from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 
 MOST_RUNS = 6
 SIGMAS = 3.0
@@ -38,14 +38,14 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Row:
+class PanelRow:
     """The panels of one block."""
 
     key: str
     panels: tuple[Panel, ...]
 
 
-def rows(records: Sequence[Record]) -> tuple[Row, ...]:
+def rows(records: Sequence[RunRecord]) -> tuple[PanelRow, ...]:
     """Of the first runs that did not fail: all sensors, of cameras the first alone, as in the paper."""
     runs = [r for r in sorted(records, key=lambda r: r.seed) if not r.failure][:MOST_RUNS]
     blocks = {b.key: b for r in runs for b in r.blocks}
@@ -53,7 +53,7 @@ def rows(records: Sequence[Record]) -> tuple[Row, ...]:
     return tuple(_row(runs, b) for b in blocks.values() if b.sensor not in lenses[1:])
 
 
-def _row(runs: Sequence[Record], block: Block) -> Row:
+def _row(runs: Sequence[RunRecord], block: GroupErrors) -> PanelRow:
     unit, scale = SHOWN_UNITS.get(block.unit, (block.unit, 1.0))
     panels = []
     for k, label in enumerate(block.labels):
@@ -63,10 +63,10 @@ def _row(runs: Sequence[Record], block: Block) -> Row:
         words = f" (undetermined in {times} of {len(own)})" if times else ""
         name = block.name if label == block.name else f"{block.name} {label}"
         panels.append(Panel(f"{block.sensor} {name}{words}".replace("_", " "), unit, curves))
-    return Row(block.key, tuple(panels))
+    return PanelRow(block.key, tuple(panels))
 
 
-def _curve(record: Record, column: int, scale: float) -> Curve:
+def _curve(record: RunRecord, column: int, scale: float) -> Curve:
     """Error and bound of one parameter. For one fixed at the guess only the result has a standard deviation. The
     consider covariance of all others is known of the result only, too, and is added at every iteration."""
     verdicts = [v for b in record.blocks for v in b.verdict]
@@ -79,7 +79,7 @@ def _curve(record: Record, column: int, scale: float) -> Curve:
     return Curve(record.seed, scale * np.abs(error), scale * SIGMAS * sigma)
 
 
-def plotly_figure(row: Row) -> Figure:
+def plotly_figure(row: PanelRow) -> Figure:
     """The panels of a block side by side."""
     n, gap, traces, layout = len(row.panels), 0.08, [], {}
     width = (1.0 - gap * (n - 1)) / n
@@ -98,7 +98,7 @@ def plotly_figure(row: Row) -> Figure:
     return figure(traces, height=300, **layout)
 
 
-def png(rows: Sequence[Row], title: str) -> bytes:
+def png(rows: Sequence[PanelRow], title: str) -> bytes:
     """All blocks as one picture, a row each. Raises RecordingError where matplotlib is not installed."""
     columns = max(len(r.panels) for r in rows)
     size = (_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * len(rows) + 0.6)

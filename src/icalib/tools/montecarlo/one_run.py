@@ -11,7 +11,7 @@ import numpy as np
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, Visited
 from icalib.tools.batch import program, sentence_on
-from icalib.tools.montecarlo.record import Block, Record, Size, Waypoint
+from icalib.tools.montecarlo.record import GroupErrors, RunRecord, Size, Waypoint
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.montecarlo.whiteness import whiteness
 from icalib.tools.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess
@@ -21,7 +21,7 @@ PlanesKind = Literal["known", "found"]
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class RunTask:
     """What a run is made from. guess: the program finds its own, or starts from one drawn about the truth. Cameras that
     follow points of the scene have a drawn guess of their intrinsics in either case: points do not show these from
     nothing. planes: the program is told which of them a LiDAR's point lies on, or finds them in the clouds."""
@@ -32,7 +32,7 @@ class Task:
     planes: PlanesKind = "known"
 
 
-def run(task: Task) -> Record:
+def run(task: RunTask) -> RunRecord:
     """Extrinsics, time offsets, intrinsics and distortions are estimated. The same task gives the same record, but for
     the seconds that it took."""
     started, visits = time.perf_counter(), list[Visited]()
@@ -47,20 +47,20 @@ def run(task: Task) -> Record:
             seen = seen.unassociated()
         result = calibrate_measurements(rig, seen, on_visit=visits.append)
     except Exception as caught:
-        return Record(task.seed, sentence_on(caught), time.perf_counter() - started, program())
+        return RunRecord(task.seed, sentence_on(caught), time.perf_counter() - started, program())
     return compare(task.seed, result, simulation.truth, visits, time.perf_counter() - started)
 
 
-def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited], seconds: float) -> Record:
+def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited], seconds: float) -> RunRecord:
     """The record of a run that reached a result."""
     blocks, errors, columns = [], [np.empty(0)], list[int]()
     for g in result.groups:
         true = true_value(truth, g.sensor, g.name)
         if g.columns is not None and true is not None:
-            blocks.append(Block(g.sensor, g.name, g.labels, g.unit, g.verdict))
+            blocks.append(GroupErrors(g.sensor, g.name, g.labels, g.unit, g.verdict))
             errors.append(error(g.name, g.value, true))
             columns += g.columns
-    return Record(
+    return RunRecord(
         seed,
         result.failure,
         seconds,
@@ -75,14 +75,14 @@ def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited],
     )
 
 
-def _path(blocks: tuple[Block, ...], truth: Truth, visits: list[Visited]) -> tuple[Waypoint, ...]:
+def _path(blocks: tuple[GroupErrors, ...], truth: Truth, visits: list[Visited]) -> tuple[Waypoint, ...]:
     """From the last guess that all was estimated from, through every estimate that went on from there."""
     stages = [v.stage for v in visits]
     begins = [k for k, stage in enumerate(stages) if k == 0 or (stage == stages[0] and stages[k - 1] != stage)]
     return tuple(_waypoint(blocks, truth, v) for v in visits[begins[-1] :]) if visits else ()
 
 
-def _waypoint(blocks: tuple[Block, ...], truth: Truth, visit: Visited) -> Waypoint:
+def _waypoint(blocks: tuple[GroupErrors, ...], truth: Truth, visit: Visited) -> Waypoint:
     errors, deviations = [np.empty(0)], [np.empty(0)]
     for b in blocks:
         true = true_value(truth, b.sensor, b.name)

@@ -10,7 +10,7 @@ import numpy as np
 from icalib.report.page import document, plot_place, resource
 from icalib.report.plot import COLORS, Figure, axis, figure, numbers
 from icalib.report.tables import Html, element, html, sentences, table
-from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.statistics import Nees
 from icalib.tools.montecarlo.store import Identity
 from icalib.tools.montecarlo.summary import Consistency
@@ -31,7 +31,7 @@ from icalib.tools.montecarlo.words import (
 MEAN = ("sensor", "kind", "mean over runs")
 
 
-def study_html(found: Consistency, identity: Identity, records: Sequence[Record]) -> str:
+def study_html(found: Consistency, identity: Identity, records: Sequence[RunRecord]) -> str:
     """The whole page; `records` for the NEES of each run."""
     sections = [
         element("h2", "Blocks"),
@@ -117,7 +117,7 @@ def _residuals(found: Consistency) -> Html:
     return element("div", [element("section", sizes), element("section", lags)], "grid")
 
 
-def _facts(identity: Identity, records: Sequence[Record]) -> list[tuple[str, object]]:
+def _facts(identity: Identity, records: Sequence[RunRecord]) -> list[tuple[str, object]]:
     seconds = float(np.median([r.seconds for r in records]))
     return [
         ("scenario", identity.scenario),

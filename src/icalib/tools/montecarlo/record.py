@@ -15,7 +15,7 @@ LEAST_SIGMA = 1e-100  # a number, however little
 
 
 @dataclass(frozen=True)
-class Block:
+class GroupErrors:
     """One group of one sensor: which entries of the record's error it has, in order, and how each was judged."""
 
     sensor: str
@@ -52,7 +52,7 @@ class Whiteness:
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where the solver stood when it looked for a step: error and formal standard deviation, entries as in `Record`."""
+    """The solver's state when it looked for a step: error and formal standard deviation, entries as in `RunRecord`."""
 
     stage: str
     error: np.ndarray  # (n,)
@@ -60,7 +60,7 @@ class Waypoint:
 
 
 @dataclass(frozen=True)
-class Record:
+class RunRecord:
     """One run. failure: a sentence, or "" where the solver converged; a run that ended early has no blocks.
 
     error (n,): estimated minus true, block after block; of rotations e of R_estimated = R_true Exp(e) [rad].
@@ -72,7 +72,7 @@ class Record:
     failure: str
     seconds: float
     program: str
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[GroupErrors, ...] = ()
     error: np.ndarray = field(default_factory=lambda: np.empty(0))
     covariance: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     undetermined: tuple[str, ...] = ()
@@ -80,7 +80,7 @@ class Record:
     whiteness: tuple[Whiteness, ...] = ()
     path: tuple[Waypoint, ...] = ()
 
-    def errors(self) -> Iterator[tuple[Block, str, str, float]]:
+    def errors(self) -> Iterator[tuple[GroupErrors, str, str, float]]:
         """Of every number that was estimated: its block, label and verdict, and its error in formal standard
         deviations, one without any taken for an enormity."""
         sigma = np.maximum(np.sqrt(np.diag(self.covariance)), LEAST_SIGMA)
@@ -98,12 +98,12 @@ class Record:
         return np.arange(0)
 
 
-def to_json(record: Record) -> bytes:
+def to_json(record: RunRecord) -> bytes:
     """The record as JSON, numbers in full."""
     return record_json(record, FORMAT)
 
 
-def from_json(text: bytes) -> Record:
+def from_json(text: bytes) -> RunRecord:
     """The record that `to_json` was given. Raises ValueError, KeyError or TypeError where `text` is something else."""
     plain = plain_record(text, FORMAT)
     plain["blocks"] = tuple(_block(b) for b in plain["blocks"])
@@ -114,8 +114,8 @@ def from_json(text: bytes) -> Record:
     plain["error"] = np.array(plain["error"], dtype=np.float64)
     n = len(plain["error"])
     plain["covariance"] = np.array(plain["covariance"], dtype=np.float64).reshape(n, n)
-    return Record(**plain)
+    return RunRecord(**plain)
 
 
-def _block(plain: dict[str, Any]) -> Block:
-    return Block(plain["sensor"], plain["name"], tuple(plain["labels"]), plain["unit"], tuple(plain["verdict"]))
+def _block(plain: dict[str, Any]) -> GroupErrors:
+    return GroupErrors(plain["sensor"], plain["name"], tuple(plain["labels"]), plain["unit"], tuple(plain["verdict"]))

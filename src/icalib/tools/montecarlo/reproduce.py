@@ -12,7 +12,7 @@ from icalib.report.tables import Html, element
 from icalib.tools.batch import write_whole
 from icalib.tools.montecarlo.convergence import plotly_figure, png, rows
 from icalib.tools.montecarlo.page import blocks_table, failures, page
-from icalib.tools.montecarlo.study import Plan, Study, run_study, scenario_digest
+from icalib.tools.montecarlo.study import Study, StudyPlan, run_study, scenario_digest
 from icalib.tools.montecarlo.words import answer, failures_words, largest_words
 from icalib.tools.simulation import load_scenario
 
@@ -22,7 +22,7 @@ FOLDER = Path(__file__).parent / "paper"
 Progress = Callable[[str, float], None]
 
 
-def reproduce(output: Path, plan: Plan, progress: Progress = lambda *_: None) -> dict[str, Study]:
+def reproduce(output: Path, plan: StudyPlan, progress: Progress = lambda *_: None) -> dict[str, Study]:
     """Both studies, each in a folder of its own below `output`, and there figures (reproduce.html, PNG) and table.
 
     Raises what `run_study` raises.

@@ -10,7 +10,7 @@ from icalib.errors import CalibrationError
 from icalib.result.provenance import versions
 from icalib.tools.batch import check_worker, program, write_whole
 from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind
-from icalib.tools.montecarlo.record import Record, from_json, to_json
+from icalib.tools.montecarlo.record import RunRecord, from_json, to_json
 
 STUDY, RUNS = "study.json", "runs"
 
@@ -41,7 +41,7 @@ _CHANGED = {
 }
 
 
-class Store:
+class RunStore:
     """Runs by seed in a folder. Raises CalibrationError where it holds another study's, or cannot be written."""
 
     def __init__(self, folder: Path, identity: Identity) -> None:
@@ -60,12 +60,12 @@ class Store:
     def __contains__(self, seed: int) -> bool:
         return self._file(seed).exists()
 
-    def add(self, record: Record) -> None:
+    def add(self, record: RunRecord) -> None:
         """Raises CalibrationError where the worker ran another icalib, or the file cannot be written."""
         check_worker(record.program, self.identity.program)
         write_whole(self._file(record.seed), to_json(record))
 
-    def read(self, seed: int) -> Record:
+    def read(self, seed: int) -> RunRecord:
         """Raises CalibrationError where the file is damaged."""
         path = self._file(seed)
         try:

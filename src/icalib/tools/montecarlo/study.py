@@ -12,10 +12,10 @@ from icalib.base.own_files import refuse_foreign, sealed
 from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
 from icalib.tools.batch import Crew, alone, write_whole
-from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind, Task
+from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind, RunTask
 from icalib.tools.montecarlo.page import study_html
-from icalib.tools.montecarlo.record import Record
-from icalib.tools.montecarlo.store import Identity, Store
+from icalib.tools.montecarlo.record import RunRecord
+from icalib.tools.montecarlo.store import Identity, RunStore
 from icalib.tools.montecarlo.summary import Consistency, consistency_json, summarise
 from icalib.tools.montecarlo.workers import run_all
 from icalib.tools.simulation import Drive, Scenario, load_scenario
@@ -25,7 +25,7 @@ FILES = ("consistency.json", "consistency.html")
 
 
 @dataclass(frozen=True)
-class Plan:
+class StudyPlan:
     """How many runs, from which seed on (the scenario's where None), from which guess, with planes that are known or
     found, and who makes them.
 
@@ -50,18 +50,18 @@ class Study:
     """The records of all runs in the order of their seeds, and their summary."""
 
     identity: Identity
-    records: tuple[Record, ...]
+    records: tuple[RunRecord, ...]
     consistency: Consistency
 
 
-def run_file(path: str | Path, output: str | Path, plan: Plan, progress: Progress = lambda *_: None) -> Study:
+def run_file(path: str | Path, output: str | Path, plan: StudyPlan, progress: Progress = lambda *_: None) -> Study:
     """`run_study` of a scenario file. Raises RigError too, where the file is wrong."""
     scenario = load_scenario(path)
     return run_study(scenario, str(path), scenario_digest(path, scenario), Path(output), plan, progress)
 
 
 def run_study(
-    scenario: Scenario, name: str, digest: str, output: Path, plan: Plan, progress: Progress = lambda *_: None
+    scenario: Scenario, name: str, digest: str, output: Path, plan: StudyPlan, progress: Progress = lambda *_: None
 ) -> Study:
     """Makes the runs that `output` does not hold yet, and writes consistency.json and consistency.html there.
 
@@ -70,7 +70,7 @@ def run_study(
     KeyboardInterrupt with a sentence on what was reached.
     """
     refuse_foreign(output / name for name in FILES)
-    store = Store(output, Identity.of(name, digest, plan.guess, plan.planes))
+    store = RunStore(output, Identity.of(name, digest, plan.guess, plan.planes))
     first = scenario.seed if plan.seed is None else plan.seed
     seeds = range(first, first + plan.runs)
     with alone(output):
@@ -92,15 +92,17 @@ def scenario_digest(path: str | Path, scenario: Scenario) -> str:
     return digest.hexdigest()
 
 
-def _fill(store: Store, scenario: Scenario, seeds: range, plan: Plan, progress: Progress) -> dict[int, Record]:
+def _fill(
+    store: RunStore, scenario: Scenario, seeds: range, plan: StudyPlan, progress: Progress
+) -> dict[int, RunRecord]:
     """Makes and stores the runs that are missing; gives those back whose worker died, which are not stored."""
     missing = [seed for seed in seeds if seed not in store]
-    done, lost = len(seeds) - len(missing), dict[int, Record]()
+    done, lost = len(seeds) - len(missing), dict[int, RunRecord]()
     if not missing:
         return lost
     progress(_words(done, seeds), 0.0)
     try:
-        tasks = [Task(scenario, seed, plan.guess, plan.planes) for seed in missing]
+        tasks = [RunTask(scenario, seed, plan.guess, plan.planes) for seed in missing]
         with closing(run_all(tasks, plan.workers, plan.scheduler)) as records:
             for made, record in enumerate(records, 1):
                 if record.program:

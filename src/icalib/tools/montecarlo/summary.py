@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from icalib.tools.montecarlo.record import Block, Record
+from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 from icalib.tools.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
 
 EVERYTHING = "calibration"  # all blocks together
@@ -85,11 +85,11 @@ class Consistency:
     undetermined: dict[str, int]
 
 
-def summarise(records: Sequence[Record]) -> Consistency:
+def summarise(records: Sequence[RunRecord]) -> Consistency:
     """Of records in any order; those that failed are listed and count for nothing else."""
     ordered = sorted(records, key=lambda r: r.seed)
     good = [r for r in ordered if not r.failure]
-    first: dict[str, Block] = {}
+    first: dict[str, GroupErrors] = {}
     for record in good:
         for block in record.blocks:
             first.setdefault(block.key, block)
@@ -112,7 +112,7 @@ def consistency_json(found: Consistency, study: Mapping[str, object]) -> bytes:
     return json.dumps({"format": "icalib consistency", "study": dict(study)} | asdict(found), indent=1).encode()
 
 
-def counting(record: Record, key: str) -> np.ndarray:
+def counting(record: RunRecord, key: str) -> np.ndarray:
     """(m,) entries of the block in the record's error that are not undetermined: those that say something."""
     block = next((b for b in record.blocks if b.key == key), None)
     if block is None:
@@ -120,7 +120,7 @@ def counting(record: Record, key: str) -> np.ndarray:
     return record.columns(key)[[v != "undetermined" for v in block.verdict]]
 
 
-def _errors(record: Record) -> list[tuple[float, str, int]]:
+def _errors(record: RunRecord) -> list[tuple[float, str, int]]:
     """Of all entries that count: error in formal standard deviations, name, seed."""
     return [
         (z, block.key if label == block.name else f"{block.key} {label}", record.seed)
@@ -129,7 +129,7 @@ def _errors(record: Record) -> list[tuple[float, str, int]]:
     ]
 
 
-def _samples(records: Sequence[Record], keys: tuple[str, ...]) -> list[Sample]:
+def _samples(records: Sequence[RunRecord], keys: tuple[str, ...]) -> list[Sample]:
     """Of the blocks `keys` together, runs without any entry that counts left out."""
     found = []
     for r in records:
@@ -139,7 +139,7 @@ def _samples(records: Sequence[Record], keys: tuple[str, ...]) -> list[Sample]:
     return found
 
 
-def _block(records: Sequence[Record], block: Block) -> BlockSummary:
+def _block(records: Sequence[RunRecord], block: GroupErrors) -> BlockSummary:
     samples = _samples(records, (block.key,))
     errors = np.concatenate([np.empty(0), *(s.error for s in samples)])
     variances = np.concatenate([np.empty(0), *(np.diag(s.covariance) for s in samples)])
@@ -157,7 +157,7 @@ def _block(records: Sequence[Record], block: Block) -> BlockSummary:
     )
 
 
-def _entry(records: Sequence[Record], block: Block, index: int) -> Entry:
+def _entry(records: Sequence[RunRecord], block: GroupErrors, index: int) -> Entry:
     own = [(r, r.columns(block.key)[index]) for r in records if len(r.columns(block.key))]
     verdicts = Counter(next(b for b in r.blocks if b.key == block.key).verdict[index] for r, _ in own)
     counted = [(r.error[k], r.covariance[k, k]) for r, k in own if k in counting(r, block.key)]

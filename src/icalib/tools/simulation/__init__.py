@@ -5,14 +5,14 @@ from icalib.tools.simulation.images.rendering import Imaging, Picture, Renderer,
 from icalib.tools.simulation.rigs import GuessError, rig_for, settings_for, with_drawn_guess
 from icalib.tools.simulation.scenario.image_faults import ImageFaults
 from icalib.tools.simulation.scenario.robot import Drive, Features, SimLidar, SimPoses, SimWheels
-from icalib.tools.simulation.scenario.room import Block, Hills, Room, hills_of_slope
-from icalib.tools.simulation.scenario.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
+from icalib.tools.simulation.scenario.room import Hills, Obstacle, Room, hills_of_slope
+from icalib.tools.simulation.scenario.scenario import ADIS16448, HandheldMotion, Scenario, SimCamera, handheld
 from icalib.tools.simulation.scenario.scenario_file import load_scenario
 from icalib.tools.simulation.scenario.tag_map import tag_map
 from icalib.tools.simulation.scenario.texture import Texture
 from icalib.tools.simulation.sensor_bag import write_sensors
 from icalib.tools.simulation.sensors.corners import CornerTruth
-from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.motion import TrueTrajectory
 from icalib.tools.simulation.sensors.poses import PoseTruth
 from icalib.tools.simulation.sensors.simulate import Simulation, Truth, simulate
 from icalib.tools.simulation.sensors.tracks import TrackTruth
@@ -22,7 +22,7 @@ from icalib.tools.simulation.writing import write_film
 
 __all__ = [
     "ADIS16448",
-    "Block",
+    "Obstacle",
     "CornerTruth",
     "Drive",
     "Features",
@@ -31,7 +31,7 @@ __all__ = [
     "Hills",
     "ImageFaults",
     "Imaging",
-    "Motion",
+    "HandheldMotion",
     "Picture",
     "PoseTruth",
     "Renderer",
@@ -47,7 +47,7 @@ __all__ = [
     "Simulation",
     "Texture",
     "TrackTruth",
-    "Trajectory",
+    "TrueTrajectory",
     "Truth",
     "WheelTruth",
     "exposure_poses",

@@ -15,7 +15,7 @@ _AT_NODE_S = 1e-6
 
 
 @dataclass(frozen=True)
-class Path:
+class CubicPath:
     """A cubic through the nodes: of positions, and of the rotation vector from each node to the next.
 
     The slopes at the nodes are those of the parabola through a node and its neighbours; that of the rotation is the
@@ -32,7 +32,7 @@ class Path:
     usable: np.ndarray
 
     @classmethod
-    def of(cls, c: Calibration) -> Path:
+    def of(cls, c: Calibration) -> CubicPath:
         path = c.trajectory
         step = np.diff(path.seconds)
         usable = (np.diff(c.recording_of(path.seconds)) == 0) & (step <= LONGEST_STEP_S)

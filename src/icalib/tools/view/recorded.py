@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from icalib.errors import CalibrationError, RecordingError
 from icalib.result import Calibration, RecordingSpan
 from icalib.rig import Camera, ImuSensor, Lidar, Rig
 from icalib.tools.view.colors import by_value
-from icalib.tools.view.path import Path
+from icalib.tools.view.path import CubicPath
 from icalib.tools.view.scene import POINT, place
 from icalib.tools.view.series import log_lines
 from icalib.tools.view.stream import Stream
@@ -58,7 +58,7 @@ class Clock:
         return (seconds > self.span.start - _EDGE_S) & (seconds < self.span.end + _EDGE_S)
 
 
-def span_of(c: Calibration, recording: FilePath) -> RecordingSpan:
+def span_of(c: Calibration, recording: Path) -> RecordingSpan:
     """The recording of the result that lies at a path. Raises CalibrationError where it is none of them."""
     if not c.recordings:
         raise CalibrationError("the result does not tell the time of its recording; calibrate again to see both.")
@@ -78,7 +78,7 @@ class Recorded:
     rig: Rig
     recording: Recording
     span: RecordingSpan
-    where: FilePath
+    where: Path
 
     def check(self) -> None:
         """Raises where a sensor of the result is not in the recording."""
@@ -156,7 +156,7 @@ class Recorded:
         stream = self.recording.lidar(sensor)
         seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
         inside = self._during(sensor.name, seconds)
-        heights, path = None, Path.of(self.calibration)
+        heights, path = None, CubicPath.of(self.calibration)
         for k in inside[:: _stride(len(inside), MOST_SCANS)]:
             points = self.points_in_world(path, sensor.name, stream, int(k), float(seconds[k]))
             if len(points) and heights is None:
@@ -171,7 +171,7 @@ class Recorded:
             *_thinned(sensor.name, most, MOST_POINTS, "points of a scan"),
         ]
 
-    def points_in_world(self, path: Path, name: str, stream: LidarStream, scan: int, second: float) -> np.ndarray:
+    def points_in_world(self, path: CubicPath, name: str, stream: LidarStream, scan: int, second: float) -> np.ndarray:
         """(n, 3) float32 points of a scan in the world [m], each moved by the pose of the body at its own instant.
 
         They are thinned evenly to MOST_POINTS; those whose instant the trajectory does not reach are left out."""

@@ -13,9 +13,9 @@ import numpy as np
 
 from icalib.tools.simulation.images.lenses import unproject
 from icalib.tools.simulation.images.rendering import Imaging, Optics
-from icalib.tools.simulation.images.roomlight import CELLS, TILE, Lens, Tone, View, light
+from icalib.tools.simulation.images.roomlight import CELLS, TILE, PixelRays, Tone, VisibleFaces, light
 from icalib.tools.simulation.scenario.image_faults import CameraFaults
-from icalib.tools.simulation.scenario.room import Block, Room
+from icalib.tools.simulation.scenario.room import Obstacle, Room
 from icalib.tools.simulation.scenario.scenario import SimCamera
 from icalib.tools.simulation.scenario.texture import Atlas, Texture, atlas_of, leaves, texel_size
 
@@ -32,10 +32,10 @@ class Interior:
     """
 
     room: Room
-    people: tuple[Block, ...] = ()
+    people: tuple[Obstacle, ...] = ()
     atlas: Atlas | None = None
 
-    def view(self, people: tuple[Block, ...] = ()) -> View:
+    def view(self, people: tuple[Obstacle, ...] = ()) -> VisibleFaces:
         """people: where those of this room, in their order, stand now."""
         others, atlas = self.room.faces_of(people), self._atlas
         faces = np.concatenate([self.room.faces, others])
@@ -45,7 +45,7 @@ class Interior:
         texels = np.stack([atlas.width[: len(faces), 0], atlas.height[: len(faces), 0]], axis=1).astype(np.float64)
         placed = [surfaces.along * texels[:, :1], surfaces.across * texels[:, 1:]]
         x, y = np.array([atlas.width[-1, 0], atlas.height[-1, 0]]) / self.room.size[:2]
-        return View(
+        return VisibleFaces(
             np.column_stack([surfaces.plane, *placed, texels, surfaces.triangle]),
             np.stack([origin, origin + u, origin + v, far], axis=1),
             np.array([x, 0.5 * atlas.width[-1, 0], y, 0.5 * atlas.height[-1, 0]]),
@@ -77,7 +77,9 @@ class RoomRenderer:
     imaging: Imaging = Imaging()
     faults: CameraFaults = CameraFaults()
 
-    def grey(self, view: View, T_world_cam: np.ndarray, gain: float, rng: np.random.Generator | None) -> np.ndarray:
+    def grey(
+        self, view: VisibleFaces, T_world_cam: np.ndarray, gain: float, rng: np.random.Generator | None
+    ) -> np.ndarray:
         """(H, W) neither rounded nor clipped, from T_world_cam (4, 4), or over the poses (4, 4, 4) of an exposure.
 
         gain: times all light. rng: where noise is wanted. Raises RigError where noise is wanted without one.
@@ -95,13 +97,13 @@ class RoomRenderer:
         return Optics(self.camera, self.imaging, CELLS)
 
     @cached_property
-    def _lens(self) -> Lens:
+    def _lens(self) -> PixelRays:
         rows, cols = self._optics.fine_shape
         pad = self._optics.pad
         u, v = ((np.arange(n) + 0.5) / CELLS - 0.5 - pad for n in (cols, rows))
         rays = unproject(self.camera, np.stack(np.meshgrid(u, v), axis=-1))
         a, b, c, d = rays[::2, ::2], rays[::2, 1::2], rays[1::2, ::2], rays[1::2, 1::2]  # half a pixel apart
-        return Lens(rays, b - a + d - c, c - a + d - b, _sides(rays))
+        return PixelRays(rays, b - a + d - c, c - a + d - b, _sides(rays))
 
 
 def _sides(rays: np.ndarray) -> np.ndarray:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.tools.simulation.scenario.room import Block
+from icalib.tools.simulation.scenario.room import Obstacle
 from icalib.tools.simulation.scenario.scenario import SimCamera
-from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 _SIZE_M = (0.5, 0.3, 1.75)
 _AWAY_M, _NEARER_M = 1.8, 0.4  # from the camera, and by how much this changes
@@ -15,12 +15,12 @@ _LATE_S = 0.5  # where the camera was, this long ago, is what they follow
 _HZ = 0.13  # of the first; every other sways by a tenth faster than the one before
 
 
-def standing(count: int) -> tuple[Block, ...]:
+def standing(count: int) -> tuple[Obstacle, ...]:
     """As many people, anywhere."""
-    return tuple(Block((0.0, 0.0), _SIZE_M) for _ in range(count))
+    return tuple(Obstacle((0.0, 0.0), _SIZE_M) for _ in range(count))
 
 
-def walking(count: int, camera: SimCamera, trajectory: Trajectory, seconds: float) -> tuple[Block, ...]:
+def walking(count: int, camera: SimCamera, trajectory: TrueTrajectory, seconds: float) -> tuple[Obstacle, ...]:
     """Where they are at an instant of the IMU's clock."""
     if not count:
         return ()
@@ -33,5 +33,5 @@ def walking(count: int, camera: SimCamera, trajectory: Trajectory, seconds: floa
         angle = np.arctan2(ahead[1], ahead[0]) + _APART_RAD * (i - 0.5 * (count - 1)) + _SWAY_RAD * np.sin(phase)
         away = _AWAY_M + _NEARER_M * np.sin(1.7 * phase)
         place = (float(eye[0] + away * np.cos(angle)), float(eye[1] + away * np.sin(angle)))
-        people.append(Block(place, _SIZE_M, float(angle + 0.5 * np.pi + 0.3 * np.sin(2.0 * phase))))
+        people.append(Obstacle(place, _SIZE_M, float(angle + 0.5 * np.pi + 0.3 * np.sin(2.0 * phase))))
     return tuple(people)

@@ -19,7 +19,7 @@ from icalib.tools.simulation.images.lenses import unproject
 from icalib.tools.simulation.images.raster import paint, paint_discs, pixel_kernel, shrink
 from icalib.tools.simulation.scenario.projection import project, visible
 from icalib.tools.simulation.scenario.scenario import SimCamera
-from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 _CELLS = 4  # a pixel, along each axis
 _REACH = 4.0  # of the blur, in standard deviations
@@ -198,7 +198,7 @@ def _distance(sheet: Sheet, T_sheet_cam: np.ndarray) -> float:
 
 
 def exposure_poses(
-    camera: SimCamera, trajectory: Trajectory, seconds: float, exposure_s: float, count: int = 5
+    camera: SimCamera, trajectory: TrueTrajectory, seconds: float, exposure_s: float, count: int = 5
 ) -> np.ndarray:
     """(count, 4, 4) T_world_cam at the middles of equal parts of an exposure about `seconds` of the IMU's clock."""
     at = seconds + exposure_s * ((np.arange(count) + 0.5) / count - 0.5)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from icalib.tools.simulation.scenario.room import Surfaces, ground
+from icalib.tools.simulation.scenario.room import RoomSurfaces, ground
 from icalib.tools.simulation.scenario.texture import Atlas
 
 CELLS = 2  # a pixel, along each axis
@@ -21,7 +21,7 @@ TILE = 16  # pixels
 _MOST_SAMPLES = 8  # of a cell, along its footprint's longer axis
 
 
-class Lens(NamedTuple):
+class PixelRays(NamedTuple):
     """rays (h s, w s, 3) of the cells of h x w pixels, any length, NaN: none; by_u, by_v (h, w, 3): derivatives by a
     pixel; sides (tiles down, tiles across, 4, 3): normals of each tile's pyramid, into it; zeros: it has no rays."""
 
@@ -39,7 +39,7 @@ class Tone(NamedTuple):
     background: float
 
 
-class View(NamedTuple):
+class VisibleFaces(NamedTuple):
     """What is seen. faces (F, 15): plane n, d; a, a0, b, b0 of the place on the texture, X = a . p - a0, Y = b . p - b0
     [texels]; its width and height; 1.0: a triangle. vertices (F, 4, 3), the last of a triangle twice. ground (4,):
     X = g0 x + g1, Y = g2 y + g3 on the hills, whose texture is the last. surfaces: of the hills."""
@@ -47,7 +47,7 @@ class View(NamedTuple):
     faces: np.ndarray
     vertices: np.ndarray
     ground: np.ndarray
-    surfaces: Surfaces
+    surfaces: RoomSurfaces
     atlas: Atlas
 
 

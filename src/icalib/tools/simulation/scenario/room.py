@@ -22,7 +22,7 @@ _CLOSE_M = 1e-9  # to the ground, where the march ends
 
 
 @dataclass(frozen=True)
-class Block:
+class Obstacle:
     """A box, or with `ramp` a wedge that rises from nothing to size z along its own x. center (x, y) [m] of its base,
     size (x, y, z) [m], turned by yaw_rad about the vertical."""
 
@@ -65,7 +65,7 @@ def hills_of_slope(slope_deg: float) -> Hills:
     return Hills(tuple((scale * shares).tolist()), waves, phases)
 
 
-class Surfaces(NamedTuple):
+class RoomSurfaces(NamedTuple):
     """What rays meet. Faces are parallelograms origin + s u + t v, 0 <= s, t <= 1, or triangles (s + t <= 1), seen
     from the side that the normal points to. Of the hills: see `Hills`."""
 
@@ -84,7 +84,7 @@ class Room:
     show of it."""
 
     size: tuple[float, float, float] = (12.0, 10.0, 3.2)
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[Obstacle, ...] = ()
     hills: Hills | None = None
     texture: Texture = Texture()
 
@@ -117,17 +117,17 @@ class Room:
         return _with_offset(_normals(self.faces), self.faces[:, 0])
 
     @cached_property
-    def surfaces(self) -> Surfaces:
+    def surfaces(self) -> RoomSurfaces:
         return self.surfaces_with(np.empty((0, 4, 3)))
 
-    def surfaces_with(self, others: np.ndarray) -> Surfaces:
+    def surfaces_with(self, others: np.ndarray) -> RoomSurfaces:
         """The room's, and faces (n, 4, 3) of what else is in it."""
         faces = np.concatenate([self.faces, others])
         origin, u, v, mark = np.moveaxis(faces, 1, 0)
         normal = _normals(faces)
         area = np.sum(normal * np.cross(u, v), axis=1)[:, None]
         hills = self.hills or Hills((), (), ())
-        return Surfaces(
+        return RoomSurfaces(
             _with_offset(normal, origin),
             _with_offset(np.cross(v, normal) / area, origin),
             _with_offset(np.cross(normal, u) / area, origin),
@@ -137,7 +137,7 @@ class Room:
             np.array(hills.phase, dtype=np.float64),
         )
 
-    def faces_of(self, blocks: Sequence[Block]) -> np.ndarray:
+    def faces_of(self, blocks: Sequence[Obstacle]) -> np.ndarray:
         """(n, 4, 3), as `faces`, of blocks that stand in it."""
         found = [face for b in blocks for face in (_ramp if b.ramp else _box)(b, self.base)]
         return np.array(found).reshape(-1, 4, 3)
@@ -174,7 +174,7 @@ def _with_offset(directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
 Face = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
-def _placed(block: Block, base: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _placed(block: Obstacle, base: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The lowest corner of a block, and its edges along its own x, y and z."""
     c, s = np.cos(block.yaw_rad), np.sin(block.yaw_rad)
     ex, ey = block.size[0] * np.array([c, s, 0.0]), block.size[1] * np.array([-s, c, 0.0])
@@ -182,13 +182,13 @@ def _placed(block: Block, base: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return np.array([*block.center, base]) - 0.5 * (ex + ey), ex, ey, ez
 
 
-def _box(block: Block, base: float) -> list[Face]:
+def _box(block: Obstacle, base: float) -> list[Face]:
     low, ex, ey, ez = _placed(block, base)
     sides = [(low + ez, ex, ey), (low, ex, ez), (low + ey, ez, ex), (low, ez, ey), (low + ex, ey, ez)]
     return [(*side, np.zeros(3)) for side in sides]
 
 
-def _ramp(block: Block, base: float) -> list[Face]:
+def _ramp(block: Obstacle, base: float) -> list[Face]:
     low, ex, ey, ez = _placed(block, base)
     whole, half = np.zeros(3), np.array([1.0, 0.0, 0.0])
     return [

@@ -97,7 +97,7 @@ class SimCamera:
 
 
 @dataclass(frozen=True)
-class Motion:
+class HandheldMotion:
     """How the rig moves in front of the board: sums of sinusoids around a pose `distance_m` in front of its centre.
 
     handheld: all axes. planar: yaw about the world's z and translation in its x and y. single_axis: rotation about
@@ -136,7 +136,7 @@ class Scenario:
     cameras: tuple[SimCamera, ...]
     target: Target = AprilGrid(6, 6, 0.088, 0.3)
     duration_s: float = 20.0
-    motion: Motion | Drive = Motion()
+    motion: HandheldMotion | Drive = HandheldMotion()
     T_world_board: np.ndarray = field(default_factory=_standing_board)
     T_world_bodies: np.ndarray | None = None
     bow: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -207,7 +207,7 @@ def handheld(
     """The EuRoC sensor unit (two radtan cameras at 20 Hz, ADIS16448 at 200 Hz) waved in front of its AprilGrid.
 
     asynchronous: cam1 takes its images half a period after cam0. imu "noisy": ten times the data sheet's densities.
-    exact: see `Motion`. noiseless: neither corners nor IMU have noise, though `rig_for` still states the sigmas.
+    exact: see `HandheldMotion`. noiseless: neither corners nor IMU have noise, but `rig_for` still states the sigmas.
     """
     scale = {"datasheet": 1.0, "noisy": 10.0}[imu]
     noise = replace(ADIS16448.scaled(scale), source="simulation")
@@ -236,7 +236,7 @@ def handheld(
     return Scenario(
         (cam0, cam1),
         duration_s=duration_s,
-        motion=Motion(exact=exact),
+        motion=HandheldMotion(exact=exact),
         imu_noise=noise,
         imu_noise_enabled=not noiseless,
         corner_noise_enabled=not noiseless,

@@ -18,7 +18,7 @@ from icalib.tools.simulation.scenario.effects import read_effects
 from icalib.tools.simulation.scenario.image_faults import ImageFaults
 from icalib.tools.simulation.scenario.projection import PARAMETER_COUNTS
 from icalib.tools.simulation.scenario.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
-from icalib.tools.simulation.scenario.room import Block, Room, hills_of_slope
+from icalib.tools.simulation.scenario.room import Obstacle, Room, hills_of_slope
 from icalib.tools.simulation.scenario.scenario import MODELS, Scenario, SimCamera, pose_from_rows
 from icalib.tools.simulation.scenario.size import refuse_large
 from icalib.tools.simulation.scenario.texture import Texture
@@ -243,11 +243,11 @@ def _image_faults(value: YamlValue) -> ImageFaults:
     return ImageFaults(**chosen)
 
 
-def _block(value: YamlValue) -> Block:
+def _block(value: YamlValue) -> Obstacle:
     found = value.record(("center", "size"), ("yaw_deg", "ramp"))
     x, y = found["center"].vector(2).tolist()
     yaw = np.deg2rad(found["yaw_deg"].number()) if "yaw_deg" in found else 0.0
-    return Block((x, y), _triple(found["size"]), float(yaw), found["ramp"].boolean() if "ramp" in found else False)
+    return Obstacle((x, y), _triple(found["size"]), float(yaw), found["ramp"].boolean() if "ramp" in found else False)
 
 
 def _motion(value: YamlValue, folder: Path) -> Drive:

@@ -11,7 +11,7 @@ from icalib.geometry.targets import Target
 from icalib.tools.simulation.scenario.projection import image_velocity, project, visible
 from icalib.tools.simulation.scenario.scenario import Scenario, SimCamera
 from icalib.tools.simulation.sensors.imu import inside
-from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 _MIN_CORNERS = 6
 _LEAD_S = 0.05  # images start and end this far inside the IMU's readings
@@ -54,7 +54,7 @@ def image_stamps(scenario: Scenario, camera: SimCamera, rng: np.random.Generator
 
 
 def see_corners(
-    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, rng: np.random.Generator
+    scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, rng: np.random.Generator
 ) -> tuple[CornerStream, CornerTruth]:
     """Corners seen by one camera; images with fewer than 6 are dropped."""
     stamps, seconds = image_stamps(scenario, camera, rng)
@@ -82,7 +82,7 @@ def see_corners(
 
 
 def _in_camera(
-    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, points: np.ndarray
+    scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
     """Points (n, 3), one for each of the target's as stated, in the camera frame at each instant, (M, n, 3)."""
     rotation, position, _ = trajectory.pose_at(seconds)
@@ -92,7 +92,9 @@ def _in_camera(
     return (imu - camera.T_imu_cam[:3, 3]) @ camera.T_imu_cam[:3, :3]
 
 
-def _from_the_front(scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
+def _from_the_front(
+    scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray
+) -> np.ndarray:
     """(M, n) bool: whether the camera is on the printed side of each point's body. Bodies do not hide each other."""
     rotation, position, _ = trajectory.pose_at(seconds)
     lens = position + rotation @ camera.T_imu_cam[:3, 3]
@@ -110,7 +112,7 @@ def _whole_tags(target: Target, seen: np.ndarray) -> np.ndarray:
 
 
 def _towards_tag_center(
-    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, points: np.ndarray
+    scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
     """(M, N, 2) unit image direction from each corner towards the centre of its tag, which lies on the bent board.
 
@@ -124,7 +126,7 @@ def _towards_tag_center(
 
 
 def _to_ellipse_centres(
-    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, uv: np.ndarray
+    scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, uv: np.ndarray
 ) -> np.ndarray:
     """(M, N, 2) px from uv, the image of each circle's centre, to the centroid of the circle's image; zero on targets
     without circles."""
@@ -149,7 +151,7 @@ def _to_ellipse_centres(
 
 
 def _corner_sigma(
-    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, seen: np.ndarray
+    scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
     """(M,) standard deviation [px] of the corners of each image."""
     if not scenario.corner_noise_enabled:

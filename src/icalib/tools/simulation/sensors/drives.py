@@ -10,7 +10,7 @@ from icalib.errors import RecordingError
 from icalib.tools.simulation.scenario.robot import Drive
 from icalib.tools.simulation.scenario.room import Room
 from icalib.tools.simulation.sensors.ground import ground_motion
-from icalib.tools.simulation.sensors.motion import ClosedForm, Reference, Waves, basis_with_z
+from icalib.tools.simulation.sensors.motion import AnalyticTrajectory, Reference, Waves, basis_with_z
 from icalib.tools.simulation.sensors.recorded import recorded_motion
 
 _HEIGHT = 0.45  # of the room's, where a free motion has its middle
@@ -25,7 +25,7 @@ _GROUND_BELOW_IMU = np.array([0.0, 0.0, -0.3])  # m, where a robot without wheel
 
 def drive_motion(
     drive: Drive, room: Room, T_imu_wheel: np.ndarray | None, duration_s: float, rng: np.random.Generator
-) -> ClosedForm:
+) -> AnalyticTrajectory:
     """The drive's motion, its phases drawn from `rng`. T_imu_wheel (4, 4): of what rolls on the floor.
 
     Raises RecordingError where a recorded motion cannot be read, is too short, or leaves the room.
@@ -45,7 +45,7 @@ def drive_motion(
     return Reference(basis, basis.T, center, np.eye(3), turns, shifts)
 
 
-def _within(room: Room, motion: ClosedForm, path: Path, duration_s: float) -> ClosedForm:
+def _within(room: Room, motion: AnalyticTrajectory, path: Path, duration_s: float) -> AnalyticTrajectory:
     _, position, _ = motion.pose_at(np.arange(0.0, duration_s, _CHECK_S))
     x, y, z = room.size
     if (position < [-0.5 * x, -0.5 * y, 0.0]).any() or (position > [0.5 * x, 0.5 * y, z]).any():

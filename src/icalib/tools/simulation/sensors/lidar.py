@@ -11,9 +11,9 @@ from numba import njit
 from icalib.data.measurements import LidarStream
 from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
 from icalib.tools.simulation.scenario.robot import SimLidar
-from icalib.tools.simulation.scenario.room import Room, Surfaces, nearest
+from icalib.tools.simulation.scenario.room import Room, RoomSurfaces, nearest
 from icalib.tools.simulation.scenario.scenario import Scenario
-from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 _FIRING_S = 2.304e-6
 
@@ -40,7 +40,7 @@ class _Points(NamedTuple):
 def scan_room(
     room: Room,
     lidar: SimLidar,
-    trajectory: Trajectory,
+    trajectory: TrueTrajectory,
     scenario: Scenario,
     seed: list[int],
     progress: Callable[[float], None],
@@ -63,7 +63,7 @@ def scan_room(
     return LidarStream(lidar.name, stamps, start, offset[:n], xyz[:n], plane[:n])
 
 
-def _sweep(lidar: SimLidar, trajectory: Trajectory, begin: float, noise: np.ndarray) -> _Sweep:
+def _sweep(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.ndarray) -> _Sweep:
     steps, rings = lidar.azimuth_steps, lidar.rings
     column_s = 1.0 / (lidar.rate_hz * steps)
     rotation, position, _ = trajectory.pose_at(begin + column_s * np.arange(steps + 1))
@@ -86,7 +86,7 @@ def _beams(lidar: SimLidar) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shoot(surfaces: Surfaces, sweep: _Sweep, column_s: float, points: _Points) -> int:
+def _shoot(surfaces: RoomSurfaces, sweep: _Sweep, column_s: float, points: _Points) -> int:
     """Fills the points in the order of their instants; returns how many there are.
 
     Within a column, of some 0.1 ms, the pose runs straight: 5 m/s^2 and 2 rad/s bend it by 1e-8 m and rad.

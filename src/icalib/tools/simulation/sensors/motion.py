@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Motion, Scenario
+from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, HandheldMotion, Scenario
 
 _ANGLES_RAD = np.array([[0.45, 0.22, 0.18], [0.12, 0.09, 0.08]])  # slow, fast sinusoid; about camera z, y, x
 _YAW_RAD = np.array([[0.25, 0.0, 0.0], [0.10, 0.0, 0.0]])
@@ -43,7 +43,7 @@ def increments(rate: np.ndarray, force: np.ndarray, dt: np.ndarray) -> tuple[np.
     return total[..., :3, :3], total[..., :3, 3], total[..., :3, 4]
 
 
-class Trajectory(Protocol):
+class TrueTrajectory(Protocol):
     """Where the IMU was at any instant."""
 
     def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -55,7 +55,7 @@ class Trajectory(Protocol):
         ...
 
 
-class ClosedForm(Trajectory, Protocol):
+class AnalyticTrajectory(TrueTrajectory, Protocol):
     """A trajectory that an IMU can sample."""
 
     def readings_at(self, seconds: np.ndarray) -> np.ndarray:
@@ -152,7 +152,7 @@ def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
     """The scenario's motion in closed form, around where the first camera looks at the board's centre, or at the
     origin of T_world_board where there are several bodies."""
     motion = scenario.motion
-    assert isinstance(motion, Motion)
+    assert isinstance(motion, HandheldMotion)
     T_imu_cam = scenario.cameras[0].T_imu_cam
     R_world_board, origin = scenario.T_world_board[:3, :3], scenario.T_world_board[:3, 3]
     corners = scenario.target.points if scenario.T_world_bodies is None else np.zeros((1, 3))
@@ -222,7 +222,7 @@ def _advance(
     )
 
 
-def exact_motion(reference: ClosedForm, seconds: np.ndarray) -> ExactTrajectory:
+def exact_motion(reference: AnalyticTrajectory, seconds: np.ndarray) -> ExactTrajectory:
     """Readings near the reference's, and their exact integral.
 
     The integral of means drifts from the reference by the trapezoid's error, so each reading is steered softly by

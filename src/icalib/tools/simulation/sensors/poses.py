@@ -10,7 +10,7 @@ from icalib.data.measurements import PoseStream
 from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
 from icalib.tools.simulation.scenario.robot import SimPoses
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
-from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class PoseTruth:
 
 
 def report_poses(
-    sensor: SimPoses, trajectory: Trajectory, imu_seconds: np.ndarray, noisy: bool, rng: np.random.Generator
+    sensor: SimPoses, trajectory: TrueTrajectory, imu_seconds: np.ndarray, noisy: bool, rng: np.random.Generator
 ) -> tuple[PoseStream, PoseTruth]:
     """The poses of one sensor within the readings of the IMU, at imu_seconds (N,)."""
     stamps, seconds = stamped(sensor, imu_seconds[-1] - LEAD_S)

@@ -18,14 +18,14 @@ from icalib.data.measurements import (
     WheelStream,
 )
 from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
-from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Motion, Scenario, SimCamera
+from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, HandheldMotion, Scenario, SimCamera
 from icalib.tools.simulation.sensors.corners import CornerTruth, see_corners
 from icalib.tools.simulation.sensors.drives import drive_motion
 from icalib.tools.simulation.sensors.imu import imu_stamps, inside, read_imu
 from icalib.tools.simulation.sensors.lidar import scan_room
-from icalib.tools.simulation.sensors.motion import ClosedForm, Trajectory, exact_motion, reference_motion
+from icalib.tools.simulation.sensors.motion import AnalyticTrajectory, TrueTrajectory, exact_motion, reference_motion
 from icalib.tools.simulation.sensors.poses import PoseTruth, report_poses
-from icalib.tools.simulation.sensors.tracks import Followed, TrackTruth, follow
+from icalib.tools.simulation.sensors.tracks import SimulatedTracks, TrackTruth, follow
 from icalib.tools.simulation.sensors.wheels import WheelTruth, read_wheels
 
 Progress = Callable[[str, float], None]  # what is being done, and the share of all that is done
@@ -59,7 +59,7 @@ class Truth:
     distortion: dict[str, np.ndarray]
     bloom_px: dict[str, float]
     corners: dict[str, CornerTruth]
-    trajectory: Trajectory
+    trajectory: TrueTrajectory
     tracks: dict[str, TrackTruth] = field(default_factory=dict)
     wheels: dict[str, WheelTruth] = field(default_factory=dict)
     points: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))  # (F, 3) m, world, by number of the feature
@@ -133,12 +133,12 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     return Simulation(scenario, measured, truth)
 
 
-def _motion(scenario: Scenario, seed: int, seconds: np.ndarray) -> tuple[Trajectory, np.ndarray]:
+def _motion(scenario: Scenario, seed: int, seconds: np.ndarray) -> tuple[TrueTrajectory, np.ndarray]:
     """The trajectory, and the rates and forces (N, 6) that an IMU without errors reads on it."""
     motion = scenario.motion
     rng = np.random.default_rng([seed if motion.seed is None else motion.seed, 0])
-    reference: ClosedForm
-    if isinstance(motion, Motion):
+    reference: AnalyticTrajectory
+    if isinstance(motion, HandheldMotion):
         reference = reference_motion(scenario, rng)
     else:
         assert scenario.room is not None  # `Scenario` sees to it
@@ -151,7 +151,7 @@ def _motion(scenario: Scenario, seed: int, seconds: np.ndarray) -> tuple[Traject
 
 
 def _corners(
-    scenario: Scenario, trajectory: Trajectory, seed: int
+    scenario: Scenario, trajectory: TrueTrajectory, seed: int
 ) -> tuple[tuple[CornerStream, ...], dict[str, CornerTruth]]:
     if not scenario.board:
         return (), {}
@@ -162,13 +162,13 @@ def _corners(
     return tuple(stream for stream, _ in seen), {stream.name: truth for stream, truth in seen}
 
 
-def _tracks(scenario: Scenario, trajectory: Trajectory, seed: int) -> Followed:
+def _tracks(scenario: Scenario, trajectory: TrueTrajectory, seed: int) -> SimulatedTracks:
     if scenario.room is None or scenario.features is None or not scenario.cameras:
-        return Followed((), (), np.empty((0, 3)))
+        return SimulatedTracks((), (), np.empty((0, 3)))
     return follow(scenario, scenario.room, scenario.features, trajectory, seed)
 
 
-def _scans(scenario: Scenario, trajectory: Trajectory, seed: int, progress: Progress) -> tuple[LidarStream, ...]:
+def _scans(scenario: Scenario, trajectory: TrueTrajectory, seed: int, progress: Progress) -> tuple[LidarStream, ...]:
     scans = []
     for i, lidar in enumerate(scenario.lidars):
         assert scenario.room is not None  # `Scenario` sees to it
@@ -183,7 +183,7 @@ def _shared(progress: Progress, stage: str, before: float, share: float) -> Call
 
 
 def _wheels(
-    scenario: Scenario, trajectory: Trajectory, seconds: np.ndarray, seed: int
+    scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray, seed: int
 ) -> tuple[tuple[WheelStream | WheelPoses, ...], dict[str, WheelTruth]]:
     read = []
     for i, wheels in enumerate(scenario.wheels):
@@ -193,7 +193,7 @@ def _wheels(
 
 
 def _poses(
-    scenario: Scenario, trajectory: Trajectory, seconds: np.ndarray, seed: int
+    scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray, seed: int
 ) -> tuple[tuple[PoseStream, ...], dict[str, PoseTruth]]:
     read = []
     for i, sensor in enumerate(scenario.poses):
@@ -202,7 +202,7 @@ def _poses(
     return tuple(stream for stream, _ in read), {stream.name: truth for stream, truth in read}
 
 
-def _motion_truth(scenario: Scenario, trajectory: Trajectory, seconds: np.ndarray) -> dict[str, Any]:
+def _motion_truth(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray) -> dict[str, Any]:
     """The fields of `Truth` on where the IMU was at its readings."""
     rotation, position, velocity = trajectory.pose_at(seconds)
     return {

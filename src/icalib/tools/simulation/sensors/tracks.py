@@ -13,7 +13,7 @@ from icalib.tools.simulation.scenario.robot import Features
 from icalib.tools.simulation.scenario.room import Room, distances
 from icalib.tools.simulation.scenario.scenario import Scenario, SimCamera
 from icalib.tools.simulation.sensors.corners import image_stamps
-from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 _NEAREST_M = 0.3
 _LOST_PERIODS = 1.5
@@ -28,7 +28,7 @@ class TrackTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class SimulatedTracks:
     """What all cameras followed. points (F, 3): where feature i truly is, in world."""
 
     streams: tuple[TrackStream, ...]
@@ -36,7 +36,9 @@ class Followed:
     points: np.ndarray
 
 
-def follow(scenario: Scenario, room: Room, features: Features, trajectory: Trajectory, seed: int) -> Followed:
+def follow(
+    scenario: Scenario, room: Room, features: Features, trajectory: TrueTrajectory, seed: int
+) -> SimulatedTracks:
     """Tracks of all cameras. Images are those of the corners; noise is each camera's `corner_noise_px`."""
     rng = np.random.default_rng(features.seed)
     surface, normal = room.points(features.count, rng)
@@ -61,7 +63,7 @@ def follow(scenario: Scenario, room: Room, features: Features, trajectory: Traje
         ),
         strict=True,
     )
-    return Followed(streams, truths, points[front_end.point_of()])
+    return SimulatedTracks(streams, truths, points[front_end.point_of()])
 
 
 def _view(

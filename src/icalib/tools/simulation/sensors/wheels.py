@@ -12,7 +12,7 @@ from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import RigError
 from icalib.tools.simulation.scenario.instants import LEAD_S, check_enough, stamped
 from icalib.tools.simulation.scenario.robot import SimWheels
-from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 _GAUSS = np.polynomial.legendre.leggauss(3)
 _STEEPEST_RAD = 1.3
@@ -31,7 +31,7 @@ class WheelTruth:
 
 
 def read_wheels(
-    wheels: SimWheels, trajectory: Trajectory, imu_seconds: np.ndarray, noisy: bool, rng: np.random.Generator
+    wheels: SimWheels, trajectory: TrueTrajectory, imu_seconds: np.ndarray, noisy: bool, rng: np.random.Generator
 ) -> tuple[WheelStream | WheelPoses, WheelTruth]:
     """One wheel sensor's readings within those of the IMU, at imu_seconds (N,)."""
     stamps, seconds = stamped(wheels, imu_seconds[-1] - LEAD_S)
@@ -57,13 +57,13 @@ def read_wheels(
     return stream, WheelTruth(seconds, true)
 
 
-def reported(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
+def reported(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> np.ndarray:
     """(N, 2) at each instant, without noise, as in `WheelStream`. Of rates (v_x -+ baseline/2 w_z) / radius."""
     some = np.split(seconds, range(_AT_A_TIME, len(seconds), _AT_A_TIME))
     return np.concatenate([_reported(wheels, trajectory, s) for s in some])
 
 
-def _reported(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
+def _reported(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> np.ndarray:
     velocity, rate = wheel_velocity(wheels.T_imu_wheel, trajectory, seconds)
     ahead, turning = velocity[:, 0], rate[:, 2]
     if wheels.reports == "twist":
@@ -89,7 +89,7 @@ def _steering(wheels: SimWheels, ahead: np.ndarray, turning: np.ndarray) -> np.n
 
 
 def wheel_velocity(
-    T_imu_wheel: np.ndarray, trajectory: Trajectory, seconds: np.ndarray
+    T_imu_wheel: np.ndarray, trajectory: TrueTrajectory, seconds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N, 3) velocity [m/s] and angular rate [rad/s] of the wheel frame in its own axes."""
     rotation, _, velocity = trajectory.pose_at(seconds)
@@ -98,7 +98,7 @@ def wheel_velocity(
     return in_imu @ T_imu_wheel[:3, :3], rate @ T_imu_wheel[:3, :3]
 
 
-def _means(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray, imu_seconds: np.ndarray) -> np.ndarray:
+def _means(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray, imu_seconds: np.ndarray) -> np.ndarray:
     """(N - 1, 2) means between the instants, by Gauss's rule between all these and the IMU's, where rates may jump."""
     within = imu_seconds[(imu_seconds > seconds[0]) & (imu_seconds < seconds[-1])]
     cuts = np.union1d(seconds, within)
@@ -110,7 +110,7 @@ def _means(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray, imu_s
     return np.diff(turned, axis=0) / np.diff(seconds)[:, None]
 
 
-def relative_poses(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def relative_poses(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(K, 3) yaw, x, y between consecutive instants (K + 1,) by the paper's (27), without noise, and (K, 3, 3) the
     covariance that integrating noisy readings would give them: yaw = e3 . Log(R_W(k)_W(k+1)), x and y of p_W(k)_W(k+1).
     """
@@ -120,7 +120,9 @@ def relative_poses(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarra
     return np.concatenate(poses), np.concatenate(covariances)
 
 
-def _relative_poses(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _relative_poses(
+    wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     parts = np.linspace(seconds[:-1], seconds[1:], 2 * _SUBSTEPS + 1, axis=1)
     rotation, position = _frames(wheels, trajectory, parts.ravel())
     rotation, position = rotation.reshape(*parts.shape, 3, 3), position.reshape(*parts.shape, 3)
@@ -135,7 +137,7 @@ def _drawn(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.standard_normal(size.shape))[..., None])[..., 0]
 
 
-def _frames(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _frames(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """R_world_wheel (N, 3, 3) and p_world_wheel (N, 3)."""
     rotation, position, _ = trajectory.pose_at(seconds)
     return rotation @ wheels.T_imu_wheel[:3, :3], position + rotation @ wheels.T_imu_wheel[:3, 3]
