@@ -358,8 +358,8 @@ class Measurements:
 
     @property
     def body(self) -> CornerStream | TrackStream | PoseStream:
-        """Without an IMU, of the sensor whose frame and clock are the body's: the first camera, or where cameras follow
-        points alone the first pose sensor."""
+        """Without an IMU: the stream of the sensor whose frame and clock are the body's. It is the first camera, or the
+        first pose sensor where cameras have nothing but feature tracks."""
         follow = bool(self.tracks) and not any(len(c.uv) for c in self.cameras)
         return (*self.poses, *self.tracks)[0] if follow else (*self.cameras, *self.poses)[0]
 

@@ -69,9 +69,9 @@ def closest_point_residual(
 ) -> np.ndarray:
     """(N,) the paper's (24) and (25) for a closest point (3,) in the world and points xyz (N, 3) in the sensor's frame.
 
-    It is n . p - d of each point where the sensor stands on the origin's side of the plane, the negative beyond it, and
-    not defined for a plane through the origin or through the sensor. In (24) p_pi / |p_pi| stands for n: with d_L < 0
-    that is -n.
+    It is n . p - d of each point if the sensor and the origin are on the same side of the plane, and the negative if
+    not. It is not defined for a plane through the origin or through the sensor. In (24) p_pi / |p_pi| stands for n:
+    with d_L < 0 that is -n.
     """
     d = np.linalg.norm(p_pi)
     normal = p_pi / d

@@ -1,4 +1,4 @@
-"""What parts of the recording make of one another: what moves without each part, and how halves predict each other."""
+"""Figures of segments: the result without each segment (jackknife), and the two-fold cross-validation."""
 
 from __future__ import annotations
 

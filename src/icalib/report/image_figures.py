@@ -1,4 +1,4 @@
-"""Residuals of what one camera saw (predicted - measured): corners, or points that it followed."""
+"""Residuals (predicted - measured) of one camera: corners or tracked points."""
 
 from __future__ import annotations
 

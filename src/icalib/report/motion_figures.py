@@ -88,12 +88,12 @@ def _outline(c: Calibration, target: Target, body: int) -> np.ndarray:
 
 
 def _seams(c: Calibration) -> np.ndarray:
-    """Nodes that are the last of a recording that others follow."""
+    """The last keyframe of each recording but the last one."""
     return np.flatnonzero(np.diff(c.recording_of(c.trajectory.seconds)))
 
 
 def _lifted(c: Calibration, values: np.ndarray) -> np.ndarray:
-    """Values (K, 3) at the nodes, NaN at the last of each recording that others follow, so that no line runs on."""
+    """Values (K, 3) at the keyframes, NaN at the last of each recording, so that no line joins two recordings."""
     out = values.copy()
     out[_seams(c)] = np.nan
     return out

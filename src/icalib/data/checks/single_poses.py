@@ -45,16 +45,16 @@ def single_wrong(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
 
 
 def _distances(
-    poses: tuple[np.ndarray, np.ndarray, np.ndarray], nodes: np.ndarray, asked: np.ndarray
+    poses: tuple[np.ndarray, np.ndarray, np.ndarray], knots: np.ndarray, asked: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) m and rad of the poses numbered `asked` (n,) from the cubic through the nearest two of `nodes` (m,) on
+    """(n, 2) m and rad of the poses numbered `asked` (n,) from the cubic through the nearest two of `knots` (m,) on
     each side, but not themselves, 0 where there are none; and how much larger noise makes it than of evenly spaced
     poses."""
     t, R, p = poses
-    left, right = np.searchsorted(nodes, asked), np.searchsorted(nodes, asked, side="right")
-    found = (left >= 2) & (right <= len(nodes) - 2)
-    left, right = np.clip(left, 2, len(nodes)), np.clip(right, 0, len(nodes) - 2)
-    beside = nodes[np.stack([left - 2, left - 1, right, right + 1])]
+    left, right = np.searchsorted(knots, asked), np.searchsorted(knots, asked, side="right")
+    found = (left >= 2) & (right <= len(knots) - 2)
+    left, right = np.clip(left, 2, len(knots)), np.clip(right, 0, len(knots) - 2)
+    beside = knots[np.stack([left - 2, left - 1, right, right + 1])]
     found &= t[beside[3]] - t[beside[0]] < _LONGEST_STEPS * np.median(np.diff(t))
     weight = np.where(found, _lagrange(np.where(found, t[beside] - t[asked], np.arange(1.0, 5.0)[:, None])), 0.0)
     off = p[asked] - np.einsum("kn,kni->ni", weight, p[beside])

@@ -99,7 +99,7 @@ def file_payload(stamp_ns: int, source: str, data: bytes, described: str = "") -
     if encoding in FILE_FORMATS and words and words[-1] in _BAYER:
         encoding = f"{encoding} {words[-1]}"
     width, height = file_size(data)
-    if encoding in ("tiff", "pnm", "webp"):  # recorded by few cameras: not worth readers of their headers
+    if encoding in ("tiff", "pnm", "webp"):  # few cameras record these: their headers have no reader
         image = _decoded(data)
         height, width = (0, 0) if image is None else image.shape[:2]
     return Payload(stamp_ns, source, encoding, data, width, height)

@@ -17,11 +17,11 @@ Source = Recording | str | Path
 
 
 def open_all(given: Source | Sequence[Source], start_s: float = 0.0, end_s: float = inf) -> dict[str, Recording]:
-    """One recording or several by name: that of the file or folder, the whole path where two share it, or a number
-    for those that are open already. start_s, end_s: as `open_recording`, of each.
+    """One recording or several, by name. The name is that of the file or folder, or the whole path where two share it.
+    A `Recording` that is passed has a number for a name. start_s, end_s: as `open_recording`, of each.
 
-    Raises RecordingError for none, for one that cannot be opened, for one that is given twice, and for a part of one
-    that is open already.
+    Raises RecordingError for no recording, one that cannot be read, one that is given twice, and a part of a
+    `Recording`.
     """
     sources: Sequence[Source] = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
     if not sources:

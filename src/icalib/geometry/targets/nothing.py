@@ -1,4 +1,4 @@
-"""No target at all: the cameras follow points of the scene."""
+"""No target at all: cameras have feature tracks of the scene."""
 
 from __future__ import annotations
 

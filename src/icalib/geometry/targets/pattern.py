@@ -103,7 +103,7 @@ def _charuco(board: Charuco, border_bits: int) -> list[_Box]:
     # Where the top left square is black, the one at the bottom left is, too, if the number of rows is odd.
     boxes = _squares(nx, ny, size, (left, top - ny * size), (1 - ny % 2 + board.first_white) % 2)
     white = [(row, col) for row in range(ny) for col in range(nx) if (row + col + board.first_white) % 2 == 1]
-    inset, bits = 0.5 * (size - marker), opencv_bits(board.dictionary)  # AprilTags on their heads, as OpenCV does
+    inset, bits = 0.5 * (size - marker), opencv_bits(board.dictionary)  # AprilTags rotated by 180 deg, as OpenCV does
     for tag_id, (row, col) in enumerate(white):
         corner = left + col * size + inset, top - (row + 1) * size + inset
         boxes += _tag(bits[tag_id], marker, corner, border_bits)

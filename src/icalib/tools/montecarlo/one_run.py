@@ -22,9 +22,9 @@ PlanesKind = Literal["known", "found"]
 
 @dataclass(frozen=True, eq=False)
 class RunTask:
-    """What a run is made from. guess: the program finds its own, or starts from one drawn about the truth. Cameras that
-    follow points of the scene have a drawn guess of their intrinsics in either case: points do not show these from
-    nothing. planes: the program is told which of them a LiDAR's point lies on, or finds them in the clouds."""
+    """Inputs of a run. guess: the program finds its own, or starts from one drawn about the truth. Cameras with feature
+    tracks have a drawn guess of their intrinsics in either case, because tracks alone do not determine these. planes:
+    the plane of each LiDAR point is known, or found in the clouds."""
 
     scenario: Scenario
     seed: int

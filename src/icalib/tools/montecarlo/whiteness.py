@@ -38,7 +38,7 @@ def _of_wheels(r: WheelResiduals) -> list[Whiteness]:
 
 
 def _of_image_points(r: ImageResiduals) -> Whiteness:
-    """A corner's next one is the same point of the target in the next image, so of a point that is followed."""
+    """Whiteness between consecutive images: of the same corner of the target, or of the same tracked point."""
     image, point = image_of(r), r.point
     order = np.lexsort((image, point))
     order = order[r.used[order]]

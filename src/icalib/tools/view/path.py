@@ -1,4 +1,4 @@
-"""Where the body was at any instant, from the nodes of a result."""
+"""The pose of the body at any instant, from the keyframes of a result."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from icalib.geometry import so3
 from icalib.geometry.cubic import hermite
 from icalib.result import Calibration
 
-LONGEST_STEP_S = 0.5  # between nodes; what lies between two that are further apart is not known
-_AT_NODE_S = 1e-6
+LONGEST_STEP_S = 0.5  # between keyframes; the pose between two that are further apart is not known
+_AT_KEYFRAME_S = 1e-6
 
 
 @dataclass(frozen=True)
 class CubicPath:
-    """A cubic through the nodes: of positions, and of the rotation vector from each node to the next.
+    """A cubic through K keyframes: of positions, and of the rotation vector from each keyframe to the next.
 
-    The slopes at the nodes are those of the parabola through a node and its neighbours; that of the rotation is the
-    angular rate in the body's axes. K nodes, seconds on the clock of the result. usable (K - 1,): the interval can be
-    looked into.
+    The slopes at a keyframe are those of the parabola through it and its neighbours; that of the rotation is the
+    angular rate in the body's axes. seconds: on the clock of the result. usable (K - 1,): poses within the interval
+    are known.
     """
 
     seconds: np.ndarray  # (K,)
@@ -44,29 +44,29 @@ class CubicPath:
 
     def at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """R_world_body (n, 3, 3), p_world_body (n, 3) at `seconds` (n,) of the result, and (n,) bool: where they are
-        known. Elsewhere they are those of a node nearby."""
+        known. Elsewhere they are those of a keyframe nearby."""
         last = max(len(self.seconds) - 2, 0)
         k = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, last)
         h = self.seconds[k + 1] - self.seconds[k]
         s = np.clip((seconds - self.seconds[k]) / h, 0.0, 1.0)
-        node = np.where(s < 0.5, k, k + 1)
-        at_node = np.abs(seconds - self.seconds[node]) <= _AT_NODE_S
+        nearest = np.where(s < 0.5, k, k + 1)
+        at_keyframe = np.abs(seconds - self.seconds[nearest]) <= _AT_KEYFRAME_S
         inside = self.usable[k] & (seconds >= self.seconds[0]) & (seconds <= self.seconds[-1])
         s = np.where(inside, s, np.round(s))[:, None]
         turn = self.turn[k]
-        # The rate at the far node as a derivative of the rotation vector: the inverse right Jacobian, to second order.
+        # The rate at the later keyframe as a derivative of the rotation vector: inverse right Jacobian, second order.
         far = self.rate[k + 1]
         far = far + 0.5 * np.cross(turn, far) + np.cross(turn, np.cross(turn, far)) / 12.0
         phi = hermite(s, turn, h[:, None] * self.rate[k], h[:, None] * far)
         moved = self.position[k + 1] - self.position[k]
         way = hermite(s, moved, h[:, None] * self.slope[k], h[:, None] * self.slope[k + 1])
         R = self.rotation[k] @ so3.exp_many(np.ascontiguousarray(phi))
-        return R, self.position[k] + way, inside | at_node
+        return R, self.position[k] + way, inside | at_keyframe
 
 
 def _slopes(between: np.ndarray, step: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """(K, 3) at the nodes, from the mean slopes `between` them (K - 1, 3); those across gaps have no part in it."""
-    weight = np.zeros((2, len(step) + 1))  # of the interval before and behind each node
+    """(K, 3) slopes at the keyframes, from the mean slopes `between` them (K - 1, 3) without those across gaps."""
+    weight = np.zeros((2, len(step) + 1))  # of the intervals before and after each keyframe
     weight[0, 1:], weight[1, :-1] = usable, usable
     i = np.flatnonzero((weight > 0.0).all(axis=0))
     weight[0, i], weight[1, i] = step[i], step[i - 1]

@@ -72,7 +72,7 @@ def log_uncertainty(s: Stream, c: Calibration) -> None:
 
 
 def log_motion(s: Stream, c: Calibration) -> None:
-    """The pose of the body at every node, and the way of each recording from its start on."""
+    """The pose of the body at each keyframe, and the trajectory of each recording so far."""
     path = c.trajectory
     s.still("world", s.rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     s.over(

@@ -40,7 +40,7 @@ def log_residuals(s: Stream, c: Calibration) -> None:
 
 
 def log_states(s: Stream, c: Calibration) -> None:
-    """Velocity [m/s] and biases [deg/s, m/s^2] at the nodes; without an IMU they say nothing."""
+    """Velocity [m/s] and biases [deg/s, m/s^2] at the keyframes; without an IMU they say nothing."""
     path = c.trajectory
     if c.imu is None:
         return

@@ -182,7 +182,7 @@ def _below(q, a, b):
 def pixel_kernel(sigma: float, s: int, pad: int) -> np.ndarray:
     """((2 pad + 1) s,) weights of the cells along one axis around a pixel: a box of one pixel, blurred by a Gaussian.
 
-    sigma [px]. The cells' own width blurs by 1 / (12 s^2) in squares, which is taken off the Gaussian.
+    sigma [px]. The cells' own width adds a variance of 1 / (12 s^2) px^2, which is subtracted from the Gaussian's.
     """
     edges = np.arange((2 * pad + 1) * s + 1) / s - pad - 0.5
     spread = np.sqrt(max(sigma**2 - 1.0 / (12.0 * s * s), 0.0))
