@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from icalib.geometry import so3
 from icalib.motion.from_nodes import in_order_of_nodes, integrate_from_node, nothing_carried
-from icalib.motion.integration import Increment, Readings, correction, integrate
+from icalib.motion.integration import Increment, Readings, finish, integrate, integration_room
+from icalib.motion.integration_step import COVARIANCE, SIZE, correction
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
 INTRINSICS = np.random.default_rng(5).normal(size=24) * np.repeat([0.01, 0.01, 0.02, 2e-3], [6, 6, 3, 9])
@@ -39,7 +40,8 @@ def run(r, t0, t1, bias=BIAS, intrinsics=None, first=None, width=6, covariance=F
     first = r.interval(t0) if first is None else first
     x = np.zeros(24) if intrinsics is None else intrinsics
     readings = Readings(r.t, r.gyro, r.accel, r.variance, r.walk, linear)
-    end = integrate(t0, t1, first, bias, readings, correction(x, max(width - 6, 0)), Increment(R, v, p, J, P))
+    room = integration_room(COVARIANCE if covariance else 0)
+    end = integrate(t0, t1, first, tuple(bias), readings, correction(x), room, Increment(R, v, p, J, P))
     return R, v, p, J, P, end
 
 
@@ -176,11 +178,13 @@ def test_what_is_carried_on_is_what_starts_anew(order, width):
     node = np.clip(np.searchsorted(0.5 * (seconds[1:] + seconds[:-1]), times), 0, 2)
     ways = {"of nodes": in_order_of_nodes(times, node, seconds), "of time": np.arange(68), "any": rng.permutation(68)}
     readings = Readings(R0.t, R0.gyro, R0.accel, R0.variance, R0.walk, True)
-    by, carried = correction(INTRINSICS, max(width - 6, 0)), nothing_carried(width)
+    by, carried, x, none = correction(INTRINSICS), nothing_carried(), np.empty(SIZE), np.empty(0)
     for i in ways[order]:
         k = node[i]
         out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
-        end = integrate_from_node(k, seconds[k], times[i], R0.interval(seconds[k]), BIAS, readings, by, carried, out)
+        first, bias = R0.interval(seconds[k]), tuple(BIAS)
+        end = integrate_from_node(k, seconds[k], times[i], first, bias, readings, by, carried, x, width)
+        finish(x, none, out)
         anew = run(R0, seconds[k], times[i], intrinsics=INTRINSICS, width=width, linear=True)
         for a, b in zip((*out[:4], *end), (*anew[:4], *anew[5]), strict=True):
             np.testing.assert_array_equal(a, b)

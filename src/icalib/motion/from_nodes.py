@@ -8,7 +8,8 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.motion.imu_data import ImuData
-from icalib.motion.integration import Increment, start, to_the_end, whole
+from icalib.motion.integration import advance
+from icalib.motion.integration_step import SIZE, D, start
 from icalib.optim.state import State
 
 
@@ -51,55 +52,55 @@ class Moving(NamedTuple):
         return cls(np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)))
 
 
-class Carried(NamedTuple):
-    """How far increments were carried from a node, in whole intervals: node and interval (2,), the instant (1,)."""
-
-    at: np.ndarray
-    now: np.ndarray
-    so_far: Increment
-
-
 @njit(cache=True, nogil=True)
-def nothing_carried(width):
-    """J of `width` columns, no covariance."""
-    so_far = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
-    return Carried(np.full(2, -1), np.empty(1), so_far)
-
-
-@njit(cache=True, nogil=True, inline="always")  # as in integration.py
-def integrate_from_node(node, t0, t1, first, bias, readings, by, carried, out):
-    """As `integrate`, without a covariance. What was `carried` from the same node in the same direction, and not
-    as far as t1, is carried on, so that many instants (`in_order_of_nodes`) cost little more than the last one."""
-    rate, force, backwards = by.room.rate, by.room.force, t1 < t0
-    so_far, way = carried.so_far, 2 * node + backwards
-    if carried.at[0] != way or (t1 >= carried.now[0] if backwards else t1 <= carried.now[0]):
-        start(so_far.R, so_far.v, so_far.p, so_far.J, so_far.P)
-        carried.at[0], carried.at[1], carried.now[0] = way, first, t0
-    j, now = whole(t1, backwards, carried.at[1], carried.now[0], bias, readings, by, so_far, so_far.P, rate, force)
-    carried.at[1], carried.now[0] = j, now
-    for i in range(3):
-        out.v[i], out.p[i] = so_far.v[i], so_far.p[i]
-        for k in range(3):
-            out.R[i, k] = so_far.R[i, k]
-    for i in range(out.J.shape[0]):
-        for k in range(out.J.shape[1]):
-            out.J[i, k] = so_far.J[i, k]
-    to_the_end(t1, j, now, bias, readings, by, out, out.P, rate, force)
+def integrate_from_node(node, t0, t1, first, bias, readings, by, carried, run, width):
+    """As `integrate`, without a covariance and into `run` (SIZE,). What was `carried` from the same node in the same
+    direction, and not as far as t1, is carried on, so that many instants (`in_order_of_nodes`) cost little more than
+    the last one. carried (SIZE + 3,): a run through whole intervals; its way, its interval, its instant."""
+    backwards = t1 < t0
+    way = 2 * node + backwards
+    if carried[SIZE] != way or (t1 >= carried[SIZE + 2] if backwards else t1 <= carried[SIZE + 2]):
+        start(carried)
+        carried[SIZE], carried[SIZE + 1], carried[SIZE + 2] = way, first, t0
+    none, j, now, rate, force = carried[:0], int(carried[SIZE + 1]), carried[SIZE + 2], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for part in range(2):  # whole intervals, and then the rest
+        x = run if part else carried
+        j, now, rate, force = advance(t1, part == 0, j, now, bias, readings, by, x, width, none, none)
+        if part == 0:
+            carried[SIZE + 1], carried[SIZE + 2] = j, now
+            for i in range(SIZE if width else D):
+                run[i] = carried[i]
     return rate, force
 
 
 @njit(cache=True, nogil=True)
+def nothing_carried():
+    """See `integrate_from_node`."""
+    carried = np.zeros(SIZE + 3)
+    carried[SIZE] = -1.0
+    return carried
+
+
+@njit(cache=True, nogil=True)
+def rotation_of(nodes, k):
+    """R_world_imu of node k: nine numbers, row by row."""
+    R = nodes.rotation
+    return R[k, 0, 0], R[k, 0, 1], R[k, 0, 2], R[k, 1, 0], R[k, 1, 1], R[k, 1, 2], R[k, 2, 0], R[k, 2, 1], R[k, 2, 2]
+
+
+@njit(cache=True, nogil=True)
 def place(i, seconds, k, nodes, way, rate, out):
-    """Fills entry i of `out`, a `Moving`, `seconds` and increments `way` from node k."""
-    R, g = nodes.rotation[k], nodes.gravity
+    """Fills entry i of `out`, a `Moving`, `seconds` and increments `way` (15,), see `integration_step`, from node k."""
+    R, g = nodes.rotation, nodes.gravity
     for a in range(3):
         out.rate[i, a] = rate[a]
-        out.position[i, a] = nodes.position[k, a] + nodes.velocity[k, a] * seconds
-        out.velocity[i, a] = nodes.velocity[k, a]
+        position = nodes.position[k, a] + nodes.velocity[k, a] * seconds
+        velocity = nodes.velocity[k, a]
         for c in range(3):
-            out.rotation[i, a, c] = R[a, 0] * way.R[0, c] + R[a, 1] * way.R[1, c] + R[a, 2] * way.R[2, c]
-            out.position[i, a] += R[a, c] * way.p[c]
-            out.velocity[i, a] += R[a, c] * way.v[c]
+            out.rotation[i, a, c] = R[k, a, 0] * way[c] + R[k, a, 1] * way[3 + c] + R[k, a, 2] * way[6 + c]
+            position += R[k, a, c] * way[12 + c]
+            velocity += R[k, a, c] * way[9 + c]
+        out.position[i, a], out.velocity[i, a] = position, velocity
     out.position[i, 2] -= 0.5 * g * seconds * seconds
     out.velocity[i, 2] -= g * seconds
 

@@ -32,7 +32,7 @@ def _lower_inverse(m):
 
 
 @njit(cache=True, nogil=True)
-def _sensitivity(intrinsics):
+def sensitivity(intrinsics):
     """A_g (3, 3)."""
     out = np.empty((3, 3))
     for i in range(3):
@@ -51,7 +51,7 @@ def correction_matrices(intrinsics):
     F = _lower_inverse(ma)
     C = so3.exp(intrinsics[12:15])
     G = tmul3(C, _lower_inverse(mg))
-    H = mul3(mul3(G, _sensitivity(intrinsics)), F)
+    H = mul3(mul3(G, sensitivity(intrinsics)), F)
     for i in range(3):
         for j in range(3):
             H[i, j] = -H[i, j]
@@ -64,7 +64,7 @@ def intrinsics_jacobians(intrinsics, F, G, force, rate, d_rate, d_force):
     C, u = so3.exp(intrinsics[12:15]), np.empty(3)
     for i in range(3):
         u[i] = C[i, 0] * rate[0] + C[i, 1] * rate[1] + C[i, 2] * rate[2]
-    GA = mul3(G, _sensitivity(intrinsics))
+    GA = mul3(G, sensitivity(intrinsics))
     for n in range(6):
         for i in range(3):
             d_force[i, n] = -F[i, _ROW[n]] * force[_COL[n]]

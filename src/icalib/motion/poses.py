@@ -16,10 +16,19 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry import so3
-from icalib.motion.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
+from icalib.motion.from_nodes import (
+    Moving,
+    integrate_from_node,
+    nodes_of,
+    nothing_carried,
+    place,
+    rotation_of,
+    ways_from,
+)
 from icalib.motion.imu_data import ImuData
 from icalib.motion.imu_model import correction_matrices, intrinsics_jacobians
-from icalib.motion.integration import Increment, correction, readings_of
+from icalib.motion.integration import bias_of, readings_of
+from icalib.motion.integration_step import SIZE, STRIDE, J, P, V, correction
 from icalib.optim.state import NODE, State
 from icalib.rig import Scheme
 from icalib.rig.imu_classes import N_INTRINSICS
@@ -68,62 +77,73 @@ def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray, forwards:
     return after - (times - nodes[after - 1] < nodes[after] - times)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _velocity(i, R0, R1, g, dv, force, J, moving):
-    """Fills entry i of `moving`: dv, J of the increments from the node (R0), force at the instant (R1)."""
+@njit(cache=True, nogil=True)
+def _velocity(i, R, run, force, g, at, moving):
+    """Fills entry i of `moving`: increments `run` (see `integration_step`) from a node at R, and `force` at the
+    instant."""
+    first = 0 * i
+    _by_start(i, first, R, run, J + 3 * STRIDE, moving.by_node, moving.by_imu)
+    _by_turn(i, first, R, run, V, moving.by_node)
     for a in range(3):
-        moving.acceleration[i, a] = R1[a, 0] * force[0] + R1[a, 1] * force[1] + R1[a, 2] * force[2]
+        E = at.rotation[i, a, 0], at.rotation[i, a, 1], at.rotation[i, a, 2]
+        moving.acceleration[i, a] = E[0] * force[0] + E[1] * force[1] + E[2] * force[2]
         moving.by_node[i, a, 6 + a] = 1.0
-        # -R_0 hat(dv)
-        moving.by_node[i, a, 0] = R0[a, 2] * dv[1] - R0[a, 1] * dv[2]
-        moving.by_node[i, a, 1] = R0[a, 0] * dv[2] - R0[a, 2] * dv[0]
-        moving.by_node[i, a, 2] = R0[a, 1] * dv[0] - R0[a, 0] * dv[1]
-        for c in range(J.shape[1]):
-            s = R0[a, 0] * J[3, c] + R0[a, 1] * J[4, c] + R0[a, 2] * J[5, c]
-            if c < 6:
-                moving.by_node[i, a, 9 + c] = s
-            else:
-                moving.by_imu[i, a, c - 6] = s
     moving.acceleration[i, 2] -= g
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _by_node(i, dt, R, J, dR, dp, Jn, Jx):
-    """Fills entry i of the Jacobians of a pose: dt, dR, dp and their Jacobian J from the node, which is at R."""
+@njit(cache=True, nogil=True)
+def _by_node(i, dt, R, run, Jn, Jx):
+    """Fills entry i of the Jacobians of a pose: dt and increments `run` (see `integration_step`) from a node at R."""
+    first = 0 * i  # an integer and no literal, for which all is compiled once more
+    _by_start(i, first + 3, R, run, J + 6 * STRIDE, Jn, Jx)
+    _by_turn(i, first + 3, R, run, P, Jn)
     for a in range(3):
         Jn[i, 3 + a, 3 + a] = 1.0
         Jn[i, 3 + a, 6 + a] = dt
-        # -R hat(dp)
-        Jn[i, 3 + a, 0] = R[a, 2] * dp[1] - R[a, 1] * dp[2]
-        Jn[i, 3 + a, 1] = R[a, 0] * dp[2] - R[a, 2] * dp[0]
-        Jn[i, 3 + a, 2] = R[a, 1] * dp[0] - R[a, 0] * dp[1]
         for c in range(3):
-            Jn[i, a, c] = dR[c, a]
-        for c in range(J.shape[1]):
-            s = R[a, 0] * J[6, c] + R[a, 1] * J[7, c] + R[a, 2] * J[8, c]
-            if c < 6:
-                Jn[i, a, 9 + c] = J[a, c]
-                Jn[i, 3 + a, 9 + c] = s
-            else:
-                Jx[i, a, c - 6] = J[a, c]
-                Jx[i, 3 + a, c - 6] = s
+            Jn[i, a, c] = run[3 * c + a]
+        for c in range(6):
+            Jn[i, a, 9 + c] = run[J + STRIDE * a + c]
+        for c in range(Jx.shape[2]):
+            Jx[i, a, c] = run[J + STRIDE * a + 6 + c]
+
+
+@njit(cache=True, nogil=True)
+def _by_turn(i, r, R, run, o, Jn):
+    """Rows r.. of Jn[i] by the rotation R of the node, of an increment d (3,), run[o:], in its axes: -R hat(d)."""
+    d = run[o], run[o + 1], run[o + 2]
+    for a in range(3):
+        R0, R1, R2 = R[3 * a], R[3 * a + 1], R[3 * a + 2]
+        Jn[i, r + a, 0] = R2 * d[1] - R1 * d[2]
+        Jn[i, r + a, 1] = R0 * d[2] - R2 * d[0]
+        Jn[i, r + a, 2] = R1 * d[0] - R0 * d[1]
+
+
+@njit(cache=True, nogil=True)
+def _by_start(i, r, R, x, o, Jn, Jx):
+    """Rows r.. of Jn[i] and Jx[i] by biases and intrinsics: R times three rows of J in x, from number o on."""
+    for a in range(3):
+        R0, R1, R2 = R[3 * a], R[3 * a + 1], R[3 * a + 2]
+        for c in range(6):
+            Jn[i, r + a, 9 + c] = R0 * x[o + c] + R1 * x[o + STRIDE + c] + R2 * x[o + 2 * STRIDE + c]
+        for c in range(Jx.shape[2]):
+            Jx[i, r + a, c] = R0 * x[o + 6 + c] + R1 * x[o + STRIDE + 6 + c] + R2 * x[o + 2 * STRIDE + 6 + c]
 
 
 @njit(cache=True, nogil=True)
 def _inertial(ways, nodes, readings, intrinsics, at, Jn, Jx, moving):
     """Fills `at`, a `Moving`, and where they are not empty the Jacobians and `moving`."""
     width = 6 + Jx.shape[2] if len(Jn) else 0
-    by, carried = correction(intrinsics, Jx.shape[2]), nothing_carried(width)
-    out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
+    by, carried, run = correction(intrinsics), nothing_carried(), np.empty(SIZE)
     for i in ways.order:
         k, t = ways.node[i], ways.times[i]
-        t0, R = nodes.seconds[k], nodes.rotation[k]
-        rate, force = integrate_from_node(k, t0, t, ways.first[i], nodes.bias[k], readings, by, carried, out)
-        place(i, t - t0, k, nodes, out, rate, at)
+        t0, bias = nodes.seconds[k], bias_of(nodes.bias, k)
+        rate, force = integrate_from_node(k, t0, t, ways.first[i], bias, readings, by, carried, run, width)
+        place(i, t - t0, k, nodes, run, rate, at)
         if len(Jn):
-            _by_node(i, t - t0, R, out.J, out.R, out.p, Jn, Jx)
+            _by_node(i, t - t0, rotation_of(nodes, k), run, Jn, Jx)
         if len(moving.acceleration):
-            _velocity(i, R, at.rotation[i], nodes.gravity, out.v, force, out.J, moving)
+            _velocity(i, rotation_of(nodes, k), run, force, nodes.gravity, at, moving)
 
 
 @njit(cache=True, nogil=True)

@@ -9,13 +9,9 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry.small import mul3
-from icalib.motion.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
 from icalib.motion.imu_data import ImuData
-from icalib.motion.integration import Increment, correction, readings_of
-from icalib.motion.poses import assign_nodes
+from icalib.motion.poses import assign_nodes, poses_alone
 from icalib.optim.state import State
-
-NO_COLUMNS = np.int64(0)  # of Jacobians; the literal 0 would be a type of its own, for which all is compiled once more
 
 
 @dataclass(frozen=True)
@@ -35,18 +31,6 @@ class Sweep(NamedTuple):
     position: np.ndarray
     rate: np.ndarray
     velocity: np.ndarray
-
-
-@njit(cache=True, nogil=True)
-def _imu_at(ways, nodes, readings, intrinsics, imu):
-    """Fills `imu`, a `Moving`, by integration from the nodes, without Jacobians."""
-    by, carried = correction(intrinsics, NO_COLUMNS), nothing_carried(NO_COLUMNS)
-    out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, 0)), np.empty((0, 0)))
-    for i in ways.order:
-        k, t = ways.node[i], ways.times[i]
-        t0 = nodes.seconds[k]
-        rate, _ = integrate_from_node(k, t0, t, ways.first[i], nodes.bias[k], readings, by, carried, out)
-        place(i, t - t0, k, nodes, out, rate, imu)
 
 
 @njit(cache=True, nogil=True)
@@ -75,9 +59,8 @@ def sweep(drive: Motion, name: str, times: np.ndarray, near: np.ndarray | None =
     next to them, or next to `near` (n,)."""
     state, imu = drive.state, drive.imu
     node = assign_nodes("inertial", state.seconds, times if near is None else near)
-    ways, imu_at = ways_from(state, times, node, imu), Moving.empty(len(times))
-    intrinsics = state.values[imu.name, "intrinsics"]
-    _imu_at(ways, nodes_of(state, drive.gravity), readings_of(imu, True), intrinsics, imu_at)
+    imu_at = poses_alone(times, node, state, imu, drive.gravity)
     R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
-    _to_lidar(np.ascontiguousarray(R_il), p_il, *imu_at)
-    return Sweep(*imu_at)
+    found = Sweep(imu_at.rotation, imu_at.position, imu_at.rate, imu_at.velocity)
+    _to_lidar(np.ascontiguousarray(R_il), p_il, *found)
+    return found

@@ -11,7 +11,8 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import inverse_cholesky, mul3, tmul3
 from icalib.motion.imu_data import ImuData
-from icalib.motion.integration import Increment, correction, integrate, readings_of
+from icalib.motion.integration import Increment, bias_of, integrate, integration_room, readings_of
+from icalib.motion.integration_step import COVARIANCE, correction
 from icalib.optim import pages
 from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.interval_sums import add_interval
@@ -24,10 +25,10 @@ ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 @njit(cache=True, nogil=True)
 def _preintegrate(k0, k1, nodes, first, readings, bias, intrinsics, dR, dv, dp, J, W):
     """Increments, bias (and intrinsics) Jacobians and inverse Cholesky factor W of the covariance, intervals k0..k1."""
-    P, by = np.empty((ROWS, ROWS)), correction(intrinsics, J.shape[2] - 6)
+    P, by, room = np.empty((ROWS, ROWS)), correction(intrinsics), integration_room(COVARIANCE)
     for k in range(k0, k1):
         out = Increment(dR[k], dv[k], dp[k], J[k], P)
-        integrate(nodes[k], nodes[k + 1], first[k], bias[k], readings, by, out)
+        integrate(nodes[k], nodes[k + 1], first[k], bias_of(bias, k), readings, by, room, out)
         inverse_cholesky(P, W[k])
 
 

@@ -1,0 +1,324 @@
+"""One step of the closed-form integration, with Jacobians and covariance (ACI^2, paper (16)-(18)).
+
+Body rate w and specific force f are constant over dt. With phi = w dt and G_m(phi) = sum_n hat(phi)^n / (n + m)!, the
+increments since the start of the interval become, exactly,
+
+    R <- R Exp(phi)    v <- v + R G1(phi) f dt    p <- p + v dt + R G2(phi) f dt^2
+
+Vectors and matrices within a step are tuples, and all that is on its way is one array: numba counts references to every
+array that a function takes, and with an array for each these counts took longer than the sums.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.base.compiled import njit
+from icalib.geometry import so3
+from icalib.geometry.small import mul3
+from icalib.motion.imu_model import correction_matrices, sensitivity
+
+_1_12, _1_48, _1_60, _1_99, _1_180, _1_360 = (1.0 / n for n in (12.0, 48.0, 60.0, 99.0, 180.0, 360.0))
+_1_1260, _1_10080, _3_112, _2_135, _2_165 = 1.0 / 1260.0, 1.0 / 10080.0, 3.0 / 112.0, 2.0 / 135.0, 2.0 / 165.0
+F, G, H, AXES, AXES_JACOBIAN, SENSITIVITY = range(6)  # rows of a `correction`
+# What is on its way is one array, `run`: R row by row, v, p; derivatives of a step, STEP numbers a row, by rate, force
+# and both biases, at D; of rate and force by the IMU intrinsics, STRIDE numbers a row, at E; J, STRIDE numbers a row,
+# of which `width` count: 6 biases, 24 IMU intrinsics. As the compiler knows the distance from row to row, it takes
+# several columns at a time.
+V, P, D, E, J, STEP, STRIDE = 9, 12, 15, 128, 320, 12, 32
+SIZE = J + 9 * STRIDE
+# The covariance of rotation, velocity, position and biases has its rows at the same places as J.
+COVARIANCE = J + 15 * STRIDE
+
+
+@njit(cache=True, nogil=True)
+def start(run):
+    """No motion yet."""
+    for i in range(SIZE):
+        run[i] = 0.0
+    run[0] = run[4] = run[8] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def correction(intrinsics):
+    """(6, 9) matrices row by row: F, G, H, see `correction_matrices`; C = Exp(r), J_r(r) and G A_g, see `imu_model`."""
+    r, by = intrinsics[12:15], np.empty((6, 9))
+    F_, G_, H_ = correction_matrices(intrinsics)
+    matrices = F_, G_, H_, so3.exp(r), so3.right_jacobian(r), mul3(G_, sensitivity(intrinsics))
+    for n in range(6):
+        for i in range(3):
+            for j in range(3):
+                by[n, 3 * i + j] = matrices[n][i, j]
+    return by
+
+
+@njit(cache=True, nogil=True)
+def matrix(by, n):
+    """Row n as a matrix: nine numbers, row by row."""
+    return by[n, 0], by[n, 1], by[n, 2], by[n, 3], by[n, 4], by[n, 5], by[n, 6], by[n, 7], by[n, 8]
+
+
+@njit(cache=True, nogil=True)
+def times(m, x):
+    """m x of a matrix and a vector."""
+    return (
+        m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
+        m[3] * x[0] + m[4] * x[1] + m[5] * x[2],
+        m[6] * x[0] + m[7] * x[1] + m[8] * x[2],
+    )
+
+
+@njit(cache=True, nogil=True)
+def row_times(x, m):
+    """x^T m of a vector and a matrix."""
+    return (
+        x[0] * m[0] + x[1] * m[3] + x[2] * m[6],
+        x[0] * m[1] + x[1] * m[4] + x[2] * m[7],
+        x[0] * m[2] + x[1] * m[5] + x[2] * m[8],
+    )
+
+
+@njit(cache=True, nogil=True)
+def _cross_product(x, m):
+    """hat(x) m of a vector and a matrix."""
+    a, b, c = x
+    return (
+        b * m[6] - c * m[3], b * m[7] - c * m[4], b * m[8] - c * m[5],
+        c * m[0] - a * m[6], c * m[1] - a * m[7], c * m[2] - a * m[8],
+        a * m[3] - b * m[0], a * m[4] - b * m[1], a * m[5] - b * m[2],
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _series(phi, c0, c1, c2):
+    """c0 I + c1 hat(phi) + c2 hat(phi)^2."""
+    x, y, z = phi
+    return (
+        c0 - c2 * (y * y + z * z), c2 * x * y - c1 * z, c2 * x * z + c1 * y,
+        c2 * x * y + c1 * z, c0 - c2 * (x * x + z * z), c2 * y * z - c1 * x,
+        c2 * x * z - c1 * y, c2 * y * z + c1 * x, c0 - c2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _coefficient_slopes(x, s1, s2, s3):
+    """Derivatives of the coefficients s1, s2, s3 of so3.jacobian_coefficients with respect to theta, over theta."""
+    if x < so3.SERIES_BELOW:
+        d1 = -_1_12 + x * _1_180 * (1.0 - x * _3_112 * (1.0 - x * _2_135))
+        d2 = -_1_60 + x * _1_1260 * (1.0 - x * _1_48 * (1.0 - x * _2_165))
+        d3 = -_1_360 + x * _1_10080 * (1.0 - x * _1_60 * (1.0 - x * _1_99))
+        return d1, d2, d3
+    s0 = 1.0 - x * s2
+    return (s0 - 2.0 * s1) / x, (s1 - 3.0 * s2) / x, (s2 - 4.0 * s3) / x
+
+
+@njit(cache=True, nogil=True)
+def _products(phi, f):
+    """hat(phi) f, hat(phi)^2 f and phi . f."""
+    x, y, z = phi
+    a, b, c = f
+    pf, pp = x * a + y * b + z * c, x * x + y * y + z * z
+    return (y * c - z * b, z * a - x * c, x * b - y * a), (x * pf - a * pp, y * pf - b * pp, z * pf - c * pp), pf
+
+
+@njit(cache=True, nogil=True)
+def _sum3(c0, f, c1, g, c2, h):
+    """c0 f + c1 g + c2 h of vectors."""
+    return (
+        c0 * f[0] + c1 * g[0] + c2 * h[0], c0 * f[1] + c1 * g[1] + c2 * h[1], c0 * f[2] + c1 * g[2] + c2 * h[2]
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _series_slope(phi, f, products, c1, c2, d1, d2):
+    """Derivative by phi of (c0 I + c1 hat(phi) + c2 hat(phi)^2) f; d1, d2 are c1'/theta, c2'/theta."""
+    x, y, z = phi
+    a, b, c = f
+    once, twice, pf = products
+    h0, h1, h2 = d1 * once[0] + d2 * twice[0], d1 * once[1] + d2 * twice[1], d1 * once[2] + d2 * twice[2]
+    return (
+        h0 * x + c2 * (x * a - 2.0 * a * x) + c2 * pf,
+        h0 * y + c2 * (x * b - 2.0 * a * y) + c1 * c,
+        h0 * z + c2 * (x * c - 2.0 * a * z) - c1 * b,
+        h1 * x + c2 * (y * a - 2.0 * b * x) - c1 * c,
+        h1 * y + c2 * (y * b - 2.0 * b * y) + c2 * pf,
+        h1 * z + c2 * (y * c - 2.0 * b * z) + c1 * a,
+        h2 * x + c2 * (z * a - 2.0 * c * x) + c1 * b,
+        h2 * y + c2 * (z * b - 2.0 * c * y) - c1 * a,
+        h2 * z + c2 * (z * c - 2.0 * c * z) + c2 * pf,
+    )
+
+
+@njit(cache=True, nogil=True)
+def step(rate, force, dt, by, run, width):
+    """Advances `run` by dt (either sign) of constant body `rate` and specific `force`; returns what `carry` needs."""
+    phi = rate[0] * dt, rate[1] * dt, rate[2] * dt
+    x = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    s0, s1, s2, s3 = so3.jacobian_coefficients(x)
+    products = _products(phi, force)
+    g1, g2 = _sum3(1.0, force, s1, products[0], s2, products[1]), _sum3(0.5, force, s2, products[0], s3, products[1])
+    turn, R = _series(phi, 1.0, s0, s1), (run[0], run[1], run[2], run[3], run[4], run[5], run[6], run[7], run[8])
+    by_turn = _scaled(-dt, _times_cross(R, g1)), _scaled(-dt * dt, _times_cross(R, g2))
+    if width > 0:
+        d1, d2, d3 = _coefficient_slopes(x, s1, s2, s3)
+        slope1 = _series_slope(phi, force, products, s1, s2, d1, d2)
+        slope2 = _series_slope(phi, force, products, s2, s3, d2, d3)
+        _fill_step(dt, _series(phi, 1.0, s1, s2), _series(phi, 0.5, s2, s3), slope1, slope2, by, run)
+        carry(turn, by_turn, dt, width, run)
+        _add_biases(run)
+        if width > 6:
+            _fill_intrinsics(rate, force, by, run)
+            _add_intrinsics(run)
+    v, p = times(R, g1), times(R, g2)
+    for i in range(3):
+        row = run[3 * i], run[3 * i + 1], run[3 * i + 2]
+        run[3 * i], run[3 * i + 1], run[3 * i + 2] = row_times(row, turn)
+    for i in range(3):
+        run[P + i] += run[V + i] * dt + dt * dt * p[i]
+        run[V + i] += dt * v[i]
+    return turn, by_turn
+
+
+@njit(cache=True, nogil=True)
+def _times_cross(R, g):
+    """R hat(g) of a matrix and a vector."""
+    return (
+        R[1] * g[2] - R[2] * g[1], R[2] * g[0] - R[0] * g[2], R[0] * g[1] - R[1] * g[0],
+        R[4] * g[2] - R[5] * g[1], R[5] * g[0] - R[3] * g[2], R[3] * g[1] - R[4] * g[0],
+        R[7] * g[2] - R[8] * g[1], R[8] * g[0] - R[6] * g[2], R[6] * g[1] - R[7] * g[0],
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _scaled(s, m):
+    """s m of a matrix."""
+    return s * m[0], s * m[1], s * m[2], s * m[3], s * m[4], s * m[5], s * m[6], s * m[7], s * m[8]
+
+
+@njit(cache=True, nogil=True)
+def _fill_step(dt, G1, G2, slope1, slope2, by, run):
+    """Fills the derivatives of a step by rate, force and biases; slope1, slope2: of G1 f and G2 f by phi."""
+    C_f, C_w, C_wf = matrix(by, F), matrix(by, G), matrix(by, H)
+    for i in range(3):
+        R = run[3 * i], run[3 * i + 1], run[3 * i + 2]
+        # The right Jacobian is the transpose of the left one, G1.
+        turn = (G1[0], G1[3], G1[6]) if i == 0 else ((G1[1], G1[4], G1[7]) if i == 1 else (G1[2], G1[5], G1[8]))
+        v, p, v_force, p_force = row_times(R, slope1), row_times(R, slope2), row_times(R, G1), row_times(R, G2)
+        _fill_row(D + STEP * i, dt, turn, 0.0, turn, C_f, C_w, C_wf, run)
+        _fill_row(D + STEP * (3 + i), dt * dt, v, dt, v_force, C_f, C_w, C_wf, run)
+        _fill_row(D + STEP * (6 + i), dt * dt * dt, p, dt * dt, p_force, C_f, C_w, C_wf, run)
+
+
+@njit(cache=True, nogil=True)
+def _fill_row(o, s, by_rate, t, by_force, C_f, C_w, C_wf, run):
+    """A row of derivatives, from number o on: s by_rate, t by_force, and from both by the biases."""
+    a0, a1, a2 = s * by_rate[0], s * by_rate[1], s * by_rate[2]
+    b0, b1, b2 = t * by_force[0], t * by_force[1], t * by_force[2]
+    w, f = row_times((-a0, -a1, -a2), C_w), row_times((-a0, -a1, -a2), C_wf)
+    run[o], run[o + 1], run[o + 2], run[o + 3], run[o + 4], run[o + 5] = a0, a1, a2, b0, b1, b2
+    run[o + 6], run[o + 7], run[o + 8] = w
+    run[o + 9] = f[0] - b0 * C_f[0] - b1 * C_f[3] - b2 * C_f[6]
+    run[o + 10] = f[1] - b0 * C_f[1] - b1 * C_f[4] - b2 * C_f[7]
+    run[o + 11] = f[2] - b0 * C_f[2] - b1 * C_f[5] - b2 * C_f[8]
+
+
+@njit(cache=True, nogil=True)
+def carry(turn, by_turn, dt, width, x):
+    """Rows of J in x: errors after a step from those before it, what the step itself adds aside."""
+    E0, E1, E2, E3, E4, E5, E6, E7, E8 = turn
+    A0, A1, A2, A3, A4, A5, A6, A7, A8 = by_turn[0]
+    B0, B1, B2, B3, B4, B5, B6, B7, B8 = by_turn[1]
+    for j in range(width):
+        a, b, c = x[J + j], x[J + STRIDE + j], x[J + 2 * STRIDE + j]
+        v0, v1, v2 = x[J + 3 * STRIDE + j], x[J + 4 * STRIDE + j], x[J + 5 * STRIDE + j]
+        x[J + 6 * STRIDE + j] += dt * v0 + B0 * a + B1 * b + B2 * c
+        x[J + 7 * STRIDE + j] += dt * v1 + B3 * a + B4 * b + B5 * c
+        x[J + 8 * STRIDE + j] += dt * v2 + B6 * a + B7 * b + B8 * c
+        x[J + 3 * STRIDE + j] = v0 + (A0 * a + A1 * b + A2 * c)
+        x[J + 4 * STRIDE + j] = v1 + (A3 * a + A4 * b + A5 * c)
+        x[J + 5 * STRIDE + j] = v2 + (A6 * a + A7 * b + A8 * c)
+        x[J + j] = E0 * a + E3 * b + E6 * c
+        x[J + STRIDE + j] = E1 * a + E4 * b + E7 * c
+        x[J + 2 * STRIDE + j] = E2 * a + E5 * b + E8 * c
+
+
+@njit(cache=True, nogil=True)
+def _add_biases(run):
+    for i in range(9):
+        for j in range(6):
+            run[J + STRIDE * i + j] += run[D + STEP * i + 6 + j]
+
+
+@njit(cache=True, nogil=True)
+def _fill_intrinsics(rate, force, by, run):
+    """Derivatives of rate (three rows) and force (three rows) by the IMU intrinsics: `imu_model.intrinsics_jacobians`,
+    of which these are the same numbers in other places."""
+    u, turn = times(matrix(by, AXES), rate), _cross_product(rate, matrix(by, AXES_JACOBIAN))
+    f, lower = force, (force[0], force[0], force[1], force[0], force[1], force[2])
+    for i in range(3):
+        F0, F1, F2 = by[F, 3 * i], by[F, 3 * i + 1], by[F, 3 * i + 2]
+        o = E + STRIDE * (3 + i)
+        run[o], run[o + 1], run[o + 2] = -F0 * lower[0], -F1 * lower[1], -F1 * lower[2]
+        run[o + 3], run[o + 4], run[o + 5] = -F2 * lower[3], -F2 * lower[4], -F2 * lower[5]
+    for i in range(3):
+        S0, S1, S2 = by[SENSITIVITY, 3 * i], by[SENSITIVITY, 3 * i + 1], by[SENSITIVITY, 3 * i + 2]
+        G0, G1, G2 = by[G, 3 * i], by[G, 3 * i + 1], by[G, 3 * i + 2]
+        o, q = E + STRIDE * i, E + STRIDE * 3
+        for n in range(6):
+            run[o + n] = -(S0 * run[q + n] + S1 * run[q + STRIDE + n] + S2 * run[q + 2 * STRIDE + n])
+        run[o + 6], run[o + 7], run[o + 8] = -G0 * u[0], -G1 * u[0], -G1 * u[1]
+        run[o + 9], run[o + 10], run[o + 11] = -G2 * u[0], -G2 * u[1], -G2 * u[2]
+        run[o + 15], run[o + 16], run[o + 17] = -G0 * f[0], -G0 * f[1], -G0 * f[2]
+        run[o + 18], run[o + 19], run[o + 20] = -G1 * f[0], -G1 * f[1], -G1 * f[2]
+        run[o + 21], run[o + 22], run[o + 23] = -G2 * f[0], -G2 * f[1], -G2 * f[2]
+    for k in range(3):
+        run[E + 12 + k], run[E + STRIDE + 12 + k], run[E + 2 * STRIDE + 12 + k] = turn[k], turn[3 + k], turn[6 + k]
+
+
+@njit(cache=True, nogil=True)
+def _add_intrinsics(run):
+    """J += what the step adds by the IMU intrinsics."""
+    for i in range(9):
+        o, d = STRIDE * i + 6, D + STEP * i
+        a, b, c = run[d], run[d + 1], run[d + 2]
+        for j in range(24):
+            x = run[J + o + j] + a * run[E + j]
+            run[J + o + j] = x + b * run[E + STRIDE + j] + c * run[E + 2 * STRIDE + j]
+    for i in range(3, 9):
+        o, d = STRIDE * i + 6, D + STEP * i + 3
+        a, b, c = run[d], run[d + 1], run[d + 2]
+        for j in range(6):  # those of the accelerometer
+            x = run[J + o + j] + a * run[E + 3 * STRIDE + j]
+            run[J + o + j] = x + b * run[E + 4 * STRIDE + j] + c * run[E + 5 * STRIDE + j]
+
+
+@njit(cache=True, nogil=True)
+def add_covariance(turn, by_turn, dt, variance, walk, run, cov, cov_t):
+    """cov, see COVARIANCE, after the step of `run` that gave turn and by_turn; cov_t: room.
+
+    F cov F^T, both halves by the same row operation, and noise. variance (3,): squared densities, see `ImuData`, walk
+    (2,): of the biases' random walks.
+    """
+    for half in range(2):
+        source, target = (cov, cov_t) if half == 0 else (cov_t, cov)
+        carry(turn, by_turn, dt, 15, source)
+        for i in range(9):
+            for k in range(6):
+                d = run[D + STEP * i + 6 + k]
+                for j in range(15):
+                    source[J + STRIDE * i + j] += d * source[J + STRIDE * (9 + k) + j]
+        for i in range(15):
+            for j in range(15):
+                target[J + STRIDE * i + j] = source[J + STRIDE * j + i]
+    for i in range(9):
+        for j in range(9):
+            s = 0.0
+            for k in range(6):
+                s += run[D + STEP * i + 6 + k] * run[D + STEP * j + 6 + k] * variance[k // 3]
+            cov[J + STRIDE * i + j] += s / dt
+    for i in range(6, 9):
+        # A force that is not constant within the stretch: white, it moves the position by dt^3 / 3, its mean by
+        # dt^3 / 4. Without it position follows velocity exactly where a stretch holds no other stamp (a bridged gap).
+        cov[J + STRIDE * i + i] += variance[2] * dt * dt * dt / 12.0
+    for k in range(6):
+        cov[J + (STRIDE + 1) * (9 + k)] += walk[k // 3] * dt
