@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -263,21 +265,19 @@ def _bundle(
     robust cost.
     """
     poses = target_poses(stream, model, params, target)
-    R, p, damping = poses.rotation, poses.position, 1e-3
-    used = _used(poses) if used is None else used
-    cost, S, g, parts = _sums(stream, model, params, target, free, R, p, used)
+    own = np.flatnonzero(_used(poses) if used is None else used)
+    seen, R, p, damping = _Seen.of(stream, target, own), poses.rotation[own], poses.position[own], 1e-3
+    sums = _sums(seen, model, params, free, R, p)
     for _ in range(ROUNDS):
-        step = -np.linalg.solve(S + damping * np.diag(np.diag(S)), g)
+        step = -np.linalg.solve(sums.S + damping * np.diag(np.diag(sums.S)), sums.g)
         trial = params.copy()
         trial[free] += step
-        R1, p1 = R.copy(), p.copy()
-        for i, (H_inv, C, gp) in parts.items():
-            d = -H_inv @ (gp + C @ step)
-            R1[i], p1[i] = R[i] @ so3.exp(d[:3]), p[i] + R[i] @ d[3:]
-        cost1, S1, g1, parts1 = _sums(stream, model, trial, target, free, R1, p1, used)
-        if cost1 < cost:
-            done = cost - cost1 < 1e-6 * cost
-            params, R, p, cost, S, g, parts = trial, R1, p1, cost1, S1, g1, parts1
+        d = -(sums.H_inv @ (sums.gp + (sums.C @ step)[:, :, None]))[:, :, 0]
+        R1, p1 = R @ so3.exp_many(np.ascontiguousarray(d[:, :3])), p + (R @ d[:, 3:, None])[:, :, 0]
+        tried = _sums(seen, model, trial, free, R1, p1)
+        if tried.cost < sums.cost:
+            done = sums.cost - tried.cost < 1e-6 * sums.cost
+            params, R, p, sums = trial, R1, p1, tried
             damping *= 0.2
             if done:
                 break
@@ -285,32 +285,64 @@ def _bundle(
             damping *= 10.0
             if damping > 1e6:
                 break
-    return params, cost
+    return params, sums.cost
 
 
-def _sums(stream, model, params, target, free, R, p, used):
-    """Robust cost, Schur complement and gradient of the free parameters; what each image's pose step needs."""
-    n = len(free)
-    cost, S, g, parts = 0.0, np.zeros((n, n)), np.zeros(n), {}
-    points = target.points[stream.point]
-    for i in np.flatnonzero(used):
-        rows = slice(stream.start[i], stream.start[i + 1])
-        X = (points[rows] - p[i]) @ R[i]
-        uv, valid, Jx, Jp = model.project_with_jacobians(params, X)
-        r = np.where(valid[:, None], uv - stream.uv[rows], 0.0)
-        size = np.linalg.norm(r, axis=1)
-        w = np.where(size > HUBER_PX, HUBER_PX / np.maximum(size, 1e-12), 1.0) * valid
-        cost += float(np.where(size > HUBER_PX, HUBER_PX * (size - 0.5 * HUBER_PX), 0.5 * size**2).sum())
-        # Corners that the model cannot see cost as much as bad ones, or it would learn to look away.
-        cost += float((~valid).sum()) * HUBER_PX * 20.0
-        turn = cross(Jx, X[:, None, :])
-        A = np.concatenate([turn, -Jx], axis=2).reshape(-1, 6)
-        B = Jp[:, :, free].reshape(-1, n)
-        w2 = np.repeat(w, 2)[:, None]
-        H = (A * w2).T @ A + 1e-9 * np.eye(6)
-        H_inv = np.linalg.inv(H)
-        C, gp = (A * w2).T @ B, (A * w2).T @ r.ravel()
-        S += (B * w2).T @ B - C.T @ H_inv @ C
-        g += (B * w2).T @ r.ravel() - C.T @ H_inv @ gp
-        parts[i] = H_inv, C, gp
-    return cost, S, g, parts
+class _Seen(NamedTuple):
+    """Corners of m images: uv (N, 2) px, points (N, 3) in the frame of the body, image (N,) of each; those of image i
+    are start[i]:start[i + 1]."""
+
+    uv: np.ndarray
+    points: np.ndarray
+    image: np.ndarray
+    start: np.ndarray
+
+    @classmethod
+    def of(cls, stream: CornerStream, target: Flat, own: np.ndarray) -> _Seen:
+        """Those of the images `own` (m,)."""
+        rows = np.flatnonzero(np.isin(stream.image, own))
+        count = np.diff(stream.start)[own]
+        start = np.concatenate([[0], np.cumsum(count)])
+        return cls(stream.uv[rows], target.points[stream.point[rows]], np.repeat(np.arange(len(own)), count), start)
+
+
+class _Sums(NamedTuple):
+    """Robust cost; Schur complement S (n, n) and gradient g (n,) of the free parameters; for the step of each image's
+    pose its inverse normal matrix H_inv (m, 6, 6), what it shares with the parameters, C (m, 6, n), and its gradient
+    gp (m, 6, 1)."""
+
+    cost: float
+    S: np.ndarray
+    g: np.ndarray
+    H_inv: np.ndarray
+    C: np.ndarray
+    gp: np.ndarray
+
+
+def _sums(seen: _Seen, model: CameraModel, params: np.ndarray, free: np.ndarray, R: np.ndarray, p: np.ndarray) -> _Sums:
+    """At camera poses R (m, 3, 3), p (m, 3) in the frame of the body."""
+    ends = list(pairwise(seen.start))
+    X = np.concatenate([(seen.points[a:b] - p[i]) @ R[i] for i, (a, b) in enumerate(ends)])
+    uv, valid, Jx, Jp = model.project_with_jacobians(params, X)
+    r = np.where(valid[:, None], uv - seen.uv, 0.0)
+    size = np.sqrt((r**2).sum(axis=1))
+    beyond = size > HUBER_PX
+    cost = float(np.where(beyond, HUBER_PX * (size - 0.5 * HUBER_PX), 0.5 * size**2).sum())
+    # Corners that the model cannot see cost as much as bad ones, or it would learn to look away.
+    cost += float((~valid).sum()) * HUBER_PX * 20.0
+    w = np.repeat(np.where(beyond, HUBER_PX / np.maximum(size, 1e-12), 1.0) * valid, 2)[:, None]
+    A = np.concatenate([cross(Jx, X[:, None, :]), -Jx], axis=2).reshape(-1, 6)
+    B, rr = Jp[:, :, free].reshape(-1, len(free)), r.ravel()
+    Aw, Bw = A * w, B * w
+    rows = [slice(2 * a, 2 * b) for a, b in ends]
+    H_inv = np.linalg.inv(_products(Aw, A, rows) + 1e-9 * np.eye(6))
+    C, gp = _products(Aw, B, rows), _products(Aw, rr, rows)[:, :, None]
+    taken = C.transpose(0, 2, 1) @ H_inv
+    S = (_products(Bw, B, rows) - taken @ C).sum(axis=0)
+    g = (_products(Bw, rr, rows) - (taken @ gp)[:, :, 0]).sum(axis=0)
+    return _Sums(cost, S, g, H_inv, C, gp)
+
+
+def _products(A: np.ndarray, B: np.ndarray, rows: list[slice]) -> np.ndarray:
+    """(m, ...) A^T B of each of m slices of the rows of A (N, a) and B (N, ...)."""
+    return np.array([A[k].T @ B[k] for k in rows]).reshape(len(rows), A.shape[1], *B.shape[1:])
