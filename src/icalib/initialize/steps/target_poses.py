@@ -47,7 +47,7 @@ def _homography(points, seen, centre, h):
             row[6], row[7] = -m * x, -m * y
             for i in range(8):
                 b[i] += row[i] * m
-                for j in range(8):
+                for j in range(i + 1):  # `solve_definite` takes the lower triangle
                     A[i, j] += row[i] * row[j]
     if not solve_definite(A, b):
         return False
@@ -105,13 +105,11 @@ def refine(points, seen, R, t, rounds):
 
     seen (n, 3): x / z, y / z, and pixels per unit of these, which on a fisheye fall to a tenth towards the border.
     """
-    rms = 1e9
+    rms, X, J, H, g = 1e9, np.empty(3), np.empty((2, 6)), np.empty((6, 6)), np.empty(6)
     for _ in range(rounds):
-        H, g = np.zeros((6, 6)), np.zeros(6)
-        J = np.zeros((2, 6))
+        H[:], g[:] = 0.0, 0.0
         total, behind = 0.0, 0
         for n in range(len(points)):
-            X = np.empty(3)
             for i in range(3):
                 X[i] = R[i, 0] * points[n, 0] + R[i, 1] * points[n, 1] + R[i, 2] * points[n, 2] + t[i]
             if X[2] < 1e-6:
@@ -133,7 +131,7 @@ def refine(points, seen, R, t, rounds):
                 J[k, 3], J[k, 4], J[k, 5] = a, b, c
             for i in range(6):
                 g[i] += w * (J[0, i] * r0 + J[1, i] * r1)
-                for j in range(6):
+                for j in range(i + 1):  # `solve_definite` takes the lower triangle
                     H[i, j] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
         rms = np.sqrt(total / (2 * len(points)))
         if len(points) - behind < 4:
