@@ -82,7 +82,7 @@ def _parts(inputs: Inputs, found: Estimate) -> None:
     pieces, residuals = problem.pieces(), problem.residuals()
     whole = min(_spent(lambda: problem.linearise(state, pieces, residuals))[1] for _ in range(REPEATS))
     print(f"{problem.n_nodes} nodes, border of {problem.layout.size}; linearising {whole:.3f} s, of which")
-    for factor in problem.sensors:
+    for factor in problem.factors.values():
         out = factor.output()
         own = min(
             _spent(lambda f=factor, o=out: [f.accumulate(state, p, o) for p in pieces])[1] for _ in range(REPEATS)

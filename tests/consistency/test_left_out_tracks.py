@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.typed import not_none
 
 from icalib.estimate.estimate import ENOUGH, estimate
 from icalib.geometry import so3
 from icalib.initialize.start import start
+from icalib.motion.factor import of_type
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -26,6 +27,10 @@ def settled():
     return inputs, estimate(inputs, state)
 
 
+def features_of(problem):
+    return of_type(problem.factors, FeatureFactor)[0]
+
+
 def passes(inputs, found, turned_deg: float):
     """The last pass from where the estimate ended, but for cam0, turned by that much; and how many passes it took."""
     end, key = found.outcome.state, ("cam0", "rotation")
@@ -33,8 +38,9 @@ def passes(inputs, found, turned_deg: float):
     begun = []
 
     def note(stage, problem, visit):
-        if not any(problem.features is p for p in begun):
-            begun.append(problem.features)
+        features = features_of(problem)
+        if not any(features is p for p in begun):
+            begun.append(features)
 
     again = estimate(inputs, replace(end, values=end.values | {key: turned}), on_visit=note, judged=found.judged)
     return again, begun
@@ -43,9 +49,9 @@ def passes(inputs, found, turned_deg: float):
 def test_tracks_that_a_wrong_pose_left_out_come_back(settled):
     inputs, found = settled
     again, begun = passes(inputs, found, 15.0)
-    assert begun[0].followed < 0.5 * found.problem.features.followed
+    assert begun[0].followed < 0.5 * features_of(found.problem).followed
     assert len(begun) == 2
-    assert not_none(again.problem.features).followed >= 0.99 * found.problem.features.followed
+    assert features_of(again.problem).followed >= 0.99 * features_of(found.problem).followed
     way = so3.log(
         np.ascontiguousarray(
             found.outcome.state.values["cam0", "rotation"].T @ again.outcome.state.values["cam0", "rotation"]
@@ -58,6 +64,4 @@ def test_where_enough_take_part_there_is_one_pass(settled):
     inputs, found = settled
     again, begun = passes(inputs, found, 0.5)
     assert len(begun) == 1
-    assert not_none(again.problem.features).followed > ENOUGH * sum(
-        int(k.sum()) for k in not_none(again.problem.features).keep
-    )
+    assert features_of(again.problem).followed > ENOUGH * sum(int(k.sum()) for k in features_of(again.problem).keep)

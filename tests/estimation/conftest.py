@@ -19,6 +19,7 @@ from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
+from icalib.motion.factor import keyed
 from icalib.motion.imu_data import ImuData
 from icalib.motion.nodes import place_nodes
 from icalib.motion.poses import assign_nodes
@@ -263,7 +264,7 @@ def make_problem(setup: Setup, start: State | None = None, scheme: Scheme = "ine
     columns = setup.layout.columns("imu0", "intrinsics")
     imu = ImuFactor.build(setup.imu, start or setup.state, 9.81, columns[columns >= 0])
     cameras = tuple(make_factor(setup, i, scheme) for i in range(len(setup.sim.measurements.cameras)))
-    return Problem(setup.layout, imu, cameras, (), setup.columns_scale())
+    return Problem(setup.layout, keyed((imu, *cameras)), (), setup.columns_scale())
 
 
 @dataclass(frozen=True)
@@ -310,7 +311,7 @@ class RoomSetup:
         lidar = self.factor(start, noise, **options)
         sensors = ImuSensor("imu0", "", class_noise("consumer")), Lidar(self.stream.name, "")
         tolerance = tolerance_of(self.layout, specs_of(self.layout, sensors), Settings())
-        return Problem(self.layout, imu, (), (), tolerance, sensors=(lidar,), framed=False)
+        return Problem(self.layout, keyed((imu, lidar)), (), tolerance, framed=False)
 
 
 def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025) -> RoomSetup:

@@ -14,7 +14,10 @@ from icalib.estimate.evidence.debias import spurious_information
 from icalib.estimate.evidence.evidence import fits
 from icalib.estimate.problem.outcome import Draws, Outcome, posterior
 from icalib.estimate.problem.solver import minimise
+from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import Piece, solve
+from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.lidar.residual import LidarFactor
 from icalib.tools.simulation import handheld, simulate
 
 pytestmark = pytest.mark.slow
@@ -68,21 +71,24 @@ def setup(setup_of):
 def cornered(setup, problem_of):
     """Corners of both cameras, of one with errors that are common to an image."""
     problem, rng = problem_of(setup), np.random.default_rng(2)
-    first, second = problem.cameras
+    second = problem.factors["cam1", "corners"]
     noise = replace(second.noise, tau=np.array([0.4, 0.3]), field=0.05 * rng.normal(size=(len(second.stream.uv), 2)))
-    return replace(problem, cameras=(first, replace(second, noise=noise)))
+    return problem.replacing([replace(second, noise=noise)])
 
 
 @pytest.fixture(scope="module")
 def followed(setup, problem_of, features_of):
     """Corners as features too, which leaves the world defined."""
-    return replace(problem_of(setup), features=features_of(setup, noise_px=0.5))
+    return problem_of(setup).replacing([features_of(setup, noise_px=0.5)])
 
 
 @pytest.fixture(scope="module")
 def scanned(room_of, sparse_room):
     room = room_of(sparse_room)
     return room.problem(room.state), room.state
+
+
+FEATURES = "cameras", "features"
 
 
 def outcome_of(problem, state):
@@ -111,7 +117,7 @@ def spent(problem, outcome):
 
 
 def of_imu(problem, state):
-    return lambda p: problem.chain.accumulate(state, p, np.zeros((problem.n_nodes - 1, 15)))
+    return lambda p: problem.chain.accumulate(state, p, problem.chain.output())
 
 
 def near(found, expected):
@@ -126,16 +132,17 @@ def test_degrees_of_freedom_of_corners_and_their_common_errors(cornered, setup, 
         sum(v for (_, k), v in found.items() if k in cornered.chain.kinds),
         paid(cornered, state, dense, of_imu(cornered, state)),
     )
-    for camera in cornered.cameras:
+    cameras = of_type(cornered.factors, CornerFactor)
+    for camera in cameras:
         # Each common error has a row of its own, its prior, and takes one degree of freedom of corners and prior.
         own = 2 * len(camera.noise.tau) * len(camera.times)
         own += paid(cornered, state, dense, lambda p, c=camera: c.accumulate(state, p, c.output(), curved=True))
         assert near(sum(v for (name, _), v in found.items() if name == camera.name), own)
-    assert found["cam1", "common error 0"] > 0.1 * 2 * len(cornered.cameras[1].times)
+    assert found["cam1", "common error 0"] > 0.1 * 2 * len(cameras[1].times)
 
 
 def test_degrees_of_freedom_of_features(followed, setup, dense):
-    factor, state = followed.features, setup.state
+    factor, state = followed.factors[FEATURES], setup.state
     outcome = outcome_of(followed, state)
     found = spent(followed, outcome)
     own = paid(followed, state, dense, lambda p: factor.accumulate(state, p, factor.output(), curved=True))
@@ -147,7 +154,7 @@ def test_degrees_of_freedom_of_features(followed, setup, dense):
 def test_degrees_of_freedom_of_features_on_planes(setup, problem_of, features_on_planes, dense):
     """Their rows for that pay for a share of the points, and for what the border has of them."""
     setup, factor = features_on_planes(setup, noise_px=0.5)
-    problem, state = replace(problem_of(setup), features=factor), setup.state
+    problem, state = problem_of(setup).replacing([factor]), setup.state
     outcome = outcome_of(problem, state)
     found = spent(problem, outcome)
     own = paid(problem, state, dense, lambda p: factor.accumulate(state, p, factor.output(), curved=True))
@@ -160,7 +167,7 @@ def test_degrees_of_freedom_of_features_on_planes(setup, problem_of, features_on
 def test_degrees_of_freedom_of_points_on_planes(scanned, dense):
     problem, state = scanned
     found = spent(problem, outcome_of(problem, state))
-    (lidar,) = problem.sensors
+    (lidar,) = of_type(problem.factors, LidarFactor)
     own = paid(problem, state, dense, lambda p: lidar.accumulate(state, p, lidar.output()))
     assert near(found[lidar.name, "points"], own)
 
@@ -180,7 +187,8 @@ def test_an_early_outcome_has_no_draws_and_they_are_made_where_they_are_asked_fo
         spurious_information(followed, without).mean, spurious_information(followed, late).mean, rtol=1e-3, atol=1e-3
     )
     bare = Piece.bare(0, followed.n_nodes - 1)
-    out = followed.features.output()
-    followed.features.accumulate(early.state, bare, out, sums=False)
-    for a, b in zip(not_none(early.residuals.features).residual, out.residual, strict=True):
+    features = followed.factors[FEATURES]
+    out = features.output()
+    features.accumulate(early.state, bare, out, sums=False)
+    for a, b in zip(early.residuals[FEATURES].residual, out.residual, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)

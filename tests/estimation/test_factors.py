@@ -33,7 +33,7 @@ from icalib.optim.robust_weights import LEAST_CURVATURE
 from icalib.optim.state import NODE, State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import CornerNoise
-from icalib.sensors.imu.residual import ROWS, ImuFactor
+from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.wheels.ground_factor import GroundFactor
@@ -68,13 +68,13 @@ def imu_sample(unlike, setup_of, imu_free):
     state = setup.perturbed(np.random.default_rng(0), 0.1)
 
     def residual(at):
-        out = np.zeros((len(at.seconds) - 1, ROWS))
+        out = factor.output()
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
-        return out.ravel()
+        return out.residual.ravel()
 
     def accumulate(at, piece, sums):
-        return factor.accumulate(at, piece, np.zeros((len(at.seconds) - 1, ROWS)), sums)
+        return factor.accumulate(at, piece, factor.output(), sums)
 
     return Sample("ImuFactor", setup, state, accumulate, residual, white(residual))
 

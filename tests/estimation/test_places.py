@@ -15,6 +15,7 @@ from icalib.estimate.evidence.feature_noise import first_following
 from icalib.estimate.evidence.places import (
     Clusters,
     _cluster_gradients,
+    _count,
     _image_cells,
     _tag_corners,
     cluster_covariances,
@@ -25,10 +26,13 @@ from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.start import start
+from icalib.motion.factor import look, of_type
 from icalib.optim.border import restricted_inverse
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.sensors.camera.bodies import Bodies
+from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow
@@ -64,32 +68,37 @@ def gradient(problem: Problem, outcome: Outcome) -> np.ndarray:
 
 def moved(problem: Problem, by: list[np.ndarray]) -> Problem:
     """Observations of each camera elsewhere, by (N, 2) px."""
-    assert problem.features is not None
-    streams = tuple(replace(s, uv=s.uv + b) for s, b in zip(problem.features.streams, by, strict=True))
-    return replace(problem, features=replace(problem.features, streams=streams))
+    (features,) = of_type(problem.factors, FeatureFactor)
+    streams = tuple(replace(s, uv=s.uv + b) for s, b in zip(features.streams, by, strict=True))
+    return problem.replacing([replace(features, streams=streams)])
+
+
+def image_cells(problem: Problem) -> tuple[FeatureFactor, Clusters]:
+    (features,) = of_type(problem.factors, FeatureFactor)
+    return features, _image_cells(of_type(problem.factors, CornerFactor), (features,))
 
 
 def test_the_gradient_of_a_cell_is_what_its_residuals_change(solved: tuple[Problem, Outcome]):
     """With residuals so small that nothing bends, those of one cell twice as large: the gradient of the whole, points
     being where they then want to be, changes by the cell's own."""
     exact, outcome = solved
-    cells, rng = _image_cells(exact), np.random.default_rng(0)
-    problem = moved(exact, [LITTLE_PX * rng.normal(size=(len(own), 2)) for own in cells.tracks])
-    assert problem.features is not None
+    (features, cells), rng = image_cells(exact), np.random.default_rng(0)
+    tracks = cells[features.key]
+    problem = moved(exact, [LITTLE_PX * rng.normal(size=(len(own), 2)) for own in tracks])
     (found,) = _cluster_gradients(problem, outcome, [cells])
-    assert found.shape == (cells.count, problem.layout.size) and cells.count == 36
-    residual = problem.features.look(outcome.state).residual
+    assert found.shape == (_count(cells), problem.layout.size) and _count(cells) == 36
+    residual = look(of_type(problem.factors, FeatureFactor)[0], outcome.state).residual
     before, size = gradient(problem, outcome), np.abs(found).max(axis=0)
     for cell in (1, 14, 30):
-        twice = moved(problem, [-r * (own == cell)[:, None] for r, own in zip(residual, cells.tracks, strict=True)])
+        twice = moved(problem, [-r * (own == cell)[:, None] for r, own in zip(residual, tracks, strict=True)])
         change = gradient(twice, outcome) - before
         np.testing.assert_allclose(change / size, found[cell] / size, atol=1e-3)
 
 
 def test_cells_together_are_all_that_cameras_say(solved: tuple[Problem, Outcome]):
     problem, outcome = solved
-    cells = _image_cells(problem)
-    whole = Clusters(cells.corners, [np.zeros(len(c), dtype=np.int32) for c in cells.tracks])
+    features, cells = image_cells(problem)
+    whole = cells | {features.key: [np.zeros(len(c), dtype=np.int32) for c in cells[features.key]]}
     parts, (one,) = _cluster_gradients(problem, outcome, [cells, whole])
     np.testing.assert_allclose(parts.sum(axis=0), one, rtol=1e-6, atol=1e-6 * np.abs(parts).max())
 

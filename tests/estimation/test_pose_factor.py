@@ -16,8 +16,8 @@ from icalib.motion.pose_rows import Frame, Mount, absolute_rows, relative_rows
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import State
 from icalib.rig import PoseSensor
+from icalib.sensors.pose.factors import next_pose_noise, pose_factor
 from icalib.sensors.pose.residual import FRAME, PoseNoise, RelativePosesFactor, frame_of
-from icalib.sensors.robot import next_posing, pose_factor
 from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
 
 
@@ -169,7 +169,7 @@ def test_rows_are_those_of_matrices():
 def test_noise_that_is_given_stays():
     noise = PoseNoise(0.01, 0.02)
     ratios = {"rotation": 4.0, "position": 9.0}
-    assert next_posing(PoseSensor("a", "a"), noise, ratios) == PoseNoise(0.02, 0.06)
-    assert next_posing(PoseSensor("a", "a"), noise, {"rotation": 4.0}) == PoseNoise(0.02, 0.02)
-    assert next_posing(PoseSensor("a", "a", rotation_noise=0.01), noise, ratios) == PoseNoise(0.01, 0.06)
-    assert next_posing(PoseSensor("a", "a", position_noise=0.02), noise, ratios) == PoseNoise(0.02, 0.02)
+    assert next_pose_noise(PoseSensor("a", "a"), noise, ratios) == PoseNoise(0.02, 0.06)
+    assert next_pose_noise(PoseSensor("a", "a"), noise, {"rotation": 4.0}) == PoseNoise(0.02, 0.02)
+    assert next_pose_noise(PoseSensor("a", "a", rotation_noise=0.01), noise, ratios) == PoseNoise(0.01, 0.06)
+    assert next_pose_noise(PoseSensor("a", "a", position_noise=0.02), noise, ratios) == PoseNoise(0.02, 0.02)

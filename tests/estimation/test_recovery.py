@@ -10,8 +10,10 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem import solver
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry import so3
+from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import THREADS, solve
 from icalib.pipeline import calibrate_measurements
+from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
@@ -158,9 +160,9 @@ def test_the_information_has_the_true_curvature_of_the_loss(unlike, setup_of, pr
             stream=replace(c.stream, uv=c.stream.uv + rng.normal(size=c.stream.uv.shape)),
             noise=replace(c.noise, sigma=np.ones_like(c.noise.sigma), loss=loss, loss_scale=1.5),
         )
-        for c in problem.cameras
+        for c in of_type(problem.factors, CornerFactor)
     )
-    problem = replace(problem, cameras=cameras)
+    problem = problem.replacing(cameras)
     outcome = minimise(problem, setup.state)
 
     def information(curved):

@@ -15,6 +15,7 @@ from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.initialize.lidar.lidar import LidarGuess, lidar_and_motion, lidar_on_motion
 from icalib.initialize.lidar.lidar_planes import ROUNDS, associate, round_search
 from icalib.initialize.lidar.lidar_rounds import check_shares
+from icalib.motion.factor import keyed
 from icalib.motion.nodes import place_nodes
 from icalib.motion.sweep import Motion
 from icalib.optim.state import State, make_layout
@@ -59,7 +60,7 @@ def solved(r, state, found):
     imu = ImuFactor.build(r.imu, state, 9.81, np.zeros(0, dtype=np.int64))
     sensors = ImuSensor("imu0", "", class_noise("consumer")), *(Lidar(s.name, "") for s in r.streams)
     tolerance = tolerance_of(layout, specs_of(layout, sensors), Settings())
-    outcome = minimise(Problem(layout, imu, (), (), tolerance, sensors=lidars, framed=False), state)
+    outcome = minimise(Problem(layout, keyed((imu, *lidars)), (), tolerance, framed=False), state)
     assert outcome.converged, outcome.status
     return outcome.state
 

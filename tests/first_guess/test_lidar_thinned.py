@@ -11,8 +11,8 @@ from icalib.data.measurements import LidarStream, Measurements
 from icalib.initialize.lidar import lidar_planes, lidar_rounds
 from icalib.initialize.lidar.lidar_planes import Association, odd_step
 from icalib.initialize.lidar.lidar_rounds import _firsts, _of_all
+from icalib.motion.clouds import Clouds
 from icalib.pipeline import calibrate_measurements
-from icalib.sensors.robot import Clouds
 from icalib.tools.simulation import rig_for
 
 pytestmark = pytest.mark.slow

@@ -16,7 +16,7 @@ from icalib.estimate.evidence.corner_noise import (
     image_speed,
     scale_common_errors,
 )
-from icalib.estimate.evidence.evidence import fits
+from icalib.estimate.evidence.evidence import chi2_by_kind, fits
 from icalib.estimate.evidence.feature_noise import first_following, next_following
 from icalib.estimate.problem.assembly import Following, assemble, host_times, nodes_for, resample
 from icalib.estimate.problem.guess_priors import guess_priors
@@ -24,17 +24,19 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome, Step, Visit, way_come
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
-from icalib.motion.factor import chi2
+from icalib.motion.factor import of_type, pairs_of
 from icalib.optim import pages
 from icalib.optim.border import NOTHING
 from icalib.optim.prior_factor import Prior, without_priors
 from icalib.optim.state import State
 from icalib.rig import PoseSensor
-from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.corner_outliers import inliers
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.image_pairs import not_simultaneous
-from icalib.sensors.lidar.residual import LidarFactor
-from icalib.sensors.robot import RobotNoise, next_posing, next_ranging
+from icalib.sensors.lidar.noise import next_lidar_noise
+from icalib.sensors.pose.factors import next_pose_noise
+from icalib.sensors.robot import RobotNoise
 
 LOOSE = 3.0  # times the prior uncertainty of a guess
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
@@ -264,11 +266,11 @@ def _is_far(way: float, way_before: float) -> bool:
 def _follows_more(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
     """Whether many tracks were left out because the poses that the pass began with did not find their points, and those
     that it ended with do."""
-    now = outcome.problem.features
+    (now,) = of_type(outcome.problem.factors, FeatureFactor) or (None,)
     if now is None or now.followed > ENOUGH * sum(int(k.sum()) for k in now.keep):
         return False
-    anew = judged.problem(inputs, _on_own_nodes(inputs, outcome.state)).features
-    return anew is not None and anew.followed > MORE * now.followed
+    anew = of_type(judged.problem(inputs, _on_own_nodes(inputs, outcome.state)).factors, FeatureFactor)
+    return any(f.followed > MORE * now.followed for f in anew)
 
 
 def _on_own_nodes(inputs: Inputs, state: State) -> State:
@@ -293,7 +295,8 @@ def _next_noise(
     """The noise of the next pass, as the residuals of this one show it."""
     settings, models, noise = inputs.rig.settings, [], []
     common = [f for f in fits(problem, outcome) if f.kind.startswith("common")] if settings.common_error else []
-    for camera, factor, out in zip(inputs.rig.cameras, problem.cameras, outcome.residuals.corners, strict=True):
+    pairs = pairs_of(problem.factors, outcome.residuals, CornerFactor)
+    for camera, (factor, out) in zip(inputs.rig.cameras, pairs, strict=True):
         if not len(factor.stream.uv):
             models.append(first_noise(camera))
             noise.append(factor.noise)
@@ -310,19 +313,19 @@ def _next_noise(
 
 def _kept(inputs: Inputs, outcome: Outcome, apart: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
     """By camera (N,) bool: corners that are not rejected, nor all those of an image, which is `apart`."""
-    cameras, outputs = outcome.problem.cameras, outcome.residuals.corners
-    keep = [inliers(f, out, inputs.rig.settings) for f, out in zip(cameras, outputs, strict=True)]
+    pairs = pairs_of(outcome.problem.factors, outcome.residuals, CornerFactor)
+    keep = [inliers(f, out, inputs.rig.settings) for f, out in pairs]
     if apart:
-        keep = [k & ~bad[c.stream.image] for k, bad, c in zip(keep, apart, cameras, strict=True)]
+        keep = [k & ~bad[c.stream.image] for k, bad, (c, _) in zip(keep, apart, pairs, strict=True)]
     return tuple(keep)
 
 
 def _apart(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, ...]:
     """By camera (M,) bool: images that are not simultaneous with others of their keyframe; empty if not tested."""
-    cameras, settings = outcome.problem.cameras, inputs.rig.settings
+    cameras, settings = of_type(outcome.problem.factors, CornerFactor), inputs.rig.settings
     if len(cameras) < 2 or not _has_cameras_alone(inputs) or settings.outlier_std <= 0.0:
         return ()
-    return tuple(not_simultaneous(cameras, outcome.residuals.corners, settings))
+    return tuple(not_simultaneous(cameras, of_type(outcome.residuals, CornerOutput), settings))
 
 
 def _has_cameras_alone(inputs: Inputs) -> bool:
@@ -333,17 +336,16 @@ def _next_robot(inputs: Inputs, problem: Problem, outcome: Outcome, robot: Robot
     """Noise of LiDARs and pose sensors, as the residuals of this pass show it: of the latter by degrees of freedom, for
     where nothing else shows the motion they pay for most of it."""
     ranging = []
-    pairs = list(zip(problem.sensors, outcome.residuals.sensors, strict=True))
+    shown = chi2_by_kind(problem, outcome.residuals) if robot.ranging else {}
     for lidar, noise in zip(inputs.rig.lidars, robot.ranging, strict=True):
-        own = [(f, out) for f, out in pairs if isinstance(f, LidarFactor) and f.name == lidar.name]
-        shown = [(chi2(out, f.kinds["points"]), f.count(out, "points")) for f, out in own]
-        ranging.append(next_ranging(lidar, noise, *shown[0]) if shown else noise)
+        own = shown.get((lidar.name, "points"))
+        ranging.append(noise if own is None else next_lidar_noise(lidar, noise, own.chi2, own.n))
     judged = fits(problem, outcome) if any(_is_open(s) for s in inputs.rig.poses) else []
     posing = []
     for sensor, noise in zip(inputs.rig.poses, robot.posing, strict=True):
         shown = [f for f in judged if f.sensor == sensor.name and f.dof > LEAST_LEFT * f.count]
         ratios = {f.kind: f.chi2 / (f.dof if inputs.imu else max(f.dof - FEW_DOF, 1.0)) for f in shown}
-        posing.append(next_posing(sensor, noise, ratios))
+        posing.append(next_pose_noise(sensor, noise, ratios))
     return RobotNoise(tuple(ranging), tuple(posing))
 
 

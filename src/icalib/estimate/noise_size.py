@@ -15,12 +15,14 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.evidence import DRAW_STEP, bare_residuals
+from icalib.estimate.evidence.evidence import DRAW_STEP
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.solver import minimise
+from icalib.motion.factor import look, of_type, pairs_of
 from icalib.motion.imu_data import joined_imu_data
 from icalib.rig import ImuNoise
+from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.imu.residual import ImuFactor
 
 ROUNDS = 12  # the scales converge linearly
@@ -71,7 +73,7 @@ def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
     """None without an IMU, where an estimate with other noise fails, or where a sensor has next to no noise."""
     if inputs.rig.imu is None or inputs.rig.assumes_motion or not isinstance(found.problem.chain, ImuFactor):
         return None
-    cameras = [c.name for c in found.problem.cameras if len(c.stream.uv)]
+    cameras = [c.name for c in of_type(found.problem.factors, CornerFactor) if len(c.stream.uv)]
     scales: dict[str, float] = dict.fromkeys([*KINDS, *cameras], 1.0)
     outcome, settled = found.outcome, False
     for _ in range(ROUNDS):
@@ -108,7 +110,7 @@ def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcom
     rig = replace(inputs.rig, imu=replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
     other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
     state, judged = found.outcome.state, found.judged
-    pairs = zip(judged.noise, found.problem.cameras, strict=True)
+    pairs = zip(judged.noise, of_type(found.problem.factors, CornerFactor), strict=True)
     noise = tuple(replace(n, sigma=(scales.get(c.name, 1.0) * n.sigma).astype(n.sigma.dtype)) for n, c in pairs)
     return minimise(replace(judged, noise=noise).problem(other, state, found.problem.held), state)
 
@@ -116,7 +118,7 @@ def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcom
 def _corner_sizes(outcome: Outcome) -> dict[str, float]:
     """By camera, how many times as large as their noise corners are off; nearly all degrees of freedom are left."""
     sizes = {}
-    for camera, out in zip(outcome.problem.cameras, outcome.residuals.corners, strict=True):
+    for camera, out in pairs_of(outcome.problem.factors, outcome.residuals, CornerFactor):
         if len(camera.stream.uv):
             sizes[camera.name] = float(np.sqrt(camera.chi2(out) / max(2 * np.count_nonzero(out.root), 1)))
     return sizes
@@ -132,14 +134,15 @@ class _ImuDraws:
 
     @classmethod
     def of(cls, outcome: Outcome) -> _ImuDraws:
-        problem, state, base = outcome.problem, outcome.state, outcome.residuals
+        problem, state = outcome.problem, outcome.state
+        base = outcome.residuals[problem.chain.key].residual
         assert outcome.draws is not None
         along = []
         for x in outcome.draws.free[:4]:
             there = state.retract(problem.layout, DRAW_STEP * x.chain, DRAW_STEP * x.border)
-            along.append((bare_residuals(problem, there).imu - base.imu) / DRAW_STEP)
+            along.append((look(problem.chain, there).residual - base) / DRAW_STEP)
         kinds = {k: r for k, r in problem.chain.kinds.items() if k in KINDS}
-        return cls(kinds, base.imu, tuple(along))
+        return cls(kinds, base, tuple(along))
 
     def _left(self, kind: str, rows: slice = slice(None)) -> tuple[int, float, float]:
         """Number, degrees of freedom and chi^2 of the intervals `rows`."""

@@ -1,15 +1,149 @@
-"""What the problem and the evidence ask of a sensor's factor, whatever it measures."""
+"""What the problem asks of a factor: all measurements of one kind by one sensor, whatever they are."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
 from icalib.motion.imu_data import ImuData
-from icalib.optim.arrowhead import Piece
+from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
 from icalib.optim.state import State
+
+FactorKey = tuple[str, str]  # sensor, and what of it is measured
+FitKey = tuple[str, str]  # sensor, and kind of its residuals
+Residuals = dict[FactorKey, Any]  # what each factor's `accumulate` left behind at a state
+T = TypeVar("T")
+
+
+class Squares(NamedTuple):
+    """Of one kind of residual: n: how many measurements are in use; and their chi^2, robust weights as they are."""
+
+    n: int
+    chi2: float
+
+
+class RawSize(NamedTuple):
+    """RMS of one kind of residual as it was before whitening, and its unit; None and "" where it has none. rejected:
+    how many measurements are outliers."""
+
+    rms: float | None
+    unit: str
+    rejected: int = 0
+
+
+class Along(NamedTuple):
+    """`share` of a step, from the state `start` to `end`: small enough for residuals to be linear."""
+
+    start: State
+    end: State
+    share: float
+
+
+class Factor(Protocol):
+    """All measurements of one kind by one sensor. The output of `accumulate` is the factor's own class of arrays.
+
+    is_sparse: one keyframe alone has too few rows to say anything of the calibration. ties_distant_nodes: rows share
+    what is eliminated with the nodes, such as points of the scene, so that segments of the chain do not stand alone.
+    """
+
+    is_sparse: ClassVar[bool]
+    ties_distant_nodes: ClassVar[bool]
+
+    @property
+    def key(self) -> FactorKey: ...
+
+    @property
+    def name(self) -> str:
+        """The sensor's."""
+        ...
+
+    def output(self) -> Any:
+        """Empty arrays for `accumulate` to fill."""
+        ...
+
+    def accumulate(self, state: State, piece: Piece, out: Any, sums: bool = True, curved: bool = False) -> float:
+        """Fills `out` for what lies in `piece`, and adds it to the piece's sums where `sums` are wanted. Returns half
+        the robust chi^2.
+
+        `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
+        """
+        ...
+
+    def squares(self, out: Any) -> dict[FitKey, Squares]:
+        """Number and chi^2 of each kind of residual."""
+        ...
+
+    def sizes(self, out: Any) -> dict[FitKey, RawSize]:
+        """RMS of each kind of residual."""
+        ...
+
+    def spent(self, out: Any, along: Along) -> dict[FitKey, float]:
+        """|J x|^2 of each kind of residual for the step x, `out` at its start: of a draw x from the posterior, the mean
+        is the number of parameters that these residuals pay for."""
+        ...
+
+    def with_imu(self, imu: ImuData) -> Self:
+        """The same measurements, at the motion that other readings give."""
+        ...
+
+    def throwaway(self) -> Any:
+        """Output for one piece that nobody will read."""
+        ...
+
+    def scratch(self, out: Any) -> Any:
+        """`out`, of this factor or of the one that it was cut from, to be filled once more."""
+        ...
+
+    def attach(self, piece: Piece, keep: bool) -> Piece:
+        """The piece with room for what the factor eliminates; `keep`: another piece shares a node with it."""
+        ...
+
+    def cut(self, state: State, nodes: tuple[int, ...]) -> Self:
+        """The same measurements, of which none ties nodes on both sides of one of `nodes`."""
+        ...
+
+    def settled(self, out: Any) -> Self:
+        """The same factor, which first looks for what it eliminates where `out` found it."""
+        ...
+
+
+class FactorDefaults:
+    """A factor that ties a node to the next one at most, and keeps all it needs in the state."""
+
+    is_sparse: ClassVar[bool] = False
+    ties_distant_nodes: ClassVar[bool] = False
+
+    def with_imu(self, imu: ImuData) -> Self:
+        """See `Factor`."""
+        factor: Any = self
+        return replace(factor, imu=imu)
+
+    def throwaway(self) -> Any:
+        """See `Factor`."""
+        factor: Any = self
+        return factor.output()
+
+    def scratch(self, out: Any) -> Any:
+        """See `Factor`."""
+        return out
+
+    def attach(self, piece: Piece, keep: bool) -> Piece:
+        """See `Factor`."""
+        del keep
+        return piece
+
+    def cut(self, state: State, nodes: tuple[int, ...]) -> Self:
+        """See `Factor`."""
+        del state, nodes
+        return self
+
+    def settled(self, out: Any) -> Self:
+        """See `Factor`."""
+        del out
+        return self
 
 
 @dataclass(frozen=True)
@@ -25,45 +159,87 @@ class Whitened:
         """Rows (n, m) to be filled."""
         return cls(np.zeros((n, m)), np.zeros((n, m)))
 
+    @classmethod
+    def without_loss(cls, n: int, m: int) -> Whitened:
+        """Rows (n, m) to be filled, all weights 1."""
+        return cls(np.zeros((n, m)), np.broadcast_to(1.0, (n, m)))
 
-class SensorFactor(Protocol):
-    """All measurements of one sensor. kinds: rows of its residuals by name; imu: the readings that carry it from nodes
-    to its own instants, None where it was measured at nodes."""
 
-    @property
-    def kinds(self) -> dict[str, slice]: ...
+class _HasRows(Protocol):
+    """What `RowFactor` asks of the factor. kinds: columns of its rows by kind of residual."""
 
     @property
     def name(self) -> str: ...
 
     @property
-    def imu(self) -> ImuData | None: ...
+    def kinds(self) -> dict[str, slice]: ...
 
-    def with_imu(self, imu: ImuData) -> SensorFactor:
-        """The same measurements, carried by other readings."""
-        ...
+    def accumulate(
+        self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False
+    ) -> float: ...
 
-    def output(self) -> Whitened:
-        """Empty rows for `accumulate` to fill."""
-        ...
+    def output(self) -> Whitened: ...
 
-    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """Fills `out` for what lies in `piece`, and adds it to the piece's sums where `sums` are wanted. Returns half
-        the robust chi^2.
+    def count(self, out: Whitened, kind: str) -> int: ...
 
-        `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
-        """
-        ...
+    def rms(self, out: Whitened, kind: str) -> tuple[float | None, str]: ...
 
-    def count(self, out: Whitened, kind: str) -> int:
-        """How many measurements of a kind are in use."""
-        ...
 
-    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
-        """Of the residuals of a kind as they were before whitening, and their unit."""
-        ...
+class RowFactor(FactorDefaults):
+    """A factor whose output are `Whitened` rows, of which some columns are of one kind."""
+
+    is_sparse: ClassVar[bool] = True
+
+    def count(self: _HasRows, out: Whitened, kind: str) -> int:
+        """How many rows of a kind are in use, times their columns."""
+        return out.residual[:, self.kinds[kind]].size
+
+    def squares(self: _HasRows, out: Whitened) -> dict[FitKey, Squares]:
+        """See `Factor`."""
+        return {(self.name, k): Squares(self.count(out, k), chi2(out, r)) for k, r in self.kinds.items()}
+
+    def sizes(self: _HasRows, out: Whitened) -> dict[FitKey, RawSize]:
+        """See `Factor`."""
+        return {(self.name, kind): RawSize(*self.rms(out, kind)) for kind in self.kinds}
+
+    def spent(self: _HasRows, out: Whitened, along: Along) -> dict[FitKey, float]:
+        """See `Factor`."""
+        slope = (look(self, along.end).residual - out.residual) / along.share * out.root
+        return {(self.name, kind): float((slope[:, r] ** 2).sum()) for kind, r in self.kinds.items()}
+
+
+def rows_of(factors: Mapping[FactorKey, Factor], outputs: Residuals, kind: FitKey) -> np.ndarray | None:
+    """(n, m) whitened and weighted residuals of one kind; None where no `RowFactor` has it."""
+    for key, factor in factors.items():
+        rows: Any = factor if isinstance(factor, RowFactor) and factor.name == kind[0] else None
+        if rows is not None and kind[1] in rows.kinds:
+            return (outputs[key].residual * outputs[key].root)[:, rows.kinds[kind[1]]]
+    return None
+
+
+def look(factor: Any, state: State) -> Any:
+    """A factor's output at `state`, the chain cut where `make_pieces` cuts it."""
+    out = factor.output()
+    pieces = make_pieces(len(state.seconds), None)
+    in_parallel(lambda piece: factor.accumulate(state, piece, out, sums=False), pieces)
+    return out
 
 
 def chi2(out: Whitened, rows: slice) -> float:
     """Of some columns of the rows, robust weights as they are."""
     return float(((out.residual[:, rows] * out.root[:, rows]) ** 2).sum())
+
+
+def keyed(factors: Iterable[Factor]) -> dict[FactorKey, Factor]:
+    """Factors by sensor and by what of it is measured, in order."""
+    return {factor.key: factor for factor in factors}
+
+
+def of_type(things: Mapping[FactorKey, Any], wanted: type[T]) -> tuple[T, ...]:
+    """The factors, or their outputs, that are of one class, in order."""
+    return tuple(x for x in things.values() if isinstance(x, wanted))
+
+
+def pairs_of(factors: Mapping[FactorKey, Factor], outputs: Residuals, wanted: type[T]) -> list[tuple[T, Any]]:
+    """The factors of one class, each with its output."""
+    return [(f, outputs[key]) for key, f in factors.items() if isinstance(f, wanted)]

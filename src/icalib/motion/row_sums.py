@@ -20,7 +20,7 @@ CHUNK = 256
 
 
 class Into(NamedTuple):
-    """Where rows go, as `SensorFactor.accumulate` is told."""
+    """Where rows go, as `Factor.accumulate` is told."""
 
     piece: Piece
     out: Whitened

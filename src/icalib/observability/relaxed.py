@@ -17,7 +17,8 @@ from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.groups import AnySensor, groups_of, sensors_of, with_groups
 from icalib.estimate.problem.inputs import Inputs, with_clouds
 from icalib.estimate.problem.outcome import Outcome, outcome_of
-from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.estimate.problem.problem import Problem
+from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Solution, solve
 from icalib.optim.border import NOTHING, restricted_root
 from icalib.optim.prior_factor import sums_of_priors

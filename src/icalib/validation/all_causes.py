@@ -54,7 +54,7 @@ def all_causes(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tu
     states and the data contradict so much that nothing else that is wrong with the estimate is news."""
     inputs, found = judged.inputs, judged.found
     stated, notes = _stated(judged, against)
-    few = any(plane_warnings(inputs.rig, found.problem.features))
+    few = any(plane_warnings(inputs.rig, found.problem.factors))
     # How far off those are that lie on planes by chance means nothing.
     fits = [f for f in judged.fits if (not against or f.kind in SEEN) and not (few and f.kind == ON_PLANES)]
     misfit = Misfit.of(fits)

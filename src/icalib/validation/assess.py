@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.evidence import Fit, fits, raw_rms
+from icalib.estimate.evidence.evidence import Fit, fits, raw_sizes
 from icalib.estimate.evidence.inflation import calibration_columns, spread_variance, white_variance
 from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.evidence.places import cluster_covariances
@@ -20,6 +20,7 @@ from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.outcome import Visit
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.axes import hardly_turned
+from icalib.motion.factor import of_type
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined
 from icalib.observability.words import Observability, observe
@@ -42,6 +43,7 @@ from icalib.result.verdict import by_size
 from icalib.rig import drive_names
 from icalib.rig.file import rig_to_dict
 from icalib.rig.pose import SCALE
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.cameras import plane_warnings
 from icalib.validation.guesses import guess_notes
@@ -77,7 +79,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
     noise = _NoiseShare.of(determined, seen.covariance, parts)
     groups = _groups(inputs, determined, seen, noise)
-    judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
+    judged = _sensor_fits([f for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, state.values))
     factors = _factors(inputs, groups)
@@ -250,7 +252,7 @@ def _empirical_variance(found: Estimate, parts: Parts | None, white: np.ndarray)
     """(B,) variances as the spread over parts of the recording shows them, or over feature tracks where it is larger,
     plus what places in the image and on the target show beyond `white` noise (B,); this where there is nothing to
     split."""
-    if parts is None and found.problem.features is None:
+    if parts is None and not of_type(found.problem.factors, FeatureFactor):
         return white
     clusters = cluster_covariances(found.problem, found.outcome)
     spread = white if clusters.tracks is None else np.diag(clusters.tracks)
@@ -279,18 +281,9 @@ def few_factor(parts: int) -> float:
     return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0
 
 
-def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
-    """Rejected features are observations that stood out; those whose track was left out are not."""
-    problem, out, rejected = found.problem, found.outcome.residuals, 0
-    rms, unit = raw_rms(problem, out, fit.sensor, fit.kind)
-    if fit.kind == "features":
-        assert problem.features is not None
-        i = [c.name for c in problem.features.cameras].index(fit.sensor)
-        rejected = int(problem.features.outliers[i].sum())
-    elif unit == "px":
-        i = [c.name for c in problem.cameras].index(fit.sensor)
-        rejected = int((out.corners[i].root == 0.0).sum())
-    return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
+def _sensor_fits(judged: Sequence[Fit], found: Estimate) -> list[SensorFit]:
+    sizes = raw_sizes(found.problem, found.outcome.residuals)
+    return [SensorFit(f.sensor, f.kind, f.count, f.dof, f.chi2, *sizes[f.sensor, f.kind]) for f in judged]
 
 
 def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:
@@ -313,10 +306,9 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
 
 def _imu_residuals(found: Estimate, trajectory: Trajectory) -> ImuResiduals:
     """Of all intervals but those between recordings, which hold nothing."""
-    seams = np.array(found.problem.chain.starts[1:], dtype=np.int64) - 1
-    return ImuResiduals(
-        np.delete(trajectory.seconds[:-1], seams), np.delete(found.outcome.residuals.imu, seams, axis=0)
-    )
+    chain = found.problem.chain
+    out, seams = found.outcome.residuals[chain.key], np.array(chain.starts[1:], dtype=np.int64) - 1
+    return ImuResiduals(np.delete(trajectory.seconds[:-1], seams), np.delete(out.residual, seams, axis=0))
 
 
 def _warnings(
@@ -325,7 +317,7 @@ def _warnings(
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
-    yield from plane_warnings(inputs.rig, found.problem.features)
+    yield from plane_warnings(inputs.rig, found.problem.factors)
     yield from pose_warnings(poses, inputs.rig)
     yield from upwards_warnings(inputs, found)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 
 from icalib.geometry import so3
+from icalib.motion.factor import Factor, FactorKey, of_type
 from icalib.observability.fixed_lens import LensStep
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.excess import excess, times
@@ -26,11 +27,12 @@ FEW_ON_PLANES = 0.1  # of the tracks: rough walls have as many where they should
 NEARER = 0.5  # times as far, in fx, fy, cx and cy
 
 
-def plane_warnings(rig: Rig, features: FeatureFactor | None) -> Iterator[str]:
+def plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[str]:
     """Where points should lie on planes, and none do, or so few that it may be chance."""
     if rig.settings.points_on_planes_m == 0.0:
         return
-    on, tracks = (0, 0) if features is None else (int((features.on.plane >= 0).sum()), features.tracks.count)
+    features = of_type(factors, FeatureFactor)
+    on, tracks = sum(int((f.on.plane >= 0).sum()) for f in features), sum(f.tracks.count for f in features)
     if on == 0:
         yield (
             "no tracked points lie on planes of the LiDARs, so points_on_planes_m in the rig file has no effect; make "

@@ -10,6 +10,8 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.clocks import instants
+from icalib.motion.factor import pairs_of
+from icalib.sensors.camera.corner_factor import CornerFactor
 
 BINS, WINDOW = 64, 3  # of the recording; a shock reaches a few keyframes beyond itself
 AT_ONE_TIME = 0.5  # of the misfit
@@ -58,9 +60,10 @@ def _chi2_over_time(found: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]
     """By sensor: seconds (n,) on the joined clock and chi^2 (n,), of the IMU's intervals and of images."""
     problem, state, out = found.problem, found.outcome.state, found.outcome.residuals
     rows = {}
-    if out.imu.size:
-        rows[problem.chain.name] = state.seconds[:-1], (out.imu[:, :9] ** 2).sum(axis=1)
-    for camera, corners in zip(problem.cameras, out.corners, strict=True):
+    inertial = out[problem.chain.key].residual[:, :9]
+    if inertial.size:
+        rows[problem.chain.name] = state.seconds[:-1], (inertial**2).sum(axis=1)
+    for camera, corners in pairs_of(problem.factors, out, CornerFactor):
         if len(camera.stream.uv):
             times = instants(camera.stream, state.values)[camera.stream.image]
             square = (corners.residual.astype(np.float64) ** 2).sum(axis=1) * corners.root.astype(np.float64) ** 2
@@ -82,7 +85,7 @@ class Lag:
 
 def lag_between_cameras(inputs: Inputs, found: Estimate) -> Lag | None:
     """Of the first two cameras of a rig without an IMU, whose images are taken for simultaneous."""
-    cameras = list(zip(found.problem.cameras, found.outcome.residuals.corners, strict=True))
+    cameras = pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)
     if inputs.rig.imu is not None or len(cameras) < 2:
         return None
     lags = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from icalib.estimate.evidence.evidence import chi2_by_kind, raw_rms
+from icalib.estimate.evidence.evidence import chi2_by_kind, raw_sizes
 from icalib.estimate.evidence.held_out import Prediction, predict, shifts
 from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.problem import Problem
@@ -26,8 +26,8 @@ def held_out(parts: Parts | None, assumed: Collection[str]) -> CrossValidation |
 
 def _fits(problem: Problem, found: Prediction) -> list[PredictedFit]:
     inside, outside = (chi2_by_kind(problem, out) for out in (found.inside, found.outside))
-    fits = []
-    for (sensor, kind), (count, chi2) in inside.items():
-        (rms, unit), (rms_outside, _) = (raw_rms(problem, out, sensor, kind) for out in (found.inside, found.outside))
-        fits.append(PredictedFit(sensor, kind, count, chi2, outside[sensor, kind][1], rms, rms_outside, unit))
-    return fits
+    size, size_outside = (raw_sizes(problem, out) for out in (found.inside, found.outside))
+    return [
+        PredictedFit(*key, count, chi2, outside[key].chi2, size[key].rms, size_outside[key].rms, size[key].unit)
+        for key, (count, chi2) in inside.items()
+    ]

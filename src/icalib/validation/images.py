@@ -6,14 +6,17 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.motion.clocks import instants
+from icalib.motion.factor import of_type, pairs_of
 from icalib.result import CornerResiduals, TrackResiduals
 from icalib.result.timeline import Timeline
+from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
 
 
 def corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResiduals, ...]:
     """By camera; those that saw no target have none in any image."""
     out = []
-    for i, (camera, corners) in enumerate(zip(found.problem.cameras, found.outcome.residuals.corners, strict=True)):
+    for i, (camera, corners) in enumerate(pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)):
         stream = camera.stream
         out.append(
             CornerResiduals(
@@ -32,10 +35,10 @@ def corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResidua
 
 def track_residuals(found: Estimate, timeline: Timeline) -> tuple[TrackResiduals, ...]:
     """By camera, where any of them follows points."""
-    factor, left = found.problem.features, found.outcome.residuals.features
-    if factor is None or left is None:
+    pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
+    if not pairs:
         return ()
-    out = []
+    (factor, left), out = pairs[0], []
     for i, (camera, stream) in enumerate(zip(factor.cameras, factor.streams, strict=True)):
         unused = (left.root[i] == 0.0)[:, None]
         residual = np.where(unused, np.nan, left.residual[i]).astype(np.float32)
@@ -58,5 +61,5 @@ def track_residuals(found: Estimate, timeline: Timeline) -> tuple[TrackResiduals
 
 def _seconds(found: Estimate, timeline: Timeline, index: int) -> np.ndarray:
     """(M,) of the images of a camera."""
-    times = instants(found.problem.cameras[index].stream, found.outcome.state.values)
+    times = instants(of_type(found.problem.factors, CornerFactor)[index].stream, found.outcome.state.values)
     return timeline.shown(times, timeline.of_images(index))

@@ -19,6 +19,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.lens_bundle import Adjusted, ImagePoints, adjust, initial_parameters
+from icalib.motion.factor import pairs_of
 from icalib.optim.state import State
 from icalib.rig import Settings
 from icalib.sensors.camera.circle_centres import with_circle_centres
@@ -68,9 +69,9 @@ def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, flo
 
     It names a better model. Where none is clearly better, a sentence appears only if the misfit exceeds the noise.
     """
-    outputs, state = estimate.outcome.residuals.corners, estimate.outcome.state
-    factors, streams = estimate.problem.cameras, inputs.measurements.cameras
-    for camera, factor, out, stream in zip(inputs.rig.cameras, factors, outputs, streams, strict=True):
+    state, streams = estimate.outcome.state, inputs.measurements.cameras
+    pairs = pairs_of(estimate.problem.factors, estimate.outcome.residuals, CornerFactor)
+    for camera, (factor, out), stream in zip(inputs.rig.cameras, pairs, streams, strict=True):
         if camera.distortion.mode == "fixed" or not (out.root > 0.0).any():
             continue
         noise = residual_noise(factor, out, inputs.rig.settings, image_speed(factor, state))

@@ -9,6 +9,7 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.noise_size import are_noise, fitting_noise
 from icalib.estimate.problem.inputs import Inputs
+from icalib.motion.factor import rows_of
 from icalib.result import CrossValidation, SensorFit
 from icalib.result.excess import FAR_BEYOND, dof_known, excess
 from icalib.validation.cameras import camera_misfit, rejected_words
@@ -85,10 +86,8 @@ def _times(f: SensorFit) -> float:
 
 def _is_noise(found: Estimate, f: SensorFit) -> bool:
     """Whether residuals of wheels or poses are white, and constant over the recording."""
-    for factor, out in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
-        if factor.name == f.sensor and f.kind in factor.kinds:
-            return are_noise((out.residual * out.root)[:, factor.kinds[f.kind]])
-    return False
+    rows = rows_of(found.problem.factors, found.outcome.residuals, (f.sensor, f.kind))
+    return rows is not None and are_noise(rows)
 
 
 def _is_small(f: SensorFit) -> bool:

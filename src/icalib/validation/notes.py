@@ -10,6 +10,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.evidence.corner_noise import NoiseModel
 from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.clocks import instants
+from icalib.motion.factor import of_type, pairs_of
 from icalib.motion.imu_data import ImuData
 from icalib.motion.nodes import usable
 from icalib.result.timeline import Timeline
@@ -18,6 +19,7 @@ from icalib.rig.imu_classes import INTRINSICS_LABELS, class_of_sigma
 from icalib.sensors.camera.bodies import words_on_left_out
 from icalib.sensors.camera.circle_centres import centre_shifts
 from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.validation.robot import robot_notes
 from icalib.validation.upwards import upwards_notes
 
@@ -36,8 +38,9 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
         yield words
     if inputs.imu is not None:
         yield from _imu_notes(inputs, inputs.imu, found, timeline)
-    apart = found.judged.apart or tuple(np.zeros(len(c.node), dtype=bool) for c in found.problem.cameras)
-    cameras = zip(inputs.rig.cameras, found.problem.cameras, found.judged.models, apart, strict=True)
+    factors = of_type(found.problem.factors, CornerFactor)
+    apart = found.judged.apart or tuple(np.zeros(len(c.node), dtype=bool) for c in factors)
+    cameras = zip(inputs.rig.cameras, factors, found.judged.models, apart, strict=True)
     for camera, factor, model, late in cameras:
         if len(factor.stream.uv):
             yield f"{camera.name}: {_noise_words(model)}."
@@ -49,7 +52,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
                 f"{camera.name}: ellipses have their centres {np.sqrt((size**2).mean()):.3f} px (RMS, {size.max():.2f} "
                 "px at most) beside the projected centres of their circles; the estimate takes it into account."
             )
-    if words := late_words(found.problem.cameras, apart):
+    if words := late_words(factors, apart):
         yield words
     yield from _feature_notes(found)
     yield from robot_notes(inputs, found)
@@ -57,9 +60,10 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
 
 
 def _feature_notes(found: Estimate):
-    factor, out = found.problem.features, found.outcome.residuals.features
-    if factor is None or out is None:
+    pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
+    if not pairs:
         return
+    factor, out = pairs[0]
     all_of_them = len(np.unique(np.concatenate([s.feature for s in factor.streams])))
     yield (
         f"{all_of_them} points of the scene were followed, in {factor.tracks.count} tracks that show where they are; "
@@ -98,7 +102,7 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
     for a, b in imu.gaps:
         how = "bridged" if b - a <= most else "left out, with the images in it"
         yield f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}."
-    for camera in found.problem.cameras:
+    for camera in of_type(found.problem.factors, CornerFactor):
         t = instants(camera.stream, found.outcome.state.values)
         left_out = int((~usable(imu, t, most)).sum())
         if left_out:

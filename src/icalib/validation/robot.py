@@ -14,7 +14,7 @@ from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.geometry.planes import plane_of
 from icalib.initialize.lidar.lidar_sight import count_of, facing
 from icalib.motion.clocks import instants
-from icalib.motion.factor import Whitened
+from icalib.motion.factor import Whitened, of_type
 from icalib.motion.nodes import usable
 from icalib.optim.state import State
 from icalib.result import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
@@ -145,16 +145,16 @@ def _sigma(noise: LidarNoise, cosine: np.ndarray) -> np.ndarray:
 
 
 def _used(found: Estimate, name: str) -> int:
-    own = (f for f in found.problem.sensors if isinstance(f, LidarFactor) and f.name == name)
-    return sum(int(f.moments.count.sum()) for f in own)
+    return sum(int(f.moments.count.sum()) for f in of_type(found.problem.factors, LidarFactor) if f.name == name)
 
 
 def wheel_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple[WheelResiduals, ...]:
     """Of each set of wheels."""
     out = []
-    for factor, rows in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
+    for key, factor in found.problem.factors.items():
         if not isinstance(factor, IncrementFactor | RelativePoseFactor):
             continue
+        rows = found.outcome.residuals[key]
         seconds = instants(inputs.stream(factor.name), found.outcome.state.values)[factor.intervals.first]
         residual = np.linalg.solve(factor.whitening, rows.residual[:, :, None])[:, :, 0]
         labels = [(label, factor.units[kind]) for kind in factor.kinds for label in LABELS[kind]]
@@ -168,9 +168,7 @@ def pose_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple
     """Of each pose sensor."""
     out = []
     labels = tuple(f"{kind} {axis}" for kind in ("rotation", "position") for axis in "xyz")
-    for factor, rows in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
-        if not isinstance(factor, AbsolutePoseFactor | RelativePosesFactor):
-            continue
+    for factor, rows in _pose_factors(found):
         seconds = instants(inputs.stream(factor.name), found.outcome.state.values, factor.instants)
         shown = timeline.shown(seconds, timeline.recording_of(seconds))
         units = ("rad",) * 3 + ("m",) * 3
@@ -202,7 +200,7 @@ def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
 
 
 def _pose_factors(found: Estimate) -> list[tuple[AbsolutePoseFactor | RelativePosesFactor, Whitened]]:
-    pairs = zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True)
+    pairs = [(f, found.outcome.residuals[key]) for key, f in found.problem.factors.items()]
     return [(f, out) for f, out in pairs if isinstance(f, AbsolutePoseFactor | RelativePosesFactor)]
 
 
@@ -243,8 +241,8 @@ def neighbours(rows: np.ndarray) -> float:
 
 def ground_warnings(found: Estimate) -> Iterator[str]:
     """Where wheels are said to stand on a floor that is not seen."""
-    for factor in found.problem.sensors:
-        if isinstance(factor, GroundFactor) and not len(factor.nodes):
+    for factor in of_type(found.problem.factors, GroundFactor):
+        if not len(factor.nodes):
             yield (
                 f"none of the planes that LiDARs see is a floor (nearly level and below the IMU), so the ground of "
                 f"{factor.name} counts for nothing; see that a LiDAR sees it, or write plane: level."

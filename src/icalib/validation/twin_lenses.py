@@ -15,8 +15,10 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
+from icalib.motion.factor import of_type
 from icalib.result import SensorFit
 from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
 
 MOST_POINTS = 400  # that lenses are compared at
 OTHER_FOCAL = 0.02  # of the focal length: sets that differ by less are one
@@ -25,7 +27,7 @@ MOST_CHI2 = 16.0  # between two lenses, four standard deviations: noise explains
 
 def twin_lens_notes(inputs: Inputs, found: Estimate, fits: list[SensorFit]) -> Iterator[str]:
     """One sentence for each camera whose observations fit another set of parameters as well."""
-    for camera, factor in zip(inputs.rig.cameras, found.problem.cameras, strict=True):
+    for camera, factor in zip(inputs.rig.cameras, of_type(found.problem.factors, CornerFactor), strict=True):
         fit = next((f for f in fits if f.sensor == camera.name and f.unit == "px" and f.rms), None)
         if camera.intrinsics.mode == "fixed" or camera.distortion.mode == "fixed" or fit is None or not fit.rms:
             continue
@@ -63,8 +65,7 @@ def twin_lens(model: CameraModel, lens: np.ndarray, uv: np.ndarray, limit_px: fl
 
 def _observed(found: Estimate, factor: CornerFactor) -> np.ndarray:
     """(N, 2) px: corners and tracked points of a camera."""
-    features = found.problem.features
-    if features is None:
-        return factor.stream.uv
-    own = [s.uv[k] for s, k in zip(features.streams, features.keep, strict=True) if s.name == factor.name]
+    features = of_type(found.problem.factors, FeatureFactor)
+    pairs = [pair for f in features for pair in zip(f.streams, f.keep, strict=True)]
+    own = [s.uv[k] for s, k in pairs if s.name == factor.name]
     return np.concatenate([factor.stream.uv, *own])

@@ -22,7 +22,7 @@ from icalib.optim.border import NOTHING
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Layout, State, make_layout
 from icalib.rig import ImuNoise
-from icalib.sensors.imu.residual import ROWS, ImuFactor
+from icalib.sensors.imu.residual import ImuFactor
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 GRID_S = 2e-3
@@ -265,7 +265,7 @@ class DriveProblem:
         return make_pieces(self.n_nodes, self.layout.size)
 
     def residuals(self):
-        return np.zeros((self.n_nodes - 1, ROWS)), self.wheels.output()
+        return self.imu.output(), self.wheels.output()
 
     def settled(self, _at):
         return self  # no points of the scene

@@ -141,7 +141,9 @@ def test_recordings_that_do_not_see_the_floor_have_no_part(world_of, drive_of_ki
     factor = GroundFactor.build("wheel0", FLOOR, (None, KEY), state, world.imu, world.layout)
     assert factor.nodes.tolist() == list(range(30, len(state.seconds) - 1))
     none = GroundFactor.build("wheel0", FLOOR, (None, None), state, world.imu, world.layout)
-    found: Any = SimpleNamespace(problem=SimpleNamespace(sensors=(factor, none)))
+    found: Any = SimpleNamespace(
+        problem=SimpleNamespace(factors={("seen", "ground"): factor, ("unseen", "ground"): none})
+    )
     (words,) = ground_warnings(found)
     assert (
         "none of the planes that LiDARs see is a floor" in words and "the ground of wheel0 counts for nothing" in words

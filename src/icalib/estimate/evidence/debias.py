@@ -116,7 +116,7 @@ class _Noise:
         """(B, B), where the trajectory follows noise of the `readings` beside a draw `chain` (K, 15) of its posterior,
         but that noise once."""
         everywhere = _with_noise(self.problem, self.outcome.state, readings)
-        between_nodes = replace(self.problem, chain=everywhere.chain)
+        between_nodes = self.problem.replacing([everywhere.chain])
         return self.added(chain + self._step(everywhere), readings) - self.added(self._step(between_nodes), None)
 
     def _step(self, problem: Problem) -> np.ndarray:
@@ -157,7 +157,5 @@ def _with_noise(problem: Problem, state: State, readings: np.ndarray) -> Problem
     old = problem.chain.imu
     imu = replace(old, gyro=old.gyro + readings[:, :3], accel=old.accel + readings[:, 3:])
     factor = ImuFactor.build(imu, state, problem.chain.gravity, problem.chain.columns)
-    cameras = tuple(replace(c, imu=imu) for c in problem.cameras)
-    features = None if problem.features is None else replace(problem.features, cameras=cameras)
-    sensors = tuple(s.with_imu(imu) for s in problem.sensors)
-    return replace(problem, chain=factor, cameras=cameras, features=features, sensors=sensors)
+    others = [f.with_imu(imu) for f in problem.factors.values() if f is not problem.chain]
+    return problem.replacing([factor, *others])

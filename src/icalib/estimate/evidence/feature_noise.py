@@ -9,10 +9,12 @@ import numpy as np
 from icalib.estimate.problem.assembly import Following, on_the_chain
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
+from icalib.motion.factor import look, pairs_of
 from icalib.optim.arrowhead import chain_cuts
 from icalib.optim.medians import grouped_quantiles, largest_normal, median_variance
 from icalib.rig import Camera, Settings
-from icalib.sensors.camera.features.feature_factor import FeatureFactor, FeatureOutput
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.feature_statistics import FeatureOutput
 from icalib.sensors.camera.features.tracks import TrackNoise
 
 FIRST_GUESS_PX = 1.0
@@ -36,8 +38,7 @@ def first_following(inputs: Inputs) -> Following | None:
 def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool) -> Following:
     """Of the next pass: noise as the residuals show it, where it is not given, and all observations but the outliers
     that stand out after the `first` pass or another."""
-    rig, factor, out = inputs.rig, outcome.problem.features, outcome.residuals.features
-    assert factor is not None and out is not None
+    rig, ((factor, out),) = inputs.rig, pairs_of(outcome.problem.factors, outcome.residuals, FeatureFactor)
     noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(rig.cameras))
     if rig.settings.outlier_std <= 0.0:
         return Following(noise, now.keep, now.outliers)
@@ -45,7 +46,7 @@ def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool
     # what a lens that was not found yet made an outlier may be none.
     shown = on_the_chain(inputs, outcome.state, factor.cameras)
     anew = replace(factor, noise=noise, keep=shown).cut(outcome.state, chain_cuts(factor.n_nodes))
-    left, share = anew.look(outcome.state), GOOD_AT_FIRST if first else GOOD
+    left, share = look(anew, outcome.state), GOOD_AT_FIRST if first else GOOD
     # The next pass uses no observation that was not judged, as those of tracks that the poses do not find.
     judged = [_judged(anew, left, i, rig.settings, share) for i in range(len(shown))]
     return Following(noise, tuple(good for good, _ in judged), tuple(outliers for _, outliers in judged))

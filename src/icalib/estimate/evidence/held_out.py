@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.estimate.evidence.parts import Parts
-from icalib.estimate.problem.problem import Residuals
+from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Piece, given_border, in_parallel
 from icalib.optim.border import HELD_BELOW, complement, restricted_inverse
 

@@ -9,9 +9,10 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimate.problem.gauge import FRAME, IN_THE_WORLD, hold_frame
 from icalib.estimate.problem.outcome import Outcome
-from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.estimate.problem.problem import Problem
+from icalib.motion.factor import Residuals
+from icalib.motion.free_nodes import FreeNodes
 from icalib.optim.arrowhead import Piece, in_parallel, marginalise
-from icalib.optim.free_nodes import FreeNodes
 from icalib.optim.state import State
 
 FEWEST_NODES = 3  # between the ends of a part
@@ -24,7 +25,7 @@ LOOSE_FRAME = 1e-3
 
 @dataclass(frozen=True)
 class Parts:
-    """Of `problem`, in which features end where parts do, at `state`; ends (G + 1,): nodes between which parts lie.
+    """Of `problem`, in which tracks end where parts do, at `state`; ends (G + 1,): nodes between which parts lie.
 
     sums (G, B + 1, B + 1): each part's information of the border, its gradient in the last column.
     """
@@ -60,7 +61,7 @@ class Parts:
         """All sums of part `g`, its nodes not yet eliminated; fills `scratch` for its measurements."""
         problem, state = self.problem, self.state
         first, last = (int(k) for k in self.ends[g : g + 2])
-        piece = problem.with_features(Piece.zeros(first, last, problem.layout.size))
+        piece = problem.attach(Piece.zeros(first, last, problem.layout.size))
         problem.add_measurements(state, piece, scratch)
         problem.add_bias_prior(state, piece)
         if not problem.framed:
@@ -84,7 +85,8 @@ def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
     """
     if not isinstance(problem.chain, FreeNodes):
         return min(count, (problem.n_nodes - 1) // FEWEST_NODES), FEWEST_NODES
-    if problem.sensors:  # poses at rest, of which there may be few
+    others = [f for f in problem.factors.values() if f is not problem.chain]
+    if any(f.is_sparse for f in others):  # poses at rest, of which there may be few
         fewer = min(count, problem.n_nodes // FEWEST_NODES)
         return fewer if fewer >= FEWEST_PARTS else 0, FEWEST_NODES
     few = count > 0 and problem.n_nodes <= FEWEST_NODES * count

@@ -11,30 +11,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from icalib.estimate.evidence.evidence import spread_covariance
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
+from icalib.motion.factor import FactorKey, of_type
 from icalib.optim.arrowhead import Piece
 from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
 
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side
 TRACK_GROUPS = 24  # their spread knows a variance to 1 / sqrt(12); twice as many, to 1 / sqrt(24) at twice the cost
 
 
-@dataclass(frozen=True)
-class Clusters:
-    """By camera the cluster of every corner (N,) and of every observation of a track (M,); count: of clusters."""
-
-    corners: list[np.ndarray]
-    tracks: list[np.ndarray]
-
-    @property
-    def count(self) -> int:
-        return 1 + max(int(c.max(initial=-1)) for c in (*self.corners, *self.tracks))
+Clusters = dict[FactorKey, Any]  # of each factor that has any, the cluster of every measurement
 
 
 @dataclass(frozen=True)
@@ -48,47 +42,46 @@ class ClusterCovariances:
 
 def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariances:
     """Cluster-robust (sandwich) covariances of the calibration parameters."""
-    kinds, tracked = list(_kinds(problem)), problem.features is not None
+    features = of_type(problem.factors, FeatureFactor)
+    kinds = list(_kinds(problem))
     if not kinds:
         return ClusterCovariances([], None)
-    if tracked:
-        kinds.append(_track_groups(problem))
+    # Features by number, so that all views of one, by all cameras, are in one group; corners are in none.
+    kinds += [{f.key: [(s.feature % TRACK_GROUPS).astype(np.int32) for s in f.streams]} for f in features]
     gradients = _cluster_gradients(problem, outcome, kinds)
-    places = gradients[:-1] if tracked else gradients
+    places = gradients[:-1] if features else gradients
     places = [spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])) for b in places]
-    if not tracked:
+    if not features:
         return ClusterCovariances(places, None)
     b = gradients[-1] - gradients[-1].mean(axis=0)
     return ClusterCovariances(places, len(b) / (len(b) - 1.0) * spread_covariance(problem, outcome, b))
 
 
 def _kinds(problem: Problem) -> Iterator[Clusters]:
-    cornered = any(len(c.stream.uv) for c in problem.cameras)
-    if cornered or problem.features is not None:
-        yield _image_cells(problem)
+    cameras, features = of_type(problem.factors, CornerFactor), of_type(problem.factors, FeatureFactor)
+    cornered = any(len(c.stream.uv) for c in cameras)
+    if cornered or features:
+        yield _image_cells(cameras, features)
     if cornered:
-        yield Clusters([_target_parts(c) for c in problem.cameras], [])
-        yield Clusters([_tag_corners(c, k) for k, c in enumerate(problem.cameras)], [])
+        yield {c.key: _target_parts(c) for c in cameras}
+        yield {c.key: _tag_corners(c, k) for k, c in enumerate(cameras)}
 
 
-def _image_cells(problem: Problem) -> Clusters:
+def _image_cells(cameras: tuple[CornerFactor, ...], features: tuple[FeatureFactor, ...]) -> Clusters:
     """Cells of the image, cameras apart; corners and tracks in the same ones."""
-    followed = [np.zeros((0, 2)) for _ in problem.cameras]
-    if problem.features is not None:
-        followed = [stream.uv for stream in problem.features.streams]
-    corners, tracks = [], []
-    for index, (camera, uv) in enumerate(zip(problem.cameras, followed, strict=True)):
-        cells = _cells(np.concatenate([camera.stream.uv, uv]), index)
-        corners.append(cells[: len(camera.stream.uv)])
-        tracks.append(cells[len(camera.stream.uv) :])
-    return Clusters(corners, tracks if problem.features is not None else [])
+    clusters: Clusters = {f.key: [] for f in features}
+    for index, camera in enumerate(cameras):
+        n = len(camera.stream.uv)
+        cells = _cells(np.concatenate([camera.stream.uv, *(f.streams[index].uv for f in features)]), index)
+        clusters[camera.key] = cells[:n]
+        for f in features:
+            clusters[f.key].append(cells[n:])
+    return clusters
 
 
-def _track_groups(problem: Problem) -> Clusters:
-    """Features by number, so that all views of one, by all cameras, are in one group; corners in none of their own."""
-    assert problem.features is not None
-    corners = [np.zeros(len(c.stream.uv), dtype=np.int32) for c in problem.cameras]
-    return Clusters(corners, [(s.feature % TRACK_GROUPS).astype(np.int32) for s in problem.features.streams])
+def _count(clusters: Clusters) -> int:
+    arrays = [a for own in clusters.values() for a in (own if isinstance(own, list) else [own])]
+    return 1 + max(int(a.max(initial=-1)) for a in arrays)
 
 
 def _cells(uv: np.ndarray, index: int) -> np.ndarray:
@@ -122,13 +115,13 @@ def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
 
 def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[Clusters]) -> list[np.ndarray]:
     """Of each of `kinds` of clusters (clusters, B), the gradient of each cluster; chain and points are marginalised."""
-    counts = [kind.count for kind in kinds]
+    counts = [_count(kind) for kind in kinds]
     B, state, at = problem.layout.size, outcome.state, problem.scratch(outcome.residuals)
     starts = B + np.cumsum([0, *counts])
 
     def segment(first: int, last: int) -> Piece:
         piece = Piece.zeros(first, last, int(starts[-1]))
-        narrow = problem.with_features(problem.narrow(piece, B))
+        narrow = problem.attach(problem.narrow(piece, B))
         problem.add_measurements(state, narrow, at)
         problem.add_bias_prior(state, narrow)
         problem.hold_frames(state, narrow)
@@ -137,10 +130,9 @@ def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[Clusters]
         if narrow.features is not None:
             piece = replace(piece, features=narrow.features.widened(int(starts[-1])))
         for kind, n, column in zip(kinds, counts, starts[:-1].tolist(), strict=True):
-            for camera, corners, cluster in zip(problem.cameras, at.corners, kind.corners, strict=True):
-                camera.accumulate_clusters(state, piece, corners, cluster, n, column)
-            if problem.features is not None and at.features is not None and kind.tracks:
-                problem.features.accumulate_clusters(state, piece, at.features, kind.tracks, n, column)
+            for key, cluster in kind.items():
+                factor: Any = problem.factors[key]  # of those that have clusters
+                factor.accumulate_clusters(state, piece, at[key], cluster, n, column)
         return piece
 
     rest = problem.marginal(segment)

@@ -13,14 +13,14 @@ from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.problem import ChainFactor, Problem
 from icalib.geometry.cameras import camera_model
 from icalib.motion.clocks import EARLY_S, instants
-from icalib.motion.factor import SensorFactor
+from icalib.motion.factor import Factor, keyed
+from icalib.motion.free_nodes import FreeNodes
 from icalib.motion.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
 from icalib.motion.poses import assign_nodes, poses_at
 from icalib.motion.sweep import Motion
 from icalib.optim import pages
 from icalib.optim.arrowhead import chain_cuts
 from icalib.optim.border import NOTHING
-from icalib.optim.free_nodes import FreeNodes
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
@@ -37,7 +37,8 @@ from icalib.sensors.camera.features.surfaces import Surfaces
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.lidar_binning import points_on_planes
-from icalib.sensors.robot import NO_ROBOT, RobotNoise, robot_factors, still_factors
+from icalib.sensors.pose.factors import still_factors
+from icalib.sensors.robot import NO_ROBOT, RobotNoise, robot_factors
 
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
@@ -199,8 +200,9 @@ def assemble(
         found = None if following is None else aside.submit(_features, inputs, state, tuple(factors), following)
         others = _others(inputs, state, robot)
         features = None if found is None else found.result()
+    tracked = () if features is None else (features,)
     return Problem(
-        layout, _chain(inputs, state), tuple(factors), _priors(inputs), inputs.tolerance, held, features, others,
+        layout, keyed((_chain(inputs, state), *factors, *tracked, *others)), _priors(inputs), inputs.tolerance, held,
         rig.has_target or rig.imu is None or (rig.assumes_motion and rig.moves_by_poses), not rig.assumes_motion,
     )  # fmt: skip
 
@@ -211,11 +213,11 @@ def motion_of(inputs: Inputs, state: State) -> Motion:
     return Motion(state, inputs.imu, inputs.rig.gravity, inputs.rig.settings.max_gap_s)
 
 
-def _others(inputs: Inputs, state: State, noise: RobotNoise) -> tuple[SensorFactor, ...]:
+def _others(inputs: Inputs, state: State, noise: RobotNoise) -> tuple[Factor, ...]:
     if inputs.imu is None:
         begins = [part.begin - EARLY_S for part in inputs.parts[1:]]
         starts = (0, *(int(k) for k in np.searchsorted(state.seconds, begins)))
-        return still_factors(inputs.rig, inputs.measurements.poses, noise, state, starts, inputs.layout)
+        return still_factors(inputs.measurements.poses, noise.posing, state, starts, inputs.layout)
     motion = motion_of(inputs, state)
     return robot_factors(inputs.rig, inputs.measurements, inputs.clouds, noise, motion, inputs.layout)
 

@@ -12,6 +12,7 @@ from icalib.data.joining import Part, join
 from icalib.data.measurements import Measurements, Stream
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets.base import BOARD
+from icalib.motion.clouds import NO_CLOUDS, Clouds
 from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.optim.state import Entry, Key, Layout, State, in_recording, make_layout
 from icalib.rig import Camera, Lidar, ParameterSpec, PoseSensor, Rig, Wheels
@@ -20,7 +21,8 @@ from icalib.rig.scene import TILT
 from icalib.rig.sensor import MOUNTED, TIME_OFFSET
 from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
 from icalib.sensors.camera.images import on_common_images
-from icalib.sensors.robot import NO_CLOUDS, Clouds, frame_entries, own_entries
+from icalib.sensors.pose.factors import frame_entries
+from icalib.sensors.robot import own_entries
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.estimate.problem.problem import Problem
+from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Draw, Piece, Solution, solve
 from icalib.optim.border import NOTHING
 from icalib.optim.state import State

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol
+from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from icalib.estimate.problem.gauge import hold_frame
-from icalib.motion.factor import SensorFactor, Whitened
+from icalib.motion.factor import Factor, FactorKey, Residuals, Whitened, keyed
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces, marginalise, marginalise_in_segments
 from icalib.optim.border import NOTHING
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Layout, State
-from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
-from icalib.sensors.camera.features.feature_factor import FeatureFactor, FeatureOutput
-from icalib.sensors.imu.residual import ROWS
 
 
-class ChainFactor(Protocol):
-    """What ties the nodes together: an `ImuFactor`, or `FreeNodes`. kinds: rows of its residuals by name; starts: the
-    first node of each recording, which nothing ties to the one before."""
-
-    @property
-    def name(self) -> str: ...
+@runtime_checkable
+class ChainFactor(Factor, Protocol):
+    """What ties the nodes together: an `ImuFactor`, or `FreeNodes`. kinds: columns of its residuals by name; starts:
+    the first node of each recording, which nothing ties to the one before."""
 
     @property
     def n_nodes(self) -> int: ...
@@ -32,10 +28,11 @@ class ChainFactor(Protocol):
     @property
     def starts(self) -> tuple[int, ...]: ...
 
-    kinds: ClassVar[dict[str, slice]]
+    @property
+    def kinds(self) -> dict[str, slice]: ...
 
-    def accumulate(self, state: State, piece: Piece, out: np.ndarray, sums: bool = True) -> float:
-        """Fills whitened residuals `out` (K - 1, 15) of `piece`, adds them to its sums; returns half the chi^2."""
+    def output(self) -> Whitened:
+        """Rows (K - 1, 15), one an interval between nodes."""
         ...
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
@@ -45,45 +42,47 @@ class ChainFactor(Protocol):
 
 
 @dataclass(frozen=True)
-class Residuals:
-    """What the factors left behind at a state: the chain's whitened residuals (K - 1, 15), the corners' by camera, the
-    features'."""
-
-    imu: np.ndarray
-    corners: tuple[CornerOutput, ...]
-    features: FeatureOutput | None = None
-    sensors: tuple[Whitened, ...] = ()  # but for the cameras
-
-
-@dataclass(frozen=True)
 class Problem:
-    """Minimise half the sum of all squared, whitened, robust residuals over a `State`."""
+    """Minimise half the sum of all squared, whitened, robust residuals over a `State`. factors: one of them is the
+    chain."""
 
     layout: Layout
-    chain: ChainFactor
-    cameras: tuple[CornerFactor, ...]
+    factors: dict[FactorKey, Factor]
     priors: tuple[Prior, ...]
     tolerance: np.ndarray  # (B,) what a user would call the same number; scales the border
     held: np.ndarray = field(
         default_factory=lambda: NOTHING
     )  # (B, m) orthonormal directions of the border, in tolerance units, that stay
-    features: FeatureFactor | None = None
-    sensors: tuple[SensorFactor, ...] = ()  # but for the cameras
     framed: bool = True  # a target says where the world's origin is; else nothing does, and it stays where it is
     levelled: bool = True  # gravity says which way is up
+
+    @cached_property
+    def chain(self) -> ChainFactor:
+        return next(f for f in self.factors.values() if isinstance(f, ChainFactor))
 
     @property
     def n_nodes(self) -> int:
         return self.chain.n_nodes
 
+    @cached_property
+    def ties_distant_nodes(self) -> bool:
+        """Whether segments of the chain do not stand alone."""
+        return any(f.ties_distant_nodes for f in self.factors.values())
+
+    def replacing(self, factors: Sequence[Factor]) -> Problem:
+        """The same problem with other `factors` of the same keys, or more of them."""
+        return replace(self, factors=self.factors | keyed(factors))
+
     def pieces(self, sums: bool = True) -> tuple[Piece, ...]:
         """The chain in pieces; without `sums`, only residuals can be asked for."""
         pieces = make_pieces(self.n_nodes, self.layout.size if sums else None)
-        return tuple(self.with_features(p, len(pieces) > 1) for p in pieces) if sums else pieces
+        return tuple(self.attach(p, len(pieces) > 1) for p in pieces) if sums else pieces
 
-    def with_features(self, piece: Piece, keep: bool = False) -> Piece:
-        """The piece with room for the features seen from its nodes; `keep`: another piece shares a node with it."""
-        return piece if self.features is None else self.features.attach(piece, keep)
+    def attach(self, piece: Piece, keep: bool = False) -> Piece:
+        """The piece with room for what factors eliminate; `keep`: another piece shares a node with it."""
+        for factor in self.factors.values():
+            piece = factor.attach(piece, keep)
+        return piece
 
     def without(self, priors: Sequence[Prior]) -> Problem:
         """The same problem, in which `priors` of it count no more."""
@@ -91,28 +90,23 @@ class Problem:
         return replace(self, priors=tuple(p for p in self.priors if id(p) not in gone))
 
     def cut(self, state: State, nodes: np.ndarray) -> Problem:
-        """The same problem, in which features end at `nodes`, so that pieces between these can stand alone."""
-        if self.features is None:
-            return self
-        return replace(self, features=self.features.cut(state, tuple(int(k) for k in nodes)))
+        """The same problem, in which nothing ties nodes on both sides of one of `nodes` but the chain, so that pieces
+        between these can stand alone."""
+        ends = tuple(int(k) for k in nodes)
+        return self.replacing([f.cut(state, ends) for f in self.factors.values()])
 
     def marginal(self, sums_of: Callable[[int, int], Piece]) -> np.ndarray:
         """Border (B + 1, B + 1) of `sums_of` from one node to another, all nodes eliminated: a segment at a time, but
-        where features tie distant nodes."""
-        if self.features is not None:
+        where factors tie distant nodes."""
+        if self.ties_distant_nodes:
             return marginalise(sums_of(0, self.n_nodes - 1))
         return marginalise_in_segments(sums_of, self.n_nodes)
 
     def sums_of(self, state: State, first: int, last: int) -> Piece:
         """The sums between two nodes alone, with the true curvature of robust losses; residuals are not kept."""
-        piece = self.with_features(Piece.zeros(first, last, self.layout.size))
-        self.chain.accumulate(state, piece, np.zeros((self.n_nodes - 1, ROWS)))
-        for camera in self.cameras:
-            camera.accumulate(state, piece, None, curved=True)
-        if self.features is not None:
-            self.features.accumulate(state, piece, self.features.output(), curved=True)
-        for sensor in self.sensors:
-            sensor.accumulate(state, piece, sensor.output(), curved=True)
+        piece = self.attach(Piece.zeros(first, last, self.layout.size))
+        for factor in self.factors.values():
+            factor.accumulate(state, piece, factor.throwaway(), curved=True)
         self.add_bias_prior(state, piece)
         for prior in self.priors if first == 0 else ():
             prior.accumulate(state, piece)
@@ -121,25 +115,20 @@ class Problem:
 
     def residuals(self) -> Residuals:
         """Empty arrays for `linearise` to fill."""
-        corners = tuple(c.output() for c in self.cameras)
-        features = None if self.features is None else self.features.output()
-        sensors = tuple(s.output() for s in self.sensors)
-        return Residuals(np.zeros((self.n_nodes - 1, ROWS)), corners, features, sensors)
+        return {key: factor.output() for key, factor in self.factors.items()}
 
     def scratch(self, at: Residuals) -> Residuals:
-        """`at`, to be filled once more, with room for features of this problem's own."""
-        return replace(at, features=None if self.features is None else self.features.output())
+        """`at`, to be filled once more, with new arrays where this problem's own are of another size."""
+        return {key: factor.scratch(at[key]) for key, factor in self.factors.items()}
 
     def settled(self, at: Residuals) -> Problem:
         """The same problem, points of the scene first looked for where they were at `at`."""
-        if self.features is None or at.features is None:
-            return self
-        return replace(self, features=self.features.settled(at.features))
+        return self.replacing([factor.settled(at[key]) for key, factor in self.factors.items()])
 
     def linearise(
         self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:
-        """Fills `pieces` and `out` at `state`; returns half the robust chi^2. `curved`: see CornerFactor.accumulate."""
+        """Fills `pieces` and `out` at `state`; returns half the robust chi^2. `curved`: see `Factor.accumulate`."""
         return sum(in_parallel(lambda p: self._accumulate(state, p, out, sums, curved), pieces))
 
     def _accumulate(self, state: State, piece: Piece, out: Residuals, sums: bool, curved: bool) -> float:
@@ -161,15 +150,8 @@ class Problem:
     def add_measurements(
         self, state: State, piece: Piece, out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:
-        """Adds IMU, corners, features and other sensors in `piece`; returns half their robust chi^2."""
-        cost = self.chain.accumulate(state, piece, out.imu, sums)
-        for camera, corners in zip(self.cameras, out.corners, strict=True):
-            cost += camera.accumulate(state, piece, corners, sums, curved)
-        if self.features is not None and out.features is not None:
-            cost += self.features.accumulate(state, piece, out.features, sums, curved)
-        for sensor, rows in zip(self.sensors, out.sensors, strict=True):
-            cost += sensor.accumulate(state, piece, rows, sums, curved)
-        return cost
+        """Adds all factors in `piece`; returns half their robust chi^2."""
+        return sum(f.accumulate(state, piece, out[key], sums, curved) for key, f in self.factors.items())
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """Adds the broad prior on the biases of recordings' first nodes, about those that the pass started from."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimate.problem.outcome import STALLED_DECREASE, Outcome, Step, Visit, outcome_of, way_come
-from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.estimate.problem.problem import Problem
+from icalib.motion.factor import Residuals
 from icalib.optim.anderson import PROMISED, Accelerator
 from icalib.optim.arrowhead import NotDefiniteError, Piece, Solution, solve
 from icalib.optim.border import DETERMINED, essential_information

@@ -14,11 +14,11 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.detection.planes.planes import MOST_POINTS, FoundPlanes, PlaneSearch, find_planes
 from icalib.errors import EstimationError
+from icalib.motion.clouds import Clouds
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import in_parallel
 from icalib.optim.state import Key
 from icalib.sensors.lidar.lidar_binning import in_world
-from icalib.sensors.robot import Clouds
 
 POINTS_AT_A_TIME = 200_000  # by one thread: what association needs beside the clouds stays small
 ROUNDS = 4

@@ -22,6 +22,7 @@ from icalib.data.measurements import CornerStream
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import BOARD
 from icalib.motion.clocks import mounted_columns, offset_at
+from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, Squares
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import Poses, poses_at, poses_of_nodes
 from icalib.optim import pages
@@ -41,6 +42,8 @@ from icalib.sensors.camera.corner_kernels import (
     accumulate_clusters,
     camera_points,
 )
+from icalib.sensors.camera.corner_statistics import corner_squares, rms_px, spent_by_corners
+from icalib.sensors.camera.views import Views
 
 BLOCK = 256  # images at a time, where nothing is summed
 POSES = 1024  # views at a time, whose poses and how these move are made together
@@ -76,33 +79,7 @@ class CornerOutput:
 
 
 @dataclass(frozen=True)
-class Views:
-    """One body of the target in one image each: corners of view j are start[j]:start[j + 1]; image and body (V,)."""
-
-    start: np.ndarray
-    image: np.ndarray
-    body: np.ndarray
-
-    @classmethod
-    def of(cls, stream: CornerStream, body: np.ndarray) -> Views:
-        """Of a stream whose corners stand body by body in each image; body (n_points,) of each point."""
-        if not body.any():
-            seen = np.flatnonzero(np.diff(stream.start))
-            start = np.append(stream.start[seen], stream.start[-1])
-            return cls(start, seen, np.zeros(len(seen), dtype=np.int64))
-        own, image = body[stream.point], stream.image
-        fresh = np.ones(len(own), dtype=bool)
-        fresh[1:] = (np.diff(image) != 0) | (np.diff(own) != 0)
-        first = np.flatnonzero(fresh)
-        return cls(np.append(first, len(own)).astype(np.int64), image[first], own[first])
-
-    def of_corners(self, v0: int, v1: int) -> np.ndarray:
-        """(n,) the view that each corner of views v0..v1 belongs to."""
-        return np.repeat(np.arange(v0, v1), np.diff(self.start[v0 : v1 + 1]))
-
-
-@dataclass(frozen=True)
-class CornerFactor:
+class CornerFactor(FactorDefaults):
     """All images of one camera.
 
     times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; node (M,), increasing: the node each
@@ -124,6 +101,10 @@ class CornerFactor:
     layout: Layout
     n_nodes: int
     seams: tuple[int, ...] = ()
+
+    @property
+    def key(self) -> FactorKey:
+        return self.name, "corners"
 
     @property
     def name(self) -> str:
@@ -218,6 +199,22 @@ class CornerFactor:
         used = out.root > 0.0
         return float(((self.errors(out)[used] * out.root[used, None]) ** 2).sum(dtype=np.float64))
 
+    def throwaway(self) -> None:
+        """None: arrays for all corners would be large beside those of a piece."""
+
+    def squares(self, out: CornerOutput) -> dict[FitKey, Squares]:
+        """See `Factor`: of the corners, and of each size of the error that an image shares."""
+        return corner_squares(self, out) if len(self.stream.uv) else {}
+
+    def sizes(self, out: CornerOutput) -> dict[FitKey, RawSize]:
+        """See `Factor`; that of the corners stands for the errors that images share, too."""
+        size = RawSize(rms_px(out.residual, out.root), "px", int((out.root == 0.0).sum()))
+        return dict.fromkeys(self.squares(out), size)
+
+    def spent(self, out: CornerOutput, along: Along) -> dict[FitKey, float]:
+        """See `Factor`. A few images at a time: residuals of all at another state would fill the memory."""
+        return spent_by_corners(self, out, along)
+
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
         """The same factor with bloom along `direction` (N, 2)."""
         return replace(self, direction=direction)
@@ -244,11 +241,7 @@ class CornerFactor:
     def accumulate(
         self, state: State, piece: Piece, out: CornerOutput | None, sums: bool = True, curved: bool = False
     ) -> float:
-        """Fills `out`, if given, for the images whose node lies in `piece`, and adds them to its sums where `sums`
-        are wanted.
-
-        Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
-        """
+        """See `Factor`: of the images whose node lies in `piece`. Without `out` residuals are not kept."""
         into, total = piece.sums(sums), 0.0
         for v0, v1, recording in self._blocks_of(piece):
             images, noise, direct, motion = self._arguments(state, v0, v1, recording, curved)

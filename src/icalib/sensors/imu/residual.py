@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import inverse_cholesky, mul3, tmul3
+from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.integration import Increment, bias_of, integrate, integration_room, readings_of
 from icalib.motion.integration_step import COVARIANCE, correction
@@ -20,6 +21,7 @@ from icalib.optim.prior_factor import accumulate_bias_prior
 from icalib.optim.state import State
 
 ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
+KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS)}
 
 
 @njit(cache=True, nogil=True)
@@ -169,17 +171,13 @@ def _accumulate(k1, chain, made, dx, columns, sums, out):
 
 
 @dataclass(frozen=True)
-class ImuFactor:
+class ImuFactor(RowFactor):
     """All intervals of one IMU between neighbouring nodes.
 
     residual (15,) of interval k: Log((dR Exp(J_R db))^T R_k^T R_k+1); R_k^T (v_k+1 - v_k - g dt) - dv - J_v db;
     R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db; b_k+1 - b_k, whitened jointly. The interval before each of
     `starts`, recordings' first nodes, carries no information.
     """
-
-    kinds: ClassVar[dict[str, slice]] = {
-        "gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS),
-    }  # fmt: skip
 
     imu: ImuData
     gravity: float
@@ -193,8 +191,31 @@ class ImuFactor:
         return self.imu.name
 
     @property
+    def key(self) -> FactorKey:
+        return self.name, "readings"
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `RowFactor`."""
+        return KINDS
+
+    @property
     def n_nodes(self) -> int:
         return len(self.made.dR) + 1
+
+    def output(self) -> Whitened:
+        """Empty rows (K - 1, 15) for `accumulate` to fill."""
+        return Whitened.without_loss(self.n_nodes - 1, ROWS)
+
+    def count(self, out: Whitened, kind: str) -> int:
+        """Rows of a kind, without those of intervals between recordings."""
+        rows = out.residual[:, self.kinds[kind]]
+        return rows.size - (len(self.starts) - 1) * rows.shape[1]
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float | None, str]:
+        """None: rows of an interval are whitened jointly."""
+        del out, kind
+        return None, ""
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """The broad prior on the biases of the recordings' first nodes in `piece`, about those of the pass's start.
@@ -231,11 +252,9 @@ class ImuFactor:
         dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
         return cls(imu, gravity, columns, Increments(*arrays, bias0), intrinsics, state.starts)
 
-    def accumulate(self, state: State, piece: Piece, out: np.ndarray, sums: bool = True) -> float:
-        """Fills whitened residuals `out` (K - 1, 15) for the intervals in `piece`, and adds them to its sums.
-
-        Returns half the chi^2.
-        """
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See `Factor`. There is no robust loss, so `curved` changes nothing."""
+        del curved
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0 if len(self.columns) else np.zeros(0)
         chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, self.gravity)
-        return _accumulate(piece.last, chain, self.made, dx, self.columns, piece.sums(sums), out)
+        return _accumulate(piece.last, chain, self.made, dx, self.columns, piece.sums(sums), out.residual)

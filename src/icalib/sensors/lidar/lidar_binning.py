@@ -39,6 +39,7 @@ from icalib.sensors.lidar.lidar_moments import (
 )
 
 BIN_S = 3e-3
+COARSE_BIN_S = 11e-3  # while all is only about where it is
 STEP_S = 1e-3  # of a longer bin
 LOOKED_AT = 500_000  # points of a LiDAR show where planes end
 POINTS_AT_A_TIME = 150_000  # by one thread: what a chunk needs beside the cloud stays small

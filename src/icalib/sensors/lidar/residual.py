@@ -9,7 +9,7 @@ runs. Its residuals are the four of each plane in a bin that stand for all point
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from icalib.data.measurements import LidarStream
 from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
-from icalib.motion.factor import Whitened
+from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import assign_nodes, poses_at
 from icalib.motion.sweep import Motion as ImuMotion
@@ -33,7 +33,7 @@ CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 
 
 @dataclass(frozen=True)
-class LidarFactor:
+class LidarFactor(RowFactor):
     """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on; walked (n,), turned
     (E, 3, 4), slope (E, 3): see `Bins`, at the state that the pass starts from; planes: keys of the values that the
     rows of the moments' planes have in a state."""
@@ -97,21 +97,20 @@ class LidarFactor:
         return np.array([self.layout.block(*p).columns for p in self.planes])
 
     @property
-    def kinds(self) -> dict[str, slice]:
-        """See `SensorFactor`."""
-        return {"points": slice(0, ROWS)}
+    def key(self) -> FactorKey:
+        return self.name, "points"
 
-    def with_imu(self, imu: ImuData) -> LidarFactor:
-        """See `SensorFactor`."""
-        return replace(self, imu=imu)
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `RowFactor`."""
+        return {"points": slice(0, ROWS)}
 
     def output(self) -> Whitened:
         """Empty rows (E, 4) for `accumulate` to fill; the moments hold the robust weights."""
-        shape = len(self.moments.plane), ROWS
-        return Whitened(np.zeros(shape), np.broadcast_to(1.0, shape))
+        return Whitened.without_loss(len(self.moments.plane), ROWS)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `SensorFactor`. `curved` changes nothing: within a pass weights are constant."""
+        """See `Factor`. `curved` changes nothing: within a pass weights are constant."""
         del curved
         into, total = piece.sums(sums), 0.0
         for bins, motion, planes in self._chunks(state, *self._bins_of(piece)):

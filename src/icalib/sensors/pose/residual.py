@@ -11,14 +11,14 @@ frame_translation (R_world_frame, p_world_frame), in each recording its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from icalib.data.measurements import PoseStream
 from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
-from icalib.motion.factor import Whitened
+from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.nodes import MERGED_WITHIN_S, usable
 from icalib.motion.pose_rows import Frame, Mount, PoseRows, absolute_rows, add_chain_rule, relative_rows
@@ -54,7 +54,7 @@ def frame_of(sensor: str, recording: int) -> str:
 
 
 @dataclass(frozen=True)
-class AbsolutePoseFactor:
+class AbsolutePoseFactor(RowFactor):
     """n poses of one sensor in its frame, see `pose_rows.absolute_rows`. node (n,), in order: of each; sigma: of its
     rotation [rad] and position [m]. imu: None where poses were taken at nodes, which nothing ties to each other."""
 
@@ -110,28 +110,24 @@ class AbsolutePoseFactor:
         return np.tile(np.repeat([self.noise.rotation, self.noise.position], 3), (len(self.seconds), 1))
 
     @property
-    def kinds(self) -> dict[str, slice]:
-        """See `SensorFactor`."""
-        return KINDS
+    def key(self) -> FactorKey:
+        return self.name, "poses"
 
-    def with_imu(self, imu: ImuData) -> AbsolutePoseFactor:
-        """See `SensorFactor`."""
-        return replace(self, imu=imu)
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `Factor`."""
+        return KINDS
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.seconds), 6)
-
-    def count(self, out: Whitened, kind: str) -> int:
-        """Poses times the rows of `kind`."""
-        return out.residual[:, KINDS[kind]].size
 
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
         """Of the residuals of `kind`."""
         return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `SensorFactor`."""
+        """See `Factor`."""
         cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last node is an end
         edges = np.searchsorted(self.node, (*self.starts, self.n_nodes))
         low, high = np.searchsorted(at, [piece.first, piece.last])
@@ -172,7 +168,7 @@ class AbsolutePoseFactor:
 
 
 @dataclass(frozen=True)
-class RelativePosesFactor:
+class RelativePosesFactor(RowFactor):
     """n ways of one sensor, see `pose_rows.relative_rows`, each between two of its stamps about from node to node;
     duration (n,) s. Their noise is that of a random walk, and independent."""
 
@@ -212,28 +208,24 @@ class RelativePosesFactor:
         return np.sqrt(duration)[:, None] * np.repeat([self.noise.rotation, self.noise.position], 3)
 
     @property
-    def kinds(self) -> dict[str, slice]:
-        """See `SensorFactor`."""
-        return KINDS
+    def key(self) -> FactorKey:
+        return self.name, "poses"
 
-    def with_imu(self, imu: ImuData) -> RelativePosesFactor:
-        """See `SensorFactor`."""
-        return replace(self, imu=imu)
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `Factor`."""
+        return KINDS
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.rotation), 6)
-
-    def count(self, out: Whitened, kind: str) -> int:
-        """Stretches times the rows of `kind`."""
-        return out.residual[:, KINDS[kind]].size
 
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
         """Of the residuals of `kind`."""
         return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `SensorFactor`."""
+        """See `Factor`."""
         low, high = (int(k) for k in np.searchsorted(self.intervals.node, [piece.first, piece.last]))
         into, cost = Into(piece, out, sums, curved), 0.0
         for clock, part in by_clock(state, self.name, self.intervals.node[low:high]):

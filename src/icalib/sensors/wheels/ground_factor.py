@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.geometry import planes
-from icalib.motion.factor import Whitened
+from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.row_sums import Into, RobustNoise, add_rows
 from icalib.optim.arrowhead import Piece
@@ -55,7 +55,7 @@ def _is_floor(plane: np.ndarray, above: np.ndarray) -> bool:
 
 
 @dataclass(frozen=True)
-class GroundFactor:
+class GroundFactor(RowFactor):
     """Rows of the wheels `name` at n nodes: tilt about both level axes, height, and what was measured of it; those that
     `ground` does not ask for weigh nothing. floor: the key of the plane in each recording; None: the horizon's, or none
     where `ground` asks for a floor that is not seen."""
@@ -82,8 +82,12 @@ class GroundFactor:
         return cls(name, ground, floor, nodes, state.starts, imu, layout)
 
     @property
+    def key(self) -> FactorKey:
+        return self.name, "ground"
+
+    @property
     def kinds(self) -> dict[str, slice]:
-        """See `SensorFactor`."""
+        """See `Factor`."""
         tilt = {TILT: slice(0, 2)} if self.ground.tilt_noise is not None else {}
         return tilt | ({HEIGHT: slice(2, 3)} if self.ground.height_sigma is not None else {})
 
@@ -104,10 +108,6 @@ class GroundFactor:
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.nodes), 4)
 
-    def count(self, out: Whitened, kind: str) -> int:
-        """Nodes times the rows of `kind`."""
-        return out.residual[:, self.kinds[kind]].size
-
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
         """Of the residuals of `kind`."""
         rows = self.kinds[kind]
@@ -115,7 +115,7 @@ class GroundFactor:
         return float(np.sqrt(np.mean(r**2))) if r.size else 0.0, "rad" if kind == TILT else "m"
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `SensorFactor`."""
+        """See `Factor`."""
         cost = 0.0
         ends = (*self.starts[1:], len(state.seconds))
         for begin, end, key in zip(self.starts, ends, self.floor, strict=True):

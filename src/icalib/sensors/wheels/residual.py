@@ -14,14 +14,14 @@ their kind: of a pair radii (left, right) and baseline, the distance between the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from icalib.data.measurements import WheelPoses
 from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
-from icalib.motion.factor import Whitened
+from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import Poses, Velocities, motion_at, poses_alone, poses_at
 from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
@@ -54,7 +54,7 @@ class WheelNoise:
 
 
 @dataclass(frozen=True)
-class IncrementFactor:
+class IncrementFactor(RowFactor):
     """Increments over n intervals. With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along the
     `inertial` scheme, X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval of
     length dt are those of `wheel_drives`; of a pair
@@ -77,6 +77,10 @@ class IncrementFactor:
     gravity: float
     noise: WheelNoise
     layout: Layout
+
+    @property
+    def key(self) -> FactorKey:
+        return self.name, "wheels"
 
     @property
     def kinds(self) -> Kinds:
@@ -116,17 +120,9 @@ class IncrementFactor:
         instants = quadrature(seconds, found, change)
         return cls(name, kind, found, measured, mean, whitening, instants, imu, gravity, noise, layout)
 
-    def with_imu(self, imu: ImuData) -> IncrementFactor:
-        """See `SensorFactor`."""
-        return replace(self, imu=imu)
-
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.measured), 4)
-
-    def count(self, out: Whitened, kind: str) -> int:
-        """Intervals times the rows of `kind`."""
-        return out.residual[:, self.kinds[kind]].size
 
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
         """Of the residuals of `kind`."""
@@ -158,7 +154,7 @@ class IncrementFactor:
 
 
 @dataclass(frozen=True)
-class RelativePoseFactor:
+class RelativePoseFactor(RowFactor):
     """Planar poses of the wheels over n intervals, paper (27)-(28):
 
         e_3 Log(R_wheel(k)_wheel(k+1)) - yaw
@@ -223,21 +219,17 @@ class RelativePoseFactor:
         return cls(name, seconds, found, poses, imu, gravity, noise, layout)
 
     @property
-    def kinds(self) -> dict[str, slice]:
-        """See `SensorFactor`."""
-        return {"yaw": slice(0, 1), "path": slice(1, 3)}
+    def key(self) -> FactorKey:
+        return self.name, "wheels"
 
-    def with_imu(self, imu: ImuData) -> RelativePoseFactor:
-        """See `SensorFactor`."""
-        return replace(self, imu=imu)
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `Factor`."""
+        return {"yaw": slice(0, 1), "path": slice(1, 3)}
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.poses.z), 3)
-
-    def count(self, out: Whitened, kind: str) -> int:
-        """Intervals times the rows of `kind`."""
-        return out.residual[:, self.kinds[kind]].size
 
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
         """Of the residuals of `kind`."""

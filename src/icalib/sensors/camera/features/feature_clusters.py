@@ -10,7 +10,7 @@ from icalib.sensors.camera.features.feature_kernels import weighted_rows
 
 
 @njit(cache=True, nogil=True)
-def accumulate_clusters(X, seen, base, motion, seeing, weighing, cluster, n_clusters, column, sums, side):
+def accumulate_clusters(X, seen, base, motion, seeing, loss, cluster, n_clusters, column, sums, side):
     """Of one camera's observations, whose points are at X (n, 3) in it: the gradient of each cluster, cluster (N,) of
     them, into columns `column` and on of the piece's sums and of side (T, 3, columns) of its features."""
     n_d = len(seeing.pars)
@@ -22,7 +22,7 @@ def accumulate_clusters(X, seen, base, motion, seeing, weighing, cluster, n_clus
         for n in range(seen.start[i], seen.start[i + 1]):
             if seen.track[n] < 0:
                 continue
-            root, _ = weighted_rows(i, n, X, seen, seeing, weighing, motion.R_cam_world, error, A)
+            root, _ = weighted_rows(i, n, X, seen, seeing, loss, motion.R_cam_world, error, A)
             if root == 0.0:
                 continue
             for d in range(6 + n_d):

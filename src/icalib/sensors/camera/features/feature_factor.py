@@ -11,12 +11,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from icalib.data.measurements import TrackStream
 from icalib.motion.clocks import clock_of, mounted_columns
-from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
+from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, Squares
+from icalib.motion.imu_data import ImuData
+from icalib.optim.arrowhead import Piece
 from icalib.optim.front import Features
 from icalib.optim.front_plan import FeatureSums, plan
 from icalib.optim.medians import median_variance
@@ -30,11 +33,16 @@ from icalib.sensors.camera.features.feature_kernels import (
     Points,
     Range,
     Seen,
-    Weighing,
     accumulate,
     add_rays,
     held_back,
     take_trials,
+)
+from icalib.sensors.camera.features.feature_statistics import (
+    FeatureOutput,
+    feature_sizes,
+    feature_squares,
+    spent_by_features,
 )
 from icalib.sensors.camera.features.feature_views import View
 from icalib.sensors.camera.features.surfaces import (
@@ -55,18 +63,7 @@ MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits wors
 
 
 @dataclass(frozen=True)
-class FeatureOutput:
-    """By camera: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
-    left out); points (T, 3) in the frames of the cameras that they move with, and how far each is off its plane."""
-
-    residual: tuple[np.ndarray, ...]
-    root: tuple[np.ndarray, ...]
-    points: np.ndarray
-    off: Distances
-
-
-@dataclass(frozen=True)
-class FeatureFactor:
+class FeatureFactor(FactorDefaults):
     """All features of all cameras. cameras: their poses and models; streams: one per camera, on its images; noise: of
     each camera's observations; keep: (N,) by camera, observations in use; seams: nodes at which further recordings
     begin; surfaces: planes that points may lie on, and which tracks are on them."""
@@ -101,6 +98,17 @@ class FeatureFactor:
         factor = cls(cameras, streams, noise, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
         return factor.cut(state, cuts)
 
+    ties_distant_nodes: ClassVar[bool] = True
+
+    @property
+    def name(self) -> str:
+        """Of all cameras: a track is one feature that several may see."""
+        return "cameras"
+
+    @property
+    def key(self) -> FactorKey:
+        return self.name, "features"
+
     @cached_property
     def sigmas(self) -> tuple[np.ndarray, ...]:
         """(N,) px, by camera: of each observation, per axis."""
@@ -115,11 +123,11 @@ class FeatureFactor:
         """How many observations take part."""
         return sum(int((t >= 0).sum()) for t in self.tracks.track)
 
-    def cut(self, state: State, cuts: tuple[int, ...]) -> FeatureFactor:
-        """The same features as tracks that end at nodes `cuts`. A track is left out whose point the poses of `state` do
+    def cut(self, state: State, nodes: tuple[int, ...]) -> FeatureFactor:
+        """The same features as tracks that end at `nodes`. A track is left out whose point the poses of `state` do
         not find where all its images can show it, whose distance they leave uncertain, or that fits far worse than
         most."""
-        edges = np.unique([0, *cuts, *self.seams, self.n_nodes])
+        edges = np.unique([0, *nodes, *self.seams, self.n_nodes])
         sightings = self._sightings()
         label = sightings.in_order(sightings.labels(state.seconds, edges, LONGEST_GAP_S))
         tracks = sightings.tracks(label, edges)
@@ -185,16 +193,31 @@ class FeatureFactor:
             Distances.zeros(points),
         )  # fmt: skip
 
-    def settled(self, at: FeatureOutput) -> FeatureFactor:
-        """The same features, first looked for where `at` found them: from far off a point may stop short, or end
-        elsewhere, and the cost would jump from one step to the next."""
-        return replace(self, tracks=replace(self.tracks, start=at.points.copy()))
+    def with_imu(self, imu: ImuData) -> FeatureFactor:
+        """See `Factor`."""
+        return replace(self, cameras=tuple(c.with_imu(imu) for c in self.cameras))
 
-    def look(self, state: State) -> FeatureOutput:
-        """What is left of the features at `state`; the chain is cut where `make_pieces` cuts it."""
-        out = self.output()
-        in_parallel(lambda piece: self.accumulate(state, piece, out, sums=False), make_pieces(self.n_nodes, None))
-        return out
+    def scratch(self, out: FeatureOutput) -> FeatureOutput:
+        """See `Factor`: a cut has other tracks."""
+        del out
+        return self.output()
+
+    def settled(self, out: FeatureOutput) -> FeatureFactor:
+        """See `Factor`: from far off a point may stop short, or end elsewhere, and the cost would jump from one step to
+        the next."""
+        return replace(self, tracks=replace(self.tracks, start=out.points.copy()))
+
+    def squares(self, out: FeatureOutput) -> dict[FitKey, Squares]:
+        """See `Factor`: of each camera's features, and of their points on planes."""
+        return feature_squares(self, out)
+
+    def sizes(self, out: FeatureOutput) -> dict[FitKey, RawSize]:
+        """See `Factor`."""
+        return feature_sizes(self, out)
+
+    def spent(self, out: FeatureOutput, along: Along) -> dict[FitKey, float]:
+        """See `Factor`."""
+        return spent_by_features(self, out, along)
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
         """The piece with room for the features that its nodes saw; `keep`: its end is shared with another piece."""
@@ -215,10 +238,7 @@ class FeatureFactor:
     def accumulate(
         self, state: State, piece: Piece, out: FeatureOutput, sums: bool = True, curved: bool = False
     ) -> float:
-        """Fills `out` for the features that the nodes of `piece` saw, and adds them to its sums where these are wanted.
-
-        Returns half the robust chi^2, the least over the points. `curved`: see CornerFactor.accumulate.
-        """
+        """See `Factor`: of the features that the nodes of `piece` saw, the cost is the least over the points."""
         tracks, pairs = self._within(piece)
         views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
         planes = self._planes(state)
@@ -231,14 +251,14 @@ class FeatureFactor:
             features.own[:, range(3), range(3)] += WEAK
         total, begin = 0.0, 0
         for view in views:
-            i, weighing = view.index, self._weighing(curved)
+            i, loss = view.index, self._loss(curved)
             lens = self.layout.columns(view.camera.name, "intrinsics", "distortion")
             for part, images in view.chunks():
                 own = slice(begin + images.start, begin + images.stop)
                 mine = features._replace(pose=features.pose[own], next_pose=features.next_pose[own])
                 X = part.in_camera(points.xyz, tracks.start)
                 total += accumulate(
-                    X, part.seen, base, part.motion, part.seeing(X, lens), weighing, into, mine, out.residual[i],
+                    X, part.seen, base, part.motion, part.seeing(X, lens), loss, into, mine, out.residual[i],
                     out.root[i],
                 )  # fmt: skip
             begin += len(view.seen.node)
@@ -259,12 +279,12 @@ class FeatureFactor:
         views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
         points, side = self._from_anchors(views, tracks, at.points[tracks]), piece.features.sums.side
         for view in views:
-            weighing, own = self._weighing(False), cluster[view.index]
+            loss, own = self._loss(False), cluster[view.index]
             lens = self.layout.columns(view.camera.name, "intrinsics", "distortion")
             for part, _ in view.chunks():
                 X = part.in_camera(points, tracks.start)
                 accumulate_clusters(
-                    X, part.seen, base, part.motion, part.seeing(X, lens), weighing, own, n_clusters, column,
+                    X, part.seen, base, part.motion, part.seeing(X, lens), loss, own, n_clusters, column,
                     piece.sums(True), side,
                 )  # fmt: skip
 
@@ -303,9 +323,6 @@ class FeatureFactor:
             np.concatenate(self.keep),
             tuple(len(s.feature) for s in self.streams),
         )
-
-    def _weighing(self, curved: bool) -> Weighing:
-        return Weighing(LOSSES[self.loss], self.loss_scale, curved)
 
     def _views(self, state: State, first: int, stop: int) -> list[View]:
         """What hangs on nodes first..stop."""
@@ -349,7 +366,7 @@ class FeatureFactor:
         )  # fmt: skip
         for step in range(MOST_STEPS):
             for view in views:
-                view.add_to_points(tracks.start, self._weighing(False), points)
+                view.add_to_points(tracks.start, self._loss(False), points)
             if planes is not None:
                 add_planes_to_points(self.on.of(tracks), planes, self._loss(False), points)
             if take_trials(points, step == 0) == 0:

@@ -38,14 +38,6 @@ class Seen(NamedTuple):
     sigma: np.ndarray
 
 
-class Weighing(NamedTuple):
-    """The robust loss, where it bends, and whether the sums have its true curvature."""
-
-    loss: int
-    scale: float
-    curved: bool
-
-
 class Range(NamedTuple):
     """The first track and the first pair of the piece."""
 
@@ -142,7 +134,7 @@ def add_rays(seen, t0, R_cw, p_wc, rays, valid, A, b):
 
 
 @njit(cache=True, nogil=True)
-def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, weighing, points):
+def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, loss, points):
     """Adds one camera's observations `which` (m,), of images (m,), to the sums, with the true curvature of the loss,
     and costs of the trial points; uv, valid and by_point (m, ...): what the model makes of these."""
     J, e = np.empty((2, 3)), np.empty(2)
@@ -157,7 +149,7 @@ def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, weighing, p
                 J[r, k] = by_point[m, r, 0] * R[0, k] + by_point[m, r, 1] * R[1, k] + by_point[m, r, 2] * R[2, k]
         variance = seen.sigma[n] * seen.sigma[n]
         square = (e[0] * e[0] + e[1] * e[1]) / variance
-        w, cost, curvature = weight(weighing.loss, weighing.scale, square)
+        w, cost, curvature = weight(loss.kind, loss.scale, square)
         w /= variance
         less = (1.0 - curvature) / (e[0] * e[0] + e[1] * e[1]) if curvature < 1.0 else 0.0
         points.trial_cost[t] += cost
@@ -290,7 +282,7 @@ def held_back(own, gradient):
 
 
 @njit(cache=True, nogil=True)
-def weighted_rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
+def weighted_rows(i, n, X, seen, seeing, loss, R_cw, error, A):
     """Weighted rows of observation n, transposed: A (6 + d + 3 + 1, 2): camera pose, parameters, point, residual.
     Returns the square root of the weight over sigma, 0 where left out, and half the robust chi^2."""
     c, D = n - seeing.first, len(A) - 1
@@ -299,7 +291,7 @@ def weighted_rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
     if not (seen.keep[n] and seeing.valid[c]):
         return 0.0, 0.0
     square = (error[0] ** 2 + error[1] ** 2) / (seen.sigma[n] * seen.sigma[n])
-    w, cost, curvature = weight(weighing.loss, weighing.scale, square)
+    w, cost, curvature = weight(loss.kind, loss.scale, square)
     root = np.sqrt(w) / seen.sigma[n]
     x, y, z = X[c, 0], X[c, 1], X[c, 2]
     for r in range(2):
@@ -311,7 +303,7 @@ def weighted_rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
         for k in range(3):
             A[D - 3 + k, r] = a0 * R_cw[i, 0, k] + a1 * R_cw[i, 1, k] + a2 * R_cw[i, 2, k]
         A[D, r] = root * error[r]
-    if weighing.curved and curvature < 1.0:
+    if loss.curved and curvature < 1.0:
         bend(A, D, 0, 1, error, np.sqrt(curvature))
     return root, cost
 
@@ -351,7 +343,7 @@ def _add_feature(A, pair, t, own_side, chained, direct, features, by_pose):
 
 
 @njit(cache=True, nogil=True)
-def accumulate(X, seen, base, motion, seeing, weighing, sums, features, residual, root):
+def accumulate(X, seen, base, motion, seeing, loss, sums, features, residual, root):
     """Residual (N, 2) and root (N,) of one camera's observations, and the normal equations where they are wanted.
     Returns half the robust chi^2."""
     n_d = len(seeing.pars)
@@ -375,7 +367,7 @@ def accumulate(X, seen, base, motion, seeing, weighing, sums, features, residual
             if seen.track[n] < 0:
                 root[n], residual[n, 0], residual[n, 1] = 0.0, 0.0, 0.0
                 continue
-            root[n], cost = weighted_rows(i, n, X, seen, seeing, weighing, motion.R_cam_world, error, A)
+            root[n], cost = weighted_rows(i, n, X, seen, seeing, loss, motion.R_cam_world, error, A)
             residual[n, 0], residual[n, 1] = error[0], error[1]
             total += cost
             if not wanted or root[n] == 0.0:

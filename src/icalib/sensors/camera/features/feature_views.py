@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.optim.robust_weights import Loss
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.corner_kernels import Motion
 from icalib.sensors.camera.features.feature_kernels import (
     Points,
     Seeing,
     Seen,
-    Weighing,
     add_to_points,
     camera_points,
     moving_points,
@@ -64,7 +64,7 @@ class View:
         found = self.camera.model.project_with_jacobians(self.params, X)
         return Seeing(int(self.seen.start[0]), *found, pars, columns[pars])
 
-    def add_to_points(self, track: int, weighing: Weighing, points: Points) -> None:
+    def add_to_points(self, track: int, loss: Loss, points: Points) -> None:
         """Adds what the observations say of those points, of tracks `track` and on, that still move."""
         for part, _ in self.chunks():
             seen, motion = part.seen, part.motion
@@ -74,4 +74,4 @@ class View:
             if m:
                 uv, valid, by_point, _ = self.camera.model.project_with_jacobians(self.params, X[:m])
                 R = motion.R_cam_world
-                add_to_points(seen, track, R, image[:m], which[:m], uv, valid, by_point, weighing, points)
+                add_to_points(seen, track, R, image[:m], which[:m], uv, valid, by_point, loss, points)

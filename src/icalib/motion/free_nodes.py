@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
+from icalib.motion.factor import FactorKey, RowFactor, Whitened
+from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece
 from icalib.optim.state import NODE, State
 
@@ -17,22 +18,43 @@ WEAK = (
 
 
 @dataclass(frozen=True)
-class FreeNodes:
+class FreeNodes(RowFactor):
     """Velocity and biases, which nothing sees, are held where they are."""
-
-    kinds: ClassVar[dict[str, slice]] = {}
 
     name: str  # of the body's sensor
     n_nodes: int
+
+    @property
+    def key(self) -> FactorKey:
+        return self.name, "nodes"
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """None: no measurement."""
+        return {}
 
     @property
     def starts(self) -> tuple[int, ...]:
         """One chain: where nothing ties neighbours, recordings make no difference."""
         return (0,)
 
-    def accumulate(self, state: State, piece: Piece, out: np.ndarray, sums: bool = True) -> float:
+    def with_imu(self, imu: ImuData) -> FreeNodes:
+        """The same: there is none."""
+        del imu
+        return self
+
+    def output(self) -> Whitened:
+        """Rows (K - 1, 15) that stay empty."""
+        return Whitened.without_loss(self.n_nodes - 1, NODE)
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float | None, str]:
+        """None: there are no kinds."""
+        del out, kind
+        return None, ""
+
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """Defines what corners leave open in the nodes of `piece`. Returns half a chi^2 of nothing."""
-        del state, out
+        del state, out, curved
         if sums:
             own = np.concatenate([np.full(POSE, WEAK), np.ones(NODE - POSE)])
             piece.diagonal[:, range(NODE), range(NODE)] += own

@@ -1,0 +1,57 @@
+"""Residual statistics of the corners of one camera, and the degrees of freedom that parameters take from them."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from icalib.motion.factor import Along, FitKey, Squares
+from icalib.optim.arrowhead import in_parallel
+
+if TYPE_CHECKING:
+    from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
+
+
+def corner_squares(camera: CornerFactor, out: CornerOutput) -> dict[FitKey, Squares]:
+    """Number and chi^2 of the corners' rows and of each kind of common error's rows."""
+    found = {(camera.name, "corners"): Squares(2 * int(np.count_nonzero(out.root)), camera.chi2(out))}
+    for k, tau in enumerate(camera.noise.tau):
+        rows = out.shared[:, :, k] / tau
+        found[camera.name, f"common error {k}"] = Squares(rows.size, float((rows**2).sum()))
+    return found
+
+
+def rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
+    """RMS of either component of residuals (N, 2) px that have weight, root (N,); None where none has."""
+    used = residual[root > 0.0]
+    return float(np.sqrt(np.mean(used**2, dtype=np.float64))) if len(used) else None
+
+
+def spent_by_corners(camera: CornerFactor, out: CornerOutput, along: Along) -> dict[FitKey, float]:
+    """See `Factor.spent`."""
+    found = in_parallel(partial(_spent_by_views, camera, out, along), camera.blocks())
+    return {(camera.name, kind): sum(one[kind] for one in found) for kind in (found[0] if found else ())}
+
+
+def _spent_by_views(camera: CornerFactor, at: CornerOutput, step: Along, views: tuple[int, int]) -> dict[str, float]:
+    """|J x|^2 of some views, its mean over their images' common errors, which follow x."""
+    own, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
+    up, down = (camera.residual(state, *views) for state in (step.end, step.start))
+    root, view = at.root[own], camera.views.of_corners(*views) - views[0]
+    along = (up - down) / step.share * root[:, None]
+    if m == 0:
+        return {"corners": float((along**2).sum())}
+    # An error c takes what is least: |along + f c|^2 + |c / tau|^2; about that its covariance is M^-1, on each axis.
+    f = camera.noise.field[own] * root[:, None]
+    M, rhs = np.zeros((n, m, m)), np.zeros((n, m, 2))
+    np.add.at(M, view, f[:, :, None] * f[:, None, :])
+    np.add.at(rhs, view, -f[:, :, None] * along[:, None, :])
+    M += np.diag(1.0 / camera.noise.tau**2)
+    inverse = np.linalg.inv(M)
+    shared = inverse @ rhs
+    total = float(((along + np.einsum("ik,ikj->ij", f, shared[view])) ** 2).sum())
+    total += 2.0 * float(np.einsum("ik,ikl,il->", f, inverse[view], f))
+    spent = ((shared**2).sum(axis=2) + 2.0 * np.diagonal(inverse, axis1=1, axis2=2)).sum(axis=0) / camera.noise.tau**2
+    return {"corners": total} | {f"common error {k}": float(spent[k]) for k in range(m)}

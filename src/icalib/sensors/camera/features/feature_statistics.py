@@ -1,0 +1,74 @@
+"""Residual statistics of feature tracks, and the degrees of freedom that points and parameters take from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from icalib.motion.factor import Along, FitKey, RawSize, Squares, look
+from icalib.sensors.camera.corner_statistics import rms_px
+from icalib.sensors.camera.features.surfaces import ON_PLANES, Distances
+
+if TYPE_CHECKING:
+    from icalib.sensors.camera.features.feature_factor import FeatureFactor
+
+FEATURES = "features"  # the kind of a track's rows
+
+
+@dataclass(frozen=True)
+class FeatureOutput:
+    """By camera: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
+    left out); points (T, 3) in the frames of the cameras that they move with, and how far each is off its plane."""
+
+    residual: tuple[np.ndarray, ...]
+    root: tuple[np.ndarray, ...]
+    points: np.ndarray
+    off: Distances
+
+
+def feature_squares(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, Squares]:
+    """Number and chi^2 of each camera's features, and of its points on planes where there are any."""
+    found, off = {}, out.off
+    for i, (camera, residual, root) in enumerate(zip(factor.cameras, out.residual, out.root, strict=True)):
+        chi2 = float(((residual * root[:, None]) ** 2).sum())
+        found[camera.name, FEATURES] = Squares(2 * int((root > 0.0).sum()), chi2)
+        if len(own := factor.on_planes_of(i)):
+            chi2 = float(((off.residual * off.root)[own] ** 2).sum())
+            found[camera.name, ON_PLANES] = Squares(len(own), chi2)
+    return found
+
+
+def feature_sizes(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, RawSize]:
+    """RMS of each camera's features and of its points on planes. Rejected are observations that stood out; those whose
+    track was left out are not."""
+    found = {}
+    for i, camera in enumerate(factor.cameras):
+        rejected = int(factor.outliers[i].sum()) if factor.outliers else 0
+        found[camera.name, FEATURES] = RawSize(rms_px(out.residual[i], out.root[i]), "px", rejected)
+        if len(own := factor.on_planes_of(i)):
+            found[camera.name, ON_PLANES] = RawSize(float(np.sqrt(np.mean(out.off.residual[own] ** 2))), "m")
+    return found
+
+
+def spent_by_features(factor: FeatureFactor, at: FeatureOutput, along: Along) -> dict[FitKey, float]:
+    """|J x|^2 of each camera's features. Their points follow x, and three degrees of freedom a point are its own: the
+    plane that it lies on pays for its share, and the cameras by the number of observations."""
+    there, count = look(factor, along.end), np.zeros(factor.tracks.count)
+    used = [root > 0.0 for root in at.root]
+    for track, u in zip(factor.tracks.track, used, strict=True):
+        count += np.bincount(track[u], minlength=len(count))
+    spent = {}
+    for i, camera in enumerate(factor.cameras):
+        root, u = at.root[i], used[i]
+        slope = (there.residual[i] - at.residual[i]) / along.share
+        own = float(((3.0 - at.off.share) / np.maximum(count, 1))[factor.tracks.track[i][u]].sum())
+        spent[camera.name, FEATURES] = own + float(((slope * root[:, None])[u] ** 2).sum())
+        if len(on := factor.on_planes_of(i)):
+            slope = (there.off.residual - at.off.residual)[on] / along.share * at.off.root[on]
+            # Of several on a patch each row weighs less than what it is off by would have it.
+            left, weight = 1.0 - at.off.share[on], factor.on.weight[on]
+            own = float((1.0 - left * (left * weight + at.off.share[on])).sum())
+            spent[camera.name, ON_PLANES] = own + float((slope**2).sum())
+    return spent

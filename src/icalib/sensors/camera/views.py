@@ -1,0 +1,35 @@
+"""Corners of one camera, grouped by image and body of the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.data.measurements import CornerStream
+
+
+@dataclass(frozen=True)
+class Views:
+    """One body of the target in one image each: corners of view j are start[j]:start[j + 1]; image and body (V,)."""
+
+    start: np.ndarray
+    image: np.ndarray
+    body: np.ndarray
+
+    @classmethod
+    def of(cls, stream: CornerStream, body: np.ndarray) -> Views:
+        """Of a stream whose corners stand body by body in each image; body (n_points,) of each point."""
+        if not body.any():
+            seen = np.flatnonzero(np.diff(stream.start))
+            start = np.append(stream.start[seen], stream.start[-1])
+            return cls(start, seen, np.zeros(len(seen), dtype=np.int64))
+        own, image = body[stream.point], stream.image
+        fresh = np.ones(len(own), dtype=bool)
+        fresh[1:] = (np.diff(image) != 0) | (np.diff(own) != 0)
+        first = np.flatnonzero(fresh)
+        return cls(np.append(first, len(own)).astype(np.int64), image[first], own[first])
+
+    def of_corners(self, v0: int, v1: int) -> np.ndarray:
+        """(n,) the view that each corner of views v0..v1 belongs to."""
+        return np.repeat(np.arange(v0, v1), np.diff(self.start[v0 : v1 + 1]))
