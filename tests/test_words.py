@@ -123,8 +123,11 @@ def wrong_strings(module: Path) -> list[str]:
 
 def code_prose(source: str) -> list[str]:
     """All docstrings and comments of a module."""
-    kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    found = [ast.get_docstring(node) for node in ast.walk(ast.parse(source)) if isinstance(node, kinds)]
+    found = [
+        ast.get_docstring(node)
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
     return [text for text in found if text] + [t.string for t in tokens if t.type == tokenize.COMMENT]
 
