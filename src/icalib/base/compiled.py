@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import os
 import threading
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("NUMBA_OPT", "2")  # 3, numba's own, takes a sixth longer to compile; kernels are as fast with 2
@@ -13,10 +16,35 @@ import numba  # noqa: E402
 from numba.core import event  # noqa: E402
 
 
+@cache
+def fingerprint(package: Path = Path(__file__).parents[1]) -> str:
+    """Hash of all files of `package` that have kernels, or the named tuples that kernels take."""
+    found = hashlib.blake2b(digest_size=16)
+    for file in sorted(package.rglob("*.py")):
+        text = file.read_bytes()
+        if b"njit" in text or b"NamedTuple" in text:
+            found.update(text)
+    return found.hexdigest()
+
+
 def njit(**options: Any) -> Any:
-    """numba.njit without an entry for callers in C, of which there are none."""
-    decorator: Any = numba.njit
-    return decorator(no_cfunc_wrapper=True, **options)
+    """numba.njit without an entry for callers in C, of which there are none, and whose cache on disk is not read after
+    any kernel has changed.
+
+    numba compares the file of a kernel with its cache, not the files of kernels that it calls. It also unpickles the
+    index of a cache before it compares, which fails where a class is there no more, as after an upgrade in place.
+    """
+    make: Any = numba.njit  # its overloads do not know of this option
+    decorator = make(no_cfunc_wrapper=True, **options)
+
+    def compiled(function: Any) -> Any:
+        dispatcher = decorator(function)
+        index = getattr(dispatcher._cache, "_cache_file", None)  # none without a cache
+        if index is not None:
+            index._version = f"{index._version} {fingerprint()}"
+        return dispatcher
+
+    return compiled
 
 
 class _NoCollection(event.Listener):
