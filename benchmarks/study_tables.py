@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from icalib.base.text_files import write_texts
-from icalib.result.quantities import SHOWN_UNITS, shown
+from icalib.result.quantities import shown
+from icalib.rig.parameter_spec import shown_unit
 from icalib.tools.montecarlo.record import from_json
 from icalib.tools.montecarlo.statistics import Nees
 from icalib.tools.montecarlo.summary import consistency_json, summarise
@@ -38,7 +39,7 @@ def block_table(found: dict[str, Any]) -> str:
     for block in found["blocks"]:
         if block["nees"] is None:
             continue
-        unit, scale = SHOWN_UNITS.get(block["unit"], (block["unit"], 1.0))
+        unit, scale = shown_unit(block["unit"])
         sizes = [f"{shown(scale * block[name], 3)} {unit}".strip() for name in ("rmse", "mean_sigma")]
         name = f"{block['sensor']} {block['name'].replace('_', ' ')}"
         rows.append(f"| {name} | {' | '.join(sizes)} | {_nees(Nees(**block['nees']))} |")

@@ -10,7 +10,7 @@ from icalib.report.tables import Html, badge, element, html, table
 from icalib.result import Calibration, RelativePose, SensorFit, Verdict, relative_poses
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
-from icalib.result.verdict import NUISANCE, by_size, lens_projection_px, lens_verdict, tolerance, worst
+from icalib.result.verdict import AUXILIARY, by_size, lens_projection_px, lens_verdict, tolerance, worst
 from icalib.rig import LENS
 
 
@@ -48,7 +48,7 @@ def _card(c: Calibration, sensor: str) -> Html:
     """Red where a component is undetermined, residuals are far beyond the noise, or a reason says that the sensor is
     wrong; amber where something is weak, or residuals are large."""
     is_camera, own = sensor in c.cameras, [f for f in c.fits if f.sensor == sensor]
-    groups = [g for g in shown_groups(c) if g.sensor == sensor and g.name not in NUISANCE]
+    groups = [g for g in shown_groups(c) if g.sensor == sensor and g.name not in AUXILIARY]
     judged: list[Verdict] = [v for g in groups if not (is_camera and g.name in LENS) for v in g.verdict]
     verdict = worst((*judged, *((lens_verdict(c, sensor),) if is_camera else ())))
     fit = max((excess(f) for f in own), default=1.0)
@@ -71,7 +71,7 @@ def _card(c: Calibration, sensor: str) -> Html:
 def _components(c: Calibration, sensor: str, is_camera: bool) -> Html:
     """One row a component; the coefficients of a lens as one."""
     hidden = {"fx", "fy", "cx", "cy", *_lens_labels(c, sensor)} if is_camera else set()
-    hidden |= set(NUISANCE)
+    hidden |= set(AUXILIARY)
     found = [r for r in rows(c) if r.sensor == sensor and r.name not in hidden]
     body = [(r.name, r.value, _std(r), badge(r.verdict)) for r in found]
     if is_camera:

@@ -8,16 +8,12 @@ from rich.text import Text
 
 from icalib.result import Calibration, relative_poses
 from icalib.result.quantities import rows, rpy_deg, shown
-from icalib.result.verdict import UNDETERMINED, tolerance
+from icalib.result.verdict import AUXILIARY, UNDETERMINED, tolerance
+from icalib.rig.kinds import SPECS
 
 TOLERANCES = ("rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance")
 SCALED = "includes the empirical factor: how much more segments of the recording scatter than the noise predicts"
 FORMAL = "is formal: the recording was not split"
-NUISANCE_WORDS = {
-    "bloom": "dark edges of the target shifted outwards by blur and the camera's response",
-    "tilt": "of the target against the vertical",
-    "shape": "how far the target deviates from its design",
-}
 STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}
 
 
@@ -81,4 +77,4 @@ def _caption(calibration: Calibration) -> str:
             f"above {UNDETERMINED:g} of it undetermined."
         )
     names = {g.name for g in calibration.groups}
-    return " ".join([text, *(f"{name}: {meaning}." for name, meaning in NUISANCE_WORDS.items() if name in names)])
+    return " ".join([text, *(f"{name}: {SPECS[name].meaning}." for name in AUXILIARY if name in names)])

@@ -18,7 +18,6 @@ TRUST: dict[Usability, str] = {
     "not usable": "wrong",
 }
 _SEEN = {"corners": "corners", "observations": "observations of points that were followed"}
-WORDS = {"rotation": "rotation", "translation": "position", "time_offset": "time offset"}
 
 
 class Html(str):

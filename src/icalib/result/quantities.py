@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icalib.result.units import SHOWN_UNITS
 from icalib.result.verdict import worst
+from icalib.rig import LENS
+from icalib.rig.kinds import ONE
+from icalib.rig.parameter_spec import shown_unit
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
@@ -98,7 +100,7 @@ def rms_words(fit: SensorFit) -> str:
 
 
 def _rows_of(group: ParameterGroup) -> list[Row]:
-    unit, scale = SHOWN_UNITS.get(group.unit, (group.unit, 1.0))
+    unit, scale = shown_unit(group.unit)
     names, values = _names(group), _values(group, scale)
     factors = [None] * len(names) if group.columns is None or group.factor is None else group.factor.tolist()
     return [
@@ -121,9 +123,9 @@ def _names(group: ParameterGroup) -> list[str]:
         return [f"rotation {a} ({turn})" for a, turn in zip("xyz", TURNS, strict=True)]
     if group.labels == (group.name,) or group.labels == ("",):
         return [group.name.replace("_", " ")]
-    if group.name in ("intrinsics", "distortion"):
+    if group.name in LENS:
         return list(group.labels)
-    one = {"radii": "radius", "scales": "scale"}.get(group.name, group.name)
+    one = ONE.get(group.name, group.name)
     return [f"{one} {label}".replace("_", " ") for label in group.labels]
 
 

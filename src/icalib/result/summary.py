@@ -10,6 +10,8 @@ import yaml
 
 from icalib.result.calibration import Calibration, ParameterGroup, SensorFit
 from icalib.result.relative import RelativePose, relative_poses
+from icalib.rig.kinds import ONE
+from icalib.rig.sensor import MOUNTED, MOUNTED_NAMES, ROTATION, TRANSLATION
 
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
@@ -26,7 +28,6 @@ HEADER = """\
 # The full covariance and all residuals are in result.npz.
 """
 KALIBR = "#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)\n"
-_OWN_KEY = ("rotation", "translation", "time_offset")
 
 
 def calibration_yaml(calibration: Calibration) -> str:
@@ -60,8 +61,7 @@ def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], 
     it says nothing alone."""
     count = Counter(label for g in groups for label in g.labels)
     own = {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
-    one = {"radii": "radius", "scales": "scale"}
-    return own | {(name, label): f"{one[name]}_{label}" for name, label in own if name in one}
+    return own | {(name, label): f"{ONE[name]}_{label}" for name, label in own if name in ONE}
 
 
 def pose_key(c: Calibration) -> str:
@@ -74,8 +74,8 @@ def _sensor(c: Calibration, name: str) -> dict[str, Any]:
     if kind != "imu":
         return {"type": kind, pose_key(c): c.T_imu_sensor(name).tolist()} | _entry(c, name)
     entry = _entry(c, name)
-    still = {"rotation": [0.0] * 3, "translation": [0.0] * 3, "time_offset": 0.0}
-    fixed = {"rotation": ["fixed"] * 3, "translation": ["fixed"] * 3, "time_offset": "fixed"}
+    still = {spec.name: [0.0] * spec.size if spec.size > 1 else 0.0 for spec in MOUNTED}
+    fixed = {spec.name: ["fixed"] * spec.size if spec.size > 1 else "fixed" for spec in MOUNTED}
     pose = {"type": kind, "T_imu_sensor": np.eye(4).tolist(), "time_offset": 0.0}
     return pose | entry | {"std": still | entry["std"], "verdict": fixed | entry["verdict"]}
 
@@ -93,9 +93,9 @@ def _target(c: Calibration, name: str) -> dict[str, Any]:
 def _entry(c: Calibration, name: str) -> dict[str, Any]:
     """time_offset, parameters, and std, verdict and empirical_factor with the same keys."""
     groups = tuple(g for g in c.groups if g.sensor == name)
-    own = [g for g in groups if g.name in _OWN_KEY or g.value.ndim == 2]
-    rest = tuple(g for g in groups if g.name not in _OWN_KEY and g.value.ndim == 1)
-    entry: dict[str, Any] = {g.name: _short(g, g.value) for g in own if g.name not in _OWN_KEY[:2]}
+    own = [g for g in groups if g.name in MOUNTED_NAMES or g.value.ndim == 2]
+    rest = tuple(g for g in groups if g.name not in MOUNTED_NAMES and g.value.ndim == 1)
+    entry: dict[str, Any] = {g.name: _short(g, g.value) for g in own if g.name not in (ROTATION.name, TRANSLATION.name)}
     entry["parameters"] = _by_key(rest, {g.name: g.value for g in rest})
     for key, of in (("std", _std), ("verdict", _verdict), ("empirical_factor", _factor)):
         given = {g.name: _short(g, value) for g in own if (value := of(g)) is not None}

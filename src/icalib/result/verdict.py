@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Literal
 
 from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
-from icalib.result.units import SHOWN_UNITS
 from icalib.rig import LENS, Settings
+from icalib.rig.kinds import SPECS
+from icalib.rig.parameter_spec import shown_unit
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, Verdict
@@ -38,7 +39,7 @@ NEXT: dict[Usability, str] = {
     ),
     "not usable": "Act on the first reason, then calibrate again.",
 }
-NUISANCE = ("bloom", "shape", "tilt")
+AUXILIARY = tuple(spec.name for spec in SPECS.values() if spec.is_auxiliary)
 WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
 UNDETERMINED = 10.0  # tolerances: a standard deviation above this says no more than a guess does
 MOST_NAMED = 6  # components in one sentence
@@ -111,7 +112,7 @@ def tolerance(c: Calibration, name: str) -> float:
 
 def _counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
     """Verdicts of a group that count for the whole; those of a lens as one."""
-    if g.name in NUISANCE:
+    if g.name in AUXILIARY:
         return ()
     if g.name in LENS and g.sensor in c.cameras:
         return (lens_verdict(c, g.sensor),) if {"weak", "undetermined"} & set(g.verdict) else ()
@@ -157,7 +158,7 @@ def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:
             if verdicts and g.name == LENS[0]:
                 yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0]
             continue
-        unit, scale = SHOWN_UNITS.get(g.unit, (g.unit, 1.0))
+        unit, scale = shown_unit(g.unit)
         for label, verdict, std in zip(g.labels, verdicts, g.std.tolist(), strict=False):
             own = g.name if label in (g.name, "") else f"{g.name} {label}"
             yield f"{g.sensor} {own.replace('_', ' ')} (std {scale * std:.2g} {unit})".replace(" )", ")"), verdict

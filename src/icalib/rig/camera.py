@@ -42,6 +42,7 @@ BLOOM = ParameterSpec(
     tolerance=0.1,
     prior_sigma=1.0,
     is_auxiliary=True,
+    meaning="dark edges of the target shifted outwards by blur and the camera's response",
     motion="show the target from more distances",
 )
 LENS = (INTRINSICS.name, DISTORTION.name)  # the groups that are the parameters of its model

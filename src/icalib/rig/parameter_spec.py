@@ -30,8 +30,8 @@ class ParameterSpec:
 
     is_positive: a length or a factor above 0; its guess is off by a share of it, and its changes are shown in percent.
     one: name of one of the numbers, where `name` is a plural. is_auxiliary: estimated so that the rest is right, and
-    not judged itself. motion: what to do where the data do not determine it; on wheels, and without a target, the
-    other sentence where there is one.
+    not judged itself; `meaning` explains it. motion: what to do where the data do not determine it, with {axes} for
+    those about which the rig hardly turned; on wheels, and without a target, the other sentence where there is one.
     """
 
     name: str
@@ -44,6 +44,7 @@ class ParameterSpec:
     is_positive: bool = False
     one: str = ""
     is_auxiliary: bool = False
+    meaning: str = ""
     motion: str = "move the rig more"
     motion_on_wheels: str = ""
     motion_without_target: str = ""
@@ -60,4 +61,9 @@ class ParameterSpec:
     @property
     def shown_unit(self) -> tuple[str, float]:
         """The unit in which people read it, and what SI values are to be multiplied by."""
-        return SHOWN_UNITS.get(self.unit, (self.unit, 1.0))
+        return shown_unit(self.unit)
+
+
+def shown_unit(unit: str) -> tuple[str, float]:
+    """The unit in which people read values of an SI `unit`, and what they are to be multiplied by."""
+    return SHOWN_UNITS.get(unit, (unit, 1.0))

@@ -24,6 +24,7 @@ SHAPE = ParameterSpec(
     tolerance=1e-3,
     prior_sigma=1e-3,
     is_auxiliary=True,
+    meaning="how far the target deviates from its design",
     motion="show the target from more sides and closer",
 )
 # Nobody guesses which way is up in the scene, nor where walls and the frames of poses are: guesses of these have no
@@ -37,6 +38,7 @@ TILT = ParameterSpec(
     tolerance=radians(0.1),
     prior_sigma=10.0,
     is_auxiliary=True,
+    meaning="of the target against the vertical",
     motion="turn the rig through larger angles, so that gravity shows on every axis",
     motion_on_wheels="drive over ramps",
 )
@@ -48,4 +50,4 @@ FRAME_ROTATION = ParameterSpec("frame_rotation", 3, "rotation", "rad", AXES, rad
 FRAME_TRANSLATION = ParameterSpec("frame_translation", 3, "vector", "m", AXES, 0.5, 10.0)
 FRAME = (FRAME_ROTATION, FRAME_TRANSLATION)  # pose of a pose sensor's frame in the world
 BODY = (ROTATION, TRANSLATION)  # pose of one of several bodies of a target in the scene
-SCENE = (SIZE, SHAPE, TILT, PLANE, *FRAME, *BODY)
+SCENE = (SIZE, TILT, SHAPE, PLANE, *FRAME, *BODY)

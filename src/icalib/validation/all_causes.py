@@ -16,7 +16,7 @@ from icalib.observability.relaxed import Relaxed, relaxed
 from icalib.optim.state import Key
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.timeline import Timeline
-from icalib.result.verdict import NUISANCE
+from icalib.result.verdict import AUXILIARY
 from icalib.rig import DRIVES, LENS
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.validation.cameras import mixed_up, other_lens, plane_warnings
@@ -108,7 +108,7 @@ def _moves_others(judged: AssessedEstimate, stated: Relaxed, key: Key) -> bool:
     neither fixed nor has its prior: then what is stated makes the result wrong."""
     step, _ = stated.step([key])
     for g in judged.groups:
-        if g.columns is None or (g.sensor, g.name) == key or g.name in NUISANCE:
+        if g.columns is None or (g.sensor, g.name) == key or g.name in AUXILIARY:
             continue
         if (np.abs(step[stated.layout.columns(g.sensor, g.name)]) > SIGMAS * g.std).any():
             return True

@@ -12,9 +12,9 @@ from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.contradicted import is_contradicted
 from icalib.result import ParameterGroup
-from icalib.result.units import SHOWN_UNITS
 from icalib.rig import LENS, Camera
 from icalib.rig.camera import INTRINSICS
+from icalib.rig.parameter_spec import shown_unit
 from icalib.validation.looks_like import looks_like
 from icalib.validation.stated import scaled
 
@@ -55,7 +55,7 @@ def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:
     if group.name == "rotation":
         off = np.rad2deg(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ group.value))))
         return f"{what} is {off:.1f} deg from what the data show, which alone count."
-    unit, scale = SHOWN_UNITS.get(group.unit, (group.unit, 1.0))
+    unit, scale = shown_unit(group.unit)
     unit = f" {unit}" if unit else ""
     if group.name == "time_offset":
         off = guess - group.value

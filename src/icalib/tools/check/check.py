@@ -23,7 +23,7 @@ from icalib.geometry import so3
 from icalib.pipeline import Progress, calibrate_measurements, measure
 from icalib.result import Calibration, ParameterGroup, SensorFit, joint_covariance
 from icalib.result.as_rig import rig_of_result
-from icalib.result.verdict import NUISANCE, lens_verdict
+from icalib.result.verdict import AUXILIARY, lens_verdict
 from icalib.rig import LENS, Rig
 from icalib.tools.comparison.compare import Comparison, Difference, compare_sides
 from icalib.tools.comparison.results import side_of_result
@@ -154,7 +154,7 @@ def _undetermined(c: Calibration) -> list[str]:
     """Names of groups that the data do not determine; a lens is judged by its projection, as the verdict does."""
     found = []
     for g in c.groups:
-        if g.columns is None or g.name in NUISANCE or g.sensor not in c.rig["sensors"] or g.mode == "prior":
+        if g.columns is None or g.name in AUXILIARY or g.sensor not in c.rig["sensors"] or g.mode == "prior":
             continue
         lens = g.name in LENS and g.sensor in c.cameras
         if (lens_verdict(c, g.sensor) == "undetermined") if lens else ("undetermined" in g.verdict):
@@ -164,7 +164,7 @@ def _undetermined(c: Calibration) -> list[str]:
 
 def _fixed(c: Calibration) -> list[str]:
     """Names of groups that the rig file fixes, but for the pose of the body in itself."""
-    own = [g for g in c.groups if g.columns is None and g.sensor in c.rig["sensors"] and g.name not in NUISANCE]
+    own = [g for g in c.groups if g.columns is None and g.sensor in c.rig["sensors"] and g.name not in AUXILIARY]
     fixed = [_block(c, g) for g in own if g.mode == "fixed" and not (g.sensor == c.body and g.name in IN_ITSELF)]
     return list(dict.fromkeys(fixed))
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.report.plot import AXIS_COLORS, COLORS, Figure, figure, numbers, stacked_axes, y_of
-from icalib.report.tables import WORDS
-from icalib.result.units import SHOWN_UNITS
+from icalib.rig.parameter_spec import shown_unit
 from icalib.tools.fleet.record import GroupRecord
 from icalib.tools.fleet.result import JobResult
 
@@ -33,7 +32,7 @@ def over_time(results: list[JobResult], sensor: str) -> Figure:
     names = list(dict.fromkeys(b.name for b in found))
     places, dated = _places(results)
     traces = [t for k, name in enumerate(names) for t in _traces(results, places, firsts[name], k)]
-    titles = [f"{WORDS.get(n, n.replace('_', ' '))}{_unit_words(firsts[n])}" for n in names]
+    titles = [f"{n.replace('_', ' ')}{_unit_words(firsts[n])}" for n in names]
     layout = stacked_axes(titles, gap=_GAPS / len(names))
     layout["xaxis"] = layout["xaxis"] | {"title": {"text": "time" if dated else "job"}}
     layout["xaxis"] |= {"type": "date" if dated else "category"}
@@ -56,7 +55,7 @@ def _traces(results: list[JobResult], places: dict[str, str], first: GroupRecord
             if (b.sensor, b.name, b.labels) == (first.sensor, first.name, first.labels):
                 at.append(r)
                 blocks.append(b)
-    scale = SHOWN_UNITS.get(first.unit, (first.unit, 1.0))[1]
+    scale = shown_unit(first.unit)[1]
     values = scale * np.array([so3.value_change(first.value, b.value) for b in blocks])
     colors = AXIS_COLORS if len(first.labels) == len(AXIS_COLORS) else COLORS
     return [
@@ -92,5 +91,5 @@ def _estimated(b: GroupRecord) -> bool:
 
 
 def _unit_words(b: GroupRecord) -> str:
-    unit = SHOWN_UNITS.get(b.unit, (b.unit, 1.0))[0]
+    unit = shown_unit(b.unit)[0]
     return f" [{unit}]" if unit else ""

@@ -11,7 +11,7 @@ import numpy as np
 
 from icalib.base.extras import load_matplotlib
 from icalib.report.plot import COLORS, Figure, axis, figure, line
-from icalib.result.units import SHOWN_UNITS
+from icalib.rig.parameter_spec import shown_unit
 from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 
 MOST_RUNS = 6
@@ -54,7 +54,7 @@ def rows(records: Sequence[RunRecord]) -> tuple[PanelRow, ...]:
 
 
 def _row(runs: Sequence[RunRecord], block: GroupErrors) -> PanelRow:
-    unit, scale = SHOWN_UNITS.get(block.unit, (block.unit, 1.0))
+    unit, scale = shown_unit(block.unit)
     panels = []
     for k, label in enumerate(block.labels):
         curves = tuple(_curve(r, int(r.columns(block.key)[k]), scale) for r in runs if len(r.columns(block.key)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from icalib.result.quantities import shown
-from icalib.result.units import SHOWN_UNITS
+from icalib.rig.parameter_spec import shown_unit
 from icalib.tools.montecarlo.statistics import PROBABILITY, Nees, Spread
 from icalib.tools.montecarlo.summary import BlockSummary, Consistency, Mean
 
@@ -13,7 +13,7 @@ NUMBERS = HEADERS[1:7] + HEADERS[8:]
 
 def block_row(block: BlockSummary) -> tuple[str, ...]:
     """Cells under HEADERS."""
-    unit, scale = SHOWN_UNITS.get(block.unit, (block.unit, 1.0))
+    unit, scale = shown_unit(block.unit)
     sizes = ["" if x is None else shown(scale * x, 3) for x in (block.rmse, block.mean_sigma)]
     return (
         f"{block.sensor} {block.name.replace('_', ' ')}",
