@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,42 +10,14 @@ import numpy as np
 from icalib.observability.determination import Determined
 from icalib.result import Verdict
 from icalib.result.verdict import by_size
+from icalib.rig import ParameterSpec
+from icalib.rig.kinds import SPECS
 
 SHARE = 0.25  # a parameter that makes up this much of an undetermined direction is undetermined itself
 NAMED = 0.2  # parts of a direction smaller than this are not named
 MOST_NAMED = 4  # of the largest
 
 EVERY_AXIS = "every axis"
-# The motion that would determine a parameter which is unobservable. {axes}: those about which the rig hardly turned.
-MISSING_MOTION = {
-    "translation": "turn the rig briskly about {axes}: a lever arm shows only in rotation",
-    "rotation": "turn the rig about {axes}",
-    "time_offset": "turn or shake the rig faster, so that a time shift shows",
-    "intrinsics": "show the target at different distances, tilted, and in every part of the image",
-    "distortion": "show the target in the corners of the image",
-    "tilt": "turn the rig through larger angles, so that gravity shows on every axis",
-    "shape": "show the target from more sides and closer",
-    "bloom": "show the target from more distances",
-    "radii": "drive further",
-    "baseline": "turn more, both ways",
-    "radius": "drive further",
-    "wheelbase": "turn more, both ways",
-    "steering_offset": "drive further",
-    "scales": "drive further, and turn more, both ways",
-}
-# Of all sensors of a rig on wheels, which cannot turn about other axes.
-ON_THE_GROUND = {
-    "translation": "turn, and drive over ramps: a flat floor does not show heights; or give it as a prior",
-    "rotation": "drive over ramps: a flat floor does not show tilts; or give it as a prior",
-    "time_offset": "speed up, brake and turn more",
-    "tilt": "drive over ramps",
-}
-SHOWN_BY_IMAGES = ("intrinsics", "distortion", "bloom", "shape")
-# Of cameras without a target, which track points of the scene.
-WITHOUT_TARGET = {
-    "intrinsics": "move so that near and far points of the scene cross the whole image",
-    "distortion": "turn so that points of the scene pass through the corners of the image",
-}
 
 
 @dataclass(frozen=True)
@@ -79,11 +51,15 @@ def observe(
     for part, spread in zip(share, found.spread, strict=True):
         is_open = part > SHARE or not found.estimate.outcome.converged
         verdicts.append("undetermined" if is_open else by_size(spread))
-    rig = MISSING_MOTION | (ON_THE_GROUND if wheels else {})
-    rig = {kind: motion.format(axes=axes or EVERY_AXIS) for kind, motion in rig.items()}
-    advice = {sensor: rig | WITHOUT_TARGET for sensor in tracking}
-    sentences = tuple(_sentence(u, names, rig, advice) for u in directions.T)
-    return Observability(found.covariance, tuple(verdicts), sentences, found.spread)
+    sentences = []
+    for direction in directions.T:
+        words, first = _words_of(direction, names)
+        sensor, kind, _ = first.rsplit(".", 2)
+        spec = SPECS[kind]
+        motion = _missing_motion(spec, bool(wheels), sensor in tracking).format(axes=axes or EVERY_AXIS)
+        by = "these images" if spec.by_images else "this motion"
+        sentences.append(f"{words}: not determined by {by}; {motion}.")
+    return Observability(found.covariance, tuple(verdicts), tuple(sentences), found.spread)
 
 
 def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
@@ -98,17 +74,19 @@ def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
     return directions @ turn if m else np.zeros((n, 0))
 
 
-def _sentence(
-    direction: np.ndarray, names: tuple[str, ...], rig: Mapping[str, str], advice: Mapping[str, Mapping[str, str]]
-) -> str:
-    """rig: the missing motion by kind of parameter; advice: the same of sensors that differ."""
+def _words_of(direction: np.ndarray, names: tuple[str, ...]) -> tuple[str, str]:
+    """The parameters that a direction (B,) moves most, in words, and the name of the first."""
     order = np.argsort(-np.abs(direction))
     # By the rig, not by size: where all move alike, noise would decide which comes first.
     parts = sorted(i for i in order[:MOST_NAMED] if abs(direction[i]) >= NAMED) or [order[0]]
-    words = " with ".join(_words(names[i]) for i in parts)
-    sensor, kind, _ = names[order[0]].rsplit(".", 2)
-    motion = advice.get(sensor, rig).get(kind, "move the rig more")
-    return f"{words}: not determined by {'these images' if kind in SHOWN_BY_IMAGES else 'this motion'}; {motion}."
+    return " with ".join(_words(names[i]) for i in parts), names[order[0]]
+
+
+def _missing_motion(spec: ParameterSpec, on_wheels: bool, without_target: bool) -> str:
+    """What would determine a parameter. A rig on wheels cannot turn about other axes; a camera without a target tracks
+    points of the scene."""
+    others = (spec.motion_without_target if without_target else "", spec.motion_on_wheels if on_wheels else "")
+    return next(filter(None, others), spec.motion)
 
 
 def _words(name: str) -> str:

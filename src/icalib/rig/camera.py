@@ -18,6 +18,7 @@ INTRINSICS = ParameterSpec(
     labels=("fx", "fy", "cx", "cy"),
     tolerance="pixel_tolerance",
     prior_sigma=15.0,
+    by_images=True,
     motion="show the target at different distances, tilted, and in every part of the image",
     motion_without_target="move so that near and far points of the scene cross the whole image",
 )
@@ -30,6 +31,7 @@ DISTORTION = ParameterSpec(
     labels=("k1", "k2", "k3", "k4"),
     tolerance=1e-2,
     prior_sigma=0.3,
+    by_images=True,
     motion="show the target in the corners of the image",
     motion_without_target="turn so that points of the scene pass through the corners of the image",
 )
@@ -43,6 +45,7 @@ BLOOM = ParameterSpec(
     prior_sigma=1.0,
     is_auxiliary=True,
     meaning="dark edges of the target shifted outwards by blur and the camera's response",
+    by_images=True,
     motion="show the target from more distances",
 )
 LENS = (INTRINSICS.name, DISTORTION.name)  # the groups that are the parameters of its model

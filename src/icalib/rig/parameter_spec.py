@@ -30,8 +30,9 @@ class ParameterSpec:
 
     is_positive: a length or a factor above 0; its guess is off by a share of it, and its changes are shown in percent.
     one: name of one of the numbers, where `name` is a plural. is_auxiliary: estimated so that the rest is right, and
-    not judged itself; `meaning` explains it. motion: what to do where the data do not determine it, with {axes} for
-    those about which the rig hardly turned; on wheels, and without a target, the other sentence where there is one.
+    not judged itself; `meaning` explains it. by_images: images show it, and not motion. motion: what to do where the
+    data do not determine it, with {axes} for those about which the rig hardly turned; on wheels, and without a target,
+    the other sentence where there is one.
     """
 
     name: str
@@ -45,6 +46,7 @@ class ParameterSpec:
     one: str = ""
     is_auxiliary: bool = False
     meaning: str = ""
+    by_images: bool = False
     motion: str = "move the rig more"
     motion_on_wheels: str = ""
     motion_without_target: str = ""

@@ -25,6 +25,7 @@ SHAPE = ParameterSpec(
     prior_sigma=1e-3,
     is_auxiliary=True,
     meaning="how far the target deviates from its design",
+    by_images=True,
     motion="show the target from more sides and closer",
 )
 # Nobody guesses which way is up in the scene, nor where walls and the frames of poses are: guesses of these have no

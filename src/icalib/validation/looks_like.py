@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.rig import Rig, Wheels
+from icalib.rig.kinds import SPECS
 
 NEAR_RAD = 0.15  # by which a rotation is off that another frame explains
 NEARLY = 0.1  # of a number in another unit
@@ -18,7 +19,6 @@ TURNS = [  # about right angles, and reflections
 ]
 LENGTHS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
 RATES = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
-ROLLING = ("radii", "radius", "baseline", "wheelbase")
 IMAGE_SIZES = (2.0, 0.5, 4.0, 0.25)
 
 
@@ -34,7 +34,7 @@ def looks_like(
         inverse = -rotation.T @ found
         if _is_near(value, inverse) and not _is_near(value, found):
             return " It looks like that of the inverse: icalib wants p_imu_sensor."
-    for size, unit in (LENGTHS if name in ("translation", *ROLLING) else {}).items():
+    for size, unit in (LENGTHS if SPECS[name].unit == "m" else {}).items():
         if _is_near(found, size * value):
             return f" It looks like {unit}: write metres."
     if name == "time_offset" and _is_near(found, 1e-3 * value):

@@ -10,6 +10,8 @@ import numpy as np
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
+from icalib.rig.parameter_spec import shown_unit
+from icalib.rig.sensor import TIME_OFFSET
 from icalib.tools.comparison.sides import LensSide, Quantity, Side
 from icalib.tools.comparison.significance import sigmas
 from icalib.tools.comparison.units import DEFAULT_TOLERANCES
@@ -191,16 +193,14 @@ def _quantities(pair: _Pair) -> Iterator[Difference]:
     clocks = pair.a.has_imu and pair.b.has_imu  # without, a time offset is against another clock
     for (sensor, key), qa in pair.a.quantities.items():
         qb = pair.b.quantities.get((sensor, key))
-        if qb is None or (key == "time_offset" and not clocks):
+        if qb is None or (key == TIME_OFFSET.name and not clocks):
             continue
-        change, (Ca, Cb), unit, scale = qb.value - qa.value, (qa.covariance, qb.covariance), "ms", 1e3
-        if key == "steering_offset":
-            unit, scale = "deg", 180.0 / np.pi
-        elif key == "intrinsics":  # of an IMU, which are parts of one, and zero where it is ideal
-            unit, scale = "percent", 1e2
-        elif key != "time_offset":
+        change, (Ca, Cb) = qb.value - qa.value, (qa.covariance, qb.covariance)
+        # Without a unit, as the intrinsics of an IMU, it is a share already.
+        unit, scale = shown_unit(qa.unit) if qa.unit and not qa.is_relative else ("percent", 1e2)
+        if qa.is_relative:
             relative = np.outer(1.0 / qa.value, 1.0 / qa.value)
-            change, Ca, Cb, unit, scale = change / qa.value, Ca * relative, Cb * relative, "percent", 1e2
+            change, Ca, Cb = change / qa.value, Ca * relative, Cb * relative
         names = (sensor, pair.a.body, qa.what)
         yield pair.difference(names, unit, scale, qa.labels, change, (Ca, Cb), _open_of(qa, qb))
 

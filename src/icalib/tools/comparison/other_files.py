@@ -10,7 +10,8 @@ import numpy as np
 from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import CalibrationError
 from icalib.export.urdf_tree import read_urdf
-from icalib.tools.comparison.results import DENSITIES, noise_quantities
+from icalib.rig.sensor import TIME_OFFSET
+from icalib.tools.comparison.results import DENSITIES, noise_quantities, quantity
 from icalib.tools.comparison.sides import LensSide, Quantity, Side, unknown
 from icalib.tools.inspection.kalibr import MODELS
 
@@ -44,7 +45,7 @@ def side_of_kalibr(root: YamlValue) -> Side:
     for name, found in cameras.items():
         if "timeshift_cam_imu" in found:
             shift = np.array([found["timeshift_cam_imu"].number()])
-            quantities[name, "time_offset"] = Quantity("time offset", ("",), shift, unknown(1))
+            quantities[name, "time_offset"] = quantity(TIME_OFFSET, shift, unknown(1))
     for name, found in list(imus.items())[:1]:
         parts[name].record(tuple(_KALIBR_NOISE.values()), tuple(k for k in found if k not in _KALIBR_NOISE.values()))
         quantities |= noise_quantities(name, {key: found[_KALIBR_NOISE[key]].positive() for key in DENSITIES})

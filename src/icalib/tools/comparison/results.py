@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from icalib.result import Calibration, joint_covariance, relative_pose
-from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
+from icalib.rig import DRIVES, LENS, Camera, Lidar, Parameter, ParameterSpec, PoseSensor, Wheels
 from icalib.rig.file import load_rig
+from icalib.rig.kinds import SPECS
+from icalib.rig.sensor import TIME_OFFSET
 from icalib.tools.comparison.sides import LensSide, Quantity, Side, unknown
 
 DENSITIES = {
@@ -18,18 +20,8 @@ DENSITIES = {
     "accel": "noise density of the accelerometer",
     "accel_walk": "bias walk of the accelerometer",
 }
-_WHAT = {
-    "time_offset": "time offset",
-    "radii": "radius",
-    "baseline": "baseline",
-    "radius": "radius",
-    "wheelbase": "wheelbase",
-    "steering_offset": "steering offset",
-    "scales": "scale",
-}
-_LABELS = {"radii": ("left", "right"), "scales": ("speed", "yaw_rate")} | {
-    name: ("",) for name in _WHAT if name not in ("radii", "scales")
-}
+# What has a difference of its own: all but poses, which are seen from other sensors, and lenses, which are projected.
+_COMPARED = (TIME_OFFSET, *(spec for drive in DRIVES.values() for spec in drive))
 
 
 def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Quantity]:
@@ -47,15 +39,15 @@ def side_of_result(c: Calibration, path: str) -> Side:
     for g in c.groups:
         # A clock that restarts has no time offset that another result could have, too.
         several = g.name == "time_offset" and len(g.value) > 1
-        if g.sensor in c.mounted and g.name in _WHAT and not several:
-            quantities[g.sensor, g.name] = Quantity(
-                _WHAT[g.name], _LABELS[g.name], g.value, joint_covariance(c, [g]), g in bad
-            )
+        if g.sensor in c.mounted and SPECS.get(g.name) in _COMPARED and not several:
+            quantities[g.sensor, g.name] = quantity(SPECS[g.name], g.value, joint_covariance(c, [g]), g in bad)
     if c.imu is not None:
         quantities |= noise_quantities(c.imu, c.rig["sensors"][c.imu]["noise"])
         own = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics") and g.columns is not None]
         for g in own:
-            quantities[c.imu, g.name] = Quantity(g.name, g.labels, g.value, joint_covariance(c, [g]), g in bad)
+            quantities[c.imu, g.name] = Quantity(
+                g.name, g.labels, g.value, joint_covariance(c, [g]), g in bad, g.unit, False
+            )
     return Side(
         path=path,
         kind="result",
@@ -70,7 +62,7 @@ def side_of_result(c: Calibration, path: str) -> Side:
 
 
 def _lens_of_result(c: Calibration, name: str) -> LensSide:
-    sensor, groups = c.rig["sensors"][name], [c.group(name, key) for key in ("intrinsics", "distortion")]
+    sensor, groups = c.rig["sensors"][name], [c.group(name, key) for key in LENS]
     width, height = sensor["resolution"]
     return LensSide(
         model=sensor["model"],
@@ -88,12 +80,11 @@ def side_of_rig(path: Path) -> Side:
     poses = {name: _pose(s) for name, s in sensors.items()} | {rig.body: np.eye(4)}
     quantities = {}
     for name, s in sensors.items():
-        for key, what in _WHAT.items():
-            p = getattr(s, key, None)
+        for spec in _COMPARED:
+            p = getattr(s, spec.name, None)
             if p is not None and p.value is not None:
-                quantities[name, key] = Quantity(
-                    what, _LABELS[key], np.atleast_1d(p.value), _covariance(p, p.value.size)
-                )
+                value = np.atleast_1d(p.value)
+                quantities[name, spec.name] = quantity(spec, value, _covariance(p, value.size))
     if rig.imu is not None:
         noise = {key: getattr(rig.imu.noise, key) for key in DENSITIES}
         quantities |= noise_quantities(rig.imu.name, noise)
@@ -115,6 +106,13 @@ def side_of_rig(path: Path) -> Side:
         quantities=quantities,
         lenses={c.name: lens for c in rig.cameras if (lens := _lens_of_rig(c)) is not None},
     )
+
+
+def quantity(spec: ParameterSpec, value: np.ndarray, covariance: np.ndarray, is_open: bool = False) -> Quantity:
+    """Of a group: its words are those of one number, which needs no label where it is the only one."""
+    labels = spec.labels if spec.size > 1 else ("",)
+    what = (spec.one or spec.name).replace("_", " ")
+    return Quantity(what, labels, value, covariance, is_open, spec.unit, spec.is_positive)
 
 
 def _pose(sensor: Camera | Lidar | Wheels | PoseSensor) -> np.ndarray:

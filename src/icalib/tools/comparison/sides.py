@@ -13,13 +13,16 @@ PoseCovariance = Callable[[str, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Quantity:
-    """value (n,) and covariance (n, n), NaN where it is not known. what: its words; open: undetermined there."""
+    """value (n,) and covariance (n, n), NaN where it is not known. what: its words; open: undetermined there. unit: SI;
+    is_relative: changes are shares of the value."""
 
     what: str
     labels: tuple[str, ...]
     value: np.ndarray
     covariance: np.ndarray
     open: bool = False
+    unit: str = ""
+    is_relative: bool = True
 
 
 @dataclass(frozen=True)

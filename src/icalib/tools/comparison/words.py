@@ -40,14 +40,11 @@ def sentence(d: Difference, c: Comparison) -> str:
             words = (
                 f"the lens of {d.sensor} moved points by {digits(d.size)} px RMS, {digits(d.most or 0.0)} px at most"
             )
-        case "time offset":
-            words = f"the time offset of {d.sensor} changed by {_signed(d.vector[0])} ms"
-        case "steering offset":
-            words = f"the steering offset of {d.sensor} changed by {_signed(d.vector[0])} deg"
         case _:
             most = int(np.argmax(np.abs(d.vector)))
+            unit = "%" if d.unit == "percent" else d.unit
             label = f"{d.labels[most]} " if d.labels[most] else ""
-            words = f"the {label}{d.what} of {d.sensor} changed by {_signed(d.vector[most])} %"
+            words = f"the {label}{d.what} of {d.sensor} changed by {_signed(d.vector[most])} {unit}"
     return f"{words}, {_certainty(d)}"
 
 
