@@ -14,6 +14,7 @@ from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration
+from icalib.rig.sensor import MOUNTED_NAMES
 
 
 @dataclass(frozen=True)
@@ -128,9 +129,7 @@ def drives(c: Calibration) -> list[str]:
     """What wheels have beside pose and clock, as "radii and baseline of wheel0"."""
     found = []
     for name in c.wheels:
-        own = [
-            g.name for g in c.groups if g.sensor == name and g.name not in ("rotation", "translation", "time_offset")
-        ]
+        own = [g.name for g in c.groups if g.sensor == name and g.name not in MOUNTED_NAMES]
         words = [group.replace("_", " ") for group in own]
         found += [f"{', '.join(words[:-1])}{' and ' if words[1:] else ''}{words[-1]} of {name}"] if words else []
     return found

@@ -43,6 +43,7 @@ from icalib.motion.nodes import first_nodes
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import ImuNoise, ImuSensor, Rig
 from icalib.rig.parameter import Parameter, fixed
+from icalib.rig.sensor import mounted
 from icalib.sensors.pose.residual import FRAME, frame_of
 
 ASSUMPTION = "assumed motion"  # no sensor is called so
@@ -183,7 +184,7 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
         for what in ("rate", "acceleration")
     )
     noise = ImuNoise(WHITE_STEP_S * turning, turning, WHITE_STEP_S * jerking, jerking, ASSUMPTION)
-    here = {"rotation": fixed(np.eye(3)), "translation": fixed(np.zeros(3)), "time_offset": fixed(np.zeros(1))}
+    here = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
     imu = ImuSensor(ASSUMPTION, "", noise, Parameter("fixed"), assumed=True)
     if not rig.moves_by_poses:
         return replace(rig, imu=imu, gravity=0.0, cameras=(replace(rig.cameras[0], **here), *rig.cameras[1:]))

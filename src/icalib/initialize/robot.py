@@ -21,6 +21,7 @@ from icalib.motion.clocks import instants
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
+from icalib.rig.sensor import mounted
 from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
@@ -183,7 +184,7 @@ def _turning(
     start, end = instants(stream, clock, rates.start), instants(stream, clock, rates.end)
     inside, rate, velocity = _means(inputs, state, start, end)
     drive = drive_guess(name, rates.rate[inside], rate, velocity, up, rates.kind)
-    found = {"rotation": drive.rotation, "translation": drive.position, "time_offset": offset} | drive.values
+    found = mounted(drive.rotation, drive.position, offset) | drive.values
     return {(name, group): value for group, value in found.items()}
 
 
@@ -203,7 +204,7 @@ def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray
     times = stream.seconds + offset[0]  # there is but one recording of relative poses
     inside, rate, velocity = _means(inputs, state, times[:-1], times[1:])
     found = mount_guess(stream, inside, rate, velocity)
-    values = {"rotation": found.rotation, "translation": found.position, "time_offset": offset}
+    values = mounted(found.rotation, found.position, offset)
     return {(stream.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 

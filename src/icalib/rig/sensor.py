@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 from icalib.rig.parameter import check_sizes
 from icalib.rig.parameter_spec import AXES, ParameterSpec
 
+T = TypeVar("T")
 TimeUnit = Literal["s", "ms", "us", "ns"]
 Axes = tuple[str, str, str]  # the columns that become x, y, z, each with its sign: ("x", "-y", "-z")
 
@@ -46,6 +47,11 @@ TIME_OFFSET = ParameterSpec(
 )
 MOUNTED = (ROTATION, TRANSLATION, TIME_OFFSET)  # of every sensor on the body
 MOUNTED_NAMES = tuple(spec.name for spec in MOUNTED)
+
+
+def mounted(rotation: T, translation: T, time_offset: T) -> dict[str, T]:
+    """Values of `MOUNTED` by name."""
+    return dict(zip(MOUNTED_NAMES, (rotation, translation, time_offset), strict=True))
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ from icalib.observability.fixed_lens import LensStep
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.excess import excess, times
 from icalib.rig import Camera, Rig
-from icalib.rig.kinds import SPECS
+from icalib.rig.camera import INTRINSICS
+from icalib.rig.sensor import ROTATION, TRANSLATION
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 
-GIVEN = ("rotation", "translation", "intrinsics")
+GIVEN = (ROTATION, TRANSLATION, INTRINSICS)
 FAR = 0.5  # of what guesses are worth: 5 cm, 3 deg, 8 px
 MUCH_NEARER = 0.3  # times as far, in all that is given
 POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images by half
@@ -119,10 +120,10 @@ def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: flo
 def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -> float:
     """How far camera `name` is from what the rig file gives of `camera`, in what guesses are worth."""
     away = 0.0
-    for group in GIVEN:
-        given, value = getattr(camera, group).value, found.get((name, group))
+    for spec in GIVEN:
+        given, value = getattr(camera, spec.name).value, found.get((name, spec.name))
         if given is None or value is None:
             continue
         off = so3.value_change(given, value)
-        away = max(away, float(np.linalg.norm(off)) / SPECS[group].prior_sigma)
+        away = max(away, float(np.linalg.norm(off)) / spec.prior_sigma)
     return away

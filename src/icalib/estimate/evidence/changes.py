@@ -18,9 +18,11 @@ import numpy as np
 from icalib.estimate.evidence.parts import Parts
 from icalib.optim.border import complement
 from icalib.optim.state import Key
+from icalib.rig.camera import INTRINSICS
+from icalib.rig.sensor import ROTATION, TIME_OFFSET, TRANSLATION
 
 # The groups that change together. Board, planes and IMU are what the others are measured by.
-CHANGING = (("time_offset",), ("rotation", "translation"), ("intrinsics",))
+CHANGING = ((TIME_OFFSET.name,), (ROTATION.name, TRANSLATION.name), (INTRINSICS.name,))
 RIDGE = 1e-6  # information in tolerance units: 1000 tolerances; keeps the form definite where nothing is known
 
 

@@ -20,6 +20,7 @@ from icalib.initialize.poses.poses import on_motion
 from icalib.initialize.steps.by_recording import Held, alone, motion_alone, naming_recording
 from icalib.optim.state import State
 from icalib.rig import Camera, Parameter, Rig
+from icalib.rig.sensor import mounted
 
 
 def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) -> Rig:
@@ -41,7 +42,7 @@ def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) ->
         with naming_recording(others, best):
             found, _ = on_motion(own.imu, path, motion_alone(others, best, state), Held())
         offset = found.offset - 1e-9 * (path.origin_ns - recordings[best].origin_ns)
-        guess = {"rotation": found.rotation, "translation": found.position, "time_offset": np.array([offset])}
+        guess = mounted(found.rotation, found.position, np.array([offset]))
         return replace(
             camera, **{k: Parameter("free", v) for k, v in guess.items() if getattr(camera, k).value is None}
         )

@@ -21,6 +21,7 @@ from icalib.initialize.tracks.track_mount import CameraExtrinsics, ImagePairs, p
 from icalib.optim.arrowhead import THREADS
 from icalib.optim.state import Key, State
 from icalib.rig import Camera
+from icalib.rig.sensor import mounted
 
 
 def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
@@ -64,13 +65,7 @@ def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict
         offset = each_clock(inputs, camera.name, lambda k: mount_in(k, found)[0].offset, {best: found.offset})
     else:
         offset = np.array([other_clocks(found.offset, camera.name, alone(inputs, best), inputs)])
-    values = {
-        "rotation": found.rotation,
-        "translation": found.position,
-        "time_offset": offset,
-        "intrinsics": lens[:4],
-        "distortion": lens[4:],
-    }
+    values = mounted(found.rotation, found.position, offset) | {"intrinsics": lens[:4], "distortion": lens[4:]}
     return {(camera.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 

@@ -20,7 +20,7 @@ from icalib.initialize.steps.clock_shifts import LONGEST_STEP_S, how_alike, long
 from icalib.initialize.steps.correlation import best_shift
 from icalib.motion.imu_data import ImuData
 from icalib.motion.stamp_intervals import LONGEST_S
-from icalib.rig import WheelKind
+from icalib.rig import WheelKind, drive_names
 
 GRID_HZ = 100.0
 SHORTEST_OVERLAP_S = 4.0
@@ -236,8 +236,8 @@ def _steered(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> t
             f"{name}: its steering angle does not match the yaw rate of the vehicle; check that it is in "
             "radians, and that of the front wheels, not of the steering wheel."
         )
-    found = {"radius": radius, "wheelbase": np.array([base]), "steering_offset": np.array([offset])}
-    return float(-turned[1] * radius[0]), found
+    found = radius, np.array([base]), np.array([offset])
+    return float(-turned[1] * radius[0]), dict(zip(drive_names("steered"), found, strict=True))
 
 
 def _check_radii(name: str, radii: np.ndarray) -> None:

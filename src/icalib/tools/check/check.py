@@ -25,13 +25,13 @@ from icalib.result import Calibration, ParameterGroup, SensorFit, joint_covarian
 from icalib.result.as_rig import rig_of_result
 from icalib.result.verdict import AUXILIARY, lens_verdict
 from icalib.rig import LENS, Rig
+from icalib.rig.sensor import MOUNTED_NAMES
 from icalib.tools.comparison.compare import Comparison, Difference, compare_sides
 from icalib.tools.comparison.results import side_of_result
 from icalib.tools.comparison.significance import sigmas
 
 Validity = Literal["valid", "changed", "cannot say"]
 EXIT_CODES: dict[Validity, int] = {"valid": 0, "changed": 1, "cannot say": 3}
-IN_ITSELF = ("rotation", "translation", "time_offset")
 READING_SHARE, SOLVED_SHARE = 0.5, 0.8  # of the time: the end of reading, and of the first solve
 
 
@@ -165,7 +165,7 @@ def _undetermined(c: Calibration) -> list[str]:
 def _fixed(c: Calibration) -> list[str]:
     """Names of groups that the rig file fixes, but for the pose of the body in itself."""
     own = [g for g in c.groups if g.columns is None and g.sensor in c.rig["sensors"] and g.name not in AUXILIARY]
-    fixed = [_block(c, g) for g in own if g.mode == "fixed" and not (g.sensor == c.body and g.name in IN_ITSELF)]
+    fixed = [_block(c, g) for g in own if g.mode == "fixed" and not (g.sensor == c.body and g.name in MOUNTED_NAMES)]
     return list(dict.fromkeys(fixed))
 
 

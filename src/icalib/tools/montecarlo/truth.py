@@ -19,19 +19,11 @@ def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:
         return np.array([truth.target_size])
     if sensor not in poses:
         return None
-    if name == "scale":
-        return np.array([truth.pose_scale[sensor]])
     if name == "rotation":
         return poses[sensor][:3, :3]
     if name == "translation":
         return poses[sensor][:3, 3]
-    stated = {
-        "time_offset": truth.time_offset,
-        "intrinsics": truth.intrinsics,
-        "distortion": truth.distortion,
-        "bloom": truth.bloom_px,
-    }
-    found = stated.get(name, {}).get(sensor, truth.drive.get(sensor, {}).get(name))
+    found = getattr(truth, name, {}).get(sensor, truth.drive.get(sensor, {}).get(name))
     return None if found is None else np.atleast_1d(np.asarray(found, dtype=np.float64))
 
 

@@ -9,6 +9,8 @@ import numpy as np
 
 from icalib.geometry.targets import NoTarget
 from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
+from icalib.rig.kinds import SPECS
+from icalib.rig.sensor import mounted
 from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
@@ -188,7 +190,7 @@ def _drawn_drive(sim: SimWheels, rng: np.random.Generator, error: GuessError) ->
     drawn, off = {}, error.focal_length * rng.standard_normal(3)
     for name, value in sim.drive.items():
         own, off = off[: value.size], off[value.size :]
-        drawn[name] = value + own * (1.0 if name == "steering_offset" else value)
+        drawn[name] = value + own * (value if SPECS[name].is_positive else 1.0)
     return drawn
 
 
@@ -196,11 +198,11 @@ def _drawn_pose(
     T_imu_sensor: np.ndarray, offset: float, rng: np.random.Generator, error: GuessError
 ) -> dict[str, np.ndarray]:
     """What every sensor has, by the names of its groups."""
-    return {
-        "rotation": T_imu_sensor[:3, :3] @ rotation_from_vector(error.rotation * rng.standard_normal(3)),
-        "translation": T_imu_sensor[:3, 3] + error.translation * rng.standard_normal(3),
-        "time_offset": offset + error.time_offset * rng.standard_normal(1),
-    }
+    return mounted(
+        T_imu_sensor[:3, :3] @ rotation_from_vector(error.rotation * rng.standard_normal(3)),
+        T_imu_sensor[:3, 3] + error.translation * rng.standard_normal(3),
+        offset + error.time_offset * rng.standard_normal(1),
+    )
 
 
 def _parameter(treatment: Treatment, truth: object) -> Parameter:

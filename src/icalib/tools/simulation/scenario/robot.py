@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from icalib.errors import RigError
+from icalib.rig import WheelKind, drive_names
 
 DriveKind = Literal[
     "free",
@@ -150,12 +151,9 @@ class SimWheels:
     @property
     def drive(self) -> dict[str, np.ndarray]:
         """Its parameters beside pose and clock, by the names of the rig's groups."""
-        if self.reports == "twist":
-            return {"scales": np.array(self.scales)}
-        if self.reports == "steering":
-            one = {"radius": self.radius, "wheelbase": self.wheelbase, "steering_offset": self.steering_offset}
-            return {name: np.array([value]) for name, value in one.items()}
-        return {"radii": np.array(self.radii), "baseline": np.array([self.baseline])}
+        kinds: dict[str, WheelKind] = {"twist": "twist", "steering": "steered"}
+        names = drive_names(kinds.get(self.reports, "pair"))
+        return {name: np.atleast_1d(np.array(getattr(self, name))) for name in names}
 
 
 @dataclass(frozen=True, eq=False)

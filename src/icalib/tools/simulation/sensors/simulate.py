@@ -17,6 +17,8 @@ from icalib.data.measurements import (
     WheelPoses,
     WheelStream,
 )
+from icalib.rig import LENS
+from icalib.rig.camera import BLOOM
 from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, HandheldMotion, Scenario, SimCamera
 from icalib.tools.simulation.sensors.corners import CornerTruth, see_corners
@@ -49,7 +51,7 @@ class Truth:
     accel_bias: np.ndarray  # (N, 3) m/s^2
     imu_intrinsics: np.ndarray  # (24,)
     target_size: float
-    pose_scale: dict[str, float]
+    scale: dict[str, float]  # of pose sensors
     gravity: np.ndarray  # (3,) m/s^2, world
     T_world_bodies: np.ndarray  # (bodies, 4, 4), in the order of the target's bodies
     bow: np.ndarray  # (3,) m
@@ -57,7 +59,7 @@ class Truth:
     time_offset: dict[str, float]  # s, between raw stamps: t_imu = t_sensor + time_offset
     intrinsics: dict[str, np.ndarray]
     distortion: dict[str, np.ndarray]
-    bloom_px: dict[str, float]
+    bloom: dict[str, float]  # px
     corners: dict[str, CornerTruth]
     trajectory: TrueTrajectory
     tracks: dict[str, TrackTruth] = field(default_factory=dict)
@@ -218,22 +220,25 @@ def _motion_truth(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.nd
 def _rig_truth(scenario: Scenario) -> dict[str, Any]:
     """The fields of `Truth` that the scenario states."""
     cameras, lidars, wheels, poses = scenario.cameras, scenario.lidars, scenario.wheels, scenario.poses
-    return {
-        "imu_intrinsics": scenario.imu_intrinsics,
-        "target_size": scenario.target_size,
-        "pose_scale": {s.name: s.scale for s in poses},
-        "gravity": GRAVITY_WORLD,
-        "T_world_bodies": scenario.body_poses,
-        "bow": np.array(scenario.bow),
-        "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
-        "T_imu_cam": {c.name: c.T_imu_cam for c in cameras},
-        "time_offset": {s.name: raw_time_offset(scenario, s) for s in (*cameras, *lidars, *wheels, *poses)},
-        "intrinsics": {c.name: np.array(c.intrinsics) for c in cameras},
-        "distortion": {c.name: np.array(c.distortion) for c in cameras},
-        "bloom_px": {c.name: c.bloom_px for c in cameras},
-        "T_imu_lidar": {s.name: s.T_imu_lidar for s in lidars},
-        "T_imu_wheel": {s.name: s.T_imu_wheel for s in wheels},
-        "drive": {s.name: s.drive for s in wheels},
-        "T_imu_pose": {s.name: s.T_imu_sensor for s in poses},
-        "T_world_frame": {s.name: s.T_world_frame for s in poses},
-    }
+    lenses = {name: {c.name: np.array(getattr(c, name)) for c in cameras} for name in LENS}
+    blooms = {BLOOM.name: {c.name: c.bloom_px for c in cameras}}
+    return (
+        lenses
+        | blooms
+        | {
+            "T_imu_cam": {c.name: c.T_imu_cam for c in cameras},
+            "imu_intrinsics": scenario.imu_intrinsics,
+            "target_size": scenario.target_size,
+            "scale": {s.name: s.scale for s in poses},
+            "gravity": GRAVITY_WORLD,
+            "T_world_bodies": scenario.body_poses,
+            "bow": np.array(scenario.bow),
+            "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
+            "time_offset": {s.name: raw_time_offset(scenario, s) for s in (*cameras, *lidars, *wheels, *poses)},
+            "T_imu_lidar": {s.name: s.T_imu_lidar for s in lidars},
+            "T_imu_wheel": {s.name: s.T_imu_wheel for s in wheels},
+            "drive": {s.name: s.drive for s in wheels},
+            "T_imu_pose": {s.name: s.T_imu_sensor for s in poses},
+            "T_world_frame": {s.name: s.T_world_frame for s in poses},
+        }
+    )
