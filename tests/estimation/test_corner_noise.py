@@ -64,9 +64,8 @@ def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     assert estimate_noise(camera, settings, factor, out, speed, ())[1] == large
     fitted = SimpleNamespace(model=factor.model, rms=0.1)
     monkeypatch.setattr(lens_models, "compare_models", lambda *_: (fitted, fitted))
-    residuals = SimpleNamespace(corners=(out,))
-    outcome = SimpleNamespace(residuals=residuals, state=setup.state)
-    found = SimpleNamespace(outcome=outcome, problem=SimpleNamespace(cameras=(factor,)))
+    outcome = SimpleNamespace(residuals={factor.key: out}, state=setup.state)
+    found = SimpleNamespace(outcome=outcome, problem=SimpleNamespace(factors={factor.key: factor}))
     rig = SimpleNamespace(cameras=(camera,), settings=settings)
     inputs = SimpleNamespace(rig=rig, measurements=SimpleNamespace(cameras=(factor.stream,)))
     assert len(list(lens_models.lens_warnings(cast(Inputs, inputs), cast(Estimate, found)))) == large

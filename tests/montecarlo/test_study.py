@@ -28,11 +28,11 @@ RUNS = 3
 _SCRIPT = """
 import sys
 from pathlib import Path
-from icalib.tools.montecarlo import Plan, run_study
+from icalib.tools.montecarlo import StudyPlan, run_study
 from icalib.tools.simulation import handheld
 
 if __name__ == "__main__":
-    run_study(handheld(6.0), "handheld", "digest", Path(sys.argv[1]), Plan(int(sys.argv[2]), workers=1))
+    run_study(handheld(6.0), "handheld", "digest", Path(sys.argv[1]), StudyPlan(int(sys.argv[2]), workers=1))
 """
 
 

@@ -306,7 +306,7 @@ class _Seen(NamedTuple):
         return cls(stream.uv[rows], target.points[stream.point[rows]], np.repeat(np.arange(len(own)), count), start)
 
 
-class _Sums(NamedTuple):
+class _LensSums(NamedTuple):
     """Robust cost; Schur complement S (n, n) and gradient g (n,) of the free parameters; for the step of each image's
     pose its inverse normal matrix H_inv (m, 6, 6), what it shares with the parameters, C (m, 6, n), and its gradient
     gp (m, 6, 1)."""
@@ -319,7 +319,9 @@ class _Sums(NamedTuple):
     gp: np.ndarray
 
 
-def _sums(seen: _Seen, model: CameraModel, params: np.ndarray, free: np.ndarray, R: np.ndarray, p: np.ndarray) -> _Sums:
+def _sums(
+    seen: _Seen, model: CameraModel, params: np.ndarray, free: np.ndarray, R: np.ndarray, p: np.ndarray
+) -> _LensSums:
     """At camera poses R (m, 3, 3), p (m, 3) in the frame of the body."""
     ends = list(pairwise(seen.start))
     X = np.concatenate([(seen.points[a:b] - p[i]) @ R[i] for i, (a, b) in enumerate(ends)])
@@ -340,7 +342,7 @@ def _sums(seen: _Seen, model: CameraModel, params: np.ndarray, free: np.ndarray,
     taken = C.transpose(0, 2, 1) @ H_inv
     S = (_products(Bw, B, rows) - taken @ C).sum(axis=0)
     g = (_products(Bw, rr, rows) - (taken @ gp)[:, :, 0]).sum(axis=0)
-    return _Sums(cost, S, g, H_inv, C, gp)
+    return _LensSums(cost, S, g, H_inv, C, gp)
 
 
 def _products(A: np.ndarray, B: np.ndarray, rows: list[slice]) -> np.ndarray:
