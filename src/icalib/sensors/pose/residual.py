@@ -53,12 +53,41 @@ def frame_of(sensor: str, recording: int) -> str:
     return in_recording(f"frame of {sensor}", recording)
 
 
-@dataclass(frozen=True)
-class AbsolutePoseFactor(RowFactor):
-    """n poses of one sensor in its frame, see `pose_rows.absolute_rows`. node (n,), in order: of each; sigma: of its
-    rotation [rad] and position [m]. imu: None where poses were taken at nodes, which nothing ties to each other."""
+class _PoseFactor(RowFactor):
+    """What both factors of poses share: three rows of rotation and three of position each. name: of the sensor."""
 
     units: ClassVar[dict[str, str]] = UNITS
+
+    name: str
+    rotation: np.ndarray
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(n, 6) of each row."""
+        raise NotImplementedError
+
+    @property
+    def key(self) -> FactorKey:
+        return self.name, "poses"
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `Factor`."""
+        return KINDS
+
+    def output(self) -> Whitened:
+        """Empty arrays for `accumulate` to fill."""
+        return Whitened.empty(len(self.rotation), 6)
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
+        """Of the residuals of `kind`."""
+        return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
+
+
+@dataclass(frozen=True)
+class AbsolutePoseFactor(_PoseFactor):
+    """n poses of one sensor in its frame, see `pose_rows.absolute_rows`. node (n,), in order: of each; sigma: of its
+    rotation [rad] and position [m]. imu: None where poses were taken at nodes, which nothing ties to each other."""
 
     name: str
     seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
@@ -109,23 +138,6 @@ class AbsolutePoseFactor(RowFactor):
         """(n, 6) of each row."""
         return np.tile(np.repeat([self.noise.rotation, self.noise.position], 3), (len(self.seconds), 1))
 
-    @property
-    def key(self) -> FactorKey:
-        return self.name, "poses"
-
-    @property
-    def kinds(self) -> dict[str, slice]:
-        """See `Factor`."""
-        return KINDS
-
-    def output(self) -> Whitened:
-        """Empty arrays for `accumulate` to fill."""
-        return Whitened.empty(len(self.seconds), 6)
-
-    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
-        """Of the residuals of `kind`."""
-        return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
-
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
         cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last node is an end
@@ -168,11 +180,9 @@ class AbsolutePoseFactor(RowFactor):
 
 
 @dataclass(frozen=True)
-class RelativePosesFactor(RowFactor):
+class RelativePosesFactor(_PoseFactor):
     """n ways of one sensor, see `pose_rows.relative_rows`, each between two of its stamps about from node to node;
     duration (n,) s. Their noise is that of a random walk, and independent."""
-
-    units: ClassVar[dict[str, str]] = UNITS
 
     name: str
     seconds: np.ndarray  # (N,) stamps since the first on the sensor's clock
@@ -206,23 +216,6 @@ class RelativePosesFactor(RowFactor):
         """(n, 6) of each row."""
         duration = self.seconds[self.intervals.last] - self.seconds[self.intervals.first]
         return np.sqrt(duration)[:, None] * np.repeat([self.noise.rotation, self.noise.position], 3)
-
-    @property
-    def key(self) -> FactorKey:
-        return self.name, "poses"
-
-    @property
-    def kinds(self) -> dict[str, slice]:
-        """See `Factor`."""
-        return KINDS
-
-    def output(self) -> Whitened:
-        """Empty arrays for `accumulate` to fill."""
-        return Whitened.empty(len(self.rotation), 6)
-
-    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
-        """Of the residuals of `kind`."""
-        return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
