@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.motion.imu_model import correction_matrices, intrinsics_jacobians
+from icalib.motion.imu_model import correction_matrices
+from icalib.motion.integration_step import SIZE, STRIDE, E, correction, fill_intrinsics
 from icalib.rig.imu_classes import INTRINSICS_LABELS as LABELS
 from icalib.rig.imu_classes import N_INTRINSICS
 
@@ -43,9 +44,9 @@ def test_derivatives_by_central_differences(size):
     intrinsics = random_intrinsics(2, size)
     gyro, accel = np.array([0.5, 1.0, -0.8]), np.array([-1.0, 4.0, 8.0])
     rate, force = corrected(intrinsics, gyro, accel)
-    F, G, _ = correction_matrices(intrinsics)
-    d_rate, d_force = np.zeros((3, N_INTRINSICS)), np.zeros((3, N_INTRINSICS))
-    intrinsics_jacobians(intrinsics, F, G, force, rate, d_rate, d_force)
+    run = np.zeros(SIZE)
+    fill_intrinsics(tuple(rate), tuple(force), correction(intrinsics), run)
+    d_rate, d_force = run[E : E + 6 * STRIDE].reshape(2, 3, STRIDE)[:, :, :N_INTRINSICS]
     h = 1e-5
     for n in range(N_INTRINSICS):
         step = h * np.eye(N_INTRINSICS)[n]

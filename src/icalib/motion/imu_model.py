@@ -56,25 +56,3 @@ def correction_matrices(intrinsics):
         for j in range(3):
             H[i, j] = -H[i, j]
     return F, G, H
-
-
-@njit(cache=True, nogil=True)
-def intrinsics_jacobians(intrinsics, F, G, force, rate, d_rate, d_force):
-    """Fills d rate / d intrinsics and d force / d intrinsics, both (3, 24), at corrected `force` and `rate`."""
-    C, u = so3.exp(intrinsics[12:15]), np.empty(3)
-    for i in range(3):
-        u[i] = C[i, 0] * rate[0] + C[i, 1] * rate[1] + C[i, 2] * rate[2]
-    GA = mul3(G, sensitivity(intrinsics))
-    for n in range(6):
-        for i in range(3):
-            d_force[i, n] = -F[i, _ROW[n]] * force[_COL[n]]
-            d_rate[i, 6 + n] = -G[i, _ROW[n]] * u[_COL[n]]
-    for n in range(6):
-        for i in range(3):
-            d_rate[i, n] = -(GA[i, 0] * d_force[0, n] + GA[i, 1] * d_force[1, n] + GA[i, 2] * d_force[2, n])
-    turn = mul3(so3.hat(rate), so3.right_jacobian(intrinsics[12:15]))
-    for i in range(3):
-        for j in range(3):
-            d_rate[i, 12 + j] = turn[i, j]
-            for k in range(3):
-                d_rate[i, 15 + 3 * j + k] = -G[i, j] * force[k]

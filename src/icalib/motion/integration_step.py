@@ -167,7 +167,7 @@ def step(rate, force, dt, by, run, width):
         carry(turn, by_turn, dt, width, run)
         _add_biases(run)
         if width > 6:
-            _fill_intrinsics(rate, force, by, run)
+            fill_intrinsics(rate, force, by, run)
             _add_intrinsics(run)
     v, p = times(R, g1), times(R, g2)
     for i in range(3):
@@ -250,9 +250,9 @@ def _add_biases(run):
 
 
 @njit(cache=True, nogil=True)
-def _fill_intrinsics(rate, force, by, run):
-    """Derivatives of rate (three rows) and force (three rows) by the IMU intrinsics: `imu_model.intrinsics_jacobians`,
-    of which these are the same numbers in other places."""
+def fill_intrinsics(rate, force, by, run):
+    """Fills the derivatives of corrected rate (three rows) and force (three rows), from number E on, by the 24 IMU
+    intrinsics, see `imu_model`; what does not depend on one is zero already."""
     u, turn = times(matrix(by, AXES), rate), _cross_product(rate, matrix(by, AXES_JACOBIAN))
     f, lower = force, (force[0], force[0], force[1], force[0], force[1], force[2])
     for i in range(3):

@@ -26,9 +26,9 @@ from icalib.motion.from_nodes import (
     ways_from,
 )
 from icalib.motion.imu_data import ImuData
-from icalib.motion.imu_model import correction_matrices, intrinsics_jacobians
+from icalib.motion.imu_model import correction_matrices
 from icalib.motion.integration import bias_of, readings_of
-from icalib.motion.integration_step import SIZE, STRIDE, J, P, V, correction
+from icalib.motion.integration_step import SIZE, STRIDE, E, J, P, V, correction, fill_intrinsics
 from icalib.optim.state import NODE, State
 from icalib.rig import Scheme
 from icalib.rig.imu_classes import N_INTRINSICS
@@ -85,8 +85,8 @@ def _velocity(i, R, run, force, g, at, moving):
     _by_start(i, first, R, run, J + 3 * STRIDE, moving.by_node, moving.by_imu)
     _by_turn(i, first, R, run, V, moving.by_node)
     for a in range(3):
-        E = at.rotation[i, a, 0], at.rotation[i, a, 1], at.rotation[i, a, 2]
-        moving.acceleration[i, a] = E[0] * force[0] + E[1] * force[1] + E[2] * force[2]
+        row = at.rotation[i, a, 0], at.rotation[i, a, 1], at.rotation[i, a, 2]
+        moving.acceleration[i, a] = row[0] * force[0] + row[1] * force[1] + row[2] * force[2]
         moving.by_node[i, a, 6 + a] = 1.0
     moving.acceleration[i, 2] -= g
 
@@ -150,7 +150,7 @@ def _inertial(ways, nodes, readings, intrinsics, at, Jn, Jx, moving):
 def _kinematic(times, node, first, nodes, R, p, v, b, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx):
     F, G, H = correction_matrices(intrinsics)
     n_x = Jx.shape[2]
-    by_w, by_f = np.zeros((3, n_x)), np.zeros((3, n_x))
+    by, run = correction(intrinsics), np.zeros(SIZE)
     w, f = np.empty(3), np.empty(3)
     for i in range(len(times)):
         k, j = node[i], first[i]
@@ -164,9 +164,9 @@ def _kinematic(times, node, first, nodes, R, p, v, b, t, gyro, accel, intrinsics
                 w[a] += G[a, c] * raw_w + H[a, c] * raw_f
                 f[a] += F[a, c] * raw_f
         turn = w * dt
-        E, Jr = so3.exp(turn), so3.right_jacobian(turn)
+        turned, Jr = so3.exp(turn), so3.right_jacobian(turn)
         if n_x:
-            intrinsics_jacobians(intrinsics, F, G, f, w, by_w, by_f)
+            fill_intrinsics((w[0], w[1], w[2]), (f[0], f[1], f[2]), by, run)
         for a in range(3):
             rate[i, a] = w[a]
             vel[i, a] = v[k, a]
@@ -174,13 +174,14 @@ def _kinematic(times, node, first, nodes, R, p, v, b, t, gyro, accel, intrinsics
             Jn[i, 3 + a, 3 + a] = 1.0
             Jn[i, 3 + a, 6 + a] = dt
             for c in range(3):
-                out_R[i, a, c] = R[k, a, 0] * E[0, c] + R[k, a, 1] * E[1, c] + R[k, a, 2] * E[2, c]
-                Jn[i, a, c] = E[c, a]
+                out_R[i, a, c] = R[k, a, 0] * turned[0, c] + R[k, a, 1] * turned[1, c] + R[k, a, 2] * turned[2, c]
+                Jn[i, a, c] = turned[c, a]
                 for d in range(3):
                     Jn[i, a, 9 + c] -= dt * Jr[a, d] * G[d, c]
                     Jn[i, a, 12 + c] -= dt * Jr[a, d] * H[d, c]
             for c in range(n_x):
-                Jx[i, a, c] = dt * (Jr[a, 0] * by_w[0, c] + Jr[a, 1] * by_w[1, c] + Jr[a, 2] * by_w[2, c])
+                by_w = run[E + c], run[E + STRIDE + c], run[E + 2 * STRIDE + c]
+                Jx[i, a, c] = dt * (Jr[a, 0] * by_w[0] + Jr[a, 1] * by_w[1] + Jr[a, 2] * by_w[2])
 
 
 @njit(cache=True, nogil=True)
@@ -191,10 +192,10 @@ def _between(times, node, nodes, R, p, out_R, out_p, rate, vel, Jn, Jm):
         s = (times[i] - nodes[k]) / span
         R01 = np.ascontiguousarray(R[k].T) @ R[k + 1]
         phi = so3.log(R01)
-        E = so3.exp(s * phi)
+        turned = so3.exp(s * phi)
         slide = s * (so3.right_jacobian(s * phi) @ so3.right_jacobian_inverse(phi))
         back = slide @ np.ascontiguousarray(R01.T)
-        out_R[i] = R[k] @ E
+        out_R[i] = R[k] @ turned
         for a in range(3):
             rate[i, a] = phi[a] / span
             vel[i, a] = (p[k + 1, a] - p[k, a]) / span
@@ -202,7 +203,7 @@ def _between(times, node, nodes, R, p, out_R, out_p, rate, vel, Jn, Jm):
             Jn[i, 3 + a, 3 + a] = 1.0 - s
             Jm[i, 3 + a, 3 + a] = s
             for c in range(3):
-                Jn[i, a, c] = E[c, a] - back[a, c]
+                Jn[i, a, c] = turned[c, a] - back[a, c]
                 Jm[i, a, c] = slide[a, c]
 
 
