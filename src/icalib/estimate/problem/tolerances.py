@@ -12,7 +12,7 @@ from icalib.rig.scene import SCENE
 from icalib.rig.sensor import TIME_OFFSET
 
 UNGUESSED = 0.03  # rad or m: how well the start knows what nobody guessed, such as which way is up
-FROM_NOTHING_M = 0.5  # what a translation is worth that nobody guessed: where the program took it to be
+FROM_NOTHING_M = 0.5  # prior uncertainty of a translation that nobody guessed: where the program took it to be
 
 
 def specs_of(layout: Layout, sensors: Iterable[Sensor]) -> dict[Key, ParameterSpec]:

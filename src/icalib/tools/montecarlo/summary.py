@@ -12,7 +12,6 @@ import numpy as np
 from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 from icalib.tools.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
 
-EVERYTHING = "calibration"  # all blocks together
 
 
 @dataclass(frozen=True)
