@@ -18,6 +18,7 @@ from icalib.initialize.steps.contradicted import has_guesses, is_contradicted, r
 from icalib.initialize.wheels.wheel_poses import mount_guess, poses_offset
 from icalib.initialize.wheels.wheels import OPPOSITE, SidewaysError, WheelRates, drive_guess, wheel_offset, wheel_rates
 from icalib.motion.clocks import instants
+from icalib.motion.imu_data import clear_of
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
@@ -219,8 +220,7 @@ def _means(
     assert inputs.imu is not None
     motion = motion_of(inputs, state)
     inside = is_known(state.seconds, start) & is_known(state.seconds, end)
-    for a, b in inputs.imu.gaps:  # across which the keyframes are extrapolated
-        inside &= (end <= a) | (start >= b)
+    inside &= clear_of(inputs.imu.gaps, start, end)  # across which the keyframes are extrapolated
     if not inside.any():
         raise EstimationError(
             "no reading of the wheels falls within the recording of the other sensors; check the clocks, or "

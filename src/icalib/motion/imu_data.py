@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,14 @@ GAP_S, GAP = 0.01, 3.0  # an interval longer than both this and so many periods 
 MOTION_CORRELATION_S = 0.1
 DENSE_S = 0.025  # with 20 Hz, jumping rates moved a time offset by a whole step; with 100 Hz, steady ones by 0.6 ms
 WITHIN = 1e-4  # keeps the covariance of a stretch without a stamp in it definite; nothing else
+
+
+def clear_of(gaps: Iterable[tuple[float, float]], start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(n,) whether each span from `start` to `end` (n,) has no part within one of `gaps`, all in seconds."""
+    clear = np.ones(len(start), dtype=bool)
+    for a, b in gaps:
+        clear &= (end <= a) | (start >= b)
+    return clear
 
 
 @dataclass(frozen=True)
@@ -40,6 +48,11 @@ class ImuData:
     gaps: tuple[tuple[float, float], ...]
     seams: tuple[tuple[float, float], ...] = ()
     forwards: bool = False
+
+    def covers(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """(n,) whether each span from `start` to `end` (n,) seconds lies within the recording and none of its gaps."""
+        inside = (start >= self.seconds[0]) & (end <= self.seconds[-1])
+        return inside & clear_of(self.gaps, start, end)
 
     @classmethod
     def build(cls, stream: ImuStream, noise: ImuNoise, forwards: bool = False) -> ImuData:

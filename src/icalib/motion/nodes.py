@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, clear_of
 
 MERGED_WITHIN_S = 2e-3  # images closer than this share a node
 SLACK = 0.1  # of the spacing: a camera of 20 Hz whose stamps jitter needs no node in between
@@ -17,12 +17,9 @@ def place_nodes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max
     """
     times = np.sort(np.concatenate(image_times))
     own = distinct(times[usable(imu, times, max_gap)])
-    long_gaps = [(a, b) for a, b in imu.gaps if b - a > max_gap]
     parts = [_filled(recorded, spacing) for recorded in np.split(own, first_nodes(imu, own)[1:])]
     nodes = np.concatenate(parts)
-    for start, end in long_gaps:
-        nodes = nodes[(nodes <= start) | (nodes >= end)]
-    return nodes
+    return nodes[clear_of(_long_gaps(imu, max_gap), nodes, nodes)]
 
 
 def _filled(times: np.ndarray, spacing: float) -> np.ndarray:
@@ -50,6 +47,8 @@ def distinct(times: np.ndarray) -> np.ndarray:
 def usable(imu: ImuData, times: np.ndarray, max_gap: float) -> np.ndarray:
     """(n,) whether the IMU was running at each time, gaps up to `max_gap` seconds allowed."""
     inside = (times >= imu.seconds[0]) & (times <= imu.seconds[-1])
-    for a, b in (*(gap for gap in imu.gaps if gap[1] - gap[0] > max_gap), *imu.seams):
-        inside &= (times <= a) | (times >= b)
-    return inside
+    return inside & clear_of((*_long_gaps(imu, max_gap), *imu.seams), times, times)
+
+
+def _long_gaps(imu: ImuData, max_gap: float) -> list[tuple[float, float]]:
+    return [(a, b) for a, b in imu.gaps if b - a > max_gap]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, clear_of
 
 LONGEST_S = 0.5  # intervals longer than this are no longer consistent
 
@@ -32,9 +32,7 @@ def choose_intervals(imu: ImuData, nodes: np.ndarray, starts: tuple[int, ...], t
     after = np.clip(np.searchsorted(times, nodes), 1, len(times) - 1)
     near = after if imu.forwards else after - (nodes - times[after - 1] < times[after] - nodes)
     a, b = times[near[:-1]], times[near[1:]]
-    good = (a < b) & (b - a <= LONGEST_S) & (a >= imu.seconds[0]) & (b <= imu.seconds[-1])
-    for start, end in (*imu.gaps, *imu.seams):
-        good &= (b <= start) | (a >= end)
+    good = (a < b) & _usable(imu, a, b)
     good[np.array(starts[1:], dtype=np.int64) - 1] = False
     node = np.flatnonzero(good)
     return StampIntervals(near[node], near[node + 1], node)
@@ -45,11 +43,13 @@ def pose_intervals(imu: ImuData, nodes: np.ndarray, starts: tuple[int, ...], tim
     clock. None leaves the IMU's recording, touches a gap in it, or lies beyond the nodes or between recordings."""
     a, b = times[:-1], times[1:]
     middle = 0.5 * (a + b)
-    good = (b - a <= LONGEST_S) & (a >= imu.seconds[0]) & (b <= imu.seconds[-1])
-    good &= (middle > nodes[0]) & (middle < nodes[-1])
-    for start, end in (*imu.gaps, *imu.seams):
-        good &= (b <= start) | (a >= end)
+    good = _usable(imu, a, b) & (middle > nodes[0]) & (middle < nodes[-1])
     node = np.searchsorted(nodes, middle) - 1
     good &= ~np.isin(node + 1, starts)
     k = np.flatnonzero(good)
     return StampIntervals(k, k + 1, node[k])
+
+
+def _usable(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(n,) whether each span is short, and lies within the IMU's recordings and none of their gaps."""
+    return (end - start <= LONGEST_S) & imu.covers(start, end) & clear_of(imu.seams, start, end)

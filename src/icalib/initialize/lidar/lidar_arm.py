@@ -24,7 +24,7 @@ import numpy as np
 from icalib.geometry import so3
 from icalib.initialize.lidar.lidar_motion import Integrals
 from icalib.initialize.steps.clocks import only_axis
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, clear_of
 
 ARM_SIGMA = 0.5  # m: what the motion leaves open stays small
 BIAS_SIGMA = 0.3  # m/s^2
@@ -202,6 +202,5 @@ def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.n
     good = (k < len(t)) & (j < k) & (i < j)
     i, j, k = i[good], j[good], k[good]
     close = (t[j] - t[i] < 2.0 * step) & (t[k] - t[j] < 2.0 * step)
-    for start, end in gaps:
-        close &= (t[k] <= start) | (t[i] >= end)
+    close &= clear_of(gaps, t[i], t[k])
     return i[close], j[close], k[close]

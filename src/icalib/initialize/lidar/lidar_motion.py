@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.initialize.steps.gyro import GyroRotation
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, clear_of
 
 SEEN_SIGMA, FELT_SIGMA, SPEED_SIGMA = 0.02, 2e-3, 0.02  # m, m, m/s: of what the LiDAR shows, of what the IMU feels
 UNFELT = 1e4  # times as much where the IMU did not run
@@ -91,9 +91,7 @@ class ImuMotion:
         h = np.diff(t)[:, None]
         speed = np.diff(once, axis=0) + h * down
         way = np.diff(twice, axis=0) - h * once[:-1] + 0.5 * h**2 * down
-        unfelt = h[:, 0] > LONGEST_STEP_S
-        for a, b in self.gyro.imu.gaps:
-            unfelt |= (t[1:] > a) & (t[:-1] < b)
+        unfelt = (h[:, 0] > LONGEST_STEP_S) | ~clear_of(self.gyro.imu.gaps, t[:-1], t[1:])
         position, velocity = _least_squares(h[:, 0], self.position, way, speed, np.where(unfelt, UNFELT, 1.0))
         return ImuMotion(self.gyro, t, self.rotation, position, velocity, self.gyro_bias, self.accel_bias, self.gravity)
 

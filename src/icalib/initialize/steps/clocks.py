@@ -138,11 +138,7 @@ def rough_alignments(
 
 def covered(imu: ImuData, rates: CameraRates, offset: float) -> np.ndarray:
     """(n,) bool: image intervals within the IMU's recording and none of its gaps."""
-    start, end = rates.start + offset, rates.end + offset
-    inside = (start >= imu.seconds[0]) & (end <= imu.seconds[-1])
-    for a, b in imu.gaps:
-        inside &= (end <= a) | (start >= b)
-    return inside
+    return imu.covers(rates.start + offset, rates.end + offset)
 
 
 def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> None:

@@ -17,7 +17,7 @@ from icalib.errors import EstimationError
 from icalib.initialize.steps.clock_shifts import USUAL_STEPS
 from icalib.initialize.steps.gyro import GyroRotation
 from icalib.initialize.steps.target_poses import TargetPoses
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, clear_of
 
 STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
 READINGS = 8192  # of the IMU at a time, whose rotations are made together
@@ -135,8 +135,7 @@ def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.n
     good = (k < len(t)) & (j < k) & (i < j)
     i, j, k = i[good], j[good], k[good]
     close = (t[j] - t[i] < longest) & (t[k] - t[j] < longest)
-    for start, end in gaps:
-        close &= (t[k] <= start) | (t[i] >= end)
+    close &= clear_of(gaps, t[i], t[k])
     return i[close], j[close], k[close]
 
 

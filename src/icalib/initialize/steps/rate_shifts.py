@@ -18,7 +18,7 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.initialize.steps.clock_shifts import MOST_PEAKS, PEAKS_APART_S, SHORTEST_OVERLAP_S, CameraRates
 from icalib.initialize.steps.mean_rates import MeanRates
 from icalib.initialize.steps.track_rotation import STEP_S, track_rates
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, clear_of
 
 STEPS_S = (STEP_S, 0.2, 0.1, 0.05)  # between images
 SHORTEST_STEP = 0.75  # times the period of the images
@@ -48,9 +48,7 @@ def best_regressions(imu: ImuData, rates: CameraRates) -> list[Regression]:
     middle = 0.5 * (rates.start + rates.end)
     seen, seen_known = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
     start = np.arange(0.0, imu.seconds[-1] - length, step)
-    felt, felt_known = MeanRates.of(imu).over(start, start + length), np.ones(len(start), dtype=bool)
-    for a, b in imu.gaps:
-        felt_known &= (start + length <= a) | (start >= b)
+    felt, felt_known = MeanRates.of(imu).over(start, start + length), clear_of(imu.gaps, start, start + length)
     if not felt_known.any() or not seen_known.any():
         return []
     explained, count = _explained(felt, felt_known, seen, seen_known)

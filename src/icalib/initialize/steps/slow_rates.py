@@ -12,7 +12,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.initialize.steps.gyro import GyroRotation
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, clear_of
 
 _SHIFT_S = 0.05  # between the offsets that are tried: short against the intervals
 _MOST_INTERVALS = 100  # that are compared at each offset
@@ -53,9 +53,7 @@ def slow_offsets(imu: ImuData, start: np.ndarray, end: np.ndarray, rate: np.ndar
     grid = np.arange(imu.seconds[0], imu.seconds[-1], _SHIFT_S)
     R = turned.at(grid).reshape(-1, 9)
     begin, length = (np.round(x / _SHIFT_S).astype(np.int64) for x in (start, end - start))
-    known = np.ones(len(grid), dtype=bool)
-    for a, b in imu.gaps:
-        known &= (grid <= a) | (grid >= b)
+    known = clear_of(imu.gaps, grid, grid)
     unknown = np.concatenate([[0], np.cumsum(~known)])
     shifts = np.arange(-int(begin[-1]), len(grid))
     left = np.concatenate(

@@ -127,8 +127,4 @@ def _fit(gyro: np.ndarray, yaw: np.ndarray, lag: int) -> float:
 
 def intervals_inside(imu: ImuData, stream: WheelPoses, offset: float) -> np.ndarray:
     """(K,) intervals within the IMU's recording and none of its gaps."""
-    start, end = stream.seconds[:-1] + offset, stream.seconds[1:] + offset
-    inside = (start >= imu.seconds[0]) & (end <= imu.seconds[-1])
-    for a, b in imu.gaps:
-        inside &= (end <= a) | (start >= b)
-    return inside
+    return imu.covers(stream.seconds[:-1] + offset, stream.seconds[1:] + offset)

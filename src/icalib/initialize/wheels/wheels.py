@@ -18,7 +18,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.initialize.steps.clock_shifts import LONGEST_STEP_S, how_alike, longest_step
 from icalib.initialize.steps.correlation import best_shift
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.stamp_intervals import LONGEST_S
 from icalib.rig import WheelKind, drive_names
 
@@ -140,7 +140,7 @@ def wheel_offset(imu: ImuData, up: np.ndarray, name: str, rates: WheelRates) -> 
     angle = np.concatenate([[0.0], np.cumsum(0.5 * (turn[1:] + turn[:-1]) * np.diff(imu.seconds))])
     for _ in range(ROUNDS):
         start, end = rates.start + offset, rates.end + offset
-        inside = _covered(imu, start, end)
+        inside = imu.covers(start, end)
         start, end, rate = start[inside], end[inside], rates.turning[inside]
         mean = (np.interp(end, imu.seconds, angle) - np.interp(start, imu.seconds, angle)) / (end - start)
         slope = (np.interp(end, imu.seconds, turn) - np.interp(start, imu.seconds, turn)) / (end - start)
@@ -307,20 +307,10 @@ def _check_arcs(name: str, w: np.ndarray, ahead: np.ndarray) -> None:
         )
 
 
-def _covered(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(n,) whether each span lies within the IMU's recording and none of its gaps."""
-    inside = (start >= imu.seconds[0]) & (end <= imu.seconds[-1])
-    for a, b in imu.gaps:
-        inside &= (end <= a) | (start >= b)
-    return inside
-
-
 def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> float:
     """Offset [s] at the peak of the correlation of the gyro's `turn` (N,) with how the wheels turn."""
     grid = np.arange(int(imu.seconds[-1] * GRID_HZ) + 1) / GRID_HZ
-    known = np.ones(len(grid), dtype=bool)
-    for start, end in imu.gaps:
-        known &= (grid <= start) | (grid >= end)
+    known = clear_of(imu.gaps, grid, grid)
     middle = 0.5 * (rates.start + rates.end)
     wheels = np.arange(int(middle[-1] * GRID_HZ) + 1) / GRID_HZ
     near = np.diff(middle, append=middle[-1]) < rates.longest_step_s
