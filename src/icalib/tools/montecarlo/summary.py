@@ -13,7 +13,6 @@ from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 from icalib.tools.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
 
 
-
 @dataclass(frozen=True)
 class Entry:
     """One number of a block: root mean square of its error and of its standard deviation over the runs in which it is
