@@ -14,6 +14,7 @@ import pytest
 
 import icalib
 from icalib.base.yaml_nodes import parse_yaml
+from icalib.estimate.problem.robot import own_entries
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets import Checkerboard
 from icalib.optim.state import make_layout
@@ -22,7 +23,6 @@ from icalib.rig.file import rig_from_dict, rig_to_dict
 from icalib.rig.file.fields import groups_to_plain, parameter_fields, parameters
 from icalib.rig.imu_classes import class_noise
 from icalib.rig.kinds import SENSOR_TYPES, SPECS
-from icalib.sensors.robot import own_entries
 
 SOURCE = Path(icalib.__file__).parent
 NAMES = {spec.name for own in SENSOR_TYPES.values() for spec in own.parameters} | set(SPECS)

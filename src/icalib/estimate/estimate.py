@@ -23,6 +23,7 @@ from icalib.estimate.problem.guess_priors import guess_priors
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome, Step, Visit, way_come
 from icalib.estimate.problem.problem import Problem
+from icalib.estimate.problem.robot import RobotNoise
 from icalib.estimate.problem.solver import minimise
 from icalib.motion.factor import of_type, pairs_of
 from icalib.optim import pages
@@ -36,7 +37,6 @@ from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.image_pairs import not_simultaneous
 from icalib.sensors.lidar.noise import next_lidar_noise
 from icalib.sensors.pose.factors import next_pose_noise
-from icalib.sensors.robot import RobotNoise
 
 LOOSE = 3.0  # times the prior uncertainty of a guess
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise

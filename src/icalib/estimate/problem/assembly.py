@@ -11,6 +11,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.problem import ChainFactor, Problem
+from icalib.estimate.problem.robot import NO_ROBOT, RobotNoise, robot_factors
 from icalib.geometry.cameras import camera_model
 from icalib.motion.clocks import EARLY_S, instants
 from icalib.motion.factor import Factor, keyed
@@ -38,7 +39,6 @@ from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.lidar_binning import points_on_planes
 from icalib.sensors.pose.factors import still_factors
-from icalib.sensors.robot import NO_ROBOT, RobotNoise, robot_factors
 
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough

@@ -10,6 +10,7 @@ import numpy as np
 
 from icalib.data.joining import Part, join
 from icalib.data.measurements import Measurements, Stream
+from icalib.estimate.problem.robot import own_entries
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets.base import BOARD
 from icalib.motion.clouds import NO_CLOUDS, Clouds
@@ -22,7 +23,6 @@ from icalib.rig.sensor import MOUNTED, TIME_OFFSET
 from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
 from icalib.sensors.camera.images import on_common_images
 from icalib.sensors.pose.factors import frame_entries
-from icalib.sensors.robot import own_entries
 
 
 @dataclass(frozen=True)
