@@ -69,18 +69,18 @@ def pointwise(setup, state, bin_s=1e-3) -> Point:
     r = np.einsum("ni,ni->n", n, world - c)
     in_body = np.einsum("nij,ni->nj", R, n)
     beam = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
-    by_pose = np.concatenate([np.cross(in_imu, in_body), n], axis=1)
+    J_pose = np.concatenate([np.cross(in_imu, in_body), n], axis=1)
     turned = np.concatenate([np.cross(beam @ R_il.T, in_body), np.zeros_like(n)], axis=1)
     o = NODE * len(state.seconds)
     J, J_c = np.zeros((2, len(used), o + setup.layout.size))
     for i, k in enumerate(node):
-        J[i, NODE * k : NODE * (k + 1)] = by_pose[i] @ poses.by_node[i]
-        J_c[i, NODE * k : NODE * (k + 1)] = turned[i] @ poses.by_node[i]
+        J[i, NODE * k : NODE * (k + 1)] = J_pose[i] @ poses.J_node[i]
+        J_c[i, NODE * k : NODE * (k + 1)] = turned[i] @ poses.J_node[i]
     columns = [o + setup.layout.columns("lidar0", name) for name in ("rotation", "translation", "time_offset")]
     J[:, columns[0]] = np.cross(xyz, in_body @ R_il)
     J[:, columns[1]] = in_body
     twist = np.concatenate([poses.rate, poses.velocity], axis=1)
-    J[:, columns[2][0]] = (by_pose * twist).sum(axis=1)
+    J[:, columns[2][0]] = (J_pose * twist).sum(axis=1)
     J_c[:, columns[0]] = np.cross(beam, in_body @ R_il)
     J_c[:, columns[2][0]] = (turned * twist).sum(axis=1)
     h = 1e-6

@@ -52,9 +52,9 @@ def test_jacobians_of_every_node_by_central_differences(setup, scheme):
             chain[k, j] = h
             plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, border))
             minus, _ = evaluate(setup, scheme, state.retract(setup.layout, -chain, border))
-            analytic = at.by_node[:, :, j] * (node == k)[:, None]
+            analytic = at.J_node[:, :, j] * (node == k)[:, None]
             if scheme == "pose":
-                analytic = analytic + at.by_next[:, :, j] * (node + 1 == k)[:, None]
+                analytic = analytic + at.J_next[:, :, j] * (node + 1 == k)[:, None]
             np.testing.assert_allclose(analytic, difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=f"{k} {j}")
 
 
@@ -63,14 +63,12 @@ def test_jacobians_of_the_imu_intrinsics_by_central_differences(setup, scheme):
     state = setup.perturbed(np.random.default_rng(2))
     at, _ = evaluate(setup, scheme, state)
     h, chain = 1e-5, np.zeros((len(state.seconds), NODE))
-    assert at.by_imu.shape == (len(TIMES), 6, 24)
+    assert at.J_imu.shape == (len(TIMES), 6, 24)
     for n, column in enumerate(setup.layout.columns("imu0", "intrinsics")):
         border = h * np.eye(setup.layout.size)[column]
         plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, border))
         minus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, -border))
-        np.testing.assert_allclose(
-            at.by_imu[:, :, n], difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=str(n)
-        )
+        np.testing.assert_allclose(at.J_imu[:, :, n], difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=str(n))
 
 
 def motion(setup, state=None, times=TIMES, imu_free=True):
@@ -81,7 +79,7 @@ def motion(setup, state=None, times=TIMES, imu_free=True):
 def test_motion_has_the_inertial_poses(setup):
     at, _ = evaluate(setup, "inertial")
     poses, _, _ = motion(setup)
-    for name in ("rotation", "position", "rate", "velocity", "by_node", "by_next", "by_imu"):
+    for name in ("rotation", "position", "rate", "velocity", "J_node", "J_next", "J_imu"):
         np.testing.assert_array_equal(getattr(poses, name), getattr(at, name))
 
 
@@ -95,9 +93,9 @@ def test_jacobians_of_the_velocity_by_central_differences(setup):
         plus, minus = (motion(setup, state.retract(setup.layout, s * chain, s * border))[0] for s in (1.0, -1.0))
         numeric = (plus.velocity - minus.velocity) / (2.0 * h)
         if column < n * NODE:
-            analytic = moving.by_node[:, :, column % NODE] * (node == column // NODE)[:, None]
+            analytic = moving.J_node[:, :, column % NODE] * (node == column // NODE)[:, None]
         elif (k := column - n * NODE) in (own := list(setup.layout.columns("imu0", "intrinsics"))):
-            analytic = moving.by_imu[:, :, own.index(k)]
+            analytic = moving.J_imu[:, :, own.index(k)]
         elif k in setup.layout.columns("board0", "tilt"):
             continue  # turns the whole state with it
         else:
@@ -137,8 +135,8 @@ def test_inertial_has_no_jumps_at_the_stamps_of_the_imu(setup):
 
 def test_shapes_without_what_is_not_wanted(setup):
     inertial, _ = evaluate(setup, "inertial", imu_free=False)
-    assert inertial.by_imu.shape == (len(TIMES), 6, 0)
-    assert inertial.by_next.shape == (0, 6, NODE)
+    assert inertial.J_imu.shape == (len(TIMES), 6, 0)
+    assert inertial.J_next.shape == (0, 6, NODE)
 
 
 def test_inertial_is_exact_from_stamp_to_stamp_on_an_exact_trajectory(setup):

@@ -43,10 +43,10 @@ def pose_chain(i, motion, Tn, Tm, Tc):
     """
     R_ic, R_cw, p_wc = motion.R_imu_cam, motion.R_cam_world[i], motion.p_world_cam[i]
     A = by_imu_pose(R_ic, motion.p_imu_cam, R_cw)
-    _product(A, motion.by_node[i], Tn)
-    if len(motion.by_next):
-        _product(A, motion.by_next[i], Tm)
-    _product(A, motion.by_imu[i], Tc)
+    _product(A, motion.J_node[i], Tn)
+    if len(motion.J_next):
+        _product(A, motion.J_next[i], Tm)
+    _product(A, motion.J_imu[i], Tc)
     for r in range(6):
         Tc[r, 6] = 0.0
         for k in range(3):

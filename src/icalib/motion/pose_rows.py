@@ -32,14 +32,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class PoseRows:
-    """n poses of 6 rows, rotation and position, not whitened. residual (n, 6); by_pose (n, 6, 6) by rotation and
-    position of the IMU, of relative poses one for each end; by_mount (n, 6, 6) by R_imu_sensor, p_imu_sensor; by_frame
+    """n poses of 6 rows, rotation and position, not whitened. residual (n, 6); J_pose (n, 6, 6) by rotation and
+    position of the IMU, of relative poses one for each end; J_mount (n, 6, 6) by R_imu_sensor, p_imu_sensor; J_frame
     (n, 6, 6 or 0) by R_world_frame, p_world_frame. Jacobians of length 0 where they are not wanted."""
 
     residual: np.ndarray
-    by_pose: tuple[np.ndarray, ...]
-    by_mount: np.ndarray
-    by_frame: np.ndarray
+    J_pose: tuple[np.ndarray, ...]
+    J_mount: np.ndarray
+    J_frame: np.ndarray
 
     @classmethod
     def alone(cls, residual: np.ndarray) -> PoseRows:
@@ -70,16 +70,16 @@ def absolute_rows(
     if not jacobians:
         return PoseRows.alone(residual)
     J = right_jacobians_inverse(e)
-    by_pose, by_mount, by_frame = (np.zeros((n, 6, 6)) for _ in range(3))
-    by_pose[:, :3, :3] = J @ mount.R.T
-    by_pose[:, 3:, :3] = -in_frame @ so3.hat_many(mount.p)
-    by_pose[:, 3:, 3:] = frame.R.T
-    by_mount[:, :3, :3] = J
-    by_mount[:, 3:, 3:] = in_frame
-    by_frame[:, :3, :3] = -J @ _t(predicted)
-    by_frame[:, 3:, :3] = so3.hat_many(x)
-    by_frame[:, 3:, 3:] = -frame.R.T
-    return PoseRows(residual, (by_pose,), by_mount, by_frame)
+    J_pose, J_mount, J_frame = (np.zeros((n, 6, 6)) for _ in range(3))
+    J_pose[:, :3, :3] = J @ mount.R.T
+    J_pose[:, 3:, :3] = -in_frame @ so3.hat_many(mount.p)
+    J_pose[:, 3:, 3:] = frame.R.T
+    J_mount[:, :3, :3] = J
+    J_mount[:, 3:, 3:] = in_frame
+    J_frame[:, :3, :3] = -J @ _t(predicted)
+    J_frame[:, 3:, :3] = so3.hat_many(x)
+    J_frame[:, 3:, 3:] = -frame.R.T
+    return PoseRows(residual, (J_pose,), J_mount, J_frame)
 
 
 def relative_rows(
@@ -105,17 +105,17 @@ def relative_rows(
     if not jacobians:
         return PoseRows.alone(residual)
     J = right_jacobians_inverse(e)
-    before, after, by_mount = (np.zeros((n, 6, 6)) for _ in range(3))
+    before, after, J_mount = (np.zeros((n, 6, 6)) for _ in range(3))
     before[:, :3, :3] = -J @ mount.R.T @ _t(turn)
     before[:, 3:, :3] = mount.R.T @ so3.hat_many(way)
     before[:, 3:, 3:] = -mount.R.T @ _t(R[0])
     after[:, :3, :3] = J @ mount.R.T
     after[:, 3:, :3] = -mount.R.T @ turn @ so3.hat_many(mount.p)
     after[:, 3:, 3:] = mount.R.T @ _t(R[0])
-    by_mount[:, :3, :3] = J @ (np.eye(3) - _t(Q))
-    by_mount[:, 3:, :3] = so3.hat_many(x)
-    by_mount[:, 3:, 3:] = mount.R.T @ (turn - np.eye(3))
-    return PoseRows(residual, (before, after), by_mount, np.zeros((n, 6, 0)))
+    J_mount[:, :3, :3] = J @ (np.eye(3) - _t(Q))
+    J_mount[:, 3:, :3] = so3.hat_many(x)
+    J_mount[:, 3:, 3:] = mount.R.T @ (turn - np.eye(3))
+    return PoseRows(residual, (before, after), J_mount, np.zeros((n, 6, 0)))
 
 
 @njit(cache=True, nogil=True)
@@ -128,21 +128,21 @@ def right_jacobians_inverse(e: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def add_chain_rule(by_pose, at, out_node, out_time, out_imu):
-    """Adds the derivatives of rows through a pose of the IMU, by_pose (n, 6, 6), `at` of which are the `Poses`: by the
+def add_chain_rule(J_pose, at, out_node, out_time, out_imu):
+    """Adds the derivatives of rows through a pose of the IMU, J_pose (n, 6, 6), `at` of which are the `Poses`: by the
     node to out_node (n, 6, 15), by time to out_time (n, 6), by the IMU intrinsics to out_imu (n, 6, 24 or 0)."""
-    by_node, by_imu, rate, velocity = at
-    for i in range(len(by_pose)):
+    J_node, J_imu, rate, velocity = at
+    for i in range(len(J_pose)):
         for q in range(6):
             for k in range(6):
-                f = by_pose[i, q, k]
+                f = J_pose[i, q, k]
                 if f == 0.0:
                     continue
                 out_time[i, q] += f * (rate[i, k] if k < 3 else velocity[i, k - 3])
                 for c in range(15):
-                    out_node[i, q, c] += f * by_node[i, k, c]
+                    out_node[i, q, c] += f * J_node[i, k, c]
                 for c in range(out_imu.shape[2]):
-                    out_imu[i, q, c] += f * by_imu[i, k, c]
+                    out_imu[i, q, c] += f * J_imu[i, k, c]
 
 
 def _t(R: np.ndarray) -> np.ndarray:

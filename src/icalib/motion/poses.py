@@ -39,29 +39,29 @@ class Poses:
     """IMU poses at n instants, and how they move. Rows of the Jacobians: rotation (right), position (world).
 
     rotation (n, 3, 3), position (n, 3); rate (n, 3) body rad/s and velocity (n, 3) world m/s, the time derivative;
-    by_node, by_next (n, 6, 15): with respect to the node and, for `pose` alone, the one after it (else of length 0);
-    by_imu (n, 6, 24 or 0): with respect to the IMU intrinsics.
+    J_node, J_next (n, 6, 15): with respect to the node and, for `pose` alone, the one after it (else of length 0);
+    J_imu (n, 6, 24 or 0): with respect to the IMU intrinsics.
     """
 
     rotation: np.ndarray
     position: np.ndarray
     rate: np.ndarray
     velocity: np.ndarray
-    by_node: np.ndarray
-    by_next: np.ndarray
-    by_imu: np.ndarray
+    J_node: np.ndarray
+    J_next: np.ndarray
+    J_imu: np.ndarray
 
 
 class Velocities(NamedTuple):
     """How the velocity in `Poses` (world, m/s) moves in the `inertial` scheme.
 
-    acceleration (n, 3) world m/s^2, its time derivative; by_node (n, 3, 15), by_imu (n, 3, 24 or 0): with respect to
+    acceleration (n, 3) world m/s^2, its time derivative; J_node (n, 3, 15), J_imu (n, 3, 24 or 0): with respect to
     the node and the IMU intrinsics. All of length 0 where not wanted.
     """
 
     acceleration: np.ndarray
-    by_node: np.ndarray
-    by_imu: np.ndarray
+    J_node: np.ndarray
+    J_imu: np.ndarray
 
     @classmethod
     def empty(cls, n: int, n_imu: int) -> Velocities:
@@ -82,12 +82,12 @@ def _velocity(i, R, run, force, g, at, moving):
     """Fills entry i of `moving`: increments `run` (see `integration_step`) from a node at R, and `force` at the
     instant."""
     first = 0 * i
-    _by_start(i, first, R, run, J + 3 * STRIDE, moving.by_node, moving.by_imu)
-    _by_turn(i, first, R, run, V, moving.by_node)
+    _by_start(i, first, R, run, J + 3 * STRIDE, moving.J_node, moving.J_imu)
+    _by_turn(i, first, R, run, V, moving.J_node)
     for a in range(3):
         row = at.rotation[i, a, 0], at.rotation[i, a, 1], at.rotation[i, a, 2]
         moving.acceleration[i, a] = row[0] * force[0] + row[1] * force[1] + row[2] * force[2]
-        moving.by_node[i, a, 6 + a] = 1.0
+        moving.J_node[i, a, 6 + a] = 1.0
     moving.acceleration[i, 2] -= g
 
 
@@ -210,10 +210,10 @@ def _between(times, node, nodes, R, p, out_R, out_p, rate, vel, Jn, Jm):
 def poses_of_nodes(node: np.ndarray, state: State) -> Poses:
     """IMU poses at the nodes themselves, which stand still: where there is no IMU, images are taken at nodes."""
     n = len(node)
-    by_node, still = np.zeros((n, 6, NODE)), np.zeros((n, 3))
-    by_node[:, range(6), range(6)] = 1.0
+    J_node, still = np.zeros((n, 6, NODE)), np.zeros((n, 3))
+    J_node[:, range(6), range(6)] = 1.0
     nothing = np.zeros((0, 6, NODE))
-    return Poses(state.rotation[node], state.position[node], still, still, by_node, nothing, np.zeros((n, 6, 0)))
+    return Poses(state.rotation[node], state.position[node], still, still, J_node, nothing, np.zeros((n, 6, 0)))
 
 
 def poses_at(
@@ -223,17 +223,17 @@ def poses_at(
     n = len(times)
     if scheme == "inertial":
         return _carried(_empty(n, n, imu_free), times, node, state, imu, gravity, Velocities.empty(0, 0))
-    out, by_node, by_imu = Moving.empty(n), np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
-    by_next = np.zeros((n if scheme == "pose" else 0, 6, NODE))
+    out, J_node, J_imu = Moving.empty(n), np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
+    J_next = np.zeros((n if scheme == "pose" else 0, 6, NODE))
     if scheme == "pose":
-        _between(times, node, state.seconds, state.rotation, state.position, *out, by_node, by_next)
+        _between(times, node, state.seconds, state.rotation, state.position, *out, J_node, J_next)
     else:
         _kinematic(
             times, node, imu.interval(state.seconds[node]), state.seconds, state.rotation, state.position,
             state.velocity, state.bias, imu.seconds, imu.gyro, imu.accel, state.values[imu.name, "intrinsics"],
-            *out, by_node, by_imu,
+            *out, J_node, J_imu,
         )  # fmt: skip
-    return Poses(*out, by_node, by_next, by_imu)
+    return Poses(*out, J_node, J_next, J_imu)
 
 
 def poses_alone(times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float) -> Poses:
@@ -252,8 +252,8 @@ def motion_at(
 
 def _empty(n: int, n_jacobians: int, imu_free: bool) -> Poses:
     """To be filled with n `inertial` poses and the Jacobians of as many, or of none."""
-    by_imu = np.zeros((n_jacobians, 6, N_INTRINSICS if imu_free else 0))
-    return Poses(*Moving.empty(n), np.zeros((n_jacobians, 6, NODE)), np.zeros((0, 6, NODE)), by_imu)
+    J_imu = np.zeros((n_jacobians, 6, N_INTRINSICS if imu_free else 0))
+    return Poses(*Moving.empty(n), np.zeros((n_jacobians, 6, NODE)), np.zeros((0, 6, NODE)), J_imu)
 
 
 def _carried(
@@ -263,5 +263,5 @@ def _carried(
     ways, nodes = ways_from(state, times, node, imu), nodes_of(state, gravity)
     at = Moving(out.rotation, out.position, out.rate, out.velocity)
     intrinsics = state.values[imu.name, "intrinsics"]
-    _inertial(ways, nodes, readings_of(imu, True), intrinsics, at, out.by_node, out.by_imu, moving)
+    _inertial(ways, nodes, readings_of(imu, True), intrinsics, at, out.J_node, out.J_imu, moving)
     return out

@@ -54,7 +54,7 @@ def add_rows(
 ) -> float:
     """Adds the rows `own` of a factor, each to the interval that begins at its `node`, and fills `into.out`; returns
     half the robust chi^2. columns (c,): of the border; those of the IMU's intrinsics follow where rows have them."""
-    if imu is not None and rows.by_border.shape[2] > len(columns):
+    if imu is not None and rows.J_calib.shape[2] > len(columns):
         columns = np.concatenate([columns, layout.columns(imu.name, "intrinsics")])
     free = np.flatnonzero(columns >= 0)
     loss = Loss(LOSSES[by.loss], by.loss_scale, into.curved)

@@ -11,13 +11,13 @@ from icalib.optim.robust_weights import weight
 
 
 class Rows(NamedTuple):
-    """n intervals of m rows: residual (n, m); by_node, by_next (n, m, 15), with respect to both nodes; by_border (n, m,
+    """n intervals of m rows: residual (n, m); J_node, J_next (n, m, 15), with respect to both nodes; J_calib (n, m,
     c): to columns of the border. Jacobians of length 0 where not wanted."""
 
     residual: np.ndarray
-    by_node: np.ndarray
-    by_next: np.ndarray
-    by_border: np.ndarray
+    J_node: np.ndarray
+    J_next: np.ndarray
+    J_calib: np.ndarray
 
     @classmethod
     def empty(cls, n: int, m: int, n_columns: int, jacobians: bool) -> Rows:
@@ -105,7 +105,7 @@ def _whiten(W, J, columns, scale, out):
 def accumulate_rows(rows, node, W, loss, free, columns, sums, residual, root):
     """Whitens rows by W (n, m, m), weighs them, and adds them to the sums where these are wanted.
 
-    free, columns (c,): columns of by_border that are estimated, and theirs in the border. residual, root (n, m):
+    free, columns (c,): columns of J_calib that are estimated, and theirs in the border. residual, root (n, m):
     whitened residuals and square roots of their weights, out. Returns half the robust chi^2.
     """
     m, n_c = W.shape[1], len(free)
@@ -120,9 +120,9 @@ def accumulate_rows(rows, node, W, loss, free, columns, sums, residual, root):
         cost += _weigh(residual[i], loss, scaled, root[i])
         if len(sums.diagonal) == 0:
             continue
-        _whiten(W[i], rows.by_node[i], chain, scaled[0], A0)
-        _whiten(W[i], rows.by_next[i], chain, scaled[0], A1)
-        _whiten(W[i], rows.by_border[i], free, scaled[0], Ac)
+        _whiten(W[i], rows.J_node[i], chain, scaled[0], A0)
+        _whiten(W[i], rows.J_next[i], chain, scaled[0], A1)
+        _whiten(W[i], rows.J_calib[i], free, scaled[0], Ac)
         for q in range(m):
             Ac[q, n_c] = scaled[1, q] * residual[i, q]
         add_interval(node[i] - sums.first, A0, A1, Ac, columns, sums)

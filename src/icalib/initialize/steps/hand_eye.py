@@ -137,7 +137,7 @@ def _refined(pairs: PosePairs, start: Mount, held: tuple[bool, bool]) -> HandEye
         residual, scales = rows.residual, _scales(rows.residual)
         weight = 1.0 / (1.0 + _squares(residual, scales).sum(axis=1) / (2.0 * 3.0 * BEND**2))
         root = np.sqrt(weight)[:, None] / np.repeat(scales, 3)
-        J = np.concatenate([rows.by_mount, rows.by_frame], axis=2) * root[:, :, None]
+        J = np.concatenate([rows.J_mount, rows.J_frame], axis=2) * root[:, :, None]
         away = np.concatenate([so3.log(np.ascontiguousarray(start.R.T @ mount.R)), mount.p - start.p])
         A = np.concatenate([J.reshape(-1, 12), np.eye(6, 12) * prior[:, None]])[:, free]
         b = np.concatenate([(residual * root).ravel(), prior * away])

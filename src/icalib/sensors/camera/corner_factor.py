@@ -297,7 +297,7 @@ class CornerFactor(FactorDefaults):
         R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
         return Motion(
             np.ascontiguousarray(R_ic), p_ic, R_cw[own], p_wc[own], poses.rate[own], poses.velocity[own],
-            poses.by_node[own], poses.by_next[own] if len(poses.by_next) else poses.by_next, poses.by_imu[own],
+            poses.J_node[own], poses.J_next[own] if len(poses.J_next) else poses.J_next, poses.J_imu[own],
             np.ascontiguousarray(R_ws), R_ws @ R_sb, p_sb @ R_ws.T, chained,
         )  # fmt: skip
 

@@ -59,9 +59,9 @@ class Motion(NamedTuple):
     p_world_cam: np.ndarray
     rate: np.ndarray
     velocity: np.ndarray
-    by_node: np.ndarray
-    by_next: np.ndarray
-    by_imu: np.ndarray
+    J_node: np.ndarray
+    J_next: np.ndarray
+    J_imu: np.ndarray
     R_world_scene: np.ndarray
     R_world_body: np.ndarray
     p_world_body: np.ndarray
@@ -75,8 +75,8 @@ class Predicted(NamedTuple):
     X: np.ndarray
     uv: np.ndarray
     valid: np.ndarray
-    by_point: np.ndarray
-    by_params: np.ndarray
+    J_point: np.ndarray
+    J_params: np.ndarray
 
 
 class Found(NamedTuple):
@@ -172,14 +172,14 @@ def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
         basis = direct.basis[images.point[n0 + k]]
         for r in range(2):
             at = r * n + k
-            a0, a1 = root * predicted.by_point[c, r, 0], root * predicted.by_point[c, r, 1]
-            a2 = root * predicted.by_point[c, r, 2]
+            a0, a1 = root * predicted.J_point[c, r, 0], root * predicted.J_point[c, r, 1]
+            a2 = root * predicted.J_point[c, r, 2]
             A[0, at] = a1 * z - a2 * y
             A[1, at] = a2 * x - a0 * z
             A[2, at] = a0 * y - a1 * x
             A[3, at], A[4, at], A[5, at] = -a0, -a1, -a2
             for q in range(n_pars):
-                A[6 + q, at] = root * predicted.by_params[c, r, direct.pars[q]]
+                A[6 + q, at] = root * predicted.J_params[c, r, direct.pars[q]]
             d = 6 + n_pars
             if has_bloom:
                 A[d, at] = root * direct.direction[n0 + k, r]
@@ -206,7 +206,7 @@ def _work(images, direct, motion):
     for i in range(len(images.start) - 1):
         most = max(most, images.start[i + 1] - images.start[i])
     D = 6 + len(direct.pars) + (len(direct.direction) > 0) + direct.basis.shape[1]
-    Tm = np.empty((6, 15 if len(motion.by_next) else 0))
+    Tm = np.empty((6, 15 if len(motion.J_next) else 0))
     return (
         np.empty((D + 1, 2 * most)), np.empty((D + 1, D + 1)), np.empty((most, 2)), np.empty((most, 2)), np.empty(most),
         np.empty((6, 15)), Tm, np.empty((6, motion.columns.shape[1])),

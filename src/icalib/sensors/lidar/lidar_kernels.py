@@ -44,9 +44,9 @@ class Motion(NamedTuple):
     p_world_lidar: np.ndarray
     rate: np.ndarray
     velocity: np.ndarray
-    by_node: np.ndarray
-    by_next: np.ndarray
-    by_imu: np.ndarray
+    J_node: np.ndarray
+    J_next: np.ndarray
+    J_imu: np.ndarray
     columns: np.ndarray
 
 
@@ -61,11 +61,11 @@ def _pose_chain(i, motion, T):
         for j in range(15):
             T[r, j] = 0.0
             for k in range(POSE):
-                T[r, j] += A[r, k] * motion.by_node[i, k, j]
+                T[r, j] += A[r, k] * motion.J_node[i, k, j]
         for j in range(n_nodes - 15):
             T[r, 15 + j] = 0.0
             for k in range(POSE):
-                T[r, 15 + j] += A[r, k] * motion.by_next[i, k, j]
+                T[r, 15 + j] += A[r, k] * motion.J_next[i, k, j]
         o = n_nodes
         for j in range(3):
             T[r, o + j] = 1.0 if r == j else 0.0
@@ -73,10 +73,10 @@ def _pose_chain(i, motion, T):
         T[r, o + 6] = 0.0
         for k in range(3):
             T[r, o + 6] += A[r, k] * motion.rate[i, k] + A[r, 3 + k] * motion.velocity[i, k]
-        for j in range(motion.by_imu.shape[2]):
+        for j in range(motion.J_imu.shape[2]):
             T[r, o + 7 + j] = 0.0
             for k in range(POSE):
-                T[r, o + 7 + j] += A[r, k] * motion.by_imu[i, k, j]
+                T[r, o + 7 + j] += A[r, k] * motion.J_imu[i, k, j]
     return A
 
 
@@ -262,7 +262,7 @@ class _Work(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _work_space(motion):
-    width = (30 if len(motion.by_next) else 15) + len(motion.columns)
+    width = (30 if len(motion.J_next) else 15) + len(motion.columns)
     return _Work(
         np.empty((POSE, width)), np.empty(ROWS), np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)),
         np.empty((POSE, POSE + 1)), np.empty((3, POSE)), np.empty((POSE, width + 1)), np.empty((PLANE, width)),
@@ -289,14 +289,14 @@ def turn_by_noise(bins, motion, planes):
     """Fills `turned` and `slope` of the bins, which are empty."""
     work = _work_space(motion)
     for i in range(len(bins.node)):
-        by_imu = _pose_chain(i, motion, work.T)
+        J_imu_pose = _pose_chain(i, motion, work.T)
         for e in range(bins.start[i], bins.start[i + 1]):
             _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m)
             _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m, work.A)
             _times_root(work.A, bins.root[e], work.B[:POSE])
             for a in range(3):
                 for j in range(POSE):
-                    w = bins.walked[i] * by_imu[j, a]
+                    w = bins.walked[i] * J_imu_pose[j, a]
                     for c in range(ROWS):
                         bins.turned[e, a, c] += w * work.B[j, c]
                         bins.slope[e, a] += w * work.A[j, c] * bins.slant[e, c] if c else 0.0

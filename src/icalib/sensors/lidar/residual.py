@@ -142,7 +142,7 @@ class LidarFactor(RowFactor):
             R_lw = np.ascontiguousarray((poses.rotation @ R_il).transpose(0, 2, 1))
             motion = Motion(
                 R_il, p_il, R_lw, poses.position + poses.rotation @ p_il, poses.rate, poses.velocity,
-                poses.by_node, poses.by_next, poses.by_imu, through_pose,
+                poses.J_node, poses.J_next, poses.J_imu, through_pose,
             )  # fmt: skip
             yield (
                 Bins(node, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant, self.turned, self.slope),

@@ -167,8 +167,8 @@ class AbsolutePoseFactor(_PoseFactor):
         made = _chained(rows, _Scaling.of(self, state, own), (poses,))
         if into.sums:
             last = node > at
-            made.by_next[last] = made.by_node[last]
-            made.by_node[last] = 0.0
+            made.J_next[last] = made.J_node[last]
+            made.J_node[last] = 0.0
         columns = np.concatenate(
             [
                 mounted_columns(self.layout, self.name, recording),
@@ -279,21 +279,21 @@ class _Scaling(NamedTuple):
 def _chained(rows: PoseRows, scaling: _Scaling, ends: tuple[Poses, ...]) -> Rows:
     """The rows, of reported positions times their scale, as rows of reported ones; by the nodes of each of their
     `ends`, and by the border: mount, time, frame, scale, IMU intrinsics."""
-    n, own = rows.by_mount.shape[0], rows.by_mount.shape[2]
+    n, own = rows.J_mount.shape[0], rows.J_mount.shape[2]
     time = slice(own, own + 1)
-    frame = slice(time.stop, time.stop + rows.by_frame.shape[2])
-    imu = slice(frame.stop + 1, frame.stop + 1 + ends[0].by_imu.shape[2])
-    by_border = np.zeros((n, 6, imu.stop))
-    by_border[:, :, :own], by_border[:, :, frame] = rows.by_mount, rows.by_frame
-    by_nodes = np.zeros((2, n, 6, NODE))
-    for by_pose, poses, by_node in zip(rows.by_pose, ends, by_nodes, strict=False):
-        moved = poses.by_node, poses.by_imu, poses.rate, poses.velocity
-        add_chain_rule(by_pose, moved, by_node, by_border[:, :, own], by_border[:, :, imu])
-    for x in (rows.residual, *by_nodes, by_border):
+    frame = slice(time.stop, time.stop + rows.J_frame.shape[2])
+    imu = slice(frame.stop + 1, frame.stop + 1 + ends[0].J_imu.shape[2])
+    J_calib = np.zeros((n, 6, imu.stop))
+    J_calib[:, :, :own], J_calib[:, :, frame] = rows.J_mount, rows.J_frame
+    J_nodes = np.zeros((2, n, 6, NODE))
+    for J_pose, poses, J_node in zip(rows.J_pose, ends, J_nodes, strict=False):
+        moved = poses.J_node, poses.J_imu, poses.rate, poses.velocity
+        add_chain_rule(J_pose, moved, J_node, J_calib[:, :, own], J_calib[:, :, imu])
+    for x in (rows.residual, *J_nodes, J_calib):
         x[:, 3:] /= scaling.scale
     if n:
-        by_border[:, 3:, frame.stop] = -(rows.residual[:, 3:] + scaling.reported) / scaling.scale
-    return Rows(rows.residual, by_nodes[0], by_nodes[1], by_border)
+        J_calib[:, 3:, frame.stop] = -(rows.residual[:, 3:] + scaling.reported) / scaling.scale
+    return Rows(rows.residual, J_nodes[0], J_nodes[1], J_calib)
 
 
 def _add(factor: PoseFactor, own: slice, rows: Rows, columns: np.ndarray, node: np.ndarray, into: Into) -> float:

@@ -149,14 +149,14 @@ class GroundFactor(RowFactor):
         up = np.einsum("kji,j->ki", R_k, n)  # in the axes of the IMU
         way = state.position[nodes] + R_k @ p - plane[3:]
         own = np.zeros((len(nodes), 4, N_COLUMNS))
-        by_node = np.zeros((len(nodes), 4, 15))
+        J_node = np.zeros((len(nodes), 4, 15))
         tilt = up @ R
         # R_k <- R_k Exp(d) takes up to up + up x d, and R <- R Exp(d) the tilt to tilt + tilt x d.
-        by_node[:, :2, :3] = np.cross(R[:, :2].T, up[:, None])
+        J_node[:, :2, :3] = np.cross(R[:, :2].T, up[:, None])
         own[:, :2, :3] = np.cross(np.eye(3)[:2], tilt[:, None])
         own[:, :2, 7:9] = np.einsum("kji,tj->kit", R_k @ R[:, :2], across)
-        by_node[:, 2, :3] = np.cross(p, up)
-        by_node[:, 2, 3:6] = n
+        J_node[:, 2, :3] = np.cross(p, up)
+        J_node[:, 2, 3:6] = n
         own[:, 2, 3:6] = up
         own[:, 2, 7:9] = way @ across.T
         own[:, 2, 9] = -sign
@@ -164,4 +164,4 @@ class GroundFactor(RowFactor):
         h = state.values.get((self.name, GROUND_HEIGHT.name), np.zeros(1))[0]
         height = way @ n - h
         residual = np.column_stack([tilt[:, :2], height, np.full(len(nodes), h - self.ground.height)])
-        return Rows(residual, by_node, np.zeros_like(by_node), own)
+        return Rows(residual, J_node, np.zeros_like(J_node), own)

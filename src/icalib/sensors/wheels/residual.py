@@ -143,7 +143,7 @@ class IncrementFactor(RowFactor):
         node = self.instants.node[seen]
         times = self.instants.times[seen] + offset_at(state, self.name, node)
         poses, moving = _motion(self, times, node, state, into.sums)
-        rows = Rows.empty(len(start) - 1, 4, N_OWN + poses.by_imu.shape[2], into.sums)
+        rows = Rows.empty(len(start) - 1, 4, N_OWN + poses.J_imu.shape[2], into.sums)
         wheels = _wheels(self.name, state, self.kind)
         c = coefficients(self.kind, wheels.drive, self.mean[own])
         increment_rows(
@@ -251,7 +251,7 @@ class RelativePoseFactor(RowFactor):
             poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
         else:
             poses = poses_alone(times, node, state, self.imu, self.gravity)
-        rows = Rows.empty(len(times) // 2, 3, N_OWN + poses.by_imu.shape[2], into.sums)
+        rows = Rows.empty(len(times) // 2, 3, N_OWN + poses.J_imu.shape[2], into.sums)
         relative_rows(_track(node, poses), _wheels(self.name, state, self.kind), z.z[own], z.J[own], z.drive0, rows)
         return _add(self, own, rows, z.W, state, into)
 
@@ -304,7 +304,7 @@ def _motion(
 
 
 def _track(node: np.ndarray, poses: Poses) -> Track:
-    return Track(node, poses.rotation, poses.position, poses.rate, poses.velocity, poses.by_node, poses.by_imu)
+    return Track(node, poses.rotation, poses.position, poses.rate, poses.velocity, poses.J_node, poses.J_imu)
 
 
 def _rms(out: Whitened, whitening: np.ndarray, rows: slice) -> float:

@@ -37,8 +37,8 @@ class Track(NamedTuple):
     position: np.ndarray
     rate: np.ndarray
     velocity: np.ndarray
-    by_node: np.ndarray
-    by_imu: np.ndarray
+    J_node: np.ndarray
+    J_imu: np.ndarray
 
 
 @njit(cache=True, nogil=True)
@@ -66,10 +66,10 @@ def _turn(a, b, track, M0, M1, Mc, wanted):
         for j in range(3):
             Mc[3 + i, 0] += after[i, j] * track.rate[b, j] - before[i, j] * track.rate[a, j]
             for c in range(15):
-                M0[3 + i, c] -= before[i, j] * track.by_node[a, j, c]
-                M1[3 + i, c] += after[i, j] * track.by_node[b, j, c]
-            for c in range(track.by_imu.shape[2]):
-                Mc[3 + i, 1 + c] += after[i, j] * track.by_imu[b, j, c] - before[i, j] * track.by_imu[a, j, c]
+                M0[3 + i, c] -= before[i, j] * track.J_node[a, j, c]
+                M1[3 + i, c] += after[i, j] * track.J_node[b, j, c]
+            for c in range(track.J_imu.shape[2]):
+                Mc[3 + i, 1 + c] += after[i, j] * track.J_imu[b, j, c] - before[i, j] * track.J_imu[a, j, c]
     return theta
 
 
@@ -90,9 +90,9 @@ def _add_travel(j, w, track, moving, D, M, Mc, wanted):
         Mc[i, 0] += w * (spin[i] + pull[i])
         for k in range(3):
             for c in range(15):
-                M[i, c] += w * (U[i, k] * track.by_node[j, k, c] + R[k, i] * moving.by_node[j, k, c])
-            for c in range(track.by_imu.shape[2]):
-                Mc[i, 1 + c] += w * (U[i, k] * track.by_imu[j, k, c] + R[k, i] * moving.by_imu[j, k, c])
+                M[i, c] += w * (U[i, k] * track.J_node[j, k, c] + R[k, i] * moving.J_node[j, k, c])
+            for c in range(track.J_imu.shape[2]):
+                Mc[i, 1 + c] += w * (U[i, k] * track.J_imu[j, k, c] + R[k, i] * moving.J_imu[j, k, c])
 
 
 @njit(cache=True, nogil=True)
@@ -120,11 +120,11 @@ def _shift(a, b, track, p, Y, M0, M1, Mc, wanted):
         for k in range(3):
             Mc[i, 0] += A[i, k] * track.rate[a, k] + B[i, k] * track.rate[b, k]
             for c in range(15):
-                M0[i, c] += A[i, k] * track.by_node[a, k, c] - Ra[k, i] * track.by_node[a, 3 + k, c]
-                M1[i, c] += B[i, k] * track.by_node[b, k, c] + Ra[k, i] * track.by_node[b, 3 + k, c]
-            for c in range(track.by_imu.shape[2]):
-                Mc[i, 1 + c] += A[i, k] * track.by_imu[a, k, c] - Ra[k, i] * track.by_imu[a, 3 + k, c]
-                Mc[i, 1 + c] += B[i, k] * track.by_imu[b, k, c] + Ra[k, i] * track.by_imu[b, 3 + k, c]
+                M0[i, c] += A[i, k] * track.J_node[a, k, c] - Ra[k, i] * track.J_node[a, 3 + k, c]
+                M1[i, c] += B[i, k] * track.J_node[b, k, c] + Ra[k, i] * track.J_node[b, 3 + k, c]
+            for c in range(track.J_imu.shape[2]):
+                Mc[i, 1 + c] += A[i, k] * track.J_imu[a, k, c] - Ra[k, i] * track.J_imu[a, 3 + k, c]
+                Mc[i, 1 + c] += B[i, k] * track.J_imu[b, k, c] + Ra[k, i] * track.J_imu[b, 3 + k, c]
 
 
 @njit(cache=True, nogil=True)
@@ -133,14 +133,14 @@ def _fill_row(i, q, gX, gT, aY, aT, X, T, M0, M1, Mc, rows):
     # R <- R Exp(d) turns X and T by -d: d X = X x d.
     x, t = _cross(gX, X), _cross(gT, T)
     for c in range(3):
-        rows.by_border[i, q, c] = x[c] + t[c]
+        rows.J_calib[i, q, c] = x[c] + t[c]
     for k in range(3):
         for c in range(15):
-            rows.by_node[i, q, c] += aY[k] * M0[k, c] + aT[k] * M0[3 + k, c]
-            rows.by_next[i, q, c] += aY[k] * M1[k, c] + aT[k] * M1[3 + k, c]
-        rows.by_border[i, q, 6] += aY[k] * Mc[k, 0] + aT[k] * Mc[3 + k, 0]
+            rows.J_node[i, q, c] += aY[k] * M0[k, c] + aT[k] * M0[3 + k, c]
+            rows.J_next[i, q, c] += aY[k] * M1[k, c] + aT[k] * M1[3 + k, c]
+        rows.J_calib[i, q, 6] += aY[k] * Mc[k, 0] + aT[k] * Mc[3 + k, 0]
         for c in range(Mc.shape[1] - 1):
-            rows.by_border[i, q, N_OWN + c] += aY[k] * Mc[k, 1 + c] + aT[k] * Mc[3 + k, 1 + c]
+            rows.J_calib[i, q, N_OWN + c] += aY[k] * Mc[k, 1 + c] + aT[k] * Mc[3 + k, 1 + c]
 
 
 @njit(cache=True, nogil=True)
@@ -160,7 +160,7 @@ def _by_drive(i, q, by_X, by_T, X, T, rows):
         s = 0.0
         for k in range(3):
             s += by_X[d, k] * X[k] + by_T[d, k] * T[k]
-        rows.by_border[i, q, 7 + d] = s
+        rows.J_calib[i, q, 7 + d] = s
 
 
 @njit(cache=True, nogil=True)
@@ -170,8 +170,8 @@ def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
     start (n + 1,), weights (m,): see Instants; track, moving: motion at these instants; c: Coefficients; measured
     (n, 4).
     """
-    wanted = len(rows.by_node) > 0
-    n_c = 1 + track.by_imu.shape[2]
+    wanted = len(rows.J_node) > 0
+    n_c = 1 + track.J_imu.shape[2]
     M0, M1, Mc, D = np.empty((6, 15)), np.empty((6, 15)), np.empty((6, n_c)), np.empty(3)
     X, T, aY, aT = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(len(start) - 1):
@@ -196,7 +196,7 @@ def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
             _fill_row(i, q, c.X[g, q], c.T[g, q], aY, aT, X, T, M0, M1, Mc, rows)
             lever = _cross(aY, theta)
             for k in range(3):
-                rows.by_border[i, q, 3 + k] = lever[k]
+                rows.J_calib[i, q, 3 + k] = lever[k]
             _by_drive(i, q, c.by_X[g, q], c.by_T[g, q], X, T, rows)
 
 
@@ -207,8 +207,8 @@ def relative_rows(track, wheels, z, J, drive0, rows):
 
     track: motion at 2 n instants, first all begins, then all ends; z, J, drive0: see RelativePoses.
     """
-    n, n_c = len(z), 1 + track.by_imu.shape[2]
-    wanted = len(rows.by_node) > 0
+    n, n_c = len(z), 1 + track.J_imu.shape[2]
+    wanted = len(rows.J_node) > 0
     M0, M1, Mc, Y = np.empty((6, 15)), np.empty((6, 15)), np.empty((6, n_c)), np.empty(3)
     X, T, none, axes = np.empty(3), np.empty(3), np.zeros(3), np.eye(3)
     for i in range(n):
@@ -231,6 +231,6 @@ def relative_rows(track, wheels, z, J, drive0, rows):
                 aY = wheels.R[:, q - 1]
                 _fill_row(i, q, axes[q - 1], none, aY, none, X, T, M0, M1, Mc, rows)
                 for k in range(3):
-                    rows.by_border[i, q, 3 + k] = aY[0] * R01[0, k] + aY[1] * R01[1, k] + aY[2] * R01[2, k] - aY[k]
+                    rows.J_calib[i, q, 3 + k] = aY[0] * R01[0, k] + aY[1] * R01[1, k] + aY[2] * R01[2, k] - aY[k]
             for k in range(3):
-                rows.by_border[i, q, 7 + k] = -J[i, q, k]
+                rows.J_calib[i, q, 7 + k] = -J[i, q, k]

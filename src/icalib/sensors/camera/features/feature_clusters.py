@@ -15,7 +15,7 @@ def accumulate_clusters(X, seen, base, motion, seeing, loss, cluster, n_clusters
     them, into columns `column` and on of the piece's sums and of side (T, 3, columns) of its features."""
     n_d = len(seeing.pars)
     A, G, error, D = np.zeros((10 + n_d, 2)), np.empty((6 + n_d, n_clusters)), np.empty(2), 9 + n_d
-    Tn, Tm = np.empty((6, 15)), np.empty((6, 15 if len(motion.by_next) else 0))
+    Tn, Tm = np.empty((6, 15)), np.empty((6, 15 if len(motion.J_next) else 0))
     Tc = np.empty((6, motion.columns.shape[1]))
     for i in range(len(seen.start) - 1):
         G[:] = 0.0

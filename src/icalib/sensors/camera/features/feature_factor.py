@@ -338,7 +338,7 @@ class FeatureFactor(FactorDefaults):
         )  # fmt: skip
         motion = Motion(
             np.ascontiguousarray(state.values[camera.name, "rotation"]), state.values[camera.name, "translation"],
-            R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
+            R_cw, p_wc, poses.rate, poses.velocity, poses.J_node, poses.J_next, poses.J_imu,
             np.eye(3), np.zeros((0, 3, 3)), np.zeros((0, 3)), self._chained(camera, state, i0, i1),
         )  # fmt: skip
         params = camera.lens(state)

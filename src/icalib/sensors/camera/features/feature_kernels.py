@@ -52,8 +52,8 @@ class Seeing(NamedTuple):
     first: int
     uv: np.ndarray
     valid: np.ndarray
-    by_point: np.ndarray
-    by_params: np.ndarray
+    J_point: np.ndarray
+    J_params: np.ndarray
     pars: np.ndarray
     columns: np.ndarray
 
@@ -134,9 +134,9 @@ def add_rays(seen, t0, R_cw, p_wc, rays, valid, A, b):
 
 
 @njit(cache=True, nogil=True)
-def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, loss, points):
+def add_to_points(seen, t0, R_cw, image, which, uv, valid, J_point, loss, points):
     """Adds one camera's observations `which` (m,), of images (m,), to the sums, with the true curvature of the loss,
-    and costs of the trial points; uv, valid and by_point (m, ...): what the model makes of these."""
+    and costs of the trial points; uv, valid and J_point (m, ...): what the model makes of these."""
     J, e = np.empty((2, 3)), np.empty(2)
     for m in range(len(which)):
         n, R = which[m], R_cw[image[m]]
@@ -146,7 +146,7 @@ def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, loss, point
         for r in range(2):
             e[r] = uv[m, r] - seen.uv[n, r]
             for k in range(3):
-                J[r, k] = by_point[m, r, 0] * R[0, k] + by_point[m, r, 1] * R[1, k] + by_point[m, r, 2] * R[2, k]
+                J[r, k] = J_point[m, r, 0] * R[0, k] + J_point[m, r, 1] * R[1, k] + J_point[m, r, 2] * R[2, k]
         variance = seen.sigma[n] * seen.sigma[n]
         square = (e[0] * e[0] + e[1] * e[1]) / variance
         w, cost, curvature = weight(loss.kind, loss.scale, square)
@@ -295,11 +295,11 @@ def weighted_rows(i, n, X, seen, seeing, loss, R_cw, error, A):
     root = np.sqrt(w) / seen.sigma[n]
     x, y, z = X[c, 0], X[c, 1], X[c, 2]
     for r in range(2):
-        a0, a1, a2 = root * seeing.by_point[c, r, 0], root * seeing.by_point[c, r, 1], root * seeing.by_point[c, r, 2]
+        a0, a1, a2 = root * seeing.J_point[c, r, 0], root * seeing.J_point[c, r, 1], root * seeing.J_point[c, r, 2]
         A[0, r], A[1, r], A[2, r] = a1 * z - a2 * y, a2 * x - a0 * z, a0 * y - a1 * x
         A[3, r], A[4, r], A[5, r] = -a0, -a1, -a2
         for q in range(len(seeing.pars)):
-            A[6 + q, r] = root * seeing.by_params[c, r, seeing.pars[q]]
+            A[6 + q, r] = root * seeing.J_params[c, r, seeing.pars[q]]
         for k in range(3):
             A[D - 3 + k, r] = a0 * R_cw[i, 0, k] + a1 * R_cw[i, 1, k] + a2 * R_cw[i, 2, k]
         A[D, r] = root * error[r]
@@ -352,7 +352,7 @@ def accumulate(X, seen, base, motion, seeing, loss, sums, features, residual, ro
     for i in range(len(seen.start) - 1):
         most = max(most, seen.start[i + 1] - seen.start[i])
     rows = np.empty((2 * most, 7 + n_d))
-    Tn, Tm = np.empty((6, 15)), np.empty((6, 15 if len(motion.by_next) else 0))
+    Tn, Tm = np.empty((6, 15)), np.empty((6, 15 if len(motion.J_next) else 0))
     Tc, total, D = np.empty((6, motion.columns.shape[1])), 0.0, 9 + n_d
     wanted = len(sums.diagonal) > 0
     for i in range(len(seen.start) - 1):

@@ -47,7 +47,7 @@ class View:
         seen = seen._replace(start=seen.start[a : b + 1], node=seen.node[own])
         m = m._replace(
             R_cam_world=m.R_cam_world[own], p_world_cam=m.p_world_cam[own], rate=m.rate[own], velocity=m.velocity[own],
-            by_node=m.by_node[own], by_next=m.by_next[own], by_imu=m.by_imu[own], columns=m.columns[own],
+            J_node=m.J_node[own], J_next=m.J_next[own], J_imu=m.J_imu[own], columns=m.columns[own],
         )  # fmt: skip
         return replace(self, first=self.first + a, seen=seen, motion=m)
 
@@ -72,6 +72,6 @@ class View:
             image, which, X = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty((most, 3))
             m = moving_points(seen, track, motion.R_cam_world, motion.p_world_cam, points, image, which, X)
             if m:
-                uv, valid, by_point, _ = self.camera.model.project_with_jacobians(self.params, X[:m])
+                uv, valid, J_point, _ = self.camera.model.project_with_jacobians(self.params, X[:m])
                 R = motion.R_cam_world
-                add_to_points(seen, track, R, image[:m], which[:m], uv, valid, by_point, loss, points)
+                add_to_points(seen, track, R, image[:m], which[:m], uv, valid, J_point, loss, points)
