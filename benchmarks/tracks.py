@@ -82,12 +82,12 @@ def _products(piece: Piece) -> Callable[[], None]:
     """The updates of the front, of matrices of the same sizes."""
     features = piece.features
     assert features is not None
-    plan, n_border = features.plan, features.sums.side.shape[2]
+    plan, n_calib = features.plan, features.sums.side.shape[2]
     ranks = []
     for g in range(len(plan.after)):
         own = plan.nodes.values[plan.nodes.start[g] : plan.nodes.start[g + 1]]
         ranks.append(int(plan.coupled[own].sum() + 3 * (plan.dying.start[g + 1] - plan.dying.start[g])))
-    wide = n_border + 3 * plan.alive
+    wide = n_calib + 3 * plan.alive
     rows, front = np.random.default_rng(0).standard_normal((max(ranks), wide.max())), np.zeros((wide.max(),) * 2)
 
     def run() -> None:

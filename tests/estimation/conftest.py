@@ -122,7 +122,7 @@ class Setup:
         return R, p - self.origin, v
 
     def columns_scale(self) -> np.ndarray:
-        """(B,) a reasonable step of each border column."""
+        """(B,) a reasonable step of each calibration column."""
         scale = np.zeros(self.layout.size)
         for b in self.layout.free:
             scale[b.columns] = 1e-3 if b.key == ("imu0", "intrinsics") else TOLERANCE[b.name]
@@ -284,7 +284,7 @@ class RoomSetup:
         return self.sim.measurements.lidars[0]
 
     def columns_scale(self) -> np.ndarray:
-        """(B,) a reasonable step of each border column."""
+        """(B,) a reasonable step of each calibration column."""
         scale = np.zeros(self.layout.size)
         for b in self.layout.free:
             scale[b.columns] = 1e-3 if b.key == ("imu0", "intrinsics") else TOLERANCE[b.name]
@@ -292,8 +292,8 @@ class RoomSetup:
 
     def perturbed(self, rng: np.random.Generator, size: float = 1.0) -> State:
         chain = rng.normal(size=(len(self.state.seconds), NODE)) * np.repeat([2e-3, 2e-3, 5e-3, 5e-4, 5e-3], 3)
-        border = rng.normal(size=self.layout.size) * self.columns_scale()
-        return self.state.retract(self.layout, size * chain, size * border)
+        calib = rng.normal(size=self.layout.size) * self.columns_scale()
+        return self.state.retract(self.layout, size * chain, size * calib)
 
     def motion(self, state: State) -> Motion:
         return Motion(state, self.imu, 9.81, 0.5)
@@ -365,10 +365,10 @@ def room_scenario(
 
 
 def make_dense(pieces: tuple[Piece, ...], n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """The normal matrix (chain, then border) and its gradient."""
-    n_border = pieces[0].border.shape[0] - 1
+    """The normal matrix (chain, then calib) and its gradient."""
+    n_calib = pieces[0].calib.shape[0] - 1
     o = NODE * n_nodes
-    H, g = np.zeros((o + n_border, o + n_border)), np.zeros(o + n_border)
+    H, g = np.zeros((o + n_calib, o + n_calib)), np.zeros(o + n_calib)
     for piece in pieces:
         for k in range(piece.first, piece.last + 1):
             i, a = k - piece.first, slice(NODE * k, NODE * k + NODE)
@@ -377,8 +377,8 @@ def make_dense(pieces: tuple[Piece, ...], n_nodes: int) -> tuple[np.ndarray, np.
             g[a] += piece.side[i, :, -1]
             if k < piece.last:
                 H[a, NODE * k + NODE : NODE * k + 2 * NODE] += piece.upper[i]
-        H[o:, o:] += piece.border[:-1, :-1]
-        g[o:] += piece.border[:-1, -1]
+        H[o:, o:] += piece.calib[:-1, :-1]
+        g[o:] += piece.calib[:-1, -1]
         for H_part, g_part in schur_of_features(piece, n_nodes) if piece.features else ():
             H -= H_part
             g -= g_part

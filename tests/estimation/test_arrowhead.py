@@ -5,17 +5,18 @@ import pytest
 
 from icalib.optim import arrowhead
 from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, marginalise_in_segments, solve
-from icalib.optim.border import HELD_BELOW, border_step
+from icalib.optim.calib_block import HELD_BELOW, calib_step
 from icalib.optim.state import NODE
 
 
-def random_pieces(n_nodes, n_border, seed=0, border_rank=None):
-    """Pieces filled with the sums of random factors: each on two neighbouring nodes and the border, or on one node."""
+def random_pieces(n_nodes, n_calib, seed=0, calib_rank=None):
+    """Pieces filled with the sums of random factors: each on two neighbouring nodes and the calibration parameters, or
+    on one node."""
     rng = np.random.default_rng(seed)
-    pieces = make_pieces(n_nodes, n_border)
-    mix = np.eye(n_border)
-    if border_rank is not None:
-        mix = rng.normal(size=(border_rank, n_border))
+    pieces = make_pieces(n_nodes, n_calib)
+    mix = np.eye(n_calib)
+    if calib_rank is not None:
+        mix = rng.normal(size=(calib_rank, n_calib))
     for piece in pieces:
         for k in range(piece.last - piece.first + 1):
             pair = k < piece.last - piece.first
@@ -37,8 +38,8 @@ def add_factor(piece, k, A, B, C, r):
         piece.upper[k] += A.T @ B
         piece.diagonal[k + 1] += B.T @ B
         piece.side[k + 1] += B.T @ Cr
-    piece.border += Cr.T @ Cr
-    piece.border[-1, -1] = 0.0
+    piece.calib += Cr.T @ Cr
+    piece.calib[-1, -1] = 0.0
 
 
 def schur(H, g, n_nodes):
@@ -49,16 +50,16 @@ def schur(H, g, n_nodes):
 
 
 def flat(solution):
-    return np.concatenate([solution.chain.ravel(), solution.border])
+    return np.concatenate([solution.chain.ravel(), solution.calib])
 
 
-@pytest.mark.parametrize("n_border", [0, 1, 3, 8])
+@pytest.mark.parametrize("n_calib", [0, 1, 3, 8])
 @pytest.mark.parametrize("n_nodes", range(1, 13))
-def test_solution_is_the_dense_one(dense, n_nodes, n_border):
-    pieces = random_pieces(n_nodes, n_border)
+def test_solution_is_the_dense_one(dense, n_nodes, n_calib):
+    pieces = random_pieces(n_nodes, n_calib)
     H, g = dense(pieces, n_nodes)
     information, _ = schur(H, g, n_nodes)
-    solution = solve(pieces, n_nodes, np.ones(n_border))
+    solution = solve(pieces, n_nodes, np.ones(n_calib))
     step = np.linalg.solve(H, -g)
     np.testing.assert_allclose(flat(solution), step, rtol=0, atol=1e-10 * np.abs(step).max())
     np.testing.assert_allclose(solution.information, information, rtol=0, atol=1e-9)
@@ -95,13 +96,13 @@ def test_marginalise_is_the_schur_complement(dense, n_nodes):
     (piece,) = random_pieces(n_nodes, 5, seed=2)
     H, g = dense((piece,), n_nodes)
     information, gradient = schur(H, g, n_nodes)
-    border = marginalise(piece)
-    np.testing.assert_allclose(border[:-1, :-1], information, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(border[:-1, -1], gradient, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(border[-1, :-1], gradient, rtol=0, atol=1e-10)
+    calib = marginalise(piece)
+    np.testing.assert_allclose(calib[:-1, :-1], information, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(calib[:-1, -1], gradient, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(calib[-1, :-1], gradient, rtol=0, atol=1e-10)
 
 
-def whole_and_segments(n_nodes, n_border, seed):
+def whole_and_segments(n_nodes, n_calib, seed):
     """A random chain whole, and a function that makes its part between two nodes: factors on a node and the next one
     belong to the part that holds both, those on a node alone to the part that it begins (the last one: ends)."""
     rng = np.random.default_rng(seed)
@@ -109,10 +110,10 @@ def whole_and_segments(n_nodes, n_border, seed):
     for k in range(n_nodes):
         for both in (True, False) if k < n_nodes - 1 else (False,):
             A, B = rng.normal(size=(2, 30, NODE))
-            factors.append((k, A, B if both else None, rng.normal(size=(30, n_border)), rng.normal(size=30)))
+            factors.append((k, A, B if both else None, rng.normal(size=(30, n_calib)), rng.normal(size=30)))
 
     def part(first, last):
-        piece = Piece.zeros(first, last, n_border)
+        piece = Piece.zeros(first, last, n_calib)
         for k, A, B, C, r in factors:
             if first <= k < last or (k == last == n_nodes - 1 and B is None):
                 add_factor(piece, k - first, A, B, C, r)
@@ -128,9 +129,9 @@ def test_marginalising_in_segments_is_the_schur_complement(monkeypatch, dense, n
     whole, part = whole_and_segments(n_nodes, 5, seed=4)
     H, g = dense((whole,), n_nodes)
     information, gradient = schur(H, g, n_nodes)
-    border = marginalise_in_segments(part, n_nodes)
-    np.testing.assert_allclose(border[:-1, :-1], information, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(border[:-1, -1], gradient, rtol=0, atol=1e-10)
+    calib = marginalise_in_segments(part, n_nodes)
+    np.testing.assert_allclose(calib[:-1, :-1], information, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(calib[:-1, -1], gradient, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("node", [0, 2, 3, 6])
@@ -150,28 +151,28 @@ def test_marginalising_in_segments_raises_where_a_node_is_not_determined(monkeyp
 
 @pytest.mark.parametrize("n_nodes", [3, 8])
 def test_undetermined_directions_stay_and_the_rest_is_solved(dense, n_nodes):
-    """Factors see three combinations of five border parameters: the two others are held."""
-    pieces = random_pieces(n_nodes, 5, seed=3, border_rank=3)
+    """Factors see three combinations of five calibration parameters: the two others are held."""
+    pieces = random_pieces(n_nodes, 5, seed=3, calib_rank=3)
     tolerance = np.array([1.0, 0.5, 2.0, 1.0, 0.3])
     H, g = dense(pieces, n_nodes)
     information, gradient = schur(H, g, n_nodes)
     values, vectors = np.linalg.eigh(information * np.outer(tolerance, tolerance))
     assert values[1] < 1e-8 < HELD_BELOW < values[2]
     solution = solve(pieces, n_nodes, tolerance)
-    np.testing.assert_allclose(vectors[:, :2].T @ (solution.border / tolerance), 0.0, atol=1e-12)
+    np.testing.assert_allclose(vectors[:, :2].T @ (solution.calib / tolerance), 0.0, atol=1e-12)
     free = tolerance[:, None] * vectors[:, 2:]
     expected = free @ np.linalg.solve(free.T @ information @ free, -free.T @ gradient)
-    np.testing.assert_allclose(solution.border, expected, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(solution.calib, expected, rtol=0, atol=1e-10)
     o, step = NODE * n_nodes, flat(solution)
-    np.testing.assert_allclose((H @ step + g)[:o], 0.0, atol=1e-9)  # the chain follows the held border
+    np.testing.assert_allclose((H @ step + g)[:o], 0.0, atol=1e-9)  # the chain follows the held parameters
     assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-8)
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
-def test_the_border_between_held_and_moved(factor):
+def test_calibration_parameters_between_held_and_moved(factor):
     """One parameter with a tolerance of 0.1: information HELD_BELOW / 0.1^2 is where it begins to move."""
     information, gradient = np.array([[factor * HELD_BELOW / 0.1**2]]), np.array([3.0])
-    step, decrease = border_step(information, gradient, np.array([0.1]))
+    step, decrease = calib_step(information, gradient, np.array([0.1]))
     expected = 0.0 if factor < 1.0 else -3.0 / information[0, 0]
     assert step[0] == pytest.approx(expected, rel=1e-12)
     assert decrease == pytest.approx(-0.5 * 3.0 * expected, rel=1e-12)

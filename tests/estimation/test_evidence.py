@@ -27,14 +27,14 @@ DRAWS = 40
 
 def columns_of(solution):
     """(n, m) the columns of a factor X of the inverse, X X^T, chain first: what unit vectors give in place of noise."""
-    factors, n_border = solution.factors, len(solution.border)
+    factors, n_calib = solution.factors, len(solution.calib)
     rows = factors.rows()
-    ends = np.cumsum([n_border, *rows])
+    ends = np.cumsum([n_calib, *rows])
     white = [np.eye(ends[-1])[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
-    border = np.zeros((n_border + 1, ends[-1]))
-    border[:n_border, :n_border] = np.linalg.cholesky(np.linalg.inv(solution.information))
-    chain = factors.back(border, white)
-    return np.concatenate([chain.reshape(-1, ends[-1]), border[:-1]])
+    calib = np.zeros((n_calib + 1, ends[-1]))
+    calib[:n_calib, :n_calib] = np.linalg.cholesky(np.linalg.inv(solution.information))
+    chain = factors.back(calib, white)
+    return np.concatenate([chain.reshape(-1, ends[-1]), calib[:-1]])
 
 
 @pytest.mark.parametrize("n_nodes", [1, 3, 4, 9])
@@ -54,11 +54,11 @@ def test_draws_have_the_covariance_of_the_posterior_where_features_tie_nodes(per
     np.testing.assert_allclose(X @ X.T, inverse, rtol=0, atol=1e-9 * np.abs(inverse).max())
 
 
-def test_still_draws_leave_the_border_and_free_ones_what_is_held():
+def test_still_draws_leave_the_calibration_and_free_ones_what_is_held():
     pieces, held = random_pieces(6, 3), np.eye(3)[:, 1:2]
     drawn = solve(pieces, 6, np.array([1.0, 2.0, 3.0]), held=held).factors.draws(np.random.default_rng(1), 4, 2)
-    assert [bool(d.border.any()) for d in drawn] == [True] * 4 + [False] * 2
-    assert all(d.border[1] == 0.0 and d.border[[0, 2]].all() and d.chain.all() for d in drawn[:4])
+    assert [bool(d.calib.any()) for d in drawn] == [True] * 4 + [False] * 2
+    assert all(d.calib[1] == 0.0 and d.calib[[0, 2]].all() and d.chain.all() for d in drawn[:4])
     assert all(d.chain.all() for d in drawn[4:])
 
 
@@ -101,7 +101,7 @@ def outcome_of(problem, state):
 
 
 def paid(problem, state, dense, what):
-    """What some factors pay for of chain and border: tr(H_s H^-1), H_s their own sums."""
+    """What some factors pay for of chain and calib: tr(H_s H^-1), H_s their own sums."""
     pieces = problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
     H, _ = dense(pieces, problem.n_nodes)
@@ -152,7 +152,7 @@ def test_degrees_of_freedom_of_features(followed, setup, dense):
 
 
 def test_degrees_of_freedom_of_features_on_planes(setup, problem_of, features_on_planes, dense):
-    """Their rows for that pay for a share of the points, and for what the border has of them."""
+    """Their rows for that pay for a share of the points, and for what the calibration parameters have of them."""
     setup, factor = features_on_planes(setup, noise_px=0.5)
     problem, state = problem_of(setup).replacing([factor]), setup.state
     outcome = outcome_of(problem, state)
@@ -181,7 +181,7 @@ def test_an_early_outcome_has_no_draws_and_they_are_made_where_they_are_asked_fo
         (*there.free, *there.still), (*not_none(late.draws).free, *not_none(late.draws).still), strict=True
     ):
         np.testing.assert_allclose(a.chain, b.chain, atol=1e-6 * np.abs(b.chain).max())
-        np.testing.assert_allclose(a.border, b.border, atol=1e-6 * np.abs(b.border).max())
+        np.testing.assert_allclose(a.calib, b.calib, atol=1e-6 * np.abs(b.calib).max())
     without = replace(late, draws=None)
     np.testing.assert_allclose(
         spurious_information(followed, without).mean, spurious_information(followed, late).mean, rtol=1e-3, atol=1e-3

@@ -395,7 +395,7 @@ DRIVES = {
 
 
 def with_wheels(setup, kind="pair"):
-    """The setup with wheel0 in its state and border; no motion that wheels could follow, which its Jacobians need not.
+    """The setup with wheel0 in its state and layout; no motion that wheels could follow, which its Jacobians need not.
 
     Readings are constant: where they are not, the time derivative of a pose between stamps is exact to the part of the
     interval squared only (test_poses), and this check asks for more.
@@ -477,7 +477,7 @@ def ground_sample(unlike, setup_of, plane, seen=True):
 
 
 def with_poses(setup, starts):
-    """The setup with mocap0 in its state and border, and the nodes of recordings that begin at `starts`; readings are
+    """The setup with mocap0 in its state and layout, and the nodes of recordings that begin at `starts`; readings are
     constant, as in `with_wheels`."""
     rng = np.random.default_rng(6)
     mount = {"rotation": so3.exp(rng.normal(size=3)), "translation": rng.normal(size=3), "time_offset": np.zeros(1)}

@@ -21,10 +21,9 @@ def random_images(n, per_node, by_next, rng):
 def random_sums(piece, n_tracks, images, rng, whole):
     """Random IMU-like factors and features, each seen in images of the piece; returns pairs of feature and image.
 
-    whole: rows (node columns, their Jacobian, feature, image, Jacobians by feature and camera pose, by the border,
-    residual) are appended.
-    """
-    n, B = piece.last - piece.first + 1, piece.border.shape[0] - 1
+    whole: rows (node columns, their Jacobian, feature, image, Jacobians by feature and camera pose, by the calibration
+    parameters, residual) are appended."""
+    n, B = piece.last - piece.first + 1, piece.calib.shape[0] - 1
     for k in range(n - 1):
         A, C, r = rng.normal(size=(40, 2 * NODE)), rng.normal(size=(40, B)), rng.normal(size=40)
         whole.append((NODE * (piece.first + k), A, None, None, None, None, C, r))
@@ -50,7 +49,7 @@ def add(piece, sums, rows):
         Cr = np.concatenate([C, r[:, None]], axis=1)
         piece.diagonal[k] += A[:, :NODE].T @ A[:, :NODE]
         piece.side[k] += A[:, :NODE].T @ Cr
-        piece.border += Cr.T @ Cr
+        piece.calib += Cr.T @ Cr
         if A.shape[1] > NODE:
             piece.upper[k] += A[:, :NODE].T @ A[:, NODE:]
             piece.diagonal[k + 1] += A[:, NODE:].T @ A[:, NODE:]
@@ -59,31 +58,31 @@ def add(piece, sums, rows):
             sums.own[f] += F.T @ F
             sums.side[f] += F.T @ Cr
             sums.block[index[f, i]] += F.T @ G
-    piece.border[-1, -1] = 0.0
+    piece.calib[-1, -1] = 0.0
 
 
-def build(n_nodes, n_tracks, n_border, seed=0, pieces=None, per_node=1, by_next=False, sizes=(2,)):
-    """Pieces with features, and the dense normal equations of chain and border with the features taken out."""
+def build(n_nodes, n_tracks, n_calib, seed=0, pieces=None, per_node=1, by_next=False, sizes=(2,)):
+    """Pieces with features, and the dense normal equations of chain and calibration parameters, features eliminated."""
     rng, J = np.random.default_rng(seed), []
-    pieces = make_pieces(n_nodes, n_border) if pieces is None else pieces
-    o, width = NODE * n_nodes, NODE * n_nodes + n_border + 1 + 3 * n_tracks * len(pieces)
+    pieces = make_pieces(n_nodes, n_calib) if pieces is None else pieces
+    o, width = NODE * n_nodes, NODE * n_nodes + n_calib + 1 + 3 * n_tracks * len(pieces)
     for i, piece in enumerate(pieces):
         rows, n, keep = [], piece.last - piece.first + 1, len(pieces) > 1
         images = random_images(n, per_node, by_next, rng)
         pairs = random_sums(piece, n_tracks, images, rng, rows)
-        sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], n_border, by_next)
+        sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], n_calib, by_next)
         sums.pose[:], sums.next_pose[:] = images[1:]
         add(piece, sums, rows)
         piece.features = Features.of(sums, plan(sums, n, piece.first == 0 or not keep, keep, sizes=sizes))
         for column, A, f, _, F, _, C, r in rows:
             row = np.zeros((len(r), width))
-            row[:, column : column + A.shape[1]], row[:, o : o + n_border], row[:, o + n_border] = A, C, r
+            row[:, column : column + A.shape[1]], row[:, o : o + n_calib], row[:, o + n_calib] = A, C, r
             if f is not None:
-                at = o + n_border + 1 + 3 * (i * n_tracks + f)
+                at = o + n_calib + 1 + 3 * (i * n_tracks + f)
                 row[:, at : at + 3] = F
             J.append(row)
     H = np.concatenate(J).T @ np.concatenate(J)
-    m = o + n_border + 1
+    m = o + n_calib + 1
     H = H[:m, :m] - H[:m, m:] @ np.linalg.pinv(H[m:, m:]) @ H[m:, :m]
     return pieces, H[:-1, :-1], H[:-1, -1]
 
@@ -92,7 +91,7 @@ def check(pieces, H, g, n_nodes):
     step, o = np.linalg.solve(H, -g), NODE * n_nodes
     information = H[o:, o:] - H[o:, :o] @ np.linalg.solve(H[:o, :o], H[:o, o:])
     solution = solve(pieces, n_nodes, np.ones(len(H) - o))
-    found = np.concatenate([solution.chain.ravel(), solution.border])
+    found = np.concatenate([solution.chain.ravel(), solution.calib])
     np.testing.assert_allclose(found, step, rtol=0, atol=1e-9 * np.abs(step).max())
     np.testing.assert_allclose(solution.information, information, rtol=0, atol=1e-8 * np.abs(information).max())
 
@@ -113,10 +112,10 @@ def test_marginalise_takes_features_out():
     (piece,), H, g = build(6, 5, 4, pieces=(Piece.zeros(0, 5, 4),))
     o = NODE * 6
     X = np.linalg.solve(H[:o, :o], np.concatenate([H[:o, o:], g[:o, None]], axis=1))
-    border = marginalise(piece)
+    calib = marginalise(piece)
     expected = np.concatenate([H[o:, o:], g[o:, None]], axis=1) - H[o:, :o] @ X
-    np.testing.assert_allclose(border[:-1], expected, rtol=0, atol=1e-9 * np.abs(expected).max())
-    np.testing.assert_allclose(border, border.T, rtol=0, atol=0)
+    np.testing.assert_allclose(calib[:-1], expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(calib, calib.T, rtol=0, atol=0)
 
 
 def by_step(lists, n):

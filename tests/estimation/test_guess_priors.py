@@ -71,7 +71,7 @@ def test_the_focal_length_of_a_sphere_model_is_as_uncertain_as_its_xi():
 
 
 def information_of(found: Estimate) -> np.ndarray:
-    """Of the border where `found` ended, of the problem that it says it is of."""
+    """Of the calibration parameters where `found` ended, of the problem that it says it is of."""
     problem = found.problem
     pieces = problem.pieces()
     problem.linearise(found.outcome.state, pieces, problem.residuals(), curved=True)
@@ -110,7 +110,7 @@ def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them
 
 
 def test_priors_that_are_let_go_leave_the_step_of_the_problem_without_them(begun):
-    """What is taken off the border's sums is what a solve without the priors does not have."""
+    """What is taken off the calibration parameters' sums is what a solve without the priors does not have."""
     inputs, state = begun
     problem = Judged.first(inputs).problem(inputs, state)
     more = guess_priors(inputs, replace(state, values=state.values | TURNED))
@@ -122,7 +122,7 @@ def test_priors_that_are_let_go_leave_the_step_of_the_problem_without_them(begun
     expected = alone.solution()
     assert at.cost == pytest.approx(alone.cost, rel=1e-12)
     assert freed.decrease == pytest.approx(expected.decrease, rel=1e-9)
-    np.testing.assert_allclose(freed.border, expected.border, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(freed.calib, expected.calib, rtol=1e-7, atol=1e-12)
     np.testing.assert_allclose(freed.chain, expected.chain, rtol=1e-6, atol=1e-10)
     scale = np.sqrt(np.diag(expected.information))
     np.testing.assert_allclose(

@@ -14,7 +14,7 @@ from icalib.estimate.evidence.evidence import chi2_by_kind
 from icalib.estimate.evidence.held_out import Half, excess, halves_of, predict, shifts
 from icalib.estimate.evidence.parts import FEWEST_NODES, Parts
 from icalib.estimate.problem.solver import minimise
-from icalib.optim.arrowhead import NODE, given_border
+from icalib.optim.arrowhead import NODE, given_calib
 from icalib.optim.prior_factor import Prior
 from icalib.tools.simulation import handheld, simulate
 
@@ -22,16 +22,16 @@ NO_PRIOR = np.zeros((3, 3)), np.zeros(3)
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_nodes_follow_the_border_from_the_first_node_and_from_another(dense, which):
+def test_nodes_follow_the_calibration_from_the_first_node_and_from_another(dense, which):
     piece = random_pieces(9, 3)[which]
     first, n = piece.first, piece.last - piece.first + 1
     piece.first, piece.last = 0, n - 1
     H, g = dense((piece,), n)
     piece.first, piece.last = first, first + n - 1
-    border = np.random.default_rng(1).normal(size=(3, 2))
+    calib = np.random.default_rng(1).normal(size=(3, 2))
     o = NODE * n
-    expected = -np.linalg.solve(H[:o, :o], g[:o, None] + H[:o, o:] @ border)
-    np.testing.assert_allclose(given_border(piece, border).reshape(o, 2), expected, rtol=1e-8, atol=1e-10)
+    expected = -np.linalg.solve(H[:o, :o], g[:o, None] + H[:o, o:] @ calib)
+    np.testing.assert_allclose(given_calib(piece, calib).reshape(o, 2), expected, rtol=1e-8, atol=1e-10)
 
 
 def rows_of(rng, n, columns):

@@ -81,11 +81,11 @@ def test_corrections_by_bias_and_intrinsics_are_right_to_first_order(factor, set
     rng = np.random.default_rng(2)
     chain = np.zeros((len(setup.state.seconds), 15))
     chain[:, 9:] = rng.normal(size=(1, 6)) * np.repeat([1e-2, 1e-1], 3)
-    border = np.zeros(setup.layout.size)
-    border[setup.layout.columns("imu0", "intrinsics")] = 1e-2 * rng.normal(size=24)
+    calib = np.zeros(setup.layout.size)
+    calib[setup.layout.columns("imu0", "intrinsics")] = 1e-2 * rng.normal(size=24)
     left = []
     for size in (1.0, 0.5):
-        state = setup.state.retract(setup.layout, size * chain, size * border)
+        state = setup.state.retract(setup.layout, size * chain, size * calib)
         anew = ImuFactor.build(setup.imu, state, 9.81, factor.columns)
         a, b = (np.linalg.solve(f.made.W, whitened(f, setup, state)[1][..., None]) for f in (factor, anew))
         left.append(np.abs(a - b).max())

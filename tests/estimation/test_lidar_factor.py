@@ -46,7 +46,7 @@ def world_points(setup, state, poses, xyz):
 
 @dataclass
 class Point:
-    """Residual (N,), cosine of incidence (N,), and the Jacobians (N, chain + border) of both, by obvious formulas, of
+    """Residual (N,), cosine of incidence (N,), and the Jacobians (N, chain + calib) of both, by obvious formulas, of
     all points on planes."""
 
     r: np.ndarray
@@ -242,7 +242,7 @@ def test_stamps_at_the_end_of_scans_and_points_in_any_order_change_nothing(spars
     state = replace(setup.state, values=later)
     found: Any = sums(ended, ended.factor(state), state, dense)
     expected: Any = sums(setup, setup.factor(), setup.state, dense)
-    # Points at the edge of bins of 3 ms change theirs, and perhaps the node; to the border that is all the same.
+    # Points at the edge of bins of 3 ms change theirs, and perhaps the node; the calibration parameters are the same.
     H, H_expected = (h[NODE * len(state.seconds) :, NODE * len(state.seconds) :] for h in (found[1], expected[1]))
     size = np.sqrt(np.diag(H_expected))
     np.testing.assert_allclose(H / np.outer(size, size), H_expected / np.outer(size, size), atol=3e-4)

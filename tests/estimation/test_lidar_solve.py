@@ -155,8 +155,8 @@ def wrong_by_a_centimetre(setup, rng):
     for own, largest in ((slice(0, 3), 5e-3), (slice(3, 6), 1e-2)):
         wave = np.sin(2.0 * np.pi * rng.uniform(0.1, 0.6, 3) * seconds[:, None] + rng.uniform(0.0, 6.0, 3))
         chain[:, own] = wave * largest / np.sqrt(3.0)
-    border = np.concatenate([rng.normal(size=3) * 3e-3, rng.normal(size=3) * 1e-2, [1e-3]])
-    return setup.state.retract(make_layout(entries), chain, border), entries
+    calib = np.concatenate([rng.normal(size=3) * 3e-3, rng.normal(size=3) * 1e-2, [1e-3]])
+    return setup.state.retract(make_layout(entries), chain, calib), entries
 
 
 def test_found_planes_do_nearly_as_well_as_known_ones(robot, room_of):

@@ -27,7 +27,7 @@ from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.start import start
 from icalib.motion.factor import look, of_type
-from icalib.optim.border import restricted_inverse
+from icalib.optim.calib_block import restricted_inverse
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.sensors.camera.bodies import Bodies
@@ -62,7 +62,7 @@ def solved() -> tuple[Problem, Outcome]:
 
 
 def gradient(problem: Problem, outcome: Outcome) -> np.ndarray:
-    """(B,) of the border, chain and points marginalised."""
+    """(B,) of the calibration parameters, chain and points marginalised."""
     return problem.marginal(lambda a, b: problem.sums_of(outcome.state, a, b))[:-1, -1]
 
 

@@ -45,13 +45,13 @@ def difference(plus, minus, at, h):
 def test_jacobians_of_every_node_by_central_differences(setup, scheme):
     state = setup.perturbed(np.random.default_rng(1))
     at, node = evaluate(setup, scheme, state)
-    h, border = 1e-6, np.zeros(setup.layout.size)
+    h, calib = 1e-6, np.zeros(setup.layout.size)
     for k in range(len(state.seconds)):
         for j in range(NODE):
             chain = np.zeros((len(state.seconds), NODE))
             chain[k, j] = h
-            plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, border))
-            minus, _ = evaluate(setup, scheme, state.retract(setup.layout, -chain, border))
+            plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, calib))
+            minus, _ = evaluate(setup, scheme, state.retract(setup.layout, -chain, calib))
             analytic = at.J_node[:, :, j] * (node == k)[:, None]
             if scheme == "pose":
                 analytic = analytic + at.J_next[:, :, j] * (node + 1 == k)[:, None]
@@ -65,9 +65,9 @@ def test_jacobians_of_the_imu_intrinsics_by_central_differences(setup, scheme):
     h, chain = 1e-5, np.zeros((len(state.seconds), NODE))
     assert at.J_imu.shape == (len(TIMES), 6, 24)
     for n, column in enumerate(setup.layout.columns("imu0", "intrinsics")):
-        border = h * np.eye(setup.layout.size)[column]
-        plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, border))
-        minus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, -border))
+        calib = h * np.eye(setup.layout.size)[column]
+        plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, calib))
+        minus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, -calib))
         np.testing.assert_allclose(at.J_imu[:, :, n], difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=str(n))
 
 
@@ -89,8 +89,8 @@ def test_jacobians_of_the_velocity_by_central_differences(setup):
     n, h = len(state.seconds), 1e-6
     for column in range(n * NODE + setup.layout.size):
         d = h * np.eye(1, n * NODE + setup.layout.size, column)[0]
-        chain, border = d[: n * NODE].reshape(n, NODE), d[n * NODE :]
-        plus, minus = (motion(setup, state.retract(setup.layout, s * chain, s * border))[0] for s in (1.0, -1.0))
+        chain, calib = d[: n * NODE].reshape(n, NODE), d[n * NODE :]
+        plus, minus = (motion(setup, state.retract(setup.layout, s * chain, s * calib))[0] for s in (1.0, -1.0))
         numeric = (plus.velocity - minus.velocity) / (2.0 * h)
         if column < n * NODE:
             analytic = moving.J_node[:, :, column % NODE] * (node == column // NODE)[:, None]

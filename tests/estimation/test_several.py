@@ -146,32 +146,31 @@ def test_the_gradient_is_that_of_the_cost(problem):
     chain_gradient = np.zeros((built.n_nodes, NODE))
     for p in pieces:
         chain_gradient[p.first : p.last + 1] += p.side[:, :, -1]
-    border_gradient = sum(p.border[:-1, -1] for p in pieces)
+    calib_gradient = sum(p.calib[:-1, -1] for p in pieces)
     for tilted in (False, True):
         chain = rng.normal(size=(built.n_nodes, NODE)) * np.repeat([1e-3, 1e-3, 1e-3, 1e-4, 1e-3], 3) * (not tilted)
-        border = np.zeros(built.layout.size)
+        calib = np.zeros(built.layout.size)
         for b in built.layout.free:
             if (b.name == "tilt") == tilted:
-                border[b.columns] = 1e-4 * rng.normal(size=b.size)
-        slope = float((chain_gradient * chain).sum() + border_gradient @ border)
+                calib[b.columns] = 1e-4 * rng.normal(size=b.size)
+        slope = float((chain_gradient * chain).sum() + calib_gradient @ calib)
         h = 1e-4
         up, down = (
-            built.linearise(state.retract(built.layout, s * chain, s * border), pieces, out, sums=False)
-            for s in (h, -h)
+            built.linearise(state.retract(built.layout, s * chain, s * calib), pieces, out, sums=False) for s in (h, -h)
         )
         assert (up - down) / (2.0 * h) == pytest.approx(slope, rel=1e-5)
 
 
 def test_a_tilt_turns_its_own_recording(problem):
     built, state = problem
-    border = np.zeros(built.layout.size)
-    border[built.layout.block("board0 in recording 2", "tilt").columns] = [0.1, -0.2]
+    calib = np.zeros(built.layout.size)
+    calib[built.layout.block("board0 in recording 2", "tilt").columns] = [0.1, -0.2]
     Q, k = so3.exp(np.array([0.1, -0.2, 0.0])), state.starts[1]
     # A turn as a whole is what the nodes' own steps are counted from.
     chain = np.zeros((len(state.seconds), NODE))
     turn = np.array([0.1, -0.2, 0.0])
     chain[k:, 0:3], chain[k:, 3:6] = turn @ state.rotation[k:], np.cross(turn, state.position[k:])
-    moved = state.retract(built.layout, chain, border)
+    moved = state.retract(built.layout, chain, calib)
     np.testing.assert_array_equal(moved.rotation[:k], state.rotation[:k])
     np.testing.assert_array_equal(moved.position[:k], state.position[:k])
     np.testing.assert_allclose(moved.rotation[k:], Q @ state.rotation[k:], atol=1e-14)

@@ -19,15 +19,15 @@ def setup(robot, room_of):
 
 
 def turning(setup, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Chain and border of a turn of all there is about the world's origin, to first order."""
-    state, border = setup.state, np.zeros(setup.layout.size)
+    """Chain and calibration steps of a turn of all there is about the world's origin, to first order."""
+    state, calib = setup.state, np.zeros(setup.layout.size)
     chain = np.zeros((len(state.seconds), 15))
     chain[:, 0:3] = np.einsum("kji,j->ki", state.rotation, turn)
     chain[:, 3:6], chain[:, 6:9] = np.cross(turn, state.position), np.cross(turn, state.velocity)
     for b in (b for b in setup.layout.free if b.kind == "plane"):
         normal, point = np.split(state.values[b.key], 2)
-        border[b.columns] = np.append(tangents(normal) @ np.cross(turn, normal), normal @ np.cross(turn, point))
-    return chain, border
+        calib[b.columns] = np.append(tangents(normal) @ np.cross(turn, normal), normal @ np.cross(turn, point))
+    return chain, calib
 
 
 def test_trajectory_and_planes_turn_exactly(setup):
@@ -58,13 +58,13 @@ def test_on_a_flat_floor_map_and_path_turn_while_no_node_does(robot, room_of):
     """All sensors turn against the IMU: on a flat floor the LiDAR sees the same."""
     setup = room_of(simulate(robot(3.0, example="table2-planar"), seed=1))
     turn, state = np.array([0.0, 0.0, 0.14]), setup.state
-    chain, border = turning(setup, turn)
+    chain, calib = turning(setup, turn)
     chain[:, 0:3] = 0.0
     rotation, translation = (state.values["lidar0", name] for name in ("rotation", "translation"))
     up = state.rotation[0].T @ turn
-    border[setup.layout.columns("lidar0", "rotation")] = rotation.T @ up
-    border[setup.layout.columns("lidar0", "translation")] = np.cross(up, translation)
-    turned, Q = state.retract(setup.layout, chain, border), Rotation.from_rotvec(turn).as_matrix()
+    calib[setup.layout.columns("lidar0", "rotation")] = rotation.T @ up
+    calib[setup.layout.columns("lidar0", "translation")] = np.cross(up, translation)
+    turned, Q = state.retract(setup.layout, chain, calib), Rotation.from_rotvec(turn).as_matrix()
     np.testing.assert_allclose(turned.rotation, state.rotation, atol=1e-12)
     np.testing.assert_allclose(turned.position, state.position @ Q.T, atol=1e-12)
     factor, pieces = setup.factor(), setup.problem(state).pieces(sums=False)
@@ -76,10 +76,10 @@ def test_on_a_flat_floor_map_and_path_turn_while_no_node_does(robot, room_of):
 def test_any_other_step_is_the_same_to_first_order(setup):
     rng = np.random.default_rng(2)
     chain = 1e-2 * rng.normal(size=(len(setup.state.seconds), 15))
-    border = 1e-2 * rng.normal(size=setup.layout.size)
+    calib = 1e-2 * rng.normal(size=setup.layout.size)
 
     def off(s: float) -> float:
-        moved = setup.state.retract(setup.layout, s * chain, s * border)
+        moved = setup.state.retract(setup.layout, s * chain, s * calib)
         return np.abs(moved.position - setup.state.position - s * chain[:, 3:6]).max()
 
     assert off(1.0) > 1e-6

@@ -13,7 +13,7 @@ from tests.typed import StandIn
 from icalib.estimate.problem.solver import minimise
 from icalib.optim.anderson import Accelerator
 from icalib.optim.arrowhead import make_pieces
-from icalib.optim.border import NOTHING
+from icalib.optim.calib_block import NOTHING
 from icalib.optim.state import State, make_layout
 
 KEY = ("sensor", "value")
@@ -45,7 +45,7 @@ class OneNumber(StandIn):
             (piece,) = pieces
             piece.clear()
             piece.diagonal[0] = np.eye(15)
-            piece.border[:] = [[J @ J, J @ r], [J @ r, 0.0]]
+            piece.calib[:] = [[J @ J, J @ r], [J @ r, 0.0]]
         return float(0.5 * r @ r)
 
 
@@ -107,8 +107,8 @@ class Saddle(OneNumber):
             piece.clear()
             piece.diagonal[0] = np.eye(15)
             A = np.column_stack([J, r])
-            piece.border[:] = A.T @ A
-            piece.border[-1, -1] = 0.0
+            piece.calib[:] = A.T @ A
+            piece.calib[-1, -1] = 0.0
         return float(0.5 * r @ r)
 
 

@@ -27,7 +27,7 @@ from icalib.estimate.problem.robot import RobotNoise
 from icalib.estimate.problem.solver import minimise
 from icalib.motion.factor import of_type, pairs_of
 from icalib.optim import pages
-from icalib.optim.border import NOTHING
+from icalib.optim.calib_block import NOTHING
 from icalib.optim.prior_factor import Prior, without_priors
 from icalib.optim.state import State
 from icalib.rig import PoseSensor
@@ -216,8 +216,8 @@ class _Passes:
 
 @dataclass
 class _Told:
-    """Passes on what a pass tells of its way, keeps the steps in a `history` of all passes, and the border's last
-    information (B, B)."""
+    """Passes on what a pass tells of its way, keeps the steps in a `history` of all passes, and the calibration
+    parameters' last information (B, B)."""
 
     name: str
     problem: Problem

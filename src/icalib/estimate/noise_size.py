@@ -139,7 +139,7 @@ class _ImuDraws:
         assert outcome.draws is not None
         along = []
         for x in outcome.draws.free[:4]:
-            there = state.retract(problem.layout, DRAW_STEP * x.chain, DRAW_STEP * x.border)
+            there = state.retract(problem.layout, DRAW_STEP * x.chain, DRAW_STEP * x.calib)
             along.append((look(problem.chain, there).residual - base) / DRAW_STEP)
         kinds = {k: r for k, r in problem.chain.kinds.items() if k in KINDS}
         return cls(kinds, base, tuple(along))

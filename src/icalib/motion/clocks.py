@@ -52,7 +52,8 @@ def by_clock(state: State, name: str, node: np.ndarray) -> Iterator[tuple[int, s
 
 
 def mounted_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
-    """(7,) border columns of a sensor's rotation, translation and the time offset number `clock`, or its only one."""
+    """(7,) calibration columns of a sensor's rotation, translation and the time offset number `clock`, or its only
+    one."""
     offset = layout.columns(name, "time_offset")
     own = offset[clock if len(offset) > 1 else 0]
     return np.append(layout.columns(name, "rotation", "translation"), own)

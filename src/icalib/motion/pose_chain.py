@@ -1,4 +1,5 @@
-"""Compiled: from a camera's pose to the nodes and border that it hangs on, and sums of one image into theirs."""
+"""Compiled: from a camera's pose to the nodes and calibration parameters that it hangs on, and sums of one image into
+theirs."""
 
 from __future__ import annotations
 
@@ -36,11 +37,10 @@ def _product(A, J, out):
 
 @njit(cache=True, nogil=True)
 def pose_chain(i, motion, Tn, Tm, Tc):
-    """Camera pose (right rotation, position in camera axes) by the nodes (Tn, Tm) and the chained border (Tc).
+    """Camera pose (right rotation, position in camera axes) by the nodes (Tn, Tm) and the chained parameters (Tc).
 
-    Chained border: rotation 3, translation 3, time offset 1, tilt of the scene 2, IMU intrinsics 24 or 0, pose of the
-    body 6 or 0.
-    """
+    Chained parameters: rotation 3, translation 3, time offset 1, tilt of the scene 2, IMU intrinsics 24 or 0, pose of
+    the body 6 or 0."""
     R_ic, R_cw, p_wc = motion.R_imu_cam, motion.R_cam_world[i], motion.p_world_cam[i]
     A = by_imu_pose(R_ic, motion.p_imu_cam, R_cw)
     _product(A, motion.J_node[i], Tn)
@@ -99,7 +99,7 @@ def _outer_add(Ti, G, Tj, out):
 
 @njit(cache=True, nogil=True)
 def _add_side(T, G, D, Tc, cols_c, cols_d, side):
-    """Node (through T) with the border and the gradient: side (15, B + 1)."""
+    """Node (through T) with the calibration parameters and the gradient: side (15, B + 1)."""
     n_b = side.shape[1] - 1
     full = np.zeros((T.shape[1], Tc.shape[1]))
     _outer_add(T, G, Tc, full)
@@ -117,8 +117,8 @@ def _add_side(T, G, D, Tc, cols_c, cols_d, side):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_border(G, D, Tc, cols_c, cols_d, border):
-    n_b = border.shape[0] - 1
+def _add_calib(G, D, Tc, cols_c, cols_d, calib):
+    n_b = calib.shape[0] - 1
     nc, nd = len(cols_c), len(cols_d)
     full = np.zeros((nc, nc))
     _outer_add(Tc, G, Tc, full)
@@ -128,24 +128,24 @@ def _add_border(G, D, Tc, cols_c, cols_d, border):
             continue
         for j in range(nc):
             if cols_c[j] >= 0:
-                border[a, cols_c[j]] += full[i, j]
+                calib[a, cols_c[j]] += full[i, j]
         for j in range(nd + 1):
             b = n_b if j == nd else cols_d[j]
             if b >= 0:
                 s = 0.0
                 for k in range(6):
                     s += Tc[k, i] * G[k, 6 + j]
-                border[a, b] += s
-                border[b, a] += s
+                calib[a, b] += s
+                calib[b, a] += s
     for i in range(nd):
         a = cols_d[i]
         if a < 0:
             continue
         for j in range(nd):
             if cols_d[j] >= 0:
-                border[a, cols_d[j]] += G[6 + i, 6 + j]
-        border[a, n_b] += G[6 + i, D]
-        border[n_b, a] += G[6 + i, D]
+                calib[a, cols_d[j]] += G[6 + i, 6 + j]
+        calib[a, n_b] += G[6 + i, D]
+        calib[n_b, a] += G[6 + i, D]
 
 
 @njit(cache=True, nogil=True)
@@ -158,12 +158,13 @@ def add_image(k, G, Tn, Tm, Tc, chained, direct, sums):
         _outer_add(Tn, G, Tm, sums.upper[k])
         _outer_add(Tm, G, Tm, sums.diagonal[k + 1])
         _add_side(Tm, G, D, Tc, chained, direct, sums.side[k + 1])
-    _add_border(G, D, Tc, chained, direct, sums.border)
+    _add_calib(G, D, Tc, chained, direct, sums.calib)
 
 
 @njit(cache=True, nogil=True)
 def add_clusters(k, G, column, Tn, Tm, Tc, chained, direct, sums):
-    """One image's gradients G (D, clusters) through its pose into columns of node k, the next, and the border."""
+    """One image's gradients G (D, clusters) through its pose into columns of node k, the next, and the calibration
+    parameters."""
     for g in range(G.shape[1]):
         for d in range(6):
             f = G[d, g]
@@ -173,7 +174,7 @@ def add_clusters(k, G, column, Tn, Tm, Tc, chained, direct, sums):
                 sums.side[k + 1, a, column + g] += Tm[d, a] * f
             for a in range(len(chained)):
                 if chained[a] >= 0:
-                    sums.border[chained[a], column + g] += Tc[d, a] * f
+                    sums.calib[chained[a], column + g] += Tc[d, a] * f
         for a in range(len(direct)):
             if direct[a] >= 0:
-                sums.border[direct[a], column + g] += G[6 + a, g]
+                sums.calib[direct[a], column + g] += G[6 + a, g]

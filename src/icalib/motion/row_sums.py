@@ -53,7 +53,8 @@ def add_rows(
     into: Into,
 ) -> float:
     """Adds the rows `own` of a factor, each to the interval that begins at its `node`, and fills `into.out`; returns
-    half the robust chi^2. columns (c,): of the border; those of the IMU's intrinsics follow where rows have them."""
+    half the robust chi^2. columns (c,): of the calibration parameters; those of the IMU's intrinsics follow where rows
+    have them."""
     if imu is not None and rows.J_calib.shape[2] > len(columns):
         columns = np.concatenate([columns, layout.columns(imu.name, "intrinsics")])
     free = np.flatnonzero(columns >= 0)

@@ -19,7 +19,7 @@ from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.geometry import so3
 from icalib.observability.determination import Determined, determine, judge, scatter
 from icalib.observability.relaxed import Relaxed, freed_inputs, stated_keys
-from icalib.optim.border import restricted_root
+from icalib.optim.calib_block import restricted_root
 from icalib.optim.state import Block, Key, State
 from icalib.rig import Parameter
 from icalib.rig.kinds import SPECS

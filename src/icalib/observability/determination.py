@@ -1,4 +1,5 @@
-"""What the data determine: estimates in which undetermined directions of the border are held where the guess has them.
+"""What the data determine: estimates in which undetermined directions of the calibration parameters are held where the
+guess has them.
 
 Broad priors do not make an undetermined direction harmless: the solver wanders along it, and what couples with it at
 second order comes out wrong with a small standard deviation. So the information of the data alone, without what noise
@@ -31,7 +32,7 @@ from icalib.estimate.problem.outcome import Outcome, Step
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.observability.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
-from icalib.optim.border import HELD_BELOW, essential_information, restricted_root
+from icalib.optim.calib_block import HELD_BELOW, essential_information, restricted_root
 from icalib.optim.prior_factor import without_priors
 from icalib.optim.state import Key, State
 
@@ -44,7 +45,7 @@ ALIKE = 0.7  # cosine of the largest angle between what is held and what is to b
 
 @dataclass(frozen=True)
 class Determined:
-    """An estimate and what is known of its border.
+    """An estimate and what is known of its calibration parameters.
 
     data, noise (B, B): information of the data alone in tolerance units, without priors but those on nuisance
     parameters and without what noise makes of it, and that; held (B, m): orthonormal directions in tolerance units,
@@ -230,7 +231,7 @@ class Judgement(NamedTuple):
 def judge(
     inputs: Inputs, outcome: Outcome, before: Judgement | None = None, columns: np.ndarray | None = None
 ) -> Judgement:
-    """Of `columns` (B,) of the border, the others fixed; of all by default.
+    """Of `columns` (B,) of the calibration parameters, the others fixed; of all by default.
 
     Parameters whose priors belong to the model (a target's shape, bloom) are open only where these are, too. Nuisance
     parameters never are: whether the motion determines all else is asked with these known, and how far all else depends

@@ -20,7 +20,7 @@ from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.estimate.problem.tolerances import UNGUESSED
 from icalib.geometry import planes, so3
-from icalib.optim.border import HELD_BELOW
+from icalib.optim.calib_block import HELD_BELOW
 from icalib.optim.state import Block, State
 from icalib.rig.sensor import ROTATION
 
@@ -47,14 +47,14 @@ def astray(
         return open_
     values, turn = np.linalg.eigh(open_.T @ asked @ open_)
     axes = open_ @ turn
-    way = axes.T @ (border_difference(problem, guess, state) / problem.tolerance)
+    way = axes.T @ (calib_difference(problem, guess, state) / problem.tolerance)
     worth = np.sqrt(np.diag(_guess_covariance(inputs, problem, state, axes)))
     return axes[:, (values < PULLED) | (np.abs(way) > FARTHEST * worth)]
 
 
 def moved_to_guess(problem: Problem, state: State, guess: State, held: np.ndarray) -> State:
     """`state`, moved along the directions `held` (B, m) to where `guess` has them."""
-    way = border_difference(problem, guess, state) / problem.tolerance
+    way = calib_difference(problem, guess, state) / problem.tolerance
     return _moved(problem, state, held @ (held.T @ way))
 
 
@@ -66,7 +66,7 @@ def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State,
     """
     if not _is_weighed(inputs, held):
         return None
-    sigma, way = _weights(inputs, state), border_difference(problem, guess, state)
+    sigma, way = _weights(inputs, state), calib_difference(problem, guess, state)
     # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
     for block in _unguessed(inputs):
         way[block.columns] = 0.0
@@ -78,8 +78,9 @@ def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State,
 
 
 def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(m + TOGETHER or fewer, B) how the border moves with each of m independent errors of the guess along the held
-    directions, one standard deviation each, and by how much more or less where all of them come together.
+    """(m + TOGETHER or fewer, B) how the calibration parameters move with each of m independent errors of the guess
+    along the held directions, one standard deviation each, and by how much more or less where all of them come
+    together.
 
     data (B, B): information of the data alone, in tolerance units. The room of `outcome` is used.
     """
@@ -149,7 +150,7 @@ def _answer(outcome: Outcome, way: np.ndarray) -> np.ndarray:
             there = minimise(problem, moved, tolerance=EARLY_DECREASE, room=outcome.room)
         except EstimationError:
             continue
-        return 2**k * border_difference(problem, there.state, state)
+        return 2**k * calib_difference(problem, there.state, state)
     return problem.tolerance * way
 
 
@@ -174,12 +175,12 @@ def _unguessed(inputs: Inputs) -> list[Block]:
 
 
 def _moved(problem: Problem, state: State, way: np.ndarray) -> State:
-    """`state` with the border moved by `way` (B,), in tolerance units."""
+    """`state` with the calibration parameters moved by `way` (B,), in tolerance units."""
     return state.retract(problem.layout, np.zeros((len(state.seconds), 15)), problem.tolerance * way)
 
 
-def border_difference(problem: Problem, a: State, b: State) -> np.ndarray:
-    """(B,) the step of the border from `b` to `a`."""
+def calib_difference(problem: Problem, a: State, b: State) -> np.ndarray:
+    """(B,) the step of the calibration parameters from `b` to `a`."""
     out = np.zeros(problem.layout.size)
     for block in problem.layout.free:
         x, y = a.values[block.key], b.values[block.key]

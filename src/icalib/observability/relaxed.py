@@ -20,7 +20,7 @@ from icalib.estimate.problem.outcome import Outcome, outcome_of
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Solution, solve
-from icalib.optim.border import NOTHING, restricted_root
+from icalib.optim.calib_block import NOTHING, restricted_root
 from icalib.optim.prior_factor import sums_of_priors
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Parameter

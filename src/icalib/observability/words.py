@@ -22,7 +22,7 @@ EVERY_AXIS = "every axis"
 
 @dataclass(frozen=True)
 class Observability:
-    """Covariance (B, B) formal; verdicts by border column; undetermined combinations as sentences.
+    """Covariance (B, B) formal; verdicts by calibration column; undetermined combinations as sentences.
 
     spread (B,): standard deviations in tolerances that the data alone give, consider covariance included.
     """

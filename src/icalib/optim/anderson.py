@@ -30,13 +30,13 @@ class Accelerator:
         """Whether plain steps, of which the next promises `decrease`, converge slowly."""
         return bool(self.moves) and decrease > SLOW * self.decrease
 
-    def step(self, chain: np.ndarray, border: np.ndarray, decrease: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """The accelerated step, chain (K, 15) and border (B,), for a plain one that promises `decrease`; None where
+    def step(self, chain: np.ndarray, calib: np.ndarray, decrease: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """The accelerated step, chain (K, 15) and calib (B,), for a plain one that promises `decrease`; None where
         plain steps converge well, or too few are known."""
         if not self.slow(decrease):
             return None
-        now = np.concatenate([chain.ravel(), border])
-        scale = self._scale(chain, border)
+        now = np.concatenate([chain.ravel(), calib])
+        scale = self._scale(chain, calib)
         changes = np.diff(np.array([*self.steps, now]), axis=0)
         share = np.linalg.lstsq((changes / scale).T, now / scale, rcond=LEAST_RANK)[0]
         best = now - share @ (np.array(self.moves) + changes)
@@ -53,10 +53,10 @@ class Accelerator:
         self.steps, self.moves, self.decrease = [], [], 0.0
 
     @staticmethod
-    def _scale(chain: np.ndarray, border: np.ndarray) -> np.ndarray:
+    def _scale(chain: np.ndarray, calib: np.ndarray) -> np.ndarray:
         """What each component of a step is compared with: the root mean square of its kind over all keyframes, so that
-        units do not matter; the border counts as much as the chain."""
+        units do not matter; the calibration parameters count as much as the chain."""
         by_kind = np.sqrt((chain**2).mean(axis=0)) * np.sqrt(len(chain))
-        own = np.abs(border)
+        own = np.abs(calib)
         both = [np.tile(np.where(by_kind > 0.0, by_kind, 1.0), len(chain)), np.where(own > 0.0, own, 1.0)]
         return np.concatenate(both)

@@ -1,12 +1,12 @@
-"""Normal equations of a chain of nodes with a dense border: an arrowhead, solved in time linear in the chain.
+"""Normal equations of a chain of nodes with dense calibration parameters: an arrowhead, solved in time linear in the
+chain.
 
     [ T   E ] [chain ]     [g_chain ]      T: block tridiagonal, 15 x 15 blocks
-    [ E^T C ] [border] = - [g_border]      E: chain x border, C: border x border
+    [ E^T C ] [calib ] = - [g_calib ]      E: chain x calib, C: calib x calib
 
 The chain is cut into pieces that share their end nodes. Each piece is accumulated and eliminated on its own, by its own
-thread, towards the node that it shares with its neighbour; shared node and border are what is left at the end.
-The number of pieces does not depend on the number of cores, so that the answer does not either.
-"""
+thread, towards the node that it shares with its neighbour; shared node and calibration parameters are what is left at
+the end. The number of pieces does not depend on the number of cores, so that the answer does not either."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.geometry.small import cholesky
 from icalib.optim import pages
-from icalib.optim.border import NOTHING, border_draws, border_step
+from icalib.optim.calib_block import NOTHING, calib_draws, calib_step
 from icalib.optim.chain_kernels import damp, eliminate_chain, forward_solve, substitute_chain
 from icalib.optim.front import Eliminated, Features, eliminate
 from icalib.optim.front_plan import plan
@@ -56,36 +56,35 @@ class Sums(NamedTuple):
     diagonal: np.ndarray
     upper: np.ndarray
     side: np.ndarray
-    border: np.ndarray
+    calib: np.ndarray
 
 
 @dataclass
 class Piece:
     """J^T J and J^T r of the factors between nodes `first` and `last`, both included.
 
-    diagonal (n, 15, 15); upper (n, 15, 15), node k with node k + 1; side (n, 15, B + 1), node with border, the node's
-    gradient in the last column; border (B + 1, B + 1), the border's gradient in its last column; features: those that
-    are seen from its nodes alone, to be eliminated with them.
-    """
+    diagonal (n, 15, 15); upper (n, 15, 15), node k with node k + 1; side (n, 15, B + 1), node with calib, the node's
+    gradient in the last column; calib (B + 1, B + 1), the calibration parameters' gradient in its last column;
+    features: those that are seen from its nodes alone, to be eliminated with them."""
 
     first: int
     last: int
     diagonal: np.ndarray
     upper: np.ndarray
     side: np.ndarray
-    border: np.ndarray
+    calib: np.ndarray
     features: Features | None = None
 
     @classmethod
-    def zeros(cls, first: int, last: int, n_border: int) -> Piece:
+    def zeros(cls, first: int, last: int, n_calib: int) -> Piece:
         n = last - first + 1
         return cls(
             first,
             last,
             pages.zeros((n, NODE, NODE)),
             pages.zeros((n, NODE, NODE)),
-            pages.zeros((n, NODE, n_border + 1)),
-            np.zeros((n_border + 1, n_border + 1)),
+            pages.zeros((n, NODE, n_calib + 1)),
+            np.zeros((n_calib + 1, n_calib + 1)),
         )
 
     @classmethod
@@ -95,7 +94,7 @@ class Piece:
         return cls(first, last, nothing, nothing, nothing, np.zeros((0, 0)))
 
     def clear(self) -> None:
-        for a in (self.diagonal, self.upper, self.side, self.border):
+        for a in (self.diagonal, self.upper, self.side, self.calib):
             a[:] = 0.0
         if self.features is not None:
             self.features.sums.clear()
@@ -106,12 +105,12 @@ class Piece:
         if features is not None:
             features = Features.of(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
         own = self.diagonal[:-1], self.upper[:-1], self.side[:-1]
-        return Piece(self.first, self.last - 1, *own, self.border, features)
+        return Piece(self.first, self.last - 1, *own, self.calib, features)
 
     def sums(self, wanted: bool) -> Sums:
         """For a kernel to add to; empty where only residuals are wanted."""
         piece = self if wanted else Piece.bare(self.first, self.last)
-        return Sums(piece.first, piece.diagonal, piece.upper, piece.side, piece.border)
+        return Sums(piece.first, piece.diagonal, piece.upper, piece.side, piece.calib)
 
 
 def chain_cuts(n_nodes: int) -> tuple[int, ...]:
@@ -120,26 +119,28 @@ def chain_cuts(n_nodes: int) -> tuple[int, ...]:
     return () if middle < 2 else (middle,)
 
 
-def make_pieces(n_nodes: int, n_border: int | None) -> tuple[Piece, ...]:
-    """Two pieces of about the same length; one where the chain is too short to share. Without a border, bare ones."""
+def make_pieces(n_nodes: int, n_calib: int | None) -> tuple[Piece, ...]:
+    """Two pieces of about the same length; one where the chain is too short to share. Without calibration parameters,
+    bare ones."""
     ends = (0, *chain_cuts(n_nodes), n_nodes - 1)
-    if n_border is not None:
+    if n_calib is not None:
         pages.give_back()  # there is no moment at which more is needed
-    return tuple(Piece.bare(a, b) if n_border is None else Piece.zeros(a, b, n_border) for a, b in pairwise(ends))
+    return tuple(Piece.bare(a, b) if n_calib is None else Piece.zeros(a, b, n_calib) for a, b in pairwise(ends))
 
 
 @dataclass(frozen=True)
 class Draw:
-    """A draw from the posterior, as a step: chain (K, 15), border (B,)."""
+    """A draw from the posterior, as a step: chain (K, 15), calib (B,)."""
 
     chain: np.ndarray
-    border: np.ndarray
+    calib: np.ndarray
 
 
 @dataclass(frozen=True)
 class Factors:
     """What an elimination leaves behind, in `pieces` too: of each piece what is `done`, of the node that they share its
-    factor and side (15, B + 1), and the `information` (B, B) of the border. tolerance, held: see border_step."""
+    factor and side (15, B + 1), and the `information` (B, B) of the calibration parameters. tolerance, held: see
+    calib_step."""
 
     pieces: tuple[Piece, ...]
     done: list[Eliminated | bool]
@@ -150,16 +151,16 @@ class Factors:
     tolerance: np.ndarray
     held: np.ndarray
 
-    def back(self, border: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
-        """(K, 15, m) the chain's part of m solutions: from border (B + 1, m), its last row what the gradient counts,
+    def back(self, calib: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
+        """(K, 15, m) the chain's part of m solutions: from calib (B + 1, m), its last row what the gradient counts,
         and what stands on the right beside the gradient, of each piece and of the shared node."""
-        m = border.shape[1]
+        m = calib.shape[1]
         chain = np.zeros((self.n_nodes, NODE, m))
         if len(self.shared):
-            chain[self.pieces[0].last] = np.linalg.solve(np.tril(self.shared).T, white[-1] - self.shared_side @ border)
+            chain[self.pieces[0].last] = np.linalg.solve(np.tril(self.shared).T, white[-1] - self.shared_side @ calib)
         keep = len(self.shared) > 0
         own = list(zip(self.pieces, self.done, white, strict=False))
-        in_parallel(lambda p: _back(p[0], p[1], p[2], keep, border, chain), own)
+        in_parallel(lambda p: _back(p[0], p[1], p[2], keep, calib, chain), own)
         return chain
 
     def rows(self) -> list[int]:
@@ -168,45 +169,45 @@ class Factors:
 
     def draws(self, rng: np.random.Generator, free: int, still: int) -> tuple[Draw, ...]:
         """Draws from the posterior, to be made before the pieces are filled anew: `free` ones in which undetermined
-        directions of the border are held, then `still` ones in which all of it is."""
+        directions of the calibration parameters are held, then `still` ones in which all of them are."""
         m = free + still
-        border = np.zeros((len(self.tolerance) + 1, m))
-        border[:-1, :free] = border_draws(
+        calib = np.zeros((len(self.tolerance) + 1, m))
+        calib[:-1, :free] = calib_draws(
             self.information, self.tolerance, self.held, rng.standard_normal((len(self.tolerance), free))
         )
-        chain = self.back(border, [rng.standard_normal((n, m)) for n in self.rows()])
-        return tuple(Draw(np.ascontiguousarray(chain[:, :, k]), border[:-1, k].copy()) for k in range(m))
+        chain = self.back(calib, [rng.standard_normal((n, m)) for n in self.rows()])
+        return tuple(Draw(np.ascontiguousarray(chain[:, :, k]), calib[:-1, k].copy()) for k in range(m))
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Step (chain (K, 15), border (B,)), `decrease` of half the chi^2 that the linear model predicts, and the factors.
+    """Step (chain (K, 15), calib (B,)), `decrease` of half the chi^2 that the linear model predicts, and the factors.
 
-    gradient (B + 1,): of the border, the chain marginalised, and twice what the chain alone takes off half the chi^2.
-    """
+    gradient (B + 1,): of the calibration parameters, the chain marginalised, and twice what the chain alone takes off
+    half the chi^2."""
 
     chain: np.ndarray
-    border: np.ndarray
+    calib: np.ndarray
     decrease: float
     gradient: np.ndarray
     factors: Factors
 
     @classmethod
     def of(cls, factors: Factors, gradient: np.ndarray) -> Solution:
-        """The step, where the border's information and `gradient` (B + 1,) are known."""
-        border, decrease = border_step(factors.information, gradient[:-1], factors.tolerance, factors.held)
+        """The step, where the calibration parameters' information and `gradient` (B + 1,) are known."""
+        calib, decrease = calib_step(factors.information, gradient[:-1], factors.tolerance, factors.held)
         white = [np.zeros((n, 1)) for n in factors.rows()]
-        chain = factors.back(np.append(border, 1.0)[:, None], white)[:, :, 0]
-        return cls(np.ascontiguousarray(chain), border, decrease - 0.5 * float(gradient[-1]), gradient, factors)
+        chain = factors.back(np.append(calib, 1.0)[:, None], white)[:, :, 0]
+        return cls(np.ascontiguousarray(chain), calib, decrease - 0.5 * float(gradient[-1]), gradient, factors)
 
     @property
     def information(self) -> np.ndarray:
-        """(B, B) of the border, the chain marginalised (damping included)."""
+        """(B, B) of the calibration parameters, the chain marginalised (damping included)."""
         return self.factors.information
 
     def less(self, information: np.ndarray, gradient: np.ndarray) -> Solution:
-        """Without what has this information (B, B) and gradient (B,) on the border, before the pieces are filled
-        anew."""
+        """Without what has this information (B, B) and gradient (B,) on the calibration parameters, before the pieces
+        are filled anew."""
         factors = replace(self.factors, information=self.information - information)
         return Solution.of(factors, self.gradient - np.append(gradient, 0.0))
 
@@ -222,7 +223,8 @@ class NotDefiniteError(EstimationError):
 
 
 def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
-    """(B + 1, B + 1) what the eliminated chain of a piece, but for a kept end node, takes from the border."""
+    """(B + 1, B + 1) what the eliminated chain of a piece, but for a kept end node, takes from the calibration
+    parameters."""
     rows = piece.side
     if keep:
         rows = rows[:-1] if piece.first == 0 else rows[1:]
@@ -231,20 +233,20 @@ def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
 
 
 def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
-    """Eliminates a piece in place, but for a kept end node: that node's sums and the border's are left. False: not
-    definite."""
+    """Eliminates a piece in place, but for a kept end node: that node's sums and the calibration parameters' are left.
+    False: not definite."""
     forwards = piece.first == 0 or not keep
     if piece.features is None:
         done = eliminate_chain(piece.diagonal, piece.upper, piece.side, forwards, keep)
         if done:
-            piece.border -= _eliminated_part(piece, keep)
+            piece.calib -= _eliminated_part(piece, keep)
         return done
     done = eliminate(piece.features, piece.diagonal, piece.upper, piece.side, forwards, keep)
     if done is None:
         return False
     left = np.triu(done.left) + np.triu(done.left, 1).T
     kept = NODE if keep else 0
-    piece.border += left[kept:, kept:]
+    piece.calib += left[kept:, kept:]
     if keep:
         end = -1 if forwards else 0
         piece.diagonal[end] += left[:NODE, :NODE]
@@ -268,15 +270,15 @@ def _unknowns(piece: Piece, done: Eliminated | bool) -> int:
 def marginalise(piece: Piece) -> np.ndarray:
     """Border (B + 1, B + 1) with all nodes of `piece` eliminated; overwrites the piece. Raises NotDefiniteError."""
     _reduce_all(piece)
-    return piece.border
+    return piece.calib
 
 
-def given_border(piece: Piece, border: np.ndarray) -> np.ndarray:
-    """(n, 15, m) the best steps of the nodes of `piece` where the border makes steps (B, m); overwrites the piece.
-    Raises NotDefiniteError."""
-    done, m = _reduce_all(piece), border.shape[1]
+def given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
+    """(n, 15, m) the best steps of the nodes of `piece` where the calibration parameters make steps (B, m); overwrites
+    the piece. Raises NotDefiniteError."""
+    done, m = _reduce_all(piece), calib.shape[1]
     chain = np.zeros((piece.last + 1, NODE, m))
-    _back(piece, done, np.zeros((_unknowns(piece, done), m)), False, np.vstack([border, np.ones((1, m))]), chain)
+    _back(piece, done, np.zeros((_unknowns(piece, done), m)), False, np.vstack([calib, np.ones((1, m))]), chain)
     return chain[piece.first :]
 
 
@@ -290,32 +292,32 @@ def marginalise_in_segments(piece: Callable[[int, int], Piece], n_nodes: int) ->
             if rest is not None:
                 own.diagonal[0] += rest.diagonal[0]
                 own.side[0] += rest.side[0]
-                own.border += rest.border
+                own.calib += rest.calib
             rest = _onto_last(own)
     return marginalise(piece(0, 0) if rest is None else rest)
 
 
 def _onto_last(piece: Piece) -> Piece:
-    """The last node and the border, all other nodes eliminated. Raises NotDefiniteError."""
+    """The last node and the calibration parameters, all other nodes eliminated. Raises NotDefiniteError."""
     if not eliminate_chain(piece.diagonal, piece.upper, piece.side, True, True):
         raise NotDefiniteError(BROKEN_DOWN)
     last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1)
     last.diagonal[0], last.side[0] = piece.diagonal[-1], piece.side[-1]
     flat = piece.side[:-1].reshape(-1, piece.side.shape[2])
-    last.border[:] = piece.border - flat.T @ flat
+    last.calib[:] = piece.calib - flat.T @ flat
     return last
 
 
 def _back(
-    piece: Piece, done: Eliminated | bool, white: np.ndarray, keep: bool, border: np.ndarray, chain: np.ndarray
+    piece: Piece, done: Eliminated | bool, white: np.ndarray, keep: bool, calib: np.ndarray, chain: np.ndarray
 ) -> None:
-    """Fills the part of `chain` (K, 15, m) that belongs to a piece, from border and the kept node's; see Factors."""
+    """Fills the part of `chain` (K, 15, m) that belongs to a piece, from `calib` and the kept node's; see Factors."""
     own = chain[piece.first : piece.last + 1]
     if isinstance(done, Eliminated):
-        done.substitute(border, white, own)
+        done.substitute(calib, white, own)
         return
-    for k in range(border.shape[1]):
-        one, known = np.ascontiguousarray(own[:, :, k]), np.ascontiguousarray(border[:, k])
+    for k in range(calib.shape[1]):
+        one, known = np.ascontiguousarray(own[:, :, k]), np.ascontiguousarray(calib[:, k])
         noise, forwards = np.ascontiguousarray(white[:, k]).reshape(-1, NODE), piece.first == 0 or not keep
         substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, known, noise, one)
         # The shared node is given, and both pieces write their own nodes alone.
@@ -326,20 +328,20 @@ def _back(
 def solve(
     pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, damping: float = 0.0, held: np.ndarray = NOTHING
 ) -> Solution:
-    """Solves (H + damping diag(H)) step = -gradient, directions of the border in `held` left alone (see border_step);
-    overwrites the pieces. Raises NotDefiniteError."""
+    """Solves (H + damping diag(H)) step = -gradient, directions of the calibration parameters in `held` left alone (see
+    calib_step); overwrites the pieces. Raises NotDefiniteError."""
     keep = len(pieces) > 1
-    n_border = len(tolerance)
-    scale = np.append(np.full(n_border, damping), 0.0)
-    extra = np.diag(scale * sum((p.border.diagonal() for p in pieces), np.zeros(n_border + 1)))
+    n_calib = len(tolerance)
+    scale = np.append(np.full(n_calib, damping), 0.0)
+    extra = np.diag(scale * sum((p.calib.diagonal() for p in pieces), np.zeros(n_calib + 1)))
     if damping:
         for piece in pieces:
             damp(piece.diagonal, damping)
     done = in_parallel(lambda p: _reduce(p, keep), pieces)
     if not all(done):
         raise NotDefiniteError(BROKEN_DOWN)
-    rest = sum((p.border for p in pieces), extra)
-    shared, shared_side = np.zeros((0, 0)), np.zeros((0, n_border + 1))
+    rest = sum((p.calib for p in pieces), extra)
+    shared, shared_side = np.zeros((0, 0)), np.zeros((0, n_calib + 1))
     if keep:
         shared = pieces[0].diagonal[-1] + pieces[1].diagonal[0]
         shared_side = pieces[0].side[-1] + pieces[1].side[0]
@@ -347,6 +349,6 @@ def solve(
             raise NotDefiniteError(BROKEN_DOWN)
         forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side
-    information = rest[:n_border, :n_border]
+    information = rest[:n_calib, :n_calib]
     factors = Factors(pieces, done, n_nodes, shared, shared_side, information, tolerance, held)
-    return Solution.of(factors, rest[:, n_border])
+    return Solution.of(factors, rest[:, n_calib])

@@ -1,4 +1,4 @@
-"""Compiled elimination of a chain of nodes with a border, and the way back (`arrowhead.py`)."""
+"""Compiled elimination of a chain of nodes with calibration parameters, and the way back (`arrowhead.py`)."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def eliminate_chain(diagonal, upper, side, forwards, keep):
 
 
 @njit(cache=True, nogil=True)
-def substitute_chain(diagonal, upper, side, forwards, keep, border, white, chain):
-    """Back substitution: fills chain (n, 15) from border (B + 1,), its last number what the gradient counts, and with
+def substitute_chain(diagonal, upper, side, forwards, keep, calib, white, chain):
+    """Back substitution: fills chain (n, 15) from calib (B + 1,), its last number what the gradient counts, and with
     `keep` the last node's step in it; white (n, 15): what stands on the right beside the gradient."""
     n = diagonal.shape[0]
     for step in range(n - 2 if keep else n - 1, -1, -1):
@@ -73,8 +73,8 @@ def substitute_chain(diagonal, upper, side, forwards, keep, border, white, chain
         L = diagonal[k]
         for i in range(L.shape[0]):
             s = -white[k, i]
-            for j in range(len(border)):
-                s += side[k, i, j] * border[j]
+            for j in range(len(calib)):
+                s += side[k, i, j] * calib[j]
             chain[k, i] = -s
         if step < n - 1:
             after = k + 1 if forwards else k - 1

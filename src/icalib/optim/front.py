@@ -28,10 +28,10 @@ class Features:
     def of(cls, sums: FeatureSums, plan: Plan) -> Features:
         return cls(sums, plan, np.empty(_sizes(plan, sums.side.shape[2]).start[-1]))
 
-    def widened(self, n_border: int) -> Features:
-        """The same with further columns of the border, between those there are and the gradient; zero, this too."""
+    def widened(self, n_calib: int) -> Features:
+        """The same with further calibration columns, between those there are and the gradient; zero, this too."""
         side = self.sums.side
-        wide = np.zeros((*side.shape[:2], n_border + 1))
+        wide = np.zeros((*side.shape[:2], n_calib + 1))
         wide[:, :, : side.shape[2] - 1] = side[:, :, :-1]
         return Features.of(self.sums._replace(side=wide), self.plan)
 
@@ -39,7 +39,7 @@ class Features:
 @dataclass(frozen=True)
 class Eliminated:
     """The factors of all steps in `room`, how nodes were turned, and what is `left` (15 or 0 + B + 1): the kept node
-    and the border, upper triangle."""
+    and the calibration parameters, upper triangle."""
 
     plan: Plan
     sizes: Sizes
@@ -52,18 +52,18 @@ class Eliminated:
         """How many unknowns were eliminated, those of features that one step alone sees aside."""
         return int(self.sizes.rest.sum() + self.sizes.coupled.sum() + self.sizes.dying.sum())
 
-    def substitute(self, border: np.ndarray, white: np.ndarray, chain: np.ndarray) -> None:
-        """Back substitution: fills `chain` (n, 15, m), of which the kept node is given, from border (B + 1, m), its
+    def substitute(self, calib: np.ndarray, white: np.ndarray, chain: np.ndarray) -> None:
+        """Back substitution: fills `chain` (n, 15, m), of which the kept node is given, from calib (B + 1, m), its
         last row what the gradient counts; white (rows, m): what stands on the right beside the gradient."""
-        substitute_all(self.plan, self.sizes, self.turn, self.room, border, white, chain)
+        substitute_all(self.plan, self.sizes, self.turn, self.room, calib, white, chain)
 
 
-def _sizes(plan: Plan, n_border: int) -> Sizes:
+def _sizes(plan: Plan, n_calib: int) -> Sizes:
     coupled = np.add.reduceat(np.append(plan.coupled[plan.nodes.values], 0), plan.nodes.start[:-1])
     counts = np.diff(plan.nodes.start)
     coupled[counts == 0] = 0
-    rest, dying, wide = NODE * counts - coupled, 3 * np.diff(plan.dying.start), n_border + 3 * plan.alive
-    room = (rest + coupled) ** 2 + dying * (dying + coupled) + rest * (NODE + n_border)
+    rest, dying, wide = NODE * counts - coupled, 3 * np.diff(plan.dying.start), n_calib + 3 * plan.alive
+    room = (rest + coupled) ** 2 + dying * (dying + coupled) + rest * (NODE + n_calib)
     room += (coupled + dying) * (NODE + wide)
     return Sizes(rest, coupled, dying, wide, np.concatenate([[0], np.cumsum(room)]))
 
@@ -72,8 +72,8 @@ def eliminate(
     features: Features, diagonal: np.ndarray, upper: np.ndarray, side: np.ndarray, forwards: bool, keep: bool
 ) -> Eliminated | None:
     """All steps; None where the sums are not positive definite. The factors are in the room of `features`."""
-    plan, sums, n_border = features.plan, features.sums, side.shape[2]
-    sizes = _sizes(plan, n_border)
+    plan, sums, n_calib = features.plan, features.sums, side.shape[2]
+    sizes = _sizes(plan, n_calib)
     widest = int(sizes.wide.max())
     turn, room = np.empty_like(diagonal), features.room
     chain = Chain(diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose))
@@ -82,7 +82,7 @@ def eliminate(
     if not eliminate_all(plan, sizes, sums, chain, room, front, carry):
         return None
     if not keep:
-        return Eliminated(plan, sizes, turn, room, front[:n_border, :n_border].copy())
-    left = np.zeros((NODE + n_border, NODE + n_border))
-    left[:NODE], left[NODE:, NODE:] = carry[:, : NODE + n_border], front[:n_border, :n_border]
+        return Eliminated(plan, sizes, turn, room, front[:n_calib, :n_calib].copy())
+    left = np.zeros((NODE + n_calib, NODE + n_calib))
+    left[:NODE], left[NODE:, NODE:] = carry[:, : NODE + n_calib], front[:n_calib, :n_calib]
     return Eliminated(plan, sizes, turn, room, left)

@@ -1,9 +1,9 @@
 """Compiled steps of the elimination of nodes and features (`front.py`), in place in a front that fits the cache.
 
-The front is the upper triangle over border and features in slots; `carry` (15, 15 + .) what is left of the node that
-comes next: with itself, border, features. Matrices are split into rows that meet no feature ("rest") and those that do
-("coupled"), and the former are eliminated first: of a node that one camera sees from, six dimensions of 15 meet any.
-"""
+The front is the upper triangle over calibration parameters and features in slots; `carry` (15, 15 + .) what is left of
+the node that comes next: with itself, calibration parameters, features. Matrices are split into rows that meet no
+feature ("rest") and those that do ("coupled"), and the former are eliminated first: of a node that one camera sees
+from, six dimensions of 15 meet any."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def _places(g, plan, rest, row):
 
 @njit(cache=True, nogil=True)
 def _fill_nodes(g, plan, chain, row, U, Wr, Wc):
-    """The step's nodes with one another, with the one after, and with the border."""
+    """The step's nodes with one another, with the one after, and with the calibration parameters."""
     a, n_b, last = len(Wr), chain.side.shape[2], plan.nodes.start[g + 1] - 1
     for q in range(plan.nodes.start[g], last + 1):
         k = plan.nodes.values[q]
@@ -250,7 +250,7 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
             return False
         solve_transposed(own, rows)
     subtract_gram(V[:, :coupled], U[rest:, rest:])
-    # Of the border features meet the `used` columns at most, and the gradient.
+    # Of the calibration parameters features meet the `used` columns at most, and the gradient.
     here, gradient, last = V[:, coupled : coupled + used], V[:, coupled + n_b - 1 :], NODE + n_b
     subtract_product(V[:, :coupled], here, Wc[:coupled, NODE : NODE + used])
     subtract_product(V[:, :coupled], gradient, Wc[:coupled, last - 1 : last])
@@ -306,8 +306,8 @@ def _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
 
 @njit(cache=True, nogil=True)
 def eliminate_all(plan, sizes, sums, chain, room, front, carry):
-    """All steps; their factors are left in `room`, the kept node's sums in `carry`, the border's in `front`. False: not
-    definite."""
+    """All steps; their factors are left in `room`, the kept node's sums in `carry`, the calibration parameters' in
+    `front`. False: not definite."""
     n_b, old_wide = chain.side.shape[2], 0
     row = np.zeros((len(chain.diagonal), NODE), dtype=np.int64)
     for g in range(len(plan.after)):
@@ -340,12 +340,12 @@ def _solve_columns(U, X):
 
 
 @njit(cache=True, nogil=True)
-def substitute_all(plan, sizes, turn, room, border, white, chain):
-    """Fills `chain` (n, 15, m), of which the kept node is given, from border (B + 1, m), its last row what the gradient
+def substitute_all(plan, sizes, turn, room, calib, white, chain):
+    """Fills `chain` (n, 15, m), of which the kept node is given, from calib (B + 1, m), its last row what the gradient
     counts; white (rows, m): what stands on the right beside the gradient, by step: rest, coupled, dying."""
-    n_b, m, end = len(border), border.shape[1], len(white)
+    n_b, m, end = len(calib), calib.shape[1], len(white)
     known = np.zeros((NODE + sizes.wide.max(), m))
-    known[NODE : NODE + n_b] = border
+    known[NODE : NODE + n_b] = calib
     for g in range(len(plan.after) - 1, -1, -1):
         a, c = sizes.rest[g], sizes.coupled[g]
         U, Ud, D, Wr, Wc = _factors(g, sizes, n_b, room)

@@ -2,9 +2,9 @@
 
 Nodes go in groups, from one end of the piece to the other. A feature that one group alone sees goes before that group,
 whatever else there is. Any other joins the front with the first group that sees it and leaves with the last one, so
-that the answer is exact however long it lives; one that lives as long as the piece is a column of the border, but in
-name. A larger group keeps more features out of the front, and fewer are at its end: its size is chosen by cost.
-"""
+that the answer is exact however long it lives; one that lives as long as the piece is a calibration parameter
+in all but name. A larger group keeps more features out of the front, and fewer are at its end: its size is
+chosen by cost."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NO_ENDS = np.zeros(0, dtype=np.int64)
 
 
 class FeatureSums(NamedTuple):
-    """What features add to the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with border,
+    """What features add to the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with calib,
     its gradient in the last column; block (E, 3, 6), feature with the camera's pose, of each pair of feature and image.
 
     pose (I, 6, 15), a camera's pose by the node its image hangs on; next_pose (I or 0, 6, 15), by the node after. track
@@ -44,12 +44,12 @@ class FeatureSums(NamedTuple):
 
     @classmethod
     def zeros(
-        cls, n_tracks: int, track: np.ndarray, image: np.ndarray, node: np.ndarray, n_border: int, by_next: bool = False
+        cls, n_tracks: int, track: np.ndarray, image: np.ndarray, node: np.ndarray, n_calib: int, by_next: bool = False
     ) -> FeatureSums:
         pose = np.zeros((len(node), POSE, NODE))
         return cls(
             np.zeros((n_tracks, 3, 3)),
-            np.zeros((n_tracks, 3, n_border + 1)),
+            np.zeros((n_tracks, 3, n_calib + 1)),
             np.zeros((len(track), 3, POSE)),
             pose,
             pose.copy() if by_next else pose[:0],
@@ -141,16 +141,16 @@ class _Lives:
         local = (first == last) & (first != nodeless) & (len(sums.next_pose) == 0)
         return cls(groups, step, first, last, local)
 
-    def cost(self, coupled: np.ndarray, n_border: int) -> float:
+    def cost(self, coupled: np.ndarray, n_calib: int) -> float:
         """Multiplications of an elimination, moving numbers included."""
         n, lasting = len(self.groups), ~self.local & (self.last >= 0)
         born = np.bincount(self.first[lasting], minlength=n)[:n]
         died = np.bincount(self.last[lasting], minlength=n)[:n]
-        wide = n_border + 3.0 * (np.cumsum(born) - np.cumsum(died) + died)
+        wide = n_calib + 3.0 * (np.cumsum(born) - np.cumsum(died) + died)
         nodes = NODE * np.array([len(g) for g in self.groups])
         meets = np.array([coupled[g].sum() + (NODE - coupled[g[:1]]).sum() for g in self.groups])
         rank = meets + 3.0 * died
-        small = nodes**3 / 6.0 + nodes**2 * n_border / 2.0 + wide * rank**2 / 2.0
+        small = nodes**3 / 6.0 + nodes**2 * n_calib / 2.0 + wide * rank**2 / 2.0
         moved = CACHED * wide**2 + STORED * (rank * wide + nodes**2)
         return float((rank * wide**2 / 2.0 + SMALL * small + moved + STEP).sum())
 

@@ -12,7 +12,7 @@ from icalib.optim.robust_weights import weight
 
 class Rows(NamedTuple):
     """n intervals of m rows: residual (n, m); J_node, J_next (n, m, 15), with respect to both nodes; J_calib (n, m,
-    c): to columns of the border. Jacobians of length 0 where not wanted."""
+    c): to calibration columns. Jacobians of length 0 where not wanted."""
 
     residual: np.ndarray
     J_node: np.ndarray
@@ -27,9 +27,9 @@ class Rows(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def add_interval(i, A0, A1, Ac, columns, sums):
-    """Adds one interval to the sums of nodes i and i + 1 of the piece, and of the border.
+    """Adds one interval to the sums of nodes i and i + 1 of the piece, and of the calibration parameters.
 
-    A0, A1 (m, 15): whitened Jacobians by the two nodes; Ac (m, n + 1): by border `columns` (n,), and the residual.
+    A0, A1 (m, 15): whitened Jacobians by the two nodes; Ac (m, n + 1): by calibration `columns` (n,), and the residual.
     """
     n_b = sums.side.shape[2] - 1
     _add_gram(A0, A0, sums.diagonal[i])
@@ -38,7 +38,7 @@ def add_interval(i, A0, A1, Ac, columns, sums):
     _scatter(A0, Ac, columns, n_b, sums.side[i])
     _scatter(A1, Ac, columns, n_b, sums.side[i + 1])
     if len(columns):
-        _scatter_border(Ac, columns, n_b, sums.border)
+        _scatter_calib(Ac, columns, n_b, sums.calib)
 
 
 @njit(cache=True, nogil=True)
@@ -65,14 +65,14 @@ def _scatter(A, Ac, cols, n_b, side):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _scatter_border(Ac, cols, n_b, border):
+def _scatter_calib(Ac, cols, n_b, calib):
     for k in range(Ac.shape[0]):
         for i in range(len(cols)):
             f = Ac[k, i]
             for j in range(len(cols)):
-                border[cols[i], cols[j]] += f * Ac[k, j]
-            border[cols[i], n_b] += f * Ac[k, len(cols)]
-            border[n_b, cols[i]] += f * Ac[k, len(cols)]
+                calib[cols[i], cols[j]] += f * Ac[k, j]
+            calib[cols[i], n_b] += f * Ac[k, len(cols)]
+            calib[n_b, cols[i]] += f * Ac[k, len(cols)]
 
 
 @njit(cache=True, nogil=True)
@@ -105,9 +105,8 @@ def _whiten(W, J, columns, scale, out):
 def accumulate_rows(rows, node, W, loss, free, columns, sums, residual, root):
     """Whitens rows by W (n, m, m), weighs them, and adds them to the sums where these are wanted.
 
-    free, columns (c,): columns of J_calib that are estimated, and theirs in the border. residual, root (n, m):
-    whitened residuals and square roots of their weights, out. Returns half the robust chi^2.
-    """
+    free, columns (c,): columns of J_calib that are estimated, and those in the calibration parameters. residual, root
+    (n, m): whitened residuals and square roots of their weights, out. Returns half the robust chi^2."""
     m, n_c = W.shape[1], len(free)
     A0, A1, Ac = np.empty((m, 15)), np.empty((m, 15)), np.empty((m, n_c + 1))
     scaled, chain = np.empty((2, m)), np.arange(15)

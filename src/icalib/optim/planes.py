@@ -11,7 +11,8 @@ from icalib.optim.state import Key, State
 
 
 class Planes(NamedTuple):
-    """normal (P, 3), tangents (P, 2, 3), point (P, 3) of each plane; columns (P, 3) in the border, -1 where fixed."""
+    """normal (P, 3), tangents (P, 2, 3), point (P, 3) of each plane; columns (P, 3) in the calibration parameters, -1
+    where fixed."""
 
     normal: np.ndarray
     tangents: np.ndarray

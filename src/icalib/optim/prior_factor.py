@@ -36,21 +36,21 @@ class Prior:
         r, J = self.residual(state)
         columns = self.block.columns
         if sums:
-            piece.border[np.ix_(columns, columns)] += J.T @ J
-            piece.border[columns, -1] += J.T @ r
-            piece.border[-1, columns] += J.T @ r
+            piece.calib[np.ix_(columns, columns)] += J.T @ J
+            piece.calib[columns, -1] += J.T @ r
+            piece.calib[-1, columns] += J.T @ r
         return 0.5 * float(r @ r)
 
 
-def sums_of_priors(priors: Sequence[Prior], state: State, n_border: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Half the chi^2 of `priors`, and their gradient (B,) and information (B, B) on the border."""
-    piece = Piece.zeros(0, 0, n_border)
+def sums_of_priors(priors: Sequence[Prior], state: State, n_calib: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Half the chi^2 of `priors`, and their gradient (B,) and information (B, B) on the calibration parameters."""
+    piece = Piece.zeros(0, 0, n_calib)
     cost = sum(p.accumulate(state, piece) for p in priors)
-    return cost, piece.border[:-1, -1], piece.border[:-1, :-1]
+    return cost, piece.calib[:-1, -1], piece.calib[:-1, :-1]
 
 
 def without_priors(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
-    """(B, B) the border's information at `state` less that of `priors`."""
+    """(B, B) the calibration parameters' information at `state` less that of `priors`."""
     return information - sums_of_priors(priors, state, len(information))[2]
 
 

@@ -1,4 +1,4 @@
-"""What is estimated: the inertial states at the nodes, and the lasting parameters of the border.
+"""What is estimated: the inertial states at the nodes, and the lasting parameters of the calibration parameters.
 
 A node is (R_world_imu, p, v, b_g, b_a), 15 tangent dimensions in this order (paper (2)).
 """
@@ -27,7 +27,7 @@ def in_recording(name: str, recording: int) -> str:
 
 @dataclass(frozen=True)
 class Block:
-    """One lasting parameter. kind: how it is perturbed; start: its first border column, None where it is fixed.
+    """One lasting parameter. kind: how it is perturbed; start: its first calibration column, None where it is fixed.
 
     rotation: R <- R Exp(d). tilt (2 columns): R_world_board <- Exp((d0, d1, 0)) R_world_board; the third turn, about
     gravity, is the freedom of the world frame. plane (3 columns): see `geometry.planes.moved`. nuisance: a vector.
@@ -45,7 +45,7 @@ class Block:
 
     @property
     def columns(self) -> np.ndarray:
-        """(size,) border columns, -1 where fixed."""
+        """(size,) calibration columns, -1 where fixed."""
         return np.full(self.size, -1) if self.start is None else np.arange(self.start, self.start + self.size)
 
     @property
@@ -56,7 +56,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each lasting parameter stands in the border."""
+    """Where each lasting parameter stands in the calibration parameters."""
 
     blocks: tuple[Block, ...]
 
@@ -117,8 +117,8 @@ class State:
         """The nodes of each recording."""
         return [slice(a, b) for a, b in pairwise((*self.starts, len(self.seconds)))]
 
-    def retract(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> State:
-        """The state moved by tangent steps chain (K, 15) and border (B,).
+    def retract(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> State:
+        """The state moved by tangent steps chain (K, 15) and calib (B,).
 
         A tilt of the board turns the whole trajectory of its recording with it, exactly; the nodes' own steps are what
         they have beyond that, and turn too. To first order nothing changes. But where gravity is weakly known the tilt
@@ -126,8 +126,8 @@ class State:
         their circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so. Without
         a board planes and trajectory turn by what turns them most alike.
         """
-        turns = self._turns(layout, chain, border)
-        values = self.values | {b.key: self._moved(b, border[b.columns], turns[0]) for b in layout.free}
+        turns = self._turns(layout, chain, calib)
+        values = self.values | {b.key: self._moved(b, calib[b.columns], turns[0]) for b in layout.free}
         R, p, v = np.empty_like(self.rotation), np.empty_like(self.position), np.empty_like(self.velocity)
         for turn, k in zip(turns, self.recordings, strict=True):
             Q = so3.exp(turn)
@@ -139,21 +139,21 @@ class State:
             v[k] = (self.velocity[k] + own_velocity) @ Q.T
         return replace(self, rotation=R, position=p, velocity=v, bias=self.bias + chain[:, 9:15], values=values)
 
-    def _turns(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> list[np.ndarray]:
+    def _turns(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> list[np.ndarray]:
         """(3,) by which each recording's world turns, in world axes. Several without a board share planes."""
-        tilts = [np.append(border[b.columns], 0.0) for b in layout.free if b.kind == "tilt"]
+        tilts = [np.append(calib[b.columns], 0.0) for b in layout.free if b.kind == "tilt"]
         if tilts:
             return tilts
-        return [self._common_turn(layout, chain, border)] if len(self.starts) == 1 else [np.zeros(3)] * len(self.starts)
+        return [self._common_turn(layout, chain, calib)] if len(self.starts) == 1 else [np.zeros(3)] * len(self.starts)
 
-    def _common_turn(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> np.ndarray:
+    def _common_turn(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> np.ndarray:
         """(3,) by which the planes turn, in world axes; without these, by which the positions do, but about a line of
         them; and what neither shows is that of the first node. On a flat floor all sensors may turn against the IMU:
         map and path turn then, and no node does."""
         free = [b for b in layout.free if b.kind == "plane"]
         if free:
             x = np.array([self.values[b.key][:3] for b in free])
-            moved = np.array([border[b.columns[:2]] @ planes.tangents(n) for b, n in zip(free, x, strict=True)])
+            moved = np.array([calib[b.columns[:2]] @ planes.tangents(n) for b, n in zip(free, x, strict=True)])
         else:
             x, moved = self.position - self.position.mean(axis=0), chain[:, 3:6] - chain[:, 3:6].mean(axis=0)
         spread = (x.T @ x) / len(x)
@@ -162,7 +162,7 @@ class State:
         return np.linalg.solve(A, turned + FIRST_NODE * (self.rotation[0] @ chain[0, 0:3]))
 
     def _moved(self, block: Block, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """The value of a block of the border, moved by `d` in a world that turns by `turn`."""
+        """The value of a block of the calibration parameters, moved by `d` in a world that turns by `turn`."""
         old = self.values[block.key]
         if block.kind == "rotation":
             return old @ so3.exp(d)

@@ -24,7 +24,7 @@ from icalib.motion.factor import of_type
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined
 from icalib.observability.words import Observability, observe
-from icalib.optim.border import restricted_inverse
+from icalib.optim.calib_block import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (
     Calibration,

@@ -18,7 +18,7 @@ from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
-from icalib.optim.border import NOTHING
+from icalib.optim.calib_block import NOTHING
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Layout, State, make_layout
 from icalib.rig import ImuNoise

@@ -20,7 +20,7 @@ LEVEL, FLOOR = Ground("level", 0.01, 0.0, 0.004, 0.002), Ground("floor", 0.01, 0
 
 
 def standing(world_of, drive_of_kind, plane=None, height=0.0):
-    """A planar world with the height of its wheels, and a plane, in its state and border."""
+    """A planar world with the height of its wheels, and a plane, in its state and layout."""
     world = world_of(drive_of_kind("planar", 1))
     own = {("wheel0", "ground_height"): np.array([height])} | ({} if plane is None else {KEY: plane})
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in world.layout.blocks]
@@ -81,7 +81,7 @@ def test_what_was_measured_of_the_height_counts_once(world_of, drive_of_kind):
 )
 def test_what_is_not_asked_for_weighs_nothing(world_of, drive_of_kind, dense, ground, kinds):
     world = standing(world_of, drive_of_kind)
-    if ground.height_sigma is None:  # then the height is not in the border
+    if ground.height_sigma is None:  # then the height is not in the calibration parameters
         world = replace(
             world,
             layout=make_layout(

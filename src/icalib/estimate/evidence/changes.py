@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from icalib.estimate.evidence.parts import Parts
-from icalib.optim.border import complement
+from icalib.optim.calib_block import complement
 from icalib.optim.state import Key
 from icalib.rig.camera import INTRINSICS
 from icalib.rig.sensor import ROTATION, TIME_OFFSET, TRANSLATION

@@ -24,7 +24,7 @@ from icalib.estimate.problem.outcome import Outcome, posterior
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, solve
-from icalib.optim.border import DETERMINED, HELD_BELOW, least_information
+from icalib.optim.calib_block import DETERMINED, HELD_BELOW, least_information
 from icalib.optim.state import State
 from icalib.sensors.imu.residual import ImuFactor
 
@@ -37,7 +37,8 @@ SURE = 0.999  # probability that noise adds no more than is allowed for
 
 @dataclass(frozen=True)
 class Spurious:
-    """What noise adds to the border's marginal information: of each draw, both signs together (n, B, B)."""
+    """What noise adds to the calibration parameters' marginal information: of each draw, both signs together (n, B,
+    B)."""
 
     each: np.ndarray
 
@@ -62,8 +63,8 @@ def spurious_information(
     enough: Callable[[Spurious], bool] = lambda _: True,
     columns: np.ndarray | None = None,
 ) -> Spurious:
-    """What noise adds to the information on `columns` (B,) of the border, by default all, the others fixed; zeros where
-    there is no IMU. Where it counts, a few draws, more where these are not `enough`.
+    """What noise adds to the information on `columns` (B,) of the calibration parameters, by default all, the others
+    fixed; zeros where there is no IMU. Where it counts, a few draws, more where these are not `enough`.
 
     Raises arrowhead.NotDefiniteError where the chain is not determined.
     """
@@ -94,8 +95,8 @@ def spurious_information(
 
 @dataclass(frozen=True)
 class _Noise:
-    """What noise adds to the border's information at an outcome, in the room of which it is found; `among` columns
-    (B,) alone, as numpy.ix_ gives them."""
+    """What noise adds to the calibration parameters' information at an outcome, in the room of which it is found;
+    `among` columns (B,) alone, as numpy.ix_ gives them."""
 
     problem: Problem
     outcome: Outcome
@@ -124,8 +125,8 @@ class _Noise:
         pieces = self.outcome.room or problem.pieces()
         problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
         factors = solve(pieces, problem.n_nodes, problem.tolerance).factors
-        border = np.append(np.zeros(problem.layout.size), 1.0)[:, None]
-        return factors.back(border, [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
+        calib = np.append(np.zeros(problem.layout.size), 1.0)[:, None]
+        return factors.back(calib, [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
 
 
 def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:

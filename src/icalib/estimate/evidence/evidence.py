@@ -11,7 +11,7 @@ from icalib.estimate.problem.outcome import Outcome, posterior
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Along, FitKey, RawSize, Residuals, Squares
 from icalib.optim.arrowhead import Draw
-from icalib.optim.border import restricted_inverse
+from icalib.optim.calib_block import restricted_inverse
 
 DRAW_STEP = 1e-3  # of a posterior sample: small enough to be linear
 
@@ -57,13 +57,13 @@ def raw_sizes(problem: Problem, at: Residuals) -> dict[FitKey, RawSize]:
 
 def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[FitKey, float]:
     """|J_s x|^2 of each sensor for one draw x."""
-    start, end = (outcome.state.retract(problem.layout, s * draw.chain, s * draw.border) for s in (0.0, DRAW_STEP))
+    start, end = (outcome.state.retract(problem.layout, s * draw.chain, s * draw.calib) for s in (0.0, DRAW_STEP))
     along, at = Along(start, end, DRAW_STEP), outcome.residuals
     return {kind: own for key, f in problem.factors.items() for kind, own in f.spent(at[key], along).items()}
 
 
 def split_covariance(outcome: Outcome, parts: Parts) -> np.ndarray:
-    """(B, B) covariance of the border as the spread over `parts` of the recording shows it.
+    """(B, B) covariance of the calibration parameters as the spread over `parts` of the recording shows it.
 
     Each part's own gradient b_g at the joint optimum (its chain marginalised) would be zero but for noise; their
     spread through the joint information S gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block

@@ -1,6 +1,7 @@
 """Whether half a recording predicts the other half as well as its formal covariance says.
 
-Near the optimum chi^2 of half h, its own nodes at their best, is a quadratic form of the border's step d:
+Near the optimum chi^2 of half h, its own nodes at their best, is a quadratic form of the step d of the calibration
+parameters:
 
     chi^2_h(d) = c_h + 2 b_h . d + d^T S_h d
 
@@ -20,8 +21,8 @@ import numpy as np
 
 from icalib.estimate.evidence.parts import Parts
 from icalib.motion.factor import Residuals
-from icalib.optim.arrowhead import Piece, given_border, in_parallel
-from icalib.optim.border import HELD_BELOW, complement, restricted_inverse
+from icalib.optim.arrowhead import Piece, given_calib, in_parallel
+from icalib.optim.calib_block import HELD_BELOW, complement, restricted_inverse
 
 LEAST_PART = 1e-6  # of a direction: shorter ones are rounding
 LINEAR = 0.1  # of the excess: what it may be off by where the step of the other half is short enough
@@ -31,10 +32,11 @@ LINEAR = 0.1  # of the excess: what it may be off by where the step of the other
 class Prediction:
     """How well each half of the parts, every other one, is predicted by the other half.
 
-    directions: how many of the border both halves know, the rest being found in each half for itself; excess: by how
-    much chi^2 is higher where they are the other half's than where they are those of both, by the quadratic form above;
-    expected, spread: mean and standard deviation of that form for noise of the stated sizes. inside, outside: residuals
-    with the solution of both, and with the other half's; linear: whether these rise as much as the form says.
+    directions: how many of the calibration parameters both halves know, the rest being found in each half for itself;
+    excess: by how much chi^2 is higher where they are the other half's than where they are those of both, by the
+    quadratic form above; expected, spread: mean and standard deviation of that form for noise of the stated sizes.
+    inside, outside: residuals with the solution of both, and with the other half's; linear: whether these rise as much
+    as the form says.
 
     Measured residuals are no test statistic: a half that knows a plane or a mount to some tolerances only sends the
     other one so far that residuals leave the quadratic form, by any amount, with nothing wrong. The form has the mean
@@ -70,7 +72,8 @@ class Excess(NamedTuple):
 
 
 def predict(parts: Parts) -> Prediction | None:
-    """Each half from the other. None where the two have nothing of the border in common that both know."""
+    """Each half from the other. None where the two have nothing of the calibration parameters in common that both
+    know."""
     t, B = parts.problem.tolerance, parts.problem.layout.size
     free = t[:, None] * complement(parts.problem.held, B)
     halves, shared, own = halves_of(parts.sums, free)
@@ -107,7 +110,7 @@ def _priors(parts: Parts) -> np.ndarray:
     piece = Piece.zeros(0, 0, parts.problem.layout.size)
     for prior in parts.problem.priors:
         prior.accumulate(parts.state, piece)
-    return piece.border
+    return piece.calib
 
 
 def _unknown(information: list[np.ndarray]) -> np.ndarray:
@@ -155,14 +158,14 @@ def excess(first: Half, second: Half, prior: tuple[np.ndarray, np.ndarray]) -> E
 
 
 def _evaluate(parts: Parts, steps: list[np.ndarray]) -> tuple[np.ndarray, Residuals, Residuals]:
-    """Half the chi^2 (2,) and the residuals at two steps of the border of either half, steps (B, 2) of both and of the
-    other: the nodes of each part follow, and nothing is linear but their step."""
+    """Half the chi^2 (2,) and the residuals at two steps of the calibration parameters of either half, steps (B, 2) of
+    both and of the other: the nodes of each part follow, and nothing is linear but their step."""
     problem, state = parts.problem, parts.state
     found, scratch = (problem.residuals(), problem.residuals()), problem.residuals()
 
     def costs(g: int) -> list[float]:
         step = steps[g % 2]
-        own = given_border(parts.piece(g, scratch), step)
+        own = given_calib(parts.piece(g, scratch), step)
         out = []
         for k in range(2):
             chain = np.zeros((problem.n_nodes, own.shape[1]))
@@ -175,8 +178,8 @@ def _evaluate(parts: Parts, steps: list[np.ndarray]) -> tuple[np.ndarray, Residu
 
 @dataclass(frozen=True)
 class Shifts:
-    """Of the border, without each of G parts: by how much the solution moves (G, B), and the standard deviation (G, B)
-    of that where noise is as stated: the variance without the part less that with it."""
+    """Of the calibration parameters, without each of G parts: by how much the solution moves (G, B), and the standard
+    deviation (G, B) of that where noise is as stated: the variance without the part less that with it."""
 
     moved: np.ndarray
     expected: np.ndarray

@@ -19,7 +19,7 @@ from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
-from icalib.optim.border import restricted_inverse
+from icalib.optim.calib_block import restricted_inverse
 from icalib.optim.prior_factor import variance_of_priors
 
 LEAST = 1.5  # below it, another weight of the priors would gain less than a tenth of a standard deviation

@@ -1,4 +1,4 @@
-"""Parts of a recording that stand alone: what each says of the border, its own nodes eliminated."""
+"""Parts of a recording that stand alone: what each says of the calibration parameters, its own nodes eliminated."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LOOSE_FRAME = 1e-3
 class Parts:
     """Of `problem`, in which tracks end where parts do, at `state`; ends (G + 1,): nodes between which parts lie.
 
-    sums (G, B + 1, B + 1): each part's information of the border, its gradient in the last column.
+    sums (G, B + 1, B + 1): each part's information of the calibration parameters, its gradient in the last column.
     """
 
     problem: Problem

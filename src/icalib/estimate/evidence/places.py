@@ -126,7 +126,7 @@ def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[Clusters]
         problem.add_bias_prior(state, narrow)
         problem.hold_frames(state, narrow)
         piece.side[:, :, :B] = narrow.side[:, :, :B]
-        piece.border[:B, :B] = narrow.border[:B, :B]
+        piece.calib[:B, :B] = narrow.calib[:B, :B]
         if narrow.features is not None:
             piece = replace(piece, features=narrow.features.widened(int(starts[-1])))
         for kind, n, column in zip(kinds, counts, starts[:-1].tolist(), strict=True):

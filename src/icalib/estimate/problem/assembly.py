@@ -21,7 +21,7 @@ from icalib.motion.poses import assign_nodes, poses_at
 from icalib.motion.sweep import Motion
 from icalib.optim import pages
 from icalib.optim.arrowhead import chain_cuts
-from icalib.optim.border import NOTHING
+from icalib.optim.calib_block import NOTHING
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
@@ -176,8 +176,8 @@ def assemble(
     straight: bool = False,
 ) -> Problem:
     """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration,
-    corners on edges bent by its lens, unless they stay on `straight` ones. held: directions of the border that stay,
-    see Problem."""
+    corners on edges bent by its lens, unless they stay on `straight` ones. held: directions of the calibration
+    parameters that stay, see Problem."""
     rig, layout = inputs.rig, inputs.layout
     factors = []
     scheme = rig.settings.scheme if inputs.imu is not None else "inertial"

@@ -1,4 +1,4 @@
-"""What an estimate is of: the rig, what was measured, and the border that both make."""
+"""What an estimate is of: the rig, what was measured, and the calibration parameters that both make."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Inputs:
 
     @property
     def tolerance(self) -> np.ndarray:
-        """(B,) of each border column."""
+        """(B,) of each calibration column."""
         return tolerance_of(self.layout, self.specs, self.rig.settings)
 
     def sensor(self, name: str) -> Camera | Lidar | Wheels | PoseSensor:
@@ -99,7 +99,8 @@ def with_clouds(inputs: Inputs, clouds: Clouds) -> Inputs:
 
 
 def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds = NO_CLOUDS) -> Layout:
-    """The border: IMU intrinsics, the scene and its bodies, then each sensor's parameters, and planes."""
+    """The calibration parameters: IMU intrinsics, the scene and its bodies, then each sensor's parameters, and
+    planes."""
     imu = rig.imu
     entries: list[Entry] = []
     if imu is not None:

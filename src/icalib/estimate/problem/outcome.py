@@ -10,7 +10,7 @@ import numpy as np
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Draw, Piece, Solution, solve
-from icalib.optim.border import NOTHING
+from icalib.optim.calib_block import NOTHING
 from icalib.optim.state import State
 
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
@@ -33,8 +33,8 @@ class Step:
 
 @dataclass(frozen=True)
 class Visit:
-    """Where the solver stood when it looked for a step: the state, and the border's information (B, B) there, the chain
-    marginalised (damping included)."""
+    """Where the solver stood when it looked for a step: the state, and the calibration parameters' information (B, B)
+    there, the chain marginalised (damping included)."""
 
     state: State
     information: np.ndarray
@@ -43,9 +43,10 @@ class Visit:
 @dataclass(frozen=True)
 class Outcome:
     """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
-    looked for where they were; information (B, B): of the border at `state`, the chain marginalised, no damping; empty,
-    and no draws, where another pass follows. half_way: left before its end, because more seemed of no use. room: the
-    pieces that it was solved in, to be filled anew; None without features, whose fronts alone are worth keeping."""
+    looked for where they were; information (B, B): of the calibration parameters at `state`, the chain marginalised, no
+    damping; empty, and no draws, where another pass follows. half_way: left before its end, because more seemed of no
+    use. room: the pieces that it was solved in, to be filled anew; None without features, whose fronts alone are worth
+    keeping."""
 
     problem: Problem
     state: State
@@ -62,8 +63,8 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Draws:
-    """Steps drawn from the posterior: `free` ones, undetermined directions of the border held, and `still` ones, all of
-    the border held."""
+    """Steps drawn from the posterior: `free` ones, undetermined directions of the calibration parameters held, and
+    `still` ones, all of the calibration parameters held."""
 
     free: tuple[Draw, ...]
     still: tuple[Draw, ...]

@@ -12,7 +12,7 @@ import numpy as np
 from icalib.estimate.problem.gauge import hold_frame
 from icalib.motion.factor import Factor, FactorKey, Residuals, Whitened, keyed
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces, marginalise, marginalise_in_segments
-from icalib.optim.border import NOTHING
+from icalib.optim.calib_block import NOTHING
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Layout, State
 
@@ -49,10 +49,10 @@ class Problem:
     layout: Layout
     factors: dict[FactorKey, Factor]
     priors: tuple[Prior, ...]
-    tolerance: np.ndarray  # (B,) what a user would call the same number; scales the border
+    tolerance: np.ndarray  # (B,) what a user would call the same number; scales the calibration parameters
     held: np.ndarray = field(
         default_factory=lambda: NOTHING
-    )  # (B, m) orthonormal directions of the border, in tolerance units, that stay
+    )  # (B, m) orthonormal directions of the calibration parameters, in tolerance units, that stay
     framed: bool = True  # a target says where the world's origin is; else nothing does, and it stays where it is
     levelled: bool = True  # gravity says which way is up
 
@@ -158,7 +158,7 @@ class Problem:
         return self.chain.accumulate_bias_prior(state, piece, sums)
 
     @staticmethod
-    def narrow(piece: Piece, n_border: int) -> Piece:
-        """A piece over the same chain blocks with a border of its own, `n_border` wide."""
-        own = Piece.zeros(piece.first, piece.last, n_border)
-        return Piece(piece.first, piece.last, piece.diagonal, piece.upper, own.side, own.border)
+    def narrow(piece: Piece, n_calib: int) -> Piece:
+        """A piece over the same chain blocks with `n_calib` calibration parameters of its own."""
+        own = Piece.zeros(piece.first, piece.last, n_calib)
+        return Piece(piece.first, piece.last, piece.diagonal, piece.upper, own.side, own.calib)

@@ -1,4 +1,5 @@
-"""LiDARs, wheels and pose sensors of a rig: what they add to the border, and their factors in one pass."""
+"""LiDARs, wheels and pose sensors of a rig: what they add to the calibration parameters, and their factors in one
+pass."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
 from icalib.optim.anderson import PROMISED, Accelerator
 from icalib.optim.arrowhead import NotDefiniteError, Piece, Solution, solve
-from icalib.optim.border import DETERMINED, essential_information
+from icalib.optim.calib_block import DETERMINED, essential_information
 from icalib.optim.prior_factor import Prior, sums_of_priors
 from icalib.optim.state import State
 
@@ -163,7 +163,8 @@ class _Descent:
         return len(before) == CREEPING and solution.decrease > 0.5 * min(before)
 
     def let_go(self, priors: Sequence[Prior], solution: Solution) -> Solution:
-        """The solution where `priors` count no more: what they add to the border is known, so nothing is solved."""
+        """The solution where `priors` count no more: what they add to the calibration parameters is known, so nothing
+        is solved."""
         cost, gradient, information = sums_of_priors(priors, self.state, self.problem.layout.size)
         self.problem, self.cost = self.problem.without(priors), self.cost - cost
         return solution.less(information, gradient)
@@ -182,7 +183,7 @@ class _Descent:
             and essential_information(solution.information, self.problem.tolerance, self.problem.layout) > DETERMINED
         ):
             return None
-        there = self.state.retract(self.problem.layout, solution.chain, solution.border)
+        there = self.state.retract(self.problem.layout, solution.chain, solution.calib)
         cost = self._linearise(there, sums=False, curved=True)
         if not cost - self.cost < ROUNDING * self.cost:
             self.cost = self._linearise(self.state, curved=True)
@@ -201,7 +202,7 @@ class _Descent:
         near = solution.decrease < self.care.curved_below * self.cost
         if self._accelerated(solution, near):
             return True, False
-        whole = there = self.state.retract(self.problem.layout, solution.chain, solution.border)
+        whole = there = self.state.retract(self.problem.layout, solution.chain, solution.calib)
         straight = self._straight(solution, there, near)
         converged = straight is not None or (self.free and solution.decrease < self.enough)
         sums = not (converged and self.early)
@@ -215,7 +216,7 @@ class _Descent:
         taken = bool(cost < self.cost) or (converged and cost - self.cost < self.enough)
         self.note(solution, taken)
         if taken and there is whole and self.free:
-            plain = solution.chain, solution.border
+            plain = solution.chain, solution.calib
             self.accelerator.note(plain, plain, solution.decrease)
         else:
             self.accelerator.forget()
@@ -228,7 +229,7 @@ class _Descent:
         """Takes an accelerated step where plain ones converge slowly, and says whether it did."""
         if not self.free or solution.decrease < self.enough:
             return False
-        best = self.accelerator.step(solution.chain, solution.border, solution.decrease)
+        best = self.accelerator.step(solution.chain, solution.calib, solution.decrease)
         if best is None:
             return False
         there = self.state.retract(self.problem.layout, *best)
@@ -237,7 +238,7 @@ class _Descent:
             self.accelerator.forget()
             return False
         self.note(solution, True)
-        self.accelerator.note((solution.chain, solution.border), best, solution.decrease)
+        self.accelerator.note((solution.chain, solution.calib), best, solution.decrease)
         self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
         return True
 
@@ -291,7 +292,7 @@ class _Descent:
         if not -OVERSHOT < gain < OVERSHOT:
             return state, cost
         share = 1.0 / (2.0 - gain)
-        short = self.state.retract(self.problem.layout, share * solution.chain, share * solution.border)
+        short = self.state.retract(self.problem.layout, share * solution.chain, share * solution.calib)
         there = self._linearise(short, True, curved)
         if there < cost:
             return short, there
@@ -312,7 +313,7 @@ class _Descent:
                 solution = self._solve(max(self.care.damping, ACROSS))
             except NotDefiniteError:
                 break
-            state = state.retract(self.problem.layout, solution.chain, solution.border)
+            state = state.retract(self.problem.layout, solution.chain, solution.calib)
             before, cost = cost, self._linearise(state, True, curved)
             share = (cost - least) / max(before - least, ROUNDING * least) if np.isfinite(cost) else np.inf
         return state, cost
@@ -341,10 +342,10 @@ def minimise(
     `on_visit` is told of each state that a step was looked for from, and of the last. Where the tolerance is wide
     another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
     `comes_back`: steps may go as far as the next ones can make good, see `_Descent`. `leaves`: asked with
-    how far it has come, as a share of half the chi^2, and the border's information (B, B), whether to end when half the
-    chi^2 can fall by less than HALF_WAY, or a step not far from there fails, or steps creep. `lets_go`: asked before
-    it, with the same, which priors are to count no more from where half the chi^2 can fall by less than HALF_WAY.
-    `room`: of an outcome of a problem with the same features, to be used again.
+    how far it has come, as a share of half the chi^2, and the calibration parameters' information (B, B), whether to
+    end when half the chi^2 can fall by less than HALF_WAY, or a step not far from there fails, or steps creep.
+    `lets_go`: asked before it, with the same, which priors are to count no more from where half the chi^2 can fall by
+    less than HALF_WAY. `room`: of an outcome of a problem with the same features, to be used again.
 
     Raises EstimationError if no step can be computed at all.
     """

@@ -24,8 +24,8 @@ def specs_of(layout: Layout, sensors: Iterable[Sensor]) -> dict[Key, ParameterSp
 
 
 def tolerance_of(layout: Layout, specs: Mapping[Key, ParameterSpec], settings: Settings) -> np.ndarray:
-    """(B,) of each border column: standard deviations below are `determined`. Angles rad, lengths m, times s, image
-    quantities px."""
+    """(B,) of each calibration column: standard deviations below are `determined`. Angles rad, lengths m, times s,
+    image quantities px."""
     out = np.zeros(layout.size)
     for b in layout.free:
         tolerance = specs[b.key].tolerance

@@ -192,7 +192,8 @@ def _moved(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _columns(a, b, body, camera, begins, columns, own):
-    """Columns of the border that the views a..b of one image meet, the lens last, and where each view has them."""
+    """Columns of the calibration parameters that the views a..b of one image meet, the lens last, and where each view
+    has them."""
     n = 0
     for v in range(a, b):
         for k in range(6):

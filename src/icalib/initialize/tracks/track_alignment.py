@@ -18,7 +18,7 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.initialize.steps.clocks import LEAST_SECOND_AXIS, Alignment, only_axis
 from icalib.initialize.steps.gyro import GyroRotation
 from icalib.initialize.steps.track_rotation import pairs_sharing, turns_information
-from icalib.optim.border import complement
+from icalib.optim.calib_block import complement
 
 STEPS_S = (0.5, 1.0)
 MOST_PAIRS = 400  # of images of a camera and a step

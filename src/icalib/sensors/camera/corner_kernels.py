@@ -39,7 +39,8 @@ class Noise(NamedTuple):
 
 class Direct(NamedTuple):
     """What shows in the image beyond the pose: model parameters `pars` that are free, bloom along direction (N, 2) or
-    (0, 2), the shape's basis (n_points, s, 3) in the world; columns (n, d): theirs in the border, -1 where fixed."""
+    (0, 2), the shape's basis (n_points, s, 3) in the world; columns (n, d): those in the calibration parameters, -1
+    where fixed."""
 
     pars: np.ndarray
     bloom: float
@@ -50,8 +51,8 @@ class Direct(NamedTuple):
 
 class Motion(NamedTuple):
     """Camera in the IMU, camera poses (n, ...) in the world, of the IMU what `Poses` holds, and where there are several
-    bodies the scene's rotation and each image's body (n, ...) in the world; columns (n, c): those of the border that
-    act through the pose."""
+    bodies the scene's rotation and each image's body (n, ...) in the world; columns (n, c): those of the calibration
+    parameters that act through the pose."""
 
     R_imu_cam: np.ndarray
     p_imu_cam: np.ndarray
@@ -241,7 +242,7 @@ def accumulate(i0, i1, images, noise, direct, motion, predicted, sums, found):
 
 @njit(cache=True, nogil=True)
 def accumulate_clusters(i0, i1, cluster, n_clusters, column, images, noise, direct, motion, predicted, sums, found):
-    """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and border."""
+    """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and calib."""
     A, gram, all_residuals, error, all_roots, Tn, Tm, Tc = _work(images, direct, motion)
     D = len(gram) - 1
     G = np.empty((D, n_clusters))

@@ -140,7 +140,7 @@ def _whiten(W, M, out):
 def _accumulate(k1, chain, made, dx, columns, sums, out):
     """Adds intervals from `sums.first` to k1 to the normal equations; whitened residuals into out (K - 1, 15).
 
-    dx, columns (24 or 0,): change and border columns of the intrinsics. Returns half the chi^2.
+    dx, columns (24 or 0,): change and calibration columns of the intrinsics. Returns half the chi^2.
     """
     n_x = len(columns)
     r, change = np.zeros(ROWS), np.zeros(9)
@@ -181,7 +181,7 @@ class ImuFactor(RowFactor):
 
     imu: ImuData
     gravity: float
-    columns: np.ndarray  # (24,) border columns of the intrinsics, or (0,) where they are fixed
+    columns: np.ndarray  # (24,) calibration columns of the intrinsics, or (0,) where they are fixed
     made: Increments
     intrinsics0: np.ndarray
     starts: tuple[int, ...] = (0,)

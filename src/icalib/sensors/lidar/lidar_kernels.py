@@ -12,7 +12,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.motion.pose_chain import by_imu_pose
-from icalib.sensors.lidar.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, border_of, no_walk, taken_off
+from icalib.sensors.lidar.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, columns_of, no_walk, taken_off
 
 ROWS = 4  # whitened residuals of a plane in a bin
 RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian
@@ -36,7 +36,8 @@ class Bins(NamedTuple):
 
 class Motion(NamedTuple):
     """LiDAR in the IMU, its poses (n, ...) in the world, and of the IMU what `Poses` holds; columns (c,): those of the
-    border that act through the pose: rotation, translation, time offset, IMU intrinsics; -1 where fixed."""
+    calibration parameters that act through the pose: rotation, translation, time offset, IMU intrinsics; -1 where
+    fixed."""
 
     R_imu_lidar: np.ndarray
     p_imu_lidar: np.ndarray
@@ -137,7 +138,7 @@ def _add_to_pose(B, A, slant, G):
 @njit(cache=True, nogil=True, inline="always")
 def _add_plane(k, B, T, columns, own, sums, V):
     """What the columns `own` of one plane in one bin share in, to the sums; V (3, w): work space."""
-    n_b, n_nodes = sums.border.shape[0] - 1, T.shape[1] - len(columns)
+    n_b, n_nodes = sums.calib.shape[0] - 1, T.shape[1] - len(columns)
     V[:] = 0.0
     for i in range(POSE):
         for t in range(PLANE):
@@ -152,32 +153,33 @@ def _add_plane(k, B, T, columns, own, sums, V):
     for j in range(len(columns)):
         if columns[j] >= 0:
             for t in range(PLANE):
-                sums.border[columns[j], own[t]] += V[t, n_nodes + j]
-                sums.border[own[t], columns[j]] += V[t, n_nodes + j]
+                sums.calib[columns[j], own[t]] += V[t, n_nodes + j]
+                sums.calib[own[t], columns[j]] += V[t, n_nodes + j]
     for t in range(PLANE):
         b = B[POSE + t]
         for c in range(PLANE + 1):
             d, other = B[POSE + c], n_b if c == PLANE else own[c]
             s = b[0] * d[0] + b[1] * d[1] + b[2] * d[2] + b[3] * d[3]
-            sums.border[own[t], other] += s
+            sums.calib[own[t], other] += s
             if c == PLANE:
-                sums.border[n_b, own[t]] += s
+                sums.calib[n_b, own[t]] += s
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_slant(A, slant, own, sums):
     """The gradient of slant . (1, R^T n) by the plane, to the sums."""
-    n_b = sums.border.shape[0] - 1
+    n_b = sums.calib.shape[0] - 1
     for t in range(PLANE):
         s = A[POSE + t, 1] * slant[1] + A[POSE + t, 2] * slant[2] + A[POSE + t, 3] * slant[3]
-        sums.border[own[t], n_b] += s
-        sums.border[n_b, own[t]] += s
+        sums.calib[own[t], n_b] += s
+        sums.calib[n_b, own[t]] += s
 
 
 @njit(cache=True, nogil=True)
 def _add_row(k, i, n_nodes, row, columns, sums):
-    """Row i of a bin's sums, by nodes, border and gradient, into those of node k, the next one, or the border."""
-    n_b, n_c = sums.border.shape[0] - 1, len(columns)
+    """Row i of a bin's sums, by nodes, calibration parameters and gradient, into those of node k, the next one, or the
+    calibration parameters."""
+    n_b, n_c = sums.calib.shape[0] - 1, len(columns)
     if i < n_nodes:
         h, r = i // 15, i % 15
         for j in range(15):
@@ -193,14 +195,15 @@ def _add_row(k, i, n_nodes, row, columns, sums):
     a = columns[i - n_nodes]
     for j in range(n_c):
         if columns[j] >= 0:
-            sums.border[a, columns[j]] += row[n_nodes + j]
-    sums.border[a, n_b] += row[n_nodes + n_c]
-    sums.border[n_b, a] += row[n_nodes + n_c]
+            sums.calib[a, columns[j]] += row[n_nodes + j]
+    sums.calib[a, n_b] += row[n_nodes + n_c]
+    sums.calib[n_b, a] += row[n_nodes + n_c]
 
 
 @njit(cache=True, nogil=True)
 def _add_pose(k, G, T, columns, sums, F, row):
-    """A bin's pose part G (6, 7) through T into nodes and border; F (6, w + 1), row (w + 1,): work space."""
+    """A bin's pose part G (6, 7) through T into nodes and calibration parameters; F (6, w + 1), row (w + 1,): work
+    space."""
     width, n_nodes = T.shape[1], T.shape[1] - len(columns)
     for i in range(POSE):
         for j in range(width + 1):
@@ -224,7 +227,7 @@ def _add_pose(k, G, T, columns, sums, F, row):
 @njit(cache=True, nogil=True, inline="always")
 def _take_off(k, walk, n_nodes, columns, of_plane, sums):
     """Ends a walk from node k; returns what it takes off the chi^2."""
-    own, V = border_of(walk, columns, of_plane), taken_off(walk)
+    own, V = columns_of(walk, columns, of_plane), taken_off(walk)
     last = V.shape[1] - 1
     row = np.empty(last + 1)
     for i in range(last if len(sums.diagonal) > 0 else 0):

@@ -84,9 +84,9 @@ def add_plane(turned, B, q, walk):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def border_of(walk, columns, of_plane):
-    """(m,) border columns of what was summed: `columns` (c,), which act through the pose, then those of the planes,
-    of_plane (P, 3)."""
+def columns_of(walk, columns, of_plane):
+    """(m,) calibration columns of what was summed: `columns` (c,), which act through the pose, then those of the
+    planes, of_plane (P, 3)."""
     n_c, n = len(columns), walk.n_met[0]
     own = np.empty(n_c + PLANE * n, np.int64)
     for j in range(n_c):  # in loops: copies of arrays take seconds to compile
@@ -99,8 +99,8 @@ def border_of(walk, columns, of_plane):
 
 @njit(cache=True, nogil=True, inline="always")
 def taken_off(walk):
-    """V (3, w + m + 1), V^T V what is taken off the sums of nodes, border and residual, the border in the order of
-    `border_of`. The walk is empty again."""
+    """V (3, w + m + 1), V^T V what is taken off the sums of nodes, calibration parameters and residual, the calibration
+    parameters in the order of `columns_of`. The walk is empty again."""
     n, width, L = walk.n_met[0], walk.by_pose.shape[1] - 1, walk.information
     last = width + PLANE * n
     V = np.empty((3, last + 1))

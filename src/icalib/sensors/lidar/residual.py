@@ -93,7 +93,7 @@ class LidarFactor(RowFactor):
 
     @cached_property
     def _of_planes(self) -> np.ndarray:
-        """(P, 3) border columns of each plane."""
+        """(P, 3) calibration columns of each plane."""
         return np.array([self.layout.block(*p).columns for p in self.planes])
 
     @property
@@ -151,7 +151,7 @@ class LidarFactor(RowFactor):
             )
 
     def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[np.ndarray, int, int]]:
-        """Bins b0..b1 by the chunk, each with its border columns that act through the pose (c,)."""
+        """Bins b0..b1 by the chunk, each with its calibration columns that act through the pose (c,)."""
         imu = self.layout.columns(self.imu.name, "intrinsics")
         for clock, own in by_clock(state, self.name, self.node[b0:b1]):
             through_pose = np.concatenate([mounted_columns(self.layout, self.name, clock), imu[imu >= 0]])

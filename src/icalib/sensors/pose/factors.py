@@ -20,7 +20,7 @@ LEAST_POSE_NOISE = 1e-6
 
 
 def frame_entries(sensor: PoseSensor, n_recordings: int, estimated: bool = True) -> list[Entry]:
-    """Of the border: where the frame of absolute poses stands in each recording's world."""
+    """Of the calibration parameters: where the frame of absolute poses stands in each recording's world."""
     frames = [frame_of(sensor.name, k) for k in range(n_recordings if sensor.kind == "absolute" else 0)]
     return [spec.entry(frame, estimated) for frame in frames for spec in FRAME]
 

@@ -278,7 +278,7 @@ class _Scaling(NamedTuple):
 
 def _chained(rows: PoseRows, scaling: _Scaling, ends: tuple[Poses, ...]) -> Rows:
     """The rows, of reported positions times their scale, as rows of reported ones; by the nodes of each of their
-    `ends`, and by the border: mount, time, frame, scale, IMU intrinsics."""
+    `ends`, and by the calibration parameters: mount, time, frame, scale, IMU intrinsics."""
     n, own = rows.J_mount.shape[0], rows.J_mount.shape[2]
     time = slice(own, own + 1)
     frame = slice(time.stop, time.stop + rows.J_frame.shape[2])

@@ -34,7 +34,7 @@ LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
 NEARLY_LEVEL = np.cos(np.deg2rad(20.0))
 LEAST_BELOW_M = 0.02
 TILT, HEIGHT = "ground tilt", "ground height"
-N_COLUMNS = 10  # of the border: rotation 3, translation 3, height 1, plane 3
+N_COLUMNS = 10  # of the calibration parameters: rotation 3, translation 3, height 1, plane 3
 
 
 def floors(state: State, keys: tuple[Key, ...], points: np.ndarray, recording: np.ndarray) -> tuple[Key | None, ...]:
@@ -131,7 +131,7 @@ class GroundFactor(RowFactor):
         return cost
 
     def _columns(self, key: Key | None) -> np.ndarray:
-        """(10,) of the border, -1 where a row does not hang on it."""
+        """(10,) of the calibration parameters, -1 where a row does not hang on it."""
         columns = np.full(N_COLUMNS, -1)
         columns[:6] = self.layout.columns(self.name, "rotation", "translation")
         if self.ground.height_sigma is not None:

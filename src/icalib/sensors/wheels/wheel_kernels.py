@@ -17,7 +17,7 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
 
-N_OWN = 10  # border columns of the wheels: rotation 3, translation 3, time offset 1, up to three of the drive
+N_OWN = 10  # calibration columns of the wheels: rotation 3, translation 3, time offset 1, up to three of the drive
 
 
 class Wheels(NamedTuple):

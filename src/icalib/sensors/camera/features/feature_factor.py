@@ -229,7 +229,7 @@ class FeatureFactor(FactorDefaults):
         by_next = any(c.scheme == "pose" and c.imu is not None for c in self.cameras)
         sums = FeatureSums.zeros(
             tracks.stop - tracks.start, self.tracks.pair_track[pairs] - tracks.start, image, node - piece.first,
-            piece.border.shape[0] - 1, by_next,
+            piece.calib.shape[0] - 1, by_next,
         )  # fmt: skip
         ends = self.tracks.edges - piece.first
         steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep, ends)
@@ -266,7 +266,7 @@ class FeatureFactor(FactorDefaults):
             loss, off = self._loss(curved), out.off.of(tracks)
             total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
         if sums and piece.features is not None:
-            piece.border[-1, -1] += held_back(features.own, features.side[:, :, -1])
+            piece.calib[-1, -1] += held_back(features.own, features.side[:, :, -1])
         return total
 
     def accumulate_clusters(
@@ -296,7 +296,7 @@ class FeatureFactor(FactorDefaults):
 
     @cached_property
     def _of_planes(self) -> np.ndarray:
-        """(P, 3) border columns of each plane."""
+        """(P, 3) calibration columns of each plane."""
         keys = () if self.surfaces is None else self.surfaces.keys
         return np.array([self.layout.block(*key).columns for key in keys])
 
@@ -345,7 +345,7 @@ class FeatureFactor(FactorDefaults):
         return View(camera, index, i0, params, seen, motion)
 
     def _chained(self, camera: CornerFactor, state: State, i0: int, i1: int) -> np.ndarray:
-        """(i1 - i0, c) border columns that act through the camera's pose in its images i0..i1, in the order of
+        """(i1 - i0, c) calibration columns that act through the camera's pose in its images i0..i1, in the order of
         `pose_chain`; points know no tilt."""
         imu = np.zeros(0, dtype=np.int64)
         if camera.imu is not None:

@@ -47,7 +47,7 @@ class Range(NamedTuple):
 
 class Seeing(NamedTuple):
     """What the model makes of observations `first` and on: uv, valid, Jacobians by the point in the camera and by the
-    parameters, those in `pars` free, their columns (d,) in the border."""
+    parameters, those in `pars` free, their columns (d,) in the calibration parameters."""
 
     first: int
     uv: np.ndarray
@@ -320,8 +320,8 @@ def _gram(rows, G):
 
 @njit(cache=True, nogil=True)
 def _add_feature(A, pair, t, own_side, chained, direct, features, by_pose):
-    """One observation's rows A into the sums of its feature; own_side (6, c): camera pose by the border, its columns
-    `chained` (c,); by_pose (6,): work space."""
+    """One observation's rows A into the sums of its feature; own_side (6, c): camera pose by the calibration
+    parameters, its columns `chained` (c,); by_pose (6,): work space."""
     D, n_b, side, block = len(A) - 1, features.side.shape[2] - 1, features.side[t], features.block[pair]
     for a in range(3):
         f0, f1 = A[D - 3 + a, 0], A[D - 3 + a, 1]

@@ -180,11 +180,11 @@ def _distance(planes, q, point):
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(on, planes, loss, xyz, A, features, border, out):
-    """Fills `out`, and adds the rows to the sums of the features and of the border, where there are any. Returns half
-    the robust chi^2."""
+def _accumulate(on, planes, loss, xyz, A, features, calib, out):
+    """Fills `out`, and adds the rows to the sums of the features and of the calibration parameters, where there are
+    any. Returns half the robust chi^2."""
     total, j, M, d = 0.0, np.empty(3), np.empty((3, 3)), np.empty(3)
-    n_b = border.shape[0] - 1
+    n_b = calib.shape[0] - 1
     for t in range(len(on.plane)):
         q = on.plane[t]
         out.residual[t] = out.root[t] = out.share[t] = 0.0
@@ -217,9 +217,9 @@ def _accumulate(on, planes, loss, xyz, A, features, border, out):
                 features.side[t, a, c] += along * n[a] * j[r]
             for s in range(3):
                 if planes.columns[q, s] >= 0:
-                    border[c, planes.columns[q, s]] += along * j[r] * j[s]
-            border[c, n_b] += w * e * j[r]
-            border[n_b, c] += w * e * j[r]
+                    calib[c, planes.columns[q, s]] += along * j[r] * j[s]
+            calib[c, n_b] += w * e * j[r]
+            calib[n_b, c] += w * e * j[r]
     return total
 
 
@@ -227,6 +227,6 @@ def add_points_on_planes(
     on: OnPlanes, planes: Planes, loss: Loss, points: Points, features: FeatureSums, piece: Piece, out: Distances
 ) -> float:
     """The rows of tracks where their points rest: into `out`, and where these are wanted into the sums of `features`
-    and of the border of `piece`. Returns half the robust chi^2."""
-    border = piece.border if len(features.own) else np.zeros((0, 0))
-    return _accumulate(on, planes, loss, points.xyz, points.A, features, border, out)
+    and of the calibration parameters of `piece`. Returns half the robust chi^2."""
+    calib = piece.calib if len(features.own) else np.zeros((0, 0))
+    return _accumulate(on, planes, loss, points.xyz, points.A, features, calib, out)

@@ -1,5 +1,5 @@
-"""The border, everything else marginalised: steps, draws and inverses in units of the tolerances, with what is not
-determined held."""
+"""The calibration parameters, everything else marginalised: steps, draws and inverses in units of the tolerances, with
+what is not determined held."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ LEAST = 1e-4  # of information in tolerance units; keeps variances finite
 NOTHING = np.zeros((0, 0))
 
 
-def border_step(
+def calib_step(
     information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray, held: np.ndarray = NOTHING
 ) -> tuple[np.ndarray, float]:
-    """Step (B,) of the border and the decrease of half the chi^2 it promises; undetermined directions are held, and
-    those in the columns of `held` (B, m), orthonormal.
+    """Step (B,) of the calibration parameters and the decrease of half the chi^2 it promises; undetermined directions
+    are held, and those in the columns of `held` (B, m), orthonormal.
 
     Directions are those of the information in units of `tolerance` (B,).
     """
@@ -70,8 +70,8 @@ def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
     return root @ root.T
 
 
-def border_draws(information: np.ndarray, tolerance: np.ndarray, held: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """(B, m) from white noise (B, m): what has the inverse of the information for its covariance, what `border_step`
+def calib_draws(information: np.ndarray, tolerance: np.ndarray, held: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """(B, m) from white noise (B, m): what has the inverse of the information for its covariance, what `calib_step`
     holds held."""
     free, values, vectors = _directions(information, tolerance, held)
     scaled = np.where(values > HELD_BELOW, 1.0 / np.sqrt(np.maximum(values, HELD_BELOW)), 0.0)
