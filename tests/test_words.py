@@ -132,7 +132,17 @@ def code_prose(source: str) -> list[str]:
     return [text for text in found if text] + [t.string for t in tokens if t.type == tokenize.COMMENT]
 
 
-REVISED = ("base", "cli", "data", "export", "geometry", "report", "rig/file", "tools")  # the list only grows
+REVISED = (
+    "base",
+    "cli",
+    "data",
+    "detection",
+    "export",
+    "geometry",
+    "report",
+    "rig/file",
+    "tools",
+)  # the list only grows
 UNREVISED: set[str] = set()  # pages that are still to be revised; the list only shrinks
 
 

@@ -11,7 +11,7 @@ from icalib.detection.primitives.corners import KEPT, VERDICTS, ImageCorners
 from icalib.geometry.targets import Markers, Scene, Target
 
 LEAST_IMAGES = 3  # with a tag whose id nobody listed; fewer may be chance
-LEAST_SHARE = 0.01  # of all images: the same
+LEAST_IMAGE_SHARE = 0.01  # of all images: the same
 _SHOWN = 10  # ids in a sentence
 Part = tuple[str, Target, int]  # name, target, number of its first point
 
@@ -35,7 +35,7 @@ def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[
     Small families are sometimes read where there is nothing, and a tag of a map that is not there would be placed
     somewhere. Tags whose ids are listed are all kept.
     """
-    least = max(LEAST_IMAGES, ceil(LEAST_SHARE * len(images)))
+    least = max(LEAST_IMAGES, ceil(LEAST_IMAGE_SHARE * len(images)))
     notes: list[str] = []
     for name, part, first in parts_of(target):
         if not isinstance(part, Markers) or part.ids:

@@ -36,7 +36,7 @@ from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.rig import Camera
 
-# Of a target's points, and of free tags' corners, an image on average: with fewer the border may be another one.
+# Of a target's points, and of free tags' corners, an image on average: with fewer the tags may have another border.
 POOR_SHARE, POOR_CORNERS = 0.5, 8
 # Images that a thread searches in turn, each where the ones before lead to expect the target. The first two are
 # searched wholly: a tag that appears apart from the others is missed for this long at most. Fewer of large images,

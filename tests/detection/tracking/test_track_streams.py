@@ -52,7 +52,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def test_every_track_has_three_observations_and_segments_share_none(scene, monkeypatch):
-    monkeypatch.setattr(streams, "SEGMENT", 8)
+    monkeypatch.setattr(streams, "SEGMENT_IMAGES", 8)
     found, notes = find_tracks(Images(scene.images), CAMERA)
     assert notes == ()
     assert found.stamps_ns.tolist() == [k * PERIOD_NS for k in range(len(scene.images))]
@@ -63,7 +63,7 @@ def test_every_track_has_three_observations_and_segments_share_none(scene, monke
 
 
 def test_tracks_do_not_depend_on_the_number_of_cores(scene, monkeypatch):
-    monkeypatch.setattr(streams, "SEGMENT", 8)
+    monkeypatch.setattr(streams, "SEGMENT_IMAGES", 8)
     found = []
     for cores in (1, 3):
         monkeypatch.setattr(image_work, "core_count", lambda cores=cores: cores)

@@ -58,7 +58,7 @@ class AprilGridDetector:
 
     @property
     def _border(self) -> float:
-        """Width of the border in tag sizes."""
+        """Width of the black border in tag sizes."""
         return self.border_bits / (self._family.bits + 2 * self.border_bits)
 
     @property

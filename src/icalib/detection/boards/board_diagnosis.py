@@ -18,10 +18,10 @@ from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.tags import find_tags
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 
-_MOST_IMAGES = 5  # that are searched; the time grows with it
+_SEARCHED_IMAGES = 5  # that are searched; the time grows with it
 _LEAST_IMAGES = 2  # that show a board of another size, of several; the cells of a tag may look like a board in one
 _LEAST_SIDE = 3  # inner corners along a side; the detector takes no smaller board
-_LEAST_TAGS = 6  # in an image; fewer may fit several layouts
+_LEAST_TAGS_OF_A_LAYOUT = 6  # in an image; fewer may fit several layouts
 # Misfits, in sides of a tag. In a right layout they come from lens and noise; in a wrong one tags are a whole row or
 # column off.
 _MOST_RIGHT = 0.1  # at most: the stated layout is right, and no other is looked at
@@ -35,7 +35,7 @@ def other_size(images: Iterable[np.ndarray], board: Checkerboard) -> str:
     "" where the first five images show none of another size either. Candidates are the board whose squares were counted
     in place of its inner corners, and the largest that OpenCV finds.
     """
-    grey = [255 - i if board.inverted else i for i in islice(images, _MOST_IMAGES)]
+    grey = [255 - i if board.inverted else i for i in islice(images, _SEARCHED_IMAGES)]
     stated = (min(board.rows, board.cols), max(board.rows, board.cols))
     by_squares = (stated[0] - 1, stated[1] - 1)  # the true size where squares were counted
     sizes = ({by_squares} | {size for image in grey for size in _largest(image)}) - {stated}
@@ -84,7 +84,7 @@ def other_columns(images: Iterable[np.ndarray], board: AprilGrid | Charuco) -> s
     across, down = ("cols", "rows") if isinstance(board, AprilGrid) else ("squares_x", "squares_y")
     stated, other = getattr(board, across), getattr(board, down)
     tags = _number_of_tags(board)
-    seen = _enough(_tags_of(ImageWithQuads(image), board, tags) for image in islice(images, _MOST_IMAGES))
+    seen = _enough(_tags_of(ImageWithQuads(image), board, tags) for image in islice(images, _SEARCHED_IMAGES))
     misfit = {stated: _misfit_of_columns(seen, board, stated, tags)}
     if not seen or misfit[stated] <= _MOST_RIGHT:
         return ""
@@ -136,7 +136,7 @@ def _tags_of(view: ImageWithQuads, board: AprilGrid | Charuco, tags: int) -> tup
 
 def _enough(images: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Those of the images, each as `_tags_of` gives it, that show six tags."""
-    return [(place, quads) for place, quads in images if len(place) >= _LEAST_TAGS]
+    return [(place, quads) for place, quads in images if len(place) >= _LEAST_TAGS_OF_A_LAYOUT]
 
 
 def _misfit_of_columns(

@@ -18,7 +18,7 @@ from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
 
-_NEAREST = 4  # markers that predict a corner
+_PREDICTING_MARKERS = 4  # markers that predict a corner
 _LEAST_TO_TELL = 6  # markers that show whether they stand as on this board
 _LEAST_MARKERS = 2  # that agree: small dictionaries are sometimes read where there is nothing
 
@@ -118,13 +118,13 @@ class CharucoDetector:
     def _expected(self, markers: np.ndarray, quads: np.ndarray) -> np.ndarray:
         """(rows + 1, cols + 1, 2) px, the squares' corners where the nearest markers found place them.
 
-        markers (m, 4, 2) in squares, quads (m, 4, 2) px.
+        markers (m, 4, 2) [squares], quads (m, 4, 2) px.
         """
         out = np.empty((self.rows + 1, self.cols + 1, 2))
         centers = markers.mean(axis=1)
         for row in range(self.rows + 1):
             for col in range(self.cols + 1):
-                near = np.argsort(((centers - (col, row)) ** 2).sum(axis=1), kind="stable")[:_NEAREST]
+                near = np.argsort(((centers - (col, row)) ** 2).sum(axis=1), kind="stable")[:_PREDICTING_MARKERS]
                 xy, uv = markers[near].reshape(-1, 2), quads[near].reshape(-1, 2)
                 out[row, col] = mapped(fit_homography(xy, uv, len(xy)), float(col), float(row))
         return out
@@ -137,8 +137,8 @@ def dark_squares(rows: int, cols: int, legacy: bool) -> np.ndarray:
 
 
 def charuco_tags(dark: np.ndarray, marker_ratio: float) -> np.ndarray:
-    """(n, 4, 2) corners of the markers in the white squares, clockwise from the top left, in squares; x to the right,
-    y down."""
+    """(n, 4, 2) corners of the markers in the white squares, clockwise from the top left [squares]; x to the right, y
+    down."""
     row, col = np.nonzero(~dark)
     margin = 0.5 * (1.0 - marker_ratio)
     unit = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
@@ -146,7 +146,7 @@ def charuco_tags(dark: np.ndarray, marker_ratio: float) -> np.ndarray:
 
 
 def _in_squares(nodes: np.ndarray, markers: np.ndarray) -> np.ndarray:
-    """(n, 4, 2) px: the markers (n, 4, 2), in squares, between the nodes (rows + 1, cols + 1, 2) px of the board."""
+    """(n, 4, 2) px: the markers (n, 4, 2) [squares] between the corners (rows + 1, cols + 1, 2) px of the board."""
     col, row = np.floor(markers.mean(axis=1)).astype(np.int64).T
     s, t = (markers - np.stack([col, row], axis=1)[:, None, :]).transpose(2, 0, 1)[..., None]
     a, b, c, d = (

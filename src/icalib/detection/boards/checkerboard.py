@@ -17,7 +17,7 @@ from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
 
 _REDUCED_PX = 1000  # larger images are searched at a fraction of their size first; only the time depends on it
-_LEAST_SEEN = 0.5  # of the corners inside the outermost, seen in rows and columns, for the thorough search
+_LEAST_SEEN_SHARE = 0.5  # of the corners inside the outermost, seen in rows and columns, for the thorough search
 _LEAST_SQUARE_PX = 4  # corners that are closer merge in the detectors' filters
 _LEAST_FOUND = 0.5  # of the corners that a search proposes, and of each side's: others are no checkerboard
 
@@ -89,7 +89,7 @@ class CheckerboardDetector:
             return
         reduced, factor = _reduced(image)
         yield from self._quick(reduced, factor)
-        if not shows_grid(image, _LEAST_SEEN * (self.rows - 2) * (self.cols - 2)):
+        if not shows_grid(image, _LEAST_SEEN_SHARE * (self.rows - 2) * (self.cols - 2)):
             return
         cv2 = load_cv2()
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE

@@ -19,14 +19,15 @@ from icalib.detection.primitives.tags import LEAST_CONTRAST
 from icalib.geometry.targets import Circles
 
 _LEAST_DIAMETER_PX = 2.0 * LEAST_HALF_AXIS_PX  # no centre of a smaller one is kept
-_CONTRAST = 0.5 * LEAST_CONTRAST  # grey levels below the local mean
+_CIRCLE_CONTRAST = 0.5 * LEAST_CONTRAST  # grey levels below the local mean
 _MOST_OBLIQUE = 0.17  # least ratio of the axes: that of a circle seen at 80 degrees
 _LIKE_ELLIPSE = 0.1  # relative error of the area of an ellipse with the same second moments; a triangle is 0.2 off
 _OUTSIDE_PX, _AROUND = 3.0, 12  # how far from the edge, and in how many directions, the white around a circle is seen
 _NEIGHBOUR = (0.5, 1.8)  # of the step of the grid, in the coordinates of an ellipse: perspective changes it so much
 _RIGHT_ANGLE = 0.45  # of the step: how far the second neighbour may be from a quarter turn of the first
-_MOST_OFF = 0.4  # of the step in the image, between a circle and where others place it; half a step is in between
-_NEAREST = 6  # known circles that place the next one; more reach where perspective and lens are others
+# Of the step in the image, between a circle and where others place it; half a step is in between.
+_MOST_CIRCLE_OFF = 0.4
+_PREDICTING_CIRCLES = 6  # known circles that place the next one; more reach where perspective and lens are others
 _LEAST_FOR_PERSPECTIVE = 5  # fewer place it by an affine map
 
 Node = tuple[int, int]
@@ -46,7 +47,9 @@ def dark_ellipses(image: np.ndarray, window: int, step: float) -> Ellipses:
     `step` is the distance of the nearest other circle, in radii.
     """
     cv2 = load_cv2()
-    dark = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, _CONTRAST)
+    dark = cv2.adaptiveThreshold(
+        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, _CIRCLE_CONTRAST
+    )
     contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     centre, unit = [], []
     least_area = 0.25 * np.pi * _LEAST_DIAMETER_PX**2 * _MOST_OBLIQUE
@@ -119,7 +122,7 @@ def _turned(nodes: np.ndarray, quarters: int) -> np.ndarray:
 
 
 def _matched(known: dict[Node, int], wanted: np.ndarray) -> list[int]:
-    """The ellipses at the nodes `wanted` (n, 2), moved to the one place where all of them are known.
+    """The ellipses at the grid points `wanted` (n, 2), moved to the one place where all of them are known.
 
     [] where there is none, or several.
     """
@@ -132,7 +135,7 @@ def _matched(known: dict[Node, int], wanted: np.ndarray) -> list[int]:
 
 
 def _grown(found: Ellipses, seed: int, step: float) -> dict[Node, int]:
-    """Ellipses by their node, from `seed` outwards; the seed alone where it has no two neighbours."""
+    """Ellipses by their grid point, from `seed` outwards; the seed alone where it has no two neighbours."""
     known: dict[Node, int] = {(0, 0): seed}
     neighbours = _two_neighbours(found, seed, step)
     if neighbours is None:
@@ -165,7 +168,7 @@ def _two_neighbours(found: Ellipses, seed: int, step: float) -> tuple[int, int] 
 
 
 def _frontier(known: dict[Node, int]) -> dict[Node, Node]:
-    """Unknown nodes beside known ones, each with one of these."""
+    """Unknown grid points beside known ones, each with one of the known."""
     beside = {}
     for a, b in known:
         for node in ((a + 1, b), (a, b + 1), (a - 1, b), (a, b - 1)):
@@ -175,10 +178,10 @@ def _frontier(known: dict[Node, int]) -> dict[Node, Node]:
 
 
 def _nearest_ellipse(centre: np.ndarray, free: np.ndarray, known: dict[Node, int], node: Node, beside: Node) -> int:
-    """The free ellipse where the nearest known ones place a node, -1 where there is none."""
+    """The free ellipse where the nearest known ones place a grid point, -1 where there is none."""
     nodes, rows = np.array(list(known)), np.array(list(known.values()))
     squared = ((nodes - node) ** 2).sum(axis=1)
-    near = np.argsort(squared, kind="stable")[:_NEAREST]
+    near = np.argsort(squared, kind="stable")[:_PREDICTING_CIRCLES]
     at, uv = nodes[near].astype(np.float64), centre[rows[near]]
     if len(near) >= _LEAST_FOR_PERSPECTIVE:
         place = np.array(mapped(fit_homography(at, uv, len(at)), float(node[0]), float(node[1])))
@@ -187,4 +190,4 @@ def _nearest_ellipse(centre: np.ndarray, free: np.ndarray, known: dict[Node, int
         place = np.array([*node, 1.0]) @ affine
     off = np.where(free, np.linalg.norm(centre - place, axis=1), np.inf)
     best = int(np.argmin(off))
-    return best if off[best] < _MOST_OFF * np.linalg.norm(place - centre[known[beside]]) else -1
+    return best if off[best] < _MOST_CIRCLE_OFF * np.linalg.norm(place - centre[known[beside]]) else -1

@@ -1,4 +1,4 @@
-"""Why is nothing of the target seen? Tries the other families, borders and ids, and says what is there."""
+"""Why no target is found: tries other families, borders and ids, and says which tags the images show."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icalib.detection.primitives.tags import tags_at
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
 
-_MOST_IMAGES = 5
+_DIAGNOSED_IMAGES = 5  # the time grows with it
 _SIZES = (50, 100, 250, 1000)  # of OpenCV's families; each starts with the smaller ones
 _TRIED = ("tag36h11", "tag25h9", "tag16h5", "tag36h10", "aruco_original", "aruco_mip_36h12") + tuple(
     f"{n}x{n}_{size}" for n, size in ((4, 250), (5, 1000), (6, 1000), (7, 1000))
@@ -48,7 +48,7 @@ def what_is_seen(
     `family`, `border_bits` and `ids` are those of the target, `field` is where a rig file names the family. Raises
     RecordingError for an image that is not grey.
     """
-    candidates = _candidates([ImageWithQuads(image).image for image in islice(images, _MOST_IMAGES)])
+    candidates = _candidates([ImageWithQuads(image).image for image in islice(images, _DIAGNOSED_IMAGES)])
     own_name = _largest(family)
     candidates.sort(key=lambda seen: (len(seen.ids), seen.family == own_name), reverse=True)
     if not candidates:
@@ -74,7 +74,7 @@ def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterab
     swapped = TagSet(tags.family, 3 - tags.border_bits, tags.ids)
     ids = sorted(set(tags.ids) - {i for other in others for i in swapped.shared_with(other)})
     found: dict[int, list[np.ndarray]] = {1: [], 2: []}
-    for image in islice(images, _MOST_IMAGES):
+    for image in islice(images, _DIAGNOSED_IMAGES):
         view = ImageWithQuads(image)
         quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for border, seen in found.items():
@@ -93,7 +93,7 @@ def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
     if board.squares_y % 2:
         return ""  # both layouts are the same
     detectors = [charuco_detector(b) for b in (board, replace(board, legacy=not board.legacy))]
-    views = [ImageWithQuads(255 - image if board.inverted else image) for image in islice(images, _MOST_IMAGES)]
+    views = [ImageWithQuads(255 - image if board.inverted else image) for image in islice(images, _DIAGNOSED_IMAGES)]
     misfits = np.array([[d.misfit(view) for d in detectors] for view in views]).reshape(-1, 2)
     misfits = misfits[np.isfinite(misfits).all(axis=1)]
     if not len(misfits) or np.median(misfits[:, 1]) > _CLEARLY_BETTER * np.median(misfits[:, 0]):

@@ -1,4 +1,4 @@
-"""Corners that were found once are kept: a file for each stream of images, named by its content and the settings.
+"""Cache of detected corners: one file for each stream of images, named by its content and the settings.
 
 The folder is the user's cache folder, or $ICALIB_CACHE. A file that is damaged or of another format is no file.
 """
@@ -18,12 +18,12 @@ from icalib.base.unpacking import load_arrays
 from icalib.data.recordings import Payload
 from icalib.detection.primitives.corners import ImageCorners
 
-VERSION = 8  # of the detectors and of the format: whatever changes corners changes this
+DETECTOR_VERSION = 8  # of the detectors and of the format: whatever changes corners changes this
 _FIELDS = ("point", "uv", "sigma", "blur", "verdict", "edges")
 
 
 def cache_folder() -> Path:
-    """Where found corners are kept."""
+    """The folder of the cache."""
     if given := os.environ.get("ICALIB_CACHE"):
         return Path(given)
     from platformdirs import user_cache_path
@@ -32,8 +32,8 @@ def cache_folder() -> Path:
 
 
 def stream_key(payloads: Iterable[Payload], settings: str) -> str:
-    """Name of a stream of images, from every byte of it and what is looked for."""
-    digest = hashlib.blake2b(f"{VERSION} {settings}".encode(), digest_size=20)
+    """Name of a stream of images: a hash of all its bytes and of the settings of the search."""
+    digest = hashlib.blake2b(f"{DETECTOR_VERSION} {settings}".encode(), digest_size=20)
     for p in payloads:
         digest.update(f"{p.stamp_ns} {p.encoding} {p.width} {p.height} {p.step} {p.big_endian} {len(p.data)} ".encode())
         digest.update(p.data)

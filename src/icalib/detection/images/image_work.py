@@ -55,7 +55,7 @@ def image_count(recording: Recording, topic: str) -> int:
 
 
 def spread_images(recording: Recording, topic: str) -> Iterator[np.ndarray]:
-    """A few images, spread over the recording as far as its number of images is known."""
+    """Up to SPREAD images, evenly spread over the recording where its number of images is known."""
     every = max(image_count(recording, topic) // SPREAD, 1)
     for payload in islice(recording.payloads(topic), 0, 2 * SPREAD * every, every):
         with suppress(DamagedImageError):
@@ -94,7 +94,7 @@ def core_count() -> int:
 
 @contextmanager
 def _pool() -> Iterator[ThreadPoolExecutor]:
-    """When interrupted, what has not begun is dropped."""
+    """A pool of threads that drops waiting work when it is interrupted."""
     pool = ThreadPoolExecutor(core_count(), thread_name_prefix="icalib-images")
     try:
         yield pool
@@ -104,7 +104,7 @@ def _pool() -> Iterator[ThreadPoolExecutor]:
 
 @contextmanager
 def _one_thread_in_opencv() -> Iterator[None]:
-    """Threads of OpenCV's own beside ours get into each other's way."""
+    """One thread in OpenCV: its own threads and ours would compete for the cores."""
     cv2 = load_cv2()
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

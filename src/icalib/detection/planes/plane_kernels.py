@@ -10,8 +10,8 @@ from icalib.base.compiled import njit
 
 MOMENTS = 10  # 1; x, xx; y, yx, yy; z, zx, zy, zz
 LARGEST_TURN = 0.26  # rad between the normal of a voxel and its region: those of voxels are rough
-APART = 1.6  # gates between a point and planes that are not its own
-REACH = 2.5  # standard deviations between a voxel's centre and the plane of its region
+EXCLUSIVE_GATES = 1.6  # gates between a point and planes that are not its own
+REGION_REACH = 2.5  # standard deviations between a voxel's centre and the plane of its region
 
 
 OUTSIDE, NEAR, OWN = 0, 1, 2  # what a cell is to its plane
@@ -80,12 +80,12 @@ def fit(moments, normal, centre):
 
 @njit(cache=True, nogil=True)
 def _fits(v, voxels, normal, centre):
-    """Whether voxel v lies on the plane of a region, and faces the same way."""
+    """Whether voxel v lies on the plane of a region, and its normal points to the same side."""
     cosine, distance = 0.0, 0.0
     for i in range(3):
         cosine += normal[i] * voxels.normal[v, i]
         distance += normal[i] * (voxels.centre[v, i] - centre[i])
-    return cosine > np.cos(LARGEST_TURN) and abs(distance) < REACH * voxels.sigma[v]
+    return cosine > np.cos(LARGEST_TURN) and abs(distance) < REGION_REACH * voxels.sigma[v]
 
 
 @njit(cache=True, nogil=True)
@@ -133,12 +133,13 @@ def _reach(q, x, y, z, cells):
 
 @njit(cache=True, nogil=True)
 def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cell, distance):
-    """The plane within `gate` standard deviations of each point, on the side that it was seen from; -1: none, or one
-    more is near, be it in a grazing beam: a floor is, at the foot of walls far away. Fills its cell and distance.
+    """Associates each point with the plane within `gate` standard deviations that is seen from the point's side; -1: no
+    plane, or a second one is near, even in a grazing beam (the floor, at the foot of a far wall). Fills `cell` and
+    `distance` of each point.
 
-    Where on the plane a point lies is asked of its foot, where the beam meets the plane. The point itself is as far
-    along the beam as its noise took it: taken by its own place, those that err one way leave a plane's edge, or come
-    near another plane, more often than those that err the other, and planes of small faces stood 1.5 mm off by it."""
+    The cell is that of the point where the beam meets the plane. The measured point itself would bias the plane: noise
+    along the beam moves points off an edge, or towards another plane, more often in one direction than in the other
+    (1.5 mm for small faces)."""
     count = len(cells.planes)
     equation, r = np.empty((4, count)), np.empty(count)  # by rows: the loop over all planes is then a few instructions
     for q in range(count):
@@ -167,7 +168,7 @@ def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cel
         plane[n] = -1
         if found == 1 and cells.use[k_own] == OWN:
             foot = x + s_own * a, y + s_own * b, z + s_own * c
-            near, longest = APART * reach, APART * reach + abs(s_own) * far
+            near, longest = EXCLUSIVE_GATES * reach, EXCLUSIVE_GATES * reach + abs(s_own) * far
             for q in range(count):
                 if abs(r[q]) > longest or q == q_own:
                     continue

@@ -1,9 +1,9 @@
-"""Planes in a cloud of points that is roughly in place, and which points lie on which.
+"""Planes in a roughly registered point cloud, and the points that lie on each.
 
-Voxels that are flat grow into regions, regions of one plane are joined, those that bend are dropped. Points then belong
-to a plane by their distance, within squares of the plane itself: cells in space would cut a noisy wall into layers.
-Points near two planes, in grazing beams, and in squares that are not flat belong to none. A wall has two sides: a plane
-is seen from the side that its normal points to.
+Flat voxels grow into regions, regions of one plane are joined, and regions that bend are dropped. Points are then
+associated with a plane by their distance to it, within square cells on the plane: cells in space would cut a noisy wall
+into layers. Points near two planes, in grazing beams, or in cells that are not flat belong to no plane. A wall has two
+sides: a plane is seen from the side that its normal points to.
 """
 
 from __future__ import annotations
@@ -30,22 +30,24 @@ from icalib.detection.planes.plane_kernels import (
 from icalib.geometry.planes import plane_of, tangents
 
 MOST_POINTS = 2_000_000  # that the search looks at
-FEWEST = 12  # points of a voxel or a cell
+FEWEST_IN_VOXEL = 12  # points of a voxel or a cell
 FEWEST_BENT = 9  # voxels that show whether a region bends
-ROUNDS = 3  # of association and fit
-ACROSS = 0.25  # of a voxel's edge: what spreads less in its own plane is a line
+FIT_ROUNDS = 3  # of association and fit
+LEAST_ELONGATION = 0.25  # of a voxel's edge: what spreads less in its own plane is a line
 SAME_TURN = np.deg2rad(4.0)  # between regions of one plane
-MIXED = 1.35  # whitened RMS of a cell that does not hold one plane
+MIXED_CELL_RMS = 1.35  # whitened RMS of a cell that does not hold one plane
 FINE_M = 1e-3  # out of place, or less: before, strays show nothing
-EVEN = 0.1  # what most points lie on strays less, or nothing is said: poses or the times of points are wrong
-BENT = 0.4  # standard deviations of a point by which a region may bow: flat ones up to 0.32, hills from 0.4 on
-UNEVEN = 0.35  # by which the means of cells may stray, RMS: planes in a cloud 3 cm out of place up to 0.27, hills 0.48
+EVEN_CELLS = 0.1  # what most points lie on strays less, or nothing is said: poses or the times of points are wrong
+BENT_REGION = 0.4  # standard deviations of a point by which a region may bow: flat ones up to 0.32, hills from 0.4 on
+# By which the means of cells may stray, RMS: planes in a cloud 3 cm out of place up to 0.27, hills 0.48.
+UNEVEN_CELLS = 0.35
 
 
 @dataclass(frozen=True)
 class PlaneSearch:
-    """noise_m of a point; how far the cloud is out of place: position_m, and angle_rad about the sensor. voxel_m: edge
-    of voxels and cells; smallest_m2: of a plane's cells together; gate: standard deviations from a point to its plane.
+    """Settings of the search. noise_m: of a point. position_m, angle_rad: registration error of the cloud, the angle
+    about the sensor. voxel_m: edge of voxels and cells. smallest_m2: least area of a plane's cells together. gate:
+    largest distance from a point to its plane, in standard deviations.
     """
 
     noise_m: float = 0.03
@@ -57,7 +59,7 @@ class PlaneSearch:
     least_cosine: float = 0.1
 
     def variance(self, points: np.ndarray, seen_from: np.ndarray) -> np.ndarray:
-        """(N,) m^2, what points (N, 3) seen from (N, 3) may be off."""
+        """Variance (N,) m^2 of points (N, 3) seen from (N, 3): noise and registration error."""
         range2 = ((points - seen_from) ** 2).sum(axis=1)
         return self.noise_m**2 + self.position_m**2 + self.angle_rad**2 * range2
 
@@ -101,8 +103,8 @@ def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch =
         np.flatnonzero(region == k) for k in np.flatnonzero(np.bincount(region[region >= 0], minlength=count) > 2)
     ]
     patches = _patches(_join(voxels, members), voxels, search)
-    for k in range(ROUNDS):
-        patches = _refined(patches, points, seen_from, variance, search, k == ROUNDS - 1)
+    for k in range(FIT_ROUNDS):
+        patches = _refined(patches, points, seen_from, variance, search, k == FIT_ROUNDS - 1)
     return FoundPlanes(_packed(patches, search.voxel_m), sum(p.own > 0 for p in patches))
 
 
@@ -121,8 +123,8 @@ def _voxels(points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, sea
     spread, axes = np.linalg.eigh(S - centre[:, :, None] * centre[:, None, :])
     normal = axes[:, :, 0] * np.sign((axes[:, :, 0] * towards).sum(axis=1, keepdims=True))
     sigma = np.sqrt(total / count)
-    thin = spread[:, 0] < np.minimum((MIXED * sigma) ** 2, 0.25 * spread[:, 1])
-    flat = (count >= FEWEST) & thin & (spread[:, 1] > (ACROSS * search.voxel_m) ** 2 / 3.0)
+    thin = spread[:, 0] < np.minimum((MIXED_CELL_RMS * sigma) ** 2, 0.25 * spread[:, 1])
+    flat = (count >= FEWEST_IN_VOXEL) & thin & (spread[:, 1] > (LEAST_ELONGATION * search.voxel_m) ** 2 / 3.0)
     around = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if i or j or k]) @ strides
     at = np.searchsorted(keys, keys[:, None] + around).clip(max=n - 1)
     neighbour = np.where(keys[at] == keys[:, None] + around, at, -1)
@@ -160,17 +162,19 @@ class _Region:
         root = np.sqrt(voxels.moments[self.members, 0])
         x, *_ = np.linalg.lstsq(A * root[:, None], gap @ self.normal * root, rcond=None)
         bow = A[:, 3:] @ x[3:]
-        return bool(0.5 * np.ptp(bow - A[:, :3] @ np.linalg.lstsq(A[:, :3], bow, rcond=None)[0]) > BENT * self.sigma)
+        return bool(
+            0.5 * np.ptp(bow - A[:, :3] @ np.linalg.lstsq(A[:, :3], bow, rcond=None)[0]) > BENT_REGION * self.sigma
+        )
 
     def continues(self, voxels: Voxels, bent: np.ndarray) -> bool:
-        """Whether it is the rest of a larger surface that bends; bent (V,) voxels."""
+        """Whether the region is the rest of a larger surface that bends; bent (V,): voxels of such surfaces."""
         around = voxels.neighbour[self.members]
         alike = voxels.normal[around] @ self.normal > np.cos(LARGEST_TURN)
         return bool((alike & bent[around] & (around >= 0)).any())
 
 
 def _join(voxels: Voxels, members: list[np.ndarray]) -> list[_Region]:
-    """Regions of the same plane as one; the largest take the others in."""
+    """Regions of one plane merged into the largest of them."""
     open_regions = sorted((_Region.of(voxels, m) for m in members), key=lambda r: -len(r.members))
     joined: list[_Region] = []
     for region in open_regions:
@@ -197,7 +201,7 @@ class _Patch:
         return int((self.use == OWN).sum())
 
     def unowned(self) -> _Patch:
-        """What takes no points, but keeps others from taking them."""
+        """The same patch owning no cell: it takes no points, and keeps other planes from taking them."""
         return replace(self, use=np.minimum(self.use, NEAR))
 
 
@@ -271,7 +275,7 @@ def _refined(
     plane, cell, distance = _associate_at_once(cells, points, seen_from, variance, search)
     stats, moments = np.zeros((len(cells.use), 3)), np.zeros((len(patches), MOMENTS))
     sum_cells(points, variance, plane, cell, distance, stats, moments)
-    good = (stats[:, 0] >= FEWEST) & (stats[:, 2] < MIXED**2 * stats[:, 0])
+    good = (stats[:, 0] >= FEWEST_IN_VOXEL) & (stats[:, 2] < MIXED_CELL_RMS**2 * stats[:, 0])
     use = np.where(good, cells.use, np.minimum(cells.use, NEAR))
     mine = [slice(a, a + p.use.size) for a, p in zip(cells.first, patches, strict=True)]
     in_place = last and search.position_m <= FINE_M
@@ -291,12 +295,12 @@ def _refined(
 
 
 def _uneven(stats: list[np.ndarray]) -> np.ndarray:
-    """(P,) whether planes, of whose cells stats are (C, 3), see `sum_cells`, stray far while most points' do not. A
-    surface that waves within its noise bends nowhere much as a whole, and there are thousands of points on it."""
+    """Whether each plane (P,) is uneven while most points lie on even ones; stats (C, 3) of cells: see `sum_cells`.
+    A surface that waves within the noise does not bend as a whole, but has thousands of points that show it."""
     strays = np.array([_unevenness(s) for s in stats])
     points, order = np.array([s[:, 0].sum() for s in stats]), np.argsort(strays)
     usual = strays[order[np.searchsorted(np.cumsum(points[order]), 0.5 * points.sum())]] if len(stats) else 0.0
-    return strays > (UNEVEN if usual < EVEN else np.inf)
+    return strays > (UNEVEN_CELLS if usual < EVEN_CELLS else np.inf)
 
 
 def _unevenness(stats: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""Do tags and corners lie where the others say?"""
+"""Consistency checks: do tags and corners lie where their neighbours predict them?"""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from icalib.base.compiled import njit
 from icalib.detection.primitives.decoding import mapped, unit_homography
 from icalib.detection.primitives.growth import fit_homography
 
-_NEAREST = 12
-_MOST_OFF = (1.0, 0.05)  # px, and of a side: how far a corner may lie from where its neighbours place it
+_PLACING_CORNERS = 12
+_MOST_CORNER_OFF = (1.0, 0.05)  # px, and of a side: how far a corner may lie from where its neighbours place it
 _OFF = (0.3, 0.01, 6.0)  # px, of a side, and times the median: the same, as far as the other corners agree
-_STRAIGHT = 1e4  # image widths, the focal length of a lens that does not bend
+_STRAIGHT_FOCAL = 1e4  # image widths, the focal length of a lens that does not bend
 _BENT = (0.1, 2.0)  # image widths, the focal lengths of lenses that do
 _SAME_LOG = 0.02  # focal lengths as near to each other leave the same distances
 _UNSURE = 0.2  # of the median distance that a lens's bend explains: how much of it may be left at single corners
@@ -81,11 +81,11 @@ def consistent_corners(
     is taken for the lens's.
     """
     middle, width = 0.5 * np.array(shape[1::-1]), float(shape[1])
-    straight = _agreeing(_rays(uv - middle, _STRAIGHT * width, False), board, found, side)
+    straight = _agreeing(_rays(uv - middle, _STRAIGHT_FOCAL * width, False), board, found, side)
     if straight.all():
         return straight
     bent = _bent_rays(uv - middle, width, board, found)
-    usual = [_usual(rays, board, found) for rays in (_rays(uv - middle, _STRAIGHT * width, False), bent)]
+    usual = [_usual(rays, board, found) for rays in (_rays(uv - middle, _STRAIGHT_FOCAL * width, False), bent)]
     return _agreeing(bent, board, found, side, _UNSURE * usual[0]) if usual[1] < usual[0] else straight
 
 
@@ -93,8 +93,8 @@ Rays = tuple[np.ndarray, np.ndarray]  # (N, 3) unit rays, (N,) px per radian
 
 
 def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, found: np.ndarray) -> Rays:
-    """By the lens of two kinds and any focal length through which the corners found are nearest to where neighbours
-    place them. uv (N, 2) px from the middle of the image."""
+    """Rays through the bent lens (of two models, any focal length) with which the corners found agree best with their
+    neighbours' predictions. uv (N, 2) px from the middle of the image."""
     best: tuple[float, Rays] | None = None
     for equidistant in (False, True):
 
@@ -110,16 +110,16 @@ def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, found: np.ndarra
 
 def _usual(rays: Rays, board: np.ndarray, found: np.ndarray) -> float:
     """The median distance of the corners found; a large one where there are too few."""
-    off = distance_from_neighbours(*rays, board, found, _NEAREST)
+    off = distance_from_neighbours(*rays, board, found, _PLACING_CORNERS)
     placed = found & np.isfinite(off)
     return float(np.median(off[placed])) if placed.any() else _FAR_PX
 
 
 def _agreeing(rays: Rays, board: np.ndarray, found: np.ndarray, side: np.ndarray, unsure: float = 0.0) -> np.ndarray:
     """As `consistent_corners`, for one lens. `unsure` [px]: the least bound, for what is not known of the lens."""
-    used, most = found.copy(), _MOST_OFF[0] + _MOST_OFF[1] * side
+    used, most = found.copy(), _MOST_CORNER_OFF[0] + _MOST_CORNER_OFF[1] * side
     while True:
-        off = distance_from_neighbours(*rays, board, used, _NEAREST)
+        off = distance_from_neighbours(*rays, board, used, _PLACING_CORNERS)
         placed = used & np.isfinite(off)
         usual = float(np.median(off[placed])) if placed.any() else np.inf
         bound = np.minimum(most, np.maximum(_OFF[0] + _OFF[1] * side, max(_OFF[2] * usual, unsure)))
@@ -130,8 +130,8 @@ def _agreeing(rays: Rays, board: np.ndarray, found: np.ndarray, side: np.ndarray
 
 
 def _rays(uv: np.ndarray, focal: float, equidistant: bool) -> Rays:
-    """Of a lens of focal length `focal` [px], uv (N, 2) px from its middle: a stereographic one, which is the division
-    model of distortion (Fitzgibbon 2001), or an equidistant one, as most fisheyes nearly are."""
+    """Rays of pixels uv (N, 2) from the middle of a lens of focal length `focal` [px]: stereographic, which is the
+    division model of distortion (Fitzgibbon 2001), or equidistant, as most fisheyes nearly are."""
     radius = np.hypot(uv[:, 0], uv[:, 1])
     r = radius / focal
     angle = np.minimum(r, _MOST_ANGLE) if equidistant else 2.0 * np.arctan(0.5 * r)

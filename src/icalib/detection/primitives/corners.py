@@ -1,4 +1,4 @@
-"""What a detector gives for one image, and the rule by which corners are dropped."""
+"""The corners of one image as a detector returns them, and the rule by which corners are dropped."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def judged(
     consistent: np.ndarray,
     crowded: float = np.inf,
 ) -> ImageCorners:
-    """Corners with sigma and verdict, by this rule; what is named first wins.
+    """Corners with sigma and verdict. The first of these rules that applies gives the verdict.
 
     inconsistent: not where the neighbours place it. oblique: its edges meet at less than 15 degrees. blurred: the
     nearest other feature is less than 1.5 px + 1.5 blurs away (L-corners: 1.5 px + 2.25 blurs; cells of a tag in the

@@ -1,8 +1,8 @@
-"""Kernel that places an X-corner, where two dark squares touch: two crossing blurred steps are fitted to its pixels.
+"""Compiled: the position of an X-corner, where two dark squares touch, by a fit of two crossing blurred steps.
 
 An X-corner is point symmetric, however blurred, however oblique and whatever the camera's response to light, and so is
-the model: what the model lacks cannot bias the point, as long as nothing else reaches into the window. The gradients
-alone would not do: where the window is not much wider than the blur, they point away from the corner.
+the model: errors of the model cannot bias the point, as long as nothing else reaches into the window. Gradients alone
+(as in cornerSubPix) do not suffice: where the window is hardly wider than the blur, they point away from the corner.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from icalib.base.compiled import njit
 from icalib.base.extras import load_cv2
+from icalib.detection.primitives.edge_model import USUAL_BLUR_PX
 from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
 from icalib.detection.primitives.tags import LEAST_CONTRAST
 
@@ -23,14 +24,13 @@ _SCALES = 3  # levels of the image pyramid; one more finds boards that are twice
 _LEAST_RESPONSE = 4 * LEAST_CONTRAST
 _PEAK_WINDOW_PX = 7  # width of the non-maximum suppression; corners less than 4 px apart merge
 _MOST_PEAKS = 500  # strongest of an image that are kept; the time grows with the square of it
-_NEAREST = 8  # peaks among which a corner's grid neighbours are looked for: four, and four diagonal ones
+_NEIGHBOUR_PEAKS = 8  # peaks among which a corner's grid neighbours are looked for: four, and four diagonal ones
 # |p + q| of two opposite neighbours, at p and q from the corner, over the shorter of them: 0 but for perspective and
 # lens. Larger, peaks of random texture have opposite neighbours by chance.
 _OPPOSITE = 0.25
 _LEAST_SINE = 0.3  # of the angle between rows and columns in the image: 17 degrees
 _MOST_MOVE = 0.2  # of a square's side, between a corner and its extrapolated place
 _CLEAR = 0.5  # of a square's side: the fitted window reaches no further
-_USUAL_BLUR = 0.7  # px, standard deviation of a Gaussian; it only sets the window
 _CONTINUED_SHARE = 0.5  # of the places beside one side of a board: with more X-corners there, the board is larger
 
 
@@ -55,7 +55,7 @@ def shows_grid(image: np.ndarray, enough: float) -> bool:
 
 def _largest_grid(at: np.ndarray) -> int:
     """How many of the points at (n, 2) px are in the largest connected part of the graph of `_grid_links`."""
-    if len(at) <= _NEAREST:
+    if len(at) <= _NEIGHBOUR_PEAKS:
         return 0
     links = _grid_links(at)
     inner = links.any(axis=1)
@@ -75,10 +75,10 @@ def _grid_links(at):
     for i in range(n):
         for j in range(n):
             distance[j] = hypot(at[j, 0] - at[i, 0], at[j, 1] - at[i, 1])
-        near = np.argsort(distance)[1 : _NEAREST + 1]
+        near = np.argsort(distance)[1 : _NEIGHBOUR_PEAKS + 1]
         first = -1
-        for a in range(_NEAREST):
-            for b in range(a + 1, _NEAREST):
+        for a in range(_NEIGHBOUR_PEAKS):
+            for b in range(a + 1, _NEIGHBOUR_PEAKS):
                 p, q = at[near[a]] - at[i], at[near[b]] - at[i]
                 if hypot(p[0] + q[0], p[1] + q[1]) > _OPPOSITE * min(distance[near[a]], distance[near[b]]):
                     continue
@@ -137,9 +137,9 @@ def _crossings(image, at, ea, eb):
     count = 0
     for i in range(len(at)):
         most = _MOST_MOVE * min(hypot(ea[i, 0], ea[i, 1]), hypot(eb[i, 0], eb[i, 1])) + 1.0
-        found, u, v = find_saddle(image, at[i, 0], at[i, 1], ea[i], eb[i], _CLEAR, _USUAL_BLUR, most)
+        found, u, v = find_saddle(image, at[i, 0], at[i, 1], ea[i], eb[i], _CLEAR, USUAL_BLUR_PX, most)
         if found:
-            contrast = crossing_contrast(image, u, v, ea[i], eb[i], _CLEAR, _USUAL_BLUR)
-            if max(contrast, crossing_contrast(image, u, v, -ea[i], eb[i], _CLEAR, _USUAL_BLUR)) >= LEAST_CONTRAST:
+            contrast = crossing_contrast(image, u, v, ea[i], eb[i], _CLEAR, USUAL_BLUR_PX)
+            if max(contrast, crossing_contrast(image, u, v, -ea[i], eb[i], _CLEAR, USUAL_BLUR_PX)) >= LEAST_CONTRAST:
                 count += 1
     return count

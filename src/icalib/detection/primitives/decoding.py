@@ -1,4 +1,4 @@
-"""Kernels that read the cells of a tag through a homography and look its pattern up."""
+"""Compiled: reads the cells of a tag through a homography, and looks its pattern up."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def bilinear(image, u, v):
 
 
 def nearest_greys(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(...) float64: grey levels of the image (h, w) in the pixels nearest to uv (..., 2) px, or its border's."""
+    """Grey levels (...) float64 of the image (h, w) in the pixels nearest to uv (..., 2) px, or the outermost ones."""
     u, v = np.moveaxis(np.rint(uv).astype(np.int64), -1, 0)
     return image[v.clip(0, image.shape[0] - 1), u.clip(0, image.shape[1] - 1)].astype(np.float64)
 
@@ -118,7 +118,7 @@ def cell_greys(image, H, n):
 
 @njit(cache=True, nogil=True)
 def levels(grey, border):
-    """(black, white): mean of the cells of the border, `border` cells wide, and of the ring without its corners."""
+    """(black, white): mean of the cells of the tag's border, `border` wide, and of the ring without its corners."""
     n = len(grey) - 2
     black, n_black, white, n_white = 0.0, 0, 0.0, 0
     for row in range(n + 2):
@@ -157,7 +157,7 @@ def _sharpened(grey, row, col):
 
 @njit(cache=True, nogil=True)
 def read_cells(grey, border, threshold):
-    """(code, cells of the border that are not black): the data cells as uint64, an unseen cell counted as black."""
+    """(code, cells of the tag's border that are not black): data cells as uint64, unseen cells counted as black."""
     n = len(grey) - 2
     code, wrong = np.uint64(0), 0
     for row in range(1, n + 1):

@@ -1,4 +1,4 @@
-"""Kernels that place an L-corner: a blurred step is fitted to the pixels about each side, and sides are intersected.
+"""Compiled: the position of an L-corner, by a fit of a blurred step to each side and the sides' intersection.
 
 OpenCV's cornerSubPix pulls such corners inwards by 0.16 to 0.20 px under ordinary blur. A straight edge away from its
 ends is symmetric under blur, so its place is not biased, and neither is the point where two of them meet.
@@ -13,12 +13,14 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.data.measurements import EDGE
 
-_ITERATIONS = 10
-_CONVERGED_PX = 1e-3
+_ITERATIONS = 10  # at most
+_CONVERGED_PX = 1e-3  # largest motion of the edge in the last step
 END_PX = 3.0  # left out at both ends of a side, where the corner's blur bends the edge
 _MOST_END = 0.25  # of the side
 _CURVED_FROM_PX = 24.0  # sides as long as that may be bent by the lens
-_BLUR_RANGE = (0.35, 6.0)
+BLUR_RANGE_PX = (0.35, 6.0)  # below, the pixel's own width is the blur
+USUAL_BLUR_PX = 0.7  # standard deviation of a Gaussian, before it is measured; it only sets windows
+LEAST_RISE = 4.0  # grey levels over 2 px at an edge
 _PER_UNIT = 128  # entries of the table of the error function: interpolated linearly, it is right to 2e-5
 _TABLE = np.array([(erf(k / _PER_UNIT), 2.0 / sqrt(pi) * np.exp(-((k / _PER_UNIT) ** 2))) for k in range(514)])
 _LEAST_SINE = 0.17  # of the angle between two sides: 10 degrees
@@ -113,7 +115,7 @@ def _fitted_step(image, u0, v0, u1, v1, end, half):
         blur = p[2] + scale * min(max(step[2], -0.5 * p[2]), p[2])
         for k in range(size):
             p[k] += step[k] if k == 3 or k == 4 else scale * step[k]
-        p[2] = min(max(blur, _BLUR_RANGE[0]), _BLUR_RANGE[1])
+        p[2] = min(max(blur, BLUR_RANGE_PX[0]), BLUR_RANGE_PX[1])
         if abs(p[0]) + abs(p[1]) + abs(p[5]) > half + 1.0 or p[4] <= p[3]:
             return p, 0.0, rows
         if largest < _CONVERGED_PX and abs(step[2]) < 0.01:

@@ -17,18 +17,18 @@ from math import erf, exp, hypot, pi, sqrt
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.detection.primitives.edge_model import solve_small
+from icalib.detection.primitives.edge_model import BLUR_RANGE_PX, solve_small
 from icalib.detection.primitives.tags import LEAST_CONTRAST
 
 _SIZE = 8  # number of parameters
-_ITERATIONS = 20  # at most; a fit that needs more counts as failed
+_MOST_ELLIPSE_STEPS = 20  # at most; a fit that needs more counts as failed
 _CONVERGED_PX = 1e-3  # largest motion of the edge in the last step; far below the noise of a centre
 _MOST_STEP_PX = 1.0  # largest motion of the edge in one step: the model is linear about a blur's width
 _HALF_STRIP = (2.0, 3.0)  # px, and blurs, whichever is larger: half the width of the strip of pixels that is fitted
-_MOST_STRIP = 0.6  # of the smaller half axis: the same, at most. More would take in the other side of the edge
-_USUAL_BLUR = 0.8  # px, start of the fit
-_BLUR_RANGE = (0.35, 6.0)  # px; below, the pixel's own width is the blur
-_MOST_MOVE = 0.5  # of the smaller half axis, and 1 px: from the start of the fit. Doubled, it may reach a neighbour
+_MOST_EDGE_STRIP = 0.6  # of the smaller half axis: the same, at most. More would take in the other side of the edge
+_FIRST_BLUR = 0.8  # px, start of the fit
+# Of the smaller half axis, and 1 px: from the start of the fit. Doubled, it may reach a neighbour.
+_MOST_CENTRE_MOVE = 0.5
 LEAST_HALF_AXIS_PX = 2.5  # beside the blur; smaller ellipses have no plateau inside, and are called blurred
 
 
@@ -72,14 +72,14 @@ def _fit(image, u0, v0, axes):
         return u0, v0, np.nan, 0.0, 0.0, 0.0
     # Rows of axes are the images of two radii: the ellipse is centre + axes^T (unit vector).
     W = np.array([[axes[1, 1], -axes[1, 0]], [-axes[0, 1], axes[0, 0]]]) / det
-    p = np.array([u0, v0, _USUAL_BLUR, 0.0, 0.0])  # centre, blur, grey inside, grey outside; W holds the shape
+    p = np.array([u0, v0, _FIRST_BLUR, 0.0, 0.0])  # centre, blur, grey inside, grey outside; W holds the shape
     A = np.zeros((_SIZE, _SIZE))
     done = False
-    for iteration in range(_ITERATIONS):
+    for iteration in range(_MOST_ELLIPSE_STEPS):
         large, small = _half_axes(W)
-        if small < 0.5 * LEAST_HALF_AXIS_PX or hypot(p[0] - u0, p[1] - v0) > _MOST_MOVE * small + 1.0:
+        if small < 0.5 * LEAST_HALF_AXIS_PX or hypot(p[0] - u0, p[1] - v0) > _MOST_CENTRE_MOVE * small + 1.0:
             return u0, v0, np.nan, 0.0, large, small
-        half = min(max(_HALF_STRIP[0], _HALF_STRIP[1] * p[2]), _MOST_STRIP * small)
+        half = min(max(_HALF_STRIP[0], _HALF_STRIP[1] * p[2]), _MOST_EDGE_STRIP * small)
         if not _inside(image, p, large + half):
             return u0, v0, np.nan, p[2], large, small
         b, n = _accumulate(A, image, p, W, half, iteration == 0)
@@ -96,7 +96,7 @@ def _fit(image, u0, v0, axes):
             for j in range(2):
                 changed[i, j] = W[i, j] + S[i, 0] * W[0, j] + S[i, 1] * W[1, j]
         W = changed
-        p[2] = min(max(p[2] + scale * min(max(step[5], -0.5 * p[2]), p[2]), _BLUR_RANGE[0]), _BLUR_RANGE[1])
+        p[2] = min(max(p[2] + scale * min(max(step[5], -0.5 * p[2]), p[2]), BLUR_RANGE_PX[0]), BLUR_RANGE_PX[1])
         # Grey levels enter linearly: their step needs no limit.
         p[3] += step[6]
         p[4] += step[7]

@@ -14,17 +14,15 @@ from icalib.detection.primitives.decoding import (
     seen_cells,
     unit_homography,
 )
-from icalib.detection.primitives.edge_model import solve_small
+from icalib.detection.primitives.edge_model import LEAST_RISE, USUAL_BLUR_PX, solve_small
 from icalib.detection.primitives.edges import fit_quad
 from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 
 _NEIGHBOURS = 3  # tags that predict another, none further than two tags away
-_LEAST_SEEN = 12  # data cells of a tag that the image cuts
+_LEAST_SEEN_CELLS = 12  # data cells of a tag that the image cuts
 _WRONG_CELLS = 0.15  # of the cells seen: the pattern is known, so many may be wrong
-_LEAST_RISE = 4.0  # grey levels over 2 px at an edge
-_MOST_MOVE = 0.12  # of a side: how far a corner may lie from where it is predicted
-_USUAL_BLUR = 0.7  # px, before it is measured
+_MOST_PREDICTION_ERROR = 0.12  # of a side: how far a corner may lie from where it is predicted
 LEAST_SIDE_PX = 6.0
 
 
@@ -112,12 +110,12 @@ def _fitted(image, quad, clear, crossing):
     """(number of corners found, quad) near a predicted quad. Corners that are not found move on with the others."""
     side = shortest_side(quad)
     if crossing:
-        most, corners, n_found = _MOST_MOVE * side + 1.0, quad.copy(), 0
+        most, corners, n_found = _MOST_PREDICTION_ERROR * side + 1.0, quad.copy(), 0
         there, moved = np.zeros(4, dtype=np.bool_), np.zeros(2)
         for k in range(4):
             ea, eb = side_vectors(quad, k)
-            found, u, v = find_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, _USUAL_BLUR, most)
-            if found and crossing_contrast(image, u, v, ea, eb, clear, _USUAL_BLUR) >= LEAST_CONTRAST:
+            found, u, v = find_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, USUAL_BLUR_PX, most)
+            if found and crossing_contrast(image, u, v, ea, eb, clear, USUAL_BLUR_PX) >= LEAST_CONTRAST:
                 corners[k, 0], corners[k, 1], there[k] = u, v, True
                 moved += corners[k] - quad[k]
                 n_found += 1
@@ -125,7 +123,7 @@ def _fitted(image, quad, clear, crossing):
             if n_found > 0 and not there[k]:
                 corners[k] += moved / n_found
         return n_found, corners
-    fits, corners = fit_quad(image, quad, min(max(1.5, 0.1 * side), 6.0), _LEAST_RISE)
+    fits, corners = fit_quad(image, quad, min(max(1.5, 0.1 * side), 6.0), LEAST_RISE)
     return 4 if fits else 0, corners
 
 
@@ -140,7 +138,7 @@ def _is_tag(image, quad, pattern, bits, border):
     code, wrong = read_cells(grey, border, 0.5 * (black + white))
     seen = seen_cells(grey, border)
     n_seen = popcount(seen)
-    return n_seen >= _LEAST_SEEN and wrong + popcount((code ^ pattern) & seen) <= _WRONG_CELLS * n_seen
+    return n_seen >= _LEAST_SEEN_CELLS and wrong + popcount((code ^ pattern) & seen) <= _WRONG_CELLS * n_seen
 
 
 @njit(cache=True, nogil=True)

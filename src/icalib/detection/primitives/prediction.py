@@ -1,4 +1,4 @@
-"""Predicts where the corners of the next image are, and kernels that fill in the other nodes of a board.
+"""Predicts where the corners of the next image are, and kernels that fill in the other corners of a board.
 
 Corners are extrapolated image by image: with constant acceleration [px / image^2] from three images, with constant
 velocity [px / image] from two.
@@ -17,7 +17,7 @@ from icalib.detection.primitives.decoding import mapped
 from icalib.detection.primitives.growth import fit_homography
 
 _LEAST_COMMON = 4  # corners that the images must share; with fewer the motion of the target is not known
-_NEAREST = 12  # known nodes whose homography predicts an unknown one; with more, distortion matters
+_PREDICTING_CORNERS = 12  # known corners whose homography predicts an unknown one; with more, distortion matters
 _MARGIN_PX = 8.0  # corners closer to the border may be missing; doubled, a target that leaves the image is lost later
 MOTION_IMAGES = 3  # latest images that the extrapolation uses: the acceleration needs three
 
@@ -67,16 +67,16 @@ def predict_corners(before: Sequence[ImageCorners]) -> PredictedCorners | None:
 
 @njit(cache=True, nogil=True)
 def predict_nodes(at, uv, rows, cols):
-    """(rows, cols, 2) px: where all nodes of a board are, from the known ones.
+    """(rows, cols, 2) px: where all corners of a board are, from the known ones.
 
-    at (n, 2) int64: row and column of the known nodes; uv (n, 2) px: where these are, which is kept. Each other node is
-    placed by the homography of the known nodes nearest to it on the board.
+    at (n, 2) int64: row and column of the known corners; uv (n, 2) px: where these are, which is kept. Each other one
+    is placed by the homography of the known corners nearest to it on the board.
     """
     out, known = np.empty((rows, cols, 2)), np.zeros((rows, cols), dtype=np.bool_)
     on_board = at.astype(np.float64)
     for i in range(len(at)):
         out[at[i, 0], at[i, 1]], known[at[i, 0], at[i, 1]] = uv[i], True
-    n = min(_NEAREST, len(at))
+    n = min(_PREDICTING_CORNERS, len(at))
     for row in range(rows):
         for col in range(cols):
             if known[row, col]:

@@ -9,10 +9,10 @@ import numpy as np
 from icalib.base.extras import load_cv2
 from icalib.detection.primitives.corners import checked_image
 
-_CONTRAST = 7  # grey levels below the local mean
+_QUAD_CONTRAST = 7  # grey levels below the local mean
 _LEAST_SIDE_PX = 7.0
 _LEAST_FILL = 0.75  # of the area of its quad that a contour covers
-_STRAIGHT = 0.05  # of the perimeter: how far a contour may leave its polygon
+_STRAIGHT_SIDE = 0.05  # of the perimeter: how far a contour may leave its polygon
 _WINDOW_SHARES = (0.08, 0.03, 0.2)  # of the width of the image
 
 
@@ -49,7 +49,7 @@ def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
     """
     cv2 = load_cv2()
     dark = cv2.adaptiveThreshold(
-        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, float(_CONTRAST)
+        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, float(_QUAD_CONTRAST)
     )
     if separate:
         dark = cv2.erode(dark, np.ones((3, 3), dtype=np.uint8))
@@ -70,7 +70,7 @@ def _quad(cv2, contour: np.ndarray) -> np.ndarray | None:
     if max(width, height) < _LEAST_SIDE_PX or min(width, height) < 0.25 * _LEAST_SIDE_PX:
         return None
     hull = cv2.convexHull(contour)
-    corners = cv2.approxPolyDP(hull, _STRAIGHT * cv2.arcLength(hull, True), True)
+    corners = cv2.approxPolyDP(hull, _STRAIGHT_SIDE * cv2.arcLength(hull, True), True)
     if len(corners) != 4:
         return None
     quad = corners[:, 0, :].astype(np.float64)

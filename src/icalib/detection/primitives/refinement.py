@@ -9,19 +9,18 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.data.measurements import EDGE
 from icalib.detection.primitives.crossing_model import LEAST_WINDOW_PX, fit_crossing
-from icalib.detection.primitives.edge_model import END_PX, fit_corners, step_blur
+from icalib.detection.primitives.edge_model import END_PX, USUAL_BLUR_PX, fit_corners, step_blur
 from icalib.detection.primitives.growth import side_vectors
 from icalib.detection.primitives.saddles import MARGIN_BLURS
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 
-_MOST_MOVE = (2.0, 0.03)  # px, and of a side: how far a corner may lie from where it was found roughly
+_MOST_CORNER_MOVE = (2.0, 0.03)  # px, and of a side: how far a corner may lie from where it was found roughly
 _LEAST_STRIP_PX = 1.5  # fitted on each side of an edge
 _MOST_STRIP = (4.0, 3.0)  # px, and blurs: the same
 _STRIP_BLURS = 2.25  # how far, in blurs, the strip along an edge keeps away from other features
 _BLUR_STRIP = (2.5, 0.06)  # px, and of a side: fitted on each side of an edge where only the blur is wanted
 _LEAST_INSET_PX = (1.0, 0.5)  # as LEAST_WINDOW_PX, for features that lie in the dark and in the white fields
 _END_BLURS = 2.4  # left out at the ends of a side
-_USUAL_BLUR = 0.7  # px, before it is measured
 MEASURES = 5  # rows of `quality` before those of the edges
 
 
@@ -46,7 +45,7 @@ def _measured_blur(image, quad, k, least):
     most = max(_BLUR_STRIP[0], _BLUR_STRIP[1] * shortest_side(quad))
     for m in (k, k + 2):
         u0, v0, u1, v1 = quad[m, 0], quad[m, 1], quad[(m + 1) % 4, 0], quad[(m + 1) % 4, 1]
-        blur, contrast = step_blur(image, u0, v0, u1, v1, END_PX, _strip(least, _USUAL_BLUR, most))
+        blur, contrast = step_blur(image, u0, v0, u1, v1, END_PX, _strip(least, USUAL_BLUR_PX, most))
         if contrast > 0.0:
             return blur
     return np.nan
@@ -60,7 +59,7 @@ def _measured_blurs(image, quads, least):
         for k in range(2):
             blur[i, k] = _measured_blur(image, quads[i], k, least[i])
     known = blur.ravel()[~np.isnan(blur.ravel())]
-    usual = np.median(known) if len(known) else _USUAL_BLUR
+    usual = np.median(known) if len(known) else USUAL_BLUR_PX
     for i in range(len(quads)):
         for k in range(2):
             if np.isnan(blur[i, k]):
@@ -94,7 +93,7 @@ def refined_crossings(image, quads, surroundings):
         quality[1, i] = blur[i].max()
         for k in range(4):
             ea, eb = side_vectors(quads[i], k)
-            most_move = max(_MOST_MOVE[0], _MOST_MOVE[1] * quality[4, i, k])
+            most_move = max(_MOST_CORNER_MOVE[0], _MOST_CORNER_MOVE[1] * quality[4, i, k])
             blur_a, blur_b = blur[i, k % 2], blur[i, (k + 1) % 2]
             u, v, sigma, contrast, edges = fit_crossing(
                 image, quads[i, k, 0], quads[i, k, 1], ea, eb, surroundings, blur_a, blur_b, most_move
@@ -119,13 +118,13 @@ def refined_corners(image, quads, clear):
     least = clear * _shapes(quads, quality)
     for i in range(len(quads)):
         most = max(_MOST_STRIP[0], _BLUR_STRIP[1] * shortest_side(quads[i]))
-        first, _, blur, _ = fit_corners(image, quads[i], END_PX, _strip(least[i], _USUAL_BLUR, most))
+        first, _, blur, _ = fit_corners(image, quads[i], END_PX, _strip(least[i], USUAL_BLUR_PX, most))
         half = _strip(least[i], blur.max(), max(_MOST_STRIP[0], _MOST_STRIP[1] * blur.max()))
         end = max(END_PX, _END_BLURS * blur.max())
         uv[i], quality[0, i], quality[1, i], edges = fit_corners(image, first, end, half)
         for k in range(4):
             quality[MEASURES:, i, k] = edges[k].ravel()
-            most_move = max(_MOST_MOVE[0], _MOST_MOVE[1] * quality[4, i, k])
+            most_move = max(_MOST_CORNER_MOVE[0], _MOST_CORNER_MOVE[1] * quality[4, i, k])
             if hypot(uv[i, k, 0] - quads[i, k, 0], uv[i, k, 1] - quads[i, k, 1]) > most_move:
                 quality[0, i, k] = np.nan
     quality[3] = clear * quality[3] - _LEAST_STRIP_PX - _STRIP_BLURS * quality[1]

@@ -9,17 +9,17 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.detection.primitives.consistency import consistent_corners
 from icalib.detection.primitives.corners import ImageCorners, judged, no_corners
+from icalib.detection.primitives.edge_model import USUAL_BLUR_PX
 from icalib.detection.primitives.growth import LEAST_SIDE_PX, side_vectors
 from icalib.detection.primitives.prediction import predict_nodes
 from icalib.detection.primitives.refinement import refined_crossings
 from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 
-_MOST_MOVE = 0.15  # of a side: how far a corner may lie from where it is expected
+_MOST_SQUARE_MOVE = 0.15  # of a side: how far a corner may lie from where it is expected
 _CLEAR = 0.5  # squares, from a corner to the nearest other feature: the next corner is as far from the same place
 _LEAST_CORNERS = 24  # found as corners of dark squares, two for most corners, that place the rest of the board
 _LEAST_CLEAR_PX = 3.0  # to the nearest other feature; nearer ones leave windows of the least size, whatever the sides
-_USUAL_BLUR = 0.7  # px, before it is measured
 
 
 def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, inset: float) -> ImageCorners:
@@ -27,7 +27,7 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
 
     image (h, w) uint8. expected (rows + 1, cols + 1, 2) px, all corners of the squares, right to some 0.15 squares; its
     columns and rows turn with the clock in the image. dark (rows, cols) bool. `inset` is how far from the edges of the
-    white squares markers begin, in squares, inf without markers.
+    white squares markers begin [squares], inf without markers.
     """
     rows, cols = dark.shape
     uv, sigma, quality = np.zeros((rows + 1, cols + 1, 2)), np.full((rows + 1, cols + 1), np.nan), {}
@@ -76,9 +76,9 @@ def _roughly(image, quads, inner, clear):
             if not inner[i, k] or shortest_side(quads[i]) < LEAST_SIDE_PX:
                 continue
             ea, eb = side_vectors(quads[i], k)
-            most = _MOST_MOVE * min(hypot(ea[0], ea[1]), hypot(eb[0], eb[1])) + 1.0
+            most = _MOST_SQUARE_MOVE * min(hypot(ea[0], ea[1]), hypot(eb[0], eb[1])) + 1.0
             u, v = quads[i, k]
-            is_there, u, v = find_saddle(image, u, v, ea, eb, clear, _USUAL_BLUR, most)
-            if is_there and crossing_contrast(image, u, v, ea, eb, clear, _USUAL_BLUR) >= LEAST_CONTRAST:
+            is_there, u, v = find_saddle(image, u, v, ea, eb, clear, USUAL_BLUR_PX, most)
+            if is_there and crossing_contrast(image, u, v, ea, eb, clear, USUAL_BLUR_PX) >= LEAST_CONTRAST:
                 out[i, k, 0], out[i, k, 1], found[i, k] = u, v, True
     return out, found

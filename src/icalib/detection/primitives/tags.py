@@ -8,13 +8,13 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.detection.primitives.decoding import cell_greys, dark_in_ring, levels, lookup, read_cells, unit_homography
+from icalib.detection.primitives.edge_model import LEAST_RISE
 from icalib.detection.primitives.edges import fit_quad
 from icalib.detection.primitives.families import Family
 from icalib.detection.primitives.quads import ImageWithQuads
 
 LEAST_CONTRAST = 16.0  # grey levels between black and white of a tag
-_LEAST_RISE = 4.0  # grey levels over 2 px at an edge
-_WRONG_BORDER = 0.15  # of the cells of the border
+_WRONG_BORDER = 0.15  # of the cells of the black border
 _WRONG_RING = 0.15  # of the places in the white around the tag
 
 
@@ -66,9 +66,9 @@ def _decode_all(image, quads, bits, border, codes, max_errors):
     for i in range(n):
         side = shortest_side(quads[i])
         reach = min(max(2.0, 0.1 * side), 12.0)
-        fits, quad = fit_quad(image, quads[i], reach, _LEAST_RISE)
+        fits, quad = fit_quad(image, quads[i], reach, LEAST_RISE)
         if fits:
-            fits, quad = fit_quad(image, quad, min(2.0, 0.1 * side + 0.5), _LEAST_RISE)
+            fits, quad = fit_quad(image, quad, min(2.0, 0.1 * side + 0.5), LEAST_RISE)
         if fits:
             ids[i], turn, contrast[i] = decode(image, quad, bits, border, codes, max_errors)
             for k in range(4):

@@ -1,1 +1,1 @@
-"""Images -> feature tracks: corners of the scene, followed from image to image (Shi and Tomasi, CVPR 1994)."""
+"""Images -> feature tracks: corners of the scene, tracked from image to image (Shi and Tomasi, CVPR 1994)."""

@@ -1,11 +1,11 @@
-"""The epipolar geometry of two images through a lens that is not known, compiled.
+"""Compiled: the epipolar geometry of two images through an unknown lens.
 
 A pixel at (x, y) from the image's centre has the ray (x, y, 1 + lam (x^2 + y^2)): the division model of Fitzgibbon
-(Simultaneous linear estimation of multiple view geometry and lens distortion, 2001). Rays f, h of a point that stands
-still satisfy h . F f = 0. F comes from eight points drawn at random; of many draws the one counts whose errors have the
-least quantile (least quantile of squares, Rousseeuw 1984). With the median, F has freedom enough to fit a body that
-moves beside less than half of the scene. F absorbs the focal length, so the distortion `lam` is all that must be known
-of the lens.
+(Simultaneous linear estimation of multiple view geometry and lens distortion, 2001). Rays f, h of a static
+point satisfy h . F f = 0. F comes from eight points drawn at random; of many draws the one with the least quantile of
+errors is taken (least quantile of squares, Rousseeuw 1984). The quantile is above the median: F has enough freedom to
+fit a body that covers nearly half of the image and moves by itself. F absorbs the focal length, so the distortion `lam`
+is all that must be known of the lens.
 """
 
 from __future__ import annotations
@@ -14,18 +14,19 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-DRAWS = 60  # at most; with 30 % of outliers, chance misses every clean sample once in 35 pairs of images
+MOST_DRAWS = 60  # at most; with 30 % of outliers, chance misses every clean sample once in 35 pairs of images
 FEWEST_DRAWS, MISSED = 12, 0.01  # drawing ends where chance has missed every clean sample with that probability
 QUANTILE, QUANTILE_OF_NORMAL = 0.65, 0.9346  # up to 35 % of the points may move; that quantile of |normal| errors
 REFITS, FITS_TIMES = 2, 3.0  # with all points whose errors are within so many quantiles
-FEWEST = 16  # points; of fewer a quantile says little
+FEWEST_MATCHED_POINTS = 16  # points; of fewer a quantile says little
 
 
 def epipolar_errors(p: np.ndarray, q: np.ndarray, lam: float, seed: int) -> tuple[np.ndarray, float]:
-    """(n,) first-order distances of points p and q (n, 2) in two images from the epipolar geometry of most, and their
-    standard deviation by the quantile. n is FEWEST at least; units are those of p and q, from the images' centre."""
+    """First-order distances (n,) of points p and q (n, 2) in two images from the epipolar geometry of most points, and
+    their standard deviation by the quantile. Units are those of p and q, counted from the images' centre; n is
+    FEWEST_MATCHED_POINTS at least."""
     rng = np.random.default_rng(seed)
-    draws = rng.permuted(np.tile(np.arange(len(p)), (DRAWS, 1)), axis=1)[:, :8].copy()
+    draws = rng.permuted(np.tile(np.arange(len(p)), (MOST_DRAWS, 1)), axis=1)[:, :8].copy()
     error = np.empty(len(p))
     quantile = _least_quantile(np.ascontiguousarray(p), np.ascontiguousarray(q), lam, draws, error)
     return error, (1.0 + 5.0 / (len(p) - 8)) / QUANTILE_OF_NORMAL * quantile  # Rousseeuw's correction for few points
@@ -33,8 +34,8 @@ def epipolar_errors(p: np.ndarray, q: np.ndarray, lam: float, seed: int) -> tupl
 
 @njit(cache=True, nogil=True)
 def _least_quantile(p, q, lam, draws, least):
-    """The least quantile of errors over all draws (m, 8), and over what all points that fit then give; least (n,): the
-    errors of that one."""
+    """The least quantile of errors over all draws (m, 8) and refits to all points that fit; fills least (n,) with the
+    errors of that F."""
     n = len(p)
     f, h, error, used = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.bool_)
     for i in range(n):

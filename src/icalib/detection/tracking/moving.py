@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.data.measurements import shared_rows
-from icalib.detection.tracking.epipolar import FEWEST, epipolar_errors
+from icalib.detection.tracking.epipolar import FEWEST_MATCHED_POINTS, epipolar_errors
 
-APART = (1, 4)  # images: each is compared with these before it
+COMPARED_IMAGES = (1, 4)  # images: each is compared with these before it
 LENS_APART, LENS_PAIRS = 6, 8  # pairs of images that show how the lens distorts
 # At an image's corner; 0 is a lens without distortion, -1 one that sees half a sphere at its corners.
 LAMBDAS = (-1.2, -1.0, -0.8, -0.6, -0.45, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2)
 TIMES_SIGMA, LEAST_PX = 4.0, 1.0  # no point is rejected for a smaller error
-MOST_MISFITS = 1.0 / 3.0  # of a feature's comparisons: one that moves fails most, a single wrong match four
+MOST_MISFIT_SHARE = 1.0 / 3.0  # of a feature's comparisons: one that moves fails most, a single wrong match four
 
 
 def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
@@ -24,19 +24,19 @@ def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, reso
     xy, half_px = from_centre(uv, resolution)
     lam = _lambda(start, feature, xy)
     tried, failed = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
-    for apart in APART:
+    for apart in COMPARED_IMAGES:
         for k in range(apart, len(start) - 1):
             before, after = shared_rows(start, feature, k - apart, k)
-            if len(before) < FEWEST:
+            if len(before) < FEWEST_MATCHED_POINTS:
                 continue
             wrong, _ = misfits(xy[before], xy[after], lam, half_px, k)
             tried[feature[before]] += 1
             failed[feature[before[wrong]]] += 1
-    return failed > MOST_MISFITS * tried
+    return failed > MOST_MISFIT_SHARE * tried
 
 
 def from_centre(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """Pixels uv (n, 2) from the image's centre, in units of half its diagonal; and that unit [px]."""
+    """Pixels uv (n, 2) relative to the image's centre, in units of half its diagonal; and that unit [px]."""
     half_px = 0.5 * float(np.hypot(*resolution))
     return (uv - 0.5 * (np.array(resolution) - 1.0)) / half_px, half_px
 
@@ -54,7 +54,7 @@ def _lambda(start: np.ndarray, feature: np.ndarray, xy: np.ndarray) -> float:
     pairs = [
         shared_rows(start, feature, int(k), int(k) + LENS_APART) for k in firsts if k + LENS_APART < len(start) - 1
     ]
-    return best_lambda([(xy[p], xy[q]) for p, q in pairs if len(p) >= FEWEST])
+    return best_lambda([(xy[p], xy[q]) for p, q in pairs if len(p) >= FEWEST_MATCHED_POINTS])
 
 
 def best_lambda(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:

@@ -1,6 +1,6 @@
-"""Alignment of an image with the first view of each track, compiled.
+"""Compiled: alignment of an image with the first view of each track.
 
-A track that is followed from image to image alone drifts: its errors add up, and the estimator cannot see that. Shi and
+A point tracked only from image to image drifts: its errors add up, and the estimator cannot see that. Shi and
 Tomasi (Good Features to Track, 1994) therefore align each image with the first view under an affine map. The map is
 found by inverse compositional Gauss-Newton (Baker and Matthews, 2004) on grey levels whose mean and contrast are
 normalised, so that a change of exposure has no effect.
@@ -17,8 +17,8 @@ from icalib.base.compiled import njit
 RADIUS = 7  # px; a patch has 15 x 15 px
 SIDE = 2 * RADIUS + 1
 CONVERGED_PX = 0.02  # of the last step
-MOST_STEPS = 12
-LEAST_CONTRAST = 1.0  # grey levels (standard deviation) of a patch; less is noise
+MOST_ALIGNMENT_STEPS = 12
+LEAST_TEXTURE = 1.0  # grey levels (standard deviation) of a patch; less is noise
 
 
 class Templates(NamedTuple):
@@ -59,15 +59,15 @@ def cut_templates(image: np.ndarray, uv: np.ndarray) -> tuple[Templates, np.ndar
     normal = np.empty((n, 6, 6))
     contrast = _cut(image, np.rint(uv).astype(np.int64), grey, slope, normal)
     normal[:, range(6), range(6)] += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None] + 1e-12
-    good = (contrast > LEAST_CONTRAST) & (np.linalg.cond(normal) < 1e8)
+    good = (contrast > LEAST_TEXTURE) & (np.linalg.cond(normal) < 1e8)
     normal[~good] = np.eye(6)
     inverse = np.linalg.inv(normal)
     return Templates(grey, slope, inverse, _spread(slope, inverse)), good
 
 
 def _spread(slope: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """(n,) px^2: by how much the affine map's shift answers to a displacement q(x) = x_a^2 of the patch, in the mean
-    over both axes a and both components of q: the second moment that is left of the patch's own."""
+    """Second moment (n,) px^2 of each patch along an axis, as the affine map weighs its points: the shift that the map
+    takes for a displacement q(x) = x_a^2, averaged over both axes a and both components of q."""
     y, x = np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1].astype(np.float64)
     by_x, by_y = slope[..., 0], slope[..., 1]
     rows = np.stack([by_x * x, by_x * y, by_y * x, by_y * y, by_x, by_y], axis=-1)
@@ -123,7 +123,7 @@ def align(image, templates, uv, A, ncc):
     seen, row, b, step = np.empty((SIDE, SIDE)), np.empty(6), np.empty(6), np.empty(6)
     for n in range(len(uv)):
         ncc[n] = -1.0
-        for _ in range(MOST_STEPS):
+        for _ in range(MOST_ALIGNMENT_STEPS):
             correlation = _sample(image, uv[n], A[n], templates.grey[n], seen)
             if correlation < 0.0:
                 break
@@ -173,7 +173,7 @@ def _sample(image, uv, A, template, seen):
             product += value * template[i, j]
     mean = total / SIDE**2
     variance = square / SIDE**2 - mean * mean
-    if not (variance > LEAST_CONTRAST**2 and product > 0.0):
+    if not (variance > LEAST_TEXTURE**2 and product > 0.0):
         return -1.0
     # Scaled by the projection on the template: what noise adds to the contrast would shrink it otherwise.
     scale = SIDE**2 / product

@@ -7,12 +7,11 @@ from scipy.spatial import KDTree
 
 SCENE_MOVES_PX = 10.0  # over a track's life, all points alike, as they do where the camera turns
 STAYS_PX = 1.0  # what a point in place moves at most, by noise and vibration
-NEAR_PX = 64.0  # a track that does not move so near to a point in place is in place, too
+NEAR_ROBOT_PX = 64.0  # a track that does not move so near to a point in place is in place, too
 
 
 def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(F,) bool, by number of the feature: whether it stays in place while the image moves, from its first view
-    to its last.
+    """Whether each feature (F,) stays in place in the image, from its first view to its last, while the scene moves.
 
     start (M + 1,), feature (N,) and uv (N, 2) as in `TrackStream`, features numbered from 0. The image moves by the
     median motion of its points, each component by itself: a turn of the camera moves all points alike, while a camera
@@ -38,7 +37,7 @@ def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.
     if in_place.any():
         still = np.flatnonzero(stays)
         distance, _ = KDTree(low[in_place]).query(low[still])
-        in_place[still[distance < NEAR_PX]] = True
+        in_place[still[distance < NEAR_ROBOT_PX]] = True
     return in_place
 
 

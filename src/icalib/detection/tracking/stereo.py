@@ -1,8 +1,8 @@
-"""Features that two cameras see at about the same time: each becomes one feature of both.
+"""Stereo matching: a feature that two cameras see at about the same time becomes one feature of both.
 
-Lucas-Kanade leads from one image to the other, from the same pixel on, and back; the patch is then aligned as from
-image to image. This finds pairs of cameras that look the same way. What does not fit the epipolar geometry of the pair,
-which is the same in all images, is left out.
+Lucas-Kanade tracking leads from a pixel of one image to the other image, and back; the patch is then aligned as from
+image to image. This finds pairs of cameras that look the same way. Matches that do not fit the epipolar geometry of the
+pair, which is the same in all images, are left out.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from icalib.base.extras import load_cv2
 from icalib.data.measurements import TrackStream
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.detection.images.image_work import on_all_cores
-from icalib.detection.tracking.epipolar import FEWEST
+from icalib.detection.tracking.epipolar import FEWEST_MATCHED_POINTS
 from icalib.detection.tracking.moving import best_lambda, from_centre, misfits
 from icalib.detection.tracking.patches import RADIUS, align, cut_templates
 from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, MIN_NCC, WINDOW_PX, prepared
 from icalib.rig import Camera
 
-EVERY_S = 0.25  # between images that are matched; features live about a second
-APART_S = 0.05  # between both images at most
-MAX_LEVEL = 4  # of the pyramid: disparities of up to 160 px
+MATCHED_EVERY_S = 0.25  # between images that are matched; features live about a second
+MOST_APART_S = 0.05  # between both images at most
+STEREO_PYRAMID_LEVEL = 4  # of the pyramid: disparities of up to 160 px
 FEWEST_MATCHES = 100  # in a recording; fewer may be chance
-LEAST_SHARE = 0.1  # of the features that were tried
-MOST_SIGMA_PX = 1.0  # of matches from their epipolar lines; more are wrong matches, or two lenses of different kinds
+LEAST_SHARED_FEATURES = 0.1  # of the features that were tried
+# Of matches from their epipolar lines; above are wrong matches, or two lenses of different kinds.
+MOST_EPIPOLAR_SIGMA_PX = 1.0
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,9 @@ class _Matches:
 
 
 def matched(recording: Recording, cameras: Sequence[Camera], streams: Sequence[TrackStream]) -> tuple[TrackStream, ...]:
-    """The streams, whose features are numbered apart, with what else each camera saw of the others' features.
+    """The streams with observations added that each camera has of the others' features; before, no number is shared.
 
-    Pairs of cameras of one resolution are tried; those that share hardly any features gain none.
+    Only pairs of cameras of one resolution are tried. A pair that shares hardly any features gains none.
     """
     found = list(streams)
     for i, j in combinations(range(len(cameras)), 2):
@@ -65,18 +66,18 @@ def _with_features_of(
     row, image = (np.concatenate([getattr(p, name) for p in parts]) for name in ("row", "image"))
     uv, tried = np.concatenate([p.uv for p in parts]), sum(p.tried for p in parts)
     good = _consistent(streams[0].uv[row], uv, cameras[0].resolution)
-    if good.sum() < max(FEWEST_MATCHES, LEAST_SHARE * tried):
+    if good.sum() < max(FEWEST_MATCHES, LEAST_SHARED_FEATURES * tried):
         return into
     return _inserted(into, image[good], streams[0].feature[row[good]], uv[good], streams[0], row[good])
 
 
 def _pairs(first: TrackStream, second: TrackStream) -> list[tuple[int, int]]:
-    """Images of both cameras that are near in time, one pair each EVERY_S."""
+    """Images of both cameras that are near in time, one pair each MATCHED_EVERY_S."""
     at = first.stamps_ns
     j = np.clip(np.searchsorted(second.stamps_ns, at), 1, max(len(second.stamps_ns) - 1, 1))
     j = np.where(np.abs(second.stamps_ns[j - 1] - at) <= np.abs(second.stamps_ns[j] - at), j - 1, j)
-    near = np.abs(second.stamps_ns[j] - at) <= APART_S * 1e9
-    slot = np.floor((at - at[0]) * 1e-9 / EVERY_S).astype(np.int64)
+    near = np.abs(second.stamps_ns[j] - at) <= MOST_APART_S * 1e9
+    slot = np.floor((at - at[0]) * 1e-9 / MATCHED_EVERY_S).astype(np.int64)
     chosen = np.flatnonzero(near)
     chosen = chosen[np.unique(slot[chosen], return_index=True)[1]]
     chosen = chosen[np.unique(j[chosen], return_index=True)[1]]  # a feature is in an image once
@@ -119,8 +120,12 @@ def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matc
     even, smooth = zip(prepared(first), prepared(second), strict=True)
     before = stream.uv[rows].astype(np.float32)
     size = (WINDOW_PX, WINDOW_PX)
-    after, there, _ = cv2.calcOpticalFlowPyrLK(even[0], even[1], before, None, winSize=size, maxLevel=MAX_LEVEL)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(even[1], even[0], after, None, winSize=size, maxLevel=MAX_LEVEL)
+    after, there, _ = cv2.calcOpticalFlowPyrLK(
+        even[0], even[1], before, None, winSize=size, maxLevel=STEREO_PYRAMID_LEVEL
+    )
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(
+        even[1], even[0], after, None, winSize=size, maxLevel=STEREO_PYRAMID_LEVEL
+    )
     good = (there.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
     whole = np.rint(stream.uv[rows])
     templates, textured = cut_templates(smooth[0], whole)
@@ -134,11 +139,11 @@ def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matc
 
 def _consistent(p: np.ndarray, q: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
     """(n,) bool: matches that fit the one epipolar geometry of the pair of cameras."""
-    if len(p) < FEWEST:
+    if len(p) < FEWEST_MATCHED_POINTS:
         return np.zeros(len(p), dtype=bool)
     (x, half_px), (y, _) = from_centre(p, resolution), from_centre(q, resolution)
     wrong, sigma_px = misfits(x, y, best_lambda([(x, y)]), half_px, 0)
-    return ~wrong & (sigma_px <= MOST_SIGMA_PX)
+    return ~wrong & (sigma_px <= MOST_EPIPOLAR_SIGMA_PX)
 
 
 def _inserted(

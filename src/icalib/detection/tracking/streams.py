@@ -1,4 +1,4 @@
-"""From a recording's images to feature tracks: decoded and followed on all cores, and kept for the next run.
+"""From a recording's images to feature tracks: decoded and tracked on all cores, and kept for the next run.
 
 Images are tracked in segments, each on one core; tracks end where a segment ends. Segments depend on the recording
 only, so that the tracks do not depend on the number of cores.
@@ -31,12 +31,12 @@ from icalib.detection.tracking.tracker import Tracker
 from icalib.errors import RecordingError
 from icalib.rig import Camera
 
-VERSION = 3  # of the tracker: whatever changes tracks changes this
-SEGMENT, SEGMENT_BYTES = 120, 128 << 20  # images that are tracked in one go; of larger ones none wait in memory
+TRACKER_VERSION = 3  # of the tracker: whatever changes tracks changes this
+SEGMENT_IMAGES, SEGMENT_BYTES = 120, 128 << 20  # images that are tracked in one go; of larger ones none wait in memory
 LEAST_APART_NS = 35_000_000  # between images with observations; those between serve to track, and add little
 FEWEST_VIEWS = 3  # of a track; two images of one point are met by almost any pose
-FEWEST_POINTS = 12  # in an image, below which it says little of the camera's motion
-NOTED = 0.05  # of the tracks; fewer that are left out are not worth a note
+FEWEST_IN_IMAGE = 12  # in an image, below which it says little of the camera's motion
+NOTED = 0.05  # of the tracks; fewer that are left out get no note
 _COLUMNS = ("stamps_ns", "start", "feature", "uv", "views", "spread", "damaged_ns")
 _COUNTS = ("moving", "in_place")
 
@@ -80,7 +80,7 @@ def find_tracks(
     """Feature tracks of all images of `camera`, numbered from 0, and sentences on what was left out.
 
     With `keep`, what an earlier run found is used, and what is found is kept. Raises RecordingError, one sentence,
-    where there are no images of the camera, they are not of its resolution, cannot be read, or show nothing to follow.
+    where there are no images of the camera, they are not of its resolution, cannot be read, or show nothing to track.
     """
     topic, where = recording.image_topic(camera), recording.where(camera)
     files: dict[int, str] = {}
@@ -88,7 +88,7 @@ def find_tracks(
     def read() -> Iterator[Payload]:
         return recording_names(with_resolution(recording.payloads(topic), camera, where), files)
 
-    key = stream_key(read(), f"tracks {VERSION}") if keep else ""
+    key = stream_key(read(), f"tracks {TRACKER_VERSION}") if keep else ""
     kept = load_kept(key, (*_COLUMNS, *_COUNTS)) if keep else None
     if kept is not None:
         stamps_ns, start, feature, uv, views, spread, damaged_ns = (kept[name] for name in _COLUMNS)
@@ -111,8 +111,8 @@ def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
     if first is None:
         return _joined(parts)
     payloads = chain([first], payloads)
-    if len(first.data) * SEGMENT <= SEGMENT_BYTES:
-        segments = on_all_cores(batches_of(payloads, SEGMENT, SEGMENT_BYTES), _track_segment)
+    if len(first.data) * SEGMENT_IMAGES <= SEGMENT_BYTES:
+        segments = on_all_cores(batches_of(payloads, SEGMENT_IMAGES, SEGMENT_BYTES), _track_segment)
     else:
         segments = _as_they_are_read(payloads)
     for part in segments:
@@ -124,7 +124,7 @@ def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
 def _as_they_are_read(payloads: Iterator[Payload]) -> Iterator[_Found]:
     """Segments of images that are too large to wait in memory, on one core."""
     for first in payloads:
-        yield _track_segment(chain([first], islice(payloads, SEGMENT - 1)))
+        yield _track_segment(chain([first], islice(payloads, SEGMENT_IMAGES - 1)))
 
 
 def _track_segment(payloads: Iterable[Payload]) -> _Found:
@@ -192,12 +192,12 @@ def _joined(parts: Sequence[_Found]) -> _Found:
 
 
 def _stream(name: str, found: _Found, where: str) -> TrackStream:
-    """Images without any observation are left out. Raises RecordingError where hardly anything was followed."""
+    """Images without any observation are left out. Raises RecordingError where hardly anything was tracked."""
     count = np.diff(found.start)
-    enough = int((count >= FEWEST_POINTS).sum())
+    enough = int((count >= FEWEST_IN_IMAGE).sum())
     if 2 * enough < len(count):
         raise RecordingError(
-            f"{where}: only {enough} of {len(count)} images have {FEWEST_POINTS} tracked points or more; "
+            f"{where}: only {enough} of {len(count)} images have {FEWEST_IN_IMAGE} tracked points or more; "
             f"record with texture and light, or let {name} see a target."
         )
     kept = count > 0

@@ -14,17 +14,17 @@ import numpy as np
 from icalib.base.extras import load_cv2
 from icalib.detection.tracking.patches import RADIUS, Templates, align, cut_templates, no_templates
 
-CELLS = 100  # of an image; each begins one track at a time
+TRACKED_CELLS = 100  # of an image; each begins one track at a time
 MOST_VIEWS = 30  # of a track; later views differ too much from the first, and long tracks cost the estimator time
-WINDOW_PX, MAX_LEVEL = 21, 3  # of Lucas-Kanade: motions of up to 80 px between images
+WINDOW_PX, PYRAMID_LEVEL = 21, 3  # of Lucas-Kanade: motions of up to 80 px between images
 LK_ENDS = 10, 0.05  # steps, and px of the last: the alignment that follows is finer
-CLIP, TILES = 3.0, (8, 8)  # of the equalisation (CLAHE)
+CLAHE_CLIP, TILES = 3.0, (8, 8)  # of the equalisation (CLAHE)
 BLUR_PX = 0.8  # before alignment: grey levels between pixels are then linear enough
 BACK_PX = 0.7  # forward and backward must meet
 ALIGNED_PX = 2.0  # of Lucas-Kanade's place: alignment goes no further
 MIN_NCC = 0.8  # correlation with the first view
 LEAST_QUALITY = 5e-4  # smallest eigenvalue of a corner (OpenCV's, grey levels of 0 to 1)
-NEAR_PX = 3  # of a corner found at half the resolution
+REFINED_WITHIN_PX = 3  # of a corner found at half the resolution
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def prepared(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The image (h, w) uint8 with its contrast equalised by regions, uint8, for Lucas-Kanade and new corners; and
     smoothed, float32, for alignment."""
     cv2 = load_cv2()
-    even = cv2.createCLAHE(CLIP, TILES).apply(image)
+    even = cv2.createCLAHE(CLAHE_CLIP, TILES).apply(image)
     return even, cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
 
 
@@ -86,11 +86,11 @@ class Tracker:
         self._next_id = 0
 
     def pass_over(self, image: np.ndarray) -> None:
-        """Leads the tracks through the next image (h, w) uint8, which counts as no view of them."""
+        """Tracks through the next image (h, w) uint8, which counts as no view of the features."""
         self._advance(image)
 
     def add(self, image: np.ndarray) -> Observations:
-        """What the next image (h, w) uint8 shows."""
+        """Tracks through the next image (h, w) uint8, and returns the observations in it."""
         even, smooth = self._advance(image)
         self._alive = self._alive.some(self._alive.views < _most_views(self._alive.feature))
         self._add_features(even, smooth)
@@ -118,7 +118,7 @@ class Tracker:
             before,
             before + self._predicted(),
             winSize=size,
-            maxLevel=MAX_LEVEL,
+            maxLevel=PYRAMID_LEVEL,
             criteria=end,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
@@ -160,13 +160,13 @@ class Tracker:
         cv2 = self._cv2
         half = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         (h, w), at = half.shape, np.rint(0.5 * self._alive.uv).astype(int)
-        side = int(np.ceil(np.sqrt(h * w / CELLS)))
+        side = int(np.ceil(np.sqrt(h * w / TRACKED_CELLS)))
         rows, cols = -(-h // side), -(-w // side)
         free = np.ones((rows, cols), dtype=bool)
         free[np.clip(at[:, 1] // side, 0, rows - 1), np.clip(at[:, 0] // side, 0, cols - 1)] = False
         quality = np.zeros((rows * side, cols * side), np.float32)
         quality[:h, :w] = cv2.cornerMinEigenVal(half, 3, ksize=3)
-        edge = (RADIUS + NEAR_PX) // 2 + 2
+        edge = (RADIUS + REFINED_WITHIN_PX) // 2 + 2
         for rim in (quality[:edge], quality[h - edge :], quality[:, :edge], quality[:, w - edge :]):
             rim[:] = 0.0
         for x, y in at.tolist():
@@ -179,11 +179,13 @@ class Tracker:
         return np.array([self._strongest_near(even, x, y) for x, y in found.tolist()]).reshape(-1, 2)
 
     def _strongest_near(self, even: np.ndarray, x: int, y: int) -> tuple[int, int]:
-        """The strongest corner NEAR_PX around a pixel that lies RADIUS inside."""
+        """The strongest corner REFINED_WITHIN_PX around a pixel that lies RADIUS inside."""
         part = even[y - RADIUS : y + RADIUS + 1, x - RADIUS : x + RADIUS + 1]
-        inner = slice(RADIUS - NEAR_PX, RADIUS + NEAR_PX + 1)
-        dy, dx = np.divmod(self._cv2.cornerMinEigenVal(part, 5, ksize=3)[inner, inner].argmax(), 2 * NEAR_PX + 1)
-        return x + int(dx) - NEAR_PX, y + int(dy) - NEAR_PX
+        inner = slice(RADIUS - REFINED_WITHIN_PX, RADIUS + REFINED_WITHIN_PX + 1)
+        dy, dx = np.divmod(
+            self._cv2.cornerMinEigenVal(part, 5, ksize=3)[inner, inner].argmax(), 2 * REFINED_WITHIN_PX + 1
+        )
+        return x + int(dx) - REFINED_WITHIN_PX, y + int(dy) - REFINED_WITHIN_PX
 
 
 def _most_views(feature: np.ndarray) -> np.ndarray:
