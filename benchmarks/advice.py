@@ -62,7 +62,7 @@ def noise(times: float) -> Callable[[int], Case]:
     def make(seed: int) -> Case:
         simulation, rig, m = camera_rig(seed)
         assert rig.imu is not None
-        return simulation, replace(rig, imu=replace(rig.imu, noise=rig.imu.noise.scaled(times))), m
+        return simulation, rig.with_(imu=replace(rig.imu, noise=rig.imu.noise.scaled(times))), m
 
     return make
 
@@ -127,7 +127,7 @@ def stated(mode: str, off_m: float, sigma: float | None = None) -> Callable[[int
         simulation, rig, m = camera_rig(seed)
         value = simulation.truth.T_imu_cam["cam0"][:3, 3] + [off_m, 0.0, 0.0]
         given = Parameter(mode, value, None if sigma is None else np.full(3, sigma))  # pyright: ignore[reportArgumentType]
-        return simulation, replace(rig, cameras=(replace(rig.cameras[0], translation=given), *rig.cameras[1:])), m
+        return simulation, rig.with_(cameras=(replace(rig.cameras[0], translation=given), *rig.cameras[1:])), m
 
     return make
 
@@ -143,7 +143,7 @@ def swapped(seed: int) -> Case:
 def corner_noise(seed: int) -> Case:
     """Stated as a third of what it is."""
     simulation, rig, m = camera_rig(seed)
-    return simulation, replace(rig, cameras=tuple(replace(c, corner_noise_px=0.07) for c in rig.cameras)), m
+    return simulation, rig.with_(cameras=tuple(replace(c, corner_noise_px=0.07) for c in rig.cameras)), m
 
 
 def robot(**stated_noise: float) -> Callable[[int], Case]:
@@ -165,7 +165,7 @@ def robot(**stated_noise: float) -> Callable[[int], Case]:
         wheels = tuple(replace(w, **{k: v * getattr(w, k) for k, v in own.items()}) for w in rig.wheels)
         by = stated_noise.get("range_noise_m", 1.0)
         lidars = tuple(replace(x, range_noise_m=by * (x.range_noise_m or 0.0)) for x in rig.lidars)
-        return simulation, replace(rig, wheels=wheels, lidars=lidars), simulation.measurements
+        return simulation, rig.with_(wheels=wheels, lidars=lidars), simulation.measurements
 
     return make
 
@@ -202,7 +202,7 @@ def densities(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
     _, rig, m = case
     assert rig.imu is not None
     found = {name: float(value) for name, value in re.findall(r"(\w+): ([\d.e-]+)", match[1])}
-    return replace(rig, imu=replace(rig.imu, noise=replace(rig.imu.noise, **found))), m
+    return rig.with_(imu=replace(rig.imu, noise=replace(rig.imu.noise, **found))), m
 
 
 def part(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
@@ -235,7 +235,7 @@ def freed(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
     name, sensor = match[1].replace(" ", "_"), match[2]
     _, rig, m = case
     cameras = tuple(replace(c, **{name: Parameter()}) if c.name == sensor else c for c in rig.cameras)
-    return replace(rig, cameras=cameras), m
+    return rig.with_(cameras=cameras), m
 
 
 def topics(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
@@ -249,12 +249,12 @@ def one_clock(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
 def left_out(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
     _, rig, m = case
     cameras = tuple(replace(c, corner_noise_px=None) for c in rig.cameras)
-    return replace(rig, cameras=cameras, lidars=tuple(replace(x, range_noise_m=None) for x in rig.lidars)), m
+    return rig.with_(cameras=cameras, lidars=tuple(replace(x, range_noise_m=None) for x in rig.lidars)), m
 
 
 def of_wheels(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
     _, rig, m = case
-    return replace(rig, wheels=tuple(replace(w, **{match[1]: float(match[2])}) for w in rig.wheels)), m
+    return rig.with_(wheels=tuple(replace(w, **{match[1]: float(match[2])}) for w in rig.wheels)), m
 
 
 ADVICE = (

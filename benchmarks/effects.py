@@ -158,8 +158,7 @@ def rig_of(scenario: Scenario, kind: Kind) -> Rig:
     target = replace(rig.target, size_sigma=SIZE_SIGMA) if rig.has_target else rig.target
     prior = Parameter("prior", np.zeros(24), class_imperfections(CLASS).sigma)
     assert rig.imu is not None
-    return replace(
-        rig,
+    return rig.with_(
         imu=replace(rig.imu, intrinsics=prior) if kind.imu else None,
         target=target,
         poses=tuple(replace(p, scale_sigma=PoseSensor.scale_sigma) for p in rig.poses),

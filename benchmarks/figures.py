@@ -66,7 +66,7 @@ def plain(rig: Rig) -> Rig:
         rig.settings, bloom=False, board_shape=False, blur_noise=False, common_error=False, segments=0, loss="huber"
     )
     cameras = tuple(dataclasses.replace(c, corner_noise_px=PLAIN_CORNER_NOISE_PX) for c in rig.cameras)
-    return dataclasses.replace(rig, cameras=cameras, settings=settings)
+    return rig.with_(cameras=cameras, settings=settings)
 
 
 def median_time(run: Callable[[], object], repeats: int) -> float:

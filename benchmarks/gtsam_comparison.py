@@ -69,9 +69,7 @@ def compare(rig: Rig, measurements: Measurements) -> Iterator[tuple[str, float, 
 
 def _like_for_like(rig: Rig) -> Rig:
     cameras = tuple(dataclasses.replace(c, time_offset=fixed([0.0])) for c in rig.cameras)
-    return dataclasses.replace(
-        rig, cameras=cameras, settings=dataclasses.replace(rig.settings, loss="none", outlier_std=0.0)
-    )
+    return rig.with_(cameras=cameras, settings=dataclasses.replace(rig.settings, loss="none", outlier_std=0.0))
 
 
 def excerpt(measurements: Measurements, seconds: float) -> Measurements:

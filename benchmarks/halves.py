@@ -67,7 +67,7 @@ def differences(a: Calibration, b: Calibration) -> tuple[dict[str, float], float
 def with_model(rig: Rig, model: str | None, **settings: bool) -> Rig:
     """The rig with other settings and, where given, another camera model with nothing known of its parameters."""
     cameras = rig.cameras if model is None else tuple(dataclasses.replace(c, model=model) for c in rig.cameras)
-    return dataclasses.replace(rig, cameras=cameras, settings=dataclasses.replace(rig.settings, **settings))
+    return rig.with_(cameras=cameras, settings=dataclasses.replace(rig.settings, **settings))
 
 
 def with_priors(rig: Rig) -> Rig:
@@ -75,7 +75,7 @@ def with_priors(rig: Rig) -> Rig:
     assert rig.imu is not None
     prior = Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(class_of_noise(rig.imu.noise)).sigma)
     target = dataclasses.replace(rig.target, size_sigma=SIZE_SIGMA)
-    return dataclasses.replace(rig, imu=dataclasses.replace(rig.imu, intrinsics=prior), target=target)
+    return rig.with_(imu=dataclasses.replace(rig.imu, intrinsics=prior), target=target)
 
 
 def main() -> None:

@@ -82,8 +82,7 @@ def _rig(scenario: Scenario) -> Rig:
         distortion="start",
         drive="start",
     )
-    return replace(
-        rig,
+    return rig.with_(
         cameras=tuple(replace(c, corner_noise_px=None, track_noise_px=None) for c in rig.cameras),
         lidars=tuple(replace(x, range_noise_m=None) for x in rig.lidars),
         wheels=tuple(replace(w, lateral_slip=1e-4, vertical_slip=1e-4) for w in rig.wheels),

@@ -99,7 +99,7 @@ def rig_of(scenario: Scenario) -> Rig:
     broad = Parameter("prior", np.zeros(24), FREE.sigma)  # what `free` means in a rig file
     imu = broad if scenario.imu_intrinsics.any() else Parameter("fixed")
     rig = rig_for(scenario, settings=Settings(), intrinsics="free", distortion="free", imu_intrinsics=imu)
-    return dataclasses.replace(rig, cameras=tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras))
+    return rig.with_(cameras=tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras))
 
 
 def _path(options: argparse.Namespace, seed: int) -> Path:

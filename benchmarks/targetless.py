@@ -174,7 +174,7 @@ def rig_of(scenario: Scenario, lens: str) -> Rig:
         middle = [0.5 * (side - 1) for side in camera.resolution]
         guess = Parameter("free", np.array([*(GUESSED * f for f in true.intrinsics[:2]), *middle]))
         cameras.append(dataclasses.replace(camera, intrinsics=guess))
-    return dataclasses.replace(rig, cameras=tuple(cameras))
+    return rig.with_(cameras=tuple(cameras))
 
 
 def _path(options: argparse.Namespace, seed: int) -> Path:

@@ -68,7 +68,7 @@ def wrong_noise(seed: int) -> tuple[Rig, Measurements]:
     """Densities a fifth of the true ones."""
     rig, measurements = recorded(handheld(15.0), seed)
     assert rig.imu is not None
-    return replace(rig, imu=replace(rig.imu, noise=rig.imu.noise.scaled(0.2))), measurements
+    return rig.with_(imu=replace(rig.imu, noise=rig.imu.noise.scaled(0.2))), measurements
 
 
 def wrong_tag_size(seed: int) -> tuple[Rig, Measurements]:
@@ -90,7 +90,7 @@ def contradicted_prior(seed: int) -> tuple[Rig, Measurements]:
     cam0, cam1 = rig.cameras
     truth = handheld(15.0).cameras[0].T_imu_cam[:3, 3]
     stated = Parameter("prior", truth + [0.06, 0.0, 0.0], sigma=np.full(3, 0.005))
-    return replace(rig, cameras=(replace(cam0, translation=stated), cam1)), measurements
+    return rig.with_(cameras=(replace(cam0, translation=stated), cam1)), measurements
 
 
 def glitch(seed: int) -> tuple[Rig, Measurements]:
@@ -121,7 +121,7 @@ def few_images(seed: int) -> tuple[Rig, Measurements]:
     """Four images of one camera without an IMU."""
     rig, measurements = recorded(handheld(8.0), seed, lens="free")
     few = thinned(measurements.cameras[0], 40)
-    return replace(rig, imu=None, cameras=rig.cameras[:1]), replace(measurements, imu=None, cameras=(few,))
+    return rig.with_(imu=None, cameras=rig.cameras[:1]), replace(measurements, imu=None, cameras=(few,))
 
 
 def thinned(stream: CornerStream, step: int) -> CornerStream:
@@ -139,7 +139,7 @@ def unsynchronised_stereo(seed: int) -> tuple[Rig, Measurements]:
     )
     rig, measurements = recorded(replace(scenario, cameras=cameras), seed, lens="free")
     cam0, cam1 = measurements.cameras
-    return replace(rig, imu=None), replace(
+    return rig.with_(imu=None), replace(
         measurements, imu=None, cameras=(cam0, replace(cam1, stamps_ns=cam0.stamps_ns[: len(cam1.stamps_ns)]))
     )
 

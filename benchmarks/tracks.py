@@ -58,7 +58,7 @@ def _rig(rig: Rig) -> Rig:
     cameras = [
         replace(c, intrinsics=Parameter("free", c.intrinsics.value * off), track_noise_px=1.0) for c in rig.cameras
     ]
-    return replace(rig, target=NoTarget(), cameras=tuple(cameras))
+    return rig.with_(target=NoTarget(), cameras=tuple(cameras))
 
 
 def _step(found: Estimate) -> None:

@@ -8,14 +8,9 @@ import pytest
 from icalib.data.joining import join, join_corners
 from icalib.data.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
 from icalib.errors import RecordingError
-from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels
+from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels, by_name
 
-RIG = Rig(
-    ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)),
-    (),
-    lidars=(Lidar("lidar0", ""),),
-    wheels=(Wheels("w", ""),),
-)
+RIG = Rig(by_name(ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)), Lidar("lidar0", ""), Wheels("w", "")))
 
 
 def recording(seed: int, origin_s: int, lidar_s: tuple[int, int], wheels_s: tuple[int, int] = (0, 10)) -> Measurements:

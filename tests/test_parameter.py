@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import icalib
 from icalib.errors import RigError
-from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, Wheels
+from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, Wheels, by_name
 from icalib.rig.parameter import Parameter
 
 TURN = Rotation.from_euler("xyz", [10.0, -20.0, 80.0], degrees=True)
@@ -83,9 +83,12 @@ def test_a_value_of_another_size_is_refused_by_the_sensor(make: Callable[[Parame
 
 def test_with_changes_one_thing_and_names_what_there_is():
     rig = Rig(
-        ImuSensor("imu0", "imu0", ImuNoise(1, 1, 1, 1)),
-        (Camera("cam0", "cam0", "eucm", (9, 9)), Camera("cam1", "cam1", "eucm", (9, 9))),
-        lidars=(Lidar("lidar0", "lidar0"),),
+        by_name(
+            ImuSensor("imu0", "imu0", ImuNoise(1, 1, 1, 1)),
+            Camera("cam0", "cam0", "eucm", (9, 9)),
+            Camera("cam1", "cam1", "eucm", (9, 9)),
+            Lidar("lidar0", "lidar0"),
+        )
     )
     kept = icalib.fixed([1.0, 2.0, 3.0, 4.0])
     changed = rig.with_("cam1", intrinsics=kept).with_("settings", loss="cauchy").with_(gravity=9.80665)
@@ -95,6 +98,7 @@ def test_with_changes_one_thing_and_names_what_there_is():
     assert rig.with_("imu0", gyro_unit="deg/s").imu == ImuSensor(
         "imu0", "imu0", ImuNoise(1, 1, 1, 1), gyro_unit="deg/s"
     )
+    assert rig.with_(cameras=(), imu=None).sensors == {"lidar0": rig.lidars[0]}
     with pytest.raises(RigError, match=r"no sensor cam2; the rig has settings, imu0, cam0, cam1, lidar0\."):
         rig.with_("cam2", intrinsics=kept)
     with pytest.raises(RigError, match=r"cam1 has no field intrinsic, did you mean 'intrinsics'; available are "):
@@ -103,3 +107,19 @@ def test_with_changes_one_thing_and_names_what_there_is():
         rig.with_("cam1", intrinsics=[1.0, 2.0, 3.0, 4.0])
     with pytest.raises(RigError, match=r"settings: loss is none, huber, cauchy, not 'cachy'; use one of these\."):
         rig.with_("settings", loss="cachy")
+
+
+def test_sensors_stand_by_kind_and_within_a_kind_as_given():
+    imu, poses = ImuSensor("imu0", "", ImuNoise(1, 1, 1, 1)), PoseSensor("mocap0", "")
+    rear, front, wheels = Lidar("rear", ""), Lidar("front", ""), Wheels("wheel0", "")
+    rig = Rig(by_name(poses, rear, wheels, imu, front))
+    assert list(rig.sensors) == ["imu0", "rear", "front", "wheel0", "mocap0"]
+    assert rig.mounted == (rear, front, wheels, poses) and rig.of(Lidar) == rig.lidars == (rear, front)
+    assert list(rig.only("front", "imu0", gravity=9.8).sensors) == ["imu0", "front"]
+    fewer = rig.without("imu0", "rear", "wheel0", gravity=9.8)
+    assert list(fewer.sensors) == ["front", "mocap0"] and (fewer.gravity, fewer.imu) == (9.8, None)
+    there = icalib.fixed([1.0, 2.0, 3.0])
+    moved = rig.with_sensors(Lidar("rear", "", translation=there), Lidar("roof", ""))
+    assert [x.name for x in moved.lidars] == ["rear", "front", "roof"] and moved.lidars[0].translation is there
+    with pytest.raises(RigError, match="the rig has two sensors called rear; rename one"):
+        by_name(rear, poses, PoseSensor("rear", ""))

@@ -18,7 +18,19 @@ from icalib.estimate.problem.robot import own_entries
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets import Checkerboard
 from icalib.optim.state import make_layout
-from icalib.rig import Camera, ImuSensor, Lidar, Parameter, ParameterSpec, PoseSensor, Rig, Sensor, Settings, Wheels
+from icalib.rig import (
+    Camera,
+    ImuSensor,
+    Lidar,
+    Parameter,
+    ParameterSpec,
+    PoseSensor,
+    Rig,
+    Sensor,
+    Settings,
+    Wheels,
+    by_name,
+)
 from icalib.rig.file import rig_from_dict, rig_to_dict
 from icalib.rig.file.fields import groups_to_plain, parameter_fields, parameters
 from icalib.rig.imu_classes import class_noise
@@ -96,10 +108,7 @@ def test_every_parameter_goes_through_the_rig_file(sensor: Sensor):
     sensor = dataclasses.replace(sensor, **{spec.name: drawn(spec) for spec in stated})
     imu = sensor if isinstance(sensor, ImuSensor) else ImuSensor("imu0", "a.csv", class_noise("consumer"))
     camera = sensor if isinstance(sensor, Camera) else Camera("eye", "a.csv", "eucm", (640, 480))
-    rig = Rig(imu, (camera,), Checkerboard(6, 7, 0.1))
-    kinds: dict[type[Sensor], str] = {Lidar: "lidars", Wheels: "wheels", PoseSensor: "poses"}
-    if type(sensor) in kinds:
-        rig = dataclasses.replace(rig, **{kinds[type(sensor)]: (sensor,)})
+    rig = Rig(by_name(imu, camera), Checkerboard(6, 7, 0.1)).with_sensors(sensor)
     plain = rig_to_dict(rig)
     assert {spec.name for spec in stated} <= set(plain["sensors"][sensor.name])
     again = rig_to_dict(rig_from_dict(plain, "again"))

@@ -13,7 +13,19 @@ from tests.typed import instance, not_none
 
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
-from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, TwoSources, Wheels
+from icalib.rig import (
+    Camera,
+    ImuNoise,
+    ImuSensor,
+    Lidar,
+    Parameter,
+    PoseSensor,
+    Rig,
+    Settings,
+    TwoSources,
+    Wheels,
+    by_name,
+)
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
 from icalib.rig.imu_classes import IMU_CLASSES, INTRINSICS_LABELS, class_imperfections, class_noise
 
@@ -519,12 +531,14 @@ def test_the_page_about_rig_files_is_right(tmp_path):
 
 def test_a_rig_for_arrays_needs_no_paths(tmp_path: Path):
     rig = Rig(
-        ImuSensor("imu0", "", ImuNoise(1e-3, 1e-4, 1e-2, 1e-3)),
-        (Camera("cam0", "", "eucm", (640, 480)),),
+        by_name(
+            ImuSensor("imu0", "", ImuNoise(1e-3, 1e-4, 1e-2, 1e-3)),
+            Camera("cam0", "", "eucm", (640, 480)),
+            Lidar("lidar0", ""),
+            Wheels("wheel0", ""),
+            PoseSensor("mocap0", ""),
+        ),
         AprilGrid(6, 6, 0.088, 0.3),
-        lidars=(Lidar("lidar0", ""),),
-        wheels=(Wheels("wheel0", ""),),
-        poses=(PoseSensor("mocap0", ""),),
     )
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig_to_dict(rig)))
     loaded = load_rig(tmp_path / "rig.yaml")

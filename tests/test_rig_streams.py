@@ -11,7 +11,7 @@ from icalib.data.measurements import ImuStream, LidarStream, Measurements, PoseS
 from icalib.data.same_rig import near, streams_of_rig
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels
+from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels, by_name
 
 STAMPS, NONE = np.arange(3), np.zeros(4, np.int64)
 IMU = ImuStream("imu0", STAMPS, np.zeros((3, 3)), np.zeros((3, 3)))
@@ -23,11 +23,13 @@ def lidar(name: str) -> LidarStream:
 
 
 RIG = Rig(
-    ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)),
-    (),
-    lidars=(Lidar("front", ""), Lidar("rear", "")),
-    wheels=(Wheels("w", ""),),
-    poses=(PoseSensor("mocap", ""),),
+    by_name(
+        ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)),
+        Lidar("front", ""),
+        Lidar("rear", ""),
+        Wheels("w", ""),
+        PoseSensor("mocap", ""),
+    )
 )
 WHOLE = Measurements(
     IMU,
@@ -51,7 +53,7 @@ def test_streams_come_in_the_order_of_the_rig():
     [
         (RIG, {"imu": None}, "drive has no readings of imu0"),
         (RIG, {"imu": replace(IMU, name="imu1")}, "a stream called imu1, but the rig has imu0 of its kind"),
-        (replace(RIG, imu=None, lidars=()), {"lidars": ()}, "a stream called imu0, but the rig has none of its kind"),
+        (RIG.with_(imu=None, lidars=()), {"lidars": ()}, "a stream called imu0, but the rig has none of its kind"),
         (RIG, {"lidars": (lidar("front"),)}, "drive has no data of rear"),
         (RIG, {"wheels": (), "poses": ()}, "drive has no data of w and mocap"),
         (RIG, {"lidars": (lidar("front"), lidar("rear"), lidar("front"))}, "two streams of front"),

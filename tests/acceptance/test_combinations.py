@@ -122,12 +122,12 @@ def rig_and_measurements(
         only = (*only, "intrinsics")
     rig = with_drawn_guess(rig, scenario, SEED, only=only)
     if not sees:
-        rig, m = replace(rig, cameras=(), target=NoTarget()), replace(m, cameras=(), tracks=())
+        rig, m = rig.with_(cameras=(), target=NoTarget()), replace(m, cameras=(), tracks=())
     for name, field in (("lidar", "lidars"), ("wheels", "wheels"), ("pose", "poses")):
         if name not in others:
-            rig, m = replace(rig, **{field: ()}), replace(m, **{field: ()})
+            rig, m = rig.with_(**{field: ()}), replace(m, **{field: ()})
     if not imu:
-        rig, m = in_body(replace(rig, imu=None), simulation), replace(m, imu=None)
+        rig, m = in_body(rig.with_(imu=None), simulation), replace(m, imu=None)
     return rig, m
 
 
@@ -147,7 +147,7 @@ def in_body(rig: Rig, simulation: Simulation) -> Rig:
         return replace(sensor, **{name: Parameter("free", value) for name, value in values})
 
     kinds = ("cameras", "wheels", "poses")
-    return replace(rig, **{kind: tuple(moved(s) for s in getattr(rig, kind)) for kind in kinds})
+    return rig.with_(**{kind: tuple(moved(s) for s in getattr(rig, kind)) for kind in kinds})
 
 
 def body(rig: Rig, simulation: Simulation) -> tuple[np.ndarray, float]:

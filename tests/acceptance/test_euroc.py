@@ -51,7 +51,7 @@ def kalibr_like(rig, whole) -> Calibration:
     """With Kalibr's settings: its noise, its corner noise, its filter, and nothing that it does not model."""
     noise = ImuNoise(gyro=5e-3, gyro_walk=4e-6, accel=1e-2, accel_walk=2e-4)
     cameras = tuple(dataclasses.replace(c, corner_noise_px=1.0) for c in rig.cameras)
-    rig = dataclasses.replace(rig, imu=dataclasses.replace(rig.imu, noise=noise), cameras=cameras)
+    rig = rig.with_(imu=dataclasses.replace(rig.imu, noise=noise), cameras=cameras)
     return calibrate_measurements(
         with_settings(rig, loss="none", outlier_std=2.0, outlier_min_px=0.2, **HONEST_OFF), whole
     )
@@ -183,7 +183,7 @@ def test_a_wrong_guess_of_everything_changes_nothing(rig, whole, unshifted):
         )
         for c in rig.cameras
     )
-    found = calibrate_measurements(with_settings(dataclasses.replace(rig, cameras=cameras), segments=0), whole)
+    found = calibrate_measurements(with_settings(rig.with_(cameras=cameras), segments=0), whole)
     for camera in CAMERAS:
         angle, distance = distances(found.T_imu_sensor(camera), unshifted.T_imu_sensor(camera))
         assert angle < 1e-3

@@ -23,7 +23,7 @@ from icalib.initialize.steps.clocks import align
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
-from icalib.rig import ImuNoise, ImuSensor, Parameter, PoseKind, PoseSensor, Rig
+from icalib.rig import ImuNoise, ImuSensor, Parameter, PoseKind, PoseSensor, Rig, by_name
 
 ALIASED = ImuNoise(3e-3, 2.2e-5, 0.1, 8.6e-4, source="tests")
 FIRST_ROW = {"hkumars": 0, "kangminsu1": 75}  # of the poses, that belongs to the first stamp
@@ -79,7 +79,7 @@ def degrees(R: np.ndarray, S: np.ndarray) -> float:
 
 def calibrated(measured: Measurements, kind: PoseKind) -> Calibration:
     imu, lidar = ImuSensor("imu0", "imu0", ALIASED, Parameter("fixed")), PoseSensor("lidar0", "lidar0", kind)
-    return calibrate_measurements(Rig(imu, (), poses=(lidar,)), measured)
+    return calibrate_measurements(Rig(by_name(imu, lidar)), measured)
 
 
 @pytest.fixture(scope="module")

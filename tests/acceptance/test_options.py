@@ -82,14 +82,14 @@ def test_setting(base, short, reference, name):
 
 @pytest.mark.parametrize("camera", [0, 1])
 def test_one_camera(base, short, reference, camera):
-    rig = dataclasses.replace(base, cameras=base.cameras[camera : camera + 1])
+    rig = base.with_(cameras=base.cameras[camera : camera + 1])
     measurements = dataclasses.replace(short, cameras=short.cameras[camera : camera + 1])
     is_near(calibrate_measurements(rig, measurements), reference, (f"cam{camera}",))
 
 
 def test_imu_intrinsics(base, short, reference):
     intrinsics = Parameter("prior", np.zeros(24), np.repeat([1e-3, 1e-3, 1e-3, 1e-4], [6, 6, 3, 9]))
-    rig = dataclasses.replace(base, imu=dataclasses.replace(base.imu, intrinsics=intrinsics))
+    rig = base.with_(imu=dataclasses.replace(base.imu, intrinsics=intrinsics))
     found = calibrate_measurements(rig, short)
     is_near(found, reference)
     assert 0.0 < np.abs(found.group("imu0", "intrinsics").value).max() < 0.05
@@ -98,7 +98,7 @@ def test_imu_intrinsics(base, short, reference):
 def with_each(rig: Rig, name: str, parameter: Callable[[str], Parameter]) -> Rig:
     """The group `name` of each camera as `parameter` of the camera's name."""
     cameras = tuple(dataclasses.replace(c, **{name: parameter(c.name)}) for c in rig.cameras)
-    return dataclasses.replace(rig, cameras=cameras)
+    return rig.with_(cameras=cameras)
 
 
 @pytest.mark.parametrize("name", GROUPS)
@@ -184,7 +184,7 @@ def test_what_the_data_do_not_know_of_the_imu_stays_as_its_class_says(rig, excer
     noise."""
     sigma = class_imperfections("industrial").sigma
     imu = dataclasses.replace(rig.imu, intrinsics=Parameter("prior", np.zeros(24), sigma))
-    found = calibrate_measurements(dataclasses.replace(rig, imu=imu), excerpt)
+    found = calibrate_measurements(rig.with_(imu=imu), excerpt)
     group = found.group("imu0", "intrinsics")
     assert not_none(group.factor).min() > 3.0
     assert (group.std < 1.3 * sigma).all() and np.abs(group.value / group.std).max() < 4.0

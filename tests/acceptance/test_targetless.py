@@ -39,7 +39,7 @@ def recorded(tmp_path_factory):
     camera = replace(
         rig.cameras[0], tracks="images", corner_noise_px=None, track_noise_px=None, intrinsics=free, distortion=free
     )
-    return replace(rig, cameras=(camera,), settings=Settings()), path, filmed.truth
+    return rig.with_(cameras=(camera,), settings=Settings()), path, filmed.truth
 
 
 def test_a_camera_is_calibrated_from_raw_images_of_a_room(recorded, tmp_path, monkeypatch):

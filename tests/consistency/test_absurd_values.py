@@ -45,7 +45,7 @@ def measured(scenario: Scenario, imu: bool) -> tuple[Rig, Measurements, Rig]:
 
 def with_value(rig: Rig, name: str, value: np.ndarray, sigma: float | None = None) -> Rig:
     own = Parameter("fixed", value) if sigma is None else Parameter("prior", value, np.full(value.shape, sigma))
-    return replace(rig, wheels=(replace(rig.wheels[0], **{name: own}),))
+    return rig.with_(wheels=(replace(rig.wheels[0], **{name: own}),))
 
 
 def drive(robot, kind: str) -> tuple[Scenario, bool]:

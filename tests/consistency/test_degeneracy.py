@@ -47,7 +47,7 @@ def guessed(simulation: Simulation, seed: int, mode: str) -> Rig:
                 time_offset=parameter(np.array([offset + OFFSET_S * rng.normal()]), OFFSET_S),
             )
         )
-    return dataclasses.replace(rig, cameras=tuple(cameras))
+    return rig.with_(cameras=tuple(cameras))
 
 
 def errors_in_sigma(result: Calibration, simulation: Simulation) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:

@@ -34,7 +34,7 @@ def stills(count: int, seed: int, shared_px: float) -> Calibration:
     uv = whole.uv[rows] + np.einsum("nk,nkj->nj", field, sizes)
     rig = rig_for(simulation.scenario, intrinsics="start", distortion="start")
     own = dataclasses.replace(rig.cameras[0], corner_noise_px=None)
-    rig = dataclasses.replace(rig, imu=None, cameras=(own,), settings=dataclasses.replace(rig.settings, segments=8))
+    rig = rig.with_(imu=None, cameras=(own,), settings=dataclasses.replace(rig.settings, segments=8))
     stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
     return calibrate_measurements(rig, Measurements(None, (stream,)))
 

@@ -23,7 +23,7 @@ TAPE_M = 3e-3
 def standing(scenario: Scenario, seed: int, ground: Ground) -> Rig:
     """Guesses 5 deg and 5 cm off."""
     rig = with_drawn_guess(rig_for(scenario), scenario, seed, only=MOUNTS)
-    return replace(rig, wheels=tuple(replace(w, ground=ground) for w in rig.wheels))
+    return rig.with_(wheels=tuple(replace(w, ground=ground) for w in rig.wheels))
 
 
 def check_known(result: Calibration, simulation: Simulation) -> None:
@@ -57,7 +57,7 @@ def test_a_flat_floor_that_the_lidar_sees(robot):
 
     (lidar,), mean = rig.lidars, simulation.truth.T_imu_lidar["lidar0"][:3, 3] + [0.1, 0.1, TAPE_M]
     tape = Parameter("prior", mean, np.array([1.0, 1.0, TAPE_M]))
-    rig = replace(rig, lidars=(replace(lidar, translation=tape),))
+    rig = rig.with_(lidars=(replace(lidar, translation=tape),))
     result = calibrate_measurements(rig, simulation.measurements)
     check_known(result, simulation)
     lower = result.group("wheel0", "translation")
@@ -69,7 +69,7 @@ def test_a_known_height_of_the_lidar_leaves_the_sigma_of_the_floors_height(robot
     scenario = robot("planar", 12.0, "lw")
     simulation, rig = simulate(scenario, 0), standing(scenario, 0, FLOOR)
     (lidar,), there = rig.lidars, simulation.truth.T_imu_lidar["lidar0"][:3, 3]
-    rig = replace(rig, lidars=(replace(lidar, translation=Parameter("fixed", there)),))
+    rig = rig.with_(lidars=(replace(lidar, translation=Parameter("fixed", there)),))
     result = calibrate_measurements(rig, simulation.measurements)
     check_known(result, simulation)
     lower = result.group("wheel0", "translation")

@@ -27,7 +27,7 @@ def simulation() -> Simulation:
 def guessed(rig: Rig, **values: np.ndarray) -> Rig:
     """The rig with guesses of its first camera."""
     own = {name: Parameter("free", np.asarray(value, dtype=np.float64)) for name, value in values.items()}
-    return replace(rig, cameras=(replace(rig.cameras[0], **own), *rig.cameras[1:]))
+    return rig.with_(cameras=(replace(rig.cameras[0], **own), *rig.cameras[1:]))
 
 
 def true_camera(simulation: Simulation) -> Camera:
@@ -118,9 +118,7 @@ def test_a_fixed_value_with_which_nothing_fits_is_named(simulation, name, words)
     rig = rig_for(simulation.scenario)
     camera = replace(rig.cameras[0], **{name: Parameter("fixed", wrong)})
     try:
-        said = calibrate_measurements(replace(rig, cameras=(camera, *rig.cameras[1:])), simulation.measurements).wrong[
-            0
-        ]
+        said = calibrate_measurements(rig.with_(cameras=(camera, *rig.cameras[1:])), simulation.measurements).wrong[0]
     except CalibrationError as error:
         said = str(error)
     assert re.search(f"the fixed value of {words}", said), said

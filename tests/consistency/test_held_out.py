@@ -27,7 +27,7 @@ def run(
 ) -> Calibration:
     """With intrinsics found too; `camera`: changes of the cameras in the rig file."""
     rig = rig_for(scenario, settings=PLAIN, intrinsics="start", distortion="start")
-    rig = replace(rig, cameras=tuple(replace(c, **camera) for c in rig.cameras))
+    rig = rig.with_(cameras=tuple(replace(c, **camera) for c in rig.cameras))
     return calibrate_measurements(rig, changed(simulate(scenario, seed).measurements))
 
 
@@ -153,7 +153,7 @@ def test_with_all_that_is_on_by_default_and_noise_alone():
     """The robust loss and noise found from residuals leave it near 1."""
     scenario = handheld(12.0)
     rig: Rig = replace(rig_for(scenario, intrinsics="start", distortion="start"), settings=Settings())
-    rig = replace(rig, cameras=tuple(_unstated(c) for c in rig.cameras))
+    rig = rig.with_(cameras=tuple(_unstated(c) for c in rig.cameras))
     found = [held(calibrate_measurements(rig, simulate(scenario, seed).measurements)) for seed in range(20)]
     excess, expected = (sum(getattr(h, name) for h in found) for name in ("excess", "expected"))
     assert excess == pytest.approx(expected, rel=0.2)

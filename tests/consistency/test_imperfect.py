@@ -58,7 +58,7 @@ def test_a_baseline_carries_the_uncertainty_of_the_target():
     measured = replace(simulate(scenario, 1).measurements, imu=None)
     sizes = {}
     for sigma in (0.0, 0.002):
-        rig = replace(rig_for(scenario), imu=None, target=replace(scenario.target, size_sigma=sigma))
+        rig = rig_for(scenario).with_(imu=None, target=replace(scenario.target, size_sigma=sigma))
         found = calibrate_measurements(rig, measured)
         group = found.group("cam1", "translation")
         along = group.value / np.linalg.norm(group.value)
@@ -73,8 +73,7 @@ def test_size_and_scale_are_found_where_an_ideal_imu_shows_them():
     scenario = replace(handheld(6.0, noiseless=True), target_size=1.02, poses=poses, robot_noise_enabled=False)
     scenario = replace(scenario, cameras=tuple(replace(c, rate_hz=10.0) for c in scenario.cameras[:1]))
     rig = rig_for(scenario)
-    rig = replace(
-        rig,
+    rig = rig.with_(
         target=replace(scenario.target, size_sigma=0.1),
         poses=tuple(replace(p, scale_sigma=0.1) for p in rig.poses),
     )

@@ -39,7 +39,7 @@ def stills(
     uv[wrong] += size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     start = np.concatenate([[0], np.cumsum(np.diff(whole.start)[kept])])
     stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
-    rig = dataclasses.replace(rig, imu=None, cameras=(own,), settings=settings)
+    rig = rig.with_(imu=None, cameras=(own,), settings=settings)
     return rig, Measurements(None, (stream,)), wrong
 
 
@@ -57,7 +57,7 @@ def test_where_the_model_does_not_follow_the_lens_another_is_named():
     assert (size > 1.0).sum() > 400  # five times the noise and more, and yet:
     assert residuals.rejected.sum() <= 5
     # The model that is named leaves the noise, and then there is nothing to say.
-    named = dataclasses.replace(rig, cameras=(dataclasses.replace(rig.cameras[0], model="eucm"),))
+    named = rig.with_(cameras=(dataclasses.replace(rig.cameras[0], model="eucm"),))
     better = calibrate_measurements(named, measurements)
     assert not pattern_of(better)
     assert better.fits[-1].rms == pytest.approx(0.2, rel=0.05)

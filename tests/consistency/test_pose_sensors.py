@@ -55,7 +55,7 @@ def errors(result, truth, name):
 
 def without_noise(rig):
     """Noise to be found from the residuals."""
-    return replace(rig, poses=tuple(replace(p, rotation_noise=None, position_noise=None) for p in rig.poses))
+    return rig.with_(poses=tuple(replace(p, rotation_noise=None, position_noise=None) for p in rig.poses))
 
 
 @pytest.mark.parametrize("kind", ["absolute", "relative"])
@@ -115,7 +115,7 @@ def test_poses_that_alternate_or_drift_are_named():
         sim = simulate(scenario, 2)
         rig = without_noise(rig_for(scenario))
         other = {"absolute": "relative", "relative": "absolute"}[kind]
-        rig = replace(rig, poses=(replace(rig.poses[0], kind=other),))
+        rig = rig.with_(poses=(replace(rig.poses[0], kind=other),))
         result = calibrate_measurements(rig, sim.measurements)
         assert any(words in w and f"kind: {kind}" in w for w in result.warnings), (kind, result.warnings)
 

@@ -107,7 +107,7 @@ def real_corners() -> tuple[Scenario, Rig]:
     rig = rig_for(scenario)
     unknown = tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras)
     settings = dataclasses.replace(rig.settings, bloom=True, board_shape=True, blur_noise=True)
-    return scenario, dataclasses.replace(rig, cameras=unknown, settings=settings)
+    return scenario, rig.with_(cameras=unknown, settings=settings)
 
 
 def test_bloom_bow_and_blur_are_recovered():
@@ -136,9 +136,7 @@ def test_imu_intrinsics_of_one_percent_are_recovered():
     scenario = dataclasses.replace(handheld(30.0), imu_intrinsics=intrinsics)
     simulation = simulate(scenario, 1)
     rig = rig_for(scenario)
-    rig = dataclasses.replace(
-        rig, imu=dataclasses.replace(not_none(rig.imu), intrinsics=Parameter("prior", np.zeros(24), FREE.sigma))
-    )
+    rig = rig.with_(imu=dataclasses.replace(not_none(rig.imu), intrinsics=Parameter("prior", np.zeros(24), FREE.sigma)))
     result = calibrate_measurements(rig, simulation.measurements)
     found = result.group("imu0", "intrinsics")
     assert np.abs((found.value - intrinsics) / found.std_formal).max() < 4.0

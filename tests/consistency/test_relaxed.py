@@ -23,7 +23,7 @@ def estimated():
     simulation, rig = simulate(made, 3), rig_for(made)
     p = simulation.truth.T_imu_cam["cam0"][:3, 3]
     own = replace(rig.cameras[0], translation=Parameter("prior", p + 1e-3, np.full(3, 1e-3)))
-    inputs, state, guess = start(replace(rig, cameras=(own, *rig.cameras[1:])), [simulation.measurements])
+    inputs, state, guess = start(rig.with_(cameras=(own, *rig.cameras[1:])), [simulation.measurements])
     return inputs, determine(inputs, state, guess=guess).estimate
 
 

@@ -51,7 +51,7 @@ def rig_from_nothing(scenario: Scenario) -> Rig:
     """As a user would write it: nothing known of the camera but its model and resolution."""
     settings = Settings(cache_corners=False)
     rig = rig_for(scenario, intrinsics="free", distortion="free", settings=settings)
-    return dataclasses.replace(rig, cameras=(dataclasses.replace(rig.cameras[0], corner_noise_px=None),))
+    return rig.with_(cameras=(dataclasses.replace(rig.cameras[0], corner_noise_px=None),))
 
 
 @pytest.fixture(scope="module")

@@ -49,7 +49,7 @@ def open_rig(scenario: Scenario, restarting: str) -> Rig:
         changes = {"rotation": free, "translation": free, "time_offset": free, "clock_restarts": part in restarting}
         if kind == "wheels":
             changes |= {"radii": free, "baseline": free, "lateral_slip": 1e-4, "vertical_slip": 1e-4}
-        rig = replace(rig, **{kind: tuple(replace(s, **changes) for s in getattr(rig, kind))})
+        rig = rig.with_(**{kind: tuple(replace(s, **changes) for s in getattr(rig, kind))})
     return rig
 
 
@@ -111,7 +111,7 @@ def test_a_prior_is_one_of_each(robot):
     simulations = simulate(scenario, 1), simulate(replace(scenario, duration_s=12.0), 2)
     rig = open_rig(scenario, "c")
     prior = Parameter("prior", np.array([0.01]), np.array([1e-7]))
-    held = replace(rig, cameras=tuple(replace(c, time_offset=prior) for c in rig.cameras))
+    held = rig.with_(cameras=tuple(replace(c, time_offset=prior) for c in rig.cameras))
     group = joint(simulations, held).group("cam0", "time_offset")
     assert np.abs(group.value - 0.01).max() < 1e-6
     assert (np.abs(group.std_formal / 1e-7 - 1.0) < 0.01).all()
@@ -170,7 +170,7 @@ def test_cameras_that_follow_points(robot):
     simulations = simulate(scenario, 1), simulate(replace(scenario, cameras=(first, later, third)), 2)
     rig = rig_for(scenario, intrinsics="start", distortion="start")
     cameras = tuple(replace(c, track_noise_px=1.0, clock_restarts=c.name == second.name) for c in rig.cameras)
-    result = joint(simulations, replace(rig, target=NoTarget(), cameras=cameras))
+    result = joint(simulations, rig.with_(target=NoTarget(), cameras=cameras))
     assert result.converged, result.status
     group = result.group(second.name, "time_offset")
     errors = group.value - [s.truth.time_offset[second.name] for s in simulations]
@@ -186,7 +186,7 @@ def test_a_pose_sensor(robot, parts):
     simulations = simulate(scenario, 1), simulate(replace(scenario, duration_s=12.0, poses=(later,)), 2)
     rig, free = rig_for(scenario), Parameter()
     poses = (replace(rig.poses[0], rotation=free, translation=free, time_offset=free, clock_restarts=True),)
-    result = joint(simulations, replace(rig, poses=poses))
+    result = joint(simulations, rig.with_(poses=poses))
     assert result.converged, result.status
     group = result.group("mocap0", "time_offset")
     errors = group.value - [s.truth.time_offset["mocap0"] for s in simulations]

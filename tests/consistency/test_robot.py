@@ -40,7 +40,7 @@ ALL = Case("ramp", 30.0, "clw", 200, DRIVEN)
 
 def steady(rig: Rig) -> Rig:
     """The rig, its wheels as free of slip as simulated ones."""
-    return replace(rig, wheels=tuple(replace(w, lateral_slip=STEADY, vertical_slip=STEADY) for w in rig.wheels))
+    return rig.with_(wheels=tuple(replace(w, lateral_slip=STEADY, vertical_slip=STEADY) for w in rig.wheels))
 
 
 def as_measured(measurements: Measurements) -> Measurements:

@@ -85,7 +85,7 @@ def test_wheels_that_never_turned_while_the_camera_looked(drive):
     late = with_wheels(simulation.measurements, lambda w: replace(w, stamps_ns=w.stamps_ns + np.int64(10**12)))
     rig = guessed(simulation)
     stated = tuple(replace(w, time_offset=replace(w.time_offset, mode="fixed")) for w in rig.wheels)
-    words = refusal(replace(rig, wheels=stated), late)
+    words = refusal(rig.with_(wheels=stated), late)
     assert re.search(r"fixed value of time offset of wheel0.*-999999\.9", words), words
     result = calibrate_measurements(rig, late)
     offset = not_none(true_value(simulation.truth, "wheel0", "time_offset"))[0] - 1000.0

@@ -39,9 +39,9 @@ def group(sensor: Sensor, name: str) -> np.ndarray:
 
 def with_guesses(rig: Rig, kind: str, guesses: dict[str, np.ndarray]) -> Rig:
     """The rig with guesses of its first sensor of a kind."""
-    first, *rest = getattr(rig, kind)
+    first = getattr(rig, kind)[0]
     own = {name: Parameter("free", np.asarray(value, dtype=np.float64)) for name, value in guesses.items()}
-    return replace(rig, **{kind: (replace(first, **own), *rest)})
+    return rig.with_sensors(replace(first, **own))
 
 
 def wrong(sensor: Sensor, what: str) -> dict[str, np.ndarray]:

@@ -45,7 +45,7 @@ def calibrated(
     rig = program.rig_of(wrong, program.Kind(lambda: wrong, imu, (), "fixed"))
     if wheels_known:
         radii = Parameter("fixed", np.array(scenario.wheels[0].radii))
-        rig = replace(rig, wheels=tuple(replace(w, radii=radii) for w in rig.wheels))
+        rig = rig.with_(wheels=tuple(replace(w, radii=radii) for w in rig.wheels))
     measured = simulate(wrong, 1).measurements
     return calibrate_measurements(rig, measured if imu else replace(measured, imu=None))
 

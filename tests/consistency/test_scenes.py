@@ -77,7 +77,7 @@ def test_a_scene_without_an_imu():
     scenario = tag_map(10.0, noiseless=True)
     together = tuple(dataclasses.replace(c, time_offset_s=0.0) for c in scenario.cameras)
     simulation = simulate(dataclasses.replace(scenario, cameras=together), 1)
-    rig = dataclasses.replace(free(simulation.scenario), imu=None)
+    rig = free(simulation.scenario).with_(imu=None)
     result = calibrate_measurements(rig, dataclasses.replace(simulation.measurements, imu=None))
     assert max(scene_errors(result, simulation)) < 1e-7
     T0, T1 = (simulation.truth.T_imu_cam[c] for c in ("cam0", "cam1"))
@@ -153,7 +153,7 @@ def test_a_wrong_lens_is_no_change_of_the_scene():
         return dataclasses.replace(p, value=0.8 * p.value)
 
     cameras = tuple(dataclasses.replace(c, distortion=wrong(c.distortion)) for c in rig.cameras)
-    rig = dataclasses.replace(rig, cameras=cameras)
+    rig = rig.with_(cameras=cameras)
     bodies, recordings = chosen(rig, [first, images(second, 10)])
     check_scene(rig, find_scene(rig, bodies, recordings), recordings)
 

@@ -226,7 +226,7 @@ def test_without_an_imu_recordings_are_more_images():
 
     scenario = still(handheld(8.0))
     simulations = simulate(scenario, 1), simulate(second(scenario), 2)
-    rig = dataclasses.replace(rig_of(simulations[0]), imu=None)
+    rig = rig_of(simulations[0]).with_(imu=None)
     recordings = [dataclasses.replace(s.measurements, imu=None) for s in simulations]
     both, alone = calibrate_measurements(rig, recordings), calibrate_measurements(rig, recordings[:1])
     assert both.converged, both.status
@@ -304,7 +304,7 @@ def test_three_recordings_share_bloom_and_bow():
     rig = rig_of(simulations[0])
     cameras = tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras)
     settings = dataclasses.replace(rig.settings, segments=6, common_error=True)
-    result = joint(tuple(simulations), dataclasses.replace(rig, cameras=cameras, settings=settings))
+    result = joint(tuple(simulations), rig.with_(cameras=cameras, settings=settings))
     assert result.converged, result.status
     shape = result.group("board0", "shape")
     assert np.abs((shape.value[:3] - np.array(bow)) / shape.std_formal[:3]).max() < 4.0

@@ -37,8 +37,8 @@ def stated(rig: Rig, name: str, value: np.ndarray, sigma: float | None = None) -
     size = 3 if name == "rotation" else value.size
     own = Parameter("fixed", value) if sigma is None else Parameter("prior", value, np.full(size, sigma))
     if rig.wheels and hasattr(rig.wheels[0], name):
-        return replace(rig, wheels=(replace(rig.wheels[0], **{name: own}), *rig.wheels[1:]))
-    return replace(rig, cameras=(replace(rig.cameras[0], **{name: own}), *rig.cameras[1:]))
+        return rig.with_(wheels=(replace(rig.wheels[0], **{name: own}), *rig.wheels[1:]))
+    return rig.with_(cameras=(replace(rig.cameras[0], **{name: own}), *rig.cameras[1:]))
 
 
 def truth(simulation: Simulation, name: str) -> np.ndarray:

@@ -56,8 +56,8 @@ def stills(count: int, noisy: bool = True, seed: int = 0, **motion) -> Stills:
         motion=replace(scenario.motion, **motion),
     )
     sim = simulate(scenario, seed)
-    rig = replace(rig_for(scenario), imu=None)
-    rig = replace(rig, poses=(replace(rig.poses[0], rotation_noise=None, position_noise=None),))
+    rig = rig_for(scenario).with_(imu=None)
+    rig = rig.with_(poses=(replace(rig.poses[0], rotation_noise=None, position_noise=None),))
     T = np.linalg.inv(sim.truth.T_imu_cam[camera.name]) @ sim.truth.T_imu_pose["flange"]
     return Stills(rig, replace(sim.measurements, imu=None), T)
 
@@ -209,7 +209,7 @@ def test_several_recordings_each_with_a_board_of_its_own():
 def test_what_is_fixed_stays():
     x = stills(12)
     sensor = replace(x.rig.poses[0], translation=fixed(x.T_cam_flange[:3, 3]))
-    result = calibrate_measurements(replace(x.rig, poses=(sensor,)), x.measurements)
+    result = calibrate_measurements(x.rig.with_(poses=(sensor,)), x.measurements)
     assert set(result.group("flange", "translation").verdict) == {"fixed"}
     turn = error("rotation", result.group("flange", "rotation").value, x.T_cam_flange[:3, :3])
     assert np.abs(turn / result.group("flange", "rotation").std_formal).max() < 4.0
@@ -220,7 +220,7 @@ def test_two_pose_sensors_at_rest(robot):
     poses = (mocap(**same), mocap("slam0", T_OTHER, **same))
     scenario: Scenario = replace(robot("3d", 25.0, ""), poses=poses, motion=Drive("free"), imu_clock_origin_ns=0)
     sim = simulate(scenario, 0)
-    rig = replace(rig_for(scenario), imu=None)
+    rig = rig_for(scenario).with_(imu=None)
     result = calibrate_measurements(rig, replace(sim.measurements, imu=None))
     true = np.linalg.inv(sim.truth.T_imu_pose["mocap0"]) @ sim.truth.T_imu_pose["slam0"]
     e, P = off(result, true, "slam0")

@@ -61,7 +61,7 @@ def test_a_length_that_is_known_shows_the_size_too():
         replace(c, translation=replace(c.translation, mode="fixed", value=simulation.truth.T_imu_cam[c.name][:3, 3]))
         for c in rig.cameras
     )
-    inputs, state, guess = start(replace(rig, cameras=cameras), [simulation.measurements])
+    inputs, state, guess = start(rig.with_(cameras=cameras), [simulation.measurements])
     estimate = determine(inputs, state, guess=guess).estimate
     size = target_size(estimate.problem, estimate.outcome.state)
     assert size is not None
@@ -125,5 +125,5 @@ def test_a_recording_that_does_not_show_it_says_nothing():
         T, offset = simulation.truth.T_imu_cam[c.name], simulation.truth.time_offset[c.name]
         known = {"rotation": Parameter("fixed", T[:3, :3]), "time_offset": Parameter("fixed", np.array([offset]))}
         cameras.append(replace(c, translation=Parameter("free", T[:3, 3]), **known))
-    result = calibrate_measurements(replace(rig, cameras=tuple(cameras)), simulation.measurements)
+    result = calibrate_measurements(rig.with_(cameras=tuple(cameras)), simulation.measurements)
     assert not [s for s in (*result.warnings, *result.notes) if "the target is" in s]

@@ -41,7 +41,7 @@ def rig_of(scenario: Scenario, scale: float = 1.0) -> Rig:
     for camera in rig.cameras:
         guess = camera.intrinsics.value * np.array([scale, scale, 1.0, 1.0])
         cameras.append(replace(camera, intrinsics=Parameter("free", guess), track_noise_px=1.0))
-    return replace(rig, target=NoTarget(), cameras=tuple(cameras))
+    return rig.with_(target=NoTarget(), cameras=tuple(cameras))
 
 
 def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
@@ -98,7 +98,7 @@ def follower(scenario: Scenario, scale: float) -> Rig:
     """`rig_of`, with what users have by default against outliers; noise is found."""
     rig = rig_of(scenario, scale)
     cameras = tuple(replace(c, track_noise_px=None) for c in rig.cameras)
-    return replace(rig, cameras=cameras, settings=replace(rig.settings, loss="huber", outlier_std=4.0))
+    return rig.with_(cameras=cameras, settings=replace(rig.settings, loss="huber", outlier_std=4.0))
 
 
 def lost(measurements: Measurements) -> Measurements:
@@ -118,7 +118,7 @@ def test_outliers_are_set_aside_and_little_else(stated: bool):
     scenario = table2(8.0)
     rig = with_drawn_guess(follower(scenario, 1.0), scenario, 2)
     if stated:
-        rig = replace(rig, cameras=tuple(replace(c, track_noise_px=1.0) for c in rig.cameras))
+        rig = rig.with_(cameras=tuple(replace(c, track_noise_px=1.0) for c in rig.cameras))
     measured = simulate(scenario, 2).measurements
     found = calibrate_measurements(rig, lost(measured))
     assert found.converged

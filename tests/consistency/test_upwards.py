@@ -42,7 +42,7 @@ def test_a_level_frame_tells_swapped_wheels(robot):
         EstimationError, match="left and right wheels are swapped.* signs to .-1, -1. .*level: false for m"
     ):
         calibrate_measurements(rig, swapped(measurements))
-    tilting = replace(rig, poses=(replace(rig.poses[0], level=False),))
+    tilting = rig.with_(poses=(replace(rig.poses[0], level=False),))
     notes, warnings = said(calibrate_measurements(tilting, swapped(measurements)))
     assert notes == [] and len(warnings) == 1
     words = " ".join(warnings)

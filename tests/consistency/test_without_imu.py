@@ -34,7 +34,7 @@ def stereo(noiseless: bool = False, apart_s: float = 0.0) -> Scenario:
 def alone(simulation: Simulation) -> tuple[Rig, Measurements]:
     """Rig and measurements without the IMU, nothing known of the cameras."""
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
-    return dataclasses.replace(rig, imu=None), dataclasses.replace(simulation.measurements, imu=None)
+    return rig.with_(imu=None), dataclasses.replace(simulation.measurements, imu=None)
 
 
 def errors(result: Calibration, simulation: Simulation) -> dict[tuple[str, str], np.ndarray]:
@@ -77,7 +77,7 @@ def test_the_covariance_is_honest():
 def test_one_camera_gives_its_intrinsics():
     simulation = simulate(stereo(), 3)
     rig, measurements = alone(simulation)
-    rig = dataclasses.replace(rig, cameras=rig.cameras[:1])
+    rig = rig.with_(cameras=rig.cameras[:1])
     result = calibrate_measurements(rig, dataclasses.replace(measurements, cameras=measurements.cameras[:1]))
     found = result.group("cam0", "intrinsics")
     assert np.abs((found.value - simulation.truth.intrinsics["cam0"]) / found.std).max() < 4.0
@@ -96,7 +96,7 @@ def test_given_extrinsics_need_no_images_taken_together():
     truth = simulation.truth
     T = np.linalg.inv(truth.T_imu_cam["cam0"]) @ truth.T_imu_cam["cam1"]
     second = dataclasses.replace(rig.cameras[1], rotation=fixed(T[:3, :3]), translation=fixed(T[:3, 3]))
-    result = calibrate_measurements(dataclasses.replace(rig, cameras=(rig.cameras[0], second)), measurements)
+    result = calibrate_measurements(rig.with_(cameras=(rig.cameras[0], second)), measurements)
     assert result.converged, result.status
     np.testing.assert_allclose(result.T_imu_sensor("cam1"), T, atol=1e-12)
 

@@ -28,7 +28,7 @@ def with_noise(simulation: Simulation, times: float) -> Calibration:
     noise = not_none(rig.imu).noise
     names = ("gyro", "gyro_walk", "accel", "accel_walk")
     wrong = replace(noise, **{name: times * getattr(noise, name) for name in names})
-    return calibrate_measurements(replace(rig, imu=replace(not_none(rig.imu), noise=wrong)), simulation.measurements)
+    return calibrate_measurements(rig.with_(imu=replace(not_none(rig.imu), noise=wrong)), simulation.measurements)
 
 
 def said(result: Calibration) -> list[str]:
@@ -50,7 +50,7 @@ def test_corner_noise_that_is_far_too_large_is_no_fault_of_the_imu(simulation, t
     rig = rig_for(simulation.scenario)
     true = zip(rig.cameras, simulation.scenario.cameras, strict=True)
     cameras = tuple(replace(c, corner_noise_px=times * s.corner_noise_px) for c, s in true)
-    result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
+    result = calibrate_measurements(rig.with_(cameras=cameras), simulation.measurements)
     assert said(result) == []
     assert [f"cam0 {1.0 / times:.2g}x and cam1 {1.0 / times:.2g}x" in w for w in result.warnings].count(True) == 1
 
@@ -75,7 +75,7 @@ def test_the_noise_that_is_advised_is_the_true_one(simulation, times):
     for name, value in found.items():
         assert 0.67 < value / getattr(noise, name) < 1.5, (name, value)
     rig = rig_for(simulation.scenario)
-    rig = replace(rig, imu=replace(not_none(rig.imu), noise=replace(noise, **found)))
+    rig = rig.with_(imu=replace(not_none(rig.imu), noise=replace(noise, **found)))
     assert said(calibrate_measurements(rig, simulation.measurements)) == []
 
 
@@ -121,7 +121,7 @@ def test_a_poor_guess_is_not_taken_for_the_other_camera(simulation):
             replace(c, translation=replace(c.translation, value=not_none(c.translation.value) + [0.0, by, 0.0]))
             for c, by in zip(rig.cameras, moved, strict=True)
         )
-        result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
+        result = calibrate_measurements(rig.with_(cameras=cameras), simulation.measurements)
         assert not any("seem to be swapped" in w for w in result.warnings)
 
 
@@ -135,7 +135,7 @@ def test_a_lens_of_another_camera_that_is_fixed(simulation, stated):
         second.distortion, value=not_none(first.distortion.value) * [*off, 1.0, 1.0] * (1.05 if stated else 1.0)
     )
     cameras = (replace(first, distortion=lens, corner_noise_px=first.corner_noise_px if stated else None), second)
-    result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
+    result = calibrate_measurements(rig.with_(cameras=cameras), simulation.measurements)
     assert result.reasons[0].startswith("the fixed value of distortion k1 of cam0"), result.reasons
     assert any("corners of cam0" in words for words in result.reasons[1:]) == stated
     assert not any("the cause is unknown" in words or "noise: {" in words for words in result.reasons)
@@ -149,7 +149,7 @@ def test_corners_that_are_off_with_no_cause_in_sight(simulation):
         moved = replace(first, uv=first.uv + rng.normal(scale=size, size=first.uv.shape))
         cameras = (replace(rig.cameras[0], corner_noise_px=noise), rig.cameras[1])
         measured = replace(simulation.measurements, cameras=(moved, second))
-        result = calibrate_measurements(replace(rig, cameras=cameras), measured)
+        result = calibrate_measurements(rig.with_(cameras=cameras), measured)
         assert words in result.reasons[0] and "the cause is unknown" in result.reasons[0], result.reasons
 
 
@@ -162,7 +162,7 @@ def with_lens(simulation: Simulation, change: list[float], mode: str = "fixed") 
     )
     value = cam0.intrinsics.value + np.array(change)
     cam0 = replace(cam0, intrinsics=replace(cam0.intrinsics, value=value))
-    return calibrate_measurements(replace(rig, cameras=(cam0, cam1)), simulation.measurements)
+    return calibrate_measurements(rig.with_(cameras=(cam0, cam1)), simulation.measurements)
 
 
 def test_the_right_lens_is_no_news(simulation):

@@ -33,7 +33,7 @@ def begun() -> tuple[Inputs, State]:
     scenario = handheld(4.0)
     rig = rig_for(scenario)
     given = Parameter("prior", np.array([0.01]), np.array([0.003]))
-    rig = replace(rig, cameras=(replace(rig.cameras[0], time_offset=given), *rig.cameras[1:]))
+    rig = rig.with_(cameras=(replace(rig.cameras[0], time_offset=given), *rig.cameras[1:]))
     inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
     return inputs, state
 

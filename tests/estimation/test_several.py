@@ -86,7 +86,7 @@ def test_streams_that_outlast_each_other_stay_apart(rig, recordings):
 def test_without_an_imu_given_offsets_keep_recordings_apart(rig, recordings):
     cameras = (rig.cameras[0], dataclasses.replace(rig.cameras[1], time_offset=fixed(np.array([500.0]))))
     alone = [dataclasses.replace(m, imu=None) for m in recordings]
-    joined, parts = join(dataclasses.replace(rig, imu=None, cameras=cameras), alone)
+    joined, parts = join(rig.with_(imu=None, cameras=cameras), alone)
     before = joined.cameras[1].stamps_ns[parts[0].images[1]] + 500 * 10**9
     assert before.max() < joined.cameras[0].stamps_ns[parts[1].images[0]].min()
 

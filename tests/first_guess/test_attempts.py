@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,9 +9,9 @@ import pytest
 from icalib.errors import EstimationError
 from icalib.initialize.attempts import explained
 from icalib.optim.arrowhead import BROKEN_DOWN, NotDefiniteError
-from icalib.rig import Camera, ImuNoise, ImuSensor, PoseSensor, Rig
+from icalib.rig import Camera, ImuNoise, ImuSensor, PoseSensor, Rig, by_name
 
-RELATIVE = Rig(ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)), (), poses=(PoseSensor("odom", "", "relative"),))
+RELATIVE = Rig(by_name(ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)), PoseSensor("odom", "", "relative")))
 BROKEN = NotDefiniteError(BROKEN_DOWN)
 
 
@@ -35,8 +34,8 @@ def test_relative_poses_that_would_work_as_absolute_ones_are_named():
     [
         (RELATIVE, failing, BROKEN),
         (RELATIVE, converging, EstimationError("the motion does not match.")),
-        (replace(RELATIVE, cameras=(Camera("cam0", "", "pinhole-radtan", (640, 480)),)), converging, BROKEN),
-        (replace(RELATIVE, poses=(PoseSensor("odom", ""),)), converging, BROKEN),
+        (RELATIVE.with_(cameras=(Camera("cam0", "", "pinhole-radtan", (640, 480)),)), converging, BROKEN),
+        (RELATIVE.with_(poses=(PoseSensor("odom", ""),)), converging, BROKEN),
     ],
 )
 def test_what_was_not_tried_or_did_not_work_is_not_said(rig, make, failed):

@@ -96,7 +96,7 @@ def test_the_gyroscope_bridges_gaps_of_all_cameras(simulation):
 
 
 def test_a_camera_bridges_gaps_of_the_other(simulation):
-    rig = replace(rig_for(simulation.scenario, intrinsics="free", distortion="free"), imu=None)
+    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free").with_(imu=None)
     for gaps in ((0,), (1,)):
         wrong, truth = shown(simulation, rig, gaps)
         assert not same_but_one_turn(wrong, truth, rig.target)
@@ -118,5 +118,5 @@ def test_a_camera_alone_keeps_its_numbers(simulation):
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
     wrong, _ = shown(simulation, rig, gaps=(0,))
     alone = replace(wrong, imu=None, cameras=wrong.cameras[:1])
-    (found,) = number_alike(replace(rig, imu=None, cameras=rig.cameras[:1]), [alone])
+    (found,) = number_alike(rig.with_(imu=None, cameras=rig.cameras[:1]), [alone])
     assert _as_sets(found.cameras[0]) == _as_sets(alone.cameras[0])

@@ -120,7 +120,7 @@ def test_a_camera_without_a_pose_is_refused_in_a_sentence(simulation: Simulation
     rig = rig_for(simulation.scenario)
     nonsense = np.array([30.0, 200.0, 371.0, 245.0])
     camera = dataclasses.replace(rig.cameras[0], intrinsics=Parameter("fixed", nonsense))
-    rig = dataclasses.replace(rig, imu=None, cameras=(camera,))
+    rig = rig.with_(imu=None, cameras=(camera,))
     m = dataclasses.replace(simulation.measurements, imu=None, cameras=simulation.measurements.cameras[:1])
     with pytest.raises(EstimationError, match="cam0.*in none of its .* images"):
         initial_guess(rig, m)
@@ -167,7 +167,7 @@ def test_what_is_given_of_a_lens_is_held_while_the_rest_is_found(simulation: Sim
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
     held = {c.name: getattr(simulation.truth, given)[c.name] * 1.01 for c in rig.cameras}
     cameras = tuple(dataclasses.replace(c, **{given: Parameter("fixed", held[c.name])}) for c in rig.cameras)
-    guess = initial_guess(dataclasses.replace(rig, cameras=cameras), simulation.measurements)
+    guess = initial_guess(rig.with_(cameras=cameras), simulation.measurements)
     for c in rig.cameras:
         params = guess.cameras[c.name].params
         np.testing.assert_array_equal(params[:4] if given == "intrinsics" else params[4:], held[c.name])
@@ -232,7 +232,7 @@ def test_one_prior_is_enough_to_start_from(simulation: Simulation):
     rig = rig_for(simulation.scenario)
     c = rig.cameras[0]
     given = Parameter("prior", np.array([0.01, 0.02, 0.03]), np.full(3, 0.01))
-    rig = dataclasses.replace(rig, cameras=(dataclasses.replace(c, translation=given), *rig.cameras[1:]))
+    rig = rig.with_(cameras=(dataclasses.replace(c, translation=given), *rig.cameras[1:]))
     guess = initial_guess(rig, simulation.measurements)
     assert np.array_equal(guess.cameras[c.name].position, not_none(given.value))
 
@@ -255,7 +255,7 @@ def test_a_wrong_fixed_offset_is_named(simulation: Simulation):
     rig = rig_for(simulation.scenario)
     c = rig.cameras[0]
     wrong = Parameter("fixed", np.array([simulation.truth.time_offset[c.name] + 3.0]))
-    rig = dataclasses.replace(rig, cameras=(dataclasses.replace(c, time_offset=wrong), *rig.cameras[1:]))
+    rig = rig.with_(cameras=(dataclasses.replace(c, time_offset=wrong), *rig.cameras[1:]))
     assert "time_offset" in failure(rig, simulation.measurements)
 
 

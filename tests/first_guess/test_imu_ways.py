@@ -69,7 +69,7 @@ def test_the_field_is_said_on_top_of_what_the_rig_file_says(run):
     """Of a rig file that swaps two axes already."""
     rig, measurements = run
     wrong = replace(measurements, imu=recorded(measurements.imu, rig, ("x", "-y", "z"), XYZ))
-    rig = replace(rig, imu=replace(rig.imu, gyro_axes=("z", "-y", "x")))
+    rig = rig.with_(imu=replace(rig.imu, gyro_axes=("z", "-y", "x")))
     with pytest.raises(EstimationError, match=r"set gyro_axes: \[z, y, x\] of imu0"):
         initial_guess(rig, wrong)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from icalib.data.measurements import Measurements, PoseStream, WheelStream
 from icalib.geometry import so3
 from icalib.initialize.steps.keyframe_spacing import LEAST_S, keyframe_spacing, pose_noise
 from icalib.initialize.steps.smooth_path import smooth_path
-from icalib.rig import PoseSensor, Rig, Settings, Wheels
+from icalib.rig import PoseSensor, Rig, Settings, Wheels, by_name
 
 TURN, WAY = 2e-3, 1e-3
 DENSITIES = (0.05, 0.2)  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz)
@@ -37,9 +36,9 @@ def spacing(noise: float | None, densities=DENSITIES, **settings: Any) -> float:
     m = recorded()
     s = m.poses[0]
     path = smooth_path(s.seconds, s.rotation, s.position, np.arange(0.0, s.seconds[-1], 0.01))
-    rig = Rig(None, (), poses=(PoseSensor("mocap0", ""),), settings=Settings(**settings))
+    rig = Rig(by_name(PoseSensor("mocap0", "")), settings=Settings(**settings))
     if noise is not None:
-        rig = replace(rig, wheels=(Wheels("wheel0", "", wheel_noise=noise),))
+        rig = rig.with_(wheels=(Wheels("wheel0", "", wheel_noise=noise),))
     return keyframe_spacing(rig, [m], [path], *densities)
 
 

@@ -28,7 +28,7 @@ def guessed(robot, mode: Mode = "free", mode_of_clock: Mode = "free"):
         translation=Parameter("free", true.position),
         time_offset=Parameter(mode_of_clock, np.array([offset])),
     )
-    return replace(rig, lidars=(lidar,)), rotation
+    return rig.with_(lidars=(lidar,)), rotation
 
 
 def started(robot, rig):

@@ -105,7 +105,7 @@ def test_what_the_rig_gives_is_taken(sim):
         "translation": fixed([0.5, 0.0, 0.0]),
         "time_offset": fixed([sim.truth.time_offset["mocap0"]]),
     }
-    inputs = inputs_for(replace(rig, poses=(replace(rig.poses[0], **given),)), [sim.measurements])
+    inputs = inputs_for(rig.with_(poses=(replace(rig.poses[0], **given),)), [sim.measurements])
     values = state_from_poses(inputs).values
     np.testing.assert_array_equal(values["mocap0", "rotation"], T[:3, :3])
     np.testing.assert_array_equal(values["mocap0", "translation"], [0.5, 0.0, 0.0])

@@ -150,7 +150,7 @@ def test_growth_needs_no_image_that_shows_all(robot):
     bodies = choose_bodies(robot.target, [Measurements(None, (stream,))], bent=False)
     assert np.bincount(np.unique(stream.image * 100 + robot.target.body[stream.point]) // 100).max() < len(bodies.used)
     rig = rig_for(robot)
-    scene = find_scene(replace(rig, cameras=rig.cameras[:1]), bodies, [Measurements(None, (stream,))])
+    scene = find_scene(rig.with_(cameras=rig.cameras[:1]), bodies, [Measurements(None, (stream,))])
     true = simulation.truth.T_world_bodies
     reference = np.linalg.inv(true[bodies.used[0]])
     for k in bodies.used[1:]:

@@ -79,7 +79,7 @@ def test_poses_once_or_twice_a_second(with_poses, every):
     sensor = replace(rig.poses[0], rotation=Parameter(), translation=Parameter(), time_offset=Parameter())
     (stream,) = m.poses
     late = replace(stream, stamps_ns=stream.stamps_ns + 7_000_000_000)
-    found = calibrate_measurements(replace(rig, poses=(sensor,)), replace(m, poses=(thinned(late, every),)))
+    found = calibrate_measurements(rig.with_(poses=(sensor,)), replace(m, poses=(thinned(late, every),)))
     truth = with_poses.scenario.poses[0]
     translation, offset = found.group("mocap0", "translation"), found.group("mocap0", "time_offset")
     assert (np.abs(found.T_imu_sensor("mocap0")[:3, 3] - truth.T_imu_sensor[:3, 3]) < 5.0 * translation.std).all()
@@ -92,13 +92,13 @@ def test_too_slow_is_said(with_poses, tmp_path):
     sensor = replace(rig.poses[0], rotation=Parameter(), translation=Parameter(), time_offset=Parameter())
     slow = replace(m, poses=(thinned(m.poses[0], 200),))
     with pytest.raises(EstimationError, match=r"mocap0: the rate of 0\.25 poses per second is too low"):
-        calibrate_measurements(replace(rig, poses=(sensor,)), slow)
+        calibrate_measurements(rig.with_(poses=(sensor,)), slow)
     other = replace(m.poses[0], rotation=m.poses[0].rotation[::-1].copy())
     with pytest.raises(EstimationError, match=r"of mocap0.* not match that.* of imu0 at any time offset"):
-        calibrate_measurements(replace(rig, poses=(sensor,)), replace(m, poses=(thinned(other, 50),)))
+        calibrate_measurements(rig.with_(poses=(sensor,)), replace(m, poses=(thinned(other, 50),)))
     (tmp_path / "wheel0").mkdir()
     (tmp_path / "wheel0" / "rates.csv").write_text("".join(f"{k * 10**9},1,{1 + k % 3}\n" for k in range(60)))
-    wheels = replace(rig, imu=None, poses=(), wheels=(Wheels("wheel0", "wheel0/rates.csv"),))
+    wheels = rig.with_(imu=None, poses=(), wheels=(Wheels("wheel0", "wheel0/rates.csv"),))
     with pytest.raises(
         Exception, match=r"wheel0/rates\.csv \(wheel0\): the rate of 1 Hz is too low to follow the wheels"
     ):

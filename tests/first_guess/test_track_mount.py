@@ -101,7 +101,7 @@ def test_what_the_rig_gives_stays():
     T = simulation.truth.T_imu_cam["cam0"]
     rotation = Parameter("fixed", T[:3, :3] @ Rotation.from_rotvec([0.0, 0.01, 0.0]).as_matrix())
     arm = Parameter("free", T[:3, 3] + [0.0, 0.0, 0.02])
-    given = replace(rig, cameras=(replace(rig.cameras[0], rotation=rotation, translation=arm),))
+    given = rig.with_(cameras=(replace(rig.cameras[0], rotation=rotation, translation=arm),))
     values = placed(simulation, state, given)
     np.testing.assert_array_equal(values["cam0", "rotation"], rotation.value)
     np.testing.assert_array_equal(values["cam0", "translation"], arm.value)
@@ -113,7 +113,7 @@ def test_of_several_recordings_one_shows_how_the_camera_stands(restarts):
     """And each the offset of a clock that was set back between them."""
     drives = drive(duration_s=12.0), drive(seed=2, set_back_s=37 if restarts else 0)
     rig = true_rig(drives[0][0])
-    rig = replace(rig, cameras=(replace(rig.cameras[0], clock_restarts=restarts),))
+    rig = rig.with_(cameras=(replace(rig.cameras[0], clock_restarts=restarts),))
     inputs = inputs_for(rig, [simulation.measurements for simulation, _ in drives])
     state = one_after_another(inputs, [s for _, s in drives], drives[0][1].values)
     values = track_camera_values(inputs, state)

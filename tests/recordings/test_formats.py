@@ -21,7 +21,7 @@ from icalib.data.measurements import ImuStream
 from icalib.data.recordings import BagRecording, Recording, decode, image_topics, open_recording, read_measurements
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
-from icalib.rig import Camera, ImuSensor, Rig
+from icalib.rig import Camera, ImuSensor, Rig, by_name
 from icalib.rig.imu_classes import class_noise
 
 FORMS = [
@@ -242,7 +242,7 @@ class TestChoice:
             imu = maker.imu(k * 5_000_000 + 1, rng.normal(size=3), rng.normal(size=3) + [0, 0, 9.8])
             messages.append(("/imu", "sensor_msgs/msg/Imu", k, imu))
         bag = open_recording(write.mcap(tmp_path / "run.mcap", messages))
-        rig = Rig(IMU, (CAM0,), AprilGrid(6, 6, 0.088, 0.3))
+        rig = Rig(by_name(IMU, CAM0), AprilGrid(6, 6, 0.088, 0.3))
         sentence = complaint(lambda: read_measurements(bag, rig))
         assert "run.mcap /cam0/image holds images, not corners" in sentence
 

@@ -14,7 +14,7 @@ from icalib.data.tables.columns import IMU, TableKind
 from icalib.data.tables.table import holds, named, read_table
 from icalib.data.tables.wheels import WheelReadings
 from icalib.errors import RecordingError, RigError
-from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels
+from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels, by_name
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
 from icalib.rig.imu_classes import class_noise
 
@@ -275,9 +275,7 @@ def test_huge_numbers_are_single_bad_readings(tmp_path):
     lines = [f"{t},{0.01 * k},{0.02 * k},0,{q}\n" for k, (t, q) in enumerate(zip(stamps, quaternions, strict=True))]
     write_table(tmp_path, "mocap0/poses.csv", "".join(lines))
     rig = Rig(
-        ImuSensor("imu0", "imu0/data.csv", class_noise("consumer")),
-        (),
-        poses=(PoseSensor("mocap0", "mocap0/poses.csv"),),
+        by_name(ImuSensor("imu0", "imu0/data.csv", class_noise("consumer")), PoseSensor("mocap0", "mocap0/poses.csv"))
     )
     found = read_measurements(FolderRecording(tmp_path), rig)
     assert found.imu is not None and len(found.imu.stamps_ns) == 598 and len(found.poses[0].stamps_ns) == 599

@@ -14,7 +14,7 @@ from icalib.data.recordings import open_recording, read_measurements
 from icalib.data.stamps.camera_checks import checked_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
-from icalib.rig import Camera, ImuSensor, Rig
+from icalib.rig import Camera, ImuSensor, Rig, by_name
 from icalib.rig.imu_classes import class_noise
 
 ORIGIN = 1_404_733_405_732_800_001
@@ -25,7 +25,7 @@ def a_rig(cameras: int = 1) -> Rig:
     imu = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
     names = [f"cam{k}" for k in range(cameras)]
     cams = tuple(Camera(n, f"{n}/corners.csv", "pinhole-radtan", (752, 480)) for n in names)
-    return Rig(imu, cams, AprilGrid(6, 6, 0.088, 0.3))
+    return Rig(by_name(imu, *cams), AprilGrid(6, 6, 0.088, 0.3))
 
 
 def imu_rows(n: int = 200) -> list[list[float]]:

@@ -25,7 +25,7 @@ from icalib.result import (
     Verdict,
     WheelResiduals,
 )
-from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels
+from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels, by_name
 from icalib.rig.file import rig_to_dict
 
 NODES, CORNERS_PER_IMAGE = 300, 34
@@ -101,7 +101,9 @@ def _rig() -> Rig:
         for name, d in DISTORTION.items()
     )
     noise = ImuNoise(1.6e-4, 2.2e-5, 2.8e-3, 8.6e-4, "default for a consumer IMU")
-    return Rig(ImuSensor("imu0", "imu0/data.csv", noise), cameras, AprilGrid(6, 6, 0.088, 0.3), settings=Settings())
+    return Rig(
+        by_name(ImuSensor("imu0", "imu0/data.csv", noise), *cameras), AprilGrid(6, 6, 0.088, 0.3), settings=Settings()
+    )
 
 
 def _groups() -> tuple[ParameterGroup, ...]:
@@ -211,7 +213,7 @@ WALLS = (([1.0, 0.0, 0.0], [6.0, 0.5, 1.0]), ([0.0, -1.0, 0.0], [0.0, 5.0, 1.2])
 @pytest.fixture(scope="session")
 def robot(calibration: Calibration) -> Calibration:
     """The same with a LiDAR, which sees two walls and the floor, and wheels."""
-    rng, rig = np.random.default_rng(8), dataclasses.replace(_rig(), lidars=(LIDAR,), wheels=(WHEELS,))
+    rng, rig = np.random.default_rng(8), _rig().with_(lidars=(LIDAR,), wheels=(WHEELS,))
     groups = list(calibration.groups)
     for name, (rpy, position) in ROBOT_POSES.items():
         R = Rotation.from_euler("xyz", rpy, degrees=True).as_matrix()

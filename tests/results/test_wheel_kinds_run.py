@@ -59,7 +59,7 @@ def run(request, tmp_path_factory) -> tuple[str, Path]:
     folder, scenario = tmp_path_factory.mktemp(request.param), scenario_of(request.param)
     rig = rig_for(scenario)
     ground = Ground("level", 0.3, 0.0, 1.0, 0.5)
-    rig = replace(rig, wheels=(replace(rig.wheels[0], ground=ground),))
+    rig = rig.with_(wheels=(replace(rig.wheels[0], ground=ground),))
     write_tables(simulate(scenario, 0), 0, folder / "recording")
     (folder / "rig.yaml").write_text(yaml.safe_dump(rig_to_dict(rig)))
     arguments = [str(folder / "rig.yaml"), str(folder / "recording"), "-o", str(folder / "out"), "--quiet"]

@@ -119,7 +119,7 @@ def test_what_is_written_is_read_again(tmp_path, robot, write, reports, what):
     sim = simulate(reporting(robot, reports), 3)
     write(sim, 3, tmp_path / "run")
     (tmp_path / "rig.yaml").write_text(RIG.replace("WHAT", what))
-    rig = replace(load_rig(tmp_path / "rig.yaml"), poses=())
+    rig = load_rig(tmp_path / "rig.yaml").with_(poses=())
     (found,), (written,) = read_measurements(open_recording(tmp_path / "run"), rig).wheels, sim.measurements.wheels
     assert (instance(found, WheelStream).kind, instance(found, WheelStream).sampling) == (
         instance(written, WheelStream).kind,

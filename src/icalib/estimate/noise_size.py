@@ -107,7 +107,7 @@ def _scaled(inputs: Inputs, scales: dict[str, float]) -> ImuNoise:
 def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcome:
     """The same estimate with noise so many times as large."""
     assert inputs.rig.imu is not None
-    rig = replace(inputs.rig, imu=replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
+    rig = inputs.rig.with_sensors(replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
     other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
     state, judged = found.outcome.state, found.judged
     pairs = zip(judged.noise, of_type(found.problem.factors, CornerFactor), strict=True)

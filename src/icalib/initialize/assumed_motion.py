@@ -115,7 +115,7 @@ def _cameras_on_poses(
     body: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], paths: Sequence[SmoothPath]
 ) -> dict[Key, np.ndarray]:
     """Cameras that follow points, placed on the motion that the first pose sensor of `body` shows."""
-    blind, unseen = replace(body, cameras=()), [replace(m, cameras=(), tracks=()) for m in recordings]
+    blind, unseen = body.with_(cameras=()), [replace(m, cameras=(), tracks=()) for m in recordings]
     alone = _felt(blind, unseen, paths, inputs_for(blind, _readings(unseen, paths)))
     felt = _felt(body, recordings, paths, inputs_for(body, _readings(recordings, paths)))
     return track_camera_values(felt, _moving(alone, shown, {})[0])
@@ -168,7 +168,7 @@ def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses
     if not rig.has_target:
         return _cameras_on_wheels(rig, recordings)
     seen = [replace(m, wheels=(), poses=()) for m in recordings]
-    alone = inputs_for(replace(rig, wheels=(), poses=()), seen)
+    alone = inputs_for(rig.with_(wheels=(), poses=()), seen)
     (guess,) = initial_guesses(alone.rig, alone.bodies, [m.measurements for m in alone.motions])
     t, R, p = guess.body_poses(alone.measurements)
     begins = [part.begin for part in alone.parts]
@@ -186,11 +186,10 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
     noise = ImuNoise(WHITE_STEP_S * turning, turning, WHITE_STEP_S * jerking, jerking, ASSUMPTION)
     here = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
     imu = ImuSensor(ASSUMPTION, "", noise, Parameter("fixed"), assumed=True)
-    if not rig.moves_by_poses:
-        return replace(rig, imu=imu, gravity=0.0, cameras=(replace(rig.cameras[0], **here), *rig.cameras[1:]))
-    spacing = keyframe_spacing(rig, recordings, paths, float(turning), float(jerking))
-    imu = replace(imu, pose_keyframes_s=spacing)
-    return replace(rig, imu=imu, gravity=0.0, poses=(replace(rig.poses[0], **here), *rig.poses[1:]))
+    if rig.moves_by_poses:
+        spacing = keyframe_spacing(rig, recordings, paths, float(turning), float(jerking))
+        imu = replace(imu, pose_keyframes_s=spacing)
+    return rig.with_sensors(imu, replace(rig.sensors[rig.body], **here), gravity=0.0)
 
 
 def _changes(path: SmoothPath, what: str) -> np.ndarray:

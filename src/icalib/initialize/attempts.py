@@ -15,7 +15,7 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.evidence.evidence import chi2_by_kind
-from icalib.estimate.problem.groups import AnySensor, groups_of, with_groups
+from icalib.estimate.problem.groups import groups_of, with_groups
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Step, Visit
 from icalib.estimate.problem.problem import Problem
@@ -27,7 +27,7 @@ from icalib.observability.contradictions import Contradiction, contradicted_by
 from icalib.observability.determination import Determined, determine
 from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.pages import give_back
-from icalib.rig import LENS, Parameter, Rig
+from icalib.rig import LENS, Parameter, Rig, Sensor
 
 POOR_FIT = 4.0  # times as large as their noise are the residuals of some sensor
 CLEARLY = 0.5  # times the misfit of another estimate
@@ -109,7 +109,7 @@ def explained(
     if not (alone and isinstance(failed, NotDefiniteError)):
         return failed
     first, *others = rig.poses
-    if _converged(replace(rig, poses=(replace(first, kind="absolute"), *others)), make) is None:
+    if _converged(rig.with_sensors(replace(first, kind="absolute")), make) is None:
         return failed
     return EstimationError(
         f"{first.name}: with kind: relative its poses are too noisy to give the motion, with kind: absolute "
@@ -139,7 +139,7 @@ def _from_nothing(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
         return None
     values = found.found.estimate.outcome.state.values
 
-    def agreeing(sensor: AnySensor, name: str, p: Parameter) -> Parameter:
+    def agreeing(sensor: Sensor, name: str, p: Parameter) -> Parameter:
         if p.mode != "free" or p.value is None or name == "time_offset":
             return Parameter() if p.mode == "free" else p
         return Parameter() if is_contradicted(name, p.value, values.get((sensor.name, name), p.value)) else p

@@ -90,7 +90,7 @@ def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
         )
 
     pairs = zip(rig.cameras, recording.cameras, strict=True)
-    return dataclasses.replace(rig, cameras=tuple(camera(c, guess.cameras[c.name], s.origin_ns) for c, s in pairs))
+    return rig.with_sensors(*(camera(c, guess.cameras[c.name], s.origin_ns) for c, s in pairs))
 
 
 def _check_clocks(rig: Rig, scene: Placed, guess: Guess, reference: Measurements, recording: Measurements) -> None:

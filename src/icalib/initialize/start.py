@@ -74,7 +74,7 @@ def _start(
     bare = whole
     if rig.wheels or rig.lidars or rig.poses:
         seen = [replace(m, wheels=(), lidars=(), poses=()) for m in recordings]
-        bare = inputs_for(replace(rig, wheels=(), lidars=(), poses=()), seen, whole)
+        bare = inputs_for(rig.with_(wheels=(), lidars=(), poses=()), seen, whole)
     guesses = _guesses(whole, recordings, bare)
     lap("first guess")
     state = first_state(bare, *guesses)
@@ -105,12 +105,12 @@ def _guesses(whole: Inputs, recordings: Sequence[Measurements], bare: Inputs) ->
 
 
 def _lidars_alone(whole: Inputs, recordings: Sequence[Measurements]) -> Inputs:
-    rig = replace(whole.rig, cameras=(), wheels=(), poses=(), target=NoTarget())
+    rig = whole.rig.with_(cameras=(), wheels=(), poses=(), target=NoTarget())
     return inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings], whole)
 
 
 def _pose_sensor_alone(whole: Inputs, recordings: Sequence[Measurements]) -> Inputs:
-    rig = replace(whole.rig, cameras=(), lidars=(), wheels=(), poses=whole.rig.poses[:1], target=NoTarget())
+    rig = whole.rig.with_(cameras=(), lidars=(), wheels=(), poses=whole.rig.poses[:1], target=NoTarget())
     own = [replace(m, cameras=(), tracks=(), lidars=(), wheels=(), poses=m.poses[:1]) for m in recordings]
     return inputs_for(rig, own, whole)
 

@@ -58,7 +58,7 @@ def start_from_pairs(
             "allow; write kind: absolute, or record them during motion, at 10 Hz or more."
         )
     own = len(rig.poses) if not rig.cameras else 0
-    still = replace(rig, poses=tuple(_at_rest(s, own > 0 and k == 0) for k, s in enumerate(rig.poses)))
+    still = rig.with_sensors(*(_at_rest(s, own > 0 and k == 0) for k, s in enumerate(rig.poses)))
     found, at = dict(cameras), list(recordings)
     for k in range(min(own, 1), len(rig.poses)):
         at, values = _mounted(still, k, at, shown)

@@ -14,7 +14,6 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimate.evidence.evidence import fits
-from icalib.estimate.problem.groups import sensors_of
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.geometry import so3
 from icalib.observability.determination import Determined, determine, judge, scatter
@@ -128,7 +127,7 @@ def _shown(
     inputs: Inputs, state: State, block: Block, step: np.ndarray, sigma: np.ndarray, factor: float
 ) -> Contradiction:
     """A stated group against where `step` (B,) leads from `state`."""
-    sensor = next(s for s in sensors_of(inputs.asked or inputs.rig) if s.name == block.sensor)
+    sensor = (inputs.asked or inputs.rig).sensors[block.sensor]
     parameter: Parameter = getattr(sensor, block.name)
     assert parameter.value is not None
     value, own = state.values[block.key], step[block.columns]

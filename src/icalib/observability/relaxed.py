@@ -14,7 +14,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.assembly import given_priors
-from icalib.estimate.problem.groups import AnySensor, groups_of, sensors_of, with_groups
+from icalib.estimate.problem.groups import groups_of, with_groups
 from icalib.estimate.problem.inputs import Inputs, with_clouds
 from icalib.estimate.problem.outcome import Outcome, outcome_of
 from icalib.estimate.problem.problem import Problem
@@ -23,7 +23,7 @@ from icalib.optim.arrowhead import Solution, solve
 from icalib.optim.calib_block import NOTHING, restricted_root
 from icalib.optim.prior_factor import sums_of_priors
 from icalib.optim.state import Key, Layout, State
-from icalib.rig import Parameter
+from icalib.rig import Parameter, Sensor
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
 
 def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
     """Groups that the rig file, as it was given, fixes or gives a prior, and that have columns in `layout`."""
-    asked, used = inputs.asked or inputs.rig, {s.name for s in sensors_of(inputs.rig)}
+    asked, used = inputs.asked or inputs.rig, {s.name for s in inputs.rig.mounted}
     body = () if inputs.rig.imu is not None and not inputs.rig.assumes_motion else ("rotation", "translation")
     if inputs.rig.assumes_motion:
         body = (*body, "time_offset")
@@ -109,7 +109,7 @@ def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
 def freed_inputs(inputs: Inputs, keys: Collection[Key] | None = None) -> Inputs:
     """`inputs` with what is fixed at a value free, and with `keys` only these, priors among them."""
 
-    def freed(sensor: AnySensor, name: str, p: Parameter) -> Parameter:
+    def freed(sensor: Sensor, name: str, p: Parameter) -> Parameter:
         wanted = p.mode == "fixed" if keys is None else (sensor.name, name) in keys
         return Parameter("free", p.value) if wanted and p.value is not None else p
 

@@ -31,6 +31,7 @@ from icalib.rig.pose import (
 )
 from icalib.rig.rig import (
     Rig,
+    by_name,
 )
 from icalib.rig.sensor import (
     PLAIN_TABLE,
@@ -94,4 +95,5 @@ __all__ = [
     "WheelMeasure",
     "Wheels",
     "drive_names",
+    "by_name",
 ]

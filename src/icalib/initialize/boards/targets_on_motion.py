@@ -47,6 +47,4 @@ def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) ->
             camera, **{k: Parameter("free", v) for k, v in guess.items() if getattr(camera, k).value is None}
         )
 
-    return replace(
-        rig, cameras=tuple(placed(k, c) if c.rotation.value is None else c for k, c in enumerate(rig.cameras))
-    )
+    return rig.with_sensors(*(placed(k, c) for k, c in enumerate(rig.cameras) if c.rotation.value is None))

@@ -68,7 +68,7 @@ def in_place_of_wheels(rig: Rig, wheels: Wheels) -> Rig:
     """The rig with a pose sensor in place of its wheels; nothing is known of where its cameras stand."""
     free = dict.fromkeys(NAMES, Parameter())
     cameras = tuple(replace(c, clock_restarts=False, **free) for c in rig.cameras)
-    return replace(rig, cameras=cameras, wheels=(), poses=(PoseSensor(wheels.name, "", "absolute"),))
+    return rig.with_(cameras=cameras, wheels=(), poses=(PoseSensor(wheels.name, "", "absolute"),))
 
 
 def pose_stream(stream: WheelStream | WheelPoses, path: BodyPoses) -> PoseStream:

@@ -13,7 +13,7 @@ from icalib.base.file_names import NAME, NAME_WORDS
 from icalib.base.yaml_nodes import YamlValue, parse_yaml, read_yaml
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Scene, Target
-from icalib.rig import Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
+from icalib.rig import Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Sensor, Settings, Wheels, by_name
 from icalib.rig.complete import lack_of
 from icalib.rig.file.fields import (
     TABLE,
@@ -62,14 +62,10 @@ def _rig(root: YamlValue) -> Rig:
             "needs a LiDAR that sees planes, and a camera with feature tracks; remove it."
         )
     return Rig(
-        imu=sensors.imus[0] if sensors.imus else None,
-        cameras=tuple(sensors.cameras),
-        target=target_or_targets(root) if targeted else NoTarget(),
+        by_name(*sensors.all),
+        target_or_targets(root) if targeted else NoTarget(),
         gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
         settings=settings,
-        lidars=tuple(sensors.lidars),
-        wheels=tuple(sensors.wheels),
-        poses=tuple(sensors.poses),
     )
 
 
@@ -111,6 +107,10 @@ class _Sensors:
     wheels: list[Wheels] = field(default_factory=list)
     poses: list[PoseSensor] = field(default_factory=list)
 
+    @property
+    def all(self) -> list[Sensor]:
+        return [*self.imus, *self.cameras, *self.lidars, *self.wheels, *self.poses]
+
 
 def _sensors(value: YamlValue) -> _Sensors:
     found = _Sensors()
@@ -140,13 +140,7 @@ def _sensors(value: YamlValue) -> _Sensors:
 def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
     """Where the sensors together cannot be calibrated."""
     imu = found.imus[0] if found.imus else None
-    rig = Rig(
-        imu,
-        tuple(found.cameras),
-        lidars=tuple(found.lidars),
-        wheels=tuple(found.wheels),
-        poses=tuple(found.poses),
-    )
+    rig = Rig(by_name(*found.all))
     lack = lack_of(rig)
     if lack is not None:
         (value.entries()[lack.sensor] if lack.sensor else value).fail(lack.sentence)

@@ -8,7 +8,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from icalib.geometry.targets import NoTarget
-from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
+from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels, by_name
 from icalib.rig.kinds import SPECS
 from icalib.rig.sensor import mounted
 from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
@@ -69,14 +69,16 @@ def rig_for(
     treated = _Treated(scenario, rotation, translation, time_offset, intrinsics, distortion, bloom, drive)
     imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, _parameter(imu_intrinsics, scenario.imu_intrinsics))
     return Rig(
-        imu,
-        tuple(treated.camera(c) for c in scenario.cameras),
+        by_name(
+            imu,
+            *(treated.camera(c) for c in scenario.cameras),
+            *(treated.lidar(s) for s in scenario.lidars),
+            *(treated.wheels(s) for s in scenario.wheels),
+            *(treated.poses(s) for s in scenario.poses),
+        ),
         replace(scenario.target, size_sigma=0.0) if scenario.board and scenario.cameras else NoTarget(),
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,
-        lidars=tuple(treated.lidar(s) for s in scenario.lidars),
-        wheels=tuple(treated.wheels(s) for s in scenario.wheels),
-        poses=tuple(treated.poses(s) for s in scenario.poses),
     )
 
 
@@ -171,12 +173,11 @@ def with_drawn_guess(
     lidars = zip(rig.lidars, scenario.lidars, strict=True)
     wheels = zip(rig.wheels, scenario.wheels, strict=True)
     poses = zip(rig.poses, scenario.poses, strict=True)
-    return replace(
-        rig,
-        cameras=tuple(guessed(c, mount(s, s.T_imu_cam) | _drawn_lens(s, rng, spread)) for c, s in cameras),
-        lidars=tuple(guessed(x, mount(s, s.T_imu_lidar)) for x, s in lidars),
-        wheels=tuple(guessed(x, mount(s, s.T_imu_wheel) | _drawn_drive(s, rng, spread)) for x, s in wheels),
-        poses=tuple(guessed(x, mount(s, s.T_imu_sensor)) for x, s in poses),
+    return rig.with_sensors(
+        *(guessed(c, mount(s, s.T_imu_cam) | _drawn_lens(s, rng, spread)) for c, s in cameras),
+        *(guessed(x, mount(s, s.T_imu_lidar)) for x, s in lidars),
+        *(guessed(x, mount(s, s.T_imu_wheel) | _drawn_drive(s, rng, spread)) for x, s in wheels),
+        *(guessed(x, mount(s, s.T_imu_sensor)) for x, s in poses),
     )
 
 
