@@ -124,6 +124,8 @@ def _same(a: Any, b: Any) -> bool:
         return type(a) is type(b) and all(_same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
     if isinstance(a, tuple | list):
         return type(a) is type(b) and len(a) == len(b) and all(map(_same, a, b))
+    if isinstance(a, dict):
+        return type(a) is type(b) and list(a) == list(b) and all(_same(a[key], b[key]) for key in a)
     return type(a) is type(b) and a == b
 
 

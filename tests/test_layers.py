@@ -26,7 +26,7 @@ ORDER = (
     ("geometry", "geometry.targets"),
     ("geometry.cameras",),
     ("rig",),
-    ("sensors.*.spec",),
+    ("sensors.*.record", "sensors.*.spec"),
     ("rig.file", "data"),
     ("sensors.*.stream",),
     ("data.stamps",),

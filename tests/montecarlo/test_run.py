@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from icalib.data.measurements import Measurements
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
-from icalib.result import Calibration, CornerResiduals, LidarResiduals, Visited, WheelResiduals
+from icalib.result import Calibration, CornerResiduals, RowResiduals, Visited, by_key
+from icalib.sensors.lidar.record import LidarResiduals
 from icalib.tools.montecarlo import one_run
 from icalib.tools.montecarlo.one_run import PlanesKind, RunTask, compare, run
 from icalib.tools.montecarlo.record import RunRecord
@@ -125,7 +126,7 @@ def test_corners_of_white_noise_are_white_and_repeated_ones_are_not(result):
     assert set(own) > {("cam0", "corners"), ("imu0", "velocity"), ("imu0", "gyroscope walk")}
     assert abs(own["cam0", "corners"].lag1) < 0.03
     assert own["cam0", "corners"].mean_square == pytest.approx(1.0, abs=0.03)
-    same = replace(result, corner_residuals=(_persistent(result.corner_residuals[0]),))
+    same = replace(result, residuals=result.residuals | by_key([_persistent(result.corner_residuals[0])]))
     assert whiteness(same)[0].lag1 == pytest.approx(0.8, abs=0.02)
 
 
@@ -215,7 +216,7 @@ def test_points_are_compared_along_their_plane(result: Calibration, rho: float):
     seconds = np.arange(n) * 1e-3 + np.where(np.arange(n) < n // 2, 0.0, 60.0)
     rest = (np.ones(n), np.full(n, 0.02), np.zeros((n, 3)), 0.02 * residual, np.zeros((n, 3)), np.zeros(n))
     points = LidarResiduals("lidar0", 10, n, n, seconds, plane, *rest)
-    own = {w.kind: w for w in whiteness(replace(result, lidar_residuals=(points,)))}
+    own = {w.kind: w for w in whiteness(replace(result, residuals=result.residuals | by_key([points])))}
     assert own["points"].lag1 == pytest.approx(rho, abs=0.03)
     assert own["points"].mean_square == pytest.approx(1.0, abs=0.05)
 
@@ -224,8 +225,9 @@ def test_rows_of_wheels_are_compared_apart(result: Calibration):
     n = 20000
     rng = np.random.default_rng(4)
     whitened = np.stack([_steps(rng, n, 0.0), 2.0 * _steps(rng, n, 0.7)], axis=1)
-    wheels = WheelResiduals("wheel0", ("left", "lateral"), ("rad", "m"), np.arange(n) * 0.02, whitened, whitened)
-    own = {w.kind: w for w in whiteness(replace(result, wheel_residuals=(wheels,)))}
+    labels, units = ("left", "lateral"), ("rad", "m")
+    wheels = RowResiduals("wheel0", "increments", labels, units, np.arange(n) * 0.02, whitened, whitened)
+    own = {w.kind: w for w in whiteness(replace(result, residuals=result.residuals | by_key([wheels])))}
     assert own["left"].lag1 == pytest.approx(0.0, abs=0.03)
     assert own["lateral"].lag1 == pytest.approx(0.7, abs=0.03)
     assert own["lateral"].mean_square == pytest.approx(4.0, rel=0.1)

@@ -16,17 +16,18 @@ from icalib.result import (
     CrossValidation,
     ImuResiduals,
     Iteration,
-    LidarResiduals,
     ParameterGroup,
     Plane,
     PredictedFit,
+    RowResiduals,
     SensorFit,
     Trajectory,
     Verdict,
-    WheelResiduals,
+    by_key,
 )
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels, by_name
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.lidar.record import LidarResiduals
 
 NODES, CORNERS_PER_IMAGE = 300, 34
 IMU_LABELS = tuple(f"accel_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz"))
@@ -64,8 +65,12 @@ def calibration() -> Calibration:
         covariance_names=names,
         undetermined=("cam1 translation y: turn the rig about a second axis to determine it.",),
         fits=tuple(_fits()),
-        corner_residuals=tuple(_corners(name, trajectory, instance(rig.target, AprilGrid), rng) for name in POSES),
-        imu_residuals=ImuResiduals(trajectory.seconds[:-1], rng.normal(size=(NODES - 1, 15))),
+        residuals=by_key(
+            [
+                *(_corners(name, trajectory, instance(rig.target, AprilGrid), rng) for name in POSES),
+                ImuResiduals("imu0", trajectory.seconds[:-1], rng.normal(size=(NODES - 1, 15))),
+            ]
+        ),
         trajectory=trajectory,
         iterations=tuple(_iterations()),
         converged=True,
@@ -235,8 +240,10 @@ def robot(calibration: Calibration) -> Calibration:
         cross_validation=_held_out(tuple(groups)),
         rig=rig_to_dict(rig),
         fits=(*calibration.fits, *fits),
-        lidar_residuals=(_points(rng),),
-        wheel_residuals=(WheelResiduals("wheel0", labels, units, seconds, 1e-3 * whitened, whitened),),
+        residuals=calibration.residuals
+        | by_key(
+            [_points(rng), RowResiduals("wheel0", "increments", labels, units, seconds, 1e-3 * whitened, whitened)]
+        ),
         planes=tuple(Plane(f"plane {k}", np.array(n), np.array(p), 9000 + k) for k, (n, p) in enumerate(WALLS)),
     )
 
@@ -257,7 +264,7 @@ def without_cameras(robot: Calibration) -> Calibration:
         covariance=robot.covariance[np.ix_(columns, columns)],
         covariance_names=tuple(robot.covariance_names[k] for k in columns),
         fits=tuple(f for f in robot.fits if f.sensor not in gone),
-        corner_residuals=(),
+        residuals={key: r for key, r in robot.residuals.items() if key[0] not in gone},
         undetermined=(),
         rig=rig,
         cross_validation=None,

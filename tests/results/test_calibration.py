@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from icalib.errors import CalibrationError
-from icalib.result import Calibration, load_calibration
+from icalib.result import Calibration, by_key, load_calibration
 from icalib.validation.misfit import scatter_warnings
 
 
@@ -135,12 +135,13 @@ def test_arrays_that_would_run_code(saved: Path):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"format_version": 1},
+        {"format_version": 2},
         {"groups": 3},
         {"groups": [{}]},
         {"groups": [{"sensor": "cam0"}]},
         {"fits": [{"sensors": 1}]},
-        {"corner_sensors": ["cam7"]},
+        {"residuals": [{"sensor": "cam7", "kind": "corners"}]},
+        {"residuals": [{"kind": "corners"}]},
         {"rig": {}},
         {"rig": {"sensors": {}}},
         {"rig": []},
@@ -194,11 +195,18 @@ SPOILT: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "text": lambda a: a.astype(np.str_),
     "complex": lambda a: a.astype(complex),
 }
-ARRAYS = ("trajectory/position", "imu_residuals/whitened", "lidars/lidar0/world", "wheels/wheel0/whitened")
+ARRAYS = ("trajectory/position", "residuals/imu0/intervals/whitened", "residuals/wheel0/increments/whitened")
 
 
 @pytest.mark.parametrize("how", SPOILT)
-@pytest.mark.parametrize("name", [*ARRAYS, "corners/cam0/uv", "corners/cam0/start", "covariance"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *ARRAYS,
+        *(f"residuals/{r}" for r in ("lidar0/points/world", "cam0/corners/uv", "cam0/corners/start")),
+        "covariance",
+    ],
+)
 def test_arrays_that_do_not_fit_the_others(robot: Calibration, tmp_path: Path, name: str, how: str):
     robot.save(tmp_path)
     with np.load(tmp_path / "result.npz") as file:
@@ -219,5 +227,5 @@ def test_images_that_do_not_divide_their_corners(calibration: Calibration, tmp_p
     r = calibration.corner_residuals[0]
     start = r.start.copy()
     start[at] += 10**6
-    dataclasses.replace(calibration, corner_residuals=(dataclasses.replace(r, start=start),)).save(tmp_path)
+    dataclasses.replace(calibration, residuals=by_key([dataclasses.replace(r, start=start)])).save(tmp_path)
     assert "start of cam0 does not divide its points among its images" in sentence_of(tmp_path)

@@ -14,7 +14,7 @@ from icalib.errors import CalibrationError
 from icalib.export.kalibr import camchain, imu_yaml
 from icalib.geometry.cameras import camera_model
 from icalib.motion.imu_model import correction_matrices
-from icalib.result import Calibration, ParameterGroup
+from icalib.result import Calibration, ParameterGroup, by_key
 from icalib.rig.imu_classes import INTRINSICS_LABELS
 
 
@@ -119,22 +119,20 @@ def test_overlaps_are_common_points_at_the_same_instant(calibration: Calibration
     right = dataclasses.replace(second, point=72 + second.point % 72)
     later = dataclasses.replace(second, seconds=second.seconds + 100.0)
     for pair in ((left, right), (first, later)):
-        apart = yaml.safe_load(camchain(dataclasses.replace(calibration, corner_residuals=pair)))
+        apart = yaml.safe_load(camchain(dataclasses.replace(calibration, residuals=by_key(pair))))
         assert (apart["cam0"]["cam_overlaps"], apart["cam1"]["cam_overlaps"]) == ([], [])
 
 
 def test_comments_say_direction_and_names(calibration: Calibration):
     assert camchain(calibration).startswith("# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu")
     assert imu_yaml(calibration).startswith("# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame")
+    first, second = calibration.corner_residuals
     sensors = {{"cam1": "right"}.get(n, n): s for n, s in calibration.rig["sensors"].items()}
     renamed = dataclasses.replace(
         calibration,
         rig=calibration.rig | {"sensors": sensors},
         groups=tuple(dataclasses.replace(g, sensor=g.sensor.replace("cam1", "right")) for g in calibration.groups),
-        corner_residuals=(
-            calibration.corner_residuals[0],
-            dataclasses.replace(calibration.corner_residuals[1], sensor="right"),
-        ),
+        residuals=by_key([first, dataclasses.replace(second, sensor="right")]),
     )
     text = camchain(renamed)
     assert "# cam1 is right." in text

@@ -138,7 +138,7 @@ def test_a_lens_that_is_fixed_is_certain(calibration: Calibration):
 
 
 def test_without_corners_the_whole_image_counts(calibration: Calibration):
-    bare = dataclasses.replace(calibration, corner_residuals=())
+    bare = dataclasses.replace(calibration, residuals={})
     found, with_corners = (projection_uncertainty(c, "cam0") for c in (bare, calibration))
     assert found is not None and with_corners is not None
     assert not found.seen.any() and found.median_seen == np.median(found.sigma)

@@ -22,6 +22,7 @@ from icalib.result import (
     Calibration,
     ProjectionMap,
     SensorFit,
+    by_key,
     joint_covariance,
     projection_uncertainty,
     working_distance,
@@ -224,7 +225,7 @@ def test_nothing_seen_and_nothing_iterated(calibration: Calibration):
     r = calibration.corner_residuals[0]
     none = dataclasses.replace(
         calibration,
-        corner_residuals=(dataclasses.replace(r, rejected=np.ones_like(r.rejected)), calibration.corner_residuals[1]),
+        residuals=calibration.residuals | by_key([dataclasses.replace(r, rejected=np.ones_like(r.rejected))]),
         iterations=(),
         undetermined=(),
         warnings=(),

@@ -12,7 +12,14 @@ import pytest
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.pipeline import calibrate_measurements
 from icalib.report import report_html
-from icalib.result import Calibration, TrackResiduals, load_calibration, projection_uncertainty, working_distance
+from icalib.result import (
+    Calibration,
+    TrackResiduals,
+    by_key,
+    load_calibration,
+    projection_uncertainty,
+    working_distance,
+)
 from icalib.tools.montecarlo.whiteness import whiteness
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
@@ -108,7 +115,7 @@ def test_noise_is_white_and_what_lasts_is_not(found: Calibration):
         white = own[r.sensor, "observations"]
         assert abs(white.lag1) < 0.1
         assert white.mean_square == pytest.approx(np.mean(r.whitened[r.used].astype(float) ** 2))
-    lasting = replace(found, track_residuals=tuple(_lasting(r) for r in found.track_residuals))
+    lasting = replace(found, residuals=found.residuals | by_key(_lasting(r) for r in found.track_residuals))
     assert all(w.lag1 > 0.95 for w in whiteness(lasting) if w.kind == "observations")
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from icalib.cli import main
 from icalib.pipeline import calibrate_measurements
-from icalib.result import TrackResiduals, rms_of_images
+from icalib.result import TrackResiduals, by_key, rms_of_images
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -26,7 +26,7 @@ def shown(read, tmp_path_factory):
     some = np.arange(len(r.uv)) % 100 == 3
     r = replace(r, rejected=some, residual=np.where(some[:, None], np.float32(np.nan), r.residual))
     folder = tmp_path_factory.mktemp("tracks")
-    replace(found, track_residuals=(r, *found.track_residuals[1:])).save(folder / "out")
+    replace(found, residuals=found.residuals | by_key([r])).save(folder / "out")
     assert main(["view", str(folder / "out"), "--save", str(folder / "a.rrd"), "--quiet"]) == 0
     return r, read(folder / "a.rrd")
 

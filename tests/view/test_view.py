@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from icalib.cli import main
 from icalib.report.ellipsoids import ellipsoids, magnification
-from icalib.result import Calibration, ParameterGroup, WheelResiduals
+from icalib.result import Calibration, ParameterGroup, RowResiduals, by_key
 from icalib.tools.view import recorded, view
 
 IMAGE = "world/imu0/cam0/image"
@@ -203,7 +203,8 @@ def test_long_recordings_are_thinned_which_is_said(shown, read, tmp_path, monkey
 def test_without_an_imu_the_first_camera_is_the_body(shown, read, tmp_path):
     c = shown.calibration
     rig = c.rig | {"sensors": {n: s for n, s in c.rig["sensors"].items() if s["type"] != "imu"}}
-    view(_saved(c, tmp_path / "out", rig=rig), save=tmp_path / "a.rrd")
+    residuals = {key: r for key, r in c.residuals.items() if key[0] in rig["sensors"]}
+    view(_saved(c, tmp_path / "out", rig=rig, residuals=residuals), save=tmp_path / "a.rrd")
     found = read(tmp_path / "a.rrd")
     assert np.isfinite(found["world/cam0"].seconds).sum() == len(c.trajectory.seconds)
     assert {"world/cam0/image", "world/cam0/lidar0"} <= set(found)
@@ -239,8 +240,10 @@ def test_wheels_are_drawn_and_their_residuals_too(shown, read, tmp_path):
     groups = tuple(_fixed("wheel0", name, np.array(value, np.float64)) for name, value in values.items())
     rig = c.rig | {"sensors": c.rig["sensors"] | {"wheel0": {"type": "wheels", "path": "wheel0/rates.csv"}}}
     rows = np.arange(12.0).reshape(6, 2)
-    wheels = WheelResiduals("wheel0", ("left", "lateral slip"), ("rad", "m"), np.arange(6.0), rows, 2.0 * rows)
-    result = _saved(c, tmp_path / "out", rig=rig, groups=(*c.groups, *groups), wheel_residuals=(wheels,))
+    wheels = RowResiduals(
+        "wheel0", "increments", ("left", "lateral slip"), ("rad", "m"), np.arange(6.0), rows, 2.0 * rows
+    )
+    result = _saved(c, tmp_path / "out", rig=rig, groups=(*c.groups, *groups), residuals=c.residuals | by_key([wheels]))
     view(result, save=tmp_path / "a.rrd")
     found = read(tmp_path / "a.rrd")
     rims = [s for s in found["world/imu0/wheel0/shape"].values["LineStrips3D:strips"][0] if len(s) == 41]

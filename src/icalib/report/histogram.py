@@ -35,8 +35,5 @@ def normalised_histogram(c: Calibration) -> Figure:
 
 def _normalised(c: Calibration) -> dict[str, np.ndarray]:
     """Residuals over their standard deviation, by what they are of."""
-    out = {f"{r.sensor} {r.kind} (u and v)": r.whitened[r.used].ravel() for r in c.image_residuals}
-    out |= {f"{r.sensor} points": r.residual / r.sigma for r in c.lidar_residuals}
-    for r in c.wheel_residuals:
-        out |= {f"{r.sensor} {label}": r.whitened[:, k] for k, label in enumerate(r.labels)}
+    out = {f"{r.sensor} {name}": z for r in c.residuals.values() for name, z in r.normalised().items()}
     return {name: z for name, z in out.items() if len(z)}

@@ -20,7 +20,8 @@ from icalib.report.plot import (
     thin,
     y_of,
 )
-from icalib.result import Calibration, LidarResiduals, Plane, PoseResiduals, WheelResiduals
+from icalib.result import Calibration, Plane, RowResiduals
+from icalib.sensors.lidar.record import LidarResiduals
 
 MOST_DOTS = 2500  # in a figure of residuals
 MOST_IN_SPACE = 20_000  # points in a picture of the planes
@@ -65,7 +66,7 @@ def _residuals_over(r: LidarResiduals, x: np.ndarray, title: str) -> Figure:
     )
 
 
-def panels(r: WheelResiduals | PoseResiduals) -> Figure:
+def panels(r: RowResiduals) -> Figure:
     """What each wheel turned, and slip, or rotation and position of poses, over time."""
     keep = thin(len(r.seconds), MOST_DOTS)
     units = ["mrad" if unit == "rad" else "mm" for unit in r.units]

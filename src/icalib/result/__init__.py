@@ -2,7 +2,6 @@
 
 from icalib.result.calibration import (
     Calibration,
-    ImuResiduals,
     Iteration,
     ParameterGroup,
     RecordingSpan,
@@ -10,13 +9,22 @@ from icalib.result.calibration import (
     Trajectory,
     Verdict,
     Visited,
+    by_key,
 )
 from icalib.result.cross_validation import CrossValidation, PredictedFit
-from icalib.result.images import CornerResiduals, ImageResiduals, TrackResiduals, image_of, rms_of_images
+from icalib.result.planes import Plane
 from icalib.result.projection import ProjectionMap, projection_uncertainty, working_distance
 from icalib.result.relative import RelativePose, joint_covariance, relative_pose, relative_poses
-from icalib.result.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 from icalib.result.saving import calibration_files, load_calibration
+from icalib.sensors.camera.record import (
+    CornerResiduals,
+    ImageResiduals,
+    TrackResiduals,
+    image_of,
+    rms_of_images,
+)
+from icalib.sensors.imu.record import ImuResiduals
+from icalib.sensors.records import Residuals, RowResiduals
 
 __all__ = [
     "Calibration",
@@ -25,20 +33,20 @@ __all__ = [
     "ImageResiduals",
     "ImuResiduals",
     "Iteration",
-    "LidarResiduals",
     "ParameterGroup",
     "Plane",
-    "PoseResiduals",
     "PredictedFit",
     "ProjectionMap",
     "RecordingSpan",
     "RelativePose",
+    "Residuals",
+    "RowResiduals",
     "SensorFit",
     "TrackResiduals",
     "Trajectory",
     "Verdict",
     "Visited",
-    "WheelResiduals",
+    "by_key",
     "calibration_files",
     "image_of",
     "joint_covariance",

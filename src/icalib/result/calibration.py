@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -11,9 +12,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from icalib.result.cross_validation import CrossValidation
-from icalib.result.images import CornerResiduals, ImageResiduals, TrackResiduals
-from icalib.result.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
+from icalib.result.planes import Plane
 from icalib.result.verdict import Usability, lens_projections_px, reasons, usability
+from icalib.sensors import SENSOR_KINDS
+from icalib.sensors.camera.record import CornerResiduals, ImageResiduals, TrackResiduals
+from icalib.sensors.imu.record import ImuResiduals
+from icalib.sensors.records import Residuals, RowResiduals
 
 if TYPE_CHECKING:
     from icalib.result.relative import RelativePose
@@ -60,17 +64,6 @@ class SensorFit:
         """Near 1 where residuals are as large as their noise says. None where the fit leaves next to no freedom: dof
         are sampled, and good to the root of the count."""
         return float(self.chi2 / self.dof) if self.dof > np.sqrt(self.count) else None
-
-
-@dataclass(frozen=True)
-class ImuResiduals:
-    """Whitened residuals of the IMU factor, one row an interval between nodes.
-
-    Columns: rotation, velocity, position, gyroscope walk, accelerometer walk, three each.
-    """
-
-    seconds: np.ndarray  # (K - 1,) start of each interval
-    whitened: np.ndarray  # (K - 1, 15)
 
 
 @dataclass(frozen=True)
@@ -129,8 +122,7 @@ class Calibration:
     covariance_names: tuple[str, ...]  # B names: "cam0.rotation.x", ...
     undetermined: tuple[str, ...]  # sentences: combinations that the data do not determine, and the missing motion
     fits: tuple[SensorFit, ...]
-    corner_residuals: tuple[CornerResiduals, ...]
-    imu_residuals: ImuResiduals
+    residuals: dict[tuple[str, str], Residuals]  # (sensor, kind), such as ("cam0", "corners"); see `by_key`
     trajectory: Trajectory
     iterations: tuple[Iteration, ...]
     converged: bool
@@ -144,18 +136,49 @@ class Calibration:
     versions: dict[str, str] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)  # stage -> seconds
     recordings: tuple[RecordingSpan, ...] = ()  # in order; arrays of seconds run through all of them
-    lidar_residuals: tuple[LidarResiduals, ...] = ()
-    wheel_residuals: tuple[WheelResiduals, ...] = ()
     planes: tuple[Plane, ...] = ()  # that LiDARs see
-    pose_residuals: tuple[PoseResiduals, ...] = ()
-    track_residuals: tuple[TrackResiduals, ...] = ()
     cross_validation: CrossValidation | None = None  # None where the recording could not be split
     wrong: tuple[str, ...] = ()  # those of `warnings` by which something in the rig file must be wrong
+
+    def residuals_of(self, *kinds: str) -> tuple[Any, ...]:
+        """The records of these kinds of measurement ("corners", "points", ...), kind by kind."""
+        return tuple(r for kind in kinds for r in self.residuals.values() if r.kind == kind)
 
     @property
     def image_residuals(self) -> tuple[ImageResiduals, ...]:
         """Of cameras that saw anything: corners of a target, tracks of points of the scene, or both."""
         return tuple(r for r in (*self.corner_residuals, *self.track_residuals) if len(r.uv))
+
+    @property
+    def corner_residuals(self) -> tuple[CornerResiduals, ...]:
+        """Of each camera that looks for a target."""
+        return self.residuals_of(CornerResiduals.kind)
+
+    @property
+    def track_residuals(self) -> tuple[TrackResiduals, ...]:
+        """Of each camera, where any tracks points."""
+        return self.residuals_of(TrackResiduals.kind)
+
+    @property
+    def imu_residuals(self) -> ImuResiduals:
+        """Of the IMU. Raises ValueError without one."""
+        (found,) = self.residuals_of(ImuResiduals.kind)
+        return found
+
+    @property
+    def lidar_residuals(self) -> tuple[Any, ...]:
+        """Of each LiDAR that sees planes."""
+        return self.residuals_of("points")
+
+    @property
+    def wheel_residuals(self) -> tuple[RowResiduals, ...]:
+        """Of each set of wheels."""
+        return self.residuals_of("increments")
+
+    @property
+    def pose_residuals(self) -> tuple[RowResiduals, ...]:
+        """Of each pose sensor."""
+        return self.residuals_of("poses")
 
     @property
     def verdict(self) -> Usability:
@@ -208,7 +231,7 @@ class Calibration:
     @property
     def imu(self) -> str | None:
         """Name of the IMU, if there is one."""
-        return next(iter(self._of_type("imu")), None)
+        return next(iter(self.of_type("imu")), None)
 
     @property
     def body(self) -> str:
@@ -216,34 +239,38 @@ class Calibration:
         target, or the first pose sensor."""
         if self.imu:
             return self.imu
-        poses = self._of_type("pose")
+        poses = self.of_type("pose")
         follow = not ({"target", "targets"} & set(self.rig))
         return (*poses, *self.cameras)[0] if follow else (*self.cameras, *poses)[0]
+
+    def of_type(self, kind: str) -> tuple[str, ...]:
+        """Names of the sensors of a type of the rig file ("imu", "camera", "lidar", ...), in the rig's order."""
+        return tuple(name for name, sensor in self.rig["sensors"].items() if sensor["type"] == kind)
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, in the rig's order."""
-        return self._of_type("camera")
+        return self.of_type("camera")
 
     @property
     def lidars(self) -> tuple[str, ...]:
         """Names of the LiDARs, in the rig's order."""
-        return self._of_type("lidar")
+        return self.of_type("lidar")
 
     @property
     def wheels(self) -> tuple[str, ...]:
         """Names of the sets of wheels, in the rig's order."""
-        return self._of_type("wheels")
+        return self.of_type("wheels")
 
     @property
     def pose_sensors(self) -> tuple[str, ...]:
         """Names of the pose sensors, in the rig's order."""
-        return self._of_type("pose")
+        return self.of_type("pose")
 
     @property
     def mounted(self) -> tuple[str, ...]:
-        """Names of all that have a pose on the body: cameras, LiDARs, wheels, pose sensors."""
-        return (*self.cameras, *self.lidars, *self.wheels, *self.pose_sensors)
+        """Names of all that have a pose on the body: all but the IMU, by kind in the order of `SENSOR_KINDS`."""
+        return tuple(name for kind in SENSOR_KINDS for name in self.of_type(kind) if name != self.imu)
 
     def value(self, sensor: str, name: str) -> np.ndarray:
         """Value of the group `name` of `sensor`, SI: (3, 3) of a rotation R_imu_sensor, else (n,)."""
@@ -293,5 +320,7 @@ class Calibration:
         refuse_foreign_set(Path(folder))
         write_files(Path(folder), calibration_files(self))
 
-    def _of_type(self, kind: str) -> tuple[str, ...]:
-        return tuple(name for name, sensor in self.rig["sensors"].items() if sensor["type"] == kind)
+
+def by_key(records: Iterable[Residuals]) -> dict[tuple[str, str], Residuals]:
+    """Records by sensor and kind, as in `Calibration.residuals`."""
+    return {(r.sensor, r.kind): r for r in records}

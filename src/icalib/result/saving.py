@@ -20,20 +20,21 @@ from icalib.base.unpacking import load_arrays
 from icalib.errors import CalibrationError
 from icalib.result.calibration import (
     Calibration,
-    ImuResiduals,
     Iteration,
     ParameterGroup,
     RecordingSpan,
     SensorFit,
     Trajectory,
+    by_key,
 )
 from icalib.result.cross_validation import CrossValidation, PredictedFit
-from icalib.result.images import CornerResiduals, TrackResiduals
-from icalib.result.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
+from icalib.result.planes import Plane
 from icalib.result.shapes import check_arrays
 from icalib.result.summary import calibration_yaml
+from icalib.sensors import SENSOR_KINDS, facet
+from icalib.sensors.records import Residuals, RowResiduals
 
-FORMAT, FORMAT_VERSION = "icalib result", 2
+FORMAT, FORMAT_VERSION = "icalib result", 3
 _TEXTS = ("undetermined", "warnings", "notes", "wrong")
 _PLAIN = ("status", "converged", "rig", "rates", "inputs", "settings", "versions", "timings")
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
@@ -76,11 +77,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "groups": [_lists(g) for g in c.groups],
         "fits": [dataclasses.asdict(f) for f in c.fits],
         "recordings": [dataclasses.asdict(r) for r in c.recordings],
-        "corner_sensors": [r.sensor for r in c.corner_residuals],
-        "lidars": [_without_arrays(r) for r in c.lidar_residuals],
-        "wheels": [_without_arrays(r) for r in c.wheel_residuals],
-        "poses": [_without_arrays(r) for r in c.pose_residuals],
-        "tracks": [_without_arrays(r) for r in c.track_residuals],
+        "residuals": [_without_arrays(r) for r in c.residuals.values()],
         "planes": [_lists(p) for p in c.planes],
         "cross_validation": None if c.cross_validation is None else _plain_cross_validation(c.cross_validation),
         "verdict": c.verdict,
@@ -99,31 +96,19 @@ def _plain_cross_validation(held: CrossValidation) -> dict[str, Any]:
     return _without_arrays(held) | {"fits": [dataclasses.asdict(f) for f in held.fits]}
 
 
-def _without_arrays(
-    residuals: LidarResiduals | WheelResiduals | PoseResiduals | TrackResiduals | CrossValidation,
-) -> dict[str, Any]:
-    arrays = _array_names(type(residuals))
-    return {f.name: getattr(residuals, f.name) for f in dataclasses.fields(residuals) if f.name not in arrays}
+def _without_arrays(record: Any) -> dict[str, Any]:
+    arrays = _array_names(type(record))
+    return {f.name: getattr(record, f.name) for f in dataclasses.fields(record) if f.name not in arrays}
 
 
 def _npz(c: Calibration) -> bytes:
     arrays = {"covariance": c.covariance, "covariance_names": np.array(c.covariance_names, dtype=np.str_)}
-    for r in c.corner_residuals:
-        arrays |= {f"corners/{r.sensor}/{name}": getattr(r, name) for name in _array_names(CornerResiduals)}
-    residuals = {
-        "lidars": c.lidar_residuals,
-        "wheels": c.wheel_residuals,
-        "poses": c.pose_residuals,
-        "tracks": c.track_residuals,
-    }
-    for folder, found in residuals.items():
-        for r in found:
-            arrays |= {f"{folder}/{r.sensor}/{name}": getattr(r, name) for name in _array_names(type(r))}
+    for (sensor, kind), r in c.residuals.items():
+        arrays |= {f"residuals/{sensor}/{kind}/{name}": getattr(r, name) for name in _array_names(type(r))}
     if c.cross_validation is not None:
         arrays |= {
             f"cross_validation/{name}": getattr(c.cross_validation, name) for name in _array_names(CrossValidation)
         }
-    arrays |= {f"imu_residuals/{name}": getattr(c.imu_residuals, name) for name in _array_names(ImuResiduals)}
     arrays |= {f"trajectory/{name}": getattr(c.trajectory, name) for name in _array_names(Trajectory)}
     for f in dataclasses.fields(Iteration):
         kind = {"stage": np.str_, "accepted": np.bool_}.get(f.name, np.float64)
@@ -176,32 +161,28 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         covariance=arrays["covariance"],
         covariance_names=tuple(arrays["covariance_names"].tolist()),
         fits=tuple(SensorFit(**f) for f in plain["fits"]),
-        corner_residuals=tuple(
-            CornerResiduals(sensor=s, **of(CornerResiduals, f"corners/{s}")) for s in plain["corner_sensors"]
-        ),
-        lidar_residuals=tuple(
-            LidarResiduals(**r, **of(LidarResiduals, f"lidars/{r['sensor']}")) for r in plain["lidars"]
-        ),
-        wheel_residuals=tuple(
-            WheelResiduals(**_tuples(r), **of(WheelResiduals, f"wheels/{r['sensor']}")) for r in plain["wheels"]
-        ),
-        pose_residuals=tuple(
-            PoseResiduals(**_tuples(r), **of(PoseResiduals, f"poses/{r['sensor']}")) for r in plain["poses"]
-        ),
-        track_residuals=tuple(
-            TrackResiduals(**r, **of(TrackResiduals, f"tracks/{r['sensor']}")) for r in plain["tracks"]
-        ),
+        residuals=by_key(_residuals(r, of) for r in plain["residuals"]),
         planes=tuple(
             Plane(p["name"], np.array(p["normal"]), np.array(p["point"]), p["count"]) for p in plain["planes"]
         ),
         cross_validation=_cross_validation(plain["cross_validation"], of),
-        imu_residuals=ImuResiduals(**of(ImuResiduals, "imu_residuals")),
         trajectory=Trajectory(**of(Trajectory, "trajectory")),
         recordings=tuple(RecordingSpan(**r) for r in plain["recordings"]),
         iterations=tuple(Iteration(*step) for step in zip(*steps, strict=True)),
         **{name: tuple(plain[name]) for name in _TEXTS},
         **{name: plain[name] for name in _PLAIN},
     )
+
+
+def _residuals(plain: dict[str, Any], of: Callable[[type, str], dict[str, Any]]) -> Residuals:
+    """A record of its own class where a kind of sensor has one for this kind of measurement, else one of rows."""
+    own = {record.kind: record for kind in SENSOR_KINDS for record in getattr(facet(kind, "record"), "RECORDS", ())}
+    fields = _tuples(plain)
+    record = own.get(fields["kind"], RowResiduals)
+    arrays = of(record, f"residuals/{fields['sensor']}/{fields['kind']}")
+    if record is not RowResiduals:
+        del fields["kind"]  # of the class
+    return record(**fields, **arrays)
 
 
 def _cross_validation(
@@ -250,6 +231,9 @@ def _check(c: Calibration) -> None:
         == (c.cross_validation.segments, n)
     ):
         raise ValueError(f"cross_validation has not {c.cross_validation.segments} segments and {n} parameters")
-    for r in c.lidar_residuals:
-        if len(r.plane) and not 0 <= r.plane.min() <= r.plane.max() < len(c.planes):
-            raise ValueError(f"{r.sensor} has points on planes that are not there")
+    for (sensor, kind), r in c.residuals.items():
+        if sensor not in c.rig["sensors"]:
+            raise ValueError(f"there are residuals of {sensor!r}, which is no sensor")
+        plane = np.asarray(getattr(r, "plane", ()))
+        if plane.size and not 0 <= plane.min() <= plane.max() < len(c.planes):
+            raise ValueError(f"{sensor} has {kind} on planes that are not there")

@@ -6,48 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from icalib.result.calibration import Calibration, ImuResiduals, Trajectory
-from icalib.result.images import CornerResiduals, TrackResiduals
-from icalib.result.robot import LidarResiduals, PoseResiduals, WheelResiduals
+from icalib.result.calibration import Calibration, Trajectory
+from icalib.sensors.records import Shapes
 
-_FLOAT, _WHOLE, _BOOL = "f", "iu", "b"  # values of numpy's dtype.kind
-_WORDS = {_FLOAT: "decimal", _WHOLE: "whole", _BOOL: "boolean"}
-# For each array its kind, then its axes. An axis is a length, or a name: equal names in one object are equal lengths.
-# "edges" is "images" + 1, and "labels" the number of the object's labels.
-_Shapes = dict[str, tuple[str | int, ...]]
-_IMAGES: _Shapes = {
-    "seconds": (_FLOAT, "images"),
-    "start": (_WHOLE, "edges"),
-    "point": (_WHOLE, "n"),
-    "uv": (_FLOAT, "n", 2),
-    "residual": (_FLOAT, "n", 2),
-    "rejected": (_BOOL, "n"),
-}
-_ROWS: _Shapes = {"seconds": (_FLOAT, "n"), "residual": (_FLOAT, "n", "labels"), "whitened": (_FLOAT, "n", "labels")}
-_SHAPES: dict[type, _Shapes] = {
-    CornerResiduals: _IMAGES | {"sigma": (_FLOAT, "n")},
-    TrackResiduals: _IMAGES | {"sigma": (_FLOAT, "n")},
-    WheelResiduals: _ROWS,
-    PoseResiduals: _ROWS,
-    LidarResiduals: {
-        "seconds": (_FLOAT, "n"),
-        "plane": (_WHOLE, "n"),
-        "distance": (_FLOAT, "n"),
-        "sigma": (_FLOAT, "n"),
-        "world": (_FLOAT, "n", 3),
-        "residual": (_FLOAT, "n"),
-        "first_world": (_FLOAT, "n", 3),
-        "first_residual": (_FLOAT, "n"),
-    },
-    ImuResiduals: {"seconds": (_FLOAT, "n"), "whitened": (_FLOAT, "n", 15)},
-    Trajectory: {
-        "seconds": (_FLOAT, "n"),
-        "rotation": (_FLOAT, "n", 3, 3),
-        "position": (_FLOAT, "n", 3),
-        "velocity": (_FLOAT, "n", 3),
-        "gyro_bias": (_FLOAT, "n", 3),
-        "accel_bias": (_FLOAT, "n", 3),
-    },
+_WORDS = {"f": "decimal", "iu": "whole", "b": "boolean"}  # by values of numpy's dtype.kind
+_TRAJECTORY: Shapes = {
+    "seconds": ("f", "n"),
+    "rotation": ("f", "n", 3, 3),
+    "position": ("f", "n", 3),
+    "velocity": ("f", "n", 3),
+    "gyro_bias": ("f", "n", 3),
+    "accel_bias": ("f", "n", 3),
 }
 
 
@@ -56,17 +25,16 @@ def check_arrays(c: Calibration) -> None:
 
     The shape of the covariance is not checked here.
     """
-    _check_kind("the covariance", c.covariance, _FLOAT)
-    residuals = (*c.corner_residuals, *c.track_residuals, *c.wheel_residuals, *c.pose_residuals, *c.lidar_residuals)
-    for part in (*residuals, c.imu_residuals, c.trajectory):
-        _check(part)
+    _check_kind("the covariance", c.covariance, "f")
+    for (sensor, _), record in c.residuals.items():
+        _check(record, sensor, record.shapes)
+    _check(c.trajectory, Trajectory.__name__, _TRAJECTORY)
 
 
-def _check(part: Any) -> None:
-    """Checks one object of a class in `_SHAPES`."""
-    what = getattr(part, "sensor", type(part).__name__)
+def _check(part: Any, what: str, shapes: Shapes) -> None:
+    """Checks one object, whose arrays must have these shapes."""
     lengths: dict[str, int] = {"labels": len(getattr(part, "labels", ()))}
-    for name, (kind, *axes) in _SHAPES[type(part)].items():
+    for name, (kind, *axes) in shapes.items():
         array = getattr(part, name)
         _check_kind(f"{name} of {what}", array, str(kind))
         if array.ndim != len(axes) or any(

@@ -1,7 +1,7 @@
 """The kinds of sensors: one folder each. A new kind is a new folder and one entry in `SENSOR_KINDS`.
 
-A facet is a module of a fixed name in the folder of a kind, for one stage of the program: `spec`, `read`, `model`,
-`initialize`, `assess`, `show`, `simulate`, `inspect`. Each stage asks the kinds for its own facet.
+A facet is a module of a fixed name in the folder of a kind, for one stage of the program: `spec`, `record`, `read`,
+`model`, `initialize`, `assess`, `show`, `simulate`, `inspect`. Each stage asks the kinds for its own facet.
 """
 
 from __future__ import annotations
@@ -12,7 +12,17 @@ from typing import Any
 
 # Sensors stand in this order in layouts and results; those of one kind in the order of the rig file.
 SENSOR_KINDS = ("imu", "camera", "lidar", "wheels", "pose")
-FACETS = ("spec", "stream", "read", "initialize", "assess", "show", "simulate", "inspect")  # levels of their own
+FACETS = (
+    "spec",
+    "record",
+    "stream",
+    "read",
+    "initialize",
+    "assess",
+    "show",
+    "simulate",
+    "inspect",
+)  # levels of their own
 
 
 def facet(kind: str, name: str) -> Any:

@@ -31,11 +31,13 @@ from icalib.result import (
     ImuResiduals,
     Iteration,
     ParameterGroup,
-    PoseResiduals,
+    Residuals,
+    RowResiduals,
     SensorFit,
     Trajectory,
     Verdict,
     Visited,
+    by_key,
 )
 from icalib.result.provenance import versions
 from icalib.result.timeline import Timeline
@@ -99,8 +101,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         covariance_names=names,
         undetermined=seen.undetermined,
         fits=tuple(judged),
-        corner_residuals=corner_residuals(found, timeline),
-        imu_residuals=_imu_residuals(found, trajectory),
+        residuals=by_key(_residuals(inputs, found, timeline, trajectory, poses)),
         trajectory=trajectory,
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
@@ -118,11 +119,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         rates=_rates(inputs),
         versions=versions(),
         recordings=timeline.spans,
-        lidar_residuals=lidar_residuals(inputs, found, timeline),
-        wheel_residuals=wheel_residuals(inputs, found, timeline),
         planes=planes(inputs, state),
-        pose_residuals=poses,
-        track_residuals=track_residuals(found, timeline),
         cross_validation=held,
         wrong=wrong,
     )
@@ -304,15 +301,28 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
     return recording[order][np.searchsorted(times[order], state.seconds)]
 
 
+def _residuals(
+    inputs: Inputs, found: Estimate, timeline: Timeline, trajectory: Trajectory, poses: tuple[RowResiduals, ...]
+) -> Iterator[Residuals]:
+    """In the order of `SENSOR_KINDS`."""
+    if inputs.imu is not None:
+        yield _imu_residuals(found, trajectory)
+    yield from corner_residuals(found, timeline)
+    yield from track_residuals(found, timeline)
+    yield from lidar_residuals(inputs, found, timeline)
+    yield from wheel_residuals(inputs, found, timeline)
+    yield from poses
+
+
 def _imu_residuals(found: Estimate, trajectory: Trajectory) -> ImuResiduals:
     """Of all intervals but those between recordings, which hold nothing."""
     chain = found.problem.chain
     out, seams = found.outcome.residuals[chain.key], np.array(chain.starts[1:], dtype=np.int64) - 1
-    return ImuResiduals(np.delete(trajectory.seconds[:-1], seams), np.delete(out.residual, seams, axis=0))
+    return ImuResiduals(chain.name, np.delete(trajectory.seconds[:-1], seams), np.delete(out.residual, seams, axis=0))
 
 
 def _warnings(
-    inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...], poses: tuple[PoseResiduals, ...]
+    inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...], poses: tuple[RowResiduals, ...]
 ) -> Iterator[str]:
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"

@@ -17,11 +17,12 @@ from icalib.motion.clocks import instants
 from icalib.motion.factor import Whitened, of_type
 from icalib.motion.nodes import usable
 from icalib.optim.state import State
-from icalib.result import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
+from icalib.result import Plane, RowResiduals, SensorFit
 from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import PoseSensor, Rig, Wheels
 from icalib.sensors.lidar.lidar_binning import LidarNoise, in_world
+from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
 from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
@@ -148,7 +149,7 @@ def _used(found: Estimate, name: str) -> int:
     return sum(int(f.moments.count.sum()) for f in of_type(found.problem.factors, LidarFactor) if f.name == name)
 
 
-def wheel_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple[WheelResiduals, ...]:
+def wheel_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple[RowResiduals, ...]:
     """Of each set of wheels."""
     out = []
     for key, factor in found.problem.factors.items():
@@ -160,11 +161,11 @@ def wheel_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
         labels = [(label, factor.units[kind]) for kind in factor.kinds for label in LABELS[kind]]
         names, units = zip(*labels, strict=True)
         shown = timeline.shown(seconds, timeline.recording_of(seconds))
-        out.append(WheelResiduals(factor.name, names, units, shown, residual, rows.residual.copy()))
+        out.append(RowResiduals(factor.name, "increments", names, units, shown, residual, rows.residual.copy()))
     return tuple(out)
 
 
-def pose_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple[PoseResiduals, ...]:
+def pose_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple[RowResiduals, ...]:
     """Of each pose sensor."""
     out = []
     labels = tuple(f"{kind} {axis}" for kind in ("rotation", "position") for axis in "xyz")
@@ -173,7 +174,7 @@ def pose_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple
         shown = timeline.shown(seconds, timeline.recording_of(seconds))
         units = ("rad",) * 3 + ("m",) * 3
         whitened = rows.residual.copy()
-        out.append(PoseResiduals(factor.name, labels, units, shown, whitened * factor.sigma, whitened))
+        out.append(RowResiduals(factor.name, "poses", labels, units, shown, whitened * factor.sigma, whitened))
     return tuple(out)
 
 
@@ -214,7 +215,7 @@ def _source(given: float | None) -> str:
     return "as residuals show it" if given is None else "as the rig file has it"
 
 
-def pose_warnings(residuals: tuple[PoseResiduals, ...], rig: Rig) -> Iterator[str]:
+def pose_warnings(residuals: tuple[RowResiduals, ...], rig: Rig) -> Iterator[str]:
     """Where residuals of poses follow one another, which noise does not."""
     kinds = {s.name: s.kind for s in rig.poses}
     for r in residuals:

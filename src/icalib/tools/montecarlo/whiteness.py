@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.result import Calibration, ImageResiduals, LidarResiduals, WheelResiduals, image_of
+from icalib.result import Calibration, ImageResiduals, ImuResiduals, RowResiduals, image_of
+from icalib.sensors.lidar.record import LidarResiduals
 from icalib.tools.montecarlo.record import Whiteness
 
 SAME_WALL_S = 0.3  # between two points of a plane that are neighbours in time
@@ -14,12 +15,14 @@ IMU_ROWS = ("rotation", "velocity", "position", "gyroscope walk", "accelerometer
 def whiteness(result: Calibration) -> tuple[Whiteness, ...]:
     """Of every kind of residual that the result holds."""
     found = [_of_image_points(r) for r in result.image_residuals]
-    if result.imu is not None:
-        for k, kind in enumerate(IMU_ROWS):
-            rows = result.imu_residuals.whitened[:, 3 * k : 3 * k + 3]
-            found.append(_statistics(result.imu, kind, rows, rows[:-1], rows[1:]))
-    found += [_of_points(r) for r in result.lidar_residuals]
-    found += [w for r in result.wheel_residuals for w in _of_wheels(r)]
+    for r in result.residuals.values():
+        if isinstance(r, ImuResiduals):
+            blocks = zip(IMU_ROWS, np.split(r.whitened, len(IMU_ROWS), axis=1), strict=True)
+            found += [_statistics(r.sensor, kind, rows, rows[:-1], rows[1:]) for kind, rows in blocks]
+        elif isinstance(r, LidarResiduals):
+            found.append(_of_points(r))
+        elif isinstance(r, RowResiduals):
+            found += _of_rows(r)
     return tuple(found)
 
 
@@ -31,8 +34,8 @@ def _of_points(r: LidarResiduals) -> Whiteness:
     return _statistics(r.sensor, "points", whitened, whitened[:-1][follows], whitened[1:][follows])
 
 
-def _of_wheels(r: WheelResiduals) -> list[Whiteness]:
-    """Each row of every stretch against that of the next stretch."""
+def _of_rows(r: RowResiduals) -> list[Whiteness]:
+    """Each column of every row against that of the next row."""
     columns = np.split(r.whitened, r.whitened.shape[1], axis=1)
     return [_statistics(r.sensor, name, x, x[:-1], x[1:]) for name, x in zip(r.labels, columns, strict=True)]
 

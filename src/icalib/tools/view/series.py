@@ -9,7 +9,8 @@ import numpy as np
 
 from icalib.report.motion_figures import BLOCKS
 from icalib.report.plot import AXIS_COLORS, COLORS, REJECTED
-from icalib.result import Calibration, ImageResiduals, LidarResiduals, rms_of_images
+from icalib.result import Calibration, ImageResiduals, rms_of_images
+from icalib.sensors.lidar.record import LidarResiduals
 from icalib.tools.view.colors import rgb
 from icalib.tools.view.scene import place
 from icalib.tools.view.stream import Stream

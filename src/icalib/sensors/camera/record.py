@@ -1,24 +1,37 @@
-"""What is left of what cameras saw: corners of a target, and points of the scene that they followed."""
+"""Residuals of images: corners of a target, and observations of tracked points of the scene."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+
+from icalib.sensors.records import Shapes
+
+_IMAGES: Shapes = {
+    "seconds": ("f", "images"),
+    "start": ("iu", "edges"),
+    "point": ("iu", "n"),
+    "uv": ("f", "n", 2),
+    "residual": ("f", "n", 2),
+    "sigma": ("f", "n"),
+    "rejected": ("b", "n"),
+}
 
 
 @dataclass(frozen=True)
 class CornerResiduals:
     """Residuals (predicted - measured) of one camera's corners, in the recording's order; rejected ones stay."""
 
-    kind: ClassVar[str] = "corners"
+    kind: str = field(default="corners", init=False)
+    shapes: ClassVar[Shapes] = _IMAGES
 
     sensor: str
     seconds: np.ndarray  # (M,) image times, imu clock, s since the first IMU stamp; see RecordingSpan for several
     start: np.ndarray  # (M + 1,) corners of image i are start[i]:start[i+1]
     point: np.ndarray  # (N,) index into the target's points
-    uv: np.ndarray  # (N, 2) measured, px; on edges as bent as the estimate says, where icalib found them in images
+    uv: np.ndarray  # (N, 2) measured, px; corrected for edge curvature by the estimate where icalib detected them
     residual: np.ndarray  # (N, 2) px
     sigma: np.ndarray  # (N,) px, standard deviation that the corner was given
     rejected: np.ndarray  # (N,) bool
@@ -33,17 +46,23 @@ class CornerResiduals:
         """(N, 2) residuals over their standard deviation."""
         return self.residual / self.sigma[:, None]
 
+    def normalised(self) -> dict[str, np.ndarray]:
+        """Of both coordinates together."""
+        return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
+
 
 @dataclass(frozen=True)
 class TrackResiduals:
-    """Residuals (predicted - measured) of the points of the scene that one camera followed, in the recording's order,
-    each point being where all its images want it. What is not in use has none, NaN: observations that were rejected,
-    and tracks that are too short, whose point is uncertain, or that fit far worse than most.
+    """Residuals (predicted - measured) of tracked points in the images of one camera, in the recording's order, with
+    each point at its least-squares position.
 
-    distance: m, median of the points in use from the camera; None where there are none.
+    The residual is NaN where an observation is not used: it is rejected, or its track is too short, its point
+    uncertain, or its fit far worse than most. distance: m, median of the points in use from the camera; None without
+    any.
     """
 
-    kind: ClassVar[str] = "observations"
+    kind: str = field(default="observations", init=False)
+    shapes: ClassVar[Shapes] = _IMAGES
 
     sensor: str
     distance: float | None
@@ -65,7 +84,12 @@ class TrackResiduals:
         """(N, 2) residuals over their standard deviation, NaN where there are none."""
         return self.residual / self.sigma[:, None]
 
+    def normalised(self) -> dict[str, np.ndarray]:
+        """Of both coordinates together."""
+        return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
 
+
+RECORDS = (CornerResiduals, TrackResiduals)
 ImageResiduals = CornerResiduals | TrackResiduals
 
 

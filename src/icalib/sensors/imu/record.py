@@ -1,0 +1,32 @@
+"""Residuals of the IMU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.sensors.records import Shapes
+
+
+@dataclass(frozen=True)
+class ImuResiduals:
+    """Whitened residuals of the IMU factor, one row an interval between keyframes.
+
+    Columns: rotation, velocity, position, gyroscope walk, accelerometer walk, three each.
+    """
+
+    kind: str = field(default="intervals", init=False)
+    shapes: ClassVar[Shapes] = {"seconds": ("f", "n"), "whitened": ("f", "n", 15)}
+
+    sensor: str
+    seconds: np.ndarray  # (K - 1,) start of each interval
+    whitened: np.ndarray  # (K - 1, 15)
+
+    def normalised(self) -> dict[str, np.ndarray]:
+        """Nothing: states between two keyframes follow the IMU, so that residuals are smaller than their noise."""
+        return {}
+
+
+RECORDS = (ImuResiduals,)
