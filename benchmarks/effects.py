@@ -26,7 +26,7 @@ from icalib.geometry.targets.base import SIZE_SIGMA
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, PoseSensor, Rig
-from icalib.rig.imu_classes import class_imperfections
+from icalib.sensors.imu.spec import class_imperfections
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import (
     Drive,

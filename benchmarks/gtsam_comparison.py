@@ -27,7 +27,7 @@ from icalib.initialize import initial_guess
 from icalib.initialize.start import first_state
 from icalib.optim.state import State
 from icalib.rig import Rig
-from icalib.rig.parameter import fixed
+from icalib.sensors.parameter import fixed
 
 SECONDS = 20.0  # of the recording, from its first image on
 POINT_SIGMA_M = 1e-6

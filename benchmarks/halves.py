@@ -20,7 +20,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
 from icalib.rig.file import load_rig
-from icalib.rig.imu_classes import N_INTRINSICS, class_imperfections, class_of_noise
+from icalib.sensors.imu.spec import N_INTRINSICS, class_imperfections, class_of_noise
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "euroc"
 PLAIN = {"bloom": False, "board_shape": False, "blur_noise": False, "common_error": False}

@@ -21,7 +21,7 @@ import numpy as np
 import icalib
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig, Settings
-from icalib.rig.imu_classes import FREE
+from icalib.sensors.imu.spec import FREE
 from icalib.tools.simulation import Scenario, SimCamera, Truth, film, handheld, rig_for, simulate, tag_map, write_film
 
 KINDS = ("pinhole", "fisheye", "stereo", "tags")

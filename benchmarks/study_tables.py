@@ -18,7 +18,7 @@ from typing import Any
 
 from icalib.base.text_files import write_texts
 from icalib.result.quantities import shown
-from icalib.rig.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import shown_unit
 from icalib.tools.montecarlo.record import from_json
 from icalib.tools.montecarlo.statistics import Nees
 from icalib.tools.montecarlo.summary import consistency_json, summarise

@@ -22,11 +22,11 @@ AT_THE_ROOT = {"__init__", "errors", "pipeline"}  # `calibrate` is the name of t
 
 # Folders below icalib; those of one line do not import one another. `sensors.*.spec`: the facet of every sensor.
 ORDER = (
-    ("base", "sensors"),
-    ("geometry", "geometry.targets"),
+    ("base",),
+    ("geometry", "geometry.targets", "sensors"),
     ("geometry.cameras",),
-    ("rig",),
     ("sensors.*.record", "sensors.*.spec"),
+    ("rig",),
     ("rig.file", "data"),
     ("sensors.*.stream",),
     ("data.stamps",),

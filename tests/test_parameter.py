@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import icalib
 from icalib.errors import RigError
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, Wheels, by_name
-from icalib.rig.parameter import Parameter
+from icalib.sensors.parameter import Parameter
 
 TURN = Rotation.from_euler("xyz", [10.0, -20.0, 80.0], degrees=True)
 

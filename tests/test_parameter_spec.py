@@ -32,9 +32,9 @@ from icalib.rig import (
     by_name,
 )
 from icalib.rig.file import rig_from_dict, rig_to_dict
-from icalib.rig.file.fields import groups_to_plain, parameter_fields, parameters
-from icalib.rig.imu_classes import class_noise
 from icalib.rig.kinds import SENSOR_TYPES, SPECS
+from icalib.sensors.fields import groups_to_plain, parameter_fields, parameters
+from icalib.sensors.imu.spec import class_noise
 
 SOURCE = Path(icalib.__file__).parent
 NAMES = {spec.name for own in SENSOR_TYPES.values() for spec in own.parameters} | set(SPECS)

@@ -6,9 +6,11 @@ import pytest
 
 from icalib.data.measurements import Measurements
 from icalib.errors import RigError
+from icalib.geometry.targets import Checkerboard
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels, by_name
-from icalib.rig.complete import lack_of
+from icalib.rig import Camera, Ground, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, Wheels, by_name
+from icalib.rig.complete import check_complete, lack_of
+from icalib.rig.file import rig_from_dict, rig_to_dict
 
 IMU = ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
 LIDAR, WHEELS = Lidar("lidar0", ""), Wheels("wheel0", "", "differential")
@@ -29,13 +31,33 @@ EMPTY = Measurements(None, ())
         (Rig(by_name(LIDAR, MOCAP)), "lidar0 needs an IMU"),
         (Rig(by_name(LIDAR, WHEELS)), "lidar0 needs an IMU"),
         (Rig(by_name(MOCAP)), "mocap0 is the only sensor"),
-        (Rig(by_name(WHEELS, ODOMETRY)), "odom0 without camera and IMU"),
+        (Rig(by_name(WHEELS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
     ],
     ids=lambda value: "" if isinstance(value, Rig) else value,
 )
 def test_what_cannot_be_calibrated_is_refused(rig: Rig, sentence: str):
     with pytest.raises(RigError, match=sentence):
         calibrate_measurements(rig, EMPTY)
+
+
+def test_a_camera_that_sees_a_target_stands_in_for_absolute_poses():
+    rig = Rig(by_name(Camera("cam0", "", "eucm", (9, 9)), ODOMETRY), Checkerboard(6, 7, 0.1))
+    assert lack_of(rig) is None and rig.body == "cam0"
+    assert rig_from_dict(rig_to_dict(rig), "rig.yaml").body == "cam0"
+
+
+@pytest.mark.parametrize(
+    ("rig", "words"),
+    [
+        (Rig(by_name(IMU, ImuSensor("imu1", "", IMU.noise), LIDAR)), "^imu1 is a second IMU beside imu0"),
+        (Rig(by_name(IMU, Camera("cam0", "", "eucm", (9, 9)))), "^target is missing; .* of cam0"),
+        (Rig(by_name(IMU, MOCAP, Wheels("w", "", ground=Ground("floor", 0.1)))), "^w.ground.plane: a LiDAR determines"),
+        (Rig(by_name(IMU, LIDAR), settings=Settings(points_on_planes_m=0.1)), "^points_on_planes_m needs a LiDAR"),
+    ],
+)
+def test_rigs_made_in_python_are_checked_as_rig_files_are(rig: Rig, words: str):
+    with pytest.raises(RigError, match=words):
+        check_complete(rig)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from icalib.rig import (
     by_name,
 )
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
-from icalib.rig.imu_classes import IMU_CLASSES, INTRINSICS_LABELS, class_imperfections, class_noise
+from icalib.sensors.imu.spec import IMU_CLASSES, INTRINSICS_LABELS, class_imperfections, class_noise
 
 VALID = """\
 sensors:

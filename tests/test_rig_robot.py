@@ -171,7 +171,7 @@ def test_without_an_imu_a_pose_sensor_shows_the_motion(tmp_path):
     assert load(tmp_path, mocap + "  slam0: {type: pose, kind: relative}\n").imu is None
     assert "sensors.mocap0: is the only sensor; add the sensors to calibrate" in complaint(tmp_path, mocap)
     relative = mocap.replace("pose}", "pose, kind: relative}")
-    assert "sensors.mocap0: without camera and IMU this sensor must determine" in complaint(tmp_path, relative + wheels)
+    assert "sensors.mocap0: without an IMU, or a camera that sees a target" in complaint(tmp_path, relative + wheels)
 
 
 def test_clocks_that_restart(tmp_path):

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from icalib.pipeline import calibrate, calibrate_measurements
     from icalib.result import Calibration, load_calibration
     from icalib.rig.file import load_rig
-    from icalib.rig.parameter import Parameter, fixed, free, guess, prior
+    from icalib.sensors.parameter import Parameter, fixed, free, guess, prior
 
 __version__ = "0.2.0"
 __all__ = [
@@ -35,16 +35,16 @@ __all__ = [
 _HOME = {
     "Calibration": "icalib.result",
     "CalibrationError": "icalib.errors",
-    "Parameter": "icalib.rig.parameter",
+    "Parameter": "icalib.sensors.parameter",
     "calibrate": "icalib.pipeline",
     "calibrate_measurements": "icalib.pipeline",
-    "fixed": "icalib.rig.parameter",
-    "free": "icalib.rig.parameter",
-    "guess": "icalib.rig.parameter",
+    "fixed": "icalib.sensors.parameter",
+    "free": "icalib.sensors.parameter",
+    "guess": "icalib.sensors.parameter",
     "load_calibration": "icalib.result",
     "load_rig": "icalib.rig.file",
     "open_recording": "icalib.data.recordings",
-    "prior": "icalib.rig.parameter",
+    "prior": "icalib.sensors.parameter",
     "progress_bar": "icalib.cli.progress",
 }
 

@@ -13,7 +13,7 @@ from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.rig.imu_classes import class_imperfections
+from icalib.sensors.imu.spec import class_imperfections
 
 CAMERAS = ("cam0", "cam1")
 GROUPS = ("rotation", "translation", "time_offset", "intrinsics", "distortion", "bloom")

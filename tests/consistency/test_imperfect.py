@@ -12,7 +12,7 @@ from tests.typed import not_none
 
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
-from icalib.rig.imu_classes import class_imperfections
+from icalib.sensors.imu.spec import class_imperfections
 from icalib.tools.simulation import SimPoses, handheld, rig_for, simulate
 
 

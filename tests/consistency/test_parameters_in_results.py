@@ -12,7 +12,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result.summary import calibration_yaml, parameter_keys
 from icalib.result.verdict import by_size, worst
 from icalib.rig.kinds import SENSOR_TYPES, SPECS
-from icalib.rig.sensor import MOUNTED
+from icalib.sensors.sensor import MOUNTED
 from icalib.tools.comparison.compare import compare_sides
 from icalib.tools.comparison.results import side_of_result
 from icalib.tools.montecarlo.truth import true_value

@@ -13,7 +13,7 @@ from icalib.geometry.targets import Charuco, Checkerboard, Target
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.rig.imu_classes import FREE
+from icalib.sensors.imu.spec import FREE
 from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 

@@ -18,7 +18,7 @@ from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
-from icalib.rig.parameter import fixed
+from icalib.sensors.parameter import fixed
 from icalib.tools.montecarlo.truth import error
 from icalib.tools.simulation import Drive, Scenario, SimPoses, handheld, rig_for, simulate
 

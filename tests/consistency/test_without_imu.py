@@ -15,7 +15,7 @@ from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
-from icalib.rig.parameter import fixed
+from icalib.sensors.parameter import fixed
 from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 EXACT = 1e-8

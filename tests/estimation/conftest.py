@@ -27,7 +27,6 @@ from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.state import NODE, Entry, Kind, Layout, State, make_layout
 from icalib.rig import ImuSensor, Lidar, Scheme, Settings
-from icalib.rig.imu_classes import class_noise
 from icalib.rig.scene import SHAPE_LABELS
 from icalib.sensors.camera.bodies import SIZE, Bodies, restrict
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
@@ -35,6 +34,7 @@ from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.surfaces import OnPlanes, Surfaces
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.lidar.residual import LidarFactor
 from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, simulate

@@ -20,8 +20,8 @@ from icalib.initialize.start import start
 from icalib.optim.arrowhead import solve
 from icalib.optim.state import State
 from icalib.rig import Parameter
-from icalib.rig.camera import DISTORTION, INTRINSICS
-from icalib.rig.sensor import ROTATION, TIME_OFFSET
+from icalib.sensors.camera.spec import DISTORTION, INTRINSICS
+from icalib.sensors.sensor import ROTATION, TIME_OFFSET
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 TURNED = {("cam0", "translation"): np.array([0.05, -0.02, 0.03]), ("cam1", "time_offset"): np.array([2e-3])}

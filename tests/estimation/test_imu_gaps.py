@@ -7,7 +7,7 @@ import pytest
 
 from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 
 
 def gaps(seconds: np.ndarray) -> int:

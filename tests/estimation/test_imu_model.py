@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from icalib.motion.imu_model import correction_matrices
 from icalib.motion.integration_step import SIZE, STRIDE, E, correction, fill_intrinsics
-from icalib.rig.imu_classes import INTRINSICS_LABELS as LABELS
-from icalib.rig.imu_classes import N_INTRINSICS
+from icalib.sensors.imu.spec import INTRINSICS_LABELS as LABELS
+from icalib.sensors.imu.spec import N_INTRINSICS
 
 LOWER = ([0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2])
 RATE, FORCE = np.array([0.7, -1.1, 0.4]), np.array([2.0, -3.0, 9.0])

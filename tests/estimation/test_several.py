@@ -23,9 +23,9 @@ from icalib.motion.factor import of_type
 from icalib.motion.nodes import first_nodes, place_nodes, usable
 from icalib.optim.state import NODE, State
 from icalib.rig import Rig
-from icalib.rig.parameter import fixed
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.parameter import fixed
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 DAY_NS = 86_400 * 10**9

@@ -11,7 +11,7 @@ import pytest
 from icalib.geometry import so3
 from icalib.initialize.lidar.lidar import LidarGuess
 from icalib.initialize.start import start
-from icalib.rig.parameter import Mode, Parameter
+from icalib.sensors.parameter import Mode, Parameter
 from icalib.tools.simulation import rig_for
 
 TURN_RAD, LATE_S = 0.15, 0.03

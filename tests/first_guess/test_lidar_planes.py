@@ -20,8 +20,8 @@ from icalib.motion.nodes import place_nodes
 from icalib.motion.sweep import Motion
 from icalib.optim.state import State, make_layout
 from icalib.rig import ImuSensor, Lidar, Settings
-from icalib.rig.imu_classes import class_noise
 from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.lidar.residual import LidarFactor
 

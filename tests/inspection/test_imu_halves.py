@@ -13,7 +13,7 @@ from icalib.data.recordings import open_recording
 from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor, TwoSources
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 from icalib.tools.inspection import inspect_recording
 from icalib.tools.inspection.draft import draft_rig
 

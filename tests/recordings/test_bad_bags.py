@@ -17,7 +17,7 @@ from icalib.data.measurements import ImuStream
 from icalib.data.recordings import Recording, open_recording
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
 S = 1_000_000_000

@@ -22,7 +22,7 @@ from icalib.data.recordings import BagRecording, Recording, decode, image_topics
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import Camera, ImuSensor, Rig, by_name
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 
 FORMS = [
     "ros1",

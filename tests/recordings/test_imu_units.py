@@ -11,7 +11,7 @@ from icalib.data.checks.imu_checks import checked_imu
 from icalib.data.measurements import ImuStream
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 from icalib.tools.simulation import handheld, simulate
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))

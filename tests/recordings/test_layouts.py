@@ -16,7 +16,7 @@ from icalib.data.tables.wheels import WheelReadings
 from icalib.errors import RecordingError, RigError
 from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels, by_name
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 
 ORIGIN, STEP, N = 1_700_000_000_123_456_789, 5_000_000, 60
 STAMPS = ORIGIN + STEP * np.arange(N)

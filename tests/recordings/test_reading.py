@@ -15,7 +15,7 @@ from icalib.data.stamps.camera_checks import checked_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import Camera, ImuSensor, Rig, by_name
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 
 ORIGIN = 1_404_733_405_732_800_001
 IMU_STEP, IMAGE_STEP = 5_000_000, 50_000_000

@@ -14,7 +14,7 @@ from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
 from icalib.rig import Camera, ImuSensor, Lidar
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 from icalib.tools.inspection import inspect_recording
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"

@@ -20,7 +20,7 @@ from icalib.data.stamps.window import Window, start_of
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate
 from icalib.rig import Camera, ImuSensor, PoseSensor, TwoSources, Wheels
-from icalib.rig.imu_classes import class_noise
+from icalib.sensors.imu.spec import class_noise
 from icalib.tools.inspection import inspect_recording
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))

@@ -17,8 +17,8 @@ from scipy.stats import chi2, norm
 from icalib.cli import main
 from icalib.export.formats import export
 from icalib.result import Calibration, Verdict, relative_pose
-from icalib.rig.file.parameters import parameter_to_plain
-from icalib.rig.parameter import fixed
+from icalib.sensors.parameter import fixed
+from icalib.sensors.parameter_fields import parameter_to_plain
 from icalib.tools.comparison.compare import Comparison, ComparisonTolerances, Difference, compare_sides
 from icalib.tools.comparison.reading import compare_files
 from icalib.tools.comparison.results import side_of_result

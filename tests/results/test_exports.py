@@ -26,7 +26,7 @@ from icalib.export.names import FORMATS
 from icalib.geometry.cameras import camera_model
 from icalib.motion.imu_model import correction_matrices
 from icalib.result import Calibration, ParameterGroup
-from icalib.rig.imu_classes import INTRINSICS_LABELS
+from icalib.sensors.imu.spec import INTRINSICS_LABELS
 
 
 def by_opencv(text: str, tmp_path: Path) -> cv2.FileStorage:

@@ -15,7 +15,7 @@ from icalib.export.kalibr import camchain, imu_yaml
 from icalib.geometry.cameras import camera_model
 from icalib.motion.imu_model import correction_matrices
 from icalib.result import Calibration, ParameterGroup, by_key
-from icalib.rig.imu_classes import INTRINSICS_LABELS
+from icalib.sensors.imu.spec import INTRINSICS_LABELS
 
 
 @pytest.fixture(scope="module")

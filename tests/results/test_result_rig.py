@@ -15,7 +15,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.result.as_rig import TREATMENTS, Treatment, rig_of_result
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
-from icalib.rig.parameter import Parameter
+from icalib.sensors.parameter import Parameter
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 ESTIMATED = [("cam0", "rotation"), ("cam0", "intrinsics"), ("lidar0", "translation"), ("wheel0", "radii")]

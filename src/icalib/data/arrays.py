@@ -23,7 +23,7 @@ from icalib.data.measurements import (
     WheelStream,
 )
 from icalib.errors import RecordingError
-from icalib.rig.parameter import ROUNDING
+from icalib.sensors.parameter import ROUNDING
 
 AnyStream = ImuStream | CornerStream | TrackStream | LidarStream | WheelStream | WheelPoses | PoseStream
 

@@ -14,7 +14,7 @@ from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration
-from icalib.rig.sensor import MOUNTED_NAMES
+from icalib.sensors.sensor import MOUNTED_NAMES
 
 
 @dataclass(frozen=True)

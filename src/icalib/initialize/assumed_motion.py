@@ -42,9 +42,9 @@ from icalib.initialize.wheels.wheels import SidewaysError
 from icalib.motion.nodes import first_nodes
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import ImuNoise, ImuSensor, Rig
-from icalib.rig.parameter import Parameter, fixed
-from icalib.rig.sensor import mounted
+from icalib.sensors.parameter import Parameter, fixed
 from icalib.sensors.pose.residual import FRAME, frame_of
+from icalib.sensors.sensor import mounted
 
 ASSUMPTION = "assumed motion"  # no sensor is called so
 STEP_S = 0.01  # between readings

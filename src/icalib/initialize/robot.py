@@ -22,8 +22,8 @@ from icalib.motion.imu_data import clear_of
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
-from icalib.rig.sensor import mounted
 from icalib.sensors.pose.residual import FRAME, frame_of
+from icalib.sensors.sensor import mounted
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
 LEVEL = 0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level

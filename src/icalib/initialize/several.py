@@ -19,8 +19,8 @@ from icalib.initialize.steps.guess import CameraGuess, Guess
 from icalib.initialize.tracks.from_tracks import guess_from_tracks
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Camera, Rig
-from icalib.rig.parameter import fixed
 from icalib.sensors.camera.bodies import Bodies
+from icalib.sensors.parameter import fixed
 
 
 def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:

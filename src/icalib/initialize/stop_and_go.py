@@ -26,7 +26,7 @@ from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.motion.pose_rows import Mount
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import PoseSensor, Rig
-from icalib.rig.parameter import fixed
+from icalib.sensors.parameter import fixed
 from icalib.sensors.pose.residual import FRAME, frame_of
 
 FEWEST_PAIRS = 3  # of one recording

@@ -31,7 +31,7 @@ from icalib.motion.integration import bias_of, readings_of
 from icalib.motion.integration_step import SIZE, STRIDE, E, J, P, V, correction, fill_intrinsics
 from icalib.optim.state import NODE, State
 from icalib.rig import Scheme
-from icalib.rig.imu_classes import N_INTRINSICS
+from icalib.sensors.imu.spec import N_INTRINSICS
 
 
 @dataclass(frozen=True)

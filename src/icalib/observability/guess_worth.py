@@ -22,7 +22,7 @@ from icalib.estimate.problem.tolerances import UNGUESSED
 from icalib.geometry import planes, so3
 from icalib.optim.calib_block import HELD_BELOW
 from icalib.optim.state import Block, State
-from icalib.rig.sensor import ROTATION
+from icalib.sensors.sensor import ROTATION
 
 PULLED = 0.25  # information in tolerance units, noise and all
 FARTHEST = 2.0  # standard deviations of the guess

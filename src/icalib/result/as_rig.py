@@ -12,7 +12,7 @@ from icalib.errors import RigError
 from icalib.result import Calibration, ParameterGroup
 from icalib.rig import Rig, Settings
 from icalib.rig.file import rig_from_dict, rig_to_dict
-from icalib.rig.parameter import Parameter
+from icalib.sensors.parameter import Parameter
 
 Treatment = Literal["fixed", "prior", "guess"]
 TREATMENTS: tuple[Treatment, ...] = ("fixed", "prior", "guess")

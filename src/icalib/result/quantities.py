@@ -11,7 +11,7 @@ import numpy as np
 from icalib.result.verdict import worst
 from icalib.rig import LENS
 from icalib.rig.kinds import ONE
-from icalib.rig.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import shown_unit
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict

@@ -11,7 +11,7 @@ import yaml
 from icalib.result.calibration import Calibration, ParameterGroup, SensorFit
 from icalib.result.relative import RelativePose, relative_poses
 from icalib.rig.kinds import ONE
-from icalib.rig.sensor import MOUNTED, MOUNTED_NAMES, ROTATION, TRANSLATION
+from icalib.sensors.sensor import MOUNTED, MOUNTED_NAMES, ROTATION, TRANSLATION
 
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.

@@ -22,7 +22,7 @@ from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
 from icalib.rig import LENS, Settings
 from icalib.rig.kinds import SPECS
-from icalib.rig.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import shown_unit
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, Verdict

@@ -1,51 +1,49 @@
 """What is calibrated: sensors and their parameters, target, settings."""
 
-from icalib.rig.camera import (
-    LENS,
-    TRACK_IMAGES,
-    Camera,
-)
-from icalib.rig.imu import (
-    BY_CLASS,
-    AccelUnit,
-    GyroUnit,
-    ImuSensor,
-    TwoSources,
-)
-from icalib.rig.imu_classes import (
-    ImuNoise,
-)
-from icalib.rig.lidar import (
-    Lidar,
-    PointTime,
-)
-from icalib.rig.parameter import (
-    Parameter,
-)
-from icalib.rig.parameter_spec import (
-    ParameterSpec,
-)
-from icalib.rig.pose import (
-    PoseKind,
-    PoseSensor,
-)
 from icalib.rig.rig import (
     Rig,
     by_name,
-)
-from icalib.rig.sensor import (
-    PLAIN_TABLE,
-    Axes,
-    Sensor,
-    TableLayout,
-    TimeUnit,
 )
 from icalib.rig.settings import (
     Loss,
     Scheme,
     Settings,
 )
-from icalib.rig.wheels import (
+from icalib.sensors.camera.spec import (
+    LENS,
+    TRACK_IMAGES,
+    Camera,
+)
+from icalib.sensors.imu.spec import (
+    BY_CLASS,
+    AccelUnit,
+    GyroUnit,
+    ImuNoise,
+    ImuSensor,
+    TwoSources,
+)
+from icalib.sensors.lidar.spec import (
+    Lidar,
+    PointTime,
+)
+from icalib.sensors.parameter import (
+    Parameter,
+)
+from icalib.sensors.parameter_spec import (
+    ParameterSpec,
+)
+from icalib.sensors.pose.spec import (
+    PoseKind,
+    PoseSensor,
+)
+from icalib.sensors.sensor import (
+    PLAIN_TABLE,
+    Axes,
+    Sensor,
+    TableLayout,
+    TimeUnit,
+)
+from icalib.sensors.wheels.spec import (
     DRIVES,
     RATE_UNITS,
     Ground,

@@ -1,48 +1,71 @@
-"""Whether the sensors of a rig can be calibrated together: something must show the motion."""
+"""Whether the sensors of a rig can be calibrated together: something must determine the motion."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 from icalib.errors import RigError
-from icalib.rig import Rig
-
-
-@dataclass(frozen=True)
-class Lack:
-    """Why a rig cannot be calibrated, about the sensor of this name, or about all where it is empty."""
-
-    sensor: str
-    sentence: str
+from icalib.rig.kinds import SENSOR_TYPES
+from icalib.rig.rig import Rig
+from icalib.sensors.sensor import Lack, has_imu
 
 
 def lack_of(rig: Rig) -> Lack | None:
-    """What keeps the sensors of the rig from being calibrated together; None where nothing does."""
-    if not rig.cameras and not rig.lidars and not rig.poses:
-        there = " and ".join([w.name for w in rig.wheels] + ([rig.imu.name] if rig.imu else []))
-        alone = f"{there} do not determine the motion, and " if rig.wheels else ""
-        return Lack("", f"{alone}there is no camera, no LiDAR and no pose sensor; add one of them.")
-    if rig.imu is not None:
-        return None
-    if rig.lidars:
-        return Lack(rig.lidars[0].name, "needs an IMU; add a sensor of type: imu, or remove this one.")
-    if not rig.moves_by_poses:
-        return None
-    first = rig.poses[0]
-    if first.kind != "absolute":
-        return Lack(
-            first.name,
-            "without camera and IMU this sensor must determine the motion; write kind: absolute, or add one."
-            if not rig.cameras else
-            "without target and IMU this sensor must determine the motion; write kind: absolute, or add one."
-        )  # fmt: skip
-    if len(rig.poses) == 1 and not (rig.wheels or rig.cameras):
-        return Lack(first.name, "is the only sensor; add the sensors to calibrate it with.")
-    return None
+    """The first reason why the sensors of the rig cannot be calibrated together; None without one."""
+    return next(_lacks(rig), None)
 
 
 def check_complete(rig: Rig) -> None:
     """Raises RigError where sensors cannot be calibrated together."""
     lack = lack_of(rig)
-    if lack is not None:
-        raise RigError(f"{lack.sensor} {lack.sentence}" if lack.sensor else lack.sentence)
+    if lack is None:
+        return
+    place = ".".join(lack.where[1:])
+    raise RigError(f"{place}{':' * (len(lack.where) > 2)} {lack.sentence}" if place else lack.sentence)
+
+
+def _lacks(rig: Rig) -> Iterator[Lack]:
+    yield from _second_imu(rig)
+    if not any(sensor.gives_motion for sensor in rig.mounted):
+        yield Lack(("sensors",), _no_motion(rig))
+    for sensor in rig.sensors.values():
+        yield from sensor.lacks(rig.sensors, rig.has_target)
+    if not has_imu(rig.sensors):
+        yield from _clocks_without_reference(rig)
+    plane_sensor = any(s.shows_planes for s in rig.mounted)
+    if rig.settings.points_on_planes_m > 0.0 and not (plane_sensor and any(s.tracks_points for s in rig.mounted)):
+        yield Lack(
+            ("settings", "points_on_planes_m"),
+            "needs a LiDAR that sees planes, and a camera with feature tracks; remove it.",
+        )
+
+
+def _second_imu(rig: Rig) -> Iterator[Lack]:
+    """The only place that refuses a second IMU: the estimator integrates one."""
+    first, *others = [s.name for s in rig.sensors.values() if s.is_inertial] or [""]
+    for name in others:
+        yield Lack(("sensors", name), f"is a second IMU beside {first}; keep the one that is the body frame.")
+
+
+def _no_motion(rig: Rig) -> str:
+    nouns = [kind.noun for kind in SENSOR_TYPES.values() if kind.gives_motion]
+    there = " and ".join(s.name for s in (*rig.mounted, rig.imu) if s is not None)
+    alone = f"{there} do not determine the motion, and " if rig.mounted else ""
+    missing = f"no {', no '.join(nouns[:-1])} and no {nouns[-1]}"
+    return f"{alone}there is {missing}; add one of them."
+
+
+def _clocks_without_reference(rig: Rig) -> Iterator[Lack]:
+    """Sensors whose clocks are said to restart, in a rig without an IMU, and that have no time offset."""
+    for sensor in rig.mounted:
+        if not getattr(sensor, "clock_restarts", False):
+            continue
+        where = ("sensors", sensor.name, "clock_restarts")
+        if rig.cameras_alone:
+            yield Lack(where, "cameras alone have no time offsets; remove it, or add a sensor of type: imu.")
+        elif sensor.name == rig.body:
+            yield Lack(
+                where,
+                f"without an IMU the clock of {rig.body} is the reference clock; set clock_restarts of the other "
+                "sensors instead, or write false.",
+            )

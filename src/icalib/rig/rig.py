@@ -10,15 +10,15 @@ from typing import Any, TypeVar
 
 from icalib.errors import RigError
 from icalib.geometry.targets import NoTarget, Target
-from icalib.rig.camera import Camera
-from icalib.rig.imu import ImuSensor
-from icalib.rig.lidar import Lidar
-from icalib.rig.parameter import check_fields
-from icalib.rig.pose import PoseSensor
-from icalib.rig.sensor import Sensor
 from icalib.rig.settings import Settings
-from icalib.rig.wheels import Wheels
 from icalib.sensors import SENSOR_KINDS
+from icalib.sensors.camera.spec import Camera
+from icalib.sensors.imu.spec import ImuSensor
+from icalib.sensors.lidar.spec import Lidar
+from icalib.sensors.parameter import check_fields
+from icalib.sensors.pose.spec import PoseSensor
+from icalib.sensors.sensor import Sensor
+from icalib.sensors.wheels.spec import Wheels
 
 T = TypeVar("T", bound=Sensor)
 # Short names for all sensors of a type: properties of a rig, and fields of `Rig.with_`.
@@ -104,8 +104,10 @@ class Rig:
 
     @property
     def first_seeing(self) -> str:
-        """Name of the sensor that is the body where there is no IMU."""
-        return (*self.poses, *self.cameras)[0].name if self.moves_by_poses else (*self.cameras, *self.poses)[0].name
+        """Name of the sensor that is the body where there is no IMU: the first that determines the motion alone, or
+        else the first that does beside an IMU."""
+        alone = (s for s in self.mounted if s.gives_motion_without_imu(self.has_target))
+        return next(s.name for s in (*alone, *(s for s in self.mounted if s.gives_motion)))
 
     @property
     def moves_by_poses(self) -> bool:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from math import radians
 
-from icalib.rig.parameter_spec import AXES, ParameterSpec
-from icalib.rig.sensor import ROTATION, TRANSLATION
+from icalib.sensors.parameter_spec import AXES, ParameterSpec
+from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 # True lengths of the target over those of the rig file.
 SIZE = ParameterSpec("size", 1, "nuisance", "", ("size",), 1e-2, 0.1)

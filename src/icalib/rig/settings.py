@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from icalib.rig.parameter_spec import ToleranceSetting
+from icalib.sensors.parameter_spec import ToleranceSetting
 
 Scheme = Literal["inertial", "pose", "kinematic"]
 Loss = Literal["none", "huber", "cauchy"]

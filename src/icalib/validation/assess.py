@@ -44,8 +44,8 @@ from icalib.result.timeline import Timeline
 from icalib.result.verdict import by_size
 from icalib.rig import drive_names
 from icalib.rig.file import rig_to_dict
-from icalib.rig.pose import SCALE
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.pose.spec import SCALE
 from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.cameras import plane_warnings
 from icalib.validation.guesses import guess_notes

@@ -13,10 +13,10 @@ from icalib.observability.fixed_lens import LensStep
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.excess import excess, times
 from icalib.rig import Camera, Rig
-from icalib.rig.camera import INTRINSICS
-from icalib.rig.sensor import ROTATION, TRANSLATION
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.surfaces import ON_PLANES
+from icalib.sensors.camera.spec import INTRINSICS
+from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 GIVEN = (ROTATION, TRANSLATION, INTRINSICS)
 FAR = 0.5  # of what guesses are worth: 5 cm, 3 deg, 8 px

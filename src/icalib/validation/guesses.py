@@ -13,8 +13,8 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.contradicted import is_contradicted
 from icalib.result import ParameterGroup
 from icalib.rig import LENS, Camera
-from icalib.rig.camera import INTRINSICS
-from icalib.rig.parameter_spec import shown_unit
+from icalib.sensors.camera.spec import INTRINSICS
+from icalib.sensors.parameter_spec import shown_unit
 from icalib.validation.looks_like import looks_like
 from icalib.validation.stated import scaled
 

@@ -15,11 +15,11 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.nodes import usable
 from icalib.result.timeline import Timeline
 from icalib.rig import ImuSensor
-from icalib.rig.imu_classes import INTRINSICS_LABELS, class_of_sigma
 from icalib.sensors.camera.bodies import words_on_left_out
 from icalib.sensors.camera.circle_centres import centre_shifts
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.imu.spec import INTRINSICS_LABELS, class_of_sigma
 from icalib.validation.robot import robot_notes
 from icalib.validation.upwards import upwards_notes
 

@@ -18,8 +18,8 @@ import numpy as np
 from icalib.estimate.evidence.parts import Parts
 from icalib.optim.calib_block import complement
 from icalib.optim.state import Key
-from icalib.rig.camera import INTRINSICS
-from icalib.rig.sensor import ROTATION, TIME_OFFSET, TRANSLATION
+from icalib.sensors.camera.spec import INTRINSICS
+from icalib.sensors.sensor import ROTATION, TIME_OFFSET, TRANSLATION
 
 # The groups that change together. Board, planes and IMU are what the others are measured by.
 CHANGING = ((TIME_OFFSET.name,), (ROTATION.name, TRANSLATION.name), (INTRINSICS.name,))

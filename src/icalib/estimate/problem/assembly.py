@@ -25,7 +25,6 @@ from icalib.optim.calib_block import NOTHING
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
-from icalib.rig.imu_classes import N_INTRINSICS
 from icalib.rig.scene import SHAPE_LABELS
 from icalib.sensors.camera.board import SHAPE_SIGMA_M, bloom_direction
 from icalib.sensors.camera.bodies import SIZE
@@ -37,6 +36,7 @@ from icalib.sensors.camera.features.patch_curvature import with_curved_patches
 from icalib.sensors.camera.features.surfaces import Surfaces
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.imu.spec import N_INTRINSICS
 from icalib.sensors.lidar.lidar_binning import points_on_planes
 from icalib.sensors.pose.factors import still_factors
 

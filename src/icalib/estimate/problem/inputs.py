@@ -17,12 +17,12 @@ from icalib.motion.clouds import NO_CLOUDS, Clouds
 from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.optim.state import Entry, Key, Layout, State, in_recording, make_layout
 from icalib.rig import Camera, Lidar, ParameterSpec, PoseSensor, Rig, Wheels
-from icalib.rig.camera import BLOOM
 from icalib.rig.scene import TILT
-from icalib.rig.sensor import MOUNTED, TIME_OFFSET
 from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
 from icalib.sensors.camera.images import on_common_images
+from icalib.sensors.camera.spec import BLOOM
 from icalib.sensors.pose.factors import frame_entries
+from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from icalib.motion.point_planes import thinned
 from icalib.motion.sweep import Motion
 from icalib.optim.state import Entry, Layout
 from icalib.rig import ParameterSpec, Rig, Sensor
-from icalib.rig.sensor import TIME_OFFSET
 from icalib.sensors.lidar.lidar_binning import BIN_S, COARSE_BIN_S, LidarNoise
 from icalib.sensors.lidar.noise import first_lidar_noise
 from icalib.sensors.lidar.residual import LidarFactor
 from icalib.sensors.pose.factors import first_pose_noise, pose_factor
 from icalib.sensors.pose.residual import PoseNoise
+from icalib.sensors.sensor import TIME_OFFSET
 from icalib.sensors.wheels.factors import ground_factors, wheel_factor
 
 

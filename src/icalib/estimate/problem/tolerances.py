@@ -9,7 +9,7 @@ import numpy as np
 from icalib.optim.state import Key, Layout
 from icalib.rig import ParameterSpec, Sensor, Settings
 from icalib.rig.scene import SCENE
-from icalib.rig.sensor import TIME_OFFSET
+from icalib.sensors.sensor import TIME_OFFSET
 
 UNGUESSED = 0.03  # rad or m: how well the start knows what nobody guessed, such as which way is up
 FROM_NOTHING_M = 0.5  # prior uncertainty of a translation that nobody guessed: where the program took it to be

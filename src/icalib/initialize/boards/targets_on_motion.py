@@ -20,7 +20,7 @@ from icalib.initialize.poses.poses import on_motion
 from icalib.initialize.steps.by_recording import Held, alone, motion_alone, naming_recording
 from icalib.optim.state import State
 from icalib.rig import Camera, Parameter, Rig
-from icalib.rig.sensor import mounted
+from icalib.sensors.sensor import mounted
 
 
 def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) -> Rig:

@@ -16,7 +16,7 @@ from icalib.geometry import so3
 from icalib.optim.state import Key
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
 from icalib.rig.kinds import SPECS
-from icalib.rig.sensor import TRANSLATION
+from icalib.sensors.sensor import TRANSLATION
 
 SIGMAS = 4.0  # times what a guess is worth
 SHARE = 0.1  # of a length or factor, by which its guess is off

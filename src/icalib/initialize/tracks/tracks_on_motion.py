@@ -21,7 +21,7 @@ from icalib.initialize.tracks.track_mount import CameraExtrinsics, ImagePairs, p
 from icalib.optim.arrowhead import THREADS
 from icalib.optim.state import Key, State
 from icalib.rig import Camera
-from icalib.rig.sensor import mounted
+from icalib.sensors.sensor import mounted
 
 
 def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:

@@ -28,7 +28,7 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.interval_sums import Rows
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Ground
-from icalib.rig.wheels import GROUND_HEIGHT
+from icalib.sensors.wheels.spec import GROUND_HEIGHT
 
 LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
 NEARLY_LEVEL = np.cos(np.deg2rad(20.0))

@@ -16,7 +16,7 @@ from icalib.data.recordings import BagRecording, Recording, TopicInfo, open_reco
 from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import RecordingError
 from icalib.rig import AccelUnit, GyroUnit, ImuSensor
-from icalib.rig.imu_classes import DEFAULT_CLASS, class_noise
+from icalib.sensors.imu.spec import DEFAULT_CLASS, class_noise
 from icalib.tools.allan.deviation import Deviation, allan_deviation_of_all
 from icalib.tools.allan.fit import AllanFit, bands_of_all, fit_noise, pooled
 from icalib.tools.allan.sampling import still_readings

@@ -25,7 +25,7 @@ from icalib.result import Calibration, ParameterGroup, SensorFit, joint_covarian
 from icalib.result.as_rig import rig_of_result
 from icalib.result.verdict import AUXILIARY, lens_verdict
 from icalib.rig import LENS, Rig
-from icalib.rig.sensor import MOUNTED_NAMES
+from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.tools.comparison.compare import Comparison, Difference, compare_sides
 from icalib.tools.comparison.results import side_of_result
 from icalib.tools.comparison.significance import sigmas

@@ -10,8 +10,8 @@ import numpy as np
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
-from icalib.rig.parameter_spec import shown_unit
-from icalib.rig.sensor import TIME_OFFSET
+from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.sensor import TIME_OFFSET
 from icalib.tools.comparison.sides import LensSide, Quantity, Side
 from icalib.tools.comparison.significance import sigmas
 from icalib.tools.comparison.units import DEFAULT_TOLERANCES

@@ -11,7 +11,7 @@ from icalib.result import Calibration, joint_covariance, relative_pose
 from icalib.rig import DRIVES, LENS, Camera, Lidar, Parameter, ParameterSpec, PoseSensor, Wheels
 from icalib.rig.file import load_rig
 from icalib.rig.kinds import SPECS
-from icalib.rig.sensor import TIME_OFFSET
+from icalib.sensors.sensor import TIME_OFFSET
 from icalib.tools.comparison.sides import LensSide, Quantity, Side, unknown
 
 DENSITIES = {

@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.report.plot import AXIS_COLORS, COLORS, Figure, figure, numbers, stacked_axes, y_of
-from icalib.rig.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import shown_unit
 from icalib.tools.fleet.record import GroupRecord
 from icalib.tools.fleet.result import JobResult
 

@@ -17,7 +17,7 @@ from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import Scene
 from icalib.rig import TwoSources
-from icalib.rig.imu_classes import DEFAULT_CLASS, IMU_CLASSES
+from icalib.sensors.imu.spec import DEFAULT_CLASS, IMU_CLASSES
 from icalib.tools.inspection.facts import CameraSource, Inspection
 from icalib.tools.inspection.frames import frame_lines
 from icalib.tools.inspection.inspect import resolution_of

@@ -12,7 +12,7 @@ from icalib.data.recordings import Recording
 from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor, TwoSources
-from icalib.rig.imu_classes import DEFAULT_CLASS, class_noise
+from icalib.sensors.imu.spec import DEFAULT_CLASS, class_noise
 from icalib.tools.inspection.facts import ImuFacts, Vector
 
 _DEGREE = np.pi / 180.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from icalib.base.extras import load_matplotlib
 from icalib.report.plot import COLORS, Figure, axis, figure, line
-from icalib.rig.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import shown_unit
 from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 
 MOST_RUNS = 6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from icalib.result.quantities import shown
-from icalib.rig.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import shown_unit
 from icalib.tools.montecarlo.statistics import PROBABILITY, Nees, Spread
 from icalib.tools.montecarlo.summary import BlockSummary, Consistency, Mean
 

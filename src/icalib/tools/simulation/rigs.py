@@ -10,7 +10,7 @@ import numpy as np
 from icalib.geometry.targets import NoTarget
 from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels, by_name
 from icalib.rig.kinds import SPECS
-from icalib.rig.sensor import mounted
+from icalib.sensors.sensor import mounted
 from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.tools.simulation.sensors.imu import rotation_from_vector

@@ -18,7 +18,7 @@ from icalib.data.measurements import (
     WheelStream,
 )
 from icalib.rig import LENS
-from icalib.rig.camera import BLOOM
+from icalib.sensors.camera.spec import BLOOM
 from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, HandheldMotion, Scenario, SimCamera
 from icalib.tools.simulation.sensors.corners import CornerTruth, see_corners

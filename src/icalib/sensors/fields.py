@@ -1,4 +1,4 @@
-"""Fields that several types of sensors of the rig file share, and back to plain data."""
+"""Fields of the rig file that several kinds of sensors share: parsed, and written back as plain data."""
 
 from __future__ import annotations
 
@@ -7,20 +7,10 @@ from collections.abc import Iterable
 from typing import Any, get_args
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.rig import (
-    PLAIN_TABLE,
-    Axes,
-    Camera,
-    Lidar,
-    Parameter,
-    ParameterSpec,
-    PoseSensor,
-    Sensor,
-    TableLayout,
-    TimeUnit,
-    Wheels,
-)
-from icalib.rig.file.parameters import parameter, parameter_to_plain
+from icalib.sensors.parameter import Parameter
+from icalib.sensors.parameter_fields import parameter, parameter_to_plain
+from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.sensor import PLAIN_TABLE, Axes, Sensor, TableLayout, TimeUnit
 
 TABLE = ("columns", "time_unit")
 
@@ -86,7 +76,8 @@ def topic_or_none(found: dict[str, YamlValue]) -> str | None:
     return found["topic"].text() if "topic" in found else None
 
 
-def groups_to_plain(sensor: Camera | Lidar | Wheels | PoseSensor) -> dict[str, Any]:
+def groups_to_plain(sensor: Sensor) -> dict[str, Any]:
+    """The parameters of the sensor, and whether its clock restarts."""
     groups = {f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)}
     plain = {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}
-    return plain | ({"clock_restarts": True} if sensor.clock_restarts else {})
+    return plain | ({"clock_restarts": True} if getattr(sensor, "clock_restarts", False) else {})

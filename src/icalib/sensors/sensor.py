@@ -1,12 +1,14 @@
-"""What all kinds of sensors share: the parameters of those that are mounted on the body, and how tables are written."""
+"""The base class of all sensors of a rig, and the parameters of those that are mounted beside the IMU."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
-from icalib.rig.parameter import check_sizes
-from icalib.rig.parameter_spec import AXES, ParameterSpec
+from icalib.base.yaml_nodes import YamlValue
+from icalib.sensors.parameter import check_sizes
+from icalib.sensors.parameter_spec import AXES, ParameterSpec
 
 T = TypeVar("T")
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -67,16 +69,42 @@ PLAIN_TABLE = TableLayout()
 
 
 @dataclass(frozen=True)
+class Lack:
+    """Why the sensors of a rig cannot be calibrated together. where: the field of the rig file, from its root on."""
+
+    where: tuple[str, ...]
+    sentence: str
+
+
+@dataclass(frozen=True)
 class Sensor:
-    """A sensor of the rig. parameters: all that sensors of its type may have; `sensor_type`: its `type` in the
-    rig file."""
+    """A sensor of the rig.
+
+    A kind of sensor declares: sensor_type, its `type` in the rig file and its folder in `icalib.sensors`; noun, its
+    name in sentences; parameters, all that sensors of this kind can have; gives_motion, whether such a sensor and an
+    IMU determine the motion of the rig; needs_imu; is_inertial; shows_planes.
+    """
 
     sensor_type: ClassVar[str]
+    noun: ClassVar[str]
     parameters: ClassVar[tuple[ParameterSpec, ...]] = MOUNTED
+    gives_motion: ClassVar[bool] = False
+    needs_imu: ClassVar[bool] = False
+    is_inertial: ClassVar[bool] = False
+    shows_planes: ClassVar[bool] = False
     name: str
 
     def __post_init__(self) -> None:
         check_sizes(self, self.specs())
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue) -> Sensor:
+        """The sensor called `name` from its fields in the rig file. Raises RigError naming file, line and field."""
+        raise NotImplementedError(cls)
+
+    def plain(self) -> dict[str, Any]:
+        """The fields of the rig file, as lists, numbers and text: what `parse` reads back as the same sensor."""
+        raise NotImplementedError(type(self))
 
     def specs(self) -> tuple[ParameterSpec, ...]:
         """The parameters that this sensor has, in the order of the layout."""
@@ -86,8 +114,27 @@ class Sensor:
         """Whether the group is estimated, as far as the sensor alone says."""
         return getattr(self, spec.name).mode != "fixed"
 
+    def gives_motion_without_imu(self, has_target: bool) -> bool:
+        """Whether this sensor alone determines the motion of the rig; has_target: the cameras of the rig see one."""
+        return False
+
+    @property
+    def tracks_points(self) -> bool:
+        """Whether the sensor has feature tracks."""
+        return False
+
+    def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
+        """What this sensor needs of the other `sensors` of its rig or of a target, and does not have."""
+        if self.needs_imu and not has_imu(sensors):
+            yield Lack(("sensors", self.name), "needs an IMU; add a sensor of type: imu, or remove this one.")
+
     @classmethod
     def stated(cls) -> tuple[ParameterSpec, ...]:
         """Those of `parameters` that are fields of the rig file."""
         names = {f.name for f in fields(cls)}
         return tuple(spec for spec in cls.parameters if spec.name in names)
+
+
+def has_imu(sensors: Mapping[str, Sensor]) -> bool:
+    """Whether one of the sensors is an IMU."""
+    return any(sensor.is_inertial for sensor in sensors.values())

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
-from icalib.rig.parameter_spec import ParameterSpec
+from icalib.sensors.parameter_spec import ParameterSpec
 
 Mode = Literal["free", "fixed", "prior"]
 ROUNDING = 1e-3  # published rotations have few digits; an error of R R^T beyond it is a mistake

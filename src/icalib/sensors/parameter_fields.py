@@ -9,9 +9,8 @@ import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import RigError
-from icalib.rig.imu_classes import IMU_CLASSES, N_INTRINSICS, class_imperfections
-from icalib.rig.parameter import ROUNDING, Parameter, nearest_rotation
-from icalib.rig.parameter_spec import ParameterSpec
+from icalib.sensors.parameter import ROUNDING, Parameter, nearest_rotation
+from icalib.sensors.parameter_spec import ParameterSpec
 
 _FORMS = "write free, {guess: VALUE}, {fixed: VALUE} or {prior: VALUE, sigma: SIGMA}"
 _ROTATION_FORMS = "a 3x3 matrix, {xyzw: [x, y, z, w]} or {rpy_deg: [roll, pitch, yaw]}"
@@ -44,17 +43,6 @@ def rotation_parameter(value: YamlValue) -> Parameter:
     if "sigma_deg" in found:
         return Parameter("prior", matrix, np.deg2rad(_sigma(found["sigma_deg"], 3)))
     return Parameter("prior", matrix, _sigma(found["sigma"], 3))
-
-
-def imu_intrinsics_parameter(value: YamlValue) -> Parameter:
-    """24 numbers, zero for an ideal IMU. The name of a class is its prior about the ideal IMU, and `fixed` an ideal
-    IMU."""
-    if value.is_mapping or value.is_list or value.text() == "free":
-        return vector_parameter(value, N_INTRINSICS)
-    name = value.choice("treatment of IMU intrinsics", ("free", "fixed", *IMU_CLASSES))
-    if name == "fixed":
-        return Parameter("fixed")
-    return Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(name).sigma)
 
 
 def parameter_to_plain(parameter: Parameter) -> Any:

@@ -1,0 +1,179 @@
+"""A camera (its lens, its corners and its feature tracks), and its fields in the rig file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.geometry.cameras import CAMERA_MODELS, camera_model
+from icalib.sensors.fields import (
+    TABLE,
+    groups_to_plain,
+    layout_to_plain,
+    parameter_fields,
+    parameters,
+    path_or,
+    table_layout,
+    topic_or_none,
+)
+from icalib.sensors.parameter import Parameter, check_sizes
+from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, Sensor, TableLayout
+
+INTRINSICS = ParameterSpec(
+    name="intrinsics",
+    size=4,
+    manifold="vector",
+    unit="px",
+    labels=("fx", "fy", "cx", "cy"),
+    tolerance="pixel_tolerance",
+    prior_sigma=15.0,
+    by_images=True,
+    motion="show the target at different distances, tilted, and in every part of the image",
+    motion_without_target="move so that near and far points of the scene cross the whole image",
+)
+# Of a polynomial; `specs` has those of the camera's own model.
+DISTORTION = ParameterSpec(
+    name="distortion",
+    size=4,
+    manifold="vector",
+    unit="",
+    labels=("k1", "k2", "k3", "k4"),
+    tolerance=1e-2,
+    prior_sigma=0.3,
+    by_images=True,
+    motion="show the target in the corners of the image",
+    motion_without_target="turn so that points of the scene pass through the corners of the image",
+)
+BLOOM = ParameterSpec(
+    name="bloom",
+    size=1,
+    manifold="vector",
+    unit="px",
+    labels=("bloom",),
+    tolerance=0.1,
+    prior_sigma=1.0,
+    is_auxiliary=True,
+    meaning="dark edges of the target shifted outwards by blur and the camera's response",
+    by_images=True,
+    motion="show the target from more distances",
+)
+LENS = (INTRINSICS.name, DISTORTION.name)  # the groups that are the parameters of its model
+TRACK_IMAGES = "images"  # `tracks` of a camera whose feature tracks are found in its images
+
+
+@dataclass(frozen=True)
+class Camera(Sensor):
+    """One camera. Intrinsics are (fx, fy, cx, cy) in pixels, distortion the model's coefficients."""
+
+    sensor_type: ClassVar[str] = "camera"
+    noun: ClassVar[str] = "camera"
+    gives_motion: ClassVar[bool] = True
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, INTRINSICS, DISTORTION, BLOOM)
+
+    path: str
+    model: str
+    resolution: tuple[int, int]
+    corner_noise_px: float | None = None  # None: estimated from the residuals
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
+    time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    intrinsics: Parameter = Parameter()
+    distortion: Parameter = Parameter()
+    bloom: Parameter = Parameter()
+    topic: str | None = None  # of its images; None: the one with the camera's name, or the only one
+    tracks: str | None = None  # path of a table of feature tracks, or TRACK_IMAGES
+    track_noise_px: float | None = None  # None: estimated from the residuals
+    layout: TableLayout = PLAIN_TABLE  # of its table of tracks, or without one of corners
+
+    def __post_init__(self) -> None:
+        known = self.model in CAMERA_MODELS  # an unknown one is named where it is used
+        check_sizes(self, self.specs() if known else MOUNTED)
+
+    def specs(self) -> tuple[ParameterSpec, ...]:
+        """As in `Sensor`, distortion as of the camera's model."""
+        model = camera_model(self.model)
+        names, scale = model.parameter_names[len(INTRINSICS.labels) :], model.distortion_scale
+        assert isinstance(DISTORTION.tolerance, float)
+        distortion = replace(
+            DISTORTION,
+            size=len(names),
+            labels=names,
+            tolerance=scale * DISTORTION.tolerance,
+            prior_sigma=scale * DISTORTION.prior_sigma,
+        )
+        return (*MOUNTED, INTRINSICS, distortion, BLOOM)
+
+    @property
+    def tracks_images(self) -> bool:
+        """Whether its feature tracks are found in its images."""
+        return self.tracks == TRACK_IMAGES
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue) -> Camera:
+        options = ("path", "topic", "corner_noise", "tracks", "track_noise", *TABLE, *parameter_fields(cls))
+        found = value.record(("type", "model", "resolution"), options)
+        model = found["model"].choice("camera model", tuple(CAMERA_MODELS))
+        groups = parameters(found, cls(name, "", model, (0, 0)).specs())
+        _refuse_negative_focal_length(found, groups)
+        return cls(
+            name=name,
+            path=path_or(found, f"{name}/corners.csv"),
+            model=model,
+            resolution=_resolution(found["resolution"]),
+            corner_noise_px=found["corner_noise"].positive() if "corner_noise" in found else None,
+            topic=topic_or_none(found),
+            tracks=found["tracks"].text() if "tracks" in found else None,
+            track_noise_px=found["track_noise"].positive() if "track_noise" in found else None,
+            layout=table_layout(found),
+            **groups,
+        )
+
+    def plain(self) -> dict[str, Any]:
+        plain: dict[str, Any] = {"type": "camera", "path": self.path, "model": self.model}
+        plain["resolution"] = list(self.resolution)
+        if self.topic is not None:
+            plain["topic"] = self.topic
+        if self.corner_noise_px is not None:
+            plain["corner_noise"] = self.corner_noise_px
+        if self.tracks is not None:
+            plain["tracks"] = self.tracks
+        if self.track_noise_px is not None:
+            plain["track_noise"] = self.track_noise_px
+        return plain | layout_to_plain(self.layout) | groups_to_plain(self)
+
+    def gives_motion_without_imu(self, has_target: bool) -> bool:
+        return has_target
+
+    @property
+    def tracks_points(self) -> bool:
+        return self.tracks is not None
+
+    def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
+        yield from super().lacks(sensors, has_target)
+        blind = [s.name for s in sensors.values() if isinstance(s, Camera) and not s.tracks_points]
+        if not has_target and blind:
+            yield Lack(
+                (),
+                "target is missing; add target, targets for several by name, or tracks (images, or a table of "
+                f"tracks) of {' and '.join(blind)}.",
+            )
+
+
+def _refuse_negative_focal_length(found: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
+    value = groups["intrinsics"].value if "intrinsics" in groups else None
+    if value is not None and (value[:2] <= 0).any():
+        found["intrinsics"].fail("fx and fy of [fx, fy, cx, cy] must be above 0 px; correct them.")
+
+
+def _resolution(value: YamlValue) -> tuple[int, int]:
+    sides = value.items()
+    if len(sides) != 2:
+        value.fail(f"must be [width, height] in pixels, but has {len(sides)} entries.")
+    return sides[0].whole(1), sides[1].whole(1)
+
+
+SENSOR = Camera

@@ -1,0 +1,250 @@
+"""An IMU: its noise, its intrinsics, the classes of IMUs that give defaults, and its fields in the rig file."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, get_args
+
+import numpy as np
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.sensors.fields import TABLE, axes_or_none, layout_to_plain, table_layout
+from icalib.sensors.parameter import Parameter
+from icalib.sensors.parameter_fields import parameter_to_plain, vector_parameter
+from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.sensor import PLAIN_TABLE, Axes, Sensor, TableLayout
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Continuous-time noise: gyro rad/s/sqrt(Hz), gyro_walk rad/s^2/sqrt(Hz), accel m/s^2/sqrt(Hz), accel_walk
+    m/s^3/sqrt(Hz)."""
+
+    gyro: float
+    gyro_walk: float
+    accel: float
+    accel_walk: float
+    source: str = "rig file"  # or "default for a consumer IMU", printed with the result
+
+    @property
+    def densities(self) -> np.ndarray:
+        """(4,) in the order of the fields."""
+        return np.array([self.gyro, self.gyro_walk, self.accel, self.accel_walk])
+
+    def scaled(self, factor: float) -> ImuNoise:
+        """That of an IMU `factor` times as noisy."""
+        four = (float(factor * density) for density in self.densities)
+        return replace(self, **dict(zip(("gyro", "gyro_walk", "accel", "accel_walk"), four, strict=True)))
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """Standard deviations of the parameters of Kalibr's scale-misalignment model (`motion.imu_model`) about the
+    ideal IMU. Scales are relative; misalignments of an axis and the rotation between gyroscope and accelerometer are in
+    rad; g-sensitivity is in rad/s per m/s^2."""
+
+    accel_scale: float
+    accel_misalignment: float
+    gyro_scale: float
+    gyro_misalignment: float
+    rotation: float
+    g_sensitivity: float
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(24,) in the order of `INTRINSICS_LABELS`: diagonal and lower triangle of two matrices, ..."""
+        lower = (0, 1, 0, 1, 1, 0)  # xx yx yy zx zy zz: 0 on the diagonal
+        accel = [(self.accel_scale, self.accel_misalignment)[k] for k in lower]
+        gyro = [(self.gyro_scale, self.gyro_misalignment)[k] for k in lower]
+        return np.array([*accel, *gyro, *[self.rotation] * 3, *[self.g_sensitivity] * 9])
+
+
+DEFAULT_CLASS = "consumer"
+INTRINSICS_LABELS = (
+    *(f"accel_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz")),
+    *(f"gyro_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz")),
+    *(f"gyro_rotation_{n}" for n in "xyz"),
+    *(f"g_sensitivity_{a}{b}" for a in "xyz" for b in "xyz"),
+)
+N_INTRINSICS = len(INTRINSICS_LABELS)
+
+# gyro, gyro_walk, accel, accel_walk in the units of ImuNoise. Where they come from:
+# consumer: Bosch BMI160 of the TUM VI data set (Schubert et al., IROS 2018), as OpenVINS sets it for that data set.
+# industrial: Analog Devices ADIS16448 as the EuRoC data set publishes it (Burri et al., IJRR 2016).
+# tactical: Honeywell HG1700 data sheet, 0.125 deg/sqrt(h) and 0.065 ft/s/sqrt(h); its biases of 1 deg/h and 1 mg are
+# taken as what the walks reach in an hour.
+_FIGURES = {
+    "consumer": (1.6e-4, 2.2e-5, 2.8e-3, 8.6e-4),
+    "industrial": (1.7e-4, 1.94e-5, 2.0e-3, 3.0e-3),
+    "tactical": (3.6e-5, 8.1e-8, 3.3e-4, 1.6e-4),
+}
+IMU_CLASSES = tuple(_FIGURES)
+
+# Tolerances of data sheets are taken for two standard deviations, typical values for one. Gyroscope and accelerometer
+# are turned against each other by what both are off the case: no sheet says that they are off together.
+# consumer: InvenSense MPU-6050 (PS-MPU-6000A, tables 6.1 and 6.2): scales +-3 %, cross-axis sensitivity +-2 %, 0.1
+# deg/s/g typical. MPU-9250 (PS-MPU-9250A, tables 1 and 2): the same scales and cross-axis sensitivity.
+# industrial: Analog Devices ADIS16448: scales +-1 %, axes 0.2 deg (accelerometer) and 0.05 deg (gyroscope) from
+# perpendicular, 0.5 deg to the case, 0.015 deg/s/g. ADIS16460, table 1: 1 %, 0.05 deg, 1 deg to the
+# case, 0.01 deg/s/g.
+# tactical: Safran STIM300 (TS1524): scales 300 ppm (accelerometer) and 500 ppm (gyroscope), axes 1 mrad, 1 deg/h/g
+# after its compensation, all typical.
+_IMPERFECTIONS = {
+    "consumer": Imperfections(0.015, 0.01, 0.015, 0.01, 0.014, 1.8e-4),
+    "industrial": Imperfections(0.005, 1.7e-3, 0.005, 4.4e-4, 6.2e-3, 2.7e-5),
+    "tactical": Imperfections(3e-4, 1e-3, 5e-4, 1e-3, 1.4e-3, 4.9e-7),
+}
+# Of IMU intrinsics that are `free`: wider than any class, so that a first calibration is not led by its prior.
+FREE = Imperfections(0.05, 0.05, 0.05, 0.05, 0.05, 0.01)
+# An IMU is tactical if all its densities are at most so many times those of that class. Consumer and industrial IMUs
+# have the same noise, and differ by their factory calibration: noise alone never makes an IMU industrial.
+ALIKE = 2.0
+
+
+def class_noise(name: str) -> ImuNoise:
+    """The figures of one of IMU_CLASSES; their source says that they are defaults."""
+    article = "an" if name[0] in "aeiou" else "a"
+    return ImuNoise(*_FIGURES[name], source=f"default for {article} {name} IMU")
+
+
+def class_imperfections(name: str) -> Imperfections:
+    """Of one of IMU_CLASSES."""
+    return _IMPERFECTIONS[name]
+
+
+def class_of_noise(noise: ImuNoise) -> str:
+    """The class of an IMU by its noise: the one that the figures come from, or tactical if they are that small, or else
+    consumer."""
+    own = next((name for name in IMU_CLASSES if class_noise(name).source == noise.source), None)
+    if own is not None:
+        return own
+    is_tactical = bool((noise.densities <= ALIKE * np.array(_FIGURES["tactical"])).all())
+    return "tactical" if is_tactical else DEFAULT_CLASS
+
+
+def class_of_sigma(sigma: np.ndarray) -> str | None:
+    """The class whose imperfections have standard deviations `sigma` (24,), or None."""
+    return next((name for name, own in _IMPERFECTIONS.items() if np.array_equal(own.sigma, sigma)), None)
+
+
+@dataclass(frozen=True)
+class TwoSources:
+    """Topics or tables of an IMU whose gyroscope and accelerometer report apart."""
+
+    gyro: str
+    accel: str
+
+
+AccelUnit = Literal["m/s^2", "g"]
+GyroUnit = Literal["rad/s", "deg/s"]
+BY_CLASS = Parameter("free")  # IMU intrinsics of which nothing is said; `free()` is another
+_CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
+_DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
+_FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")
+
+
+@dataclass(frozen=True)
+class ImuSensor(Sensor):
+    """The inertial sensor; its frame is the body frame. Units and axes: of the readings as they are recorded; None: SI
+    units (g is recognised), and the axes as they are. assumed: there is none, but an assumption of smooth motion in
+    its place (see `initialize.assumed_motion`). intrinsics (24,): see `motion.imu_model`. They always
+    have a prior: by default that of the IMU's class about the ideal IMU, a broad one where they are free, about the
+    guess. What is fixed without a value is the ideal IMU."""
+
+    sensor_type: ClassVar[str] = "imu"
+    noun: ClassVar[str] = "IMU"
+    is_inertial: ClassVar[bool] = True
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (
+        ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1),
+    )
+
+    path: str | TwoSources
+    noise: ImuNoise
+    intrinsics: Parameter = BY_CLASS
+    topic: str | TwoSources | None = None  # in a bag; None: those with the sensor's name, or the only ones
+    accel_unit: AccelUnit | None = None
+    gyro_unit: GyroUnit | None = None
+    accel_axes: Axes | None = None
+    gyro_axes: Axes | None = None
+    assumed: bool = False
+    pose_keyframes_s: float = 0.02  # between keyframes that poses alone place
+    layout: TableLayout = PLAIN_TABLE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.intrinsics is BY_CLASS:
+            object.__setattr__(self, "intrinsics", _CLASS_PRIORS[class_of_noise(self.noise)])
+        elif self.intrinsics.mode == "free":
+            start = np.zeros(N_INTRINSICS) if self.intrinsics.value is None else self.intrinsics.value
+            object.__setattr__(self, "intrinsics", Parameter("prior", start, FREE.sigma))
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue) -> ImuSensor:
+        names = [spec.name for spec in cls.stated()]
+        found = value.record(("type",), ("path", "topic", "noise", *names, *_FIELDS, *TABLE))
+        units: dict[str, Any] = {
+            field: found[field].choice("such unit as", get_args(kind))
+            for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
+            if field in found
+        }
+        groups: dict[str, Any] = {name: _intrinsics(found[name]) for name in names if name in found}
+        return cls(
+            name=name,
+            path=_source(found["path"]) if "path" in found else f"{name}/data.csv",
+            noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
+            topic=_source(found["topic"]) if "topic" in found else None,
+            accel_axes=axes_or_none(found, "accel_axes"),
+            gyro_axes=axes_or_none(found, "gyro_axes"),
+            layout=table_layout(found),
+            **units,
+            **groups,
+        )
+
+    def plain(self) -> dict[str, Any]:
+        plain: dict[str, Any] = {"type": "imu", "path": _plain_source(self.path)}
+        plain["noise"] = dataclasses.asdict(self.noise)
+        plain |= layout_to_plain(self.layout)
+        if self.topic is not None:
+            plain["topic"] = _plain_source(self.topic)
+        for field in _FIELDS:
+            given = getattr(self, field)
+            if given is not None:
+                plain[field] = list(given) if isinstance(given, tuple) else given
+        groups = {spec.name: getattr(self, spec.name) for spec in self.stated()}
+        ideal = [name for name, p in groups.items() if p.mode == "fixed" and p.value is None]
+        return plain | {name: "fixed" if name in ideal else parameter_to_plain(p) for name, p in groups.items()}
+
+
+def _noise(value: YamlValue) -> ImuNoise:
+    if not value.is_mapping:
+        return class_noise(value.choice("IMU class", IMU_CLASSES))
+    found = value.record(_DENSITIES, ("source",))
+    densities = {name: found[name].positive() for name in _DENSITIES}
+    return ImuNoise(**densities, source=found["source"].text() if "source" in found else ImuNoise.source)
+
+
+def _source(value: YamlValue) -> str | TwoSources:
+    """One name, or one for each of the two sensors."""
+    if not value.is_mapping:
+        return value.text()
+    found = value.record(("gyro", "accel"))
+    return TwoSources(found["gyro"].text(), found["accel"].text())
+
+
+def _plain_source(source: str | TwoSources) -> str | dict[str, str]:
+    return dataclasses.asdict(source) if isinstance(source, TwoSources) else source
+
+
+def _intrinsics(value: YamlValue) -> Parameter:
+    """24 numbers, zero for an ideal IMU. The name of a class is its prior about the ideal IMU, and `fixed` an ideal
+    IMU."""
+    if value.is_mapping or value.is_list or value.text() == "free":
+        return vector_parameter(value, N_INTRINSICS)
+    name = value.choice("treatment of IMU intrinsics", ("free", "fixed", *IMU_CLASSES))
+    if name == "fixed":
+        return Parameter("fixed")
+    return Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(name).sigma)
+
+
+SENSOR = ImuSensor

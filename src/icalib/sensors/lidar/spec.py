@@ -1,0 +1,93 @@
+"""A LiDAR, and its fields in the rig file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.sensors.fields import (
+    choice_or,
+    groups_to_plain,
+    parameter_fields,
+    parameters,
+    path_or,
+    positive_or,
+    topic_or_none,
+)
+from icalib.sensors.parameter import Parameter
+from icalib.sensors.sensor import Sensor, TimeUnit
+
+PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
+_FIELDS = (
+    "path", "topic", "range_noise", "min_range", "max_range", "point_time", "point_time_field", "point_time_unit",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Lidar(Sensor):
+    """One LiDAR. Points nearer than min_range_m or farther than max_range_m are left out.
+
+    point_time: what a point's time is counted from; see `data.messages.point_times`. point_time_field, point_time_unit:
+    where the time of a point stands, and in what unit; None: told from the data.
+    """
+
+    sensor_type: ClassVar[str] = "lidar"
+    noun: ClassVar[str] = "LiDAR"
+    gives_motion: ClassVar[bool] = True
+    needs_imu: ClassVar[bool] = True
+    shows_planes: ClassVar[bool] = True
+
+    path: str
+    range_noise_m: float | None = None  # along the beam; None: estimated from the residuals
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
+    time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    min_range_m: float = 0.5
+    max_range_m: float = 100.0
+    point_time: PointTime = "auto"
+    topic: str | None = None  # of its clouds; None: the one with the LiDAR's name, or the only one
+    point_time_field: str | None = None
+    point_time_unit: TimeUnit | None = None
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue) -> Lidar:
+        found = value.record(("type",), (*_FIELDS, *parameter_fields(cls)))
+        low = positive_or(found, "min_range", cls.min_range_m)
+        high = positive_or(found, "max_range", cls.max_range_m)
+        if low >= high:
+            found["min_range" if "min_range" in found else "max_range"].fail(
+                f"the range from {low:g} to {high:g} m is empty; min_range must be below max_range."
+            )
+        return cls(
+            name=name,
+            path=path_or(found, f"{name}/scans.npz"),
+            range_noise_m=found["range_noise"].positive() if "range_noise" in found else None,
+            min_range_m=low,
+            max_range_m=high,
+            point_time=_point_time(found),
+            point_time_field=found["point_time_field"].text() if "point_time_field" in found else None,
+            point_time_unit=choice_or(found, "point_time_unit", TimeUnit, None),
+            topic=topic_or_none(found),
+            **parameters(found, cls.stated()),
+        )
+
+    def plain(self) -> dict[str, Any]:
+        plain: dict[str, Any] = {"type": "lidar", "path": self.path, "min_range": self.min_range_m}
+        plain |= {"max_range": self.max_range_m, "point_time": self.point_time}
+        given = {"range_noise": self.range_noise_m, "topic": self.topic}
+        given |= {name: getattr(self, name) for name in ("point_time_field", "point_time_unit")}
+        return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
+
+
+def _point_time(found: dict[str, YamlValue]) -> PointTime:
+    """Fails where points would have a time of their own and none."""
+    chosen = choice_or(found, "point_time", PointTime, Lidar.point_time)
+    for name in ("point_time_field", "point_time_unit"):
+        if name in found and chosen in ("azimuth", "snapshot"):
+            found[name].fail(f"point_time: {chosen} uses no point times; remove {name}, or point_time.")
+    return chosen
+
+
+SENSOR = Lidar

@@ -1,0 +1,131 @@
+"""A pose sensor (motion capture, or another program's odometry), and its fields in the rig file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.sensors.fields import (
+    TABLE,
+    axes_or_none,
+    choice_or,
+    groups_to_plain,
+    layout_to_plain,
+    parameter_fields,
+    parameters,
+    path_or,
+    table_layout,
+    topic_or_none,
+)
+from icalib.sensors.parameter import Parameter
+from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, Lack, Sensor, TableLayout, has_imu
+
+PoseKind = Literal["absolute", "relative"]
+SCALE = ParameterSpec("scale", 1, "nuisance", "", ("scale",), 1e-2, 0.1)  # true lengths over reported ones
+_FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted", "frames", "scale_sigma")
+_NOISE = ("rotation_noise", "position_noise")
+
+
+@dataclass(frozen=True)
+class PoseSensor(Sensor):
+    """Something that says where it is: motion capture, or another program's odometry.
+
+    absolute: in a frame that stands still, whose place in the world is estimated; noise is white, rad and m. relative:
+    only the way from each pose to the next counts; noise is a random walk, rad/sqrt(s) and m/sqrt(s). level: z of its
+    frame points up, as far as the motion does not say otherwise; used where neither an IMU nor a target shows it.
+    """
+
+    sensor_type: ClassVar[str] = "pose"
+    noun: ClassVar[str] = "pose sensor"
+    gives_motion: ClassVar[bool] = True
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, SCALE)
+
+    path: str
+    kind: PoseKind = "absolute"
+    rotation_noise: float | None = None  # of each axis; None: estimated from the residuals
+    position_noise: float | None = None
+    level: bool = True
+    position_axes: Axes | None = None  # of positions as recorded, in the order and with the signs of rotations
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
+    time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
+    layout: TableLayout = PLAIN_TABLE
+    inverted: bool = False  # what is recorded is T_sensor_frame
+    frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: it is not one
+    scale_sigma: float = 0.001  # of all its lengths, relative: true over reported ones is about 1; 0: exact
+
+    @property
+    def scale(self) -> Parameter:
+        """True lengths over reported ones."""
+        one = np.ones(1)
+        return Parameter("prior", one, self.scale_sigma * one) if self.scale_sigma > 0.0 else Parameter("fixed", one)
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue) -> PoseSensor:
+        found = value.record(("type",), (*_FIELDS, *_NOISE, *TABLE, *parameter_fields(cls)))
+        return cls(
+            name=name,
+            path=path_or(found, f"{name}/poses.csv"),
+            kind=choice_or(found, "kind", PoseKind, cls.kind),
+            position_axes=axes_or_none(found, "position_axes"),
+            level=found["level"].boolean() if "level" in found else cls.level,
+            topic=topic_or_none(found),
+            rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
+            position_noise=found["position_noise"].positive() if "position_noise" in found else None,
+            inverted="inverted" in found and found["inverted"].boolean(),
+            layout=table_layout(found),
+            scale_sigma=_scale_sigma(found["scale_sigma"]) if "scale_sigma" in found else cls.scale_sigma,
+            frames=_frames(found["frames"]) if "frames" in found else None,
+            **parameters(found, cls.stated()),
+        )
+
+    def plain(self) -> dict[str, Any]:
+        plain: dict[str, Any] = {"type": "pose", "path": self.path, "kind": self.kind, "level": self.level}
+        plain["scale_sigma"] = self.scale_sigma
+        plain |= layout_to_plain(self.layout)
+        given = {name: getattr(self, name) for name in (*_NOISE, "topic")}
+        axes, frames = self.position_axes, self.frames
+        given |= {"inverted": self.inverted or None, "position_axes": None if axes is None else list(axes)}
+        given["frames"] = None if frames is None else list(frames)
+        return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
+
+    def gives_motion_without_imu(self, has_target: bool) -> bool:
+        return True
+
+    def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
+        yield from super().lacks(sensors, has_target)
+        first = next(s for s in sensors.values() if s.gives_motion_without_imu(has_target))
+        if has_imu(sensors) or first.name != self.name:
+            return
+        if self.kind != "absolute":
+            yield Lack(
+                ("sensors", self.name),
+                "without an IMU, or a camera that sees a target, this sensor must determine the motion; write kind: "
+                "absolute, or add one of them.",
+            )
+        if len(sensors) == 1:
+            yield Lack(("sensors", self.name), "is the only sensor; add the sensors to calibrate it with.")
+
+
+def _scale_sigma(value: YamlValue) -> float:
+    if not 0.0 <= (sigma := value.number()) < 1.0:
+        value.fail(f"is a share of all lengths between 0 (exact) and 1, but is {sigma:g}; write 0.001 for 0.1 %.")
+    return sigma
+
+
+def _frames(value: YamlValue) -> tuple[str, str]:
+    """Parent and child."""
+    names = [entry.text() for entry in value.items()]
+    if len(names) != 2 or names[0].lstrip("/") == names[1].lstrip("/"):
+        value.fail("must name two frames, the parent and the child, as in [base_link, tool0]; correct it.")
+    return names[0], names[1]
+
+
+SENSOR = PoseSensor

@@ -1,0 +1,344 @@
+"""Wheels (how they drive and report, what they stand on, their sizes), and their fields in the rig file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.sensors.fields import (
+    TABLE,
+    choice_or,
+    groups_to_plain,
+    layout_to_plain,
+    parameter_fields,
+    parameters,
+    path_or,
+    positive_or,
+    table_layout,
+    topic_or_none,
+)
+from icalib.sensors.parameter import Parameter, check_sizes
+from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, Sensor, TableLayout
+
+WheelFactor = Literal["increments", "relative-poses"]
+WheelMeasure = Literal["rates", "angles", "ticks", "poses", "twist"]
+WheelDrive = Literal["differential", "skid-steer", "ackermann"]
+RateUnit = Literal["rad/s", "deg/s", "rpm"]
+RATE_UNITS: dict[RateUnit, float] = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}  # in rad/s
+WheelKind = Literal["pair", "steered", "twist"]  # what the two columns of a `WheelStream` are
+
+# The parameters of each kind of wheels beside pose and clock.
+DRIVES: dict[WheelKind, tuple[ParameterSpec, ...]] = {
+    "pair": (
+        ParameterSpec("radii", 2, "vector", "m", ("left", "right"), 1e-4, 0.01, True, "radius", motion="drive further"),
+        ParameterSpec("baseline", 1, "vector", "m", ("baseline",), 1e-3, 0.05, True, motion="turn more, both ways"),
+    ),
+    "steered": (
+        ParameterSpec("radius", 1, "vector", "m", ("radius",), 1e-4, 0.01, True, motion="drive further"),
+        ParameterSpec("wheelbase", 1, "vector", "m", ("wheelbase",), 2e-3, 0.1, True, motion="turn more, both ways"),
+        ParameterSpec(
+            "steering_offset", 1, "vector", "rad", ("steering_offset",), math.radians(0.1), 0.1, motion="drive further"
+        ),
+    ),
+    "twist": (
+        ParameterSpec(
+            name="scales",
+            size=2,
+            manifold="vector",
+            unit="",
+            labels=("speed", "yaw_rate"),
+            tolerance=1e-3,
+            prior_sigma=0.1,
+            is_positive=True,
+            one="scale",
+            motion="drive further, and turn more, both ways",
+        ),
+    ),
+}
+
+
+def drive_names(kind: WheelKind) -> tuple[str, ...]:
+    """Names of the parameters of `DRIVES`."""
+    return tuple(spec.name for spec in DRIVES[kind])
+
+
+GROUND_HEIGHT = ParameterSpec("ground_height", 1, "vector", "m", ("ground_height",), 5e-3, 0.1)
+
+GroundPlane = Literal["floor", "level"]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What wheels stand on: the floor that LiDARs see, or a plane as level as the horizon through the world's origin.
+
+    tilt_noise: of the wheels' frame on the plane, at each node, about each axis; None: it may be tilted anyhow. height:
+    of the frame's origin over the plane, with height_sigma, the same error all the time; None: it is not known.
+    bump_noise: of the height at each node.
+    """
+
+    plane: GroundPlane
+    tilt_noise: float | None = None  # rad
+    height: float = 0.0  # m
+    height_sigma: float | None = None  # m
+    bump_noise: float = 3e-3  # m
+
+
+_WORDS = (
+    "path", "topic", "drive", "measures", "sampling", "counts_per_turn", "counter_size", "angle_range", "rate_unit",
+    "signs", "joints", "factor",
+)  # fmt: skip
+_NOISES = ("wheel_noise", "speed_noise", "yaw_noise", "steering_noise")
+_GROUND = ("tilt_noise", "height", "height_sigma", "bump_noise")
+_SLIP = ("lateral_slip", "vertical_slip")
+_TURNED = ("rates", "angles", "ticks")
+# Fields that go with some of `measures` only.
+_ONLY_OF: dict[str, tuple[str, ...]] = {
+    "sampling": ("rates", "twist"), "counts_per_turn": ("ticks",), "counter_size": ("ticks",), "joints": _TURNED,
+    "angle_range": ("angles",), "rate_unit": ("rates",), "signs": (*_TURNED, "twist"),
+}  # fmt: skip
+# And with some kinds of wheels only.
+_ONLY_OF_KIND: dict[str, tuple[str, ...]] = {
+    **{spec.name: (kind,) for kind, specs in DRIVES.items() for spec in specs},
+    "wheel_noise": ("pair", "steered"), "speed_noise": ("twist",), "yaw_noise": ("twist",),
+    "steering_noise": ("steered",),
+}  # fmt: skip
+_CALLED = {"pair": "a left and a right side", "steered": "drive: ackermann", "twist": "measures: twist"}
+_JOINTS = {
+    "differential": ((2,), "two joints, [left, right]"),
+    "skid-steer": ((4,), "four joints, [front left, rear left, front right, rear right]"),
+    "ackermann": (
+        (2, 4), "two joints, [driven wheel, steering], or four, [rear left, rear right, steering left, steering right]",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Wheels(Sensor):
+    """What rolls on the ground. Its frame has x forward, y to the left, z up, its origin midway between the wheels of
+    the axle that is not steered.
+
+    drive: differential, two driven wheels of one axle; skid-steer, two pairs of which each turns alike; ackermann, the
+    front wheels steer. measures: rates [rad/s], angles turned [rad], counts of encoders (ticks), relative planar poses
+    (tables only), or twist, forward speed [m/s] and yaw rate [rad/s]. sampling: of rates and twist; see `WheelStream`.
+    Densities: of each wheel's angle, of speed and yaw rate, of the steering angle, and of slip.
+    """
+
+    sensor_type: ClassVar[str] = "wheels"
+    noun: ClassVar[str] = "wheels"
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (
+        *MOUNTED,
+        GROUND_HEIGHT,
+        *(spec for drive in DRIVES.values() for spec in drive),
+    )
+
+    path: str
+    drive: WheelDrive = "differential"
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
+    time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    radii: Parameter = Parameter()  # (2,) left, right [m]
+    baseline: Parameter = Parameter()  # (1,) between the wheels [m]; of skid-steer the effective one
+    radius: Parameter = Parameter()  # (1,) of the driven wheel of ackermann [m]
+    wheelbase: Parameter = Parameter()  # (1,) from rear to front axle [m]
+    steering_offset: Parameter = Parameter()  # (1,) what to add to the steering angle [rad]
+    scales: Parameter = Parameter()  # (2,) what to multiply speed and yaw rate by
+    wheel_noise: float = 0.03  # rad/sqrt(s): of rates at 70 Hz 0.25 rad/s each, as simulated wheels have it
+    speed_noise: float = 2e-3  # m/sqrt(s)
+    yaw_noise: float = 1e-2  # rad/sqrt(s)
+    steering_noise: float = 1e-3  # rad/sqrt(Hz): of angles at 70 Hz half a degree each
+    lateral_slip: float = 5e-3  # m/sqrt(s)
+    vertical_slip: float = 5e-3  # m/sqrt(s), off the ground
+    factor: WheelFactor = "increments"  # relative-poses: the paper's (27)
+    measures: WheelMeasure = "rates"
+    sampling: Literal["interval-mean", "instantaneous"] = "interval-mean"
+    counts_per_turn: float | None = None  # of ticks, for one turn of the wheel
+    signs: tuple[int, ...] | None = None  # 1 or -1 of each column of its table, or each joint; None: all 1
+    rate_unit: RateUnit = "rad/s"  # of rates
+    angle_range: float | None = None  # angles [rad] start anew after so much; None: never, or where it is plain
+    counter_size: int | None = None  # the counters go back to zero after so many ticks; None: never
+    topic: str | None = None  # of its messages; None: the one with the wheels' name, or the only one
+    joints: tuple[str, ...] | None = None  # in JointState; None: told by "left" and "right" in the names
+    ground: Ground | None = None
+    layout: TableLayout = PLAIN_TABLE
+
+    def __post_init__(self) -> None:
+        check_sizes(self, self.stated())  # those of other drives, too
+
+    def specs(self) -> tuple[ParameterSpec, ...]:
+        """As in `Sensor`: those of its drive, and the height where that is estimated."""
+        return (*MOUNTED, *((GROUND_HEIGHT,) if self.knows_height else ()), *self.drive_specs)
+
+    def is_estimated(self, spec: ParameterSpec) -> bool:
+        """As in `Sensor`; relative poses do not depend on the drive."""
+        return super().is_estimated(spec) and (self.measures != "poses" or spec not in self.drive_specs)
+
+    @property
+    def ground_height(self) -> Parameter:
+        """What the height over the ground starts from, where it is estimated."""
+        return Parameter("free", np.array([0.0 if self.ground is None else self.ground.height]))
+
+    @property
+    def kind(self) -> WheelKind:
+        """Which parameters it has: see `DRIVES`."""
+        if self.measures == "twist":
+            return "twist"
+        return "steered" if self.drive == "ackermann" else "pair"
+
+    @property
+    def drive_specs(self) -> tuple[ParameterSpec, ...]:
+        """Its parameters beside pose, clock and height."""
+        return DRIVES[self.kind]
+
+    @property
+    def knows_height(self) -> bool:
+        """Whether `ground_height` is estimated."""
+        return self.ground is not None and self.ground.height_sigma is not None
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue) -> Wheels:
+        found = value.record(
+            ("type",),
+            (*_WORDS, "ground", *_NOISES, *_SLIP, *TABLE, *parameter_fields(cls)),
+        )
+        measures: WheelMeasure = choice_or(found, "measures", WheelMeasure, cls.measures)
+        drive: WheelDrive = choice_or(found, "drive", WheelDrive, cls.drive)
+        bare = cls(name, "", drive, measures=measures)
+        _refuse_other_measures(value, found, bare)
+        groups = parameters(found, bare.specs())
+        _refuse_negative_lengths(found, groups, bare)
+        given: dict[str, Any] = {d: positive_or(found, d, getattr(cls, d)) for d in (*_NOISES, *_SLIP)}
+        given |= groups
+        return cls(
+            name=name,
+            path=path_or(found, f"{name}/{measures}.csv"),
+            drive=drive,
+            factor=choice_or(found, "factor", WheelFactor, "relative-poses" if measures == "poses" else cls.factor),
+            measures=measures,
+            sampling=choice_or(found, "sampling", Literal["interval-mean", "instantaneous"], cls.sampling),
+            counts_per_turn=found["counts_per_turn"].positive() if "counts_per_turn" in found else None,
+            counter_size=found["counter_size"].whole(2) if "counter_size" in found else None,
+            angle_range=found["angle_range"].positive() if "angle_range" in found else None,
+            rate_unit=choice_or(found, "rate_unit", RateUnit, cls.rate_unit),
+            signs=_signs(found["signs"], drive) if "signs" in found else None,
+            topic=topic_or_none(found),
+            joints=_joints(found["joints"], drive) if "joints" in found else None,
+            ground=_ground(found["ground"]) if "ground" in found else None,
+            layout=table_layout(found),
+            **given,
+        )
+
+    def plain(self) -> dict[str, Any]:
+        noises = [name for name in _NOISES if self.kind in _ONLY_OF_KIND[name]]
+        same = ("path", "drive", "measures", "factor", *noises, *_SLIP)
+        plain: dict[str, Any] = {"type": "wheels", **{name: getattr(self, name) for name in same}}
+        given = {name: getattr(self, name) for name, of in _ONLY_OF.items() if self.measures in of}
+        given |= layout_to_plain(self.layout)
+        given["ground"] = None if self.ground is None else _ground_to_plain(self.ground)
+        lists = {name: getattr(self, name) for name in ("joints", "signs")}
+        given |= {"topic": self.topic, **{name: None if x is None else list(x) for name, x in lists.items()}}
+        foreign = {spec.name for spec in self.parameters} - {spec.name for spec in self.specs()}
+        groups = {name: p for name, p in groups_to_plain(self).items() if name not in foreign}
+        return plain | {name: value for name, value in given.items() if value is not None} | groups
+
+    def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
+        yield from super().lacks(sensors, has_target)
+        if self.ground is None:
+            return
+        if self.ground.plane == "floor" and not any(s.shows_planes for s in sensors.values()):
+            yield Lack(
+                ("sensors", self.name, "ground", "plane"),
+                "a LiDAR determines the floor, and there is none; write level.",
+            )
+        if self.ground.plane == "level" and self.knows_height and not has_target:
+            yield Lack(
+                ("sensors", self.name, "ground", "height_sigma"),
+                "the height is relative to the target, and there is none; remove it, or with a LiDAR write "
+                "plane: floor.",
+            )
+
+
+def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], bare: Wheels) -> None:
+    """Fields that do not go with what the wheels measure or with how they are driven, or are missing."""
+    for name, measures in _ONLY_OF.items():
+        if name in found and bare.measures not in measures:
+            found[name].fail(
+                f"belongs to wheels that measure {' or '.join(measures)}, not {bare.measures}; remove it, or correct "
+                "measures."
+            )
+    if bare.measures == "ticks" and "counts_per_turn" not in found:
+        value.fail(
+            "counts_per_turn is missing; add the number of ticks per turn of the wheel, including the gear ratio."
+        )
+    if bare.drive != "differential" and bare.measures not in _TURNED:
+        found["drive"].fail(f"goes with wheels that measure {' or '.join(_TURNED)}; remove it, or correct measures.")
+    for name, kinds in _ONLY_OF_KIND.items():
+        if name in found and bare.kind not in kinds:
+            found[name].fail(
+                f"belongs to wheels with {' or '.join(_CALLED[k] for k in kinds)}; remove it, or correct drive and "
+                "measures."
+            )
+    _refuse_factor(found, bare)
+
+
+def _refuse_factor(found: dict[str, YamlValue], bare: Wheels) -> None:
+    given = found["factor"].text() if "factor" in found else None
+    if bare.measures == "poses" and given == "increments":
+        found["factor"].fail("relative poses have no increments of wheels; write relative-poses.")
+    if bare.kind != "pair" and given == "relative-poses":
+        found["factor"].fail("relative-poses (the paper's factor) needs a left and a right wheel; write increments.")
+
+
+def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Any], bare: Wheels) -> None:
+    for spec in bare.drive_specs:
+        value = groups[spec.name].value if spec.name in groups else None
+        if spec.is_positive and value is not None and (value <= 0).any():
+            unit = "is in metres and" if spec.unit == "m" else "are factors and"
+            found[spec.name].fail(f"{unit} must be above 0; correct it.")
+
+
+def _signs(value: YamlValue, drive: WheelDrive) -> tuple[int, ...]:
+    signs = [item.number() for item in value.items()]
+    counts, words = _JOINTS[drive]
+    if len(signs) not in counts or any(abs(s) != 1.0 for s in signs):
+        value.fail(f"must be 1 or -1 for each of {words}; correct it.")
+    return tuple(int(s) for s in signs)
+
+
+def _joints(value: YamlValue, drive: WheelDrive) -> tuple[str, ...]:
+    names = tuple(item.text() for item in value.items())
+    counts, words = _JOINTS[drive]
+    if len(names) not in counts or len(set(names)) < len(names):
+        value.fail(f"must be the names of {words}; correct it.")
+    return names
+
+
+def _ground(value: YamlValue) -> Ground:
+    found = value.record(("plane",), _GROUND)
+    if "tilt_noise" not in found and "height_sigma" not in found:
+        value.fail("has no effect; add tilt_noise (rad), or height and height_sigma (m), or both.")
+    for name in ("height", "bump_noise"):
+        if name in found and "height_sigma" not in found:
+            found[name].fail("needs height_sigma, the uncertainty of the height (m); add it.")
+    return Ground(
+        choice_or(found, "plane", GroundPlane, "level"),
+        tilt_noise=found["tilt_noise"].positive() if "tilt_noise" in found else None,
+        height=found["height"].number() if "height" in found else Ground.height,
+        height_sigma=found["height_sigma"].positive() if "height_sigma" in found else None,
+        bump_noise=positive_or(found, "bump_noise", Ground.bump_noise),
+    )
+
+
+def _ground_to_plain(ground: Ground) -> dict[str, Any]:
+    fields = [name for name in _GROUND if name == "tilt_noise" or ground.height_sigma is not None]
+    plain = {name: getattr(ground, name) for name in ("plane", *fields)}
+    return {name: value for name, value in plain.items() if value is not None}
+
+
+SENSOR = Wheels
