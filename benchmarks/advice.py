@@ -55,7 +55,7 @@ def with_imu(case: Case, change: Callable[[np.ndarray, np.ndarray, np.ndarray], 
     simulation, rig, m = case
     assert m.imu is not None
     gyro, accel = change(m.imu.seconds, m.imu.gyro, m.imu.accel)
-    return simulation, rig, replace(m, imu=replace(m.imu, gyro=gyro, accel=accel))
+    return simulation, rig, m.with_streams(replace(m.imu, gyro=gyro, accel=accel))
 
 
 def noise(times: float) -> Callable[[int], Case]:
@@ -109,7 +109,7 @@ def jump(seed: int) -> Case:
     simulation, rig, m = camera_rig(seed)
     cam0, cam1 = m.cameras
     late = np.where(cam0.seconds > 9.4, 4_000_000, 0)
-    return simulation, rig, replace(m, cameras=(replace(cam0, stamps_ns=cam0.stamps_ns + late), cam1))
+    return simulation, rig, m.with_streams(replace(cam0, stamps_ns=cam0.stamps_ns + late), cam1)
 
 
 def size(times: float) -> Callable[[int], Case]:
@@ -137,7 +137,7 @@ def swapped(seed: int) -> Case:
     given = {"rotation": "start", "translation": "start", "intrinsics": "start", "distortion": "start"}
     rig = rig_for(simulation.scenario, settings=ten_runs.SETTINGS, **given)  # pyright: ignore[reportArgumentType]
     a, b = m.cameras
-    return simulation, rig, replace(m, cameras=(replace(b, name=a.name), replace(a, name=b.name)))
+    return simulation, rig, m.with_streams(replace(b, name=a.name), replace(a, name=b.name))
 
 
 def corner_noise(seed: int) -> Case:
@@ -195,7 +195,7 @@ FAULTS: dict[str, Callable[[int], Case]] = {
 
 
 def drifting(m: Measurements) -> Measurements:
-    return replace(m, cameras=(ten_runs.with_drift(m.cameras[0], 3e-4), *m.cameras[1:]))
+    return m.with_streams(ten_runs.with_drift(m.cameras[0], 3e-4), *m.cameras[1:])
 
 
 def densities(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
@@ -221,8 +221,7 @@ def well_off(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:
 def within(m: Measurements, window: Window) -> Measurements:
     streams = [s for s in (m.imu, *m.cameras) if s is not None]
     spans = [(int(s.stamps_ns[0]), int(s.stamps_ns[-1])) for s in streams]
-    imu = None if m.imu is None else cut(window, m.imu, "imu", spans)
-    return replace(m, imu=imu, cameras=tuple(cut(window, c, c.name, spans) for c in m.cameras))
+    return m.with_streams(*(cut(window, s, s.name, spans) for s in streams))
 
 
 def resized(match: re.Match[str], case: Case) -> tuple[Rig, Measurements]:

@@ -216,7 +216,7 @@ def row_of(kind: Kind, effect: str, times: float, seeds: Sequence[int]) -> Row:
     rig = rig_of(base, kind)
     for seed in seeds:
         simulation = simulate(with_effect(base, effect, times, seed), seed)
-        measured = simulation.measurements if kind.imu else replace(simulation.measurements, imu=None)
+        measured = simulation.measurements if kind.imu else simulation.measurements.without("imu0")
         try:
             result = calibrate_measurements(rig, measured)
         except CalibrationError as failure:

@@ -160,7 +160,7 @@ def repeated(measurements: Measurements, n: int) -> Measurements:
     imu = measurements.imu
     assert imu is not None
     whole_imu = ImuStream(imu.name, stamps(imu), np.tile(imu.gyro, (n, 1)), np.tile(imu.accel, (n, 1)))
-    return Measurements(whole_imu, tuple(camera(s) for s in measurements.cameras))
+    return Measurements.of_streams(whole_imu, *(camera(s) for s in measurements.cameras))
 
 
 def duration(rig: Rig, measurements: Measurements, n: int) -> list[Figure]:

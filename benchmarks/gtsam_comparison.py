@@ -90,7 +90,7 @@ def excerpt(measurements: Measurements, seconds: float) -> Measurements:
     i = np.searchsorted(imu.stamps_ns, common[0], "right") - 1
     j = np.searchsorted(imu.stamps_ns, common[-1], "left") + 1
     part = ImuStream(imu.name, imu.stamps_ns[i:j], imu.gyro[i:j], imu.accel[i:j])
-    return Measurements(part, tuple(some(s) for s in measurements.cameras))
+    return Measurements.of_streams(part, *(some(s) for s in measurements.cameras))
 
 
 def build(inputs: Inputs, state: State, half_turn: bool = False) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:

@@ -45,7 +45,7 @@ def part(measurements: Measurements, start: float, stop: float) -> Measurements:
         k = np.flatnonzero((c.stamps_ns >= low) & (c.stamps_ns <= high))
         a, b = c.start[k[0]], c.start[k[-1] + 1]
         cameras.append(CornerStream(c.name, c.stamps_ns[k], c.start[k[0] : k[-1] + 2] - a, c.point[a:b], c.uv[a:b]))
-    return Measurements(ImuStream(imu.name, imu.stamps_ns[m], imu.gyro[m], imu.accel[m]), tuple(cameras))
+    return Measurements.of_streams(ImuStream(imu.name, imu.stamps_ns[m], imu.gyro[m], imu.accel[m]), *cameras)
 
 
 def differences(a: Calibration, b: Calibration) -> tuple[dict[str, float], float, float]:

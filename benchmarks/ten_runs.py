@@ -81,7 +81,7 @@ def swapped_topics(seed: int) -> tuple[Rig, Measurements]:
     rig, measurements = recorded(handheld(15.0), seed, lens="start")
     rig = rig_for(handheld(15.0), settings=SETTINGS, rotation="start", translation="start", intrinsics="start")
     a, b = measurements.cameras
-    return rig, replace(measurements, cameras=(replace(b, name=a.name), replace(a, name=b.name)))
+    return rig, measurements.with_streams(replace(b, name=a.name), replace(a, name=b.name))
 
 
 def contradicted_prior(seed: int) -> tuple[Rig, Measurements]:
@@ -101,14 +101,14 @@ def glitch(seed: int) -> tuple[Rig, Measurements]:
     accel = imu.accel.copy()
     k = len(accel) // 2
     accel[k : k + 5] += [40.0, -25.0, 10.0]
-    return rig, replace(measurements, imu=replace(imu, accel=accel))
+    return rig, measurements.with_streams(replace(imu, accel=accel))
 
 
 def clock_drift(seed: int) -> tuple[Rig, Measurements]:
     """The clock of cam0 runs 300 ppm fast: 4.5 ms over the recording."""
     rig, measurements = recorded(handheld(15.0), seed)
     cam0, cam1 = measurements.cameras
-    return rig, replace(measurements, cameras=(with_drift(cam0, 3e-4), cam1))
+    return rig, measurements.with_streams(with_drift(cam0, 3e-4), cam1)
 
 
 def with_drift(stream: CornerStream, rate: float) -> CornerStream:
@@ -121,7 +121,7 @@ def few_images(seed: int) -> tuple[Rig, Measurements]:
     """Four images of one camera without an IMU."""
     rig, measurements = recorded(handheld(8.0), seed, lens="free")
     few = thinned(measurements.cameras[0], 40)
-    return rig.with_(imu=None, cameras=rig.cameras[:1]), replace(measurements, imu=None, cameras=(few,))
+    return rig.with_(imu=None, cameras=rig.cameras[:1]), measurements.only("cam0").with_streams(few)
 
 
 def thinned(stream: CornerStream, step: int) -> CornerStream:
@@ -139,8 +139,8 @@ def unsynchronised_stereo(seed: int) -> tuple[Rig, Measurements]:
     )
     rig, measurements = recorded(replace(scenario, cameras=cameras), seed, lens="free")
     cam0, cam1 = measurements.cameras
-    return rig.with_(imu=None), replace(
-        measurements, imu=None, cameras=(cam0, replace(cam1, stamps_ns=cam0.stamps_ns[: len(cam1.stamps_ns)]))
+    return rig.with_(imu=None), measurements.without("imu0").with_streams(
+        cam0, replace(cam1, stamps_ns=cam0.stamps_ns[: len(cam1.stamps_ns)])
     )
 
 

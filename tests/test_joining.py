@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.data.joining import join, join_corners
+from icalib.data.joining import join
 from icalib.data.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
 from icalib.errors import RecordingError
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels, by_name
@@ -25,7 +25,7 @@ def recording(seed: int, origin_s: int, lidar_s: tuple[int, int], wheels_s: tupl
     lidar = LidarStream("lidar0", scans, start, offset, xyz, rng.integers(-1, 5, n).astype(np.int32))
     wheels = WheelStream("w", turns, rng.normal(size=(len(turns), 2)))
     readings = ImuStream("imu0", imu, rng.normal(size=(len(imu), 3)), rng.normal(size=(len(imu), 3)))
-    return Measurements(readings, (), name=f"r{seed}", lidars=(lidar,), wheels=(wheels,))
+    return Measurements.of_streams(readings, lidar, wheels, name=f"r{seed}")
 
 
 @pytest.mark.parametrize("origins", [(0, 20), (20, 0), (7, 7)])
@@ -56,7 +56,7 @@ def test_a_lidar_that_went_on_longer_than_the_imu_keeps_recordings_apart():
 def test_relative_poses_cannot_be_joined():
     poses = WheelPoses("w", np.arange(3) * 10**9, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))
     one = recording(1, 0, (0, 10))
-    both = [Measurements(one.imu, (), lidars=one.lidars, wheels=(poses,), name=n) for n in "ab"]
+    both = [one.without("w").with_streams(poses)] * 2
     with pytest.raises(RecordingError, match="w measures relative poses, and there is none between two recordings"):
         join(RIG, both)
 
@@ -70,7 +70,8 @@ def corners(seed: int, stated: bool) -> CornerStream:
 @pytest.mark.parametrize("stated", [True, False])
 def test_corners_keep_their_sigma_where_all_recordings_state_it(stated):
     a, b = corners(1, True), corners(2, stated)
-    joined = join_corners([(a, 0), (b, 20 * 10**9)])
+    joined = CornerStream.joined([a, b], [0, 20 * 10**9])
+    assert joined.joins_ns == (20 * 10**9,)
     assert joined.start.tolist() == [0, 3, 5, 8, 10]
     np.testing.assert_array_equal(joined.uv, np.concatenate([a.uv, b.uv]))
     np.testing.assert_array_equal(joined.sigma, np.concatenate([a.sigma, b.sigma]) if stated else [])

@@ -15,7 +15,7 @@ from icalib.rig.file import rig_from_dict, rig_to_dict
 IMU = ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
 LIDAR, WHEELS = Lidar("lidar0", ""), Wheels("wheel0", "", "differential")
 MOCAP, ODOMETRY = PoseSensor("mocap0", ""), PoseSensor("odom0", "", "relative")
-EMPTY = Measurements(None, ())
+EMPTY = Measurements.of_streams()
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.data.measurements import ImuStream, LidarStream, Measurements, PoseStream, TrackStream, WheelStream
-from icalib.data.same_rig import near, streams_of_rig
+from icalib.data.measurements import (
+    CornerStream,
+    ImuStream,
+    LidarStream,
+    Measurements,
+    PoseStream,
+    TrackStream,
+    WheelStream,
+)
+from icalib.data.same_rig import streams_of_rig
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels, by_name
@@ -31,13 +39,13 @@ RIG = Rig(
         PoseSensor("mocap", ""),
     )
 )
-WHOLE = Measurements(
+WHOLE = Measurements.of_streams(
     IMU,
-    (),
+    lidar("rear"),
+    lidar("front"),
+    WheelStream("w", STAMPS, np.zeros((3, 2))),
+    PoseStream("mocap", STAMPS, np.zeros((3, 3, 3)), np.zeros((3, 3))),
     name="drive",
-    lidars=(lidar("rear"), lidar("front")),
-    wheels=(WheelStream("w", STAMPS, np.zeros((3, 2))),),
-    poses=(PoseStream("mocap", STAMPS, np.zeros((3, 3, 3)), np.zeros((3, 3))),),
 )
 TRACKS = TrackStream("cam7", STAMPS, NONE, np.empty(0, np.int64), np.empty((0, 2)))
 
@@ -49,21 +57,31 @@ def test_streams_come_in_the_order_of_the_rig():
 
 
 @pytest.mark.parametrize(
-    ("rig", "changed", "words"),
+    ("rig", "measured", "words"),
     [
-        (RIG, {"imu": None}, "drive has no readings of imu0"),
-        (RIG, {"imu": replace(IMU, name="imu1")}, "a stream called imu1, but the rig has imu0 of its kind"),
-        (RIG.with_(imu=None, lidars=()), {"lidars": ()}, "a stream called imu0, but the rig has none of its kind"),
-        (RIG, {"lidars": (lidar("front"),)}, "drive has no data of rear"),
-        (RIG, {"wheels": (), "poses": ()}, "drive has no data of w and mocap"),
-        (RIG, {"lidars": (lidar("front"), lidar("rear"), lidar("front"))}, "two streams of front"),
-        (RIG, {"lidars": (lidar("front"), lidar("roof"))}, "a stream called roof, but the rig has front and rear"),
-        (RIG, {"tracks": (TRACKS,)}, "a stream called cam7, but the rig has none of its kind"),
+        (RIG, WHOLE.without("imu0"), "drive has no data of imu0"),
+        (RIG, WHOLE.with_streams(replace(IMU, name="imu1")), "a stream called imu1, but the rig has imu0 of its kind"),
+        (
+            RIG.only("w", "mocap"),
+            WHOLE.without("front", "rear"),
+            "a stream called imu0, but the rig has none of its kind",
+        ),
+        (RIG, WHOLE.only("imu0", "front", "w", "mocap"), "drive has no data of rear"),
+        (RIG, WHOLE.without("w", "mocap"), "drive has no data of w and mocap"),
+        (RIG, WHOLE.with_streams(lidar("roof")), "a stream called roof, but the rig has front and rear"),
+        (RIG, WHOLE.with_streams(TRACKS), "a stream called cam7, but the rig has none of its kind"),
     ],
 )
-def test_others_are_refused_by_name(rig: Rig, changed: dict, words: str):
+def test_others_are_refused_by_name(rig: Rig, measured: Measurements, words: str):
     with pytest.raises(RecordingError, match=words):
-        calibrate_measurements(rig, replace(WHOLE, **changed))
+        calibrate_measurements(rig, measured)
+
+
+def test_a_sensor_has_one_stream_of_a_kind_but_a_camera_corners_and_tracks():
+    corners = CornerStream("cam7", STAMPS, NONE, np.empty(0, np.int64), np.empty((0, 2)))
+    assert [*Measurements.of_streams(corners, TRACKS).streams] == ["cam7", "cam7/tracks"]
+    with pytest.raises(RecordingError, match="drive has two streams of front; give one"):
+        Measurements.of_streams(lidar("front"), lidar("rear"), lidar("front"), name="drive")
 
 
 @pytest.mark.parametrize("far", [[465_875.0, 5_248_232.0, 413.0], [-7e6, 0.0, 0.0], [0.0, 50.0, 0.0]])
@@ -71,7 +89,7 @@ def test_far_positions_are_counted_from_among_them(far):
     """No digit is lost: what is taken off added again is what was written."""
     position = far + np.random.default_rng(0).normal(size=(9, 3))
     stream = PoseStream("mocap", np.arange(9), np.zeros((9, 3, 3)), position)
-    counted, notes = near(stream)
+    counted, notes = stream.near_origin()
     if np.linalg.norm(far) < 100.0:
         assert counted is stream and notes == ()
         return

@@ -72,11 +72,11 @@ def cut() -> Callable[[Measurements, float, float], Measurements]:
         begin, end = first + int(length * low), first + int(length * high)
         kept = (not_none(imu).stamps_ns >= begin) & (not_none(imu).stamps_ns <= end)
         cameras = tuple(_images(c, (c.stamps_ns >= begin) & (c.stamps_ns <= end)) for c in measurements.cameras)
-        return Measurements(
+        return Measurements.of_streams(
             ImuStream(
                 not_none(imu).name, not_none(imu).stamps_ns[kept], not_none(imu).gyro[kept], not_none(imu).accel[kept]
             ),
-            cameras,
+            *cameras,
         )
 
     return part

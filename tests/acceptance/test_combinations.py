@@ -122,13 +122,12 @@ def rig_and_measurements(
         only = (*only, "intrinsics")
     rig = with_drawn_guess(rig, scenario, SEED, only=only)
     if not sees:
-        rig, m = rig.with_(cameras=(), target=NoTarget()), replace(m, cameras=(), tracks=())
-    for name, field in (("lidar", "lidars"), ("wheels", "wheels"), ("pose", "poses")):
-        if name not in others:
-            rig, m = rig.with_(**{field: ()}), replace(m, **{field: ()})
+        rig = rig.with_(cameras=(), target=NoTarget())
+    unused = [s.name for s in rig.sensors.values() if s.sensor_type in {"lidar", "wheels", "pose"} - set(others)]
+    rig = rig.without(*unused)
     if not imu:
-        rig, m = in_body(rig.with_(imu=None), simulation), replace(m, imu=None)
-    return rig, m
+        rig = in_body(rig.with_(imu=None), simulation)
+    return rig, m.only(*rig.sensors)
 
 
 def in_body(rig: Rig, simulation: Simulation) -> Rig:

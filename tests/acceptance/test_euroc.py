@@ -154,7 +154,9 @@ def unshifted(rig, whole) -> Calibration:
 @pytest.mark.parametrize("shift_ns", [37_000_000, 1_000_037_000_000, -5_000_000_000])
 def test_a_shift_of_the_imu_clock_is_recovered(rig, whole, unshifted, shift_ns):
     imu = whole.imu
-    shifted = Measurements(ImuStream(imu.name, imu.stamps_ns + shift_ns, imu.gyro, imu.accel), whole.cameras)
+    shifted = Measurements.of_streams(
+        ImuStream(imu.name, imu.stamps_ns + shift_ns, imu.gyro, imu.accel), *whole.cameras
+    )
     found = calibrate_measurements(with_settings(rig, segments=0), shifted)
     for camera in CAMERAS:
         recovered = found.group(camera, "time_offset").value[0] - unshifted.group(camera, "time_offset").value[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
 from icalib.geometry import so3
@@ -25,7 +26,7 @@ def test_cameras_that_see_the_board_in_turns_are_placed_as_published(
     rig_equidistant: Rig, excerpt: Measurements, cut: Callable[[Measurements, float, float], Measurements]
 ):
     cameras = cut(excerpt, 0.0, 0.5).cameras[0], cut(excerpt, 0.5, 1.0).cameras[1]
-    result = calibrate_measurements(rig_equidistant, Measurements(excerpt.imu, cameras))
+    result = calibrate_measurements(rig_equidistant, Measurements.of_streams(not_none(excerpt.imu), *cameras))
     assert result.converged, result.status
     published = [pose(c) for c in load_rig(EXAMPLE / "published.yaml").cameras]
     found = [result.T_imu_sensor(c) for c in ("cam0", "cam1")]

@@ -60,7 +60,7 @@ def logs(request, odometry_logs: Path) -> tuple[str, Measurements, Published]:
     T = [np.array([row.split() for row in part.split("Homogeneous")[1].split("\n")[1:4]], float) for part in text]
     lag = -shift(filtered[:, -1], filtered[:, :3], imu[:, 7], imu[:, :3])
     published = Published((T[0][:, :3], T[1][:, :3]), (T[0][:, 3], T[1][:, 3]), -lag)
-    return request.param, Measurements(readings, (), poses=(stream,)), published
+    return request.param, Measurements.of_streams(readings, stream), published
 
 
 def shift(t: np.ndarray, x: np.ndarray, t_other: np.ndarray, other: np.ndarray) -> float:

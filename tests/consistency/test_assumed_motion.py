@@ -37,7 +37,7 @@ def mocap(name: str = "mocap0", T: np.ndarray = T_IMU_MOCAP, **others) -> SimPos
 
 def without_imu(scenario: Scenario, seed: int = 0) -> tuple[Rig, Measurements, Simulation]:
     simulation = simulate(replace(scenario, imu_noise_enabled=False), seed)
-    return rig_for(scenario).with_(imu=None), replace(simulation.measurements, imu=None), simulation
+    return rig_for(scenario).with_(imu=None), simulation.measurements.without("imu0"), simulation
 
 
 def true_beside(simulation: Simulation, body: str, sensor: str, name: str) -> np.ndarray | None:
@@ -137,7 +137,7 @@ def test_cameras_that_follow_points_and_motion_capture_from_nothing(robot):
     scenario = replace(scenario, duration_s=12.0, cameras=(camera,), lidars=(), wheels=(), poses=(mocap(),))
     simulation = simulate(replace(scenario, imu_noise_enabled=False), 0)
     rig = rig_for(scenario, intrinsics="free", distortion="free").with_(imu=None)
-    result = calibrate_measurements(rig, replace(simulation.measurements, imu=None))
+    result = calibrate_measurements(rig, simulation.measurements.without("imu0"))
     assert result.body == "mocap0"
     check_known(result, simulation, 7 + 8)
 
@@ -157,7 +157,7 @@ def followed_by_wheels(example: str, seed: int, drive: str) -> tuple[Rig, Measur
     scenario = replace(scenario, duration_s=15.0, cameras=cameras, lidars=())
     simulation = simulate(scenario, seed)
     rig = rig_for(scenario, intrinsics="free", distortion="free", drive=drive)  # pyright: ignore
-    return rig.with_(imu=None), replace(simulation.measurements, imu=None), simulation
+    return rig.with_(imu=None), simulation.measurements.without("imu0"), simulation
 
 
 @pytest.mark.parametrize(("seed", "drive"), [(1, "start"), (2, "fixed")])

@@ -45,7 +45,7 @@ def calibrated(simulation: Simulation, lidar: LidarStream) -> tuple[Calibration,
     sensor = Lidar("lidar0", "")
     stream, _ = in_seconds(lidar.unassociated(), sensor, "here")
     stream, notes = checked_lidar(sifted(stream, Sieve(sensor.min_range_m, sensor.max_range_m)), "here")
-    measurements = replace(simulation.measurements, lidars=(stream,))
+    measurements = simulation.measurements.with_streams(stream)
     return calibrate_measurements(rig_for(simulation.scenario), measurements), notes
 
 

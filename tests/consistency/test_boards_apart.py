@@ -51,7 +51,7 @@ def _before(T_world_cam: np.ndarray, grid: AprilGrid, shift: float) -> np.ndarra
 def calibrated(*simulations: Simulation, lens: Literal["free", "fixed"] = "free") -> Calibration:
     """From cameras alone, nothing known of how they stand."""
     rig = rig_for(simulations[0].scenario, intrinsics=lens, distortion=lens).with_(imu=None)
-    seen = [replace(s.measurements, imu=None, name=f"run{k}") for k, s in enumerate(simulations)]
+    seen = [replace(s.measurements.without("imu0"), name=f"run{k}") for k, s in enumerate(simulations)]
     return calibrate_measurements(rig, seen if len(seen) > 1 else seen[0])
 
 

@@ -28,7 +28,7 @@ def calibrated(simulation: Simulation, measured: Measurements, lens: str = "fixe
 
 
 def with_first(m: Measurements, stream: CornerStream) -> Measurements:
-    return replace(m, cameras=(stream, *m.cameras[1:]))
+    return m.with_streams(stream, *m.cameras[1:])
 
 
 def stamped(m: Measurements, late_s: np.ndarray) -> Measurements:
@@ -102,7 +102,7 @@ def test_a_shock_at_one_time(simulation):
     accel = imu.accel.copy()
     hit = imu.seconds.searchsorted(7.5)
     accel[hit : hit + 5] += [40.0, -25.0, 10.0]
-    result = calibrated(simulation, replace(simulation.measurements, imu=replace(imu, accel=accel)))
+    result = calibrated(simulation, simulation.measurements.with_streams(replace(imu, accel=accel)))
     match = re.search(r"comes at one time, near (\S+) s: .* --to (\S+), or --from (\S+)\.", result.reasons[0])
     assert match is not None and float(match[2]) < 7.5 < float(match[3]), result.reasons
     assert abs(float(match[1]) - 7.5) < 0.5 and "noise: {" not in " ".join(result.reasons)

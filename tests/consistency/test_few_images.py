@@ -36,7 +36,7 @@ def stills(count: int, seed: int, shared_px: float) -> Calibration:
     own = dataclasses.replace(rig.cameras[0], corner_noise_px=None)
     rig = rig.with_(imu=None, cameras=(own,), settings=dataclasses.replace(rig.settings, segments=8))
     stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
-    return calibrate_measurements(rig, Measurements(None, (stream,)))
+    return calibrate_measurements(rig, Measurements.of_streams(stream))
 
 
 def in_deviations(result: Calibration, formal: bool) -> list[float]:

@@ -56,4 +56,4 @@ def test_where_the_lidar_shows_nothing_either_the_camera_says_what_is_missing(ro
     (lidar,) = seen.lidars
     scattered = np.random.default_rng(0).uniform(-20.0, 20.0, lidar.xyz.shape).astype(np.float32)
     with pytest.raises(EstimationError, match="cam0 turned about one axis only"):
-        start(rig_for(scenario), [replace(seen, lidars=(replace(lidar, xyz=scattered),))])
+        start(rig_for(scenario), [seen.with_streams(replace(lidar, xyz=scattered))])

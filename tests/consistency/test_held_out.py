@@ -88,7 +88,7 @@ def test_errors_that_stay_for_a_second_show():
             second = (s.seconds[s.image] - s.seconds[0]).astype(int)
             errors = 0.6 * rng.normal(size=(second.max() + 1, s.point.max() + 1, 2))
             streams.append(replace(s, uv=s.uv + errors[second, s.point]))
-        return replace(m, cameras=tuple(streams))
+        return m.with_streams(*streams)
 
     result = run(handheld(12.0), 1, off, corner_noise_px=None)
     found, ratios = held(result), [f.chi2_per_dof for f in result.fits if f.kind == "corners"]

@@ -55,7 +55,7 @@ def test_a_baseline_carries_the_uncertainty_of_the_target():
     """Cameras alone: what is 0.2 % of the target is 0.2 % of the baseline."""
     scenario = handheld(6.0)
     scenario = replace(scenario, cameras=tuple(replace(c, time_offset_s=0.0, rate_hz=4.0) for c in scenario.cameras))
-    measured = replace(simulate(scenario, 1).measurements, imu=None)
+    measured = simulate(scenario, 1).measurements.without("imu0")
     sizes = {}
     for sigma in (0.0, 0.002):
         rig = rig_for(scenario).with_(imu=None, target=replace(scenario.target, size_sigma=sigma))

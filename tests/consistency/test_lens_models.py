@@ -40,7 +40,7 @@ def stills(
     start = np.concatenate([[0], np.cumsum(np.diff(whole.start)[kept])])
     stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
     rig = rig.with_(imu=None, cameras=(own,), settings=settings)
-    return rig, Measurements(None, (stream,)), wrong
+    return rig, Measurements.of_streams(stream), wrong
 
 
 def pattern_of(result: Calibration) -> list[str]:
@@ -92,7 +92,7 @@ def test_models_are_compared_by_the_corners_of_the_detector(monkeypatch):
     rig, measurements, wrong = stills(WIDE, "pinhole-radtan", 4, outliers=0.01, images=24)
     (stream,) = measurements.cameras
     edges = np.tile(np.array([-30.0, 0.0, 30.0, 0.0, 0.0, 60.0, 0.0], dtype=np.float32), (len(stream.uv), 2, 1))
-    measurements = Measurements(None, (dataclasses.replace(stream, edges=edges),))
+    measurements = Measurements.of_streams(dataclasses.replace(stream, edges=edges))
     given = []
     monkeypatch.setattr(lens_models, "compare_models", lambda *args: given.append(args) or (None, None))
     result = calibrate_measurements(rig, measurements)

@@ -32,7 +32,9 @@ def test_pairs_that_were_not_exposed_together_are_left_out_and_told(late: tuple[
     cameras = tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras)
     settings = dataclasses.replace(rig.settings, loss="huber", outlier_std=4.0)
     rig = rig.with_(imu=None, cameras=cameras, settings=settings)
-    result = calibrate_measurements(rig, Measurements(None, (some_images(first, chosen), some_images(second, other))))
+    result = calibrate_measurements(
+        rig, Measurements.of_streams(some_images(first, chosen), some_images(second, other))
+    )
     told = [n for n in result.notes if "not exposed together" in n]
     assert len(told) == (1 if late else 0)
     for k in late:

@@ -177,7 +177,7 @@ def test_two_recordings_without_any_other_sensor(kind):
 
 
 def cut(sim, stream: PoseStream):
-    return replace(sim.measurements, poses=(stream,))
+    return sim.measurements.with_streams(stream)
 
 
 def test_what_cannot_be_calibrated_is_said():
@@ -198,7 +198,7 @@ def test_what_cannot_be_calibrated_is_said():
         calibrate_measurements(rig, cut(sim, large))
     in_g = replace(not_none(sim.measurements.imu), accel=not_none(sim.measurements.imu).accel / 9.81)
     with pytest.raises(EstimationError, match=r"give a gravity of [\d.]* m/s\^2 instead of 9.81; check that the acc"):
-        calibrate_measurements(rig, replace(sim.measurements, imu=in_g))
+        calibrate_measurements(rig, sim.measurements.with_streams(in_g))
     bad = replace(cut(sim, other), name="second")
     with pytest.raises(EstimationError, match="second: .*mocap0 does not turn as imu0 does"):
         calibrate_measurements(rig, [replace(sim.measurements, name="first"), bad])

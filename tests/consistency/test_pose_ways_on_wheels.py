@@ -28,7 +28,7 @@ def recorded(request, robot):
 @pytest.mark.parametrize(("way", "words"), WRONG)
 def test_the_way_that_wheels_fit_is_named(recorded, way, words):
     rig, measurements, _ = recorded
-    written = replace(measurements, poses=tuple(way(x) for x in measurements.poses))
+    written = measurements.with_streams(*(way(x) for x in measurements.poses))
     with pytest.raises(EstimationError, match=words):
         start_without_imu(rig, [written])
 

@@ -133,7 +133,7 @@ def test_a_stream_that_outlasts_the_others(robot):
     longer = replace(
         wheels, stamps_ns=stamps, rate=np.concatenate([instance(wheels, WheelStream).rate, np.zeros((n, 2))])
     )
-    first = replace(first, measurements=replace(first.measurements, wheels=(longer,)))
+    first = replace(first, measurements=first.measurements.with_streams(longer))
     result = joint((first, second), open_rig(scenario, ""))
     assert result.converged
     check = result.group("wheel0", "time_offset")

@@ -208,7 +208,7 @@ def displaced(measurements: Measurements, seed: int) -> Measurements:
         own, xyz = rng.random(len(x.xyz)) < 0.1, x.xyz.copy()
         xyz[own] *= rng.uniform(0.2, 1.1, (own.sum(), 1)).astype(np.float32)
         damaged.append(replace(x, xyz=xyz))
-    return replace(measurements, lidars=tuple(damaged)).unassociated()
+    return measurements.with_streams(*damaged).unassociated()
 
 
 def passed_by(measurements: Measurements, seed: int) -> Measurements:
@@ -221,7 +221,7 @@ def passed_by(measurements: Measurements, seed: int) -> Measurements:
         hidden = (np.abs(aside) < 0.1 * np.pi) & (far > 2.3)
         near = 2.0 + 0.2 * np.cos(10.0 * aside) + 0.03 * rng.standard_normal(len(far))
         damaged.append(replace(x, xyz=np.where(hidden, near / far, 1.0).astype(np.float32)[:, None] * x.xyz))
-    return replace(measurements, lidars=tuple(damaged)).unassociated()
+    return measurements.with_streams(*damaged).unassociated()
 
 
 def check_outliers(robot, seed: int, damage, case: Case) -> None:

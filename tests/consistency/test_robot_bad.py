@@ -45,13 +45,13 @@ def guessed(simulation: Simulation) -> Rig:
 
 
 def with_wheels(measurements: Measurements, damage: Callable[[WheelStream], WheelStream]) -> Measurements:
-    return replace(measurements, wheels=tuple(damage(w) for w in measurements.wheels if isinstance(w, WheelStream)))
+    return measurements.with_streams(*(damage(w) for w in measurements.wheels if isinstance(w, WheelStream)))
 
 
 def with_scans(measurements: Measurements, damage: Damage) -> Measurements:
     """Damaged scans, of which nobody knows what lies on which plane."""
     damaged = (damage(x) for x in measurements.lidars)
-    return replace(measurements, lidars=tuple(replace(x, plane=np.full(len(x.xyz), -1, np.int32)) for x in damaged))
+    return measurements.with_streams(*(replace(x, plane=np.full(len(x.xyz), -1, np.int32)) for x in damaged))
 
 
 def refusal(rig: Rig, measurements: Measurements) -> str:

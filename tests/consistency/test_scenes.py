@@ -31,7 +31,7 @@ def seen_only(recording: Measurements, wanted: Callable[[np.ndarray], np.ndarray
         start = np.concatenate([[0], np.cumsum(count[count > 0])])
         return CornerStream(s.name, s.stamps_ns[count > 0], start, s.point[keep], s.uv[keep])
 
-    return dataclasses.replace(recording, cameras=tuple(cut(c) for c in recording.cameras))
+    return recording.with_streams(*(cut(c) for c in recording.cameras))
 
 
 def free(scenario: Scenario) -> Rig:
@@ -78,7 +78,7 @@ def test_a_scene_without_an_imu():
     together = tuple(dataclasses.replace(c, time_offset_s=0.0) for c in scenario.cameras)
     simulation = simulate(dataclasses.replace(scenario, cameras=together), 1)
     rig = free(simulation.scenario).with_(imu=None)
-    result = calibrate_measurements(rig, dataclasses.replace(simulation.measurements, imu=None))
+    result = calibrate_measurements(rig, simulation.measurements.without("imu0"))
     assert max(scene_errors(result, simulation)) < 1e-7
     T0, T1 = (simulation.truth.T_imu_cam[c] for c in ("cam0", "cam1"))
     np.testing.assert_allclose(result.T_imu_sensor("cam1"), np.linalg.inv(T0) @ T1, atol=1e-7)
@@ -126,7 +126,7 @@ def test_a_small_change_is_named_beside_noise():
 def images(recording: Measurements, count: int) -> Measurements:
     """The first images of each camera."""
     cameras = (c.of_rows(c.image < count, c.stamps_ns[:count], np.diff(c.start)[:count]) for c in recording.cameras)
-    return dataclasses.replace(recording, cameras=tuple(cameras))
+    return recording.with_streams(*cameras)
 
 
 def chosen(rig: Rig, recordings: list[Measurements]) -> tuple[Bodies, list[Measurements]]:
@@ -179,7 +179,7 @@ def test_tags_that_no_image_ties_to_the_others_are_left_out_and_named():
     first = only.cameras[0]
     stamps = first.stamps_ns + np.int64(1_000)  # images of their own
     merged = merge(measurements.cameras[0], dataclasses.replace(first, stamps_ns=stamps))
-    measurements = dataclasses.replace(measurements, cameras=(merged, measurements.cameras[1]))
+    measurements = measurements.with_streams(merged, measurements.cameras[1])
     result = calibrate_measurements(free(simulation.scenario), measurements)
     left_out = simulation.scenario.target.bodies[5]
     assert left_out not in result.bodies

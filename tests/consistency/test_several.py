@@ -187,7 +187,7 @@ def later(imu: ImuStream, ns: int) -> ImuStream:
 @pytest.mark.parametrize("shift_ns", [300_000_000, 10**15])
 def test_a_clock_that_was_set_between_recordings_is_named(noisy, shift_ns: int):
     first, other = (s.measurements for s in noisy)
-    moved = dataclasses.replace(other, imu=later(other.imu, shift_ns), name="evening")
+    moved = dataclasses.replace(other.with_streams(later(other.imu, shift_ns)), name="evening")
     with pytest.raises(
         EstimationError, match=rf"^evening: the time offset of cam0 differs by \+{shift_ns * 1e-9:.3f} s from that in"
     ):
@@ -199,7 +199,7 @@ def test_a_recording_without_a_guess_is_named(noisy):
     imu = other.imu
     wild = ImuStream(imu.name, imu.stamps_ns, np.roll(imu.gyro, 1, axis=1)[::-1].copy(), imu.accel)
     with pytest.raises(EstimationError, match=r"^recording 2: "):
-        calibrate_measurements(rig_of(noisy[0]), [first, dataclasses.replace(other, imu=wild)])
+        calibrate_measurements(rig_of(noisy[0]), [first, other.with_streams(wild)])
 
 
 def test_gaps_and_other_schemes(noisy):
@@ -211,9 +211,7 @@ def test_gaps_and_other_schemes(noisy):
     rig = rig_of(noisy[0])
     for scheme in ("pose", "kinematic"):
         settings = dataclasses.replace(rig.settings, scheme=scheme, keyframes="first-camera")
-        result = calibrate_measurements(
-            dataclasses.replace(rig, settings=settings), [first, dataclasses.replace(other, imu=imu)]
-        )
+        result = calibrate_measurements(dataclasses.replace(rig, settings=settings), [first, other.with_streams(imu)])
         error, _ = errors(result, noisy[0].truth)
         assert np.abs(error[:6]).max() < 5e-3
         assert any("has a gap of 0.1" in n and "s of recording 2, bridged" in n for n in result.notes)
@@ -227,7 +225,7 @@ def test_without_an_imu_recordings_are_more_images():
     scenario = still(handheld(8.0))
     simulations = simulate(scenario, 1), simulate(second(scenario), 2)
     rig = rig_of(simulations[0]).with_(imu=None)
-    recordings = [dataclasses.replace(s.measurements, imu=None) for s in simulations]
+    recordings = [s.measurements.without("imu0") for s in simulations]
     both, alone = calibrate_measurements(rig, recordings), calibrate_measurements(rig, recordings[:1])
     assert both.converged, both.status
     assert len(both.trajectory.seconds) == sum(len(m.cameras[0].stamps_ns) for m in recordings)
@@ -241,7 +239,7 @@ def test_without_an_imu_recordings_are_more_images():
 def test_a_recording_that_shows_too_little_is_named(noisy):
     """The first guess needs motion, and a chain needs three images within the recording of the IMU."""
     first, other = (s.measurements for s in noisy)
-    short = dataclasses.replace(other, cameras=tuple(only(c, 0, 15) for c in other.cameras), name="short")
+    short = dataclasses.replace(other.with_streams(*(only(c, 0, 15) for c in other.cameras)), name="short")
     with pytest.raises(EstimationError, match=r"^short: cam0: only \d+ pairs of consecutive images"):
         calibrate_measurements(rig_of(noisy[0]), [first, short])
 
@@ -276,7 +274,7 @@ def test_images_that_outlast_the_imu_are_left_out(noisy):
     first, other = (s.measurements for s in noisy)
     early, late = first.imu.stamps_ns < first.imu.stamps_ns[0] + 9 * 10**9, other.imu.seconds > 2.0
     cut = [
-        dataclasses.replace(m, imu=ImuStream("imu0", m.imu.stamps_ns[k], m.imu.gyro[k], m.imu.accel[k]))
+        m.with_streams(ImuStream("imu0", m.imu.stamps_ns[k], m.imu.gyro[k], m.imu.accel[k]))
         for m, k in ((first, early), (other, late))
     ]
     result = calibrate_measurements(rig_of(noisy[0]), cut)

@@ -85,4 +85,4 @@ def test_a_recording_without_planes_is_named(robot):
     rng = np.random.default_rng(0)
     scattered = (replace(x, xyz=rng.uniform(-20.0, 20.0, x.xyz.shape).astype(np.float32)) for x in bad.lidars)
     with pytest.raises(EstimationError, match="^b: lidar0"):
-        calibrate_measurements(rig, [good, replace(bad, lidars=tuple(scattered))])
+        calibrate_measurements(rig, [good, bad.with_streams(*scattered)])

@@ -108,7 +108,7 @@ def test_a_wrong_baseline_is_named(driven):
 def test_wheels_that_no_vehicle_has_are_named(driven):
     """Their rates are in rpm, and nothing in the rig file says otherwise."""
     fast = tuple(replace(s, rate=s.rate * 30.0 / np.pi) for s in driven.measurements.wheels)
-    result = calibrate_measurements(rig_for(driven.scenario), replace(driven.measurements, wheels=fast))
+    result = calibrate_measurements(rig_for(driven.scenario), driven.measurements.with_streams(*fast))
     words = [w for w in result.warnings if "which no vehicle has" in w]
     assert len(words) == 1 and "a radius of 10.6 mm and 420" in words[0] and "rate_unit" in words[0], words
 

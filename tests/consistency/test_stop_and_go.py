@@ -59,7 +59,7 @@ def stills(count: int, noisy: bool = True, seed: int = 0, **motion) -> Stills:
     rig = rig_for(scenario).with_(imu=None)
     rig = rig.with_(poses=(replace(rig.poses[0], rotation_noise=None, position_noise=None),))
     T = np.linalg.inv(sim.truth.T_imu_cam[camera.name]) @ sim.truth.T_imu_pose["flange"]
-    return Stills(rig, replace(sim.measurements, imu=None), T)
+    return Stills(rig, sim.measurements.without("imu0"), T)
 
 
 def off(result: Calibration, true: np.ndarray, name: str = "flange") -> tuple[np.ndarray, np.ndarray]:
@@ -72,7 +72,7 @@ def off(result: Calibration, true: np.ndarray, name: str = "flange") -> tuple[np
 
 
 def changed(x: Stills, **columns) -> Measurements:
-    return replace(x.measurements, poses=(replace(x.measurements.poses[0], **columns),))
+    return x.measurements.with_streams(replace(x.measurements.poses[0], **columns))
 
 
 def inverse(stream: PoseStream) -> PoseStream:
@@ -140,7 +140,7 @@ def test_three_pairs_are_few():
 def test_the_board_on_the_flange_before_a_camera_that_stands_still():
     """The same equation with inverted poses: what is found is where the robot's base is, seen from the camera."""
     x = stills(20)
-    eye_to_hand = replace(x.measurements, poses=(inverse(x.measurements.poses[0]),))
+    eye_to_hand = x.measurements.with_streams(inverse(x.measurements.poses[0]))
     with pytest.raises(EstimationError, match="inverted: true"):
         calibrate_measurements(x.rig, eye_to_hand)
 
@@ -201,7 +201,7 @@ def test_poses_are_streamed_while_the_robot_goes_from_stop_to_stop(late_s):
 def test_several_recordings_each_with_a_board_of_its_own():
     one, two = stills(10, seed=1), stills(12, seed=2)
     moved = replace(two.measurements.poses[0], position=two.measurements.poses[0].position + [0.5, 0.0, 1.0])
-    result = calibrate_measurements(one.rig, [one.measurements, replace(two.measurements, poses=(moved,))])
+    result = calibrate_measurements(one.rig, [one.measurements, two.measurements.with_streams(moved)])
     e, P = off(result, one.T_cam_flange)
     assert np.abs(e / np.sqrt(np.diag(P))).max() < 4.0
 
@@ -221,7 +221,7 @@ def test_two_pose_sensors_at_rest(robot):
     scenario: Scenario = replace(robot("3d", 25.0, ""), poses=poses, motion=Drive("free"), imu_clock_origin_ns=0)
     sim = simulate(scenario, 0)
     rig = rig_for(scenario).with_(imu=None)
-    result = calibrate_measurements(rig, replace(sim.measurements, imu=None))
+    result = calibrate_measurements(rig, sim.measurements.without("imu0"))
     true = np.linalg.inv(sim.truth.T_imu_pose["mocap0"]) @ sim.truth.T_imu_pose["slam0"]
     e, P = off(result, true, "slam0")
     assert result.converged and np.abs(e / np.sqrt(np.diag(P))).max() < 4.0
@@ -232,4 +232,4 @@ def test_too_few_poses_of_a_camera_that_moves():
     scenario = handheld(15.8)
     seen = simulate(replace(scenario, cameras=scenario.cameras[:1], imu_clock_origin_ns=0), 0).measurements.cameras
     with pytest.raises(EstimationError, match="stand still for half a second around each"):
-        calibrate_measurements(x.rig, replace(x.measurements, cameras=seen))
+        calibrate_measurements(x.rig, x.measurements.with_streams(*seen))

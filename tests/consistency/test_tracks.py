@@ -104,7 +104,7 @@ def follower(scenario: Scenario, scale: float) -> Rig:
 def lost(measurements: Measurements) -> Measurements:
     """One observation of twenty is of something else, up to 30 px away on each axis."""
     rng = np.random.default_rng(5)
-    return replace(measurements, tracks=tuple(_lost(t, rng) for t in measurements.tracks))
+    return measurements.with_streams(*(_lost(t, rng) for t in measurements.tracks))
 
 
 def _lost(stream: TrackStream, rng: np.random.Generator) -> TrackStream:

@@ -21,7 +21,7 @@ LEVEL = np.array([[0.0, 1.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0
 def swapped(measurements: Measurements) -> Measurements:
     (wheels,) = measurements.wheels
     assert isinstance(wheels, WheelStream)
-    return replace(measurements, wheels=(replace(wheels, rate=np.ascontiguousarray(wheels.rate[:, ::-1])),))
+    return measurements.with_streams(replace(wheels, rate=np.ascontiguousarray(wheels.rate[:, ::-1])))
 
 
 def level(**others) -> SimPoses:
@@ -56,7 +56,7 @@ def test_signs_put_swapped_wheels_right(robot):
     rig, measurements, simulation = without_imu(replace(robot("ramp", 15.0, "w"), poses=(level(),)))
     (wheels,) = swapped(measurements).wheels
     assert isinstance(wheels, WheelStream)
-    result = calibrate_measurements(rig, replace(measurements, wheels=(replace(wheels, rate=-wheels.rate),)))
+    result = calibrate_measurements(rig, measurements.with_streams(replace(wheels, rate=-wheels.rate)))
     radii, true = result.group("wheel0", "radii"), simulation.truth.drive["wheel0"]["radii"]
     assert (np.abs(radii.value - true[::-1]) < 4.0 * radii.std).all()
 

@@ -85,7 +85,7 @@ def test_residuals_that_are_no_noise_get_no_advice_on_the_noise(simulation):
     noise = np.random.default_rng(3).normal(size=m.imu.accel.shape)
     shaken = np.asarray(lfilter([1.0], [1.0, -0.95], noise, axis=0))
     imu = replace(m.imu, accel=m.imu.accel + 0.1 * shaken)
-    result = calibrate_measurements(rig_for(simulation.scenario), replace(m, imu=imu))
+    result = calibrate_measurements(rig_for(simulation.scenario), m.with_streams(imu))
     (words,) = said(result)
     assert "the cause is unknown" in words and "Checked: " in words and "noise: {" not in words
     assert result.reasons[0] == words
@@ -94,7 +94,7 @@ def test_residuals_that_are_no_noise_get_no_advice_on_the_noise(simulation):
 def swapped(simulation: Simulation) -> Measurements:
     """Each camera's images under the other's name."""
     a, b = simulation.measurements.cameras
-    return replace(simulation.measurements, cameras=(replace(b, name=a.name), replace(a, name=b.name)))
+    return simulation.measurements.with_streams(replace(b, name=a.name), replace(a, name=b.name))
 
 
 GUESSES: list[dict[str, Any]] = [
@@ -148,7 +148,7 @@ def test_corners_that_are_off_with_no_cause_in_sight(simulation):
     for size, noise, words in ((0.5, 0.2, "larger than its corner_noise predicts"), (2.0, None, "ten times the error")):
         moved = replace(first, uv=first.uv + rng.normal(scale=size, size=first.uv.shape))
         cameras = (replace(rig.cameras[0], corner_noise_px=noise), rig.cameras[1])
-        measured = replace(simulation.measurements, cameras=(moved, second))
+        measured = simulation.measurements.with_streams(moved, second)
         result = calibrate_measurements(rig.with_(cameras=cameras), measured)
         assert words in result.reasons[0] and "the cause is unknown" in result.reasons[0], result.reasons
 

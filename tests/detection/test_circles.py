@@ -152,7 +152,7 @@ def calibrated(target: Circles, camera: SimCamera, stream: CornerStream, folder:
     fields = ", ".join(f"{name}: {str(value).lower()}" for name, value in target.plain().items())
     text = f"{{type: camera, model: {camera.model}, resolution: [752, 480]}}\ntarget: {{{fields}}}\n"
     (folder / "rig.yaml").write_text(f"sensors:\n  cam0: {text}settings: {{board_shape: false}}\n")
-    return calibrate_measurements(load_rig(folder / "rig.yaml"), Measurements(None, (stream,)))
+    return calibrate_measurements(load_rig(folder / "rig.yaml"), Measurements.of_streams(stream))
 
 
 @pytest.mark.parametrize(

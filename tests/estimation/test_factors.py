@@ -271,7 +271,7 @@ def lidar_sample(
     setup = replace(setup, imu=replace(setup.imu, variance=noisy**2 * setup.imu.variance))
     if restarts:
         stream = replace(setup.stream, joins_ns=(int(setup.stream.stamps_ns[2]),))
-        measured = replace(setup.sim.measurements, lidars=(stream,))
+        measured = setup.sim.measurements.with_streams(stream)
         setup = with_two_clocks(replace(setup, sim=replace(setup.sim, measurements=measured)))
     rng = np.random.default_rng(5)
     start = setup.perturbed(rng, 0.3)

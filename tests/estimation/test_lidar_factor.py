@@ -149,7 +149,7 @@ def brisk(robot):
     keep = np.sort(order[np.unique(at[order], return_index=True)[1]])
     start = np.searchsorted(keep, stream.start)
     few = replace(stream, start=start, xyz=stream.xyz[keep], offset_s=stream.offset_s[keep], plane=stream.plane[keep])
-    return replace(simulation, measurements=replace(simulation.measurements, lidars=(few,)))
+    return replace(simulation, measurements=simulation.measurements.with_streams(few))
 
 
 def test_points_move_to_the_centre_of_their_bin_as_the_sensor_moved(robot, room_of):
@@ -225,7 +225,7 @@ def test_points_without_a_plane_or_without_imu_are_left_out(sparse_room, room_of
 
 
 def with_stream(setup, stream, plane=None):
-    measurements = replace(setup.sim.measurements, lidars=(stream,))
+    measurements = setup.sim.measurements.with_streams(stream)
     return replace(
         setup, sim=replace(setup.sim, measurements=measurements), plane=setup.plane if plane is None else plane
     )

@@ -105,7 +105,7 @@ def test_cells_together_are_all_that_cameras_say(solved: tuple[Problem, Outcome]
 
 def bent(measurements: Measurements, scenario: Scenario) -> Measurements:
     """Through lenses with ripples of 1 px that no model here follows, the same in all images."""
-    return replace(measurements, tracks=tuple(_bent(t, scenario) for t in measurements.tracks))
+    return measurements.with_streams(*(_bent(t, scenario) for t in measurements.tracks))
 
 
 def _bent(stream: TrackStream, scenario: Scenario) -> TrackStream:
@@ -172,7 +172,7 @@ def test_errors_that_stay_along_a_track_are_in_the_standard_deviations():
     assert sigma is not None
     white = tuple(replace(t, uv=t.uv + rng.normal(0.0, sigma, t.uv.shape)) for t in clean.tracks)
     alike = tuple(drifting(t, sigma, rng) for t in clean.tracks)
-    of_white, of_alike = (track_spread(replace(clean, tracks=tracks), rig) for tracks in (white, alike))
+    of_white, of_alike = (track_spread(clean.with_streams(*tracks), rig) for tracks in (white, alike))
     print(of_white, of_alike)
     assert 0.7 < of_white < 1.3
     assert of_alike > 1.5 * of_white

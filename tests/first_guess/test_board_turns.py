@@ -82,9 +82,8 @@ def shown(simulation: Simulation, rig: Rig, gaps: tuple[int, ...]) -> tuple[Meas
         if k in gaps:
             turn[cameras[k].seconds > begin] += 1 + k
         wrong.append(turned(cameras[k], target, turn % len(target.turns)))
-    imu = simulation.measurements.imu if rig.imu else None
-    measured = replace(simulation.measurements, imu=imu)
-    return replace(measured, cameras=tuple(wrong)), replace(measured, cameras=tuple(cameras))
+    measured = simulation.measurements.only(*rig.sensors)
+    return measured.with_streams(*wrong), measured.with_streams(*cameras)
 
 
 def test_the_gyroscope_bridges_gaps_of_all_cameras(simulation):
@@ -117,6 +116,6 @@ def test_a_camera_alone_keeps_its_numbers(simulation):
     """Between two images it may have turned by any angle."""
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
     wrong, _ = shown(simulation, rig, gaps=(0,))
-    alone = replace(wrong, imu=None, cameras=wrong.cameras[:1])
+    alone = wrong.only(wrong.cameras[0].name)
     (found,) = number_alike(rig.with_(imu=None, cameras=rig.cameras[:1]), [alone])
     assert _as_sets(found.cameras[0]) == _as_sets(alone.cameras[0])

@@ -32,9 +32,8 @@ def simulation() -> Simulation:
 
 def shifted(measurements: Measurements, seconds: float) -> Measurements:
     imu = measurements.imu
-    return dataclasses.replace(
-        measurements,
-        imu=dataclasses.replace(not_none(imu), stamps_ns=not_none(imu).stamps_ns + np.int64(round(seconds * 1e9))),
+    return measurements.with_streams(
+        dataclasses.replace(not_none(imu), stamps_ns=not_none(imu).stamps_ns + np.int64(round(seconds * 1e9)))
     )
 
 
@@ -121,7 +120,7 @@ def test_a_camera_without_a_pose_is_refused_in_a_sentence(simulation: Simulation
     nonsense = np.array([30.0, 200.0, 371.0, 245.0])
     camera = dataclasses.replace(rig.cameras[0], intrinsics=Parameter("fixed", nonsense))
     rig = rig.with_(imu=None, cameras=(camera,))
-    m = dataclasses.replace(simulation.measurements, imu=None, cameras=simulation.measurements.cameras[:1])
+    m = simulation.measurements.only("cam0")
     with pytest.raises(EstimationError, match="cam0.*in none of its .* images"):
         initial_guess(rig, m)
 
@@ -181,14 +180,13 @@ def test_what_is_given_of_a_lens_is_held_while_the_rest_is_found(simulation: Sim
 
 def with_imu(measurements: Measurements, gyro_scale: float = 1.0, accel_scale: float = 1.0) -> Measurements:
     imu = measurements.imu
-    return dataclasses.replace(
-        measurements,
-        imu=ImuStream(
+    return measurements.with_streams(
+        ImuStream(
             not_none(imu).name,
             not_none(imu).stamps_ns,
             not_none(imu).gyro * gyro_scale,
             not_none(imu).accel * accel_scale,
-        ),
+        )
     )
 
 
@@ -224,7 +222,7 @@ def test_a_motionless_recording_is_refused():
 
 def test_an_imu_of_another_motion_is_refused(simulation: Simulation):
     other = simulate(dataclasses.replace(handheld(20.0), motion=HandheldMotion(seed=99)), 4)
-    mixed = dataclasses.replace(simulation.measurements, imu=other.measurements.imu)
+    mixed = simulation.measurements.with_streams(not_none(other.measurements.imu))
     assert "does not match" in failure(rig_for(simulation.scenario), mixed)
 
 
@@ -242,9 +240,8 @@ def test_an_imu_that_covers_a_part_is_enough(simulation: Simulation, span: tuple
     imu = simulation.measurements.imu
     t = not_none(imu).seconds
     m = (t >= span[0]) & (t <= span[1])
-    part = dataclasses.replace(
-        simulation.measurements,
-        imu=ImuStream(not_none(imu).name, not_none(imu).stamps_ns[m], not_none(imu).gyro[m], not_none(imu).accel[m]),
+    part = simulation.measurements.with_streams(
+        ImuStream(not_none(imu).name, not_none(imu).stamps_ns[m], not_none(imu).gyro[m], not_none(imu).accel[m])
     )
     guess = initial_guess(rig_for(simulation.scenario), part)
     for name in guess.cameras:
@@ -263,7 +260,7 @@ def test_corners_without_rhyme_are_refused(simulation: Simulation):
     rng = np.random.default_rng(0)
     cameras = tuple(dataclasses.replace(c, uv=rng.permutation(c.uv)) for c in simulation.measurements.cameras)
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
-    assert "intrinsics" in failure(rig, dataclasses.replace(simulation.measurements, cameras=cameras))
+    assert "intrinsics" in failure(rig, simulation.measurements.with_streams(*cameras))
 
 
 def test_a_few_gross_outliers_cost_hardly_a_pose(simulation: Simulation):
@@ -272,9 +269,7 @@ def test_a_few_gross_outliers_cost_hardly_a_pose(simulation: Simulation):
     for c in simulation.measurements.cameras:
         far = rng.random(len(c.uv)) < 0.03
         cameras.append(dataclasses.replace(c, uv=c.uv + 20.0 * far[:, None] * rng.choice([-1.0, 1.0], c.uv.shape)))
-    guess = initial_guess(
-        rig_for(simulation.scenario), dataclasses.replace(simulation.measurements, cameras=tuple(cameras))
-    )
+    guess = initial_guess(rig_for(simulation.scenario), simulation.measurements.with_streams(*cameras))
     for camera in guess.cameras.values():
         assert camera.poses.ok.mean() > 0.9
 

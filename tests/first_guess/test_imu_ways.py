@@ -55,11 +55,11 @@ def asked_for(sentence: str, sensor: ImuSensor) -> ImuSensor:
 )
 def test_each_way_is_named_and_undone(run, gyro, accel, words):
     rig, measurements = run
-    wrong = replace(measurements, imu=recorded(measurements.imu, rig, gyro, accel))
+    wrong = measurements.with_streams(recorded(measurements.imu, rig, gyro, accel))
     with pytest.raises(EstimationError) as error:
         initial_guess(rig, wrong)
     assert words in str(error.value) and str(error.value).endswith(f"of {rig.imu.name} in the rig file.")
-    right = replace(wrong, imu=in_si(wrong.imu, asked_for(str(error.value), rig.imu)))
+    right = wrong.with_streams(in_si(wrong.imu, asked_for(str(error.value), rig.imu)))
     found, good = initial_guess(rig, right), initial_guess(rig, measurements)
     assert abs(found.cameras["cam0"].offset - good.cameras["cam0"].offset) < 2e-3
     np.testing.assert_allclose(np.abs(found.cameras["cam0"].position), np.abs(good.cameras["cam0"].position), atol=0.03)
@@ -68,7 +68,7 @@ def test_each_way_is_named_and_undone(run, gyro, accel, words):
 def test_the_field_is_said_on_top_of_what_the_rig_file_says(run):
     """Of a rig file that swaps two axes already."""
     rig, measurements = run
-    wrong = replace(measurements, imu=recorded(measurements.imu, rig, ("x", "-y", "z"), XYZ))
+    wrong = measurements.with_streams(recorded(measurements.imu, rig, ("x", "-y", "z"), XYZ))
     rig = rig.with_(imu=replace(rig.imu, gyro_axes=("z", "-y", "x")))
     with pytest.raises(EstimationError, match=r"set gyro_axes: \[z, y, x\] of imu0"):
         initial_guess(rig, wrong)
@@ -77,6 +77,6 @@ def test_the_field_is_said_on_top_of_what_the_rig_file_says(run):
 def test_another_motion_is_no_way(run):
     rig, measurements = run
     imu = measurements.imu
-    other = replace(measurements, imu=replace(imu, gyro=imu.gyro[::-1].copy(), accel=imu.accel[::-1].copy()))
+    other = measurements.with_streams(replace(imu, gyro=imu.gyro[::-1].copy(), accel=imu.accel[::-1].copy()))
     with pytest.raises(EstimationError, match="does not match"):
         initial_guess(rig, other)

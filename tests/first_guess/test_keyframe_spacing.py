@@ -29,7 +29,7 @@ def recorded(seconds: float = 20.0) -> Measurements:
     poses = PoseStream("mocap0", stamps, R, p + rng.normal(0.0, WAY, p.shape))
     turn = (0.4 + 0.3 * np.cos(t)) * BASELINE / 2.0
     rate = np.stack([speed - turn, speed + turn], axis=1) / RADIUS
-    return Measurements(None, (), wheels=(WheelStream("wheel0", stamps[::2], rate[::2]),), poses=(poses,))
+    return Measurements.of_streams(WheelStream("wheel0", stamps[::2], rate[::2]), poses)
 
 
 def spacing(noise: float | None, densities=DENSITIES, **settings: Any) -> float:

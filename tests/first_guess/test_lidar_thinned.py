@@ -57,7 +57,7 @@ def test_the_result_is_that_of_all_points(robot, monkeypatch):
     sims = [robot(10.0, seed, {"azimuth_steps": 600}).sim for seed in (1, 2)]
 
     def raw(m: Measurements) -> Measurements:
-        return replace(m, lidars=tuple(replace(x, plane=np.full(len(x.xyz), -1, np.int32)) for x in m.lidars))
+        return m.with_streams(*(replace(x, plane=np.full(len(x.xyz), -1, np.int32)) for x in m.lidars))
 
     recordings, rig = [raw(s.measurements) for s in sims], rig_for(sims[0].scenario)
     whole = calibrate_measurements(rig, recordings)

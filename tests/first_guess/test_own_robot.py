@@ -83,7 +83,7 @@ def test_of_a_long_recording_its_middle_tells(robot, monkeypatch):
 def test_what_is_said_and_what_stays(robot):
     r = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar")
     stream, hit = with_panel(r.streams[0], *PANELS["panel ahead"])
-    recording = Measurements(r.sim.measurements.imu, (), lidars=(stream,), warnings=("before.",))
+    recording = replace(Measurements.of_streams(r.sim.measurements.imu, stream), warnings=("before.",))
     found = without_own_robot(recording)
     before, (said,) = found.warnings[0], found.warnings[1:]
     assert before == "before." and said.startswith("lidar0 has self-returns: ") and said.endswith(".")
@@ -92,14 +92,12 @@ def test_what_is_said_and_what_stays(robot):
     (kept,) = found.lidars
     assert len(kept.stamps_ns) == len(stream.stamps_ns)
     assert len(kept.xyz) == pytest.approx((~hit).sum(), rel=0.01)
-    all_round = without_own_robot(replace(recording, lidars=(with_panel(r.streams[0], *PANELS["deck below"])[0],)))
+    all_round = without_own_robot(recording.with_streams(with_panel(r.streams[0], *PANELS["deck below"])[0]))
     assert "on all sides" in all_round.warnings[-1]
 
 
 def test_points_of_known_planes_are_left_alone(robot):
     """Whoever knows what lies on which plane knows what is the robot's."""
     stream, _ = with_panel(robot(16.0, 1, {"azimuth_steps": 300}).streams[0], *PANELS["panel ahead"])
-    known = Measurements(
-        None, (), lidars=(replace(stream, plane=np.where(stream.xyz[:, 0] < 0.0, 1, -1).astype(np.int32)),)
-    )
+    known = Measurements.of_streams(replace(stream, plane=np.where(stream.xyz[:, 0] < 0.0, 1, -1).astype(np.int32)))
     assert without_own_robot(known).lidars[0] is known.lidars[0]

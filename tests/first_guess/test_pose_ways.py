@@ -92,7 +92,7 @@ def state_of(sim) -> State:
 
 @pytest.mark.parametrize(("way", "words"), WRONG)
 def test_written_another_way(sim, way, words):
-    written = replace(sim.measurements, poses=tuple(way(x) for x in sim.measurements.poses))
+    written = sim.measurements.with_streams(*(way(x) for x in sim.measurements.poses))
     inputs = inputs_for(rig_for(sim.scenario), [written])
     with pytest.raises(EstimationError, match=words):
         state_from_poses(inputs)
@@ -106,7 +106,7 @@ def test_on_a_floor_inverted_poses_fit_by_their_rates_alone():
         (), duration_s=12.0, motion=Drive("planar"), board=False, room=Room(), poses=(SimPoses("mocap0", np.eye(4)),)
     )
     sim = simulate(scenario, 1)
-    inputs = inputs_for(rig_for(scenario), [replace(sim.measurements, poses=(inverted(sim.measurements.poses[0]),))])
+    inputs = inputs_for(rig_for(scenario), [sim.measurements.with_streams(inverted(sim.measurements.poses[0]))])
     with pytest.raises(EstimationError, match="the poses of mocap0 are inverted"):
         state_from_poses(inputs)
     state_from_poses(inputs_for(rig_for(scenario), [sim.measurements]))
@@ -114,6 +114,6 @@ def test_on_a_floor_inverted_poses_fit_by_their_rates_alone():
 
 def test_a_motion_of_another_recording_is_not_called_inverted(sim):
     other = simulate(sim.scenario, 7).measurements.poses
-    inputs = inputs_for(rig_for(sim.scenario), [replace(sim.measurements, poses=other)])
+    inputs = inputs_for(rig_for(sim.scenario), [sim.measurements.with_streams(*other)])
     with pytest.raises(EstimationError, match="does not match"):
         state_from_poses(inputs)

@@ -94,7 +94,7 @@ def test_noise_of_rotations_does_not_shorten_the_lever_arm(sim):
     (stream,), rng = sim.measurements.poses, np.random.default_rng(0)
     turns = Rotation.from_rotvec(4e-3 * rng.normal(size=(len(stream.stamps_ns), 3))).as_matrix()
     noisy = replace(stream, rotation=stream.rotation @ turns)
-    inputs = inputs_for(rig_for(sim.scenario), [replace(sim.measurements, poses=(noisy,))])
+    inputs = inputs_for(rig_for(sim.scenario), [sim.measurements.with_streams(noisy)])
     assert errors(sim, state_from_poses(inputs).values)[1] < 0.02
 
 

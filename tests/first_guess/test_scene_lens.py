@@ -108,7 +108,7 @@ def test_a_tag_that_nothing_ties_to_the_others_is_left_out():
     scenario = tag_map(6.0)
     simulation = simulate(scenario, 0)
     cameras = tuple(scrambled(c, instance(scenario.target, Markers), 7) for c in simulation.measurements.cameras)
-    result = calibrate_measurements(rig_for(scenario), replace(simulation.measurements, cameras=cameras))
+    result = calibrate_measurements(rig_for(scenario), simulation.measurements.with_streams(*cameras))
     name = scenario.target.bodies[7]
     assert result.converged
     assert name not in result.bodies
@@ -124,7 +124,7 @@ def test_corners_that_no_lens_explains_are_named():
     cameras = tuple(replace(c, uv=c.uv + rng.normal(0.0, 25.0, c.uv.shape)) for c in simulation.measurements.cameras)
     rig = rig_for(scenario, intrinsics="free", distortion="free")
     with pytest.raises(EstimationError, match="cam0: no lens of model pinhole-radtan explains the bodies"):
-        calibrate_measurements(rig, replace(simulation.measurements, cameras=cameras))
+        calibrate_measurements(rig, simulation.measurements.with_streams(*cameras))
 
 
 def test_a_scene_of_one_body_has_no_poses():
@@ -138,7 +138,7 @@ def test_a_scene_of_one_body_has_no_poses():
         start = np.concatenate([[0], np.cumsum(count[count > 0])])
         return CornerStream(s.name, s.stamps_ns[count > 0], start, s.point[keep], s.uv[keep])
 
-    recording = Measurements(None, tuple(first_tag_only(c) for c in recording.cameras))
+    recording = Measurements.of_streams(*(first_tag_only(c) for c in recording.cameras))
     bodies = choose_bodies(scenario.target, [recording], bent=False)
     assert find_scene(rig_for(scenario), bodies, [recording]).values == {}
 
@@ -147,10 +147,10 @@ def test_growth_needs_no_image_that_shows_all(robot):
     """The scene is tied together along images of which none shows more than a few tags."""
     simulation = simulate(robot, 2)
     stream = simulation.measurements.cameras[0]
-    bodies = choose_bodies(robot.target, [Measurements(None, (stream,))], bent=False)
+    bodies = choose_bodies(robot.target, [Measurements.of_streams(stream)], bent=False)
     assert np.bincount(np.unique(stream.image * 100 + robot.target.body[stream.point]) // 100).max() < len(bodies.used)
     rig = rig_for(robot)
-    scene = find_scene(rig.with_(cameras=rig.cameras[:1]), bodies, [Measurements(None, (stream,))])
+    scene = find_scene(rig.with_(cameras=rig.cameras[:1]), bodies, [Measurements.of_streams(stream)])
     true = simulation.truth.T_world_bodies
     reference = np.linalg.inv(true[bodies.used[0]])
     for k in bodies.used[1:]:
@@ -166,4 +166,4 @@ def test_images_that_show_no_body_are_an_error():
     rng = np.random.default_rng(0)
     cameras = tuple(replace(c, uv=rng.uniform(0.0, 480.0, c.uv.shape)) for c in simulation.measurements.cameras)
     with pytest.raises(EstimationError, match=r"of the 12 bodies of the target"):
-        calibrate_measurements(rig_for(scenario), replace(simulation.measurements, cameras=cameras))
+        calibrate_measurements(rig_for(scenario), simulation.measurements.with_streams(*cameras))

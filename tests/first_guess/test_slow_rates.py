@@ -40,7 +40,7 @@ def thinned(stream, every: int):
 def test_a_camera_of_4_and_1_images_a_second(every):
     simulation = simulate(handheld(30.0), 2)
     m, rig = simulation.measurements, rig_for(simulation.scenario)
-    found = calibrate_measurements(rig, replace(m, cameras=tuple(thinned(c, every) for c in m.cameras)))
+    found = calibrate_measurements(rig, m.with_streams(*(thinned(c, every) for c in m.cameras)))
     for camera in simulation.scenario.cameras:
         translation = found.group(camera.name, "translation")
         error = found.T_imu_sensor(camera.name)[:3, 3] - camera.T_imu_cam[:3, 3]
@@ -79,7 +79,7 @@ def test_poses_once_or_twice_a_second(with_poses, every):
     sensor = replace(rig.poses[0], rotation=Parameter(), translation=Parameter(), time_offset=Parameter())
     (stream,) = m.poses
     late = replace(stream, stamps_ns=stream.stamps_ns + 7_000_000_000)
-    found = calibrate_measurements(rig.with_(poses=(sensor,)), replace(m, poses=(thinned(late, every),)))
+    found = calibrate_measurements(rig.with_(poses=(sensor,)), m.with_streams(thinned(late, every)))
     truth = with_poses.scenario.poses[0]
     translation, offset = found.group("mocap0", "translation"), found.group("mocap0", "time_offset")
     assert (np.abs(found.T_imu_sensor("mocap0")[:3, 3] - truth.T_imu_sensor[:3, 3]) < 5.0 * translation.std).all()
@@ -90,12 +90,12 @@ def test_poses_once_or_twice_a_second(with_poses, every):
 def test_too_slow_is_said(with_poses, tmp_path):
     m, rig = with_poses.measurements, rig_for(with_poses.scenario)
     sensor = replace(rig.poses[0], rotation=Parameter(), translation=Parameter(), time_offset=Parameter())
-    slow = replace(m, poses=(thinned(m.poses[0], 200),))
+    slow = m.with_streams(thinned(m.poses[0], 200))
     with pytest.raises(EstimationError, match=r"mocap0: the rate of 0\.25 poses per second is too low"):
         calibrate_measurements(rig.with_(poses=(sensor,)), slow)
     other = replace(m.poses[0], rotation=m.poses[0].rotation[::-1].copy())
     with pytest.raises(EstimationError, match=r"of mocap0.* not match that.* of imu0 at any time offset"):
-        calibrate_measurements(rig.with_(poses=(sensor,)), replace(m, poses=(thinned(other, 50),)))
+        calibrate_measurements(rig.with_(poses=(sensor,)), m.with_streams(thinned(other, 50)))
     (tmp_path / "wheel0").mkdir()
     (tmp_path / "wheel0" / "rates.csv").write_text("".join(f"{k * 10**9},1,{1 + k % 3}\n" for k in range(60)))
     wheels = rig.with_(imu=None, poses=(), wheels=(Wheels("wheel0", "wheel0/rates.csv"),))
@@ -107,7 +107,7 @@ def test_too_slow_is_said(with_poses, tmp_path):
 
 def test_offsets_by_angles(with_poses):
     m = with_poses.measurements
-    inputs = inputs_for(rig_for(with_poses.scenario), [replace(m, poses=(thinned(m.poses[0], 50),))])
+    inputs = inputs_for(rig_for(with_poses.scenario), [m.with_streams(thinned(m.poses[0], 50))])
     assert inputs.imu is not None
     start = np.arange(5.0, 30.0)
     exact = ChainedRates.of(inputs.imu)

@@ -200,7 +200,7 @@ def test_points_without_parallax_are_named():
     stars = replace(stream, start=start, feature=np.concatenate(feature), uv=np.concatenate(uv))
     rig = replace(rig_for(simulation.scenario, intrinsics="start", distortion="start"), target=NoTarget())
     with pytest.raises(EstimationError, match="cam0: the tracked points move as in a pure rotation"):
-        calibrate_measurements(rig, replace(simulation.measurements, tracks=(stars,)))
+        calibrate_measurements(rig, simulation.measurements.with_streams(stars))
 
 
 def _between(simulation: Simulation) -> float:

@@ -138,7 +138,7 @@ def test_a_camera_whose_image_stands_still_does_not_fit():
     simulation, state = drive()
     stream, measured = simulation.measurements.tracks[0], simulation.measurements
     _, first, which = np.unique(stream.feature, return_index=True, return_inverse=True)
-    frozen = replace(measured, tracks=(replace(stream, uv=stream.uv[first[which]]),))
+    frozen = measured.with_streams(replace(stream, uv=stream.uv[first[which]]))
     with pytest.raises(EstimationError, match="contradict the motion of the other sensors"):
         placed(replace(simulation, measurements=frozen), state, true_rig(simulation))
 
@@ -147,7 +147,7 @@ def lost_after(simulation, seconds):
     """Each point is another one then."""
     stream, measured = simulation.measurements.tracks[0], simulation.measurements
     lost = stream.feature * 1000 + (stream.seconds / seconds).astype(np.int64)[stream.image]
-    return replace(simulation, measurements=replace(measured, tracks=(replace(stream, feature=lost),)))
+    return replace(simulation, measurements=measured.with_streams(replace(stream, feature=lost)))
 
 
 def test_points_that_are_soon_lost_show_the_camera_over_shorter_steps():
@@ -170,7 +170,7 @@ def test_points_followed_at_random_do_not_fit_a_lens_without_bounds():
     simulation, state = drive()
     stream, measured = simulation.measurements.tracks[0], simulation.measurements
     anywhere = np.random.default_rng(0).uniform([0.0, 0.0], [752.0, 480.0], stream.uv.shape)
-    random = replace(measured, tracks=(replace(stream, uv=anywhere),))
+    random = measured.with_streams(replace(stream, uv=anywhere))
     rig = rig_for(simulation.scenario, intrinsics="start", distortion="free")
     with pytest.raises(EstimationError, match="contradict the motion of the other sensors"):
         placed(replace(simulation, measurements=random), state, rig)

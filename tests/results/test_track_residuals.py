@@ -38,7 +38,7 @@ def scenario() -> Scenario:
 def seen(scenario: Scenario) -> Measurements:
     """As cameras see it, some observations far off."""
     own = simulate(scenario, 2).measurements
-    return replace(own, tracks=tuple(_spoilt(t) for t in own.tracks))
+    return own.with_streams(*(_spoilt(t) for t in own.tracks))
 
 
 def _spoilt(stream: TrackStream) -> TrackStream:

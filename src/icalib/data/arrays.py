@@ -19,29 +19,19 @@ from icalib.data.measurements import (
     Measurements,
     PoseStream,
     TrackStream,
-    WheelPoses,
     WheelStream,
 )
 from icalib.errors import RecordingError
 from icalib.sensors.parameter import ROUNDING
+from icalib.sensors.stream import Stream
 
-AnyStream = ImuStream | CornerStream | TrackStream | LidarStream | WheelStream | WheelPoses | PoseStream
 
-
-def measurements(*streams: AnyStream, name: str = "") -> Measurements:
+def measurements(*streams: Stream, name: str = "") -> Measurements:
     """What one recording holds: the streams of all its sensors, in any order. name: of the recording, for messages."""
     imus = [s for s in streams if isinstance(s, ImuStream)]
     if len(imus) > 1:
         raise RecordingError(f"{imus[1].name} is a second IMU beside {imus[0].name}; give one.")
-    return Measurements(
-        imu=imus[0] if imus else None,
-        cameras=tuple(s for s in streams if isinstance(s, CornerStream)),
-        tracks=tuple(s for s in streams if isinstance(s, TrackStream)),
-        lidars=tuple(s for s in streams if isinstance(s, LidarStream)),
-        wheels=tuple(s for s in streams if isinstance(s, WheelStream | WheelPoses)),
-        poses=tuple(s for s in streams if isinstance(s, PoseStream)),
-        name=name,
-    )
+    return Measurements.of_streams(*streams, name=name)
 
 
 def imu(name: str, stamps: Any, gyro: Any, accel: Any) -> ImuStream:

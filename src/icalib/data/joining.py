@@ -8,19 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.data.measurements import (
-    CornerStream,
-    ImuStream,
-    LidarStream,
-    Measurements,
-    PoseStream,
-    Stream,
-    TrackStream,
-    WheelPoses,
-    WheelStream,
-)
+from icalib.data.measurements import Measurements
 from icalib.errors import RecordingError
 from icalib.rig import Rig
+from icalib.sensors.sensor import TIME_OFFSET
+from icalib.sensors.stream import Stream
 
 PAUSE_NS = 10_000_000_000
 
@@ -63,15 +55,10 @@ def join(
     return (_joined(recordings, shifts) if len(recordings) > 1 else recordings[0]), parts
 
 
-def _streams(measurements: Measurements) -> list[ImuStream | Stream]:
-    imus = [] if measurements.imu is None else [measurements.imu]
-    return [*imus, *measurements.cameras, *measurements.lidars, *measurements.wheels, *measurements.poses]
-
-
 def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
     """What to add to the stamps of each recording [ns]. Raises RecordingError where a stream of one is empty."""
     for recording in recordings if len(recordings) > 1 else ():
-        empty = [s.name for s in _streams(recording) if not len(s.stamps_ns)]
+        empty = [s.name for s in recording.streams.values() if not len(s.stamps_ns)]
         if empty:
             raise RecordingError(
                 f"{recording.name}: {' and '.join(empty)} has no data that the other recordings could be "
@@ -79,7 +66,7 @@ def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
             )
     shifts = [0]
     for before, after in pairwise(recordings):
-        pairs = zip(_streams(before), _streams(after), strict=True)
+        pairs = [(before.streams[key], s) for key, s in after.streams.items()]
         follows = max(int(a.stamps_ns[-1]) - int(b.stamps_ns[0]) for a, b in pairs)
         shifts.append(shifts[-1] + follows + _length_ns(rig, before) + _length_ns(rig, after) + PAUSE_NS)
     return shifts
@@ -87,116 +74,29 @@ def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
 
 def _length_ns(rig: Rig, measurements: Measurements) -> int:
     """Of the longest stream; without an IMU from the first stamp of any sensor to the last: offsets are known then."""
-    spans = [(int(s.stamps_ns[0]), int(s.stamps_ns[-1])) for s in _streams(measurements)]
+    streams = measurements.streams.values()
+    spans = [(int(s.stamps_ns[0]), int(s.stamps_ns[-1])) for s in streams]
     if measurements.imu is not None:
         return max(b - a for a, b in spans)
-    given = [s.time_offset.value for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)]
+    given = [getattr(rig.sensors[s.name], TIME_OFFSET.name).value for s in streams]
     offsets = [0 if v is None else round(1e9 * float(v[0])) for v in given]
     begins, ends = zip(*((a + d, b + d) for (a, b), d in zip(spans, offsets, strict=True)), strict=True)
     return max(ends) - min(begins)
 
 
 def _joined(recordings: Sequence[Measurements], shifts: Sequence[int]) -> Measurements:
-    shifted = list(zip(recordings, shifts, strict=True))
-    imus = [(m.imu, shift) for m, shift in shifted if m.imu is not None]
-    imu = None
-    if imus:
-        stamps = np.concatenate([i.stamps_ns + np.int64(shift) for i, shift in imus])
-        gyro, accel = np.concatenate([i.gyro for i, _ in imus]), np.concatenate([i.accel for i, _ in imus])
-        imu = ImuStream(imus[0][0].name, stamps, gyro, accel)
-    cameras = (join_corners([(m.cameras[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].cameras)))
     notes, warnings = (
         tuple(f"{m.name}: {words}" for m in recordings for words in getattr(m, kind)) for kind in ("notes", "warnings")
     )
-    lidars = (join_scans([(m.lidars[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].lidars)))
-    wheels = (join_wheels([(m.wheels[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].wheels)))
-    poses = (join_poses([(m.poses[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].poses)))
-    return Measurements(
-        imu,
-        tuple(cameras),
-        notes,
-        tracks=_joined_tracks(shifted),
-        lidars=tuple(lidars),
-        wheels=tuple(wheels),
-        poses=tuple(poses),
-        warnings=warnings,
-    )
+    found = _disjoint(recordings)
+    streams = {k: type(s).joined([own[k] for own in found], shifts) for k, s in found[0].items()}
+    return Measurements(streams, notes, warnings=warnings)
 
 
-def _joined_tracks(recordings: list[tuple[Measurements, int]]) -> tuple[TrackStream, ...]:
-    """Tracks of all recordings, each with what to add to its stamps [ns]; a number in two of them is two points."""
-    most = [1 + max((int(t.feature.max(initial=-1)) for t in m.tracks), default=-1) for m, _ in recordings]
-    least = [min((int(t.feature.min(initial=0)) for t in m.tracks), default=0) for m, _ in recordings]
-    sizes = np.cumsum([0, *(a - b for a, b in zip(most, least, strict=True))])
-    joined = []
-    for k, one in enumerate(recordings[0][0].tracks):
-        streams = [m.tracks[k] for m, _ in recordings]
-        stamps = [s.stamps_ns + np.int64(shift) for s, (_, shift) in zip(streams, recordings, strict=True)]
-        numbers = [s.feature - low + at for s, low, at in zip(streams, least, sizes, strict=False)]
-        start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s in streams]))])
-        uv = np.concatenate([s.uv for s in streams])
-        stated = {name: np.concatenate([getattr(s, name) for s in streams]) for name in ("views", "spread")}
-        joined.append(
-            TrackStream(
-                one.name,
-                np.concatenate(stamps),
-                start.astype(np.int64),
-                np.concatenate(numbers),
-                uv,
-                **{name: values for name, values in stated.items() if len(values) == len(uv)},
-            )
-        )
-    return tuple(joined)
-
-
-def join_corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:
-    """One camera's images of all recordings, each with what to add to its stamps [ns]."""
-    stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
-    start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))])
-    point, uv = np.concatenate([s.point for s, _ in streams]), np.concatenate([s.uv for s, _ in streams])
-    stated = {
-        field: np.concatenate([getattr(s, field) for s, _ in streams])
-        for field in ("sigma", "edges")
-        if all(len(getattr(s, field)) == len(s.uv) for s, _ in streams)
-    }
-    name, start = streams[0][0].name, start.astype(np.int64)
-    files = {stamp + shift: file for s, shift in streams for stamp, file in s.files.items()}
-    return CornerStream(name, stamps, start, point, uv, joins_ns=_joins(streams), files=files, **stated)
-
-
-def join_scans(streams: list[tuple[LidarStream, int]]) -> LidarStream:
-    """One LiDAR's scans of all recordings, each with what to add to its stamps [ns]."""
-    stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
-    start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))]).astype(np.int64)
-    columns = (np.concatenate([getattr(s, name) for s, _ in streams]) for name in ("offset_s", "xyz", "plane"))
-    return LidarStream(streams[0][0].name, stamps, start, *columns, joins_ns=_joins(streams))
-
-
-def join_wheels(streams: list[tuple[WheelStream | WheelPoses, int]]) -> WheelStream:
-    """The readings of all recordings, each with what to add to its stamps [ns]; a mean rate from the end of one to the
-    beginning of the next means nothing. Raises RecordingError for relative poses: there is none between recordings."""
-    stamps, rates = [], []
-    for wheels, shift in streams:
-        if isinstance(wheels, WheelPoses):
-            raise RecordingError(
-                f"{wheels.name} measures relative poses, and there is none between two recordings; give one "
-                "recording, or wheels that measure rates, angles or ticks."
-            )
-        stamps.append(wheels.stamps_ns + np.int64(shift))
-        rates.append(wheels.rate)
-    first = streams[0][0]
-    assert isinstance(first, WheelStream)  # see above
-    stamps, rates = np.concatenate(stamps), np.concatenate(rates)
-    return WheelStream(first.name, stamps, rates, first.sampling, first.kind, joins_ns=_joins(streams))
-
-
-def join_poses(streams: list[tuple[PoseStream, int]]) -> PoseStream:
-    """The poses of all recordings, each with what to add to its stamps [ns]; each recording has a frame of its own."""
-    stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
-    rotation, position = (np.concatenate([getattr(s, name) for s, _ in streams]) for name in ("rotation", "position"))
-    return PoseStream(streams[0][0].name, stamps, rotation, position, joins_ns=_joins(streams))
-
-
-def _joins(streams: Sequence[tuple[Stream, int]]) -> tuple[int, ...]:
-    """The first stamp of each recording but the first."""
-    return tuple(int(s.stamps_ns[0]) + shift for s, shift in streams[1:])
+def _disjoint(recordings: Sequence[Measurements]) -> list[dict[str, Stream]]:
+    """The streams of each recording, such that a number in two recordings is two things."""
+    found = [dict(m.streams) for m in recordings]
+    for kind in dict.fromkeys(type(s) for s in recordings[0].streams.values()):
+        for own, streams in zip(found, kind.disjoint([m.of(kind) for m in recordings]), strict=True):
+            own.update({s.key: s for s in streams})
+    return found

@@ -73,7 +73,7 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> Start:
 def _refuse_other_ways(rig: Rig, recordings: Sequence[Measurements], error: EstimationError) -> None:
     """Raises EstimationError where the wheels fit poses of the body that are written another way."""
     for words, way in (*WAYS, *TURNED):
-        others = [replace(m, poses=(way(m.poses[0]), *m.poses[1:])) for m in recordings]
+        others = [m.with_streams(way(m.poses[0])) for m in recordings]
         try:
             _start(rig, others)
         except EstimationError:
@@ -115,7 +115,8 @@ def _cameras_on_poses(
     body: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], paths: Sequence[SmoothPath]
 ) -> dict[Key, np.ndarray]:
     """Cameras that follow points, placed on the motion that the first pose sensor of `body` shows."""
-    blind, unseen = body.with_(cameras=()), [replace(m, cameras=(), tracks=()) for m in recordings]
+    blind = body.with_(cameras=())
+    unseen = [m.only(*blind.sensors) for m in recordings]
     alone = _felt(blind, unseen, paths, inputs_for(blind, _readings(unseen, paths)))
     felt = _felt(body, recordings, paths, inputs_for(body, _readings(recordings, paths)))
     return track_camera_values(felt, _moving(alone, shown, {})[0])
@@ -127,7 +128,7 @@ def _cameras_on_wheels(rig: Rig, recordings: Sequence[Measurements]) -> tuple[li
     shown = [wheel_path(wheels, s) for s in streams]
     blank, posed = in_place_of_wheels(rig, wheels), []
     for m, stream, path in zip(recordings, streams, shown, strict=True):
-        posed.append(replace(m, wheels=(), poses=(pose_stream(stream, path),)))
+        posed.append(m.only(*blank.sensors).with_streams(pose_stream(stream, path)))
     paths = [own.at(np.arange(0.0, own.seconds[-1], STEP_S)) for own in shown]
     try:
         values = _cameras_on_poses(_with_assumption(blank, posed, paths), posed, shown, paths)
@@ -167,8 +168,8 @@ def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses
         return [BodyPoses(s.seconds, s.rotation, s.position) for s in (m.poses[0] for m in recordings)], {}
     if not rig.has_target:
         return _cameras_on_wheels(rig, recordings)
-    seen = [replace(m, wheels=(), poses=()) for m in recordings]
-    alone = inputs_for(rig.with_(wheels=(), poses=()), seen)
+    seeing = rig.with_(wheels=(), poses=())
+    alone = inputs_for(seeing, [m.only(*seeing.sensors) for m in recordings])
     (guess,) = initial_guesses(alone.rig, alone.bodies, [m.measurements for m in alone.motions])
     t, R, p = guess.body_poses(alone.measurements)
     begins = [part.begin for part in alone.parts]
@@ -210,7 +211,7 @@ def _readings(
         used = path.near.copy() if max_gap_s is None else _bridged(path, max_gap_s)
         used[:1] = True  # its clock begins where the body's does
         gyro, accel = (x[used] * float(max_gap_s is None) for x in (path.rate, path.acceleration))
-        out.append(replace(m, imu=ImuStream(ASSUMPTION, stamps[used], gyro, accel)))
+        out.append(m.with_streams(ImuStream(ASSUMPTION, stamps[used], gyro, accel)))
     return out
 
 

@@ -41,7 +41,7 @@ def without_own_robot(recording: Measurements) -> Measurements:
             warnings.append(_words(stream, own))
             stream = stream.some(~own)
         lidars.append(stream)
-    return replace(recording, lidars=tuple(lidars), warnings=tuple(warnings))
+    return replace(recording.with_streams(*lidars), warnings=tuple(warnings))
 
 
 def own_points(stream: LidarStream) -> np.ndarray | None:

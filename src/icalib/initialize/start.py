@@ -73,8 +73,8 @@ def _start(
         return _start_from_poses(whole, recordings, lap)
     bare = whole
     if rig.wheels or rig.lidars or rig.poses:
-        seen = [replace(m, wheels=(), lidars=(), poses=()) for m in recordings]
-        bare = inputs_for(rig.with_(wheels=(), lidars=(), poses=()), seen, whole)
+        seeing = rig.with_(wheels=(), lidars=(), poses=())
+        bare = inputs_for(seeing, [m.only(*seeing.sensors) for m in recordings], whole)
     guesses = _guesses(whole, recordings, bare)
     lap("first guess")
     state = first_state(bare, *guesses)
@@ -106,13 +106,12 @@ def _guesses(whole: Inputs, recordings: Sequence[Measurements], bare: Inputs) ->
 
 def _lidars_alone(whole: Inputs, recordings: Sequence[Measurements]) -> Inputs:
     rig = whole.rig.with_(cameras=(), wheels=(), poses=(), target=NoTarget())
-    return inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings], whole)
+    return inputs_for(rig, [m.only(*rig.sensors) for m in recordings], whole)
 
 
 def _pose_sensor_alone(whole: Inputs, recordings: Sequence[Measurements]) -> Inputs:
     rig = whole.rig.with_(cameras=(), lidars=(), wheels=(), poses=whole.rig.poses[:1], target=NoTarget())
-    own = [replace(m, cameras=(), tracks=(), lidars=(), wheels=(), poses=m.poses[:1]) for m in recordings]
-    return inputs_for(rig, own, whole)
+    return inputs_for(rig, [m.only(*rig.sensors) for m in recordings], whole)
 
 
 def _with_all_but_lidars(
@@ -120,7 +119,7 @@ def _with_all_but_lidars(
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     """All of `start`, where the first LiDAR has shown the motion: the others are placed on it."""
     alone, state, guess = with_robot(alone, state)
-    measured = replace(whole.measurements, lidars=alone.measurements.lidars, notes=alone.measurements.notes)
+    measured = replace(whole.measurements.with_streams(*alone.measurements.lidars), notes=alone.measurements.notes)
     inputs = replace(with_clouds(replace(whole, measurements=measured), alone.clouds), guess=alone.guess)
     cameras = track_camera_values(inputs, state)
     values = start_values(inputs, state.values | cameras)

@@ -126,8 +126,9 @@ def _mounted(
         bad = outliers(here.residual)
         good = np.flatnonzero(~bad)
         columns = {name: getattr(own.stream, name)[good] for name in ("stamps_ns", "rotation", "position")}
-        streams = tuple(replace(own.stream, **columns) if s.name == sensor.name else s for s in m.poses)
-        out.append(replace(m, poses=streams, notes=(*m.notes, *_notes(rig, sensor, own, bad, m))))
+        out.append(
+            replace(m.with_streams(replace(own.stream, **columns)), notes=(*m.notes, *_notes(rig, sensor, own, bad, m)))
+        )
     return out, values
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from icalib.base.extras import load_cv2
-from icalib.data.measurements import which_image
 from icalib.errors import RecordingError
+from icalib.sensors.stream import which_image
 
 NO_PICTURE = "unknown"  # the encoding of a file that is no image
 FILE_FORMATS = ("jpeg", "png", "bmp", "tiff", "pnm", "webp")  # all that OpenCV decodes

@@ -63,16 +63,11 @@ def read_measurements(
         for s in rig.poses
         for stream, where in [read(recording.poses(s), s)]
     ]
-    notes = sum((found for _, found in (*lidars, *wheels, *poses)), notes + followed + seen)
-    return Measurements(
-        imu,
-        cameras,
-        recording.notes() + jumps.notes + notes,
-        tracks=tracks,
-        lidars=tuple(stream for stream, _ in lidars),
-        wheels=tuple(stream for stream, _ in wheels),
-        poses=tuple(stream for stream, _ in poses),
-    )
+    others = (*lidars, *wheels, *poses)
+    notes = sum((found for _, found in others), notes + followed + seen)
+    imus = () if imu is None else (imu,)
+    streams = (*imus, *cameras, *tracks, *(stream for stream, _ in others))
+    return Measurements.of_streams(*streams, notes=recording.notes() + jumps.notes + notes)
 
 
 def _scans(
@@ -95,23 +90,8 @@ def without_jumps(rig: Rig, measurements: Measurements) -> Measurements:
     if not is_timed(rig):
         return m
 
-    def cut(streams: tuple[S, ...]) -> tuple[S, ...]:
-        return tuple(jumps.cut(s, s.name) for s in streams)
-
-    (imu,) = (None,) if m.imu is None else cut((m.imu,))
-    tracks, cameras, lidars, wheels, poses = map(cut, (m.tracks, m.cameras, m.lidars, m.wheels, m.poses))
-    if not jumps.notes:
-        return m
-    return replace(
-        m,
-        imu=imu,
-        tracks=tracks,
-        cameras=cameras,
-        lidars=lidars,
-        wheels=wheels,
-        poses=poses,
-        notes=m.notes + jumps.notes,
-    )
+    streams = {key: jumps.cut(s, s.name) for key, s in m.streams.items()}
+    return replace(m, streams=streams, notes=m.notes + jumps.notes) if jumps.notes else m
 
 
 def _whole(stream: S, what: str) -> S:

@@ -13,10 +13,10 @@ from typing import TypeVar
 import numpy as np
 
 from icalib.base.extras import load_cv2
-from icalib.data.measurements import which_image
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.errors import RecordingError
 from icalib.rig import Camera
+from icalib.sensors.stream import which_image
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.data.joining import join_corners
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.detection.sightings import Part, parts_of
 from icalib.errors import EstimationError
@@ -91,8 +90,12 @@ def number_alike(rig: Rig, recordings: Sequence[Measurements]) -> list[Measureme
 
 def _lenses(rig: Rig, recordings: Sequence[Measurements]) -> Lenses:
     """Of all cameras that saw the target. Raises EstimationError where the lens of one is not found."""
-    streams = {c.name: [(s, 0) for m in recordings for s in m.cameras if s.name == c.name] for c in rig.cameras}
-    return {c.name: camera_params(c, join_corners(streams[c.name]), rig.target) for c in rig.cameras if streams[c.name]}
+    streams = {c.name: [s for m in recordings for s in m.cameras if s.name == c.name] for c in rig.cameras}
+    return {
+        c.name: camera_params(c, CornerStream.joined(streams[c.name]), rig.target)
+        for c in rig.cameras
+        if streams[c.name]
+    }
 
 
 def _renumbered(rig: Rig, part: Part, lenses: Lenses, measured: Measurements) -> Measurements:
@@ -108,7 +111,7 @@ def _renumbered(rig: Rig, part: Part, lenses: Lenses, measured: Measurements) ->
         order = np.lexsort((point, stream.image))
         renumbered = replace(stream, point=point)
         streams.append(renumbered.of_rows(order, stream.stamps_ns, np.diff(stream.start)))
-    return replace(measured, cameras=tuple(streams))
+    return measured.with_streams(*streams)
 
 
 def _views_of(camera: Camera, stream: CornerStream, part: Part, params: np.ndarray) -> _Views:

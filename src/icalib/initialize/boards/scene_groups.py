@@ -15,8 +15,7 @@ from itertools import permutations
 
 import numpy as np
 
-from icalib.data.joining import join_corners
-from icalib.data.measurements import Measurements
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.boards.scene import Placed, scene_poses
@@ -66,7 +65,7 @@ class _Group:
         scene = Placed(bodies)
         if bodies.several:
             seeing = [i for i in range(len(models)) if any(len(r.cameras[i].point) for r in own)]
-            streams = [join_corners([(r.cameras[i], 0) for r in own]) for i in seeing]
+            streams = [CornerStream.joined([r.cameras[i] for r in own]) for i in seeing]
             scene = place_bodies(bodies, streams, [models[i] for i in seeing], params)
         times = [camera_times(rig, r, whole.origin_ns) for r, whole in zip(own, recordings, strict=True)]
         poses = [

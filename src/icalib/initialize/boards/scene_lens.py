@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.data.joining import join_corners
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
@@ -41,7 +40,7 @@ def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> 
     only. Raises EstimationError where images do not tell; `UntiedBodiesError` where they do not of some."""
     if not bodies.several:
         return Placed(bodies)
-    streams = [join_corners([(r.cameras[i], 0) for r in recordings]) for i in range(len(rig.cameras))]
+    streams = [CornerStream.joined([r.cameras[i] for r in recordings]) for i in range(len(rig.cameras))]
     params = {c.name: scene_params(rig.target, c, s) for c, s in zip(rig.cameras, streams, strict=True)}
     if rig.cameras_alone and len(tied_by_images(bodies, recordings)) > 1:
         return place_groups(rig, bodies, recordings, params)
@@ -61,7 +60,7 @@ def scene_params(target: Target, camera: Camera, stream: CornerStream) -> np.nda
     """
     if camera.intrinsics.value is not None and camera.distortion.value is not None:
         return camera_params(camera, stream, target)
-    alone = Measurements(None, (stream,))
+    alone = Measurements.of_streams(stream)
     bodies = choose_bodies(target, [alone], bent=False)
     if not bodies.several:
         return camera_params(camera, stream, target)

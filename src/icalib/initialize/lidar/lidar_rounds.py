@@ -148,8 +148,8 @@ def _thinned(inputs: Inputs, step: int) -> Inputs:
     """With every `step`th point only, no more than the search for planes looks at: where all is does not depend on
     more, and the last round uses all."""
     streams = inputs.measurements.lidars
-    fewer = tuple(s.some(np.arange(len(s.xyz)) % step == 0) for s in streams)
-    return replace(inputs, measurements=replace(inputs.measurements, lidars=fewer))
+    fewer = [s.some(np.arange(len(s.xyz)) % step == 0) for s in streams]
+    return replace(inputs, measurements=inputs.measurements.with_streams(*fewer))
 
 
 def _firsts(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
@@ -209,7 +209,7 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
                 "other sensor determines the motion at that time."
             )
         lidars.append(stream.some(np.repeat(known, np.diff(stream.start)) & are_somewhere(stream.xyz)))
-    return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))
+    return replace(inputs, measurements=replace(measured.with_streams(*lidars), notes=tuple(notes)))
 
 
 def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:

@@ -221,15 +221,15 @@ def restrict(bodies: Bodies, recording: Measurements) -> Measurements:
     """The recording without corners of bodies that are not in use, corners of an image body by body."""
     if len(bodies.target.bodies) == 1:
         return recording
-    return replace(recording, cameras=tuple(_restricted(bodies, c) for c in recording.cameras))
+    return recording.with_streams(*(_restricted(bodies, c) for c in recording.cameras))
 
 
 def without_bodies(target: Target, names: Sequence[str], recording: Measurements) -> Measurements:
     """The recording without corners of the bodies given by `names`, which a note says."""
     kept = tuple(k for k, name in enumerate(target.bodies) if name not in names)
-    cameras = tuple(_restricted(Bodies(target, kept), c) for c in recording.cameras)
+    cameras = [_restricted(Bodies(target, kept), c) for c in recording.cameras]
     note = f"ignored, because no image determines their poses relative to the others: {_listed(names)}."
-    return replace(recording, cameras=cameras, notes=(*recording.notes, note))
+    return replace(recording.with_streams(*cameras), notes=(*recording.notes, note))
 
 
 def _restricted(bodies: Bodies, stream: CornerStream) -> CornerStream:

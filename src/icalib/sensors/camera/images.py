@@ -27,7 +27,9 @@ def on_common_images(rig: Rig, recording: Measurements) -> Measurements:
         )
     corners, tracks = {c.name: c for c in recording.cameras}, {t.name: t for t in recording.tracks}
     pairs = [_together(c.name, corners.get(c.name), tracks.get(c.name)) for c in rig.cameras]
-    return replace(recording, cameras=tuple(c for c, _ in pairs), tracks=tuple(t for _, t in pairs))
+    return recording.without(*(c.name for c in rig.cameras)).with_streams(
+        *(stream for pair in pairs for stream in pair)
+    )
 
 
 def _together(name: str, corners: CornerStream | None, tracks: TrackStream | None) -> tuple[CornerStream, TrackStream]:

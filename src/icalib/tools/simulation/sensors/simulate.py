@@ -131,7 +131,7 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
         poses=pose_truth,
         points=followed.points,
     )
-    measured = Measurements(imu, corners, tracks=followed.streams, lidars=lidars, wheels=wheels, poses=poses)
+    measured = Measurements.of_streams(imu, *corners, *followed.streams, *lidars, *wheels, *poses)
     return Simulation(scenario, measured, truth)
 
 
