@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.data.measurements import EDGE, NO_EDGES, CornerStream
 from icalib.errors import RecordingError
+from icalib.sensors.camera.stream import EDGE, NO_EDGES, CornerStream
 
 IMAGE_NOISE = 2.0  # grey levels, assumed of every image: the sigmas are right up to this common factor
 MODEL_SIGMA_PX = 0.02  # what sampling, printing and the lens add to the noise's share

@@ -12,9 +12,9 @@ from math import atan2, cos, hypot, sin, sqrt
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.data.measurements import EDGE
 from icalib.detection.primitives.edge_model import error_function, normal_equations, row_product, solve_small
 from icalib.detection.primitives.saddles import LEAST_SINE, MARGIN_BLURS, room_for, window_bounds, window_frame
+from icalib.sensors.camera.stream import EDGE
 
 _ITERATIONS = 12
 _CONVERGED_PX = 2e-3

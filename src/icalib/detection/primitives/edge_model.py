@@ -11,7 +11,7 @@ from math import erf, hypot, pi, sqrt
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.data.measurements import EDGE
+from icalib.sensors.camera.stream import EDGE
 
 _ITERATIONS = 10  # at most
 _CONVERGED_PX = 1e-3  # largest motion of the edge in the last step

@@ -7,12 +7,12 @@ from math import hypot
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.data.measurements import EDGE
 from icalib.detection.primitives.crossing_model import LEAST_WINDOW_PX, fit_crossing
 from icalib.detection.primitives.edge_model import END_PX, USUAL_BLUR_PX, fit_corners, step_blur
 from icalib.detection.primitives.growth import side_vectors
 from icalib.detection.primitives.saddles import MARGIN_BLURS
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
+from icalib.sensors.camera.stream import EDGE
 
 _MOST_CORNER_MOVE = (2.0, 0.03)  # px, and of a side: how far a corner may lie from where it was found roughly
 _LEAST_STRIP_PX = 1.5  # fitted on each side of an edge

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.data.measurements import shared_rows
 from icalib.detection.tracking.epipolar import FEWEST_MATCHED_POINTS, epipolar_errors
+from icalib.sensors.camera.stream import shared_rows
 
 COMPARED_IMAGES = (1, 4)  # images: each is compared with these before it
 LENS_APART, LENS_PAIRS = 6, 8  # pairs of images that show how the lens distorts

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.data.measurements import TrackStream, shared_rows
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
 from icalib.initialize.steps.clock_shifts import CameraRates
+from icalib.sensors.camera.stream import TrackStream, shared_rows
 
 FEWEST_COMMON = 12  # points in two images
 FEWEST_RATES = 20

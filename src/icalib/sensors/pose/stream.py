@@ -1,0 +1,39 @@
+"""What a pose sensor measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from icalib.sensors.stream import Stream, check, far_origin
+
+
+@dataclass(frozen=True)
+class PoseStream(Stream):
+    """Where a sensor said that it was: its poses in a frame that stands still, or nearly so.
+
+    stamps_ns (N,) int64, strictly increasing; rotation (N, 3, 3) R_frame_sensor; position (N, 3) p_frame_sensor [m].
+    """
+
+    sensor_type: ClassVar[str] = "pose"
+    rotation: np.ndarray
+    position: np.ndarray
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        n = len(self.stamps_ns)
+        shape = self.rotation.shape
+        check(shape == (n, 3, 3), f"{self.name}: rotation must have shape ({n}, 3, 3), not {shape}.")
+        shape = self.position.shape
+        check(shape == (n, 3), f"{self.name}: position must have shape ({n}, 3), not {shape}.")
+
+    def near_origin(self) -> tuple[Self, tuple[str, ...]]:
+        origin = far_origin(self.position)
+        if origin is None:
+            return self, ()
+        x, y, z = origin
+        where = f"({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away"
+        note = f"{self.name}: positions are relative to {where}."
+        return replace(self, position=self.position - origin), (note,)
