@@ -110,7 +110,7 @@ def sums(name: str, rig: Rig, measurements: Measurements) -> list[Figure]:
     inputs = inputs_for(rig, [measurements])
     state = first_state(inputs, initial_guess(rig, measurements))
     pairs = list(zip(rig.cameras, measurements.cameras, strict=True))
-    noise = [first_noise(c).noise(s, c, rig.settings) for c, s in pairs]
+    noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in pairs}
     problem = assemble(inputs, state, noise, [np.ones(len(s.uv), dtype=bool) for _, s in pairs])
     pieces, out = problem.pieces(), problem.residuals()
     seconds = median_time(lambda: problem.linearise(state, pieces, out), 9)

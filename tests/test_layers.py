@@ -39,8 +39,10 @@ ORDER = (
     ("detection", "detection.tracking"),
     ("optim",),
     ("motion",),
+    ("model",),
     ("sensors.camera", "sensors.imu", "sensors.lidar", "sensors.pose", "sensors.wheels"),
     ("sensors.camera.features",),
+    ("sensors.*.model",),
     ("estimate.problem",),
     ("estimate.evidence",),
     ("estimate",),
@@ -72,7 +74,7 @@ EVERYWHERE = {"errors"}
 ROOT_NAMES = {"__version__"}  # of icalib/__init__.py, which any module may ask for
 TOOL_FACETS = ("simulate", "inspect")
 DATA_FACETS = ("spec", "stream", "read", "simulate")
-ESTIMATOR = ("optim", "motion", "sensors", "estimate", "initialize", "observability", "validation", "pipeline")
+ESTIMATOR = ("optim", "motion", "model", "sensors", "estimate", "initialize", "observability", "validation", "pipeline")
 
 
 def folder_of(module: str) -> str:

@@ -14,9 +14,9 @@ import pytest
 
 import icalib
 from icalib.base.yaml_nodes import parse_yaml
-from icalib.estimate.problem.robot import own_entries
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets import Checkerboard
+from icalib.model.sensor_model import own_entries
 from icalib.optim.state import make_layout
 from icalib.rig import (
     Camera,

@@ -58,7 +58,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
     state = first_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
     state = replace(state, bias=np.zeros_like(state.bias))  # the prior on the first biases then pulls nothing
     streams = inputs.measurements.cameras
-    noise = [first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)]
+    noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)}
     nothing = [np.zeros(0, dtype=bool) for _ in streams]
     last = None
     for _ in range(3):

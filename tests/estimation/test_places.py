@@ -53,7 +53,7 @@ def solved() -> tuple[Problem, Outcome]:
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
     inputs, state, _ = start(rig, [simulate(scenario, 1).measurements])
     streams = inputs.measurements.cameras
-    noise = [first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)]
+    noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)}
     following = first_following(inputs)
     assert following is not None
     whole = replace(following, cut=False)  # points of short tracks are far from known, and move far for little

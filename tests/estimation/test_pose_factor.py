@@ -12,11 +12,12 @@ from tests.typed import not_none
 from icalib.data.measurements import PoseStream
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import inputs_for
+from icalib.model.sensor_model import Pass
 from icalib.motion.pose_rows import Frame, Mount, absolute_rows, relative_rows
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import State
 from icalib.rig import PoseSensor
-from icalib.sensors.pose.factors import next_pose_noise, pose_factor
+from icalib.sensors.pose.model import MODEL, scaled_noise
 from icalib.sensors.pose.residual import FRAME, PoseNoise, RelativePosesFactor, frame_of
 from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
 
@@ -72,7 +73,8 @@ def world(request):
 def rows(inputs, state, stream, at=None):
     """Residuals before whitening (n, 6) of the factor built at `state`, evaluated there or at another."""
     sensor = inputs.rig.poses[0]
-    factor = pose_factor(sensor, stream, motion_of(inputs, state), PoseNoise(1e-3, 2e-3), inputs.layout)
+    frozen = Pass(inputs.rig, inputs.clouds, inputs.layout, state, motion_of(inputs, state), state.starts)
+    (factor,) = MODEL.factors(sensor, stream, PoseNoise(1e-3, 2e-3), frozen)
     out = factor.output()
     for piece in make_pieces(len(state.seconds), inputs.layout.size):
         factor.accumulate(at or state, piece, out, sums=False)
@@ -169,7 +171,7 @@ def test_rows_are_those_of_matrices():
 def test_noise_that_is_given_stays():
     noise = PoseNoise(0.01, 0.02)
     ratios = {"rotation": 4.0, "position": 9.0}
-    assert next_pose_noise(PoseSensor("a", "a"), noise, ratios) == PoseNoise(0.02, 0.06)
-    assert next_pose_noise(PoseSensor("a", "a"), noise, {"rotation": 4.0}) == PoseNoise(0.02, 0.02)
-    assert next_pose_noise(PoseSensor("a", "a", rotation_noise=0.01), noise, ratios) == PoseNoise(0.01, 0.06)
-    assert next_pose_noise(PoseSensor("a", "a", position_noise=0.02), noise, ratios) == PoseNoise(0.02, 0.02)
+    assert scaled_noise(PoseSensor("a", "a"), noise, ratios) == PoseNoise(0.02, 0.06)
+    assert scaled_noise(PoseSensor("a", "a"), noise, {"rotation": 4.0}) == PoseNoise(0.02, 0.02)
+    assert scaled_noise(PoseSensor("a", "a", rotation_noise=0.01), noise, ratios) == PoseNoise(0.01, 0.06)
+    assert scaled_noise(PoseSensor("a", "a", position_noise=0.02), noise, ratios) == PoseNoise(0.02, 0.02)

@@ -113,7 +113,7 @@ def problem(rig, recordings, request):
         state.values["board0", "shape"][:] = 1e-3
     models = [NoiseModel(0.2, tau=(0.1,) if real else ()) for _ in rig.cameras]
     streams = inputs.measurements.cameras
-    noise = [m.noise(s, c, settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)]
+    noise = {c.name: m.noise(s, c, settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)}
     return assemble(inputs, state, noise, [np.ones(len(s.uv), dtype=bool) for s in streams]), state
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -23,26 +25,21 @@ from icalib.estimate.problem.guess_priors import guess_priors
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome, Step, Visit, way_come
 from icalib.estimate.problem.problem import Problem
-from icalib.estimate.problem.robot import RobotNoise
 from icalib.estimate.problem.solver import minimise
+from icalib.model.sensor_model import model_of
+from icalib.model.statistics import Fit, ResidualStatistics
 from icalib.motion.factor import of_type, pairs_of
 from icalib.optim import pages
 from icalib.optim.calib_block import NOTHING
 from icalib.optim.prior_factor import Prior, without_priors
 from icalib.optim.state import State
-from icalib.rig import PoseSensor
+from icalib.rig import Camera
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.corner_outliers import inliers
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.image_pairs import not_simultaneous
-from icalib.sensors.lidar.noise import next_lidar_noise
-from icalib.sensors.pose.factors import next_pose_noise
 
 LOOSE = 3.0  # times the prior uncertainty of a guess
-LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
-# Degrees of freedom off those of poses at rest, of which there may be few: the mean of a variance that chi^2 shows, its
-# logarithm unknown before (Jeffreys' prior); standard deviations are then those of Student's t distribution.
-FEW_DOF = 2.0
 EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
 AGAIN = 4  # further passes, at most, where the last one began too far from its end, or without tracks that it found
 FAR = 1.1  # times the chi^2 at its end: what a pass froze where it began is not what it would freeze at the end
@@ -57,17 +54,16 @@ OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its 
 
 @dataclass(frozen=True)
 class Judged:
-    """What the residuals of a pass say before the next: how each camera's corners err, as a model and as their `noise`,
-    which of them to `keep`; of tracks what is `following`; and the noise of the robot's sensors. straight: the lens is
-    not yet known well enough to say how edges are bent. apart: by camera (M,) bool, images that are rejected because
-    they are not simultaneous with others of their keyframe; empty where that is not tested."""
+    """What the residuals of a pass say before the next. noise: by sensor, of the class that its kind has; models: by
+    camera, how its corners err; keep: by camera (N,), corners in use; following: of tracks. coarse: nothing is known
+    yet, so the pass takes fewer points, and edges for straight. apart: by camera (M,) bool, images that are rejected
+    because they are not simultaneous with others of their keyframe; empty where that is not tested."""
 
+    noise: Mapping[str, Any]
     models: tuple[NoiseModel, ...]
-    noise: tuple[CornerNoise, ...]
     keep: tuple[np.ndarray, ...]
     following: Following | None
-    robot: RobotNoise
-    straight: bool = False
+    coarse: bool = False
     apart: tuple[np.ndarray, ...] = ()
 
     @classmethod
@@ -75,13 +71,14 @@ class Judged:
         """Before any pass: what the rig file says, or what is usual, of all there is."""
         rig, streams = inputs.rig, inputs.measurements.cameras
         models = tuple(first_noise(c) for c in rig.cameras)
-        noise = tuple(m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True))
+        noise = {s.name: model_of(s).first_noise(s, rig.settings) for s in rig.mounted if not isinstance(s, Camera)}
+        noise |= {c.name: m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)}
         keep = tuple(np.ones(len(s.uv), dtype=bool) for s in streams)
-        return cls(models, noise, keep, first_following(inputs), RobotNoise.first(rig), True)
+        return cls(noise, models, keep, first_following(inputs), True)
 
     def problem(self, inputs: Inputs, state: State, held: np.ndarray = NOTHING) -> Problem:
         """See `assemble`."""
-        return assemble(inputs, state, self.noise, self.keep, held, self.following, self.robot, self.straight)
+        return assemble(inputs, state, self.noise, self.keep, held, self.following, self.coarse)
 
     def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> Judged:
         """As what a pass left behind, the `first` or another, shows it."""
@@ -90,9 +87,10 @@ class Judged:
         if now.following is not None:
             now = replace(now, following=next_following(inputs, outcome, now.following, first))
         if _noise_is_estimated(inputs):
-            models, noise = _next_noise(inputs, problem, outcome)
-            now = replace(now, models=models, noise=noise, robot=_next_robot(inputs, problem, outcome, now.robot))
-        return replace(now, robot=replace(now.robot, coarse=False), straight=False)
+            all_fits = cache(lambda: fits(problem, outcome))
+            models, cameras = _next_noise(inputs, problem, outcome, all_fits)
+            now = replace(now, models=models, noise=_next_others(inputs, outcome, now.noise, all_fits) | cameras)
+        return replace(now, coarse=False)
 
 
 @dataclass(frozen=True)
@@ -290,16 +288,16 @@ def first_pass(inputs: Inputs, state: State) -> State:
 
 
 def _next_noise(
-    inputs: Inputs, problem: Problem, outcome: Outcome
-) -> tuple[tuple[NoiseModel, ...], tuple[CornerNoise, ...]]:
-    """The noise of the next pass, as the residuals of this one show it."""
-    settings, models, noise = inputs.rig.settings, [], []
-    common = [f for f in fits(problem, outcome) if f.kind.startswith("common")] if settings.common_error else []
+    inputs: Inputs, problem: Problem, outcome: Outcome, all_fits: Callable[[], list[Fit]]
+) -> tuple[tuple[NoiseModel, ...], dict[str, CornerNoise]]:
+    """The noise of cameras in the next pass, as the residuals of this one show it."""
+    settings, models, noise = inputs.rig.settings, [], {}
+    common = [f for f in all_fits() if f.kind.startswith("common")] if settings.common_error else []
     pairs = pairs_of(problem.factors, outcome.residuals, CornerFactor)
     for camera, (factor, out) in zip(inputs.rig.cameras, pairs, strict=True):
         if not len(factor.stream.uv):
             models.append(first_noise(camera))
-            noise.append(factor.noise)
+            noise[camera.name] = factor.noise
             continue
         speed = image_speed(factor, outcome.state)
         tau = (FIRST_TAU_PX,) * COMMON_ERRORS if settings.common_error else ()
@@ -307,8 +305,8 @@ def _next_noise(
             tau = scale_common_errors(tuple(factor.noise.tau), [f for f in common if f.sensor == camera.name])
         model, large = estimate_noise(camera, settings, factor, out, speed, tau)
         models.append(replace(model, later=large and _has_cameras_alone(inputs)))
-        noise.append(models[-1].noise(factor.stream, camera, settings, speed))
-    return tuple(models), tuple(noise)
+        noise[camera.name] = models[-1].noise(factor.stream, camera, settings, speed)
+    return tuple(models), noise
 
 
 def _kept(inputs: Inputs, outcome: Outcome, apart: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
@@ -332,26 +330,14 @@ def _has_cameras_alone(inputs: Inputs) -> bool:
     return inputs.imu is None and len(inputs.sensors) == len(inputs.rig.cameras)
 
 
-def _next_robot(inputs: Inputs, problem: Problem, outcome: Outcome, robot: RobotNoise) -> RobotNoise:
-    """Noise of LiDARs and pose sensors, as the residuals of this pass show it: of the latter by degrees of freedom, for
-    where nothing else shows the motion they pay for most of it."""
-    ranging = []
-    shown = chi2_by_kind(problem, outcome.residuals) if robot.ranging else {}
-    for lidar, noise in zip(inputs.rig.lidars, robot.ranging, strict=True):
-        own = shown.get((lidar.name, "points"))
-        ranging.append(noise if own is None else next_lidar_noise(lidar, noise, own.chi2, own.n))
-    judged = fits(problem, outcome) if any(_is_open(s) for s in inputs.rig.poses) else []
-    posing = []
-    for sensor, noise in zip(inputs.rig.poses, robot.posing, strict=True):
-        shown = [f for f in judged if f.sensor == sensor.name and f.dof > LEAST_LEFT * f.count]
-        ratios = {f.kind: f.chi2 / (f.dof if inputs.imu else max(f.dof - FEW_DOF, 1.0)) for f in shown}
-        posing.append(next_pose_noise(sensor, noise, ratios))
-    return RobotNoise(tuple(ranging), tuple(posing))
-
-
-def _is_open(sensor: PoseSensor) -> bool:
-    """Whether some of its noise is estimated."""
-    return sensor.rotation_noise is None or sensor.position_noise is None
+def _next_others(
+    inputs: Inputs, outcome: Outcome, noise: Mapping[str, Any], all_fits: Callable[[], list[Fit]]
+) -> dict[str, Any]:
+    """The noise of all other sensors in the next pass, as their models estimate it."""
+    squares, at_rest = cache(lambda: chi2_by_kind(outcome.problem, outcome.residuals)), inputs.imu is None
+    others = [s for s in inputs.rig.mounted if not isinstance(s, Camera)]
+    found = {s.name: ResidualStatistics(s.name, at_rest, squares, all_fits) for s in others}
+    return {s.name: model_of(s).next_noise(s, noise[s.name], found[s.name]) for s in others}
 
 
 def _noise_is_estimated(inputs: Inputs) -> bool:
@@ -362,8 +348,7 @@ def _noise_is_estimated(inputs: Inputs) -> bool:
         (bool(cornered) and (settings.blur_noise or settings.common_error))
         or any(c.corner_noise_px is None for c in cornered)
         or any(c.track_noise_px is None for c in tracked)
-        or (inputs.clouds.count > 0 and any(x.range_noise_m is None for x in inputs.rig.lidars))
-        or any(_is_open(x) for x in inputs.rig.poses)
+        or any(model_of(s).noise_passes(s) for s in inputs.sensors)
     )
 
 
@@ -373,5 +358,5 @@ def pass_names(inputs: Inputs) -> tuple[str, ...]:
     judged = bool(inputs.measurements.tracks) and inputs.rig.settings.outlier_std > 0.0
     if not (judged or _noise_is_estimated(inputs)):
         return ("first", "final")
-    twice = inputs.rig.settings.common_error or any(_is_open(x) for x in inputs.rig.poses)
+    twice = inputs.rig.settings.common_error or any(model_of(s).noise_passes(s) > 1 for s in inputs.sensors)
     return ("first", "noise", "noise again", "final") if twice else ("first", "noise", "final")

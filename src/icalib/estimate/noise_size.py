@@ -110,9 +110,11 @@ def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcom
     rig = inputs.rig.with_sensors(replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
     other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
     state, judged = found.outcome.state, found.judged
-    pairs = zip(judged.noise, of_type(found.problem.factors, CornerFactor), strict=True)
-    noise = tuple(replace(n, sigma=(scales.get(c.name, 1.0) * n.sigma).astype(n.sigma.dtype)) for n, c in pairs)
-    return minimise(replace(judged, noise=noise).problem(other, state, found.problem.held), state)
+    cameras = {c.name: judged.noise[c.name] for c in rig.cameras}
+    noise = {
+        name: replace(n, sigma=(scales.get(name, 1.0) * n.sigma).astype(n.sigma.dtype)) for name, n in cameras.items()
+    }
+    return minimise(replace(judged, noise={**judged.noise, **noise}).problem(other, state, found.problem.held), state)
 
 
 def _corner_sizes(outcome: Outcome) -> dict[str, float]:

@@ -12,17 +12,8 @@ from typing import Any
 
 # Sensors stand in this order in layouts and results; those of one kind in the order of the rig file.
 SENSOR_KINDS = ("imu", "camera", "lidar", "wheels", "pose")
-FACETS = (
-    "spec",
-    "record",
-    "stream",
-    "read",
-    "initialize",
-    "assess",
-    "show",
-    "simulate",
-    "inspect",
-)  # levels of their own
+# Levels of their own in tests/test_layers.py.
+FACETS = ("spec", "record", "stream", "read", "model", "initialize", "assess", "show", "simulate", "inspect")
 
 
 def facet(kind: str, name: str) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.evidence import Fit, fits, raw_sizes
+from icalib.estimate.evidence.evidence import fits, raw_sizes
 from icalib.estimate.evidence.inflation import calibration_columns, spread_variance, white_variance
 from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.evidence.places import cluster_covariances
@@ -19,6 +19,7 @@ from icalib.estimate.problem.gauge import IN_THE_WORLD
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.outcome import Visit
 from icalib.estimate.problem.problem import Problem
+from icalib.model.statistics import Fit
 from icalib.motion.axes import hardly_turned
 from icalib.motion.factor import of_type
 from icalib.observability.contradictions import Contradiction

@@ -69,8 +69,8 @@ def lidar_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
     before = [in_world(first, stream) for stream, _ in thinned]
     guessed = _fitted([(points, plane) for (points, _), (_, plane) in zip(before, thinned, strict=True)], values)
     out = []
-    for whole, (stream, plane), noise, (first_world, seen_from) in zip(
-        inputs.measurements.lidars, thinned, found.judged.robot.ranging, before, strict=True
+    for whole, (stream, plane), (first_world, seen_from) in zip(
+        inputs.measurements.lidars, thinned, before, strict=True
     ):
         seconds = _seconds_of(stream, state)
         world, at = in_world(now, stream)
@@ -85,7 +85,7 @@ def lidar_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
                 timeline.shown(seconds, timeline.recording_of(seconds)),
                 plane,
                 np.linalg.norm(stream.xyz, axis=1),
-                _sigma(noise, cosine),
+                _sigma(found.judged.noise[stream.name], cosine),
                 world,
                 residual,
                 first_world,
@@ -181,14 +181,14 @@ def pose_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple
 def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """How much of LiDARs and pose sensors is in use, and their noise."""
     counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(found)}
-    posing = found.judged.robot.posing
+    posing = [found.judged.noise[s.name] for s in inputs.rig.poses]
     for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, posing, strict=True):
         what = "poses" if sensor.kind == "absolute" else "steps"
         count = f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses"
         yield f"{count} of {sensor.name}; {_noise(sensor, noise)}."
     if not inputs.clouds.count:
         return
-    ranging = found.judged.robot.ranging
+    ranging = [found.judged.noise[s.name] for s in inputs.rig.lidars]
     for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, ranging, strict=True):
         given = lidar.range_noise_m is not None
         size = f"{1e3 * noise.beam_sigma:.1f} mm along the beam, as the rig file has it"

@@ -20,7 +20,7 @@ import numpy as np
 
 from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
-from icalib.estimate.evidence.evidence import Fit
+from icalib.model.statistics import Fit
 from icalib.optim.medians import median_variance
 from icalib.optim.state import State
 from icalib.rig import Camera, Settings

@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.outcome import Outcome, posterior
 from icalib.estimate.problem.problem import Problem
+from icalib.model.statistics import Fit
 from icalib.motion.factor import Along, FitKey, RawSize, Residuals, Squares
 from icalib.optim.arrowhead import Draw
 from icalib.optim.calib_block import restricted_inverse
 
 DRAW_STEP = 1e-3  # of a posterior sample: small enough to be linear
-
-
-@dataclass(frozen=True)
-class Fit:
-    """chi^2 of one kind of residual, their number, and the degrees of freedom that are left after the fit.
-
-    kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", "points on planes", or "common error 0", 1,
-    ... for the images' own.
-    """
-
-    sensor: str
-    kind: str
-    count: int
-    dof: float
-    chi2: float
 
 
 def fits(problem: Problem, outcome: Outcome) -> list[Fit]:

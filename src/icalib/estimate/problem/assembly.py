@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.problem import ChainFactor, Problem
-from icalib.estimate.problem.robot import NO_ROBOT, RobotNoise, robot_factors
 from icalib.geometry.cameras import camera_model
+from icalib.model.sensor_model import Pass, SensorModel, kind_model, model_of
 from icalib.motion.clocks import EARLY_S, instants
 from icalib.motion.factor import Factor, keyed
 from icalib.motion.free_nodes import FreeNodes
@@ -23,37 +24,37 @@ from icalib.optim import pages
 from icalib.optim.arrowhead import chain_cuts
 from icalib.optim.calib_block import NOTHING
 from icalib.optim.prior_factor import Prior
-from icalib.optim.state import Key, Layout, State
-from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
+from icalib.optim.state import Block, Key, State
+from icalib.rig import Camera, Parameter, Rig, Scheme, Sensor
 from icalib.rig.scene import SHAPE_LABELS
+from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.camera.board import SHAPE_SIGMA_M, bloom_direction
 from icalib.sensors.camera.bodies import SIZE
 from icalib.sensors.camera.circle_centres import with_circle_centres
-from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
+from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.edge_curvature import with_bent_edges
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.patch_curvature import with_curved_patches
 from icalib.sensors.camera.features.surfaces import Surfaces
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
-from icalib.sensors.imu.spec import N_INTRINSICS
 from icalib.sensors.lidar.lidar_binning import points_on_planes
-from icalib.sensors.pose.factors import still_factors
+from icalib.sensors.sensor import TIME_OFFSET
 
-BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
 CUT_S = 0.5
 
 
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     """All priors: those that belong to the model, those on nuisance parameters, and others that were given."""
-    rig, layout = inputs.rig, inputs.layout
+    layout = inputs.layout
     priors = [
         Prior(layout.block(b, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M) for b in inputs.bodies.bending
     ]
-    for camera in rig.cameras if rig.blooms else ():
-        if camera.bloom.mode == "free":
-            priors.append(Prior(layout.block(camera.name, "bloom"), np.zeros(1), np.full(1, BLOOM_SIGMA_PX)))
+    for block in layout.free:
+        stated, spec = inputs.stated(block), inputs.specs[block.key]
+        if stated is not None and spec.is_auxiliary and stated.mode == "free":
+            priors.append(Prior(block, np.zeros(block.size), np.full(block.size, spec.prior_sigma)))
     return (*priors, *stated_priors(inputs))
 
 
@@ -64,33 +65,34 @@ def stated_priors(inputs: Inputs) -> tuple[Prior, ...]:
 
 def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
     """The priors on how imperfect sensors and targets are, whether the rig file gives them or they are the default."""
-    imu, layout, one = inputs.rig.imu, inputs.layout, np.ones(1)
-    priors = [] if imu is None else _given(layout, imu.name, "intrinsics", imu.intrinsics)
-    sigmas = {SIZE: inputs.rig.target.size_sigma} | {(p.name, "scale"): p.scale_sigma for p in inputs.rig.poses}
-    priors += [Prior(b, one, sigmas[b.key] * one) for b in layout.free if b.key in sigmas]
+    priors, one = [], np.ones(1)
+    for block in inputs.layout.free:
+        stated = inputs.stated(block)
+        if block.key == SIZE:
+            priors.append(Prior(block, one, inputs.rig.target.size_sigma * one))
+        elif block.is_nuisance and stated is not None:
+            priors += _given(block, stated)
     return tuple(priors)
 
 
 def given_priors(inputs: Inputs) -> tuple[Prior, ...]:
     """The priors that the rig file gives on what is calibrated."""
     priors = []
-    names = {s.name: s for s in inputs.sensors}
     for block in inputs.layout.free:
-        if block.sensor not in names or block.is_nuisance:
+        stated = inputs.stated(block)
+        if stated is None or block.is_nuisance:
             continue
-        difference = origin_difference(inputs.measurements, inputs.stream(block.sensor))
-        shift = difference if block.name == "time_offset" else 0.0
-        given = getattr(names[block.sensor], block.name)
-        priors += _given(inputs.layout, block.sensor, block.name, given, shift)
+        is_clock = block.name == TIME_OFFSET.name
+        shift = origin_difference(inputs.measurements, inputs.stream(block.sensor)) if is_clock else 0.0
+        priors += _given(block, stated, shift)
     return tuple(priors)
 
 
-def _given(layout: Layout, sensor: str, name: str, parameter: Parameter, shift: float = 0.0) -> list[Prior]:
-    block = layout.block(sensor, name)
-    if block.start is None or parameter.mode != "prior" or parameter.value is None or parameter.sigma is None:
+def _given(block: Block, parameter: Parameter, shift: float = 0.0) -> list[Prior]:
+    if parameter.mode != "prior" or parameter.value is None or parameter.sigma is None:
         return []
     value, sigma = parameter.value + shift, parameter.sigma
-    if name == "time_offset":  # of a clock that restarts, the prior of each
+    if block.name == TIME_OFFSET.name:  # of a clock that restarts, the prior of each
         value, sigma = np.broadcast_to(value, block.size), np.broadcast_to(sigma, block.size)
     return [Prior(block, value, sigma)]
 
@@ -101,23 +103,23 @@ def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarra
 
 
 def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
-    """Instants that nodes are placed at, by sensor, seconds on the body's clock since its first stamp: those of images,
-    or without cameras those of scans, or without either those of poses, as many as are needed; both where motion is
-    assumed that poses show."""
-    assumed = inputs.rig.assumes_motion and inputs.rig.moves_by_poses
-    images = image_times(inputs, values) if inputs.rig.cameras else []
-    if images and not assumed:
-        return images
-    if inputs.rig.lidars:
-        return [instants(x, values) for x in inputs.measurements.lidars]
-    first, imu = inputs.measurements.poses[0], inputs.rig.imu or ImuSensor  # its default
-    return [*images, instants(first, values, thinned(first.seconds, imu.pose_keyframes_s))]
+    """Instants that keyframes are placed at, by sensor, seconds on the body's clock since its first stamp."""
+    return [
+        model.keyframe_times(sensor, inputs.stream(sensor.name), values, inputs.rig)
+        for model, sensors in _keyframe_sources(inputs.rig)
+        for sensor in sensors
+    ]
 
 
-def thinned(times: np.ndarray, apart: float) -> np.ndarray:
-    """The first of `times` (n,), in order, in each stretch of `apart` seconds, and the last of all."""
-    k = np.flatnonzero(np.diff(np.floor(times / apart + 1e-6), prepend=-1.0))
-    return times[np.append(k, len(times) - 1)] if k[-1] < len(times) - 1 else times[k]
+def _keyframe_sources(rig: Rig) -> list[tuple[SensorModel, list[Sensor]]]:
+    """The sensors of the first kind that places keyframes, and its model; of all kinds where the motion is an
+    assumption that poses show."""
+    found = []
+    for kind in SENSOR_KINDS:
+        model, own = kind_model(kind), [s for s in rig.sensors.values() if s.sensor_type == kind]
+        if model.keyframes and own:
+            found.append((model, own[:1] if model.only_first_places_keyframes else own))
+    return found if rig.assumes_motion and rig.moves_by_poses else found[:1]
 
 
 def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
@@ -148,10 +150,8 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
 
 
 def _hosts(rig: Rig) -> str:
-    what, sensors = ("images", rig.cameras) if rig.cameras else ("scans", rig.lidars)
-    if not sensors:
-        what, sensors = "poses", rig.poses[:1]
-    return f"{what} of {', '.join(s.name for s in sensors)}"
+    model, sensors = _keyframe_sources(rig)[0]
+    return f"{model.keyframes} of {', '.join(s.name for s in sensors)}"
 
 
 @dataclass(frozen=True)
@@ -168,37 +168,36 @@ class Following:
 def assemble(
     inputs: Inputs,
     state: State,
-    noise: Sequence[CornerNoise],
+    noise: Mapping[str, Any],
     keep: Sequence[np.ndarray],
     held: np.ndarray = NOTHING,
     following: Following | None = None,
-    robot: RobotNoise = NO_ROBOT,
-    straight: bool = False,
+    coarse: bool = False,
 ) -> Problem:
-    """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration,
-    corners on edges bent by its lens, unless they stay on `straight` ones. held: directions of the calibration
-    parameters that stay, see Problem."""
+    """The problem at the keyframes of `state`, everything frozen that a pass freezes: assignment, preintegration,
+    corners on edges that the lens bends, or on straight ones where the lens is unknown (`coarse`).
+
+    noise: by sensor, of the class that its kind has; keep: by camera (N,), corners in use; held: directions of the
+    calibration parameters that are fixed, see Problem."""
     rig, layout = inputs.rig, inputs.layout
     factors = []
     scheme = rig.settings.scheme if inputs.imu is not None else "inertial"
     times = image_times(inputs, state.values)
-    for i, (camera, stream, t, n, k) in enumerate(
-        zip(rig.cameras, inputs.measurements.cameras, times, noise, keep, strict=True)
-    ):
+    for i, (camera, stream, t, k) in enumerate(zip(rig.cameras, inputs.measurements.cameras, times, keep, strict=True)):
         own = [m.images[i] for m in inputs.motions]
         node = _nodes_of(scheme, state, t, own, inputs.imu is not None and inputs.imu.forwards)
         seen = is_seen(inputs, t, state.seconds[node])
         factor = CornerFactor(
             stream, camera_model(camera.model), inputs.imu, rig.gravity, scheme, stream.seconds, node,
-            k & np.repeat(seen, np.diff(stream.start)), n, NO_BLOOM, inputs.bodies, layout,
+            k & np.repeat(seen, np.diff(stream.start)), noise[camera.name], NO_BLOOM, inputs.bodies, layout,
             len(state.seconds), tuple(images.start for images in own[1:]),
         )  # fmt: skip
-        factor = factor if straight else with_circle_centres(with_bent_edges(factor, state), state)
+        factor = factor if coarse else with_circle_centres(with_bent_edges(factor, state), state)
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
     # Beside one another, in a thread of its own: points of LiDARs use the solver's.
     with ThreadPoolExecutor(1) as aside:
         found = None if following is None else aside.submit(_features, inputs, state, tuple(factors), following)
-        others = _others(inputs, state, robot)
+        others = _others(inputs, state, noise, coarse)
         features = None if found is None else found.result()
     tracked = () if features is None else (features,)
     return Problem(
@@ -213,13 +212,22 @@ def motion_of(inputs: Inputs, state: State) -> Motion:
     return Motion(state, inputs.imu, inputs.rig.gravity, inputs.rig.settings.max_gap_s)
 
 
-def _others(inputs: Inputs, state: State, noise: RobotNoise) -> tuple[Factor, ...]:
-    if inputs.imu is None:
-        begins = [part.begin - EARLY_S for part in inputs.parts[1:]]
-        starts = (0, *(int(k) for k in np.searchsorted(state.seconds, begins)))
-        return still_factors(inputs.measurements.poses, noise.posing, state, starts, inputs.layout)
-    motion = motion_of(inputs, state)
-    return robot_factors(inputs.rig, inputs.measurements, inputs.clouds, noise, motion, inputs.layout)
+def _others(inputs: Inputs, state: State, noise: Mapping[str, Any], coarse: bool) -> tuple[Factor, ...]:
+    """Of all sensors but cameras and the IMU."""
+    at, factors = _pass(inputs, state, coarse), []
+    for sensor in inputs.sensors:
+        model, own = model_of(sensor), (sensor, inputs.stream(sensor.name), noise[sensor.name], at)
+        factors += model.still_factors(*own) if at.motion is None else model.factors(*own)
+    return tuple(factors)
+
+
+def _pass(inputs: Inputs, state: State, coarse: bool) -> Pass:
+    if inputs.imu is not None:
+        motion = motion_of(inputs, state)
+        return Pass(inputs.rig, inputs.clouds, inputs.layout, state, motion, state.starts, coarse)
+    begins = [part.begin - EARLY_S for part in inputs.parts[1:]]
+    starts = (0, *(int(k) for k in np.searchsorted(state.seconds, begins)))
+    return Pass(inputs.rig, inputs.clouds, inputs.layout, state, None, starts, coarse)
 
 
 def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], following: Following) -> FeatureFactor:
@@ -294,19 +302,17 @@ def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) ->
 
 def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
     """Values of all blocks: the guess, completed by what starts from zero."""
-    one = np.ones(1)
-    values = guess_values | {SIZE: one} | {(p.name, "scale"): one for p in inputs.rig.poses}
+    rig, values = inputs.rig, guess_values | {SIZE: np.ones(1)}
     for name in inputs.bodies.bending:
         values[name, "shape"] = np.zeros(len(SHAPE_LABELS))
     for reference in inputs.bodies.names[:1]:
         values[reference, "rotation"], values[reference, "translation"] = np.eye(3), np.zeros(3)
-    if (imu := inputs.rig.imu) is not None:
-        given = imu.intrinsics.value
-        values[imu.name, "intrinsics"] = np.zeros(N_INTRINSICS) if given is None else given.copy()
-    for camera in inputs.rig.cameras:
-        bloom = camera.bloom.value if inputs.rig.blooms else None
-        values[camera.name, "bloom"] = np.zeros(1) if bloom is None else bloom.copy()
-    for sensor in (*inputs.rig.cameras, *inputs.rig.lidars, *inputs.rig.wheels, *inputs.rig.poses):
-        if (own := values.get((sensor.name, "time_offset"))) is not None:
-            values[sensor.name, "time_offset"] = np.broadcast_to(own, inputs.clocks_of(sensor))
+    for sensor in rig.sensors.values():
+        for spec in sensor.specs():
+            value = model_of(sensor).start_value(sensor, spec, rig)
+            if value is not None:
+                values[sensor.name, spec.name] = value
+    for sensor in rig.mounted:
+        if (own := values.get((sensor.name, TIME_OFFSET.name))) is not None:
+            values[sensor.name, TIME_OFFSET.name] = np.broadcast_to(own, inputs.clocks_of(sensor))
     return {key: np.ascontiguousarray(v, dtype=np.float64) for key, v in values.items()}

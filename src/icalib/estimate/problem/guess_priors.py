@@ -11,17 +11,18 @@ from icalib.geometry.cameras import camera_model
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import State
 from icalib.rig import Camera
+from icalib.sensors.sensor import TRANSLATION
 
 RATIO_STEP = 1e-4  # of a coefficient, for a difference quotient
 
 
 def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
     """(B,) standard deviations of the guess: given ones, or the default ones. `state` has the lenses."""
-    sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
+    sigma = np.zeros(inputs.layout.size)
     for b in inputs.layout.free:
-        sigma[b.columns] = inputs.specs[b.key].prior_sigma
-        if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
-            sigma[b.columns] = FROM_NOTHING_M
+        stated = inputs.stated(b)
+        is_guessed = b.name != TRANSLATION.name or stated is None or stated.value is not None
+        sigma[b.columns] = inputs.specs[b.key].prior_sigma if is_guessed else FROM_NOTHING_M
     for camera in inputs.rig.cameras:
         columns = inputs.layout.columns(camera.name, "intrinsics", "distortion")
         if (columns >= 0).all():

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from icalib.data.joining import Part, join
 from icalib.data.measurements import Measurements, Stream
-from icalib.estimate.problem.robot import own_entries
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets.base import BOARD
+from icalib.model.sensor_model import clocks_of, model_of
 from icalib.motion.clouds import NO_CLOUDS, Clouds
 from icalib.motion.imu_data import ImuData, joined_imu_data
-from icalib.optim.state import Entry, Key, Layout, State, in_recording, make_layout
-from icalib.rig import Camera, Lidar, ParameterSpec, PoseSensor, Rig, Wheels
+from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, make_layout
+from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
 from icalib.rig.scene import TILT
 from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
 from icalib.sensors.camera.images import on_common_images
-from icalib.sensors.camera.spec import BLOOM
-from icalib.sensors.pose.factors import frame_entries
-from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 
 
 @dataclass(frozen=True)
@@ -43,31 +41,41 @@ class Inputs:
     asked: Rig | None = None
 
     @property
-    def sensors(self) -> tuple[Camera | Lidar | Wheels | PoseSensor, ...]:
+    def sensors(self) -> tuple[Sensor, ...]:
         """All that take part, but for the IMU."""
-        lidars = self.rig.lidars if self.clouds.count else ()
-        return (*self.rig.cameras, *lidars, *self.rig.wheels, *self.rig.poses)
+        return _taking_part(self.rig, self.clouds)
+
+    @cached_property
+    def owners(self) -> dict[str, Sensor]:
+        """All that take part, the IMU first, by name."""
+        return {s.name: s for s in self.rig.sensors.values() if model_of(s).takes_part(s, self.clouds)}
 
     @cached_property
     def specs(self) -> dict[Key, ParameterSpec]:
         """Definitions of the blocks of the layout."""
-        return specs_of(self.layout, (*(() if self.rig.imu is None else (self.rig.imu,)), *self.sensors))
+        return specs_of(self.layout, self.owners.values())
+
+    def stated(self, block: Block) -> Parameter | None:
+        """What the rig says of a block of a sensor's; None of blocks of the scene."""
+        owner = self.owners.get(block.sensor)
+        return None if owner is None else getattr(owner, block.name)
 
     @property
     def tolerance(self) -> np.ndarray:
         """(B,) of each calibration column."""
         return tolerance_of(self.layout, self.specs, self.rig.settings)
 
-    def sensor(self, name: str) -> Camera | Lidar | Wheels | PoseSensor:
-        return next(s for s in self.sensors if s.name == name)
+    def sensor(self, name: str) -> Any:
+        """The sensor `name`, of the class of its kind."""
+        return self.rig.sensors[name]
 
     def stream(self, name: str) -> Stream:
         m = self.measurements
         return next(s for s in (*m.cameras, *m.lidars, *m.wheels, *m.poses) if s.name == name)
 
-    def clocks_of(self, sensor: Camera | Lidar | Wheels | PoseSensor) -> int:
+    def clocks_of(self, sensor: Sensor) -> int:
         """How many time offsets it has."""
-        return len(self.parts) if sensor.clock_restarts else 1
+        return clocks_of(sensor, len(self.parts))
 
     def is_sensor(self, name: str) -> bool:
         """Whether `name` is a sensor's, not a body's of the target or a plane's."""
@@ -101,29 +109,24 @@ def with_clouds(inputs: Inputs, clouds: Clouds) -> Inputs:
 def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds = NO_CLOUDS) -> Layout:
     """The calibration parameters: IMU intrinsics, the scene and its bodies, then each sensor's parameters, and
     planes."""
-    imu = rig.imu
+    imu, sensors = rig.imu, _taking_part(rig, clouds)
     entries: list[Entry] = []
     if imu is not None:
-        entries += own_entries(imu)
+        entries += model_of(imu).entries(imu, rig, n_recordings)
     # Without an IMU the scene's frame is the world's, in all recordings.
     levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():
         entries.append(TILT.entry(in_recording(BOARD, k), levelled))
     entries += bodies.size_entries() + bodies.shape_entries()
-    for camera in rig.cameras:
-        entries += own_entries(camera, n_recordings, partial(_is_estimated, rig, camera))
-    for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels, *rig.poses):
-        entries += own_entries(sensor, n_recordings)
-    for k, sensor in enumerate(rig.poses):
-        is_world = (imu is None or rig.assumes_motion) and rig.moves_by_poses and k == 0
-        entries += frame_entries(sensor, n_recordings, not is_world)
+    for sensor in sensors:
+        entries += model_of(sensor).entries(sensor, rig, n_recordings)
+    for sensor in sensors:
+        entries += model_of(sensor).scene_entries(sensor, rig, n_recordings)
     return make_layout(entries + bodies.pose_entries() + clouds.entries)
 
 
-def _is_estimated(rig: Rig, camera: Camera, spec: ParameterSpec) -> bool:
-    if rig.imu is None and (spec == TIME_OFFSET or (camera.name == rig.body and spec in MOUNTED)):
-        return False
-    return camera.is_estimated(spec) and (spec != BLOOM or rig.blooms)
+def _taking_part(rig: Rig, clouds: Clouds) -> tuple[Sensor, ...]:
+    return tuple(s for s in rig.mounted if model_of(s).takes_part(s, clouds))
 
 
 def origin_difference(measurements: Measurements, stream: Stream) -> float:

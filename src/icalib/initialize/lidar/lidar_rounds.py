@@ -42,7 +42,7 @@ from icalib.motion.sweep import Motion, sweep
 from icalib.optim.state import Key, State
 from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 from icalib.sensors.lidar.lidar_binning import COARSE_BIN_S, Associated, LidarNoise, Moments, take_moments
-from icalib.sensors.lidar.noise import FIRST_RANGE_M
+from icalib.sensors.lidar.model import FIRST_RANGE_M
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost

@@ -17,6 +17,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from icalib.data.measurements import PoseStream
+from icalib.model.frames import FRAME, frame_of
 from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
@@ -28,10 +29,8 @@ from icalib.motion.stamp_intervals import StampIntervals, choose_intervals
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece
 from icalib.optim.interval_sums import Rows
-from icalib.optim.state import NODE, Layout, State, in_recording
-from icalib.rig import scene
+from icalib.optim.state import NODE, Layout, State
 
-FRAME = tuple(spec.name for spec in scene.FRAME)
 NEAR_NODE_S = 0.05  # a pose further from all nodes is left out: the IMU alone would carry it there
 KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
 UNITS = {"rotation": "rad", "position": "m"}
@@ -46,11 +45,6 @@ class PoseNoise:
     position: float
     loss: str = "none"
     loss_scale: float = 2.5
-
-
-def frame_of(sensor: str, recording: int) -> str:
-    """Name of the frame in which a sensor's poses are given in one of several recordings, counted from 0."""
-    return in_recording(f"frame of {sensor}", recording)
 
 
 class _PoseFactor(RowFactor):

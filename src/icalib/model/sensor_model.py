@@ -1,0 +1,141 @@
+"""What the problem asks of a kind of sensor. `sensors/KIND/model.py` has an instance for its kind, called `MODEL`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+
+from icalib.model.statistics import ResidualStatistics
+from icalib.motion.clocks import instants
+from icalib.motion.clouds import Clouds
+from icalib.motion.factor import Factor
+from icalib.motion.sweep import Motion
+from icalib.optim.state import Entry, Key, Layout, State
+from icalib.rig import ParameterSpec, Rig, Sensor, Settings
+from icalib.sensors import facet
+from icalib.sensors.sensor import TIME_OFFSET
+
+S = TypeVar("S", bound=Sensor)
+N = TypeVar("N")
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What the factors of one pass are frozen at. motion: of the IMU; None without one. starts: the first keyframe of
+    each recording. coarse: an early pass, which shall cost little and lead near."""
+
+    rig: Rig
+    clouds: Clouds
+    layout: Layout
+    state: State
+    motion: Motion | None
+    starts: tuple[int, ...]
+    coarse: bool = False
+
+
+class SensorModel(Generic[S, N]):
+    """How the sensors S of one kind enter the problem, with noise of the class N. The defaults are those of a sensor
+    with a pose and a clock, and with no factor.
+
+    keyframes: what keyframes are placed at, as in "images of cam0"; empty where the kind places none.
+    only_first_places_keyframes: and not each of several sensors.
+    """
+
+    keyframes: ClassVar[str] = ""
+    only_first_places_keyframes: ClassVar[bool] = False
+
+    # Parameters
+
+    def takes_part(self, sensor: S, clouds: Clouds) -> bool:
+        """Whether the sensor has parameters and factors. clouds: points of LiDARs on planes."""
+        del sensor, clouds
+        return True
+
+    def is_estimated(self, sensor: S, spec: ParameterSpec, rig: Rig) -> bool:
+        """Whether one of the sensor's own groups of parameters is estimated."""
+        del rig
+        return sensor.is_estimated(spec)
+
+    def entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
+        """The sensor's own groups of parameters in the layout."""
+        return own_entries(sensor, n_recordings, lambda spec: self.is_estimated(sensor, spec, rig))
+
+    def scene_entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
+        """What the scene has because of this sensor, such as the frame that it reports in."""
+        del sensor, rig, n_recordings
+        return []
+
+    def start_value(self, sensor: S, spec: ParameterSpec, rig: Rig) -> np.ndarray | None:
+        """(spec.size,) of a group that needs no guess: how imperfect the sensor is. None for all others."""
+        del rig
+        if not (spec.manifold == "nuisance" or spec.is_auxiliary):
+            return None
+        stated = getattr(sensor, spec.name).value
+        return np.zeros(spec.size) if stated is None else stated.copy()
+
+    def keyframe_times(self, sensor: S, stream: Any, values: dict[Key, np.ndarray], rig: Rig) -> np.ndarray:
+        """(n,) instants at which the sensor wants keyframes, s on the body's clock since its first stamp."""
+        del sensor, rig
+        return instants(stream, values)
+
+    # Noise
+
+    def first_noise(self, sensor: S, settings: Settings) -> N:
+        """The noise before any residuals are known: the stated, or a usual one."""
+        raise NotImplementedError
+
+    def next_noise(self, sensor: S, noise: N, found: ResidualStatistics) -> N:
+        """The noise that the residuals of a pass with `noise` show, as far as it is estimated."""
+        del sensor, found
+        return noise
+
+    def noise_passes(self, sensor: S) -> int:
+        """How many passes the estimate of the noise takes; 0: all of it is stated."""
+        del sensor
+        return 0
+
+    def noise_is_estimated(self, sensor: S) -> bool:
+        """Whether the residuals show some of the noise."""
+        return self.noise_passes(sensor) > 0
+
+    # Factors
+
+    def factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
+        """With an IMU: `at.motion` is its motion."""
+        del sensor, stream, noise, at
+        return ()
+
+    def still_factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
+        """Without an IMU: of what was measured at keyframes, which nothing ties to one another."""
+        del sensor, stream, noise, at
+        return ()
+
+
+def model_of(sensor: Sensor) -> SensorModel[Any, Any]:
+    """The model of a sensor's kind."""
+    return kind_model(sensor.sensor_type)
+
+
+@cache
+def kind_model(kind: str) -> SensorModel[Any, Any]:
+    """The model of one of `SENSOR_KINDS`."""
+    return facet(kind, "model").MODEL
+
+
+def own_entries(
+    sensor: Sensor, n_recordings: int = 1, is_estimated: Callable[[ParameterSpec], bool] | None = None
+) -> list[Entry]:
+    """The parameters of a sensor; a clock that restarts has a time offset in each recording."""
+    n_clocks = clocks_of(sensor, n_recordings)
+    specs = (spec.in_recordings(n_clocks) if spec == TIME_OFFSET else spec for spec in sensor.specs())
+    free = is_estimated or sensor.is_estimated
+    return [spec.entry(sensor.name, free(spec)) for spec in specs]
+
+
+def clocks_of(sensor: Sensor, n_recordings: int) -> int:
+    """How many time offsets a sensor has: one in each recording where its clock restarts."""
+    return n_recordings if getattr(sensor, "clock_restarts", False) else 1

@@ -1,0 +1,61 @@
+"""How a LiDAR enters the problem: points on planes, where any are known to lie on planes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icalib.data.measurements import LidarStream
+from icalib.model.sensor_model import Pass, SensorModel
+from icalib.model.statistics import ResidualStatistics
+from icalib.motion.clouds import Clouds
+from icalib.motion.point_planes import thinned
+from icalib.rig import Lidar, Settings
+from icalib.sensors.lidar.lidar_binning import BIN_S, COARSE_BIN_S, LidarNoise
+from icalib.sensors.lidar.residual import LidarFactor
+
+NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the model lacks where beams graze a plane
+FIRST_RANGE_M = 0.03  # where the noise is not stated
+LEAST_RANGE_M = 1e-3
+
+
+class LidarModel(SensorModel[Lidar, LidarNoise]):
+    """Takes part once planes are known. Stated noise is along the beam, estimated noise alike in all directions."""
+
+    keyframes = "scans"
+
+    def takes_part(self, sensor: Lidar, clouds: Clouds) -> bool:
+        """See `SensorModel`."""
+        del sensor
+        return clouds.count > 0
+
+    def first_noise(self, sensor: Lidar, settings: Settings) -> LidarNoise:
+        """See `SensorModel`."""
+        loss, scale = settings.loss, settings.loss_scale
+        if sensor.range_noise_m is None:
+            return LidarNoise(FIRST_RANGE_M, 0.0, loss, scale)
+        return LidarNoise(NEAR_PLANE_M, sensor.range_noise_m, loss, scale)
+
+    def next_noise(self, sensor: Lidar, noise: LidarNoise, found: ResidualStatistics) -> LidarNoise:
+        """The RMS of the whitened distances scales it."""
+        points = found.squares.get("points")
+        if sensor.range_noise_m is not None or points is None:
+            return noise
+        sigma = max(noise.sigma * float(np.sqrt(points.chi2 / points.n)), LEAST_RANGE_M)
+        return LidarNoise(sigma, 0.0, noise.loss, noise.loss_scale)
+
+    def noise_passes(self, sensor: Lidar) -> int:
+        """See `SensorModel`."""
+        return int(sensor.range_noise_m is None)
+
+    def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[LidarFactor]:
+        """One; early passes take fewer points, in longer bins."""
+        assert at.motion is not None
+        plane = at.clouds.plane[[x.name for x in at.rig.lidars].index(sensor.name)]
+        used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)
+        scheme = at.rig.settings.scheme
+        yield LidarFactor.build(stream, used, at.clouds.keys, at.motion, noise, at.layout, scheme, bin_s)
+
+
+MODEL = LidarModel()

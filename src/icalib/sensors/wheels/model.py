@@ -1,0 +1,55 @@
+"""How wheels enter the problem: by what they turn or report, and by the ground that they stand on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from icalib.data.measurements import WheelPoses, WheelStream
+from icalib.model.sensor_model import Pass, SensorModel
+from icalib.motion.clocks import instants
+from icalib.motion.factor import Factor
+from icalib.motion.sweep import Motion
+from icalib.optim.state import Key, Layout
+from icalib.rig import Settings, Wheels
+from icalib.sensors.wheels.ground_factor import GroundFactor, floors
+from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
+from icalib.sensors.wheels.wheel_angles import integrals_of
+
+
+class WheelModel(SensorModel[Wheels, WheelNoise]):
+    """Their noise is stated."""
+
+    def first_noise(self, sensor: Wheels, settings: Settings) -> WheelNoise:
+        """As stated."""
+        return WheelNoise(
+            sensor.wheel_noise, sensor.lateral_slip, sensor.vertical_slip, settings.loss, settings.loss_scale,
+            sensor.speed_noise, sensor.yaw_noise, sensor.steering_noise,
+        )  # fmt: skip
+
+    def factors(
+        self, sensor: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, at: Pass
+    ) -> Iterator[Factor]:
+        """One of what they turn or report, and one of the ground where it is stated."""
+        assert at.motion is not None
+        yield wheel_factor(sensor, stream, noise, at.motion, at.layout)
+        if sensor.ground is not None:
+            floor: tuple[Key | None, ...] = (None,) * len(at.state.recordings)
+            if sensor.ground.plane == "floor" and at.clouds.count:
+                floor = floors(at.state, at.clouds.keys, at.clouds.points, at.clouds.recording)
+            yield GroundFactor.build(sensor.name, sensor.ground, floor, at.state, at.motion.imu, at.layout)
+
+
+def wheel_factor(
+    wheels: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, motion: Motion, layout: Layout
+) -> IncrementFactor | RelativePoseFactor:
+    """The factor that the wheels' `measures` and `factor` ask for."""
+    if isinstance(stream, WheelPoses):
+        return RelativePoseFactor.of_poses(stream, motion.imu, motion.gravity, noise, layout, motion.state)
+    own = wheels.name, stream.seconds, integrals_of(stream), motion.imu, motion.gravity, noise, layout, motion.state
+    times = instants(stream, motion.state.values)
+    if wheels.factor == "relative-poses":
+        return RelativePoseFactor.build(*own, times)
+    return IncrementFactor.build(*own, stream.kind, times)
+
+
+MODEL = WheelModel()
