@@ -28,6 +28,7 @@ from icalib.geometry.targets import AprilGrid, NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.montecarlo.one_run import compare
 from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, rig_for, simulate, with_drawn_guess
 
@@ -125,7 +126,7 @@ def stated(mode: str, off_m: float, sigma: float | None = None) -> Callable[[int
 
     def make(seed: int) -> Case:
         simulation, rig, m = camera_rig(seed)
-        value = simulation.truth.T_imu_cam["cam0"][:3, 3] + [off_m, 0.0, 0.0]
+        value = simulation.truth.T_imu_sensor["cam0"][:3, 3] + [off_m, 0.0, 0.0]
         given = Parameter(mode, value, None if sigma is None else np.full(3, sigma))  # pyright: ignore[reportArgumentType]
         return simulation, rig.with_(cameras=(replace(rig.cameras[0], translation=given), *rig.cameras[1:])), m
 
@@ -151,7 +152,7 @@ def robot(**stated_noise: float) -> Callable[[int], Case]:
 
     def make(seed: int) -> Case:
         scenario = load_scenario(PAPER / "table2-ramp.yaml")
-        lidars = tuple(replace(x, azimuth_steps=150) for x in scenario.lidars)
+        scenario = scenario.with_sensors(*(replace(x, azimuth_steps=150) for x in scenario.of(SimLidar)))
         none: dict[str, Any] = {
             "cameras": (),
             "features": None,
@@ -159,7 +160,7 @@ def robot(**stated_noise: float) -> Callable[[int], Case]:
             "target": NoTarget(),
             "T_world_bodies": np.zeros((0, 4, 4)),
         }
-        simulation = simulate(replace(scenario, duration_s=20.0, lidars=lidars, **none), seed)
+        simulation = simulate(replace(scenario, duration_s=20.0, **none), seed)
         rig = with_drawn_guess(rig_for(simulation.scenario, settings=ten_runs.SETTINGS), simulation.scenario, seed)
         own = {k: v for k, v in stated_noise.items() if k != "range_noise_m"}
         wheels = tuple(replace(w, **{k: v * getattr(w, k) for k, v in own.items()}) for w in rig.wheels)

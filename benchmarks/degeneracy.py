@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.base.text_files import write_texts
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.montecarlo import RunRecord, StudyPlan, run_study
 from icalib.tools.montecarlo.study import scenario_digest
 from icalib.tools.simulation import Scenario, load_scenario
@@ -52,10 +53,9 @@ def variant(motion: str, noise: float) -> Scenario:
     assert features is not None
     share = PER_IMAGE / features.per_image
     return replace(
-        scenario,
+        scenario.with_sensors(*(replace(x, azimuth_steps=AZIMUTH_STEPS) for x in scenario.of(SimLidar))),
         duration_s=SECONDS,
         imu_noise=scenario.imu_noise.scaled(noise),
-        lidars=tuple(replace(x, azimuth_steps=AZIMUTH_STEPS) for x in scenario.lidars),
         features=replace(
             features,
             per_image=PER_IMAGE,

@@ -27,18 +27,11 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, PoseSensor, Rig
 from icalib.sensors.imu.spec import class_imperfections
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.truth import error, true_value
-from icalib.tools.simulation import (
-    Drive,
-    Room,
-    Scenario,
-    SimPoses,
-    Simulation,
-    handheld,
-    load_scenario,
-    rig_for,
-    simulate,
-)
+from icalib.tools.simulation import Drive, Room, Scenario, Simulation, handheld, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
 FAR = 4.0  # standard deviations
@@ -68,7 +61,7 @@ def _pose(vector_z: float, position: Sequence[float]) -> np.ndarray:
 
 
 def _mocap() -> SimPoses:
-    return SimPoses("mocap0", _pose(0.3, [0.1, -0.2, 0.15]), "absolute", _pose(2.0, [3.0, -1.0, 0.5]), 0.0123)
+    return SimPoses("mocap0", _pose(0.3, [0.1, -0.2, 0.15]), 0.0123, T_world_frame=_pose(2.0, [3.0, -1.0, 0.5]))
 
 
 def camera_imu() -> Scenario:
@@ -82,28 +75,27 @@ def tracks_imu() -> Scenario:
     scenario = load_scenario(PAPER / "table2-3d.yaml")
     assert scenario.features is not None
     features = replace(scenario.features, per_image=60, count=900, persistent=120)
-    alone = {"cameras": scenario.cameras[:1], "lidars": (), "wheels": ()}
-    return replace(scenario, duration_s=8.0, features=features, **alone)
+    return replace(scenario, duration_s=8.0, features=features, cameras=scenario.cameras[:1], sensors=())
 
 
 def lidar_imu() -> Scenario:
     """A LiDAR that moves freely in a room, 10 s."""
     scenario = load_scenario(PAPER / "table2-3d.yaml")
-    lidars = tuple(replace(x, azimuth_steps=450) for x in scenario.lidars)
-    return replace(scenario, duration_s=10.0, cameras=(), features=None, wheels=(), lidars=lidars)
+    lidars = tuple(replace(x, azimuth_steps=450) for x in scenario.of(SimLidar))
+    return replace(scenario, duration_s=10.0, cameras=(), features=None, sensors=lidars)
 
 
 def poses_imu() -> Scenario:
     """Motion capture of a body that moves freely, 10 s."""
     room, motion = Room((8.0, 6.0, 3.0)), Drive("free", exact=True)
-    return Scenario((), duration_s=10.0, motion=motion, board=False, room=room, poses=(_mocap(),))
+    return Scenario((), duration_s=10.0, motion=motion, board=False, room=room, sensors=(_mocap(),))
 
 
 def wheels_poses_imu() -> Scenario:
     """Wheels on hills before motion capture, 20 s."""
     scenario = load_scenario(PAPER / "table2-ramp.yaml")
-    wheels = tuple(replace(w, noise=ENCODER) for w in scenario.wheels)
-    return replace(scenario, duration_s=20.0, cameras=(), features=None, lidars=(), wheels=wheels, poses=(_mocap(),))
+    wheels = tuple(replace(w, noise=ENCODER) for w in scenario.of(SimWheels))
+    return replace(scenario, duration_s=20.0, cameras=(), features=None, sensors=(*wheels, _mocap()))
 
 
 def camera_wheels() -> Scenario:
@@ -111,8 +103,8 @@ def camera_wheels() -> Scenario:
     scenario = load_scenario(PAPER / "table2-ramp.yaml")
     cameras = tuple(replace(c, corner_noise_px=0.15) for c in scenario.cameras[:1])
     board = {"board": True, "T_world_board": ON_WALL, "target": AprilGrid(4, 10, 0.6, 0.3)}
-    wheels = tuple(replace(w, noise=ENCODER) for w in scenario.wheels)
-    return replace(scenario, duration_s=20.0, cameras=cameras, features=None, lidars=(), wheels=wheels, **board)
+    wheels = tuple(replace(w, noise=ENCODER) for w in scenario.of(SimWheels))
+    return replace(scenario, duration_s=20.0, cameras=cameras, features=None, sensors=wheels, **board)
 
 
 @dataclass(frozen=True)
@@ -148,7 +140,7 @@ def with_effect(scenario: Scenario, effect: str, times: float, seed: int) -> Sce
         return replace(scenario, target_size=float(1.0 + times * signs[0] * SIZE_SIGMA))
     if effect == SCALE:
         scale = float(1.0 + times * signs[0] * PoseSensor.scale_sigma)
-        return replace(scenario, poses=tuple(replace(p, scale=scale) for p in scenario.poses))
+        return scenario.with_sensors(*(replace(p, scale=scale) for p in scenario.of(SimPoses)))
     return scenario
 
 

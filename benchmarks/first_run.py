@@ -22,6 +22,7 @@ from memory import in_a_process
 from rendered import rig_of, scenario_of
 
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Scenario, film, load_scenario, simulate, write_film, write_sensors
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -68,7 +69,7 @@ def _rendered(folder: Path) -> tuple[Path, Path]:
 def _lidar(folder: Path) -> tuple[Path, Path]:
     """A LiDAR in a room, in free motion."""
     scenario = load_scenario(ROOT / "examples" / "paper" / "table2-3d.yaml")
-    scenario = replace(scenario, duration_s=SECONDS, cameras=(), wheels=(), features=None)
+    scenario = replace(scenario, duration_s=SECONDS, cameras=(), sensors=scenario.of(SimLidar), features=None)
     bag = folder / "recording.bag"
     write_sensors(simulate(scenario, 0), 0, bag)
     return _rig_file(scenario, folder), bag

@@ -42,9 +42,9 @@ if __name__ == "__main__":
 def turned(scenario: Scenario, angle: float) -> Scenario:
     """cam1 turned about its x axis [rad]."""
     cam0, cam1 = scenario.cameras
-    T, c, s = cam1.T_imu_cam.copy(), np.cos(angle), np.sin(angle)
+    T, c, s = cam1.T_imu_sensor.copy(), np.cos(angle), np.sin(angle)
     T[:3, :3] = T[:3, :3] @ [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]
-    return replace(scenario, cameras=(cam0, replace(cam1, T_imu_cam=T)))
+    return replace(scenario, cameras=(cam0, replace(cam1, T_imu_sensor=T)))
 
 
 def record(folder: Path, seconds: float) -> None:

@@ -16,9 +16,9 @@ import yaml
 
 from icalib.cli import main
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.simulation import (
     Scenario,
-    SimPoses,
     Simulation,
     handheld,
     load_scenario,
@@ -27,7 +27,7 @@ from icalib.tools.simulation import (
     write_sensors,
     write_tables,
 )
-from icalib.tools.simulation.bag_writer import IMU, IMU_TOPIC, BagForm, BagWriter
+from icalib.tools.simulation.output.bag_writer import IMU, IMU_TOPIC, BagForm, BagWriter
 
 _AT = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 _ABOVE = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1]]"
@@ -125,8 +125,8 @@ def _stopping() -> Scenario:
     clock = {"rate_hz": 1.0, "phase_s": 0.5, "time_offset_s": 0.0, "clock_origin_ns": _START_NS}
     camera = dataclasses.replace(scenario.cameras[0], **clock)
     mount = np.array(yaml.safe_load(_AT), dtype=float)
-    poses = SimPoses("pose0", mount, "absolute", np.eye(4), rotation_noise=2e-3, position_noise=1e-3, **clock)
-    return dataclasses.replace(scenario, cameras=(camera,), poses=(poses,), imu_clock_origin_ns=_START_NS)
+    poses = SimPoses("pose0", mount, rotation_noise=2e-3, position_noise=1e-3, **clock)
+    return dataclasses.replace(scenario, cameras=(camera,), sensors=(poses,), imu_clock_origin_ns=_START_NS)
 
 
 def _write_recording(folder: Path, name: str, made: Simulation, rigs: dict[str, tuple[str, ...]]) -> None:

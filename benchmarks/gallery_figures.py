@@ -45,8 +45,7 @@ def tracks() -> np.ndarray:
     scenario = replace(
         scenario,
         cameras=(camera,),
-        lidars=(),
-        wheels=(),
+        sensors=(),
         features=None,
         target=NoTarget(),
         T_world_bodies=np.zeros((0, 4, 4)),

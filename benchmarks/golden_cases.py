@@ -14,6 +14,7 @@ from icalib.data.recordings import open_recording
 from icalib.pipeline import measure
 from icalib.rig import Rig
 from icalib.rig.file import load_rig
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,7 +48,7 @@ def _robot(motion: str, lidar_alone: bool = False) -> Case:
     def case(data: Path) -> tuple[Rig, list[Measurements]]:
         scenario = replace(load_scenario(ROOT / "examples" / "paper" / f"{motion}.yaml"), duration_s=SECONDS)
         if lidar_alone:
-            scenario = replace(scenario, cameras=(), wheels=(), features=None)
+            scenario = replace(scenario, cameras=(), sensors=scenario.of(SimLidar), features=None)
         rig = rig_for(scenario, intrinsics="free", distortion="free")
         return with_drawn_guess(rig, scenario, SEED), [simulate(scenario, SEED).measurements]
 

@@ -18,6 +18,7 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[1] / "examples" / "paper"
@@ -55,8 +56,8 @@ def main() -> None:
 
 def _simulated(motion: str, seconds: float, steps: int) -> Simulation:
     scenario = load_scenario(PAPER / f"table2-{motion}.yaml")
-    lidar = replace(scenario.lidars[0], rate_hz=RATE_HZ, azimuth_steps=steps)
-    alone = replace(scenario, duration_s=seconds, cameras=(), wheels=(), features=None, board=False, lidars=(lidar,))
+    lidar = replace(scenario.of(SimLidar)[0], rate_hz=RATE_HZ, azimuth_steps=steps)
+    alone = replace(scenario, duration_s=seconds, cameras=(), features=None, board=False, sensors=(lidar,))
     return simulate(alone, 1)
 
 
@@ -69,7 +70,7 @@ def _recording(simulation: Simulation) -> tuple[Rig, Measurements]:
 
 def _errors(simulation: Simulation, result) -> None:
     name = result.lidar_residuals[0].sensor
-    T, truth = result.T_imu_sensor(name), simulation.truth.T_imu_lidar[name]
+    T, truth = result.T_imu_sensor(name), simulation.truth.T_imu_sensor[name]
     cosine = 0.5 * (np.trace(truth[:3, :3].T @ T[:3, :3]) - 1.0)
     off_us = 1e6 * (result.group(name, "time_offset").value[0] - simulation.truth.time_offset[name])
     way_mm = 1e3 * np.linalg.norm(T[:3, 3] - truth[:3, 3])

@@ -17,10 +17,13 @@ import numpy as np
 
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.one_run import compare
 from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.statistics import Nees, Sample, nees
-from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, handheld, load_scenario, rig_for, simulate
+from icalib.tools.simulation import Drive, Room, Scenario, handheld, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
 FALSE_ALARMS = 1e-3  # in a round, where standard deviations are honest
@@ -67,7 +70,7 @@ def _pose(turn: float, position: list[float]) -> np.ndarray:
 
 
 def _mocap() -> SimPoses:
-    return SimPoses("mocap0", _pose(0.3, [0.1, -0.2, 0.15]), "absolute", _pose(2.0, [3.0, -1.0, 0.5]), 0.0123)
+    return SimPoses("mocap0", _pose(0.3, [0.1, -0.2, 0.15]), 0.0123, T_world_frame=_pose(2.0, [3.0, -1.0, 0.5]))
 
 
 def _rig(scenario: Scenario) -> Rig:
@@ -102,23 +105,17 @@ def _tracks() -> Case:
     scenario = load_scenario(PAPER / "table2-3d.yaml")
     assert scenario.features is not None
     features = replace(scenario.features, per_image=40, count=600, persistent=80)
-    alone = {"cameras": scenario.cameras[:1], "lidars": (), "wheels": ()}
-    scenario = replace(scenario, duration_s=5.0, features=features, **alone)
+    scenario = replace(scenario, duration_s=5.0, features=features, cameras=scenario.cameras[:1], sensors=())
     return Case(scenario, _rig(scenario), 30)
 
 
 def _drive() -> Case:
     """A robot on hills with a LiDAR, wheels and motion capture."""
     scenario = load_scenario(PAPER / "table2-ramp.yaml")
-    scenario = replace(
-        scenario,
-        duration_s=6.0,
-        cameras=(),
-        features=None,
-        poses=(_mocap(),),
-        lidars=tuple(replace(x, azimuth_steps=200) for x in scenario.lidars),
-        wheels=tuple(replace(w, noise=0.005) for w in scenario.wheels),
-    )
+    lidars = tuple(replace(x, azimuth_steps=200) for x in scenario.of(SimLidar))
+    wheels = tuple(replace(w, noise=0.005) for w in scenario.of(SimWheels))
+    sensors = (*lidars, *wheels, _mocap())
+    scenario = replace(scenario, duration_s=6.0, cameras=(), features=None, sensors=sensors)
     return Case(scenario, _rig(scenario), 20, ("lidar", "wheel", "mocap"))
 
 
@@ -126,7 +123,7 @@ def _poses() -> Case:
     """Motion capture, and another program's odometry, which drifts."""
     odometry = replace(_mocap(), name="odom0", kind="relative", rotation_noise=5e-3, position_noise=1e-2)
     room, motion = Room((8.0, 6.0, 3.0)), Drive("free", exact=True)
-    scenario = Scenario((), duration_s=5.0, motion=motion, board=False, room=room, poses=(_mocap(), odometry))
+    scenario = Scenario((), duration_s=5.0, motion=motion, board=False, room=room, sensors=(_mocap(), odometry))
     return Case(scenario, _rig(scenario), 30, ("mocap", "odom"))
 
 

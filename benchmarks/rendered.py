@@ -120,7 +120,7 @@ def _rendered(options: argparse.Namespace, scenario: Scenario, seed: int) -> Pat
 def errors(result: Calibration, truth: Truth, camera: str) -> np.ndarray:
     """(6,): errors of rotation [deg], translation [mm] and time offset [us], each before its ratio to the standard
     deviation that the result states."""
-    T, true = result.T_imu_sensor(camera), truth.T_imu_cam[camera]
+    T, true = result.T_imu_sensor(camera), truth.T_imu_sensor[camera]
     apart = true[:3, :3].T @ T[:3, :3]
     sine = 0.5 * np.linalg.norm([apart[2, 1] - apart[1, 2], apart[0, 2] - apart[2, 0], apart[1, 0] - apart[0, 1]])
     error = [

@@ -61,10 +61,10 @@ def run(case: Case, seed: int) -> tuple[dict[str, float], float, float]:
 
 
 def _errors(found: Calibration, truth: Truth, block: str) -> tuple[np.ndarray, np.ndarray]:
-    groups = [g for g in found.groups if g.name == block and g.columns is not None and g.sensor in truth.T_imu_cam]
+    groups = [g for g in found.groups if g.name == block and g.columns is not None and g.sensor in truth.T_imu_sensor]
     errors = []
     for g in groups:
-        T = truth.T_imu_cam[g.sensor]
+        T = truth.T_imu_sensor[g.sensor]
         if block == "rotation":
             errors.append(Rotation.from_matrix(T[:3, :3].T @ g.value).as_rotvec())
         else:

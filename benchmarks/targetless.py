@@ -97,7 +97,7 @@ def _calibrated(
     share = nees(whole[-1:]).mean
     for camera, found in rows.items():
         intrinsics = result.group(camera, "intrinsics")
-        fx = abs(intrinsics.value[0] - simulation.truth.intrinsics[camera][0])
+        fx = abs(intrinsics.value[0] - simulation.truth.values[camera]["intrinsics"][0])
         found.append(np.append(errors(result, simulation.truth, camera), [fx, fx / intrinsics.std[0]]))
         end = f"{share:>8.2f}{spent[0]:>8.1f}{spent[1]:>7.1f}   {result.converged}"
         print(f"{f'{seed} {camera}':<14}{_line(found[-1])}{end}", flush=True)
@@ -150,7 +150,9 @@ def scenario_of(kind: str, duration_s: float, rate_hz: float) -> Scenario:
     if kind == "stereo":
         aside = np.eye(4)
         aside[0, 3] = BASELINE_M
-        other = dataclasses.replace(base.cameras[1], T_imu_cam=camera.T_imu_cam @ aside, rate_hz=rate_hz, phase_s=0.0)
+        other = dataclasses.replace(
+            base.cameras[1], T_imu_sensor=camera.T_imu_sensor @ aside, rate_hz=rate_hz, phase_s=0.0
+        )
         cameras.append(other)
     if kind == "robot":
         cameras = list(base.cameras)
@@ -159,8 +161,7 @@ def scenario_of(kind: str, duration_s: float, rate_hz: float) -> Scenario:
         duration_s=duration_s,
         cameras=tuple(cameras),
         features=None,
-        lidars=base.lidars if kind in ("lidar", "robot") else (),
-        wheels=base.wheels if kind in ("wheels", "robot") else (),
+        sensors=tuple(s for s in base.sensors if kind in (s.sensor_type, "robot")),
     )
 
 

@@ -88,7 +88,7 @@ def contradicted_prior(seed: int) -> tuple[Rig, Measurements]:
     """The position of cam0, measured to 5 mm and typed 60 mm off."""
     rig, measurements = recorded(handheld(15.0), seed)
     cam0, cam1 = rig.cameras
-    truth = handheld(15.0).cameras[0].T_imu_cam[:3, 3]
+    truth = handheld(15.0).cameras[0].T_imu_sensor[:3, 3]
     stated = Parameter("prior", truth + [0.06, 0.0, 0.0], sigma=np.full(3, 0.005))
     return rig.with_(cameras=(replace(cam0, translation=stated), cam1)), measurements
 

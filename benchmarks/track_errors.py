@@ -56,7 +56,7 @@ def views_of(simulation: Simulation, stream: TrackStream) -> Views:
     camera = next(c for c in simulation.scenario.cameras if c.name == stream.name)
     seconds = (stream.stamps_ns - camera.clock_origin_ns) * 1e-9 + camera.time_offset_s
     rotation, position, _ = simulation.truth.pose_at(seconds)
-    R, C = rotation @ camera.T_imu_cam[:3, :3], position + rotation @ camera.T_imu_cam[:3, 3]
+    R, C = rotation @ camera.T_imu_sensor[:3, :3], position + rotation @ camera.T_imu_sensor[:3, 3]
     image = np.repeat(np.arange(len(stream.stamps_ns)), np.diff(stream.start))
     order = np.lexsort((image, stream.feature))
     track, image = np.unique(stream.feature[order], return_inverse=True)[1], image[order]

@@ -35,7 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0, help="of the recording (60)")
     seconds = parser.parse_args().seconds
-    scenario = replace(load_scenario(SCENARIO), lidars=(), wheels=(), duration_s=seconds)
+    scenario = replace(load_scenario(SCENARIO), sensors=(), duration_s=seconds)
     simulation, rig = simulate(scenario, 1), _rig(rig_for(scenario, intrinsics="start", distortion="start"))
     calibrate_measurements(rig, simulation.measurements)  # compiles
     print(f"load before: {os.getloadavg()[0]:.1f}")

@@ -58,7 +58,7 @@ ORDER = (
     ("pipeline",),
     ("report",),
     ("sensors.*.show",),
-    ("export",),
+    ("export", "tools.simulation.output"),
     ("tools", "tools.batch", "tools.simulation.scenario"),
     ("tools.simulation.sensors",),
     ("tools.simulation.images", "sensors.*.simulate"),

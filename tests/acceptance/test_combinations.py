@@ -17,17 +17,11 @@ from icalib.geometry.targets import AprilGrid, Markers, NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.truth import error, true_value
-from icalib.tools.simulation import (
-    Features,
-    Scenario,
-    SimPoses,
-    Simulation,
-    load_scenario,
-    rig_for,
-    simulate,
-    with_drawn_guess,
-)
+from icalib.tools.simulation import Features, Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 SECONDS, SEED = 8.0, 5
@@ -78,13 +72,13 @@ def recording(tags_on_walls: Callable) -> Callable[[str], Simulation]:
     """The paper's robot on hills, of fewer points and images: one drive, before a board, tags or points."""
     base = load_scenario(PAPER / "table2-ramp.yaml")
     assert base.room is not None
+    lidars = tuple(replace(x, azimuth_steps=100) for x in base.of(SimLidar))
+    wheels = tuple(replace(w, noise=0.005, allowed_slip=1e-4) for w in base.of(SimWheels))
     robot = replace(
         base,
         duration_s=SECONDS,
         cameras=tuple(replace(c, rate_hz=8.0, phase_s=0.0, corner_noise_px=0.2) for c in base.cameras),
-        lidars=tuple(replace(x, azimuth_steps=100) for x in base.lidars),
-        wheels=tuple(replace(w, noise=0.005, allowed_slip=1e-4) for w in base.wheels),
-        poses=(MOCAP,),
+        sensors=(*lidars, *wheels, MOCAP),
         features=None,
     )
     tags = Markers("tag36h11", TAG_M, tuple(range(4 * TAGS_A_WALL)))
@@ -154,7 +148,7 @@ def body(rig: Rig, simulation: Simulation) -> tuple[np.ndarray, float]:
     if rig.imu is not None:
         return np.eye(4), 0.0
     truth = simulation.truth
-    return (truth.T_imu_cam | truth.T_imu_pose)[rig.body], float(truth.time_offset[rig.body])
+    return truth.T_imu_sensor[rig.body], float(truth.time_offset[rig.body])
 
 
 def wrong(result: Calibration, rig: Rig, simulation: Simulation) -> list[str]:

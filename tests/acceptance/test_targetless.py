@@ -25,8 +25,7 @@ def recorded(tmp_path_factory):
     scenario = replace(
         scenario,
         cameras=(camera,),
-        lidars=(),
-        wheels=(),
+        sensors=(),
         features=None,
         target=NoTarget(),
         T_world_bodies=np.zeros((0, 4, 4)),
@@ -48,13 +47,13 @@ def test_a_camera_is_calibrated_from_raw_images_of_a_room(recorded, tmp_path, mo
     found = icalib.calibrate(rig, path)
     assert found.converged
     groups = {g.name: g for g in found.groups if g.sensor == "cam0"}
-    T = truth.T_imu_cam["cam0"]
+    T = truth.T_imu_sensor["cam0"]
     turn = so3.log(T[:3, :3].T @ groups["rotation"].value)
     errors = {
         "rotation": turn,
         "translation": groups["translation"].value - T[:3, 3],
         "time_offset": groups["time_offset"].value - truth.time_offset["cam0"],
-        "intrinsics": groups["intrinsics"].value - truth.intrinsics["cam0"],
+        "intrinsics": groups["intrinsics"].value - truth.values["cam0"]["intrinsics"],
     }
     most = {"rotation": np.radians(0.1), "translation": 0.02, "time_offset": 2e-4, "intrinsics": 0.5}
     for name, error in errors.items():

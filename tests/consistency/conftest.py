@@ -13,6 +13,8 @@ from icalib.data.measurements import Measurements
 from icalib.geometry.targets import AprilGrid, NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.one_run import compare
 from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.statistics import Nees, Sample, nees
@@ -65,7 +67,8 @@ def consistency():
 def make_robot(example: str, seconds: float, parts: str, azimuth_steps: int = 150, **changes) -> Scenario:
     """The paper's robot with some of its `parts`: c a camera and a wall of tags, l a LiDAR of few points, w wheels."""
     scenario = load_scenario(PAPER / f"table2-{example}.yaml")
-    lidars = tuple(replace(x, azimuth_steps=azimuth_steps) for x in scenario.lidars)
+    lidars = tuple(replace(x, azimuth_steps=azimuth_steps) for x in scenario.of(SimLidar) if "l" in parts)
+    wheels = tuple(replace(w, noise=ENCODER) for w in scenario.of(SimWheels) if "w" in parts)
     camera = replace(scenario.cameras[0], corner_noise_px=0.15)
     board = {"board": True, "T_world_board": ON_WALL, "target": WALL_GRID}
     if "c" not in parts:
@@ -75,8 +78,7 @@ def make_robot(example: str, seconds: float, parts: str, azimuth_steps: int = 15
         duration_s=seconds,
         features=None,
         cameras=(camera,) if "c" in parts else (),
-        lidars=lidars if "l" in parts else (),
-        wheels=tuple(replace(w, noise=ENCODER) for w in scenario.wheels) if "w" in parts else (),
+        sensors=(*lidars, *wheels),
         **board,
         **changes,
     )

@@ -36,7 +36,7 @@ def solved(monkeypatch) -> list[Rig]:
 
 def measured(scenario: Scenario, imu: bool) -> tuple[Rig, Measurements, Rig]:
     """The rig from nothing, what it measured, and the rig at its true values."""
-    truth = rig_for(scenario, rotation="fixed", translation="fixed", drive="fixed")
+    truth = rig_for(scenario, rotation="fixed", translation="fixed", others="fixed")
     if not imu:
         rig, measurements, _ = without_imu(scenario, SEED)
         return rig, measurements, truth
@@ -51,7 +51,7 @@ def with_value(rig: Rig, name: str, value: np.ndarray, sigma: float | None = Non
 def drive(robot, kind: str) -> tuple[Scenario, bool]:
     """A robot by what shows its motion, and whether it has an IMU; or by what its wheels report."""
     if kind == "mocap":
-        scenario = robot("planar", SECONDS, "w", poses=(mocap(),))
+        scenario = robot("planar", SECONDS, "w").with_sensors(mocap())
         return replace(scenario, motion=replace(scenario.motion, seed=3)), False
     if kind in ("twist", "steering"):
         return reporting(robot("ramp", SECONDS, "cw"), kind), True

@@ -17,8 +17,10 @@ from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.truth import error, true_value
-from icalib.tools.simulation import Drive, Scenario, SimPoses, Simulation, load_scenario, rig_for, simulate
+from icalib.tools.simulation import Drive, Scenario, Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 MOUNT = ("rotation", "translation", "time_offset")
@@ -73,7 +75,7 @@ def check_known(result: Calibration, simulation: Simulation, count: int) -> None
 
 
 def test_wheels_and_motion_capture_on_ramps(robot, tmp_path):
-    scenario = replace(robot("ramp", 20.0, "w"), poses=(mocap(),))
+    scenario = robot("ramp", 20.0, "w").with_sensors(mocap())
     rig, measurements, simulation = without_imu(scenario)
     result = calibrate_measurements(rig, measurements)
     check_known(result, simulation, 10)
@@ -111,7 +113,7 @@ def test_a_target_that_is_out_of_sight_for_long(robot, seed):
 def test_two_pose_sensors(robot):
     """What is called hand-eye calibration."""
     poses = (mocap(), mocap("slam0", T_OTHER, time_offset_s=-0.02, rate_hz=30.0))
-    scenario = replace(robot("3d", 12.0, ""), poses=poses)
+    scenario = robot("3d", 12.0, "").with_sensors(*poses)
     rig, measurements, simulation = without_imu(scenario)
     result = calibrate_measurements(rig, measurements)
     check_known(result, simulation, 7)
@@ -120,7 +122,7 @@ def test_two_pose_sensors(robot):
 
 
 def test_on_a_flat_floor_height_and_roll_remain_open(robot):
-    rig, measurements, simulation = without_imu(replace(robot("planar", 20.0, "w"), poses=(mocap(),)))
+    rig, measurements, simulation = without_imu(robot("planar", 20.0, "w").with_sensors(mocap()))
     result = calibrate_measurements(rig, measurements)
     assert result.converged, result.status
     assert result.group("wheel0", "rotation").verdict[0] == "undetermined"
@@ -134,7 +136,7 @@ def test_cameras_that_follow_points_and_motion_capture_from_nothing(robot):
     """Of the camera there is no guess, lens included; the body is the motion capture's."""
     scenario = load_scenario(PAPER / "table2-3d.yaml")
     camera = replace(scenario.cameras[0], corner_noise_px=0.3)
-    scenario = replace(scenario, duration_s=12.0, cameras=(camera,), lidars=(), wheels=(), poses=(mocap(),))
+    scenario = replace(scenario, duration_s=12.0, cameras=(camera,), sensors=(mocap(),))
     simulation = simulate(replace(scenario, imu_noise_enabled=False), 0)
     rig = rig_for(scenario, intrinsics="free", distortion="free").with_(imu=None)
     result = calibrate_measurements(rig, simulation.measurements.without("imu0"))
@@ -144,7 +146,7 @@ def test_cameras_that_follow_points_and_motion_capture_from_nothing(robot):
 
 def test_one_arc_all_the_time_is_refused(robot):
     """What its wheels then show is one ratio, no radii and no baseline."""
-    scenario = replace(robot("planar", 20.0, "w"), motion=Drive("arc"), poses=(mocap(),))
+    scenario = replace(robot("planar", 20.0, "w").with_sensors(mocap()), motion=Drive("arc"))
     rig, measurements, _ = without_imu(scenario)
     with pytest.raises(EstimationError, match="the yaw rate was nearly constant"):
         calibrate_measurements(rig, measurements)
@@ -154,9 +156,9 @@ def followed_by_wheels(example: str, seed: int, drive: str) -> tuple[Rig, Measur
     """A camera that follows points, wheels, and nothing else; of the camera nothing is known."""
     scenario = load_scenario(PAPER / f"table2-{example}.yaml")
     cameras = tuple(replace(c, corner_noise_px=0.5) for c in scenario.cameras[:1])
-    scenario = replace(scenario, duration_s=15.0, cameras=cameras, lidars=())
+    scenario = replace(scenario, duration_s=15.0, cameras=cameras, sensors=scenario.of(SimWheels))
     simulation = simulate(scenario, seed)
-    rig = rig_for(scenario, intrinsics="free", distortion="free", drive=drive)  # pyright: ignore
+    rig = rig_for(scenario, intrinsics="free", distortion="free", others=drive)  # pyright: ignore
     return rig.with_(imu=None), simulation.measurements.without("imu0"), simulation
 
 
@@ -189,7 +191,7 @@ def test_what_wheels_do_not_show_to_cameras_that_follow_points(example, drive, w
 def test_nees(robot):
     """Of what does not hang on the slip that the rig file allows for, and simulated wheels do not have: yaw, pitch and
     sideways are known far better than their standard deviations say."""
-    scenario = replace(robot("ramp", 20.0, "w"), poses=(mocap(),))
+    scenario = robot("ramp", 20.0, "w").with_sensors(mocap())
     seen = np.array([0, 3, 5, 6, 7, 8, 9])  # roll, x, z, time offset, radii, baseline
     runs = []
     for seed in range(20):
@@ -217,7 +219,7 @@ def test_nees_of_a_camera_and_wheels(robot):
 def test_the_clock_of_wheels_that_say_more_than_the_poses(robot):
     """The rate of a node is the mean until the next. Carried backwards as well, it goes with the noise of one neighbour
     more than with the other's, and the time offset is off by 0.6 ms, three standard deviations."""
-    scenario = replace(robot("ramp", 20.0, "w"), poses=(mocap(),))
+    scenario = robot("ramp", 20.0, "w").with_sensors(mocap())
     normal = []
     for seed in (15, 16, 17, 19):
         rig, measurements, simulation = without_imu(scenario, seed)
@@ -231,5 +233,5 @@ def test_poses_of_half_a_degree_and_a_centimetre(robot, first):
     """As a target that is seen from far, and motion capture, whichever is the body."""
     poor = mocap("cam0", T_OTHER, rotation_noise=0.01, position_noise=0.01, time_offset_s=-0.02, rate_hz=30.0)
     poses = (mocap(), poor) if first == "mocap0" else (poor, mocap())
-    rig, measurements, simulation = without_imu(replace(robot("3d", 20.0, ""), poses=poses))
+    rig, measurements, simulation = without_imu(robot("3d", 20.0, "").with_sensors(*poses))
     check_known(calibrate_measurements(rig, measurements), simulation, 7)

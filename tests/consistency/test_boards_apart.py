@@ -26,7 +26,7 @@ def boards_apart(noiseless: bool = False, front: int = 1) -> Scenario:
     """Two cameras, waved between two walls, each with a grid before it; front: grids on the first wall."""
     base = handheld(5.0, noiseless=noiseless)
     cam0, cam1 = (replace(c, time_offset_s=0.0, rate_hz=5.0, phase_s=0.0) for c in base.cameras)
-    cam1 = replace(cam1, T_imu_cam=cam0.T_imu_cam @ BACK)
+    cam1 = replace(cam1, T_imu_sensor=cam0.T_imu_sensor @ BACK)
     T_world_cam0 = base.T_world_board @ np.diag([1.0, -1.0, -1.0, 1.0])
     T_world_cam0[:3, 3] += DISTANCE_M * base.T_world_board[:3, 2]
     columns = 6 // front

@@ -78,10 +78,10 @@ def test_a_clock_that_jumps(simulation):
 
 def test_a_camera_that_moves_on_its_mount(simulation):
     cam0, cam1 = simulation.scenario.cameras
-    T = cam0.T_imu_cam.copy()
+    T = cam0.T_imu_sensor.copy()
     T[:3, 3] += [0.0, 0.003, 0.0]
     result = calibrated(
-        simulation, spliced(simulation, replace(simulation.scenario, cameras=(replace(cam0, T_imu_cam=T), cam1)))
+        simulation, spliced(simulation, replace(simulation.scenario, cameras=(replace(cam0, T_imu_sensor=T), cam1)))
     )
     assert re.search(r"cam\d changes near (9|10|11)\.\d+ s: it moves on its mount", result.reasons[0]), result.reasons
 

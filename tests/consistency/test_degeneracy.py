@@ -37,7 +37,7 @@ def guessed(simulation: Simulation, seed: int, mode: str) -> Rig:
 
     rig, cameras = rig_for(simulation.scenario), []
     for camera in rig.cameras:
-        T, offset = simulation.truth.T_imu_cam[camera.name], simulation.truth.time_offset[camera.name]
+        T, offset = simulation.truth.T_imu_sensor[camera.name], simulation.truth.time_offset[camera.name]
         turn = Rotation.from_rotvec(ROTATION_RAD * rng.normal(size=3)).as_matrix()
         cameras.append(
             dataclasses.replace(
@@ -53,7 +53,7 @@ def guessed(simulation: Simulation, seed: int, mode: str) -> Rig:
 def errors_in_sigma(result: Calibration, simulation: Simulation) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:
     """By block of a camera: errors over formal standard deviations, and verdicts."""
     found = {}
-    for camera, T in simulation.truth.T_imu_cam.items():
+    for camera, T in simulation.truth.T_imu_sensor.items():
         R = result.group(camera, "rotation").value
         error = {
             "rotation": Rotation.from_matrix(T[:3, :3].T @ R).as_rotvec(),

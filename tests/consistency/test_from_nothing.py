@@ -15,9 +15,11 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.initialize.start import start
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.montecarlo.one_run import RunTask, run
 from icalib.tools.montecarlo.statistics import Sample, nees
-from icalib.tools.simulation import Scenario, SimPoses, load_scenario, rig_for, simulate
+from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 
@@ -36,8 +38,8 @@ def check(scenario: Scenario, seed: int, flat: bool) -> None:
 @pytest.mark.parametrize(("example", "seed"), [("planar", 4000), ("ramp", 4000)])
 def test_cameras_that_follow_points(example, seed):
     scenario = load_scenario(PAPER / f"table2-{example}.yaml")
-    lidars = tuple(replace(x, azimuth_steps=300) for x in scenario.lidars)
-    scenario = replace(scenario, duration_s=20.0, cameras=scenario.cameras[:2], lidars=lidars, wheels=())
+    lidars = tuple(replace(x, azimuth_steps=300) for x in scenario.of(SimLidar))
+    scenario = replace(scenario, duration_s=20.0, cameras=scenario.cameras[:2], sensors=lidars)
     check(scenario, seed, example == "planar")
 
 
@@ -47,7 +49,7 @@ def test_a_camera_that_sees_a_target_from_a_flat_floor(robot):
 
 def test_motion_capture_shows_it_as_well(robot):
     mocap = SimPoses("mocap0", np.eye(4), rotation_noise=1e-3, position_noise=5e-4)
-    check(replace(robot("planar", 20.0, "c"), poses=(mocap,)), 4, True)
+    check(robot("planar", 20.0, "c").with_sensors(mocap), 4, True)
 
 
 def test_where_the_lidar_shows_nothing_either_the_camera_says_what_is_missing(robot):

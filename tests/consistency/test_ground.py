@@ -11,6 +11,7 @@ from tests.typed import not_none
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Ground, Parameter, Rig
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
 
@@ -39,10 +40,10 @@ def check_known(result: Calibration, simulation: Simulation) -> None:
 def check_upright(result: Calibration, simulation: Simulation) -> None:
     """Roll and pitch to 0.03 deg, and so the baseline."""
     turn, baseline = result.group("wheel0", "rotation"), result.group("wheel0", "baseline")
-    off = error("rotation", turn.value, simulation.truth.T_imu_wheel["wheel0"][:3, :3])
+    off = error("rotation", turn.value, simulation.truth.T_imu_sensor["wheel0"][:3, :3])
     assert turn.verdict[:2] == ("determined", "determined") and baseline.verdict == ("determined",)
     assert np.rad2deg(np.abs(off[:2])).max() < 0.03 and np.rad2deg(turn.std_formal[:2]).max() < 0.03
-    assert abs(baseline.value[0] - simulation.truth.drive["wheel0"]["baseline"][0]) < 1.5e-3
+    assert abs(baseline.value[0] - simulation.truth.values["wheel0"]["baseline"][0]) < 1.5e-3
 
 
 def test_a_flat_floor_that_the_lidar_sees(robot):
@@ -55,20 +56,20 @@ def test_a_flat_floor_that_the_lidar_sees(robot):
     assert any("lidar0 translation z with wheel0 translation z" in words for words in result.undetermined)
     assert result.group("wheel0", "ground_height").std_formal[0] == pytest.approx(HEIGHT, rel=0.05)
 
-    (lidar,), mean = rig.lidars, simulation.truth.T_imu_lidar["lidar0"][:3, 3] + [0.1, 0.1, TAPE_M]
+    (lidar,), mean = rig.lidars, simulation.truth.T_imu_sensor["lidar0"][:3, 3] + [0.1, 0.1, TAPE_M]
     tape = Parameter("prior", mean, np.array([1.0, 1.0, TAPE_M]))
     rig = rig.with_(lidars=(replace(lidar, translation=tape),))
     result = calibrate_measurements(rig, simulation.measurements)
     check_known(result, simulation)
     lower = result.group("wheel0", "translation")
     assert lower.std_formal[2] == pytest.approx(np.hypot(TAPE_M, HEIGHT), rel=0.1)
-    assert abs((lower.value - simulation.truth.T_imu_wheel["wheel0"][:3, 3])[2] - TAPE_M) < 1e-3
+    assert abs((lower.value - simulation.truth.T_imu_sensor["wheel0"][:3, 3])[2] - TAPE_M) < 1e-3
 
 
 def test_a_known_height_of_the_lidar_leaves_the_sigma_of_the_floors_height(robot):
     scenario = robot("planar", 12.0, "lw")
     simulation, rig = simulate(scenario, 0), standing(scenario, 0, FLOOR)
-    (lidar,), there = rig.lidars, simulation.truth.T_imu_lidar["lidar0"][:3, 3]
+    (lidar,), there = rig.lidars, simulation.truth.T_imu_sensor["lidar0"][:3, 3]
     rig = rig.with_(lidars=(replace(lidar, translation=Parameter("fixed", there)),))
     result = calibrate_measurements(rig, simulation.measurements)
     check_known(result, simulation)
@@ -79,7 +80,9 @@ def test_a_known_height_of_the_lidar_leaves_the_sigma_of_the_floors_height(robot
 
 def under_the_target(scenario: Scenario, simulation: Simulation) -> float:
     """Of the wheels' frame on the floor, over the origin of the world, which is that of the target."""
-    wheel = simulation.truth.position[0] + simulation.truth.R_world_imu[0] @ scenario.wheels[0].T_imu_wheel[:3, 3]
+    wheel = (
+        simulation.truth.position[0] + simulation.truth.R_world_imu[0] @ scenario.of(SimWheels)[0].T_imu_sensor[:3, 3]
+    )
     return float(wheel[2] - simulation.truth.T_world_bodies[0, 2, 3])
 
 

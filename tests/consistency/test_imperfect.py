@@ -13,7 +13,8 @@ from tests.typed import not_none
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
 from icalib.sensors.imu.spec import class_imperfections
-from icalib.tools.simulation import SimPoses, handheld, rig_for, simulate
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def test_a_baseline_carries_the_uncertainty_of_the_target():
 def test_size_and_scale_are_found_where_an_ideal_imu_shows_them():
     """Without noise, and with priors so wide that they do not pull."""
     poses = (SimPoses("mocap0", np.eye(4), rate_hz=50.0, scale=0.99),)
-    scenario = replace(handheld(6.0, noiseless=True), target_size=1.02, poses=poses, robot_noise_enabled=False)
+    scenario = replace(handheld(6.0, noiseless=True), target_size=1.02, sensors=poses, robot_noise_enabled=False)
     scenario = replace(scenario, cameras=tuple(replace(c, rate_hz=10.0) for c in scenario.cameras[:1]))
     rig = rig_for(scenario)
     rig = rig.with_(

@@ -13,6 +13,7 @@ from icalib.geometry import so3
 from icalib.initialize.start import start
 from icalib.motion.factor import of_type
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -21,7 +22,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 @pytest.fixture(scope="module")
 def settled():
     """Cameras that follow points and a LiDAR, and where they are estimated to be."""
-    scenario = replace(load_scenario(EXAMPLE), duration_s=8.0, wheels=())
+    scenario = load_scenario(EXAMPLE)
+    scenario = replace(scenario, duration_s=8.0, sensors=scenario.of(SimLidar))
     rig = with_drawn_guess(rig_for(scenario), scenario, 0)
     inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
     return inputs, estimate(inputs, state)

@@ -12,6 +12,7 @@ from tests.typed import not_none
 
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.montecarlo.one_run import compare
 from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
 from icalib.tools.simulation.rigs import Treatment
@@ -25,10 +26,9 @@ def thin(motion: str, noise: float, seconds: float = SECONDS) -> Scenario:
     """A little of the example's motion with few points, and an IMU `noise` times as noisy as its data sheet says."""
     scenario = load_scenario(PAPER / f"{motion}.yaml")
     return replace(
-        scenario,
+        scenario.with_sensors(*(replace(x, azimuth_steps=300) for x in scenario.of(SimLidar))),
         duration_s=seconds,
         imu_noise=scenario.imu_noise.scaled(noise),
-        lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
         features=replace(not_none(scenario.features), per_image=30, count=450, persistent=60),
     )
 

@@ -42,6 +42,6 @@ def test_pairs_that_were_not_exposed_together_are_left_out_and_told(late: tuple[
     for residuals in result.corner_residuals:
         image = np.repeat(np.arange(30), np.diff(residuals.start))
         assert set(image[residuals.rejected].tolist()) == set(late)
-    truth = np.linalg.inv(simulation.truth.T_imu_cam["cam0"]) @ simulation.truth.T_imu_cam["cam1"]
+    truth = np.linalg.inv(simulation.truth.T_imu_sensor["cam0"]) @ simulation.truth.T_imu_sensor["cam1"]
     group = result.group("cam1", "translation")
     assert (np.abs(group.value - truth[:3, 3]) / group.std).max() < 4.0

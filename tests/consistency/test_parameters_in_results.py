@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import yaml
@@ -12,18 +10,19 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result.summary import calibration_yaml, parameter_keys
 from icalib.result.verdict import by_size, worst
 from icalib.rig.kinds import SENSOR_TYPES, SPECS
+from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.sensor import MOUNTED
 from icalib.tools.comparison.compare import compare_sides
 from icalib.tools.comparison.results import side_of_result
 from icalib.tools.montecarlo.truth import true_value
-from icalib.tools.simulation import SimPoses, rig_for, simulate
+from icalib.tools.simulation import rig_for, simulate
 
 pytestmark = pytest.mark.slow
 
 
 def test_every_parameter_of_a_robot_is_in_its_result(robot):
     scenario = robot("ramp", 20.0, "clw")
-    scenario = replace(scenario, poses=(SimPoses("mocap0", scenario.cameras[0].T_imu_cam),))
+    scenario = scenario.with_sensors(SimPoses("mocap0", scenario.cameras[0].T_imu_sensor))
     rig, simulation = rig_for(scenario, intrinsics="free", distortion="free"), simulate(scenario, 0)
     assert rig.imu is not None
     result = calibrate_measurements(rig, simulation.measurements)

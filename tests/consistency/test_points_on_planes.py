@@ -13,6 +13,7 @@ from tests.typed import not_none
 
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.montecarlo.one_run import compare
 from icalib.tools.montecarlo.statistics import Sample, nees
 from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
@@ -29,8 +30,7 @@ def scenario_of(example: str, seed: int, relief_m: float = RELIEF_M) -> Scenario
         scenario,
         duration_s=10.0,
         cameras=scenario.cameras[:1],
-        lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
-        wheels=(),
+        sensors=tuple(replace(x, azimuth_steps=300) for x in scenario.of(SimLidar)),
         features=replace(not_none(scenario.features), relief_m=relief_m, seed=seed),
     )
 
@@ -49,7 +49,7 @@ def between(result: Calibration, simulation: Simulation) -> tuple[float, float]:
     """Of the camera's height over the LiDAR's: its error and its standard deviation [m]."""
     camera, lidar = (result.group(name, "translation") for name in ("cam0", "lidar0"))
     truth = simulation.truth
-    off = camera.value - lidar.value - truth.T_imu_cam["cam0"][:3, 3] + truth.T_imu_lidar["lidar0"][:3, 3]
+    off = camera.value - lidar.value - truth.T_imu_sensor["cam0"][:3, 3] + truth.T_imu_sensor["lidar0"][:3, 3]
     i, j = not_none(camera.columns)[2], not_none(lidar.columns)[2]
     C = result.covariance
     return float(off[2]), float(np.sqrt(C[i, i] + C[j, j] - 2.0 * C[i, j]))

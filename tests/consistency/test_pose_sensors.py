@@ -13,8 +13,9 @@ from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import relative_poses
+from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.montecarlo.truth import error, true_value
-from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, handheld, rig_for, simulate
+from icalib.tools.simulation import Drive, Room, Scenario, handheld, rig_for, simulate
 from icalib.tools.simulation.scenario.robot import DriveKind
 
 ROOM = Room((8.0, 6.0, 3.0))
@@ -34,8 +35,8 @@ def sensor(kind, name="mocap0", **others):
     return SimPoses(
         name,
         pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]),
-        kind,
-        pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
+        kind=kind,
+        T_world_frame=pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
         **({"time_offset_s": 0.0123, "clock_origin_ns": 777, "phase_s": 0.003} | others),
         rotation_noise=turn,
         position_noise=way,
@@ -44,7 +45,7 @@ def sensor(kind, name="mocap0", **others):
 
 def alone(kind, motion: DriveKind = "free", exact=True, **others):
     drive = Drive(motion, exact=exact)
-    return Scenario((), duration_s=12.0, motion=drive, board=False, room=ROOM, poses=(sensor(kind),), **others)
+    return Scenario((), duration_s=12.0, motion=drive, board=False, room=ROOM, sensors=(sensor(kind),), **others)
 
 
 def errors(result, truth, name):
@@ -74,7 +75,7 @@ def test_beside_a_camera_it_is_recovered(kind):
     """The target gives the motion, the world is the target's; frames still are anywhere. Poses are taken at stamps of
     the IMU: between these the simulated rates are constant, and the scheme takes them to be linear."""
     poses = (sensor(kind, clock_origin_ns=10**18, rate_hz=50.0, phase_s=0.0),)
-    scenario = replace(handheld(8.0, noiseless=True), poses=poses)
+    scenario = replace(handheld(8.0, noiseless=True), sensors=poses)
     scenario = replace(scenario, robot_noise_enabled=False, cameras=scenario.cameras[:1])
     sim = simulate(scenario, 1)
     result = calibrate_measurements(rig_for(scenario), sim.measurements)
@@ -139,7 +140,7 @@ def test_planar_motion_leaves_height_open():
 def test_two_of_them_and_one_gives_the_motion():
     mocap = sensor("absolute")
     odom = replace(sensor("relative", "odom0", rate_hz=20.0), T_imu_sensor=pose([0.0, 0.4, -0.3], [-0.2, 0.1, 0.0]))
-    scenario = replace(alone("absolute"), poses=(mocap, odom))
+    scenario = replace(alone("absolute"), sensors=(mocap, odom))
     sim = simulate(scenario, 6)
     result = calibrate_measurements(rig_for(scenario), sim.measurements)
     for name in ("mocap0", "odom0"):
@@ -149,9 +150,10 @@ def test_two_of_them_and_one_gives_the_motion():
 
 def test_two_recordings_share_what_is_calibrated():
     """Each has a world and a frame of its own; the frame was put up anew in between."""
-    scenario = replace(handheld(6.0), poses=(sensor("absolute", clock_origin_ns=10**18, rate_hz=50.0),))
+    scenario = replace(handheld(6.0), sensors=(sensor("absolute", clock_origin_ns=10**18, rate_hz=50.0),))
     scenario = replace(scenario, cameras=scenario.cameras[:1])
-    other = replace(scenario, poses=(replace(scenario.poses[0], T_world_frame=pose([0.0, -0.3, 1.0], [0, 1, 2])),))
+    (mocap,) = scenario.of(SimPoses)
+    other = scenario.with_sensors(replace(mocap, T_world_frame=pose([0.0, -0.3, 1.0], [0, 1, 2])))
     sims = [simulate(scenario, 1), simulate(other, 2)]
     both = calibrate_measurements(rig_for(scenario), [s.measurements for s in sims])
     one = calibrate_measurements(rig_for(scenario), sims[0].measurements)
@@ -166,7 +168,8 @@ def test_two_recordings_without_any_other_sensor(kind):
     scenario = alone(kind)
     short = replace(scenario, duration_s=8.0)
     if kind == "absolute":
-        short = replace(short, poses=(replace(short.poses[0], T_world_frame=pose([0.0, -0.3, 1.0], [0, 1, 2])),))
+        (mocap,) = short.of(SimPoses)
+        short = short.with_sensors(replace(mocap, T_world_frame=pose([0.0, -0.3, 1.0], [0, 1, 2])))
     sims = [simulate(short, 3), simulate(scenario, 4)]
     both = calibrate_measurements(rig_for(scenario), [s.measurements for s in sims])
     one = calibrate_measurements(rig_for(scenario), sims[1].measurements)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from tests.consistency.test_assumed_motion import without_imu
 from tests.consistency.test_upwards import level
@@ -22,7 +20,7 @@ WRONG = [
 
 @pytest.fixture(scope="module", params=["planar", "ramp"])
 def recorded(request, robot):
-    return without_imu(replace(robot(request.param, 12.0, "w"), poses=(level(),)))
+    return without_imu(robot(request.param, 12.0, "w").with_sensors(level()))
 
 
 @pytest.mark.parametrize(("way", "words"), WRONG)

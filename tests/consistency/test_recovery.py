@@ -19,7 +19,7 @@ from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, sim
 
 def extrinsics_error(result: Calibration, simulation: Simulation, camera: str) -> tuple[float, float, float]:
     """rad, m, s."""
-    T = simulation.truth.T_imu_cam[camera]
+    T = simulation.truth.T_imu_sensor[camera]
     turn = Rotation.from_matrix(T[:3, :3].T @ result.group(camera, "rotation").value).magnitude()
     move = np.linalg.norm(result.group(camera, "translation").value - T[:3, 3])
     offset = result.group(camera, "time_offset").value[0] - simulation.truth.time_offset[camera]
@@ -35,7 +35,7 @@ def test_noiseless_recordings_are_recovered_from_nothing(asynchronous: bool):
     for camera in ("cam0", "cam1"):
         assert max(extrinsics_error(result, simulation, camera)) < 1e-8
         intrinsics = result.group(camera, "intrinsics").value
-        assert intrinsics == pytest.approx(np.array(simulation.truth.intrinsics[camera]), rel=1e-8)
+        assert intrinsics == pytest.approx(np.array(simulation.truth.values[camera]["intrinsics"]), rel=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,9 @@ def test_wide_lenses_are_recovered_from_nothing(model: str, intrinsics: tuple, d
     turn[:3, :3] = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
     scenario = handheld(12.0, noiseless=True)
     cameras = tuple(
-        dataclasses.replace(c, model=model, intrinsics=intrinsics, distortion=distortion, T_imu_cam=c.T_imu_cam @ turn)
+        dataclasses.replace(
+            c, model=model, intrinsics=intrinsics, distortion=distortion, T_imu_sensor=c.T_imu_sensor @ turn
+        )
         for c in scenario.cameras
     )
     motion = dataclasses.replace(scenario.motion, distance_m=0.35)

@@ -21,7 +21,7 @@ LENS, MOUNT = ("cam0", "distortion"), ("cam0", "translation")
 def estimated():
     made = handheld(10.0)
     simulation, rig = simulate(made, 3), rig_for(made)
-    p = simulation.truth.T_imu_cam["cam0"][:3, 3]
+    p = simulation.truth.T_imu_sensor["cam0"][:3, 3]
     own = replace(rig.cameras[0], translation=Parameter("prior", p + 1e-3, np.full(3, 1e-3)))
     inputs, state, guess = start(rig.with_(cameras=(own, *rig.cameras[1:])), [simulation.measurements])
     return inputs, determine(inputs, state, guess=guess).estimate

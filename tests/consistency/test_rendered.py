@@ -68,12 +68,12 @@ def standardised(result: Calibration, truth: Truth, block: str) -> np.ndarray:
     """Errors of one block of cam0 in formal standard deviations."""
     group = result.group("cam0", block)
     if block == "rotation":
-        error = Rotation.from_matrix(truth.T_imu_cam["cam0"][:3, :3].T @ group.value).as_rotvec()
+        error = Rotation.from_matrix(truth.T_imu_sensor["cam0"][:3, :3].T @ group.value).as_rotvec()
         return error / group.std_formal
     true = {
-        "translation": truth.T_imu_cam["cam0"][:3, 3],
+        "translation": truth.T_imu_sensor["cam0"][:3, 3],
         "time_offset": [truth.time_offset["cam0"]],
-        "intrinsics": truth.intrinsics["cam0"],
+        "intrinsics": truth.values["cam0"]["intrinsics"],
     }
     return (group.value - true[block]) / group.std_formal
 

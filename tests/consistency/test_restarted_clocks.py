@@ -18,7 +18,8 @@ from icalib.geometry.targets import NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, joint_covariance, load_calibration
 from icalib.rig import Parameter, Rig
-from icalib.tools.simulation import Scenario, SimPoses, Simulation, load_scenario, rig_for, simulate
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 T_IMU_MOCAP = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
@@ -164,7 +165,7 @@ def test_a_recording_with_nothing_of_a_sensor_is_named(robot):
 
 def test_cameras_that_follow_points(robot):
     """Without a target: tracks of both recordings, the second camera's clock set back between them."""
-    scenario = replace(load_scenario(PAPER / "table2-3d.yaml"), lidars=(), wheels=(), duration_s=8.0)
+    scenario = replace(load_scenario(PAPER / "table2-3d.yaml"), sensors=(), duration_s=8.0)
     first, second, third = scenario.cameras
     later = replace(second, clock_origin_ns=second.clock_origin_ns - round(1e9 * SET_BACK_S["c"]))
     simulations = simulate(scenario, 1), simulate(replace(scenario, cameras=(first, later, third)), 2)
@@ -181,9 +182,9 @@ def test_cameras_that_follow_points(robot):
 @pytest.mark.parametrize("parts", ["c", ""])
 def test_a_pose_sensor(robot, parts):
     """Beside a camera, and as what shows the motion."""
-    scenario = replace(robot("3d", 14.0, parts), poses=(mocap(),))
+    scenario = robot("3d", 14.0, parts).with_sensors(mocap())
     later = replace(mocap(), clock_origin_ns=mocap().clock_origin_ns + 77 * 10**9)
-    simulations = simulate(scenario, 1), simulate(replace(scenario, duration_s=12.0, poses=(later,)), 2)
+    simulations = simulate(scenario, 1), simulate(replace(scenario.with_sensors(later), duration_s=12.0), 2)
     rig, free = rig_for(scenario), Parameter()
     poses = (replace(rig.poses[0], rotation=free, translation=free, time_offset=free, clock_restarts=True),)
     result = joint(simulations, rig.with_(poses=poses))

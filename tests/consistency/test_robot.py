@@ -98,7 +98,7 @@ def test_a_target_far_away_shows_the_lever_arm(robot):
     for seed in range(4):
         simulation = simulate(robot("ramp", 20.0, "c"), seed)
         found = initial_guess(rig_for(simulation.scenario), simulation.measurements).cameras["cam0"]
-        off.append(found.position - simulation.truth.T_imu_cam["cam0"][:3, 3])
+        off.append(found.position - simulation.truth.T_imu_sensor["cam0"][:3, 3])
     assert np.sqrt(np.mean(np.square(off))) < 0.1
 
 
@@ -156,7 +156,7 @@ def test_a_flat_floor_with_no_guess_at_all(robot):
     result = calibrate_measurements(rig_for(scenario), simulation.measurements.unassociated())
     check_known(result, simulation)
     wheels = result.group("wheel0", "translation")
-    off = wheels.value - simulation.truth.T_imu_wheel["wheel0"][:3, 3]
+    off = wheels.value - simulation.truth.T_imu_sensor["wheel0"][:3, 3]
     assert abs(off[2]) > 0.3 and wheels.verdict[2] == "undetermined"
     assert (np.abs(off) < 2.0 * wheels.std_formal).all()
 
@@ -230,7 +230,7 @@ def check_outliers(robot, seed: int, damage, case: Case) -> None:
     rig = replace(rig, settings=replace(rig.settings, loss="huber"))
     result = calibrate_measurements(rig, damage(simulation.measurements, seed))
     check_known(result, simulation)
-    T = simulation.truth.T_imu_lidar["lidar0"]
+    T = simulation.truth.T_imu_sensor["lidar0"]
     assert np.linalg.norm(result.group("lidar0", "translation").value - T[:3, 3]) < 3e-3
     assert np.rad2deg(np.linalg.norm(error("rotation", result.group("lidar0", "rotation").value, T[:3, :3]))) < 0.03
 

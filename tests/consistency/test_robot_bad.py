@@ -169,7 +169,7 @@ def test_a_corridor_is_told(drive, seconds: float, faces: list[int], known: bool
     assert any("planes that lidar0 saw face two directions only, as in a corridor" in w for w in result.warnings)
     translation = result.group("lidar0", "translation")
     sure = np.array([v != "undetermined" for v in translation.verdict])
-    off = translation.value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
+    off = translation.value - simulation.truth.T_imu_sensor["lidar0"][:3, 3]
     assert (np.abs(off) < 4.0 * translation.std)[sure].all()
 
 
@@ -199,7 +199,7 @@ def test_points_without_numbers_and_at_zero_are_left_out(drive):
     simulation = drive("3d", 12.0, "l")
     result = calibrated(simulation, damage)
     assert result.converged and not any("directions only" in w for w in result.warnings)
-    off = result.group("lidar0", "translation").value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
+    off = result.group("lidar0", "translation").value - simulation.truth.T_imu_sensor["lidar0"][:3, 3]
     assert np.linalg.norm(off) < 5e-3
 
 
@@ -217,7 +217,7 @@ def test_points_on_the_robot_itself_are_left_out_and_told(drive):
     simulation = drive("3d", 12.0, "l")
     result = calibrated(simulation, damage)
     assert result.converged and [w for w in result.warnings if "lidar0 has self-returns" in w]
-    truth = simulation.truth.T_imu_lidar["lidar0"]
+    truth = simulation.truth.T_imu_sensor["lidar0"]
     off = {"rotation": np.zeros(3), "translation": result.group("lidar0", "translation").value - truth[:3, 3]}
     off["rotation"] = so3.log(np.ascontiguousarray(truth[:3, :3].T @ result.group("lidar0", "rotation").value))
     for name, error in off.items():

@@ -15,8 +15,8 @@ from icalib.initialize.start import start
 from icalib.optim.state import State
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Rig, Wheels
+from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.simulation import Simulation, rig_for, simulate
-from icalib.tools.simulation.scenario.robot import SimPoses
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 ON_TOP = np.array([[1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, 0.2], [0.0, 1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
@@ -28,7 +28,7 @@ KINDS = ("cameras", "lidars", "wheels", "poses")
 @pytest.fixture(scope="module")
 def simulation(robot) -> Simulation:
     scenario = robot("ramp", 12.0, "cw")
-    return simulate(replace(scenario, poses=(SimPoses("mocap", ON_TOP, rate_hz=50.0, time_offset_s=0.01),)), 1)
+    return simulate(scenario.with_sensors(SimPoses("mocap", ON_TOP, rate_hz=50.0, time_offset_s=0.01)), 1)
 
 
 def group(sensor: Sensor, name: str) -> np.ndarray:

@@ -13,7 +13,9 @@ import pytest
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter
-from icalib.tools.simulation import Scenario, SimPoses, handheld, simulate
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.sensors.wheels.simulate import SimWheels
+from icalib.tools.simulation import Scenario, handheld, simulate
 
 OFF = 1.03  # true over stated lengths
 
@@ -31,7 +33,7 @@ def stereo() -> Scenario:
 def mocap() -> Scenario:
     scenario = handheld(6.0)
     cameras = tuple(replace(c, rate_hz=10.0) for c in scenario.cameras[:1])
-    return replace(scenario, cameras=cameras, poses=(SimPoses("mocap0", np.eye(4), rate_hz=50.0),))
+    return replace(scenario, cameras=cameras, sensors=(SimPoses("mocap0", np.eye(4), rate_hz=50.0),))
 
 
 def calibrated(
@@ -41,10 +43,10 @@ def calibrated(
     scale."""
     wrong = replace(scenario, target_size=OFF)
     if not scenario.board:
-        wrong = replace(scenario, poses=tuple(replace(p, scale=OFF) for p in scenario.poses))
+        wrong = scenario.with_sensors(*(replace(p, scale=OFF) for p in scenario.of(SimPoses)))
     rig = program.rig_of(wrong, program.Kind(lambda: wrong, imu, (), "fixed"))
     if wheels_known:
-        radii = Parameter("fixed", np.array(scenario.wheels[0].radii))
+        radii = Parameter("fixed", np.array(scenario.of(SimWheels)[0].radii))
         rig = rig.with_(wheels=tuple(replace(w, radii=radii) for w in rig.wheels))
     measured = simulate(wrong, 1).measurements
     return calibrate_measurements(rig, measured if imu else measured.without("imu0"))

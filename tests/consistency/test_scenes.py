@@ -40,13 +40,13 @@ def free(scenario: Scenario) -> Rig:
 
 def camera_errors(result: Calibration, simulation: Simulation, camera: str) -> list[float]:
     """rad, m, s, relative."""
-    T = simulation.truth.T_imu_cam[camera]
+    T = simulation.truth.T_imu_sensor[camera]
     found = result.group(camera, "intrinsics").value
     return [
         Rotation.from_matrix(T[:3, :3].T @ result.group(camera, "rotation").value).magnitude(),
         float(np.linalg.norm(result.group(camera, "translation").value - T[:3, 3])),
         abs(float(result.group(camera, "time_offset").value[0] - simulation.truth.time_offset[camera])),
-        float(np.abs(found / simulation.truth.intrinsics[camera] - 1.0).max()),
+        float(np.abs(found / simulation.truth.values[camera]["intrinsics"] - 1.0).max()),
     ]
 
 
@@ -80,7 +80,7 @@ def test_a_scene_without_an_imu():
     rig = free(simulation.scenario).with_(imu=None)
     result = calibrate_measurements(rig, simulation.measurements.without("imu0"))
     assert max(scene_errors(result, simulation)) < 1e-7
-    T0, T1 = (simulation.truth.T_imu_cam[c] for c in ("cam0", "cam1"))
+    T0, T1 = (simulation.truth.T_imu_sensor[c] for c in ("cam0", "cam1"))
     np.testing.assert_allclose(result.T_imu_sensor("cam1"), np.linalg.inv(T0) @ T1, atol=1e-7)
 
 

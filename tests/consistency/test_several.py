@@ -55,12 +55,12 @@ def joint(simulations: tuple[Simulation, ...], rig: Rig | None = None) -> Calibr
 def errors(result: Calibration, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
     """Estimated minus true (n,) of all that the recordings share, and their columns."""
     found, columns = [], []
-    for camera, T in truth.T_imu_cam.items():
+    for camera, T in truth.T_imu_sensor.items():
         true = {
             "translation": T[:3, 3],
             "time_offset": np.array([truth.time_offset[camera]]),
-            "intrinsics": truth.intrinsics[camera],
-            "distortion": truth.distortion[camera],
+            "intrinsics": truth.values[camera]["intrinsics"],
+            "distortion": truth.values[camera]["distortion"],
         }
         for name in GROUPS:
             g = result.group(camera, name)
@@ -231,7 +231,7 @@ def test_without_an_imu_recordings_are_more_images():
     assert len(both.trajectory.seconds) == sum(len(m.cameras[0].stamps_ns) for m in recordings)
     counts = np.bincount(both.recording_of(both.trajectory.seconds))
     assert counts.tolist() == [len(m.cameras[0].stamps_ns) for m in recordings]
-    g, truth = both.group("cam0", "intrinsics"), simulations[0].truth.intrinsics["cam0"]
+    g, truth = both.group("cam0", "intrinsics"), simulations[0].truth.values["cam0"]["intrinsics"]
     assert np.abs((g.value - truth) / g.std_formal).max() < 4.0
     assert (g.std_formal < 0.9 * alone.group("cam0", "intrinsics").std_formal).all()
 
@@ -265,7 +265,7 @@ def test_a_recording_on_wheels_needs_another():
         calibrate_measurements(rig, wheels.measurements)
     result = calibrate_measurements(rig, [wheels.measurements, hand.measurements])
     assert result.converged, result.status
-    for camera, T in hand.truth.T_imu_cam.items():
+    for camera, T in hand.truth.T_imu_sensor.items():
         np.testing.assert_allclose(result.T_imu_sensor(camera), T, atol=1e-8)
 
 

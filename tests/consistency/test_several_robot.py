@@ -35,8 +35,7 @@ def another_day(scenario: Scenario) -> Scenario:
         accel_bias=(0.1, -0.1, 0.05),
         imu_clock_origin_ns=scenario.imu_clock_origin_ns - MONTH_NS,
         cameras=earlier(scenario.cameras),
-        lidars=earlier(scenario.lidars),
-        wheels=earlier(scenario.wheels),
+        sensors=earlier(scenario.sensors),
     )
 
 

@@ -42,7 +42,7 @@ def stated(rig: Rig, name: str, value: np.ndarray, sigma: float | None = None) -
 
 
 def truth(simulation: Simulation, name: str) -> np.ndarray:
-    rig = rig_for(simulation.scenario, rotation="fixed", translation="fixed", time_offset="fixed", drive="fixed")
+    rig = rig_for(simulation.scenario, rotation="fixed", translation="fixed", time_offset="fixed", others="fixed")
     sensor = rig.wheels[0] if rig.wheels and name in drive_names(rig.wheels[0].kind) else rig.cameras[0]
     value = getattr(sensor, name).value
     assert value is not None
@@ -94,7 +94,7 @@ def test_a_wrong_rotation_is_named_and_nothing_else(simulation, sigma):
 
 
 def test_true_wheels_are_no_news(driven):
-    rig = rig_for(driven.scenario, drive="fixed")
+    rig = rig_for(driven.scenario, others="fixed")
     result = calibrate_measurements(rig, driven.measurements)
     assert result.converged and said(result) == []
 

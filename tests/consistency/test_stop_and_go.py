@@ -19,8 +19,9 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
 from icalib.sensors.parameter import fixed
+from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.montecarlo.truth import error
-from icalib.tools.simulation import Drive, Scenario, SimPoses, handheld, rig_for, simulate
+from icalib.tools.simulation import Drive, Scenario, handheld, rig_for, simulate
 
 MOUNT, FRAME = pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]), pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5])
 
@@ -38,8 +39,7 @@ def stills(count: int, noisy: bool = True, seed: int = 0, **motion) -> Stills:
     flange = SimPoses(
         "flange",
         MOUNT,
-        "absolute",
-        FRAME,
+        T_world_frame=FRAME,
         time_offset_s=0.0,
         clock_origin_ns=0,
         phase_s=0.5,
@@ -50,7 +50,7 @@ def stills(count: int, noisy: bool = True, seed: int = 0, **motion) -> Stills:
     scenario = replace(
         scenario,
         cameras=(camera,),
-        poses=(flange,),
+        sensors=(flange,),
         imu_clock_origin_ns=0,
         robot_noise_enabled=noisy,
         motion=replace(scenario.motion, **motion),
@@ -58,7 +58,7 @@ def stills(count: int, noisy: bool = True, seed: int = 0, **motion) -> Stills:
     sim = simulate(scenario, seed)
     rig = rig_for(scenario).with_(imu=None)
     rig = rig.with_(poses=(replace(rig.poses[0], rotation_noise=None, position_noise=None),))
-    T = np.linalg.inv(sim.truth.T_imu_cam[camera.name]) @ sim.truth.T_imu_pose["flange"]
+    T = np.linalg.inv(sim.truth.T_imu_sensor[camera.name]) @ sim.truth.T_imu_sensor["flange"]
     return Stills(rig, sim.measurements.without("imu0"), T)
 
 
@@ -218,11 +218,11 @@ def test_what_is_fixed_stays():
 def test_two_pose_sensors_at_rest(robot):
     same = {"rate_hz": 1.0, "time_offset_s": 0.0, "clock_origin_ns": 0, "phase_s": 0.5}
     poses = (mocap(**same), mocap("slam0", T_OTHER, **same))
-    scenario: Scenario = replace(robot("3d", 25.0, ""), poses=poses, motion=Drive("free"), imu_clock_origin_ns=0)
+    scenario: Scenario = replace(robot("3d", 25.0, ""), sensors=poses, motion=Drive("free"), imu_clock_origin_ns=0)
     sim = simulate(scenario, 0)
     rig = rig_for(scenario).with_(imu=None)
     result = calibrate_measurements(rig, sim.measurements.without("imu0"))
-    true = np.linalg.inv(sim.truth.T_imu_pose["mocap0"]) @ sim.truth.T_imu_pose["slam0"]
+    true = np.linalg.inv(sim.truth.T_imu_sensor["mocap0"]) @ sim.truth.T_imu_sensor["slam0"]
     e, P = off(result, true, "slam0")
     assert result.converged and np.abs(e / np.sqrt(np.diag(P))).max() < 4.0
 

@@ -58,7 +58,7 @@ def test_a_length_that_is_known_shows_the_size_too():
     made = handheld(SECONDS, exact=False)
     simulation, rig = simulate(made, 0), of_size(rig_for(made), 0.95)
     cameras = tuple(
-        replace(c, translation=replace(c.translation, mode="fixed", value=simulation.truth.T_imu_cam[c.name][:3, 3]))
+        replace(c, translation=replace(c.translation, mode="fixed", value=simulation.truth.T_imu_sensor[c.name][:3, 3]))
         for c in rig.cameras
     )
     inputs, state, guess = start(rig.with_(cameras=cameras), [simulation.measurements])
@@ -122,7 +122,7 @@ def test_a_recording_that_does_not_show_it_says_nothing():
     rig, simulation = rig_for(still), simulate(still, 0)
     cameras = []
     for c in rig.cameras:
-        T, offset = simulation.truth.T_imu_cam[c.name], simulation.truth.time_offset[c.name]
+        T, offset = simulation.truth.T_imu_sensor[c.name], simulation.truth.time_offset[c.name]
         known = {"rotation": Parameter("fixed", T[:3, :3]), "time_offset": Parameter("fixed", np.array([offset]))}
         cameras.append(replace(c, translation=Parameter("free", T[:3, 3]), **known))
     result = calibrate_measurements(rig.with_(cameras=tuple(cameras)), simulation.measurements)

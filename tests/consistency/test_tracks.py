@@ -31,7 +31,7 @@ EXACT = 1e-7  # rad, m, s; relative for intrinsics
 
 def table2(duration_s: float) -> Scenario:
     """IMU and three cameras of Table II that follow points of a room, alone."""
-    return replace(load_scenario(SCENARIO), lidars=(), wheels=(), duration_s=duration_s)
+    return replace(load_scenario(SCENARIO), sensors=(), duration_s=duration_s)
 
 
 def rig_of(scenario: Scenario, scale: float = 1.0) -> Rig:
@@ -70,7 +70,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
         state = resample(state, nodes_for(inputs, image_times(inputs, state.values)), inputs)
     _is_the_same_in_its_own_room(*not_none(last))
     for camera, stream in zip(scenario.cameras, streams, strict=True):
-        value, T = {name: state.values[camera.name, name] for name in CALIBRATED}, camera.T_imu_cam
+        value, T = {name: state.values[camera.name, name] for name in CALIBRATED}, camera.T_imu_sensor
         offset = simulation.truth.time_offset[camera.name] + origin_difference(inputs.measurements, stream)
         assert Rotation.from_matrix(T[:3, :3].T @ value["rotation"]).magnitude() < EXACT
         assert np.abs(value["translation"] - T[:3, 3]).max() < EXACT

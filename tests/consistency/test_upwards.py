@@ -13,7 +13,7 @@ from icalib.data.measurements import Measurements, WheelStream
 from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
-from icalib.tools.simulation import SimPoses
+from icalib.sensors.pose.simulate import SimPoses
 
 LEVEL = np.array([[0.0, 1.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]])
 
@@ -34,7 +34,7 @@ def said(result: Calibration) -> tuple[list[str], list[str]]:
 
 
 def test_a_level_frame_tells_swapped_wheels(robot):
-    rig, measurements, simulation = without_imu(replace(robot("ramp", 15.0, "w"), poses=(level(),)))
+    rig, measurements, simulation = without_imu(robot("ramp", 15.0, "w").with_sensors(level()))
     result = calibrate_measurements(rig, measurements)
     check_known(result, simulation, 10)
     assert said(result) == ([], [])
@@ -53,11 +53,11 @@ def test_a_level_frame_tells_swapped_wheels(robot):
 
 def test_signs_put_swapped_wheels_right(robot):
     """The frame then looks backwards, and each radius is that of the wheel on the other side."""
-    rig, measurements, simulation = without_imu(replace(robot("ramp", 15.0, "w"), poses=(level(),)))
+    rig, measurements, simulation = without_imu(robot("ramp", 15.0, "w").with_sensors(level()))
     (wheels,) = swapped(measurements).wheels
     assert isinstance(wheels, WheelStream)
     result = calibrate_measurements(rig, measurements.with_streams(replace(wheels, rate=-wheels.rate)))
-    radii, true = result.group("wheel0", "radii"), simulation.truth.drive["wheel0"]["radii"]
+    radii, true = result.group("wheel0", "radii"), simulation.truth.values["wheel0"]["radii"]
     assert (np.abs(radii.value - true[::-1]) < 4.0 * radii.std).all()
 
 

@@ -10,6 +10,7 @@ from tests.consistency.test_robot import steady
 
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import WheelKind, drive_names
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Scenario, rig_for, simulate
 
@@ -20,7 +21,7 @@ KINDS: dict[str, WheelKind] = {"twist": "twist", "steering": "steered"}
 def reporting(scenario: Scenario, reports: str) -> Scenario:
     """Its wheels as good as the encoders of the other tests, with parameters that are not the defaults."""
     changed = replace(
-        scenario.wheels[0],
+        scenario.of(SimWheels)[0],
         reports=reports,
         scales=(1.03, 0.97),
         speed_noise=5e-4,
@@ -29,7 +30,7 @@ def reporting(scenario: Scenario, reports: str) -> Scenario:
         steering_offset=0.02,
         steering_noise=5e-4,
     )
-    return replace(scenario, wheels=(changed,))
+    return scenario.with_sensors(changed)
 
 
 def check(consistency, robot, reports: str, seeds: range, probability: float) -> None:
@@ -58,7 +59,7 @@ def test_a_straight_line_leaves_what_only_turning_shows(robot, reports, open_, k
     scenario = reporting(robot("planar", 20.0, "lw"), reports)
     scenario = replace(scenario, motion=replace(scenario.motion, kind="straight-line"))
     simulation = simulate(scenario, 0)
-    rig = rig_for(scenario, rotation="start", translation="start", time_offset="start", drive="start")
+    rig = rig_for(scenario, rotation="start", translation="start", time_offset="start", others="start")
     result = calibrate_measurements(rig, simulation.measurements)
     assert result.converged, result.status
     verdicts = {

@@ -40,11 +40,11 @@ def alone(simulation: Simulation) -> tuple[Rig, Measurements]:
 def errors(result: Calibration, simulation: Simulation) -> dict[tuple[str, str], np.ndarray]:
     """Estimated minus true by group; the truth of cam1's pose is that in cam0."""
     truth = simulation.truth
-    T = np.linalg.inv(truth.T_imu_cam["cam0"]) @ truth.T_imu_cam["cam1"]
+    T = np.linalg.inv(truth.T_imu_sensor["cam0"]) @ truth.T_imu_sensor["cam1"]
     found = {}
     for name in ("cam0", "cam1"):
-        found[name, "intrinsics"] = result.group(name, "intrinsics").value - truth.intrinsics[name]
-        found[name, "distortion"] = result.group(name, "distortion").value - truth.distortion[name]
+        found[name, "intrinsics"] = result.group(name, "intrinsics").value - truth.values[name]["intrinsics"]
+        found[name, "distortion"] = result.group(name, "distortion").value - truth.values[name]["distortion"]
     got = result.T_imu_sensor("cam1")
     found["cam1", "rotation"] = Rotation.from_matrix(T[:3, :3].T @ got[:3, :3]).as_rotvec()
     found["cam1", "translation"] = got[:3, 3] - T[:3, 3]
@@ -80,7 +80,7 @@ def test_one_camera_gives_its_intrinsics():
     rig = rig.with_(cameras=rig.cameras[:1])
     result = calibrate_measurements(rig, measurements.only("cam0"))
     found = result.group("cam0", "intrinsics")
-    assert np.abs((found.value - simulation.truth.intrinsics["cam0"]) / found.std).max() < 4.0
+    assert np.abs((found.value - simulation.truth.values["cam0"]["intrinsics"]) / found.std).max() < 4.0
     np.testing.assert_array_equal(result.T_imu_sensor("cam0"), np.eye(4))
 
 
@@ -94,7 +94,7 @@ def test_given_extrinsics_need_no_images_taken_together():
     simulation = simulate(stereo(apart_s=0.1), 1)
     rig, measurements = alone(simulation)
     truth = simulation.truth
-    T = np.linalg.inv(truth.T_imu_cam["cam0"]) @ truth.T_imu_cam["cam1"]
+    T = np.linalg.inv(truth.T_imu_sensor["cam0"]) @ truth.T_imu_sensor["cam1"]
     second = dataclasses.replace(rig.cameras[1], rotation=fixed(T[:3, :3]), translation=fixed(T[:3, 3]))
     result = calibrate_measurements(rig.with_(cameras=(rig.cameras[0], second)), measurements)
     assert result.converged, result.status

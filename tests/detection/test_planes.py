@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.detection.planes.planes import PlaneSearch, find_planes
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import load_scenario, simulate
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -31,8 +32,8 @@ def room():
     """Points of a room and where they were seen from, in the world, by a trajectory wrong by up to 1 cm and 0.5 deg;
     the face of each."""
     scenario = load_scenario(EXAMPLE)
-    lidar = replace(scenario.lidars[0], azimuth_steps=900)
-    scenario = replace(scenario, duration_s=10.0, cameras=(), wheels=(), features=None, board=False, lidars=(lidar,))
+    lidar = replace(scenario.of(SimLidar)[0], azimuth_steps=900)
+    scenario = replace(scenario, duration_s=10.0, cameras=(), features=None, board=False, sensors=(lidar,))
     simulation = simulate(scenario, 2)
     stream, truth, rng = simulation.measurements.lidars[0], simulation.truth, np.random.default_rng(0)
     stamps = (stream.stamps_ns - truth.imu_clock_origin_ns) * 1e-9 + lidar.time_offset_s
@@ -40,8 +41,8 @@ def room():
     columns, of_point = np.unique(np.round(times, 6), return_inverse=True)
     R, p, _ = truth.pose_at(columns)
     R = R @ Rotation.from_rotvec(smooth(rng, columns, np.deg2rad(0.5))).as_matrix()
-    p = p + smooth(rng, columns, 0.01) + R @ lidar.T_imu_lidar[:3, 3]
-    R = R @ lidar.T_imu_lidar[:3, :3]
+    p = p + smooth(rng, columns, 0.01) + R @ lidar.T_imu_sensor[:3, 3]
+    R = R @ lidar.T_imu_sensor[:3, :3]
     return np.einsum("nij,nj->ni", R[of_point], stream.xyz) + p[of_point], p[of_point], stream.plane
 
 

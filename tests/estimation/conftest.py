@@ -37,6 +37,7 @@ from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.lidar.residual import LidarFactor
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, simulate
 
 TOLERANCE = {
@@ -164,14 +165,14 @@ def make_setup(
             values[body, "rotation"], values[body, "translation"] = R_body, p_body
     times = []
     for c in measurements.cameras:
-        T = truth.T_imu_cam[c.name]
+        T = truth.T_imu_sensor[c.name]
         offset = truth.time_offset[c.name] + (c.origin_ns - not_none(measurements.imu).origin_ns) * 1e-9
         parameters = {
             "rotation": T[:3, :3].copy(),
             "translation": T[:3, 3].copy(),
             "time_offset": np.array([offset]),
-            "intrinsics": truth.intrinsics[c.name].copy(),
-            "distortion": truth.distortion[c.name].copy(),
+            "intrinsics": truth.values[c.name]["intrinsics"].copy(),
+            "distortion": truth.values[c.name]["distortion"].copy(),
             "bloom": np.zeros(1),
         }
         for name, value in parameters.items():
@@ -330,7 +331,7 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
     entries.append((stream.name, "translation", "vector", 3, True))
     entries.append((stream.name, "time_offset", "vector", 1, True))
     entries.extend((*key, "plane", 3, True) for key in planes)
-    T, origin_s = truth.T_imu_lidar[stream.name], (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
+    T, origin_s = truth.T_imu_sensor[stream.name], (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
     offset = truth.time_offset[stream.name] + origin_s
     values = {("imu0", "intrinsics"): truth.imu_intrinsics.copy(), (stream.name, "time_offset"): np.array([offset])}
     values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()
@@ -354,8 +355,7 @@ def room_scenario(
         scenario,
         duration_s=duration_s,
         cameras=(),
-        lidars=(replace(scenario.lidars[0], **lidar),),
-        wheels=(),
+        sensors=(replace(scenario.of(SimLidar)[0], **lidar),),
         features=None,
         board=False,
         motion=replace(scenario.motion, exact=exact),

@@ -8,6 +8,7 @@ import pytest
 
 from icalib.estimate.problem.assembly import host_times, image_times, nodes_for
 from icalib.estimate.problem.inputs import inputs_for
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -15,7 +16,8 @@ SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 
 @pytest.fixture(scope="module")
 def inputs():
-    scenario = replace(load_scenario(SCENARIO), duration_s=4.0, lidars=())
+    scenario = load_scenario(SCENARIO)
+    scenario = replace(scenario, duration_s=4.0, sensors=scenario.of(SimWheels))
     return inputs_for(rig_for(scenario), [simulate(scenario, 0).measurements])
 
 

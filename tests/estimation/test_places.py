@@ -42,7 +42,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 
 
 def followers(seconds: float) -> Scenario:
-    return replace(load_scenario(EXAMPLE), duration_s=seconds, lidars=(), wheels=())
+    return replace(load_scenario(EXAMPLE), duration_s=seconds, sensors=())
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def errors(rig: Rig, scenario: Scenario, seed: int, seen) -> tuple[np.ndarray, n
     assert found.converged
     formal, printed = [], []
     for camera in scenario.cameras:
-        for name, true in (("translation", camera.T_imu_cam[:3, 3]), ("intrinsics", np.array(camera.intrinsics))):
+        for name, true in (("translation", camera.T_imu_sensor[:3, 3]), ("intrinsics", np.array(camera.intrinsics))):
             g = found.group(camera.name, name)
             formal.append((g.value - true) / g.std_formal)
             printed.append((g.value - true) / g.std)

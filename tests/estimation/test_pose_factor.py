@@ -19,7 +19,8 @@ from icalib.optim.state import State
 from icalib.rig import PoseSensor
 from icalib.sensors.pose.model import MODEL, scaled_noise
 from icalib.sensors.pose.residual import FRAME, PoseNoise, RelativePosesFactor, frame_of
-from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate
 
 
 def pose(vector, position):
@@ -34,8 +35,8 @@ def world(request):
     mocap = SimPoses(
         "mocap0",
         pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]),
-        request.param,
-        pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
+        kind=request.param,
+        T_world_frame=pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
         time_offset_s=0.0123,
         clock_origin_ns=777,
         scale=1.02,
@@ -47,7 +48,7 @@ def world(request):
         motion=drive,
         board=False,
         room=Room((8.0, 6.0, 3.0)),
-        poses=(mocap,),
+        sensors=(mocap,),
         imu_noise_enabled=False,
         robot_noise_enabled=False,
     )

@@ -45,7 +45,7 @@ def projected(room, own):
     offset = room.state.values[stream.name, "time_offset"][0]
     seconds = stream.seconds[scan] + stream.offset_s[own] + offset
     R, p, _ = room.sim.truth.pose_at(seconds + room.sim.truth.seconds[0])
-    T = room.sim.truth.T_imu_lidar[stream.name]
+    T = room.sim.truth.T_imu_sensor[stream.name]
     world = np.einsum("nij,nj->ni", R, stream.xyz[own] @ T[:3, :3].T + T[:3, 3]) + p
     plane = np.array([room.state.values[room.planes[k]] for k in room.plane[own]])
     off = np.einsum("na,na->n", plane[:, :3], world - plane[:, 3:])

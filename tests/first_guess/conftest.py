@@ -16,6 +16,7 @@ from icalib.geometry import so3
 from icalib.initialize.lidar.lidar import LidarGuess
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Simulation, load_scenario, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
@@ -37,7 +38,7 @@ class Robot:
 
     def truth(self, k: int = 0) -> LidarGuess:
         stream, truth = self.streams[k], self.sim.truth
-        T = truth.T_imu_lidar[stream.name]
+        T = truth.T_imu_sensor[stream.name]
         origins_s = (stream.origin_ns - not_none(self.sim.measurements.imu).origin_ns) * 1e-9
         return LidarGuess(T[:3, :3].copy(), T[:3, 3].copy(), truth.time_offset[stream.name] + origins_s)
 
@@ -64,12 +65,10 @@ def make_robot(duration_s: float, seed: int, *lidars: dict, example: str = "tabl
     """lidars: how each differs from the paper's; changes: of the scenario."""
     scenario = load_scenario(PAPER / f"{example}.yaml")
     own = tuple(
-        replace(scenario.lidars[0], **({"name": f"lidar{k}", "azimuth_steps": 600} | d))
+        replace(scenario.of(SimLidar)[0], **({"name": f"lidar{k}", "azimuth_steps": 600} | d))
         for k, d in enumerate(lidars or ({},))
     )
-    alone = replace(
-        scenario, duration_s=duration_s, cameras=(), wheels=(), features=None, board=False, lidars=own, **changes
-    )
+    alone = replace(scenario, duration_s=duration_s, cameras=(), features=None, board=False, sensors=own, **changes)
     return Robot(simulate(alone, seed))
 
 

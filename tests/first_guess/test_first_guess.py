@@ -48,12 +48,12 @@ def test_everything_is_found_from_nothing(simulation: Simulation, free: bool):
     guess = initial_guess(rig, simulation.measurements)
     truth = simulation.truth
     for name, camera in guess.cameras.items():
-        T = truth.T_imu_cam[name]
+        T = truth.T_imu_sensor[name]
         assert angle_deg(T[:3, :3], camera.rotation) < (1.5 if free else 0.6)
         assert np.linalg.norm(T[:3, 3] - camera.position) < (0.05 if free else 0.02)
         assert raw_offset(guess, simulation.measurements, name) == pytest.approx(truth.time_offset[name], abs=5e-4)
         if free:
-            assert camera.params[:4] == pytest.approx(np.array(truth.intrinsics[name]), abs=8.0)
+            assert camera.params[:4] == pytest.approx(np.array(truth.values[name]["intrinsics"]), abs=8.0)
     up = guess.R_world_board.T @ np.array([0.0, 0.0, 1.0])
     true_up = truth.T_world_board[:3, :3].T @ np.array([0.0, 0.0, 1.0])
     assert np.rad2deg(np.arccos(up @ true_up)) < 1.0
@@ -172,9 +172,9 @@ def test_what_is_given_of_a_lens_is_held_while_the_rest_is_found(simulation: Sim
         np.testing.assert_array_equal(params[:4] if given == "intrinsics" else params[4:], held[c.name])
         if given == "distortion":
             # The focal length makes up for what the wrong coefficients do, which it could not after the fit.
-            np.testing.assert_allclose(params[:4], simulation.truth.intrinsics[c.name], rtol=0.01)
+            np.testing.assert_allclose(params[:4], simulation.truth.values[c.name]["intrinsics"], rtol=0.01)
         else:
-            assert params[4] != pytest.approx(simulation.truth.distortion[c.name][0], abs=1e-3)
+            assert params[4] != pytest.approx(simulation.truth.values[c.name]["distortion"][0], abs=1e-3)
             assert np.median(guess.cameras[c.name].poses.rms_px) < 1.0
 
 
@@ -286,7 +286,9 @@ def test_corners_on_a_line_have_no_pose_and_stop_nothing(simulation: Simulation)
     stream = simulation.measurements.cameras[0]
     on_a_line = dataclasses.replace(stream, uv=np.column_stack([stream.uv[:, 0], np.full(len(stream.uv), 240.0)]))
     camera = rig_for(simulation.scenario).cameras[0]
-    params = np.concatenate([simulation.truth.intrinsics["cam0"], simulation.truth.distortion["cam0"]])
+    params = np.concatenate(
+        [simulation.truth.values["cam0"]["intrinsics"], simulation.truth.values["cam0"]["distortion"]]
+    )
     poses = target_poses(on_a_line, camera_model(camera.model), params, Flat(simulation.scenario.target.points))
     assert not poses.ok.any()
 
@@ -308,4 +310,4 @@ def test_a_gap_in_the_imu_spoils_no_guess(length: float):
     simulation = simulate(scenario, 2)
     guess = initial_guess(rig_for(scenario), simulation.measurements)
     for name, c in guess.cameras.items():
-        assert np.linalg.norm(c.position - simulation.truth.T_imu_cam[name][:3, 3]) < 0.03
+        assert np.linalg.norm(c.position - simulation.truth.T_imu_sensor[name][:3, 3]) < 0.03

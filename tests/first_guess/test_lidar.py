@@ -60,7 +60,7 @@ def test_any_orientation_and_clocks_far_apart(robot, seed):
     T = np.eye(4)
     T[:3, :3] = random_rotations(None, seed=seed).as_matrix()
     T[:3, 3] = np.random.default_rng(seed).uniform(-0.3, 0.3, 3)
-    r = robot(16.0, 3, {"T_imu_lidar": T, "time_offset_s": 0.7 - seed, "clock_origin_ns": 5 * 10**18})
+    r = robot(16.0, 3, {"T_imu_sensor": T, "time_offset_s": 0.7 - seed, "clock_origin_ns": 5 * 10**18})
     assert within(r, lidar_and_motion(r.imu, r.streams[0], 9.81)[0], 2.0, 0.15, 5e-3)
     known = r.state(np.arange(0.0, r.imu.seconds[-1], NODE_S))
     assert within(r, lidar_on_motion(r.imu, r.streams[0], known), 2.0, 0.15, 5e-3)

@@ -98,7 +98,7 @@ def faces_of(found, streams):
 def two_lidars(robot):
     """The second stands on its head, elsewhere, with a clock of its own."""
     T = np.array([[0.0, 1.0, 0.0, -0.2], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.15], [0.0, 0.0, 0.0, 1.0]])
-    r = robot(12.0, 7, {"azimuth_steps": 900}, {"T_imu_lidar": T, "time_offset_s": 0.02, "rate_hz": 10.0})
+    r = robot(12.0, 7, {"azimuth_steps": 900}, {"T_imu_sensor": T, "time_offset_s": 0.02, "rate_hz": 10.0})
     return r, *calibrated(r)
 
 

@@ -13,7 +13,8 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.initialize.poses.poses import pose_values, state_from_poses
 from icalib.optim.state import State
-from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 
@@ -78,8 +79,8 @@ def sim(request):
     T[:3, :3], T[:3, 3] = Rotation.from_rotvec([2.0, -0.5, 1.0]).as_matrix(), [0.1, -0.2, 0.15]
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = Rotation.from_rotvec([0.0, 0.0, 2.0]).as_matrix(), [3.0, -1.0, 0.5]
-    mocap = SimPoses("mocap0", T, "absolute", frame, time_offset_s=0.5, rate_hz=50.0, clock_origin_ns=777)
-    scenario = Scenario((), duration_s=12.0, motion=Drive("free"), board=False, room=Room(), poses=(mocap,))
+    mocap = SimPoses("mocap0", T, T_world_frame=frame, time_offset_s=0.5, rate_hz=50.0, clock_origin_ns=777)
+    scenario = Scenario((), duration_s=12.0, motion=Drive("free"), board=False, room=Room(), sensors=(mocap,))
     return simulate(scenario, request.param)
 
 
@@ -103,7 +104,7 @@ def test_written_another_way(sim, way, words):
 def test_on_a_floor_inverted_poses_fit_by_their_rates_alone():
     """The inverse turns the other way about the one axis, as if the sensor stood upside down."""
     scenario = Scenario(
-        (), duration_s=12.0, motion=Drive("planar"), board=False, room=Room(), poses=(SimPoses("mocap0", np.eye(4)),)
+        (), duration_s=12.0, motion=Drive("planar"), board=False, room=Room(), sensors=(SimPoses("mocap0", np.eye(4)),)
     )
     sim = simulate(scenario, 1)
     inputs = inputs_for(rig_for(scenario), [sim.measurements.with_streams(inverted(sim.measurements.poses[0]))])

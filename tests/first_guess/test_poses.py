@@ -13,7 +13,8 @@ from icalib.initialize.poses.poses import pose_rates, pose_values, state_from_po
 from icalib.optim.state import State
 from icalib.sensors.parameter import Parameter, fixed
 from icalib.sensors.pose.residual import FRAME, frame_of
-from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate
 
 # Twice the worst of five seeds: rotation [deg], translation [m], time offset [s].
 ALONE = {"absolute": (0.16, 8e-3, 6e-4), "relative": (0.8, 0.08, 5e-3)}
@@ -32,8 +33,8 @@ def sim(request):
     mocap = SimPoses(
         "mocap0",
         pose([2.0, -0.5, 1.0], [0.1, -0.2, 0.15]),
-        request.param,
-        pose([0.4, 0.1, 2.0], [3.0, -1.0, 0.5]),
+        kind=request.param,
+        T_world_frame=pose([0.4, 0.1, 2.0], [3.0, -1.0, 0.5]),
         time_offset_s=0.5,
         rate_hz=50.0,
         clock_origin_ns=777,
@@ -41,14 +42,14 @@ def sim(request):
         position_noise=noise[1],
     )
     scenario = Scenario(
-        (), duration_s=15.0, motion=Drive("free"), board=False, room=Room((8.0, 6.0, 3.0)), poses=(mocap,)
+        (), duration_s=15.0, motion=Drive("free"), board=False, room=Room((8.0, 6.0, 3.0)), sensors=(mocap,)
     )
     return simulate(scenario, 4)
 
 
 def errors(sim, values):
     """Of rotation [deg], translation [m], time offset [s]."""
-    T = sim.truth.T_imu_pose["mocap0"]
+    T = sim.truth.T_imu_sensor["mocap0"]
     turn = Rotation.from_matrix(T[:3, :3].T @ values["mocap0", "rotation"]).magnitude()
     (stream,) = sim.measurements.poses
     offset = sim.truth.time_offset["mocap0"] + (stream.origin_ns - sim.measurements.imu.origin_ns) * 1e-9
@@ -66,7 +67,7 @@ def test_with_the_imu_alone(sim):
     """And the motion: gravity points down, velocities are those of the truth but for the direction of the world's x."""
     inputs = inputs_for(rig_for(sim.scenario), [sim.measurements])
     state = state_from_poses(inputs)
-    assert (np.array(errors(sim, state.values)) < ALONE[sim.scenario.poses[0].kind]).all()
+    assert (np.array(errors(sim, state.values)) < ALONE[sim.scenario.of(SimPoses)[0].kind]).all()
     truth = truth_at(sim, state.seconds)
     tilt = np.einsum("nij,i->nj", state.rotation, [0.0, 0.0, 1.0]) - truth.rotation[:, 2]
     assert np.abs(tilt).max() < 0.06
@@ -77,12 +78,12 @@ def test_with_the_imu_alone(sim):
 def test_on_a_motion_that_is_known(sim):
     inputs = inputs_for(rig_for(sim.scenario), [sim.measurements])
     found = pose_values(inputs, truth_at(sim, np.arange(0.0, 14.9, 0.05)))
-    assert (np.array(errors(sim, found)) < KNOWN[sim.scenario.poses[0].kind]).all()
+    assert (np.array(errors(sim, found)) < KNOWN[sim.scenario.of(SimPoses)[0].kind]).all()
     frame = frame_of("mocap0", 0)
-    if sim.scenario.poses[0].kind == "relative":
+    if sim.scenario.of(SimPoses)[0].kind == "relative":
         assert (frame, FRAME[0]) not in found
         return
-    T = sim.truth.T_world_frame["mocap0"]
+    T = sim.scenario.of(SimPoses)[0].T_world_frame
     assert np.rad2deg(Rotation.from_matrix(T[:3, :3].T @ found[frame, FRAME[0]]).magnitude()) < 0.3
     assert np.linalg.norm(found[frame, FRAME[1]] - T[:3, 3]) < 0.05
 
@@ -99,7 +100,7 @@ def test_noise_of_rotations_does_not_shorten_the_lever_arm(sim):
 
 
 def test_what_the_rig_gives_is_taken(sim):
-    rig, T = rig_for(sim.scenario), sim.truth.T_imu_pose["mocap0"]
+    rig, T = rig_for(sim.scenario), sim.truth.T_imu_sensor["mocap0"]
     given = {
         "rotation": Parameter("free", T[:3, :3]),
         "translation": fixed([0.5, 0.0, 0.0]),
@@ -122,5 +123,5 @@ def test_rates_are_means_over_windows(sim):
     imu = sim.measurements.imu
     at = (imu.stamps_ns - sim.truth.imu_clock_origin_ns) * 1e-9
     gyro = np.stack([np.interp(seconds, at, w) for w in (imu.gyro - sim.truth.gyro_bias).T], axis=1)
-    seen = rates.rate @ sim.truth.T_imu_pose["mocap0"][:3, :3].T
+    seen = rates.rate @ sim.truth.T_imu_sensor["mocap0"][:3, :3].T
     assert np.sqrt(np.mean((seen - gyro) ** 2)) < 0.05

@@ -29,7 +29,9 @@ def far():
 
 def lens(simulation, name):
     model = next(c.model for c in simulation.scenario.cameras if c.name == name)
-    return camera_model(model), np.concatenate([simulation.truth.intrinsics[name], simulation.truth.distortion[name]])
+    return camera_model(model), np.concatenate(
+        [simulation.truth.values[name]["intrinsics"], simulation.truth.values[name]["distortion"]]
+    )
 
 
 def in_camera(simulation, stream, body):
@@ -37,7 +39,7 @@ def in_camera(simulation, stream, body):
     camera = stream.name
     T = simulation.truth.T_world_bodies[body]
     R_wi, _, _ = simulation.truth.pose_at(simulation.truth.corners[camera].seconds)
-    R_wc = R_wi @ simulation.truth.T_imu_cam[camera][:3, :3]
+    R_wc = R_wi @ simulation.truth.T_imu_sensor[camera][:3, :3]
     return R_wc.transpose(0, 2, 1) @ T[:3, :3]
 
 

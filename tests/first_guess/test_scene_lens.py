@@ -18,6 +18,7 @@ from icalib.initialize.boards.scene_lens import find_scene, is_possible, scene_p
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
 from icalib.sensors.camera.bodies import choose_bodies
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate, tag_map
 
 pytestmark = pytest.mark.slow
@@ -43,9 +44,8 @@ def robot(tags_on_walls):
         base,
         duration_s=10.0,
         features=None,
-        lidars=(),
         cameras=tuple(replace(base.cameras[k], corner_noise_px=0.2, rate_hz=10.0) for k in (0, 2)),
-        wheels=tuple(replace(w, noise=0.005, allowed_slip=1e-4) for w in base.wheels),
+        sensors=tuple(replace(w, noise=0.005, allowed_slip=1e-4) for w in base.of(SimWheels)),
         target=Markers("tag36h11", EDGE_M, tuple(range(4 * PER_WALL))),
         board=True,
         T_world_bodies=tags_on_walls(not_none(base.room).size, PER_WALL),
@@ -57,8 +57,8 @@ def test_lenses_are_found_from_tags_alone(robot):
     rig = rig_for(robot, intrinsics="free", distortion="free")
     for camera, stream in zip(rig.cameras, simulation.measurements.cameras, strict=True):
         params = scene_params(rig.target, camera, stream)
-        np.testing.assert_allclose(params[:2], simulation.truth.intrinsics[camera.name][:2], rtol=0.01)
-        np.testing.assert_allclose(params[2:4], simulation.truth.intrinsics[camera.name][2:], atol=5.0)
+        np.testing.assert_allclose(params[:2], simulation.truth.values[camera.name]["intrinsics"][:2], rtol=0.01)
+        np.testing.assert_allclose(params[2:4], simulation.truth.values[camera.name]["intrinsics"][2:], atol=5.0)
 
 
 def test_camera_wheels_and_tags_are_calibrated_from_nothing(robot):
@@ -66,10 +66,10 @@ def test_camera_wheels_and_tags_are_calibrated_from_nothing(robot):
     rig = rig_for(robot, intrinsics="free", distortion="free")
     result = calibrate_measurements(rig, simulation.measurements)
     assert result.converged
-    for sensor, true in (simulation.truth.T_imu_cam | simulation.truth.T_imu_wheel).items():
+    for sensor, true in simulation.truth.T_imu_sensor.items():
         np.testing.assert_allclose(result.T_imu_sensor(sensor), true, atol=0.03)
     np.testing.assert_allclose(
-        result.group("wheel0", "radii").value, simulation.truth.drive["wheel0"]["radii"], rtol=5e-3
+        result.group("wheel0", "radii").value, simulation.truth.values["wheel0"]["radii"], rtol=5e-3
     )
 
 
@@ -79,7 +79,7 @@ def test_a_rough_focal_length_is_a_start_only(robot):
     guess = Parameter("free", np.array([600.0, 600.0, 375.5, 239.5]))
     stream = simulation.measurements.cameras[0]
     params = scene_params(rig.target, replace(rig.cameras[0], intrinsics=guess), stream)
-    np.testing.assert_allclose(params[:2], simulation.truth.intrinsics["cam0"][:2], rtol=0.01)
+    np.testing.assert_allclose(params[:2], simulation.truth.values["cam0"]["intrinsics"][:2], rtol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_a_tag_that_nothing_ties_to_the_others_is_left_out():
     assert result.converged
     assert name not in result.bodies
     assert any("ignored, because no image determines" in note and name in note for note in result.notes)
-    for camera, true in simulation.truth.T_imu_cam.items():
+    for camera, true in simulation.truth.T_imu_sensor.items():
         np.testing.assert_allclose(result.T_imu_sensor(camera), true, atol=0.02)
 
 

@@ -17,8 +17,8 @@ from icalib.initialize.steps.clock_shifts import longest_step
 from icalib.initialize.steps.slow_rates import ChainedRates, slow_offsets
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Wheels
+from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.simulation import handheld, load_scenario, rig_for, simulate
-from icalib.tools.simulation.scenario.robot import SimPoses
 
 ORIGIN_NS = 1_700_000_000_000_000_000  # of all clocks of the scenario
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -43,7 +43,7 @@ def test_a_camera_of_4_and_1_images_a_second(every):
     found = calibrate_measurements(rig, m.with_streams(*(thinned(c, every) for c in m.cameras)))
     for camera in simulation.scenario.cameras:
         translation = found.group(camera.name, "translation")
-        error = found.T_imu_sensor(camera.name)[:3, 3] - camera.T_imu_cam[:3, 3]
+        error = found.T_imu_sensor(camera.name)[:3, 3] - camera.T_imu_sensor[:3, 3]
         assert (np.abs(error) < 5.0 * translation.std).all() and translation.std.max() < 0.01
         offset = found.group(camera.name, "time_offset")
         assert abs(offset.value[0] - camera.time_offset_s) < 5.0 * offset.std[0] < 1e-3
@@ -54,7 +54,7 @@ def with_poses():
     """The motion of the paper, an IMU and a pose sensor on another clock."""
     scenario = load_scenario(SCENARIO)
     pose = load_pose_scenario()
-    return simulate(replace(scenario, duration_s=40.0, lidars=(), cameras=(), wheels=(), poses=pose, features=None), 5)
+    return simulate(replace(scenario, duration_s=40.0, cameras=(), sensors=pose, features=None), 5)
 
 
 def load_pose_scenario():
@@ -80,7 +80,7 @@ def test_poses_once_or_twice_a_second(with_poses, every):
     (stream,) = m.poses
     late = replace(stream, stamps_ns=stream.stamps_ns + 7_000_000_000)
     found = calibrate_measurements(rig.with_(poses=(sensor,)), m.with_streams(thinned(late, every)))
-    truth = with_poses.scenario.poses[0]
+    truth = with_poses.scenario.of(SimPoses)[0]
     translation, offset = found.group("mocap0", "translation"), found.group("mocap0", "time_offset")
     assert (np.abs(found.T_imu_sensor("mocap0")[:3, 3] - truth.T_imu_sensor[:3, 3]) < 5.0 * translation.std).all()
     assert translation.std.max() < 0.02

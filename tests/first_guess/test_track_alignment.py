@@ -19,7 +19,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"
 @pytest.fixture(scope="module", params=[1, 2])
 def planar(request):
     """A planar drive with cameras alone, their lenses guessed roughly; and what `align_together` made of its start."""
-    scenario = replace(load_scenario(EXAMPLES / "table2-planar.yaml"), duration_s=20.0, lidars=(), wheels=())
+    scenario = replace(load_scenario(EXAMPLES / "table2-planar.yaml"), duration_s=20.0, sensors=())
     simulation = simulate(scenario, request.param)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, request.param)
     kept = {}

@@ -44,7 +44,7 @@ def drive(lens: str = "radtan", example="table2-3d", noise_px=0.5, duration_s=15
         distortion=distortion,
         corner_noise_px=noise_px,
     )
-    return simulate(replace(scenario, duration_s=duration_s, cameras=(camera,), lidars=(), wheels=(), **changes), seed)
+    return simulate(replace(scenario, duration_s=duration_s, cameras=(camera,), sensors=(), **changes), seed)
 
 
 def camera_of(simulation: Simulation) -> Camera:
@@ -64,7 +64,10 @@ def imu_of(simulation: Simulation) -> ImuData:
 def off_px(simulation: Simulation, lens: np.ndarray) -> float:
     """RMS between the true lens and this one, over most of the image, turned so that the two are most alike."""
     camera, truth = camera_of(simulation), simulation.truth
-    model, true = camera_model(camera.model), np.append(truth.intrinsics["cam0"], truth.distortion["cam0"])
+    model, true = (
+        camera_model(camera.model),
+        np.append(truth.values["cam0"]["intrinsics"], truth.values["cam0"]["distortion"]),
+    )
     width, height = camera.resolution
     u, v = np.meshgrid(np.linspace(0.15, 0.85, 9) * width, np.linspace(0.15, 0.85, 7) * height)
     uv = np.stack([u.ravel(), v.ravel()], axis=1)
@@ -95,14 +98,14 @@ def test_other_motions(example: str, noise_px: float, most_px: float):
 
 def test_distortion_of_the_rig_file_stays():
     simulation = drive()
-    known = Parameter("free", simulation.truth.distortion["cam0"])
+    known = Parameter("free", simulation.truth.values["cam0"]["distortion"])
     lens = found_lens(simulation, replace(camera_of(simulation), distortion=known))
     np.testing.assert_array_equal(lens[4:], known.value)
-    np.testing.assert_allclose(lens[:2], simulation.truth.intrinsics["cam0"][:2], rtol=3e-3)
+    np.testing.assert_allclose(lens[:2], simulation.truth.values["cam0"]["intrinsics"][:2], rtol=3e-3)
 
 
 def test_turns_about_the_line_of_sight_do_not_show_the_focal_length():
-    T = load_scenario(PAPER / "single-axis.yaml").cameras[0].T_imu_cam
+    T = load_scenario(PAPER / "single-axis.yaml").cameras[0].T_imu_sensor
     along = Drive("single-axis", axis_imu=tuple(T[:3, 2].tolist()))
     with pytest.raises(
         EstimationError, match="cam0: the rotation in the recording does not determine the focal length"
@@ -140,7 +143,7 @@ def test_calibration_from_nothing(lens: str, seed: int, longest_s: float):
 @pytest.mark.parametrize("mode", ["free", "fixed"])
 def test_a_guess_of_half_the_focal_length_is_replaced_and_a_fixed_value_is_named(mode):
     simulation = drive(noise_px=0.3, duration_s=12.0)
-    true = simulation.truth.intrinsics["cam0"]
+    true = simulation.truth.values["cam0"]["intrinsics"]
     half = Parameter(mode, true * [0.5, 0.5, 1.0, 1.0])
     rig = rig_for(simulation.scenario, intrinsics=half, distortion="free")
     if mode == "fixed":
@@ -155,12 +158,12 @@ def test_turns_of_a_camera_that_moves_sideways_end_in_no_local_minimum():
     """From the turn that fits best without motion one in four ends 3 to 10 degrees off."""
     scenario = load_scenario(PAPER / "table2-3d.yaml")
     camera = replace(scenario.cameras[1], corner_noise_px=0.5)
-    simulation = simulate(replace(scenario, duration_s=20.0, cameras=(camera,), lidars=(), wheels=()), 2)
+    simulation = simulate(replace(scenario, duration_s=20.0, cameras=(camera,), sensors=()), 2)
     stream, truth, measured = simulation.measurements.tracks[0], simulation.truth, simulation.measurements
-    lens = np.append(truth.intrinsics["cam1"], truth.distortion["cam1"])
+    lens = np.append(truth.values["cam1"]["intrinsics"], truth.values["cam1"]["distortion"])
     rates = track_rates(stream, camera_model(camera.model), lens, chained=True)
     later = (stream.origin_ns - measured.origin_ns) * 1e-9 + truth.time_offset["cam1"] + truth.seconds[0]
-    a, b = (truth.pose_at(t + later)[0] @ truth.T_imu_cam["cam1"][:3, :3] for t in (rates.start, rates.end))
+    a, b = (truth.pose_at(t + later)[0] @ truth.T_imu_sensor["cam1"][:3, :3] for t in (rates.start, rates.end))
     off = so3.log_many(np.ascontiguousarray(a.transpose(0, 2, 1) @ b)) - rates.rate * 0.4
     assert np.rad2deg(np.linalg.norm(off, axis=1)).max() < 2.5
 
@@ -186,10 +189,10 @@ def test_points_without_parallax_are_named():
     """As far away as stars they show how the rig turns, and nothing else."""
     simulation = drive(noise_px=0.3, duration_s=8.0)
     stream, truth, camera = simulation.measurements.tracks[0], simulation.truth, camera_of(simulation)
-    rng, T = np.random.default_rng(0), truth.T_imu_cam["cam0"]
+    rng, T = np.random.default_rng(0), truth.T_imu_sensor["cam0"]
     far = rng.normal(size=(400, 3))
     rotation = truth.pose_at(truth.seconds[0] + stream.seconds + _between(simulation))[0]
-    lens = np.append(truth.intrinsics["cam0"], truth.distortion["cam0"])
+    lens = np.append(truth.values["cam0"]["intrinsics"], truth.values["cam0"]["distortion"])
     uv, feature = [], []
     for R in rotation:
         pixels, valid = camera_model(camera.model).project(lens, far @ R @ T[:3, :3])

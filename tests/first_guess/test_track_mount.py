@@ -35,7 +35,7 @@ def drive(example="table2-planar", cameras=1, seed=1, noise_px=0.0, duration_s=2
         replace(c, corner_noise_px=noise_px, clock_origin_ns=c.clock_origin_ns - set_back_s * 10**9)
         for c in scenario.cameras[:cameras]
     )
-    scenario = replace(scenario, duration_s=duration_s, cameras=own, lidars=(), wheels=(), **changes)
+    scenario = replace(scenario, duration_s=duration_s, cameras=own, sensors=(), **changes)
     simulation = simulate(scenario, seed)
     truth = simulation.truth
     imu = ImuData.build(not_none(simulation.measurements.imu), scenario.imu_noise)
@@ -58,7 +58,7 @@ def true_rig(simulation):
 def errors(simulation, values, name):
     """Rotation [deg] and lever arm [m] in the axes of the IMU, time offset [s]."""
     truth, measured = simulation.truth, simulation.measurements
-    T, stream = truth.T_imu_cam[name], next(s for s in measured.tracks if s.name == name)
+    T, stream = truth.T_imu_sensor[name], next(s for s in measured.tracks if s.name == name)
     turn = Rotation.from_matrix(values[name, "rotation"] @ T[:3, :3].T).as_rotvec(degrees=True)
     between = 1e-9 * (stream.origin_ns - measured.origin_ns)
     offset = values[name, "time_offset"][0] - between - truth.time_offset[name]
@@ -90,15 +90,15 @@ def test_a_rough_lens_is_found_with_the_camera(example):
         assert np.abs(arm[:2]).max() < 0.15
         assert abs(arm[2]) < 0.5  # nothing shows it on a floor: it stays where lever arms are
         assert abs(offset) < 0.01
-        focal = values[camera.name, "intrinsics"][:2] / simulation.truth.intrinsics[camera.name][:2]
+        focal = values[camera.name, "intrinsics"][:2] / simulation.truth.values[camera.name]["intrinsics"][:2]
         assert np.abs(focal - 1.0).max() < 0.05
-    assert abs(values["cam0", "distortion"][0] - simulation.truth.distortion["cam0"][0]) < 0.06
+    assert abs(values["cam0", "distortion"][0] - simulation.truth.values["cam0"]["distortion"][0]) < 0.06
 
 
 def test_what_the_rig_gives_stays():
     simulation, state = drive()
     rig = true_rig(simulation)
-    T = simulation.truth.T_imu_cam["cam0"]
+    T = simulation.truth.T_imu_sensor["cam0"]
     rotation = Parameter("fixed", T[:3, :3] @ Rotation.from_rotvec([0.0, 0.01, 0.0]).as_matrix())
     arm = Parameter("free", T[:3, 3] + [0.0, 0.0, 0.02])
     given = rig.with_(cameras=(replace(rig.cameras[0], rotation=rotation, translation=arm),))
@@ -117,7 +117,7 @@ def test_of_several_recordings_one_shows_how_the_camera_stands(restarts):
     inputs = inputs_for(rig, [simulation.measurements for simulation, _ in drives])
     state = one_after_another(inputs, [s for _, s in drives], drives[0][1].values)
     values = track_camera_values(inputs, state)
-    T = drives[0][0].truth.T_imu_cam["cam0"]
+    T = drives[0][0].truth.T_imu_sensor["cam0"]
     turn = Rotation.from_matrix(values["cam0", "rotation"] @ T[:3, :3].T).magnitude()
     assert np.rad2deg(turn) < 0.005
     assert np.abs(values["cam0", "translation"] - T[:3, 3])[:2].max() < 1e-3

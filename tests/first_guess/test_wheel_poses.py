@@ -12,6 +12,7 @@ from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.initialize.wheels.wheel_poses import intervals_inside, mount_guess, poses_offset
 from icalib.motion.imu_data import ImuData
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
@@ -20,8 +21,8 @@ PAPER = Path(__file__).parents[2] / "examples" / "paper"
 @pytest.fixture(scope="module")
 def free_motion():
     scenario = load_scenario(PAPER / "table2-3d.yaml")
-    wheels = replace(scenario.wheels[0], time_offset_s=0.034, clock_origin_ns=7_000_000_000, phase_s=3.0)
-    return simulate(replace(scenario, duration_s=30.0, cameras=(), lidars=(), features=None, wheels=(wheels,)), 4)
+    wheels = replace(scenario.of(SimWheels)[0], time_offset_s=0.034, clock_origin_ns=7_000_000_000, phase_s=3.0)
+    return simulate(replace(scenario, duration_s=30.0, cameras=(), features=None, sensors=(wheels,)), 4)
 
 
 def setting(sim):
@@ -43,7 +44,7 @@ def test_mount(free_motion):
     R, _, velocity = free_motion.truth.pose_at(t)
     rate = free_motion.truth.trajectory.rate_at(t)
     found = mount_guess(stream, inside, rate, np.einsum("nji,nj->ni", R, velocity))
-    T = free_motion.truth.T_imu_wheel["wheel0"]
+    T = free_motion.truth.T_imu_sensor["wheel0"]
     turn = so3.log(np.ascontiguousarray(T[:3, :3].T @ found.rotation))
     assert np.abs(np.rad2deg(turn)).max() < 1.0
     assert np.abs(found.position - T[:3, 3]).max() < 0.02

@@ -35,9 +35,9 @@ NAMES = ["anton-r0", "anton-turned", "berta-r0", "berta-r1"]
 
 def _turned(scenario: Scenario) -> Scenario:
     cam0, cam1 = scenario.cameras
-    T = cam1.T_imu_cam.copy()
+    T = cam1.T_imu_sensor.copy()
     T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec([TURN, 0.0, 0.0]).as_matrix()
-    return replace(scenario, cameras=(cam0, replace(cam1, T_imu_cam=T)))
+    return replace(scenario, cameras=(cam0, replace(cam1, T_imu_sensor=T)))
 
 
 @pytest.fixture(scope="session")

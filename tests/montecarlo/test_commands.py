@@ -11,6 +11,8 @@ import pytest
 from rich.console import Console
 
 from icalib.cli import main
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.batch import program
 from icalib.tools.montecarlo import study as study_module
 from icalib.tools.montecarlo.console import table
@@ -85,7 +87,7 @@ def test_the_scenarios_are_those_of_the_examples(motion: str):
     name = f"table2-{motion}.yaml"
     assert (FOLDER / name).read_bytes() == (PAPER / name).read_bytes()
     scenario = load_scenario(FOLDER / name)
-    assert scenario.features and scenario.lidars and scenario.wheels
+    assert scenario.features and scenario.of(SimLidar) and scenario.of(SimWheels)
 
 
 def sentence(capsys, *arguments: str) -> str:

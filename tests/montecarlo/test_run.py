@@ -14,6 +14,8 @@ from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, CornerResiduals, RowResiduals, Visited, by_key
 from icalib.sensors.lidar.record import LidarResiduals
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo import one_run
 from icalib.tools.montecarlo.one_run import PlanesKind, RunTask, compare, run
 from icalib.tools.montecarlo.record import RunRecord
@@ -21,6 +23,7 @@ from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.montecarlo.whiteness import whiteness
 from icalib.tools.simulation import (
     HandheldMotion,
+    Room,
     Simulation,
     handheld,
     load_scenario,
@@ -61,7 +64,7 @@ def test_errors_are_estimated_minus_true_in_the_columns_of_the_covariance(record
         for c in ("cam0", "cam1")
         for n in ("rotation", "translation", "time_offset", "intrinsics", "distortion")
     ]
-    R_true, R = truth.T_imu_cam["cam1"][:3, :3], result.group("cam1", "rotation").value
+    R_true, R = truth.T_imu_sensor["cam1"][:3, :3], result.group("cam1", "rotation").value
     e = record.error[record.columns("cam1.rotation")]
     np.testing.assert_allclose(R_true @ Rotation.from_rotvec(e).as_matrix(), R, atol=1e-12)
     offset = result.group("cam0", "time_offset").value - truth.time_offset["cam0"]
@@ -88,12 +91,10 @@ def test_a_rotation_error_is_on_the_right():
 
 
 def test_truth_of_every_sensor(simulation):
-    truth = replace(
-        simulation.truth,
-        T_imu_lidar={"lidar0": np.diag([-1.0, -1.0, 1.0, 1.0])},
-        T_imu_wheel={"wheel0": np.eye(4) + np.eye(4, k=3)},
-        drive={"wheel0": {"radii": np.array([0.1, 0.2]), "baseline": np.array([0.4])}},
-    )
+    T_imu_lidar, T_imu_wheel = np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4) + np.eye(4, k=3)
+    lidar = SimLidar("lidar0", T_imu_lidar)
+    wheels = SimWheels("wheel0", T_imu_wheel, reports="poses", radii=(0.1, 0.2), baseline=0.4)
+    truth = simulate(replace(SCENARIO, duration_s=0.5, room=Room(), sensors=(lidar, wheels)), 1).truth
     np.testing.assert_array_equal(true_value(truth, "lidar0", "rotation"), np.diag([-1.0, -1.0, 1.0]))
     np.testing.assert_array_equal(true_value(truth, "wheel0", "translation"), [1.0, 0.0, 0.0])
     np.testing.assert_array_equal(true_value(truth, "wheel0", "radii"), [0.1, 0.2])
@@ -108,7 +109,7 @@ def test_the_path_leads_from_the_guess_to_the_result(record, result, simulation,
     rig = with_drawn_guess(rig_for(SCENARIO, intrinsics="free", distortion="free"), SCENARIO, 1)
     guess = rig.cameras[0].translation.value
     k = record.columns("cam0.translation")
-    assert record.path[0].error[k] == pytest.approx(guess - simulation.truth.T_imu_cam["cam0"][:3, 3])
+    assert record.path[0].error[k] == pytest.approx(guess - simulation.truth.T_imu_sensor["cam0"][:3, 3])
     np.testing.assert_array_equal(record.path[-1].error, record.error)
     # The result also has what noise in the Jacobians does: next to nothing here.
     assert record.path[-1].std == pytest.approx(np.sqrt(np.diag(record.covariance)), rel=1e-3)

@@ -135,7 +135,7 @@ def test_a_jump_does_not_move_the_result(simulation, which):
     truth = 0.0042 - {"imu": -1, "cameras": 1, "both": 0}[which] * by * 1e-9
     assert abs(offset.value[0] - truth) < 5.0 * offset.std[0] + 1e-6 * (which != "both")
     T = result.T_imu_sensor("cam0")
-    np.testing.assert_allclose(T, simulation.scenario.cameras[0].T_imu_cam, atol=3e-3)
+    np.testing.assert_allclose(T, simulation.scenario.cameras[0].T_imu_sensor, atol=3e-3)
 
 
 def test_commands_that_read_an_imu_alone(tmp_path: Path):

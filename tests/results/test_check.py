@@ -48,7 +48,7 @@ def turned(scenario: Scenario, names: tuple[str, ...], from_left: bool = False) 
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("x", TURN_DEG, degrees=True).as_matrix()
     cameras = tuple(
-        replace(c, T_imu_cam=turn @ c.T_imu_cam if from_left else c.T_imu_cam @ turn) if c.name in names else c
+        replace(c, T_imu_sensor=turn @ c.T_imu_sensor if from_left else c.T_imu_sensor @ turn) if c.name in names else c
         for c in scenario.cameras
     )
     return replace(scenario, cameras=cameras)
@@ -86,7 +86,7 @@ def test_a_sensor_that_moved_is_named(
     (drift,) = (d for d in found.drifts if (d.sensor, d.name) == ("cam1", "rotation"))
     true = np.array([np.deg2rad(TURN_DEG), 0.0, 0.0])
     if name == "imu0":  # about the x axis of the IMU
-        true = scenario.cameras[1].T_imu_cam[:3, :3].T @ true
+        true = scenario.cameras[1].T_imu_sensor[:3, :3].T @ true
     assert (np.abs(np.array(drift.change) - true) < 4.0 * np.array(drift.std)).all()
     assert drift.sigmas is not None and drift.sigmas > found.limit
     # The old values do not fit the new data, which the new ones do.

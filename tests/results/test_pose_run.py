@@ -14,6 +14,7 @@ from icalib.cli import main
 from icalib.export.formats import export
 from icalib.result import Calibration, load_calibration
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.comparison.reading import compare_files
 from icalib.tools.simulation import Scenario, load_scenario, rig_for
 
@@ -58,7 +59,7 @@ def found(out: Path) -> Calibration:
 
 
 def test_it_is_what_was_simulated(found: Calibration, scenario: tuple[Path, Scenario]):
-    (mocap,) = scenario[1].poses
+    (mocap,) = scenario[1].of(SimPoses)
     translation, offset = found.group("mocap0", "translation"), found.group("mocap0", "time_offset")
     assert (np.abs(translation.value - mocap.T_imu_sensor[:3, 3]) < 4.0 * translation.std).all()
     assert abs(offset.value[0] - 0.02) < 4.0 * offset.std[0]

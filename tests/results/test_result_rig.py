@@ -101,6 +101,6 @@ def test_a_second_recording_improves_on_priors_from_the_first():
     second = calibrate_measurements(rig_of_result(first, "prior")[0], simulate(scenario, 2).measurements)
     assert not second.wrong and second.verdict == first.verdict
     for camera in scenario.cameras:
-        error = second.value(camera.name, "translation") - camera.T_imu_cam[:3, 3]
+        error = second.value(camera.name, "translation") - camera.T_imu_sensor[:3, 3]
         std = second.std(camera.name, "translation")
         assert (np.abs(error) < 4.0 * std).all() and (std < 0.9 * first.std(camera.name, "translation")).all()

@@ -12,6 +12,8 @@ import yaml
 from icalib.cli import main
 from icalib.result import Calibration, load_calibration
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Scenario, load_scenario, rig_for
 from icalib.validation import robot
 
@@ -54,11 +56,14 @@ def found(out: Path) -> Calibration:
 
 
 def test_it_is_the_robot_that_was_simulated(found: Calibration, scenario: Scenario):
-    for name, T in (("lidar0", scenario.lidars[0].T_imu_lidar), ("wheel0", scenario.wheels[0].T_imu_wheel)):
+    for name, T in (
+        ("lidar0", scenario.of(SimLidar)[0].T_imu_sensor),
+        ("wheel0", scenario.of(SimWheels)[0].T_imu_sensor),
+    ):
         error = found.group(name, "translation").value - T[:3, 3]
         assert (np.abs(error) < 4.0 * found.group(name, "translation").std + 1e-9).all(), name
     radii = found.group("wheel0", "radii")
-    assert (np.abs(radii.value - scenario.wheels[0].radii) < 4.0 * radii.std).all()
+    assert (np.abs(radii.value - scenario.of(SimWheels)[0].radii) < 4.0 * radii.std).all()
 
 
 def test_kept_points_are_thinned_and_redraw_their_residuals(found: Calibration):

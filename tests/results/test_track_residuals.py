@@ -31,7 +31,7 @@ MOVED_PX, EVERY = 40.0, 211  # of some observations
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    return replace(load_scenario(EXAMPLE), duration_s=8.0, lidars=(), wheels=())
+    return replace(load_scenario(EXAMPLE), duration_s=8.0, sensors=())
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,7 @@ def test_a_note_names_it_where_the_noise_hides_the_difference(noise_px: float, n
         distortion=tuple(LENS[4:].tolist()),
         corner_noise_px=noise_px,
     )
-    scenario = replace(base, duration_s=10.0, cameras=(camera,), lidars=(), wheels=())
+    scenario = replace(base, duration_s=10.0, cameras=(camera,), sensors=())
     rig = replace(rig_for(scenario, intrinsics="free", distortion="free"), target=NoTarget())
     result = calibrate_measurements(rig, simulate(scenario, 1).measurements)
     assert any("second set of parameters" in note for note in result.notes) == named

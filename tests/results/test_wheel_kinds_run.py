@@ -16,6 +16,7 @@ from icalib.geometry.targets import AprilGrid
 from icalib.result import load_calibration
 from icalib.rig import Ground
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate
 from icalib.tools.simulation.tables import write_tables
 
@@ -31,7 +32,7 @@ def scenario_of(reports: str) -> Scenario:
     """Twenty seconds on hills before a wall of tags."""
     scenario = load_scenario(PAPER / "table2-ramp.yaml")
     wheels = replace(
-        scenario.wheels[0],
+        scenario.of(SimWheels)[0],
         reports=reports,
         scales=(1.03, 0.97),
         steering_offset=0.02,
@@ -45,8 +46,7 @@ def scenario_of(reports: str) -> Scenario:
         duration_s=20.0,
         features=None,
         cameras=(replace(scenario.cameras[0], corner_noise_px=0.15),),
-        lidars=(),
-        wheels=(wheels,),
+        sensors=(wheels,),
         board=True,
         T_world_board=ON_WALL,
         target=AprilGrid(4, 10, 0.6, 0.3),

@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 from tests.typed import not_none
 
-from icalib.tools.simulation import (
-    Drive,
-    Features,
-    Obstacle,
-    Room,
-    Scenario,
-    SimCamera,
-    SimLidar,
-    SimWheels,
-    hills_of_slope,
-)
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.simulate import SimWheels
+from icalib.tools.simulation import Drive, Features, Obstacle, Room, Scenario, SimCamera, hills_of_slope
 from icalib.tools.simulation.scenario.robot import DriveKind
 
 CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_imu_cam of one that looks ahead
@@ -108,21 +100,21 @@ def robot() -> Scenario:
         board=False,
         room=Room(blocks=blocks),
         features=Features(count=800, persistent=100),
-        lidars=(lidar,),
-        wheels=(wheels,),
+        sensors=(lidar, wheels),
     )
 
 
 def on_ground(robot: Scenario, kind: DriveKind, **motion) -> Scenario:
     """The robot with wheels that report rates, on the floor or, for ramps, on hills."""
     hills = hills_of_slope(12.0) if kind == "ramps" else None
-    wheels = tuple(replace(w, reports="rates") for w in robot.wheels)
-    return replace(robot, motion=Drive(kind, **motion), room=replace(not_none(robot.room), hills=hills), wheels=wheels)
+    wheels = tuple(replace(w, reports="rates") for w in robot.of(SimWheels))
+    room = replace(not_none(robot.room), hills=hills)
+    return replace(robot, motion=Drive(kind, **motion), room=room, sensors=(*robot.of(SimLidar), *wheels))
 
 
 def alone(robot: Scenario) -> Scenario:
     """The robot without what takes time: cameras' points and the LiDAR."""
-    return replace(robot, features=None, lidars=())
+    return replace(robot, features=None, sensors=robot.of(SimWheels))
 
 
 def wheel_path(truth, T_imu_wheel: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

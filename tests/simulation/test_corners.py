@@ -67,7 +67,7 @@ def expected_corners(sim, index, time_offset):
     camera, stream, truth = sim.scenario.cameras[index], sim.measurements.cameras[index], sim.truth
     since_origin = (stream.stamps_ns - truth.imu_clock_origin_ns).astype(np.float64) * 1e-9
     R, p, _ = truth.pose_at(since_origin + time_offset)
-    T_world_board, T_imu_cam = truth.T_world_board, truth.T_imu_cam[camera.name]
+    T_world_board, T_imu_cam = truth.T_world_board, truth.T_imu_sensor[camera.name]
     uv = []
     for image, point in zip(stream.image, stream.point, strict=True):
         T_world_imu = np.eye(4)

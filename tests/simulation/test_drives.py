@@ -10,7 +10,8 @@ import pytest
 from tests.typed import not_none
 
 from icalib.errors import RecordingError, RigError
-from icalib.tools.simulation import Drive, Room, SimWheels, hills_of_slope, simulate
+from icalib.sensors.wheels.simulate import SimWheels
+from icalib.tools.simulation import Drive, Room, hills_of_slope, simulate
 from icalib.tools.simulation.scenario.jets import Jet
 
 from .conftest import alone, on_ground, turn, wheel_path
@@ -90,7 +91,7 @@ def test_wheels_do_not_slide(robot, kind, exact, bound):
     """Steering lets an exact trajectory stray from the closed form, by 0.2 mm/s RMS."""
     sim = simulated(robot, kind, exact=exact)
     t = np.linspace(0.1, 3.9, 200)
-    T = sim.scenario.wheels[0].T_imu_wheel
+    T = sim.scenario.of(SimWheels)[0].T_imu_sensor
     R, p = wheel_path(sim.truth, T, t)
     velocity = (wheel_path(sim.truth, T, t + STEP_S)[1] - wheel_path(sim.truth, T, t - STEP_S)[1]) / (2.0 * STEP_S)
     local = np.einsum("nji,nj->ni", R, velocity)
@@ -102,7 +103,7 @@ def test_wheels_do_not_slide(robot, kind, exact, bound):
 def test_sideslip_slides_by_its_angle(robot):
     sim = simulated(robot, "planar", duration_s=20.0, sideslip_deg=2.0)
     t = np.linspace(0.1, 19.9, 2000)
-    T = sim.scenario.wheels[0].T_imu_wheel
+    T = sim.scenario.of(SimWheels)[0].T_imu_sensor
     velocity = (wheel_path(sim.truth, T, t + STEP_S)[1] - wheel_path(sim.truth, T, t - STEP_S)[1]) / (2.0 * STEP_S)
     local = np.einsum("nji,nj->ni", wheel_path(sim.truth, T, t)[0], velocity)
     angle = np.rad2deg(np.arctan2(local[:, 1], local[:, 0]))
@@ -112,7 +113,7 @@ def test_sideslip_slides_by_its_angle(robot):
 
 def test_each_motion_is_what_it_is_called(robot):
     found = {kind: simulated(robot, kind, duration_s=30.0, seed=3) for kind in ("free", "single-axis", *GROUND)}
-    T = robot.wheels[0].T_imu_wheel
+    T = robot.of(SimWheels)[0].T_imu_sensor
     paths = {kind: wheel_path(sim.truth, T, sim.truth.seconds) for kind, sim in found.items()}
     rates = {kind: not_none(sim.measurements.imu).gyro for kind, sim in found.items()}
     spread = {kind: np.ptp(position, axis=0) for kind, (_, position) in paths.items()}
@@ -158,7 +159,7 @@ def test_the_robot_stays_in_its_room_clear_of_the_blocks(robot, kind, seed):
 
 
 def test_motion_seed_holds_the_motion(robot):
-    free = alone(replace(robot, motion=Drive("planar"), wheels=()))
+    free = replace(robot, motion=Drive("planar"), features=None, sensors=())
     held = replace(free, motion=Drive("planar", seed=5))
     np.testing.assert_array_equal(simulate(held, 1).truth.position, simulate(held, 2).truth.position)
     assert np.abs(simulate(free, 1).truth.position - simulate(free, 2).truth.position).max() > 0.1
@@ -208,13 +209,13 @@ def test_a_bad_trajectory_is_refused(robot, tmp_path, content, words):
 
 
 def test_parts_that_do_not_go_together_are_refused(robot):
-    rates = (replace(robot.wheels[0], reports="rates"),)
+    rates = (replace(robot.of(SimWheels)[0], reports="rates"),)
     hilly = replace(robot.room, hills=hills_of_slope(10.0))
     for change, words in (
         ({"room": None}, "need a room"),
         ({"motion": Drive("ramps")}, "needs hills"),
         ({"motion": Drive("planar"), "room": hilly}, "needs a flat floor"),
-        ({"wheels": rates}, "cannot roll"),
+        ({"sensors": rates}, "cannot roll"),
     ):
         with pytest.raises(RigError, match=words):
             replace(robot, **change)

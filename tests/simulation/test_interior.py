@@ -186,7 +186,7 @@ def scenario() -> Scenario:
     axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     T = np.eye(4)
     T[:3, :3] = axes
-    camera = replace(DISTORTED[0], T_imu_cam=T, rate_hz=10.0)
+    camera = replace(DISTORTED[0], T_imu_sensor=T, rate_hz=10.0)
     room = Room((6.0, 5.0, 2.5), texture=Texture(share=1.0))
     return Scenario((camera,), duration_s=2.0, motion=Drive("free"), board=False, room=room)
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.tools.simulation import SimLidar, hills_of_slope, simulate
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.simulate import SimWheels
+from icalib.tools.simulation import hills_of_slope, simulate
 
 from .conftest import alone, on_ground
 
@@ -17,7 +19,7 @@ def in_world(sim, shift_s: float | np.ndarray = 0.0):
     stream, truth = sim.measurements.lidars[0], sim.truth
     since = (stream.stamps_ns - truth.imu_clock_origin_ns) * 1e-9 + truth.time_offset[stream.name]
     seconds = np.repeat(since, np.diff(stream.start)) + stream.offset_s.astype(np.float64) + shift_s
-    T = truth.T_imu_lidar[stream.name]
+    T = truth.T_imu_sensor[stream.name]
     R, p, _ = truth.pose_at(seconds)
     return p + np.einsum("nij,nj->ni", R, stream.xyz.astype(np.float64) @ T[:3, :3].T + T[:3, 3])
 
@@ -29,13 +31,13 @@ def distance(sim, points):
 
 @pytest.fixture(scope="module")
 def quiet(robot):
-    return simulate(replace(alone(robot), duration_s=3.0, lidars=robot.lidars, robot_noise_enabled=False), 4)
+    return simulate(replace(alone(robot), duration_s=3.0, sensors=robot.sensors, robot_noise_enabled=False), 4)
 
 
 @pytest.mark.parametrize("exact", [False, True])
 def test_points_lie_on_their_planes_at_their_own_instants(robot, exact):
     motion = replace(robot.motion, exact=exact)
-    sim = simulate(replace(alone(robot), lidars=robot.lidars, robot_noise_enabled=False, motion=motion), 4)
+    sim = simulate(replace(alone(robot), sensors=robot.sensors, robot_noise_enabled=False, motion=motion), 4)
     stream = sim.measurements.lidars[0]
     assert len(stream.stamps_ns) == 31 and (np.diff(stream.start) == 180 * 8).all()
     assert len(np.unique(stream.plane)) > 8 and stream.plane.min() >= 0
@@ -47,7 +49,7 @@ def test_points_lie_on_their_planes_at_their_own_instants(robot, exact):
 
 
 def test_a_scan_turns_once_and_its_rings_fire_one_after_another(robot, quiet):
-    stream, lidar = quiet.measurements.lidars[0], robot.lidars[0]
+    stream, lidar = quiet.measurements.lidars[0], robot.of(SimLidar)[0]
     np.testing.assert_array_equal(np.diff(stream.stamps_ns), 125_000_000)
     assert stream.stamps_ns[0] == 77 + 60_000_000  # 50 ms of the IMU's clock, the LiDAR's lags by -10 ms
     xyz, offset = stream.xyz[:1440].reshape(180, 8, 3), stream.offset_s[:1440].reshape(180, 8)
@@ -86,8 +88,10 @@ def test_points_on_hills_have_no_plane(robot):
 
 
 def test_what_is_out_of_range_gives_no_point(robot):
-    lidar = replace(robot.lidars[0], range_m=(3.0, 5.0))
-    sim = simulate(replace(alone(robot), duration_s=1.0, lidars=(lidar,), robot_noise_enabled=False), 4)
+    lidar = replace(robot.of(SimLidar)[0], range_m=(3.0, 5.0))
+    sim = simulate(
+        replace(alone(robot), duration_s=1.0, sensors=(lidar, *robot.of(SimWheels)), robot_noise_enabled=False), 4
+    )
     stream = sim.measurements.lidars[0]
     reach = np.linalg.norm(stream.xyz, axis=1)
     assert 3.0 - 1e-5 < reach.min() < 3.1 and 4.9 < reach.max() < 5.0 + 1e-5

@@ -11,8 +11,8 @@ from tests.typed import random_rotations
 
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.rig.file import load_rig
-from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, simulate, write_sensors, write_tables
-from icalib.tools.simulation.sensors.poses import quaternion
+from icalib.sensors.pose.simulate import SimPoses, quaternion
+from icalib.tools.simulation import Drive, Room, Scenario, simulate, write_sensors, write_tables
 
 from .conftest import pose, turn
 
@@ -41,7 +41,7 @@ def scenario() -> Scenario:
         motion=Drive("free"),
         board=False,
         room=Room((8.0, 6.0, 3.0)),
-        poses=(mocap, odom),
+        sensors=(mocap, odom),
         imu_clock_origin_ns=2 * 10**9,
     )
 
@@ -54,7 +54,7 @@ def test_points_seen_by_the_sensor_stand_where_it_says(scenario):
     """A point at x in the sensor's frame is at T_world_imu T_imu_sensor x in the world, and where the pose puts it."""
     sim = simulate(replace(scenario, robot_noise_enabled=False), 1)
     x = np.array([0.5, -0.7, 1.1])
-    for sensor, stream in zip(scenario.poses, sim.measurements.poses, strict=True):
+    for sensor, stream in zip(scenario.of(SimPoses), sim.measurements.poses, strict=True):
         offset = sim.truth.time_offset[sensor.name]
         seconds = (stream.stamps_ns - sim.truth.imu_clock_origin_ns) * 1e-9 + offset
         R, p, _ = sim.truth.pose_at(seconds)
@@ -69,7 +69,7 @@ def test_points_seen_by_the_sensor_stand_where_it_says(scenario):
 
 def test_noise_of_absolute_poses_is_white(scenario):
     sim = simulate(scenario, 1)
-    stream, truth = sim.measurements.poses[0], sim.truth.poses["mocap0"]
+    stream, truth = sim.measurements.poses[0], sim.truth.reported["mocap0"]
     error = stream.position - truth.position
     assert error.std() == pytest.approx(1e-3, rel=0.05)
     assert abs(np.corrcoef(error[1:].ravel(), error[:-1].ravel())[0, 1]) < 0.1
@@ -82,7 +82,7 @@ def test_noise_of_relative_poses_adds_up(scenario):
     steps, ends, truth = [], [], None
     for seed in range(20):
         sim = simulate(scenario, seed)
-        stream, truth = sim.measurements.poses[1], sim.truth.poses["odom0"]
+        stream, truth = sim.measurements.poses[1], sim.truth.reported["odom0"]
 
         def way(rotation, position, k):
             return np.einsum("nji,nj->ni", rotation[:-k], position[k:] - position[:-k])

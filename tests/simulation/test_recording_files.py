@@ -17,6 +17,8 @@ from icalib.data.recordings.bag import BagRecording
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import ImuSensor
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import ADIS16448, handheld, rig_for, simulate, write_sensors, write_tables
 
 from .conftest import on_ground, pose
@@ -77,7 +79,7 @@ def test_tables_read_back_exactly(simulation, folder):
 
 
 def test_relative_poses_have_their_covariance_in_the_table(robot, tmp_path):
-    sim = simulate(replace(robot, duration_s=1.0, lidars=(), features=None), 1)
+    sim = simulate(replace(robot, duration_s=1.0, sensors=robot.of(SimWheels), features=None), 1)
     write_tables(sim, 1, tmp_path / "run")
     header, *rows = (tmp_path / "run" / "wheel0" / "poses.csv").read_text().splitlines()
     numbers = np.array([[float(x) for x in row.split(",")] for row in rows])
@@ -101,7 +103,7 @@ def test_the_truth_is_beside_the_tables(simulation, folder):
         if name != "imu0":
             assert sensor["time_offset"] == simulation.truth.time_offset[name]
     assert truth["sensors"]["wheel0"]["radii"] == [0.1, 0.103] and truth["sensors"]["wheel0"]["baseline"] == 0.4
-    np.testing.assert_array_equal(truth["sensors"]["lidar0"]["T_imu_sensor"], simulation.truth.T_imu_lidar["lidar0"])
+    np.testing.assert_array_equal(truth["sensors"]["lidar0"]["T_imu_sensor"], simulation.truth.T_imu_sensor["lidar0"])
     with np.load(folder / "truth.npz", allow_pickle=False) as arrays:
         np.testing.assert_array_equal(arrays["stamps_ns"], simulation.measurements.imu.stamps_ns)
         np.testing.assert_array_equal(arrays["rotation"], simulation.truth.R_world_imu)
@@ -136,10 +138,10 @@ def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name, monkeypatch
 
 
 def test_a_bag_without_a_target_shows_the_room(robot, tmp_path):
-    (camera, *_), (lidar,) = robot.cameras, robot.lidars
+    (camera, *_), (lidar,) = robot.cameras, robot.of(SimLidar)
     camera = replace(camera, resolution=(80, 60), intrinsics=(50.0, 50.0, 39.5, 29.5))
     lidar = replace(lidar, azimuth_steps=36)
-    hilly = replace(on_ground(robot, "ramps"), duration_s=0.5, cameras=(camera,), lidars=(lidar,))
+    hilly = replace(on_ground(robot, "ramps").with_sensors(lidar), duration_s=0.5, cameras=(camera,))
     assert write_sensors(simulate(hilly, 1), 1, tmp_path / "run") == ()
     bag = BagRecording(tmp_path / "run")
     images = [image.image for image in bag.images("/cam0/image_raw")]
@@ -148,13 +150,14 @@ def test_a_bag_without_a_target_shows_the_room(robot, tmp_path):
 
 
 def test_what_no_sensor_sends_is_said(robot, tmp_path):
-    sim = simulate(replace(robot, duration_s=0.5, lidars=(), features=None, cameras=()), 1)
+    sim = simulate(replace(robot, duration_s=0.5, sensors=robot.of(SimWheels), features=None, cameras=()), 1)
     (note,) = write_sensors(sim, 1, tmp_path / "run")
     assert "wheel0 reports relative poses" in note
     (note,) = write_sensors(simulate(replace(handheld(0.5), board=False), 1), 1, tmp_path / "dark")
     assert "no images are written" in note
-    instant = replace(on_ground(robot, "planar"), duration_s=0.5, lidars=(), features=None, cameras=())
-    instant = replace(instant, wheels=(replace(instant.wheels[0], sampling="instantaneous"),))
+    rolling = on_ground(robot, "planar")
+    wheels = tuple(replace(w, sampling="instantaneous") for w in rolling.of(SimWheels))
+    instant = replace(rolling, duration_s=0.5, sensors=wheels, features=None, cameras=())
     write_sensors(simulate(instant, 1), 1, tmp_path / "instant")
     assert np.isnan(read_joints(BagRecording(tmp_path / "instant"), "/wheel0/joint_states").position).all()
 

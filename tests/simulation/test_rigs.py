@@ -11,6 +11,7 @@ from tests.typed import not_none
 
 import icalib.tools.simulation
 from icalib.rig import Parameter, Settings, Wheels
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import (
     ADIS16448,
     GuessError,
@@ -29,6 +30,7 @@ ALLOWED = (
     "icalib.base.file_names",
     "icalib.data.measurements",
     "icalib.rig",
+    "icalib.sensors.sensor",
     "icalib.geometry.targets",
     "icalib.tools.simulation",
     "icalib.base.staging",
@@ -68,8 +70,8 @@ def test_cameras_of_a_room_track_images_where_there_are_no_tables_of_tracks():
 def test_a_rig_that_is_told_nothing_of_slip_allows_for_what_real_wheels_may_have():
     scenario = load_scenario(EXAMPLES / "table2-ramp.yaml")
     for told, expected in ((None, Wheels.lateral_slip), (1e-4, 1e-4)):
-        wheels = tuple(replace(w, allowed_slip=told) for w in scenario.wheels)
-        (found,) = rig_for(replace(scenario, wheels=wheels)).wheels
+        wheels = tuple(replace(w, allowed_slip=told) for w in scenario.of(SimWheels))
+        (found,) = rig_for(scenario.with_sensors(*wheels)).wheels
         assert (found.lateral_slip, found.vertical_slip) == (expected, expected)
 
 
@@ -103,13 +105,13 @@ def test_simulation_imports_nothing_that_it_is_to_check():
 
 def test_guesses_are_drawn_about_the_truth_with_the_given_spread():
     scenario = handheld()
-    error = GuessError(rotation=0.1, translation=0.2, time_offset=0.3, focal_length=0.04)
+    error = GuessError(rotation=0.1, translation=0.2, time_offset=0.3, relative=0.04)
     found = {"turn": [], "move": [], "offset": [], "focal": []}
     for seed in range(400):
         cam0, truth = with_drawn_guess(rig_for(scenario), scenario, seed, error).cameras[0], scenario.cameras[0]
-        turn = truth.T_imu_cam[:3, :3].T @ cam0.rotation.value
+        turn = truth.T_imu_sensor[:3, :3].T @ cam0.rotation.value
         found["turn"] += Rotation.from_matrix(turn).as_rotvec().tolist()
-        found["move"] += (cam0.translation.value - truth.T_imu_cam[:3, 3]).tolist()
+        found["move"] += (cam0.translation.value - truth.T_imu_sensor[:3, 3]).tolist()
         found["offset"] += (not_none(cam0.time_offset.value) - truth.time_offset_s).tolist()
         drawn = with_drawn_guess(rig_for(scenario, intrinsics="free"), scenario, seed, error).cameras[0].intrinsics
         found["focal"].append(not_none(drawn.value)[0] / truth.intrinsics[0] - 1.0)

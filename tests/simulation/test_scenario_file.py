@@ -12,6 +12,9 @@ from tests.typed import not_none
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.pose.simulate import SimPoses
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Drive, Features, ImageFaults, Texture, load_scenario, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
@@ -102,11 +105,11 @@ def test_every_field_arrives(tmp_path):
     assert (n.gyro, n.gyro_walk, n.accel, n.accel_walk) == (1e-4, 2e-5, 3e-3, 4e-4)
     assert s.gyro_bias == (0.01, 0.02, 0.03) and s.accel_bias == (0.1, 0.2, 0.3)
     T = np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]])
-    (camera,), (lidar,), (wheels,) = s.cameras, s.lidars, s.wheels
+    (camera,), (lidar,), (wheels,) = s.cameras, s.of(SimLidar), s.of(SimWheels)
     for sensor, rate, offset, phase, pose in (
-        (camera, 20.0, 0.002, 0.01, camera.T_imu_cam),
-        (lidar, 10.0, -0.01, 0.0, lidar.T_imu_lidar),
-        (wheels, 50.0, 0.0, 0.0, wheels.T_imu_wheel),
+        (camera, 20.0, 0.002, 0.01, camera.T_imu_sensor),
+        (lidar, 10.0, -0.01, 0.0, lidar.T_imu_sensor),
+        (wheels, 50.0, 0.0, 0.0, wheels.T_imu_sensor),
     ):
         assert (sensor.rate_hz, sensor.time_offset_s, sensor.phase_s) == (rate, offset, phase)
         assert sensor.clock_origin_ns == 5_000_000_000
@@ -118,7 +121,7 @@ def test_every_field_arrives(tmp_path):
     assert (wheels.radii, wheels.baseline, wheels.noise) == ((0.1, 0.11), 0.5, 0.01)
     assert (wheels.slip, wheels.allowed_slip) == (0.002, 0.003)
     assert (wheels.reports, wheels.sampling, wheels.poses_every) == ("rates", "instantaneous", 5)
-    (mocap,) = s.poses
+    (mocap,) = s.of(SimPoses)
     assert (mocap.name, mocap.kind, mocap.rate_hz) == ("mocap", "relative", 30.0)
     assert (mocap.rotation_noise, mocap.position_noise) == (0.003, 0.004)
     np.testing.assert_allclose([mocap.T_imu_sensor, mocap.T_world_frame], [T, T], atol=1e-12)
@@ -136,8 +139,8 @@ def test_every_field_arrives(tmp_path):
 @pytest.mark.parametrize("path", sorted(PAPER.glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_scenarios_load_and_run(path):
     scenario = load_scenario(path)
-    lidars = tuple(replace(s, azimuth_steps=36) for s in scenario.lidars)
-    measured = simulate(replace(scenario, duration_s=1.5, lidars=lidars), scenario.seed).measurements
+    lidars = tuple(replace(s, azimuth_steps=36) for s in scenario.of(SimLidar))
+    measured = simulate(replace(scenario.with_sensors(*lidars), duration_s=1.5), scenario.seed).measurements
     assert [len(group) for group in (measured.tracks, measured.lidars, measured.wheels)] == [3, 1, 1]
     assert measured.cameras == () and all(len(s.uv) > 100 for s in measured.tracks)
     assert len(not_none(measured.imu).stamps_ns) == 451 and len(measured.lidars[0].stamps_ns) == 11
@@ -149,7 +152,7 @@ def test_table_2_is_that_of_the_paper():
     assert [c.rate_hz for c in s.cameras] == [20, 10, 10]
     assert [c.time_offset_s for c in s.cameras] == [0.010, -0.010, 0.0]
     assert [c.corner_noise_px for c in s.cameras] == [1.0, 1.0, 1.0]
-    (lidar,), (wheels,) = s.lidars, s.wheels
+    (lidar,), (wheels,) = s.of(SimLidar), s.of(SimWheels)
     assert (lidar.rate_hz, lidar.rings, lidar.time_offset_s, lidar.range_noise_m) == (8, 16, -0.010, 0.03)
     assert (wheels.rate_hz, wheels.time_offset_s, wheels.noise) == (70, 0.0, 0.03)
 
@@ -308,7 +311,7 @@ def test_effects_are_read(tmp_path):
     x = np.zeros(24)
     x[[0, 2, 5, 7, 9, 10, 12, 13, 14]] = 0.01 * np.arange(1, 10)
     np.testing.assert_allclose(scenario.imu_intrinsics, x)
-    assert [p.scale for p in scenario.poses] == [0.99] and scenario.target_size == 1.01
+    assert [p.scale for p in scenario.of(SimPoses)] == [0.99] and scenario.target_size == 1.01
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_every_corner_is_the_projection_of_its_own_body(with_grid: bool):
         T_world_imu = np.eye(4)
         T_world_imu[:3, :3], T_world_imu[:3, 3] = R[image], p[image]
         P = truth.T_world_bodies[target.body[point]] @ np.append(target.points[point], 1.0)
-        in_camera.append(np.linalg.solve(T_world_imu @ camera.T_imu_cam, P)[:3])
+        in_camera.append(np.linalg.solve(T_world_imu @ camera.T_imu_sensor, P)[:3])
     np.testing.assert_allclose(stream.uv, project(camera, np.array(in_camera)), atol=1e-8)
     assert len(truth.T_world_bodies) == len(target.bodies) == 12 + with_grid
 

@@ -11,7 +11,7 @@ from icalib.tools.simulation import simulate
 
 def test_errors_of_tracks_are_those_that_they_were_given(robot, benchmark_program):
     program = benchmark_program("track_errors")
-    scenario = replace(robot, lidars=(), wheels=(), cameras=robot.cameras[:1], robot_noise_enabled=False)
+    scenario = replace(robot, sensors=(), cameras=robot.cameras[:1], robot_noise_enabled=False)
     simulation = simulate(scenario, 2)
     (stream,) = simulation.measurements.tracks
     views = program.views_of(simulation, stream)

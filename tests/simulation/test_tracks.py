@@ -11,6 +11,8 @@ from tests.typed import instance, not_none
 
 from icalib.data.measurements import WheelPoses
 from icalib.errors import RigError
+from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Features, simulate
 
 from .conftest import alone
@@ -24,7 +26,7 @@ def eye(sim, camera, image):
     R, p, _ = truth.pose_at(since + truth.time_offset[stream.name])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R[0], p[0]
-    return T @ truth.T_imu_cam[stream.name]
+    return T @ truth.T_imu_sensor[stream.name]
 
 
 def projected(camera, T_world_cam, point):
@@ -118,7 +120,7 @@ def test_the_same_seed_gives_the_same_recording(robot):
     for a, b, c in zip(arrays(one), arrays(two), arrays(other), strict=True):
         np.testing.assert_array_equal(a, b)
         assert a.shape != c.shape or (a != c).any()
-    without = simulate(replace(robot, lidars=(), features=None), 1).measurements
+    without = simulate(replace(robot, sensors=robot.of(SimWheels), features=None), 1).measurements
     np.testing.assert_array_equal(
         instance(without.wheels[0], WheelPoses).pose, instance(one.wheels[0], WheelPoses).pose
     )
@@ -127,11 +129,11 @@ def test_the_same_seed_gives_the_same_recording(robot):
 
 def test_a_sensor_without_time_to_measure_is_named(robot):
     for change, name in (
-        ({"cameras": (replace(robot.cameras[1], rate_hz=0.1),), "lidars": ()}, "cam1"),
-        ({"lidars": (replace(robot.lidars[0], rate_hz=0.5),)}, "lidar0"),
-        ({"wheels": (replace(robot.wheels[0], rate_hz=0.2),)}, "wheel0"),
-        ({"wheels": (replace(robot.wheels[0], poses_every=300),)}, "wheel0"),
+        ({"cameras": (replace(robot.cameras[1], rate_hz=0.1),), "sensors": ()}, "cam1"),
+        ({"sensors": (replace(robot.of(SimLidar)[0], rate_hz=0.5),)}, "lidar0"),
+        ({"sensors": (replace(robot.of(SimWheels)[0], rate_hz=0.2),)}, "wheel0"),
+        ({"sensors": (replace(robot.of(SimWheels)[0], poses_every=300),)}, "wheel0"),
     ):
         with pytest.raises(RigError, match=f"{name} has fewer than two measurements"):
             simulate(replace(robot, **change), 1)
-    assert simulate(replace(robot, cameras=(), lidars=()), 1).measurements.tracks == ()
+    assert simulate(replace(robot, cameras=(), sensors=robot.of(SimWheels)), 1).measurements.tracks == ()

@@ -12,6 +12,7 @@ from icalib.data.measurements import WheelStream
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import RigError
 from icalib.rig.file import load_rig
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import simulate
 from icalib.tools.simulation.scenario.robot import DriveKind
 from icalib.tools.simulation.sensor_bag import write_sensors
@@ -25,7 +26,7 @@ SCALES, OFFSET, BASE, RADIUS = (1.1, 0.9), 0.05, 0.6, 0.12
 def reporting(robot, reports, sampling="interval-mean", kind: DriveKind = "planar", **changes):
     scenario = alone(on_ground(robot, kind))
     wheels = replace(
-        scenario.wheels[0],
+        scenario.of(SimWheels)[0],
         reports=reports,
         sampling=sampling,
         scales=SCALES,
@@ -34,7 +35,7 @@ def reporting(robot, reports, sampling="interval-mean", kind: DriveKind = "plana
         steering_offset=OFFSET,
         **changes,
     )
-    return replace(scenario, cameras=(), wheels=(wheels,))
+    return replace(scenario.with_sensors(wheels), cameras=())
 
 
 def instants(sim):
@@ -45,8 +46,8 @@ def instants(sim):
 def moved(sim, begin, end, parts=400):
     """Path [m] and yaw [rad], by summing up the small moves of the wheel frame."""
     at = np.linspace(begin, end, parts + 1)
-    R, p = wheel_path(sim.truth, sim.scenario.wheels[0].T_imu_wheel, at)
-    middle, _ = wheel_path(sim.truth, sim.scenario.wheels[0].T_imu_wheel, 0.5 * (at[1:] + at[:-1]))
+    R, p = wheel_path(sim.truth, sim.scenario.of(SimWheels)[0].T_imu_sensor, at)
+    middle, _ = wheel_path(sim.truth, sim.scenario.of(SimWheels)[0].T_imu_sensor, 0.5 * (at[1:] + at[:-1]))
     small = np.einsum("nji,njk->nik", R[:-1], R[1:])
     path = np.einsum("ni,ni->n", middle[:, :, 0], np.diff(p, axis=0)).sum()
     return np.array([path, 0.5 * (small[:, 1, 0] - small[:, 0, 1]).sum()])
@@ -74,7 +75,7 @@ def test_a_point_ahead_moves_where_the_front_wheels_point(robot, sampling):
         sampling,
     ) and np.ptp(instance(stream, WheelStream).rate[:, 1]) > 0.2
     for i in (1, 80, 200):
-        R, p = wheel_path(sim.truth, sim.scenario.wheels[0].T_imu_wheel, t[i] + np.array([-1e-4, 0.0, 1e-4]))
+        R, p = wheel_path(sim.truth, sim.scenario.of(SimWheels)[0].T_imu_sensor, t[i] + np.array([-1e-4, 0.0, 1e-4]))
         front = p + BASE * R[:, :, 0]
         ahead, left, _ = R[1].T @ (front[2] - front[0])
         assert instance(stream, WheelStream).rate[i, 1] + OFFSET == pytest.approx(np.arctan(left / ahead), abs=1e-5)
@@ -98,10 +99,10 @@ def test_noise_is_a_density(robot, reports, noise, density):
         instance(sim.measurements.wheels[0], WheelStream).rate
         - instance(quiet.measurements.wheels[0], WheelStream).rate
     )
-    expected = np.array(density) * np.sqrt(scenario.wheels[0].rate_hz)
+    expected = np.array(density) * np.sqrt(scenario.of(SimWheels)[0].rate_hz)
     np.testing.assert_allclose(off.std(axis=0), expected, rtol=0.15)
     assert instance(quiet.measurements.wheels[0], WheelStream).rate == pytest.approx(
-        quiet.truth.wheels["wheel0"].value, abs=1e-12
+        quiet.truth.reported["wheel0"].value, abs=1e-12
     )
 
 

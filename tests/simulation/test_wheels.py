@@ -9,6 +9,7 @@ import pytest
 from tests.typed import instance
 
 from icalib.data.measurements import WheelPoses, WheelStream
+from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import simulate
 
 from .conftest import alone, on_ground, wheel_path
@@ -21,10 +22,10 @@ def instants(sim):
 
 def turned(sim, begin, end, parts=2000):
     """(2,) angles that the wheels turn, by summing up the small moves of the wheel frame."""
-    w = sim.scenario.wheels[0]
-    R, p = wheel_path(sim.truth, w.T_imu_wheel, np.linspace(begin, end, parts + 1))
+    w = sim.scenario.of(SimWheels)[0]
+    R, p = wheel_path(sim.truth, w.T_imu_sensor, np.linspace(begin, end, parts + 1))
     middle, _ = wheel_path(
-        sim.truth, w.T_imu_wheel, np.linspace(begin, end, parts + 1)[:-1] + 0.5 * (end - begin) / parts
+        sim.truth, w.T_imu_sensor, np.linspace(begin, end, parts + 1)[:-1] + 0.5 * (end - begin) / parts
     )
     ahead = np.einsum("ni,ni->n", middle[:, :, 0], np.diff(p, axis=0)).sum()
     small = np.einsum("nji,njk->nik", R[:-1], R[1:])
@@ -38,7 +39,7 @@ def test_mean_rates_are_the_angles_turned_since_the_stamp_before(robot, kind, ex
     scenario = replace(alone(on_ground(robot, kind, exact=exact)), robot_noise_enabled=False)
     sim = simulate(scenario, 6)
     stream, t = sim.measurements.wheels[0], instants(sim)
-    np.testing.assert_allclose(sim.truth.wheels["wheel0"].seconds, t, atol=1e-9)
+    np.testing.assert_allclose(sim.truth.reported["wheel0"].seconds, t, atol=1e-9)
     for i in (1, 50, 200):
         expected = turned(sim, t[i - 1], t[i], 200) / (t[i] - t[i - 1])
         np.testing.assert_allclose(instance(stream, WheelStream).rate[i], expected, rtol=1e-5, atol=1e-6)
@@ -48,7 +49,7 @@ def test_mean_rates_are_the_angles_turned_since_the_stamp_before(robot, kind, ex
 
 def test_instant_rates_are_those_at_the_stamp(robot):
     scenario = replace(alone(on_ground(robot, "planar")), robot_noise_enabled=False)
-    instant = replace(scenario, wheels=(replace(scenario.wheels[0], sampling="instantaneous"),))
+    instant = scenario.with_sensors(replace(scenario.of(SimWheels)[0], sampling="instantaneous"))
     sim, mean = simulate(instant, 6), simulate(scenario, 6)
     stream, t = sim.measurements.wheels[0], instants(sim)
     assert (
@@ -70,8 +71,8 @@ def test_the_path_is_found_again_from_the_rates(robot):
     """Dead reckoning over a flat floor: what encoders are there for."""
     scenario = replace(alone(on_ground(robot, "planar")), robot_noise_enabled=False, duration_s=10.0)
     sim = simulate(scenario, 7)
-    w, stream, t = scenario.wheels[0], sim.measurements.wheels[0], instants(sim)
-    R, p = wheel_path(sim.truth, w.T_imu_wheel, t)
+    w, stream, t = scenario.of(SimWheels)[0], sim.measurements.wheels[0], instants(sim)
+    R, p = wheel_path(sim.truth, w.T_imu_sensor, t)
     x, y, heading = *p[0, :2], np.arctan2(R[0, 1, 0], R[0, 0, 0])
     for (left, right), dt in zip(instance(stream, WheelStream).rate[1:], np.diff(t), strict=True):
         ahead = 0.5 * dt * (left * w.radii[0] + right * w.radii[1])
@@ -96,7 +97,7 @@ def test_relative_poses_are_those_of_27(robot, kind):
     sim = simulate(scenario, 9)
     stream, t = sim.measurements.wheels[0], instants(sim)
     assert len(t) == len(instance(stream, WheelPoses).pose) + 1 and np.allclose(np.diff(t), 3.0 / 70.0, atol=2e-9)
-    T = scenario.wheels[0].T_imu_wheel
+    T = scenario.of(SimWheels)[0].T_imu_sensor
     R_W_I, p_W_I = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
     p_I_W = T[:3, 3]
     R, p, _ = sim.truth.pose_at(t)
@@ -117,14 +118,14 @@ def test_relative_poses_are_those_of_27(robot, kind):
 
 def test_covariance_of_relative_poses_is_that_of_integrated_noise(robot):
     """10 000 dead reckonings with noisy rates along one curve, against the covariance stated for it."""
-    wheels = replace(robot.wheels[0], reports="poses", poses_every=35, slip=0.004)
-    scenario = replace(alone(robot), motion=replace(robot.motion, kind="planar"), wheels=(wheels,))
+    wheels = replace(robot.of(SimWheels)[0], reports="poses", poses_every=35, slip=0.004)
+    scenario = replace(alone(robot), motion=replace(robot.motion, kind="planar"), sensors=(wheels,))
     sim = simulate(scenario, 11)
     stream, t = sim.measurements.wheels[0], instants(sim)
     k, parts, runs = 2, 200, 10_000
     dt = (t[k + 1] - t[k]) / parts
     middle = t[k] + dt * (np.arange(parts) + 0.5)
-    R, p = wheel_path(sim.truth, wheels.T_imu_wheel, np.concatenate([middle - 0.5 * dt, middle[-1:] + 0.5 * dt]))
+    R, p = wheel_path(sim.truth, wheels.T_imu_sensor, np.concatenate([middle - 0.5 * dt, middle[-1:] + 0.5 * dt]))
     speed = np.linalg.norm(np.diff(p, axis=0), axis=1) / dt
     heading = np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
     yaw_rate = np.diff(heading) / dt
@@ -147,7 +148,7 @@ def test_covariance_of_relative_poses_is_that_of_integrated_noise(robot):
 def test_noise_of_relative_poses_has_their_covariance(robot):
     scenario = replace(alone(robot), duration_s=60.0)
     stream = simulate(scenario, 12).measurements.wheels[0]
-    error = instance(stream, WheelPoses).pose - simulate(scenario, 12).truth.wheels["wheel0"].value
+    error = instance(stream, WheelPoses).pose - simulate(scenario, 12).truth.reported["wheel0"].value
     whitened = np.linalg.solve(np.linalg.cholesky(instance(stream, WheelPoses).covariance), error[..., None])[..., 0]
     n = len(whitened)
     np.testing.assert_allclose(whitened.T @ whitened / n, np.eye(3), atol=4.0 * np.sqrt(2.0 / n))
@@ -157,9 +158,9 @@ def test_noise_of_relative_poses_has_their_covariance(robot):
 def test_readings_do_not_depend_on_how_many_are_made_at_a_time(robot, reports, monkeypatch):
     scenario = alone(robot) if reports == "poses" else alone(on_ground(robot, "planar"))
     scenario = replace(scenario, robot_noise_enabled=False)
-    assert scenario.wheels[0].reports == reports
+    assert scenario.of(SimWheels)[0].reports == reports
     whole = simulate(scenario, 9).measurements.wheels[0]
-    monkeypatch.setattr("icalib.tools.simulation.sensors.wheels._AT_A_TIME", 177)
+    monkeypatch.setattr("icalib.sensors.wheels.simulate._AT_A_TIME", 177)
     parts = simulate(scenario, 9).measurements.wheels[0]
     same = "rate" if reports == "rates" else "pose"
     np.testing.assert_array_equal(getattr(parts, same), getattr(whole, same))

@@ -17,6 +17,7 @@ from icalib.cli import main
 from icalib.geometry.targets import AprilGrid
 from icalib.result import Calibration, load_calibration
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Simulation, load_scenario, rig_for, simulate, write_tables
 
 THREE_D = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -44,9 +45,8 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
         scenario,
         duration_s=12.0,
         features=None,
-        wheels=(),
         cameras=(replace(scenario.cameras[0], corner_noise_px=0.15),),
-        lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
+        sensors=tuple(replace(x, azimuth_steps=300) for x in scenario.of(SimLidar)),
         board=True,
         T_world_board=ON_WALL,
         target=AprilGrid(4, 10, 0.6, 0.3),

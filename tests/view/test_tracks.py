@@ -19,7 +19,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 @pytest.fixture(scope="module")
 def shown(read, tmp_path_factory):
     """The residuals of cam0, and what the viewer has of the result."""
-    scenario = replace(load_scenario(EXAMPLE), duration_s=6.0, lidars=(), wheels=())
+    scenario = replace(load_scenario(EXAMPLE), duration_s=6.0, sensors=())
     rig = with_drawn_guess(rig_for(scenario), scenario, 1)
     found = calibrate_measurements(rig, simulate(scenario, 1).measurements)
     r = found.track_residuals[0]

@@ -109,7 +109,7 @@ def _true_points(shown, scan: int) -> tuple[np.ndarray, np.ndarray]:
     """(N, 3) all points of a scan in the simulated world, each from where the LiDAR was at its instant; and (N,) these
     on the clock of the result."""
     truth, m = shown.simulation.truth, shown.simulation.measurements
-    stream, T = m.lidars[0], truth.T_imu_lidar["lidar0"]
+    stream, T = m.lidars[0], truth.T_imu_sensor["lidar0"]
     own = slice(*stream.start[scan : scan + 2])
     seconds = (int(stream.stamps_ns[scan]) - truth.imu_clock_origin_ns) * 1e-9 + truth.time_offset["lidar0"]
     R, p, _ = truth.pose_at(seconds + stream.offset_s[own].astype(np.float64))

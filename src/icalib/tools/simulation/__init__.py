@@ -4,19 +4,18 @@ from icalib.tools.simulation.images.filming import Film, Shot, film, sheets_of
 from icalib.tools.simulation.images.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
 from icalib.tools.simulation.rigs import GuessError, rig_for, settings_for, with_drawn_guess
 from icalib.tools.simulation.scenario.image_faults import ImageFaults
-from icalib.tools.simulation.scenario.robot import Drive, Features, SimLidar, SimPoses, SimWheels
+from icalib.tools.simulation.scenario.robot import Drive, Features
 from icalib.tools.simulation.scenario.room import Hills, Obstacle, Room, hills_of_slope
 from icalib.tools.simulation.scenario.scenario import ADIS16448, HandheldMotion, Scenario, SimCamera, handheld
 from icalib.tools.simulation.scenario.scenario_file import load_scenario
+from icalib.tools.simulation.scenario.sensor import SimSensor
 from icalib.tools.simulation.scenario.tag_map import tag_map
 from icalib.tools.simulation.scenario.texture import Texture
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 from icalib.tools.simulation.sensor_bag import write_sensors
 from icalib.tools.simulation.sensors.corners import CornerTruth
-from icalib.tools.simulation.sensors.motion import TrueTrajectory
-from icalib.tools.simulation.sensors.poses import PoseTruth
 from icalib.tools.simulation.sensors.simulate import Simulation, Truth, simulate
 from icalib.tools.simulation.sensors.tracks import TrackTruth
-from icalib.tools.simulation.sensors.wheels import WheelTruth
 from icalib.tools.simulation.tables import write_tables
 from icalib.tools.simulation.writing import write_film
 
@@ -33,7 +32,6 @@ __all__ = [
     "Imaging",
     "HandheldMotion",
     "Picture",
-    "PoseTruth",
     "Renderer",
     "Room",
     "Scenario",
@@ -41,15 +39,12 @@ __all__ = [
     "SheetTruth",
     "Shot",
     "SimCamera",
-    "SimLidar",
-    "SimPoses",
-    "SimWheels",
+    "SimSensor",
     "Simulation",
     "Texture",
     "TrackTruth",
     "TrueTrajectory",
     "Truth",
-    "WheelTruth",
     "exposure_poses",
     "film",
     "handheld",

@@ -3,34 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 
 from icalib.geometry.targets import NoTarget
-from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels, by_name
-from icalib.rig.kinds import SPECS
+from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
 from icalib.sensors.sensor import mounted
-from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
-from icalib.tools.simulation.sensors.simulate import raw_time_offset
+from icalib.tools.simulation.sensors.simulate import raw_time_offset, true_values
 
-Sensor = TypeVar("Sensor", Camera, Lidar, Wheels, PoseSensor)
-Robotic = TypeVar("Robotic", Lidar, Wheels, PoseSensor)
 Treatment = Literal["free", "start", "fixed"] | Parameter
 _GUESS_STREAM = 3000  # of random numbers; see `simulate` for the others
 
 
 @dataclass(frozen=True)
 class GuessError:
-    """Standard deviations of a drawn first guess: of each axis of a rotation [rad] and of a translation [m], of a time
-    offset [s], and of a focal length, as a share of it."""
+    """Standard deviations of a drawn initial guess: of each axis of a rotation [rad] and of a translation [m], of a
+    time offset [s]; relative: of focal lengths and own parameters of sensors, as a share of them."""
 
     rotation: float = float(np.deg2rad(5.0))
     translation: float = 0.05
     time_offset: float = 0.02
-    focal_length: float = 0.03
+    relative: float = 0.03
 
 
 def settings_for(scenario: Scenario) -> Settings:
@@ -47,111 +43,54 @@ def settings_for(scenario: Scenario) -> Settings:
 
 
 def rig_for(
-    scenario: Scenario,
-    *,
-    settings: Settings | None = None,
-    rotation: Treatment = "free",
-    translation: Treatment = "free",
-    time_offset: Treatment = "free",
-    intrinsics: Treatment = "fixed",
-    distortion: Treatment = "fixed",
-    bloom: Treatment = "free",
-    imu_intrinsics: Treatment = "fixed",
-    drive: Treatment = "free",
+    scenario: Scenario, *, settings: Settings | None = None, others: Treatment = "free", **named: Treatment
 ) -> Rig:
     """The scenario's rig, noise as simulated (as stated by the scenario, where its noise is switched off).
 
-    Cameras in a room without target and without `features` track its images. Each group of parameters, of all cameras
-    alike: "free" (no guess), "start" (free, from the truth), "fixed" (at the truth), or a Parameter. settings: by
-    default those of `settings_for`.
+    Cameras in a room without target and without `features` track its images. settings: by default those of
+    `settings_for`. Each group of parameters, of all sensors alike: "free" (no guess), "start" (free, from the truth),
+    "fixed" (at the truth), or a Parameter. named: by the name of the group in the rig, imu_intrinsics of the IMU; by
+    default both intrinsics and distortion are fixed. others: all groups that are not named. Raises TypeError for a name
+    that no group has.
     """
-
-    treated = _Treated(scenario, rotation, translation, time_offset, intrinsics, distortion, bloom, drive)
-    imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, _parameter(imu_intrinsics, scenario.imu_intrinsics))
+    treated: dict[str, Treatment] = {"imu_intrinsics": "fixed", "intrinsics": "fixed", "distortion": "fixed", **named}
+    sims = {sim.name: sim for sim in scenario.mounted}
+    plain = [*(_camera(scenario, c) for c in scenario.cameras), *(s.rig_entry() for s in scenario.sensors)]
+    known = {"imu_intrinsics", *(spec.name for kind in (Camera, *map(type, plain)) for spec in kind.stated())}
+    if unknown := named.keys() - known:
+        raise TypeError(f"no group of parameters is called {min(unknown)}.")
+    sensors = [_treated(s, true_values(scenario, sims[s.name]), treated, others) for s in plain]
+    imu_intrinsics = _parameter(treated["imu_intrinsics"], scenario.imu_intrinsics)
     return Rig(
-        by_name(
-            imu,
-            *(treated.camera(c) for c in scenario.cameras),
-            *(treated.lidar(s) for s in scenario.lidars),
-            *(treated.wheels(s) for s in scenario.wheels),
-            *(treated.poses(s) for s in scenario.poses),
-        ),
+        by_name(ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, imu_intrinsics), *sensors),
         replace(scenario.target, size_sigma=0.0) if scenario.board and scenario.cameras else NoTarget(),
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,
     )
 
 
-@dataclass(frozen=True)
-class _Treated:
-    """Sensors of the rig, with each group of parameters treated alike in all."""
+def _camera(scenario: Scenario, sim: SimCamera) -> Camera:
+    """As `SimSensor.rig_entry`."""
+    tracks = f"{sim.name}/tracks.csv"
+    if scenario.features is None:
+        tracks = None if scenario.board or scenario.room is None else TRACK_IMAGES
+    return Camera(
+        sim.name,
+        f"{sim.name}/corners.csv",
+        sim.model,
+        sim.resolution,
+        corner_noise_px=sim.corner_noise_px,
+        tracks=tracks,
+        track_noise_px=None if scenario.features is None else sim.corner_noise_px,
+    )
 
-    scenario: Scenario
-    rotation: Treatment
-    translation: Treatment
-    time_offset: Treatment
-    intrinsics: Treatment
-    distortion: Treatment
-    bloom: Treatment
-    drive: Treatment
 
-    def _tracks(self, sim: SimCamera) -> str | None:
-        if self.scenario.features is not None:
-            return f"{sim.name}/tracks.csv"
-        return None if self.scenario.board or self.scenario.room is None else TRACK_IMAGES
-
-    def camera(self, sim: SimCamera) -> Camera:
-        return Camera(
-            sim.name,
-            f"{sim.name}/corners.csv",
-            sim.model,
-            sim.resolution,
-            corner_noise_px=sim.corner_noise_px,
-            tracks=self._tracks(sim),
-            track_noise_px=None if self.scenario.features is None else sim.corner_noise_px,
-            rotation=_parameter(self.rotation, sim.T_imu_cam[:3, :3]),
-            translation=_parameter(self.translation, sim.T_imu_cam[:3, 3]),
-            time_offset=_parameter(self.time_offset, [raw_time_offset(self.scenario, sim)]),
-            intrinsics=_parameter(self.intrinsics, sim.intrinsics),
-            distortion=_parameter(self.distortion, sim.distortion),
-            bloom=_parameter(self.bloom, [sim.bloom_px]),
-        )
-
-    def _mounted(self, sensor: Robotic, sim: SimLidar | SimWheels | SimPoses, T_imu_sensor: np.ndarray) -> Robotic:
-        return replace(
-            sensor,
-            rotation=_parameter(self.rotation, T_imu_sensor[:3, :3]),
-            translation=_parameter(self.translation, T_imu_sensor[:3, 3]),
-            time_offset=_parameter(self.time_offset, [raw_time_offset(self.scenario, sim)]),
-        )
-
-    def wheels(self, sim: SimWheels) -> Wheels:
-        kind = "rates" if sim.reports == "steering" else sim.reports
-        given = Wheels(
-            sim.name,
-            f"{sim.name}/{kind}.csv",
-            "ackermann" if sim.reports == "steering" else "differential",
-            wheel_noise=sim.noise,
-            speed_noise=sim.speed_noise,
-            yaw_noise=sim.yaw_noise,
-            steering_noise=sim.steering_noise,
-            measures=kind,
-            sampling=sim.sampling,
-        )
-        if sim.allowed_slip is not None:
-            given = replace(given, lateral_slip=sim.allowed_slip, vertical_slip=sim.allowed_slip)
-        given = replace(given, **{name: _parameter(self.drive, value) for name, value in sim.drive.items()})
-        return self._mounted(given, sim, sim.T_imu_wheel)
-
-    def lidar(self, sim: SimLidar) -> Lidar:
-        near, far = sim.range_m
-        given = Lidar(sim.name, f"{sim.name}/scans.npz", sim.range_noise_m, min_range_m=near, max_range_m=far)
-        return self._mounted(given, sim, sim.T_imu_lidar)
-
-    def poses(self, sim: SimPoses) -> PoseSensor:
-        noise = sim.rotation_noise, sim.position_noise
-        given = PoseSensor(sim.name, f"{sim.name}/poses.csv", sim.kind, *noise, scale_sigma=0.0)
-        return self._mounted(given, sim, sim.T_imu_sensor)
+def _treated(
+    sensor: Sensor, true: dict[str, np.ndarray], treatments: dict[str, Treatment], others: Treatment
+) -> Sensor:
+    """The sensor with each group treated as asked for; true: values by name."""
+    groups = {spec.name for spec in sensor.stated()} & true.keys()
+    return replace(sensor, **{name: _parameter(treatments.get(name, others), true[name]) for name in groups})
 
 
 def with_drawn_guess(
@@ -161,38 +100,21 @@ def with_drawn_guess(
     the same. Principal points are guessed in the middle of the image, and of distortions there is no guess."""
     rng = np.random.default_rng([seed, _GUESS_STREAM])
     spread = GuessError() if error is None else error
+    sims = {sim.name: sim for sim in scenario.mounted}
 
-    def mount(sim: SimCamera | SimLidar | SimWheels | SimPoses, T_imu_sensor: np.ndarray) -> dict[str, np.ndarray]:
-        return _drawn_pose(T_imu_sensor, raw_time_offset(scenario, sim), rng, spread)
-
-    def guessed(sensor: Sensor, drawn: dict[str, np.ndarray]) -> Sensor:
+    def guessed(sensor: Sensor) -> Sensor:
+        sim = sims[sensor.name]
+        drawn = _drawn_pose(sim.T_imu_sensor, raw_time_offset(scenario, sim), rng, spread)
+        drawn |= _drawn_lens(sim, rng, spread) if isinstance(sim, SimCamera) else sim.drawn_values(rng, spread.relative)
         free = {k: v for k, v in drawn.items() if getattr(sensor, k).mode == "free" and (only is None or k in only)}
         return replace(sensor, **{name: Parameter("free", value) for name, value in free.items()})
 
-    cameras = zip(rig.cameras, scenario.cameras, strict=True)
-    lidars = zip(rig.lidars, scenario.lidars, strict=True)
-    wheels = zip(rig.wheels, scenario.wheels, strict=True)
-    poses = zip(rig.poses, scenario.poses, strict=True)
-    return rig.with_sensors(
-        *(guessed(c, mount(s, s.T_imu_cam) | _drawn_lens(s, rng, spread)) for c, s in cameras),
-        *(guessed(x, mount(s, s.T_imu_lidar)) for x, s in lidars),
-        *(guessed(x, mount(s, s.T_imu_wheel) | _drawn_drive(s, rng, spread)) for x, s in wheels),
-        *(guessed(x, mount(s, s.T_imu_sensor)) for x, s in poses),
-    )
+    return rig.with_sensors(*map(guessed, rig.mounted))
 
 
 def _drawn_lens(sim: SimCamera, rng: np.random.Generator, error: GuessError) -> dict[str, np.ndarray]:
-    focal = np.array(sim.intrinsics[:2]) * (1.0 + error.focal_length * rng.standard_normal())
+    focal = np.array(sim.intrinsics[:2]) * (1.0 + error.relative * rng.standard_normal())
     return {"intrinsics": np.array([*focal, *(0.5 * (side - 1) for side in sim.resolution)])}
-
-
-def _drawn_drive(sim: SimWheels, rng: np.random.Generator, error: GuessError) -> dict[str, np.ndarray]:
-    """Radii, baseline and the like, as far off as focal lengths; an angle by as many radians."""
-    drawn, off = {}, error.focal_length * rng.standard_normal(3)
-    for name, value in sim.drive.items():
-        own, off = off[: value.size], off[value.size :]
-        drawn[name] = value + own * (value if SPECS[name].is_positive else 1.0)
-    return drawn
 
 
 def _drawn_pose(

@@ -13,30 +13,16 @@ import yaml
 
 from icalib.base.file_names import below
 from icalib.base.staging import staged
-from icalib.data.measurements import (
-    CornerStream,
-    ImuStream,
-    LidarStream,
-    PoseStream,
-    TrackStream,
-    WheelPoses,
-    WheelStream,
-)
+from icalib.data.measurements import CornerStream, ImuStream, TrackStream
 from icalib.errors import RecordingError
+from icalib.tools.simulation.output.csv_table import write_table
 from icalib.tools.simulation.scenario.scenario import Scenario
-from icalib.tools.simulation.sensors.poses import quaternion
 from icalib.tools.simulation.sensors.simulate import Simulation, Truth
 
 _TRUTH_HEADER = """\
 # Truth of a simulated recording, in SI units: p_imu = T_imu_sensor p_sensor, t_imu = t_sensor + time_offset.
 # Planes: [nx, ny, nz, d] in the world, n . p = d. The trajectory and the points of the tracks are in truth.npz.
 """
-_WHEEL_COLUMNS = {
-    "pair": ("rates", "left [rad/s],right [rad/s]"),
-    "steered": ("rates", "wheel [rad/s],steering [rad]"),
-    "twist": ("twist", "v [m/s],w [rad/s]"),
-}
-_WHEEL_SAMPLING = {"interval-mean": "means since the stamp before", "instantaneous": "values at the stamp"}
 
 
 def check_absent(path: Path) -> None:
@@ -76,9 +62,8 @@ def write_tables(
         steps: list[Callable[[], None]] = [partial(_write_imu, below(folder, measured.imu.name), measured.imu)]
         steps += [partial(_write_corners, below(folder, c.name), c, simulation.scenario) for c in measured.cameras]
         steps += [partial(_write_tracks, below(folder, t.name), t) for t in measured.tracks]
-        steps += [partial(_write_scans, below(folder, s.name), s) for s in measured.lidars]
-        steps += [partial(_write_wheels, below(folder, w.name), w) for w in measured.wheels]
-        steps += [partial(_write_poses, below(folder, s.name), s) for s in measured.poses]
+        for sensor in simulation.scenario.sensors:
+            steps.append(partial(sensor.write_table, below(folder, sensor.name), measured.streams[sensor.name]))
         steps += [partial(write_truth, simulation, seed, folder)]
         for i, step in enumerate(steps):
             step()
@@ -107,69 +92,34 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
     }
     for c in scenario.cameras:
         parameters = {"intrinsics": list(map(float, c.intrinsics)), "distortion": list(map(float, c.distortion))}
-        sensors[c.name] = _mounted(truth, c.name, "camera", c.T_imu_cam) | {"model": c.model} | parameters
-    for s in scenario.lidars:
-        sensors[s.name] = _mounted(truth, s.name, "lidar", s.T_imu_lidar)
-    for w in scenario.wheels:
-        sizes = {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in w.drive.items()}
-        sensors[w.name] = _mounted(truth, w.name, "wheels", w.T_imu_wheel) | sizes
-    for p in scenario.poses:
-        frame = {"kind": p.kind, "T_world_frame": p.T_world_frame.tolist(), "scale": p.scale}
-        sensors[p.name] = _mounted(truth, p.name, "pose", p.T_imu_sensor) | frame
+        sensors[c.name] = _mounted(truth, c.name, "camera") | {"model": c.model} | parameters
+    for s in scenario.sensors:
+        sensors[s.name] = _mounted(truth, s.name, s.sensor_type) | s.plain()
     plain: dict[str, Any] = {"seed": seed, "gravity": truth.gravity.tolist(), "sensors": sensors}
     if scenario.board:
         plain |= {"T_world_bodies": truth.T_world_bodies.tolist(), "target_size": truth.target_size}
     return plain | {"planes": truth.planes.tolist()}
 
 
-def _mounted(truth: Truth, name: str, kind: str, T_imu_sensor: np.ndarray) -> dict[str, Any]:
-    return {"type": kind, "T_imu_sensor": T_imu_sensor.tolist(), "time_offset": float(truth.time_offset[name])}
-
-
-def _write_table(path: Path, header: str, *columns: np.ndarray) -> None:
-    """A CSV whose numbers read back exactly. columns: (N,) or (N, k) each."""
-    lists = [c.tolist() for column in columns for c in (column.T if column.ndim == 2 else [column])]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8") as file:
-        file.write(f"#{header}\n")
-        file.writelines(",".join(map(repr, row)) + "\n" for row in zip(*lists, strict=True))
+def _mounted(truth: Truth, name: str, kind: str) -> dict[str, Any]:
+    return {
+        "type": kind,
+        "T_imu_sensor": truth.T_imu_sensor[name].tolist(),
+        "time_offset": float(truth.time_offset[name]),
+    }
 
 
 def _write_imu(folder: Path, imu: ImuStream) -> None:
     header = "t [ns],wx [rad/s],wy [rad/s],wz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
-    _write_table(folder / "data.csv", header, imu.stamps_ns, imu.gyro, imu.accel)
+    write_table(folder / "data.csv", header, imu.stamps_ns, imu.gyro, imu.accel)
 
 
 def _write_corners(folder: Path, corners: CornerStream, scenario: Scenario) -> None:
     names = scenario.target.point_identity(corners.point)
     stamps = corners.stamps_ns[corners.image]
-    _write_table(folder / "corners.csv", "t [ns],tag id,corner,u [px],v [px]", stamps, *names, corners.uv)
+    write_table(folder / "corners.csv", "t [ns],tag id,corner,u [px],v [px]", stamps, *names, corners.uv)
 
 
 def _write_tracks(folder: Path, tracks: TrackStream) -> None:
     stamps = tracks.stamps_ns[tracks.image]
-    _write_table(folder / "tracks.csv", "t [ns],feature,u [px],v [px]", stamps, tracks.feature, tracks.uv)
-
-
-def _write_scans(folder: Path, lidar: LidarStream) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    arrays = {name: getattr(lidar, name) for name in ("stamps_ns", "start", "offset_s", "xyz", "plane")}
-    np.savez(folder / "scans.npz", **arrays)
-
-
-def _write_wheels(folder: Path, wheels: WheelStream | WheelPoses) -> None:
-    if isinstance(wheels, WheelStream):
-        name, columns = _WHEEL_COLUMNS[wheels.kind]
-        header = f"t [ns],{columns}; {_WHEEL_SAMPLING[wheels.sampling]}"
-        _write_table(folder / f"{name}.csv", header, wheels.stamps_ns, wheels.rate)
-        return
-    header = "from [ns],to [ns],yaw [rad],x [m],y [m],covariance: yaw yaw,yaw x,yaw y,x x,x y,y y"
-    stamps = wheels.stamps_ns
-    upper = wheels.covariance[:, *np.triu_indices(3)]
-    _write_table(folder / "poses.csv", header, stamps[:-1], stamps[1:], wheels.pose, upper)
-
-
-def _write_poses(folder: Path, poses: PoseStream) -> None:
-    header = "t [ns],x [m],y [m],z [m],qx,qy,qz,qw"
-    xyzw = np.array([quaternion(R) for R in poses.rotation])
-    _write_table(folder / "poses.csv", header, poses.stamps_ns, poses.position, xyzw)
+    write_table(folder / "tracks.csv", "t [ns],feature,u [px],v [px]", stamps, tracks.feature, tracks.uv)

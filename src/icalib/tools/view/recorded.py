@@ -20,7 +20,7 @@ from icalib.tools.view.colors import by_value
 from icalib.tools.view.path import CubicPath
 from icalib.tools.view.scene import POINT, place
 from icalib.tools.view.series import log_lines
-from icalib.tools.view.stream import Stream
+from icalib.tools.view.stream import RerunStream
 
 MOST_READINGS = 100_000
 MOST_IMAGES = 600  # of a camera
@@ -89,7 +89,7 @@ class Recorded:
             if camera.tracks is None or self.recording.sees(camera):
                 self.recording.where(camera)
 
-    def log(self, s: Stream, progress: Progress) -> list[str]:
+    def log(self, s: RerunStream, progress: Progress) -> list[str]:
         """Logs all, and returns sentences on what was left out."""
         topics = image_topics(self.recording, [c for c in self.rig.cameras if self._pictured(c)])
         imus = () if self.rig.imu is None else (self.rig.imu,)
@@ -125,7 +125,7 @@ class Recorded:
             )
         return inside
 
-    def _readings(self, s: Stream, sensor: ImuSensor) -> list[str]:
+    def _readings(self, s: RerunStream, sensor: ImuSensor) -> list[str]:
         imu, _ = read_imu(self.recording, sensor, ClockJumps())
         seconds = self._clock(sensor.name).seconds(imu.stamps_ns)
         inside = self._during(sensor.name, seconds)
@@ -135,7 +135,7 @@ class Recorded:
         log_lines(s, f"readings/{sensor.name}/accel", seconds[keep], imu.accel[keep], "xyz")
         return _thinned(sensor.name, len(inside), MOST_READINGS, "readings")
 
-    def _images(self, s: Stream, name: str, topic: str) -> list[str]:
+    def _images(self, s: RerunStream, name: str, topic: str) -> list[str]:
         """One after the other, and of those that are left out not even the pixels."""
         seconds = self._clock(name).seconds(self.recording.stamps(topic))
         count = len(self._during(name, np.sort(seconds)))
@@ -152,7 +152,7 @@ class Recorded:
         notes = [f"{name}: {damaged} damaged images are not shown."] if damaged else []
         return notes + _thinned(name, count, MOST_IMAGES, "images")
 
-    def _scans(self, s: Stream, sensor: Lidar) -> list[str]:
+    def _scans(self, s: RerunStream, sensor: Lidar) -> list[str]:
         stream = self.recording.lidar(sensor)
         seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
         inside = self._during(sensor.name, seconds)

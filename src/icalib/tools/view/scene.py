@@ -11,7 +11,7 @@ from icalib.report.ellipsoids import SIGMAS, VERDICT_COLORS, ellipsoids, magnifi
 from icalib.report.plot import COLORS
 from icalib.result import Calibration, RecordingSpan
 from icalib.tools.view.colors import by_value, rgb
-from icalib.tools.view.stream import Stream
+from icalib.tools.view.stream import RerunStream
 
 POINT = 1.5  # radius of a point of a LiDAR, in points of the screen
 _TARGET, _WAY = "#be185d", "#64748b"
@@ -29,7 +29,7 @@ def spans(c: Calibration) -> tuple[RecordingSpan, ...]:
     return c.recordings or (RecordingSpan("", ends[0], ends[1], 0),)
 
 
-def log_rig(s: Stream, c: Calibration) -> None:
+def log_rig(s: RerunStream, c: Calibration) -> None:
     """Frames of all sensors, fields of view, rings about LiDARs, wheels; all but the body stand still on it."""
     spread = rig_shapes.spread(c)
     for name, T in rig_shapes.frames(c).items():
@@ -45,7 +45,7 @@ def log_rig(s: Stream, c: Calibration) -> None:
         s.still(f"{place(c, name)}/shape", strips)
 
 
-def _pinhole(s: Stream, c: Calibration, name: str, depth: float):
+def _pinhole(s: RerunStream, c: Calibration, name: str, depth: float):
     """Rerun's pixel (0, 0) is the corner of the image, ours the centre of its first pixel; it knows no distortion."""
     fx, fy, cx, cy = c.group(name, "intrinsics").value
     return s.rr.Pinhole(
@@ -56,7 +56,7 @@ def _pinhole(s: Stream, c: Calibration, name: str, depth: float):
     )
 
 
-def log_uncertainty(s: Stream, c: Calibration) -> None:
+def log_uncertainty(s: RerunStream, c: Calibration) -> None:
     """The ellipsoids, magnified alike, coloured by verdict."""
     factor = magnification(c)
     for e in ellipsoids(c):
@@ -71,7 +71,7 @@ def log_uncertainty(s: Stream, c: Calibration) -> None:
         s.still(f"world/{c.body}/uncertainty/{e.sensor}", ellipsoid)
 
 
-def log_motion(s: Stream, c: Calibration) -> None:
+def log_motion(s: RerunStream, c: Calibration) -> None:
     """The pose of the body at each keyframe, and the trajectory of each recording so far."""
     path = c.trajectory
     s.still("world", s.rr.ViewCoordinates.RIGHT_HAND_Z_UP)
@@ -85,7 +85,7 @@ def log_motion(s: Stream, c: Calibration) -> None:
         s.at("world/way", span.start, s.rr.LineStrips3D([path.position[of == k]], colors=rgb(_WAY)))
 
 
-def log_target(s: Stream, c: Calibration) -> None:
+def log_target(s: RerunStream, c: Calibration) -> None:
     """Outline and points of each body of the target, as the scene stands in the world of each recording."""
     target, stands = target_from_plain(c.rig), rig_shapes.scene_in_worlds(c)
     if target is None or not stands:
@@ -101,7 +101,7 @@ def log_target(s: Stream, c: Calibration) -> None:
         s.still(f"{entity}/points", s.rr.Points3D(target.points[target.body == k], colors=rgb(_TARGET)))
 
 
-def log_planes(s: Stream, c: Calibration) -> None:
+def log_planes(s: RerunStream, c: Calibration) -> None:
     """Points of LiDARs on the planes that they were found to lie on, coloured by how far off they are."""
     for r in c.lidar_residuals:
         of, size = c.recording_of(r.seconds), np.abs(r.residual.astype(np.float64))

@@ -13,14 +13,14 @@ from icalib.result import Calibration, ImageResiduals, rms_of_images
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.tools.view.colors import rgb
 from icalib.tools.view.scene import place
-from icalib.tools.view.stream import Stream
+from icalib.tools.view.stream import RerunStream
 
 BIN_S = 0.1  # over which points of a LiDAR are taken together
 _DOT = 3.0  # radius, in points of the screen
 _GOOD, _LEFT_OUT = "#22c55e", "#9ca3af"
 
 
-def log_residuals(s: Stream, c: Calibration) -> None:
+def log_residuals(s: RerunStream, c: Calibration) -> None:
     """Of cameras the RMS of each image [px], of LiDARs that of each tenth of a second [mm], of all else whitened."""
     for r in c.image_residuals:
         rms = rms_of_images(r)
@@ -40,7 +40,7 @@ def log_residuals(s: Stream, c: Calibration) -> None:
             log_lines(s, entity, r.seconds, r.whitened[:, k : k + 1], [f"{label}, whitened"])
 
 
-def log_states(s: Stream, c: Calibration) -> None:
+def log_states(s: RerunStream, c: Calibration) -> None:
     """Velocity [m/s] and biases [deg/s, m/s^2] at the keyframes; without an IMU they say nothing."""
     path = c.trajectory
     if c.imu is None:
@@ -50,7 +50,7 @@ def log_states(s: Stream, c: Calibration) -> None:
     log_lines(s, "motion/accel_bias", path.seconds, path.accel_bias, "xyz")
 
 
-def log_lines(s: Stream, entity: str, seconds: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
+def log_lines(s: RerunStream, entity: str, seconds: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
     """Lines over time: values (n, m), a column for each of the m names."""
     colors = AXIS_COLORS if len(names) == 3 else COLORS[: len(names)]
     s.still(entity, s.rr.SeriesLines(names=list(names), colors=rgb(*colors)))
@@ -65,7 +65,7 @@ def rms_of_bins(r: LidarResiduals) -> tuple[np.ndarray, np.ndarray]:
     return BIN_S * (number + 0.5), np.sqrt(total / np.bincount(of, minlength=len(number)))
 
 
-def _log_seen(s: Stream, c: Calibration, r: ImageResiduals) -> None:
+def _log_seen(s: RerunStream, c: Calibration, r: ImageResiduals) -> None:
     """Corners, or points that were followed, as they were measured in the camera's image; red where they were
     rejected, grey where their track is not in use."""
     rr, entity = s.rr, f"{place(c, r.sensor)}/image/{r.kind}"

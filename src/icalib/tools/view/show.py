@@ -15,7 +15,7 @@ from icalib.tools.view.layout import blueprint
 from icalib.tools.view.recorded import Recorded, span_of
 from icalib.tools.view.scene import log_motion, log_planes, log_rig, log_target, log_uncertainty
 from icalib.tools.view.series import log_residuals, log_states
-from icalib.tools.view.stream import Stream, opened
+from icalib.tools.view.stream import RerunStream, opened
 
 
 def view(
@@ -51,7 +51,7 @@ def _recorded(c: Calibration, folder: Path, recording: Path) -> Recorded:
     return found
 
 
-def _log_result(stream: Stream, c: Calibration) -> None:
+def _log_result(stream: RerunStream, c: Calibration) -> None:
     for log in (log_rig, log_uncertainty, log_motion, log_target, log_planes, log_residuals, log_states):
         log(stream, c)
 

@@ -19,7 +19,7 @@ _PATIENCE_S = 30.0  # until the viewer has taken what it was sent
 
 
 @dataclass(frozen=True)
-class Stream:
+class RerunStream:
     """One recording of Rerun, which may be watched while it grows. rr: the package, rec: its stream. All that is not
     still stands on one timeline, in seconds of the result's clock."""
 
@@ -43,7 +43,7 @@ class Stream:
 
 
 @contextlib.contextmanager
-def opened(rr: Any, blueprint: Any, save: Path | None) -> Iterator[Stream]:
+def opened(rr: Any, blueprint: Any, save: Path | None) -> Iterator[RerunStream]:
     """A stream into the file `save`, which replaces an old one once all is written; without it into a viewer that is
     started. Raises CalibrationError where the file cannot be written, or there is no viewer."""
     rec = rr.RecordingStream("icalib")
@@ -51,7 +51,7 @@ def opened(rr: Any, blueprint: Any, save: Path | None) -> Iterator[Stream]:
     if save is None:
         with _sentence("Rerun's viewer cannot be started or does not answer", "write a file by --save"):
             rec.spawn(default_blueprint=blueprint)
-        yield Stream(rr, rec)
+        yield RerunStream(rr, rec)
         with _sentence("Rerun's viewer cannot be started or does not answer", "write a file by --save"):
             rec.flush(timeout_sec=_PATIENCE_S)
         return
@@ -62,7 +62,7 @@ def opened(rr: Any, blueprint: Any, save: Path | None) -> Iterator[Stream]:
                     raise IsADirectoryError(0, "it is a folder")
                 part = stack.enter_context(staged(save.parent)) / save.name
                 rec.save(part, default_blueprint=blueprint)
-            yield Stream(rr, rec)
+            yield RerunStream(rr, rec)
             with _sentence(f"{save} cannot be written", "choose another place"):
                 rec.flush()
                 rec.disconnect()

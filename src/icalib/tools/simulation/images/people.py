@@ -6,7 +6,7 @@ import numpy as np
 
 from icalib.tools.simulation.scenario.room import Obstacle
 from icalib.tools.simulation.scenario.scenario import SimCamera
-from icalib.tools.simulation.sensors.motion import TrueTrajectory
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
 _SIZE_M = (0.5, 0.3, 1.75)
 _AWAY_M, _NEARER_M = 1.8, 0.4  # from the camera, and by how much this changes
@@ -25,8 +25,8 @@ def walking(count: int, camera: SimCamera, trajectory: TrueTrajectory, seconds: 
     if not count:
         return ()
     rotation, position, _ = trajectory.pose_at(np.array([seconds - _LATE_S]))
-    eye = position[0] + rotation[0] @ camera.T_imu_cam[:3, 3]
-    ahead = rotation[0] @ camera.T_imu_cam[:3, 2]
+    eye = position[0] + rotation[0] @ camera.T_imu_sensor[:3, 3]
+    ahead = rotation[0] @ camera.T_imu_sensor[:3, 2]
     people = []
     for i in range(count):
         phase = 2.0 * np.pi * _HZ * 1.1**i * seconds + 2.0 * i

@@ -19,7 +19,7 @@ from icalib.tools.simulation.images.lenses import unproject
 from icalib.tools.simulation.images.raster import paint, paint_discs, pixel_kernel, shrink
 from icalib.tools.simulation.scenario.projection import project, visible
 from icalib.tools.simulation.scenario.scenario import SimCamera
-from icalib.tools.simulation.sensors.motion import TrueTrajectory
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
 _CELLS = 4  # a pixel, along each axis
 _REACH = 4.0  # of the blur, in standard deviations
@@ -205,4 +205,4 @@ def exposure_poses(
     rotation, position, _ = trajectory.pose_at(at)
     T_world_imu = np.tile(np.eye(4), (count, 1, 1))
     T_world_imu[:, :3, :3], T_world_imu[:, :3, 3] = rotation, position
-    return T_world_imu @ camera.T_imu_cam
+    return T_world_imu @ camera.T_imu_sensor

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.tools.simulation.scenario.robot import SimPoses
+from icalib.tools.simulation.scenario.sensor import SimSensor, simulated_kinds
 
 # Field of the IMU -> where its numbers stand in `Scenario.imu_intrinsics`.
 _IMU = {
@@ -23,19 +23,26 @@ _IMU = {
 _LARGEST = 0.2  # of a relative error: the recording is that of another sensor
 
 
-def read_effects(value: YamlValue, poses: Sequence[SimPoses]) -> dict[str, Any]:
-    """The fields of `Scenario` that effects change; `poses`: its pose sensors. Raises RigError naming file, line and
-    field."""
-    found, changed = value.record((), ("imu", "target_size", "pose_scale")), {}
+def read_effects(value: YamlValue, sensors: Sequence[SimSensor]) -> dict[str, Any]:
+    """The fields of `Scenario` that effects change; `sensors`: those of the scenario file. Raises RigError naming file,
+    line and field."""
+    scales = {effect: (kind, field) for kind in simulated_kinds().values() for effect, field in kind.effects.items()}
+    found, changed = value.record((), ("imu", "target_size", *scales)), {}
     if "imu" in found:
         changed["imu_intrinsics"] = _intrinsics(found["imu"])
     if "target_size" in found:
         changed["target_size"] = _ratio(found["target_size"])
-    if "pose_scale" in found:
-        scales = found["pose_scale"].record((), tuple(p.name for p in poses))
-        by_name = {name: _ratio(scale) for name, scale in scales.items()}
-        changed["poses"] = tuple(replace(p, scale=by_name.get(p.name, p.scale)) for p in poses)
+    for effect in scales.keys() & found.keys():
+        sensors = _scaled(found[effect], sensors, *scales[effect])
+        changed["sensors"] = sensors
     return changed
+
+
+def _scaled(value: YamlValue, sensors: Sequence[SimSensor], kind: type[SimSensor], field: str) -> tuple[SimSensor, ...]:
+    """The same sensors, `field` of those of `kind` changed to the ratio that `value` states for their names."""
+    ratios = value.record((), tuple(s.name for s in sensors if isinstance(s, kind)))
+    by_name = {name: _ratio(ratio) for name, ratio in ratios.items()}
+    return tuple(replace(s, **{field: by_name[s.name]}) if s.name in by_name else s for s in sensors)
 
 
 def _intrinsics(value: YamlValue) -> np.ndarray:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Target
 from icalib.rig import ImuNoise
+from icalib.tools.simulation.scenario.fields import pose_from_rows
 from icalib.tools.simulation.scenario.image_faults import ImageFaults
-from icalib.tools.simulation.scenario.robot import Drive, Features, SimLidar, SimPoses, SimWheels
+from icalib.tools.simulation.scenario.robot import Drive, Features
 from icalib.tools.simulation.scenario.room import Room
+from icalib.tools.simulation.scenario.sensor import SimSensor
+
+Kind = TypeVar("Kind", bound=SimSensor)
 
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
 Interval = tuple[float, float]  # (start, end) in seconds on the IMU's clock, since its origin
@@ -40,14 +44,6 @@ _EUROC_T_IMU_CAM1 = (
     (-0.0253898008918, 0.0179005838253, 0.999517347078, 0.00786212447038),
     (0.0, 0.0, 0.0, 1.0),
 )
-
-
-def pose_from_rows(rows: object) -> np.ndarray:
-    """4x4 pose from printed numbers: the rotation is made orthonormal (nearest in the Frobenius norm, by SVD)."""
-    T = np.array(rows, dtype=np.float64)
-    left, _, right = np.linalg.svd(T[:3, :3])
-    T[:3, :3] = left @ right
-    return T
 
 
 def _standing_board() -> np.ndarray:
@@ -79,7 +75,7 @@ class SimCamera:
     resolution: tuple[int, int]
     intrinsics: tuple[float, ...]
     distortion: tuple[float, ...]
-    T_imu_cam: np.ndarray  # (4, 4)
+    T_imu_sensor: np.ndarray  # (4, 4)
     time_offset_s: float = 0.0
     rate_hz: float = 20.0
     phase_s: float = 0.0
@@ -94,6 +90,14 @@ class SimCamera:
             raise RigError(
                 f"{self.name}: the simulator has no camera model {self.model!r}; available are {', '.join(MODELS)}."
             )
+
+    def values(self) -> dict[str, np.ndarray]:
+        """True values of its parameters by their names in the rig, except extrinsics and time offset."""
+        return {
+            "intrinsics": np.array(self.intrinsics),
+            "distortion": np.array(self.distortion),
+            "bloom": np.array([self.bloom_px]),
+        }
 
 
 @dataclass(frozen=True)
@@ -158,11 +162,9 @@ class Scenario:
     board: bool = True  # whether the target stands in the scene
     room: Room | None = None
     features: Features | None = None  # on the room's surfaces; None: no tracks
-    lidars: tuple[SimLidar, ...] = ()
-    wheels: tuple[SimWheels, ...] = ()
-    poses: tuple[SimPoses, ...] = ()
+    sensors: tuple[SimSensor, ...] = ()  # beside IMU and cameras
     image_faults: ImageFaults = ImageFaults()
-    robot_noise_enabled: bool = True  # of tracks, LiDARs, wheels and pose sensors
+    robot_noise_enabled: bool = True  # of tracks, and of `sensors`
     seed: int = 0  # where none is asked for
 
     def __post_init__(self) -> None:
@@ -178,23 +180,32 @@ class Scenario:
         """(bodies, 4, 4) T_world_body."""
         return self.T_world_board[None] if self.T_world_bodies is None else self.T_world_bodies
 
+    @property
+    def mounted(self) -> tuple[SimCamera | SimSensor, ...]:
+        """All sensors but the IMU."""
+        return *self.cameras, *self.sensors
+
+    def of(self, kind: type[Kind]) -> tuple[Kind, ...]:
+        """The sensors of one kind."""
+        return tuple(sensor for sensor in self.sensors if isinstance(sensor, kind))
+
+    def with_sensors(self, *sensors: SimSensor) -> Scenario:
+        """The same scenario with these `sensors`: in place of those of the same names, or beside the others."""
+        named = {sensor.name: sensor for sensor in (*self.sensors, *sensors)}
+        return replace(self, sensors=tuple(named.values()))
+
 
 def _check_robot(scenario: Scenario) -> None:
     """Raises RigError where the parts of a scenario do not go together."""
-    drive = scenario.motion if isinstance(scenario.motion, Drive) else None
-    needs_room = drive or scenario.features or scenario.lidars
-    if needs_room and scenario.room is None:
-        raise RigError("drives, features and LiDARs need a room; give the scenario one.")
-    if drive is not None and drive.kind == "ramps" and (scenario.room is None or scenario.room.hills is None):
+    drive, room = (scenario.motion if isinstance(scenario.motion, Drive) else None), scenario.room
+    if (drive or scenario.features) and room is None:
+        raise RigError("drives and features need a room; give the scenario one.")
+    if drive is not None and drive.kind == "ramps" and (room is None or room.hills is None):
         raise RigError("the motion ramps needs hills; give the room a slope.")
-    if scenario.room and scenario.room.hills and drive is not None and drive.on_ground and drive.kind != "ramps":
+    if room and room.hills and drive is not None and drive.on_ground and drive.kind != "ramps":
         raise RigError(f"the motion {drive.kind} needs a flat floor; remove the slope from the room.")
-    for wheels in scenario.wheels:
-        if wheels.reports != "poses" and not (drive is not None and drive.on_ground):
-            raise RigError(
-                f"{wheels.name} cannot roll, because the motion is not that of wheels on a floor; use reports: "
-                "poses, or choose a motion on the ground."
-            )
+    for sensor in scenario.sensors:
+        sensor.check(room, drive)
 
 
 def handheld(

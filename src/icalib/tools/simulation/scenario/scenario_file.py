@@ -14,19 +14,19 @@ from icalib.base.yaml_nodes import MOST_WHOLE, YamlValue, read_yaml
 from icalib.errors import RigError
 from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
+from icalib.sensors import SENSOR_KINDS
 from icalib.tools.simulation.scenario.effects import read_effects
+from icalib.tools.simulation.scenario.fields import at_least, intervals, mounted_fields, pose, share, triple
 from icalib.tools.simulation.scenario.image_faults import ImageFaults
 from icalib.tools.simulation.scenario.projection import PARAMETER_COUNTS
-from icalib.tools.simulation.scenario.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
+from icalib.tools.simulation.scenario.robot import Drive, DriveKind, Features
 from icalib.tools.simulation.scenario.room import Obstacle, Room, hills_of_slope
-from icalib.tools.simulation.scenario.scenario import MODELS, Scenario, SimCamera, pose_from_rows
+from icalib.tools.simulation.scenario.scenario import MODELS, Scenario, SimCamera
+from icalib.tools.simulation.scenario.sensor import SimSensor, simulated_kinds
 from icalib.tools.simulation.scenario.size import refuse_large
 from icalib.tools.simulation.scenario.texture import Texture
 
-_SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
-_CLOCK = ("T_imu_sensor", "rate")
-_CLOCK_OPTIONS = ("time_offset", "phase")
 _START_NS = 1_700_000_000_000_000_000  # of all clocks, where the file gives none
 _MARGIN_S = 3600.0  # by which clocks of sensors may differ
 _STEEPEST_DEG = 45.0
@@ -47,7 +47,7 @@ def load_scenario(path: str | Path) -> Scenario:
     sensors = _sensors(found["sensors"], start_ns)
     room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
     features = _features(found["features"]) if "features" in found else None
-    effects: dict[str, Any] = read_effects(found["effects"], sensors["poses"]) if "effects" in found else {}
+    effects: dict[str, Any] = read_effects(found["effects"], sensors["sensors"]) if "effects" in found else {}
     board: dict[str, Any] = _board(found["target"]) if "target" in found else {"board": False}
     scenario = _made(
         root,
@@ -79,32 +79,28 @@ def _made(value: YamlValue, kind: Callable[..., Made], /, **fields: Any) -> Made
 
 def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
     """The fields of `Scenario` that the sensors fill."""
+    kinds = simulated_kinds()
+    types = tuple(kind for kind in SENSOR_KINDS if kind in kinds or kind in ("imu", "camera"))
     imus: list[dict[str, Any]] = []
     cameras: list[SimCamera] = []
-    lidars: list[SimLidar] = []
-    wheels: list[SimWheels] = []
-    poses: list[SimPoses] = []
+    others: list[SimSensor] = []
     for name, sensor in value.entries().items():
         if not NAME.fullmatch(name):
             sensor.fail(f"a sensor's name is {NAME_WORDS}, as in cam0; rename it.")
         fields = sensor.entries()
         if "type" not in fields:
-            sensor.fail(f"type is missing; add type: {' or type: '.join(_SENSOR_TYPES)}.")
-        kind = fields["type"].choice("sensor type", _SENSOR_TYPES)
+            sensor.fail(f"type is missing; add type: {' or type: '.join(types)}.")
+        kind = fields["type"].choice("sensor type", types)
         if kind == "imu":
             imus.append(_imu(name, sensor))
         elif kind == "camera":
             cameras.append(_camera(name, sensor, start_ns))
-        elif kind == "lidar":
-            lidars.append(_lidar(name, sensor, start_ns))
-        elif kind == "pose":
-            poses.append(_poses(name, sensor, start_ns))
         else:
-            wheels.append(_wheels(name, sensor, start_ns))
+            others.append(kinds[kind].parse(name, sensor, start_ns))
     if len(imus) != 1:
         value.fail(f"there must be one sensor of type: imu, not {len(imus)}; its frame is the robot's.")
-    others = {"cameras": tuple(cameras), "lidars": tuple(lidars), "wheels": tuple(wheels), "poses": tuple(poses)}
-    return imus[0] | others
+    others.sort(key=lambda sensor: types.index(sensor.sensor_type))
+    return imus[0] | {"cameras": tuple(cameras), "sensors": tuple(others)}
 
 
 def _imu(name: str, value: YamlValue) -> dict[str, Any]:
@@ -117,19 +113,9 @@ def _imu(name: str, value: YamlValue) -> dict[str, Any]:
     return {"imu_rate_hz": found["rate"].positive(), "imu_noise": noise} | biases
 
 
-def _clock(found: dict[str, YamlValue], start_ns: int) -> dict[str, Any]:
-    """What all sensors but the IMU have, by the names of their fields."""
-    return {
-        "time_offset_s": found["time_offset"].number() if "time_offset" in found else 0.0,
-        "rate_hz": found["rate"].positive(),
-        "phase_s": _least(found["phase"], 0.0) if "phase" in found else 0.0,
-        "clock_origin_ns": start_ns,
-    }
-
-
 def _camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
-    required = ("type", *_CLOCK, "model", "resolution", "intrinsics", "distortion", "noise_px")
-    found = value.record(required, (*_CLOCK_OPTIONS, "dropouts"))
+    required = ("model", "resolution", "intrinsics", "distortion", "noise_px")
+    found, common = mounted_fields(value, start_ns, required, ("dropouts",))
     model = found["model"].choice("camera model", MODELS)
     sides = found["resolution"].items()
     if len(sides) != 2:
@@ -140,71 +126,10 @@ def _camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
         (sides[0].whole(1), sides[1].whole(1)),
         tuple(found["intrinsics"].vector(4).tolist()),
         tuple(found["distortion"].vector(PARAMETER_COUNTS[model]).tolist()),
-        _pose(found["T_imu_sensor"]),
-        corner_noise_px=_least(found["noise_px"], 0.0),
-        dropouts=_intervals(found["dropouts"]) if "dropouts" in found else (),
-        **_clock(found, start_ns),
+        corner_noise_px=at_least(found["noise_px"], 0.0),
+        dropouts=intervals(found["dropouts"]) if "dropouts" in found else (),
+        **common,
     )
-
-
-def _lidar(name: str, value: YamlValue, start_ns: int) -> SimLidar:
-    options = ("rings", "azimuth_steps", "elevation_deg", "range", "noise")
-    found = value.record(("type", *_CLOCK), _CLOCK_OPTIONS + options)
-    chosen: dict[str, Any] = {key: found[key].whole(1) for key in ("rings", "azimuth_steps") if key in found}
-    if "elevation_deg" in found:
-        chosen["elevation_deg"] = _interval(found["elevation_deg"])
-    if "range" in found:
-        chosen["range_m"] = _interval(found["range"])
-    if "noise" in found:
-        chosen["range_noise_m"] = _least(found["noise"], 0.0)
-    return SimLidar(name, _pose(found["T_imu_sensor"]), **chosen, **_clock(found, start_ns))
-
-
-# What wheels must have, by what they report, and what noise they may have.
-_DRIVES = {
-    "rates": (("radii", "baseline"), ("noise", "slip", "allowed_slip", "poses_every")),
-    "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
-    "twist": (("scales",), ("speed_noise", "yaw_noise", "allowed_slip")),
-    "steering": (("radius", "wheelbase"), ("steering_offset", "noise", "steering_noise", "allowed_slip")),
-}
-
-
-def _wheels(name: str, value: YamlValue, start_ns: int) -> SimWheels:
-    fields = value.entries()
-    reports = fields["reports"].choice("reports", tuple(_DRIVES)) if "reports" in fields else SimWheels.reports
-    required, options = _DRIVES[reports]
-    found = value.record(("type", *_CLOCK, *required), (*_CLOCK_OPTIONS, *options, "reports", "sampling"))
-    chosen: dict[str, Any] = {"reports": reports}
-    for key in found.keys() & {*required, *options}:
-        chosen[key] = _drive_value(key, found[key])
-    if "sampling" in found:
-        chosen["sampling"] = found["sampling"].choice("sampling", ("interval-mean", "instantaneous"))
-    return SimWheels(name, _pose(found["T_imu_sensor"]), **chosen, **_clock(found, start_ns))
-
-
-def _drive_value(key: str, value: YamlValue) -> Any:
-    if key in ("radii", "scales"):
-        two = value.items()
-        if len(two) != 2:
-            words = "[left, right] in metres" if key == "radii" else "[speed, yaw rate]"
-            value.fail(f"must be {words}, but has {len(two)} entries.")
-        return two[0].positive(), two[1].positive()
-    if key == "poses_every":
-        return value.whole(1)
-    if key == "steering_offset":
-        return value.number()
-    return _least(value, 0.0) if key == "slip" or key.endswith("noise") else value.positive()
-
-
-def _poses(name: str, value: YamlValue, start_ns: int) -> SimPoses:
-    options = ("kind", "T_world_frame", "rotation_noise", "position_noise")
-    found = value.record(("type", *_CLOCK), _CLOCK_OPTIONS + options)
-    chosen: dict[str, Any] = {key: _least(found[key], 0.0) for key in options[2:] if key in found}
-    if "kind" in found:
-        chosen["kind"] = found["kind"].choice("kind", ("absolute", "relative"))
-    if "T_world_frame" in found:
-        chosen["T_world_frame"] = _pose(found["T_world_frame"])
-    return SimPoses(name, _pose(found["T_imu_sensor"]), **chosen, **_clock(found, start_ns))
 
 
 def _room(value: YamlValue) -> Room:
@@ -217,12 +142,12 @@ def _room(value: YamlValue) -> Room:
             found["slope_deg"].fail(f"must be at most {_STEEPEST_DEG:g} degrees, but is {slope:g}.")
         hills = hills_of_slope(slope)
     texture = _texture(found["texture"]) if "texture" in found else Texture()
-    return _made(value, Room, size=_triple(found["size"]), blocks=blocks, hills=hills, texture=texture)
+    return _made(value, Room, size=triple(found["size"]), blocks=blocks, hills=hills, texture=texture)
 
 
 def _texture(value: YamlValue) -> Texture:
     found = value.record((), ("seed", "share", "contrast"))
-    chosen: dict[str, Any] = {key: _share(found[key]) for key in ("share", "contrast") if key in found}
+    chosen: dict[str, Any] = {key: share(found[key]) for key in ("share", "contrast") if key in found}
     if "seed" in found:
         chosen["seed"] = found["seed"].whole(0)
     return Texture(**chosen)
@@ -237,9 +162,9 @@ def _image_faults(value: YamlValue) -> ImageFaults:
             found["gain_steps"].fail("each entry is [instant, gain], with a gain above 0; correct it.")
         chosen["gain_steps"] = tuple(map(tuple, steps))
     if "frozen" in found:
-        chosen["frozen"] = _intervals(found["frozen"])
+        chosen["frozen"] = intervals(found["frozen"])
     if "robot_part" in found:
-        chosen["robot_part"] = _share(found["robot_part"])
+        chosen["robot_part"] = share(found["robot_part"])
     return ImageFaults(**chosen)
 
 
@@ -247,7 +172,7 @@ def _block(value: YamlValue) -> Obstacle:
     found = value.record(("center", "size"), ("yaw_deg", "ramp"))
     x, y = found["center"].vector(2).tolist()
     yaw = np.deg2rad(found["yaw_deg"].number()) if "yaw_deg" in found else 0.0
-    return Obstacle((x, y), _triple(found["size"]), float(yaw), found["ramp"].boolean() if "ramp" in found else False)
+    return Obstacle((x, y), triple(found["size"]), float(yaw), found["ramp"].boolean() if "ramp" in found else False)
 
 
 def _motion(value: YamlValue, folder: Path) -> Drive:
@@ -262,7 +187,7 @@ def _motion(value: YamlValue, folder: Path) -> Drive:
     if "path" in found:
         chosen["path"] = folder / found["path"].text()
     if "sideslip_deg" in found:
-        chosen["sideslip_deg"] = _least(found["sideslip_deg"], 0.0)
+        chosen["sideslip_deg"] = at_least(found["sideslip_deg"], 0.0)
     if "seed" in found:
         chosen["seed"] = found["seed"].whole(0)
     return _made(value, Drive, **chosen)
@@ -280,7 +205,7 @@ def _board(value: YamlValue) -> dict[str, Any]:
     found = value.record(("type", "T_world_board", *required), optional)
     types = get_type_hints(kind)
     chosen = {f.name: _of_type(found[f.name], types[f.name]) for f in asked if f.name in found}
-    return {"target": _made(value, kind, **chosen), "T_world_board": _pose(found["T_world_board"])}
+    return {"target": _made(value, kind, **chosen), "T_world_board": pose(found["T_world_board"])}
 
 
 def _of_type(value: YamlValue, kind: type) -> Any:
@@ -298,53 +223,8 @@ def _features(value: YamlValue) -> Features:
     named = {"longest_track": "longest_track_s", "range": "range_m"}
     chosen |= {field: found[key].positive() for key, field in named.items() if key in found}
     if "relief" in found:
-        chosen["relief_m"] = _least(found["relief"], 0.0)
+        chosen["relief_m"] = at_least(found["relief"], 0.0)
     features = Features(**chosen)
     if features.persistent > features.count:
         value.fail(f"{features.persistent} persistent points are more than all {features.count}; lower persistent.")
     return features
-
-
-def _least(value: YamlValue, least: float) -> float:
-    number = value.number()
-    if number < least:
-        value.fail(f"must be at least {least:g}, but is {number:g}.")
-    return number
-
-
-def _share(value: YamlValue) -> float:
-    share = _least(value, 0.0)
-    if share > 1.0:
-        value.fail(f"must be at most 1, but is {share:g}.")
-    return share
-
-
-def _intervals(value: YamlValue) -> tuple[tuple[float, float], ...]:
-    return tuple(_interval(item) for item in value.items())
-
-
-def _interval(value: YamlValue) -> tuple[float, float]:
-    low, high = value.vector(2).tolist()
-    if low > high:
-        value.fail(f"must be [lowest, highest], but is [{low:g}, {high:g}].")
-    return low, high
-
-
-def _triple(value: YamlValue) -> tuple[float, float, float]:
-    """Three positive lengths."""
-    sides = value.items()
-    if len(sides) != 3:
-        value.fail(f"must be a list of 3 numbers, but has {len(sides)}.")
-    return sides[0].positive(), sides[1].positive(), sides[2].positive()
-
-
-def _pose(value: YamlValue) -> np.ndarray:
-    """4 x 4, its rotation made orthonormal."""
-    rows = value.items()
-    if len(rows) != 4:
-        value.fail(f"must be 4 rows of 4 numbers, but has {len(rows)}.")
-    T = np.array([row.vector(4) for row in rows])
-    R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0 or (T[3] != [0, 0, 0, 1]).any():
-        value.fail("is not a pose: its first three columns must be a rotation, its last row 0, 0, 0, 1; correct it.")
-    return pose_from_rows(T)

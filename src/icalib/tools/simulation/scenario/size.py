@@ -11,7 +11,7 @@ from icalib.tools.simulation.scenario.scenario import Scenario
 
 # Of all sensors together. Either takes about 1 GB with intermediate arrays; twice the number takes twice the memory.
 MOST_INSTANTS = 5_000_000  # readings, images and scans: an IMU at 200 Hz for 7 h
-MOST_POINTS = 100_000_000  # corners, tracked points and LiDAR points: 16 rings of 1800 steps at 8 Hz for 7 min
+MOST_POINTS = 100_000_000  # corners, tracked points and points of scans: 16 rings of 1800 steps at 8 Hz for 7 min
 _LARGEST_COUNT = 1e18  # larger ones are cut to it, so that products stay finite
 
 
@@ -59,7 +59,5 @@ def _rates(scenario: Scenario) -> Iterator[_Rate]:
     tracked = scenario.features.per_image if scenario.features else 0
     for camera in scenario.cameras:
         yield _Rate(camera.name, camera.rate_hz, "images", corners + tracked, "corners and points")
-    for lidar in scenario.lidars:
-        yield _Rate(lidar.name, lidar.rate_hz, "scans", lidar.rings * lidar.azimuth_steps)
-    for sensor in (*scenario.wheels, *scenario.poses):
-        yield _Rate(sensor.name, sensor.rate_hz, "readings")
+    for sensor in scenario.sensors:
+        yield _Rate(sensor.name, sensor.rate_hz, sensor.measures, sensor.points)

@@ -10,8 +10,8 @@ from icalib.data.measurements import CornerStream
 from icalib.geometry.targets import Target
 from icalib.tools.simulation.scenario.projection import image_velocity, project, visible
 from icalib.tools.simulation.scenario.scenario import Scenario, SimCamera
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 from icalib.tools.simulation.sensors.imu import inside
-from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 _MIN_CORNERS = 6
 _LEAD_S = 0.05  # images start and end this far inside the IMU's readings
@@ -89,7 +89,7 @@ def _in_camera(
     T_world_body = scenario.body_poses[scenario.target.body]
     world = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], scenario.target_size * points) + T_world_body[:, :3, 3]
     imu = (world - position[:, None, :]) @ rotation
-    return (imu - camera.T_imu_cam[:3, 3]) @ camera.T_imu_cam[:3, :3]
+    return (imu - camera.T_imu_sensor[:3, 3]) @ camera.T_imu_sensor[:3, :3]
 
 
 def _from_the_front(
@@ -97,7 +97,7 @@ def _from_the_front(
 ) -> np.ndarray:
     """(M, n) bool: whether the camera is on the printed side of each point's body. Bodies do not hide each other."""
     rotation, position, _ = trajectory.pose_at(seconds)
-    lens = position + rotation @ camera.T_imu_cam[:3, 3]
+    lens = position + rotation @ camera.T_imu_sensor[:3, 3]
     origin, normal = scenario.body_poses[:, :3, 3], scenario.body_poses[:, :3, 2]
     return (np.sum((lens[:, None] - origin) * normal, axis=-1) > 0.0)[:, scenario.target.body]
 

@@ -6,11 +6,11 @@ Frames: world (z up), imu. Rates and specific forces are in the imu frame: R' = 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, HandheldMotion, Scenario
+from icalib.tools.simulation.scenario.trajectory import AnalyticTrajectory
 
 _ANGLES_RAD = np.array([[0.45, 0.22, 0.18], [0.12, 0.09, 0.08]])  # slow, fast sinusoid; about camera z, y, x
 _YAW_RAD = np.array([[0.25, 0.0, 0.0], [0.10, 0.0, 0.0]])
@@ -41,26 +41,6 @@ def increments(rate: np.ndarray, force: np.ndarray, dt: np.ndarray) -> tuple[np.
     for order in range(_TAYLOR_ORDER, 0, -1):
         total = identity + A @ total / order
     return total[..., :3, :3], total[..., :3, 3], total[..., :3, 4]
-
-
-class TrueTrajectory(Protocol):
-    """Where the IMU was at any instant."""
-
-    def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """seconds (N,) since the IMU clock's origin -> R_world_imu (N, 3, 3), position, velocity (N, 3) in world."""
-        ...
-
-    def rate_at(self, seconds: np.ndarray) -> np.ndarray:
-        """seconds (N,) -> angular rate (N, 3) [rad/s] in the imu frame."""
-        ...
-
-
-class AnalyticTrajectory(TrueTrajectory, Protocol):
-    """A trajectory that an IMU can sample."""
-
-    def readings_at(self, seconds: np.ndarray) -> np.ndarray:
-        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the imu frame."""
-        ...
 
 
 def readings_of(rotation: np.ndarray, rotation_rate: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
@@ -153,7 +133,7 @@ def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
     origin of T_world_board where there are several bodies."""
     motion = scenario.motion
     assert isinstance(motion, HandheldMotion)
-    T_imu_cam = scenario.cameras[0].T_imu_cam
+    T_imu_cam = scenario.cameras[0].T_imu_sensor
     R_world_board, origin = scenario.T_world_board[:3, :3], scenario.T_world_board[:3, 3]
     corners = scenario.target.points if scenario.T_world_bodies is None else np.zeros((1, 3))
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) + [0.0, 0.0, motion.distance_m]

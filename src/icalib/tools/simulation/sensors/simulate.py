@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from icalib.data.measurements import (
-    CornerStream,
-    ImuStream,
-    LidarStream,
-    Measurements,
-    PoseStream,
-    WheelPoses,
-    WheelStream,
-)
-from icalib.rig import LENS
-from icalib.sensors.camera.spec import BLOOM
-from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
+from icalib.data.measurements import CornerStream, ImuStream, Measurements
+from icalib.geometry.targets.base import BOARD
+from icalib.sensors.sensor import mounted
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, HandheldMotion, Scenario, SimCamera
+from icalib.tools.simulation.scenario.sensor import Report, SimScene, SimSensor
+from icalib.tools.simulation.scenario.trajectory import AnalyticTrajectory, TrueTrajectory
 from icalib.tools.simulation.sensors.corners import CornerTruth, see_corners
 from icalib.tools.simulation.sensors.drives import drive_motion
 from icalib.tools.simulation.sensors.imu import imu_stamps, inside, read_imu
-from icalib.tools.simulation.sensors.lidar import scan_room
-from icalib.tools.simulation.sensors.motion import AnalyticTrajectory, TrueTrajectory, exact_motion, reference_motion
-from icalib.tools.simulation.sensors.poses import PoseTruth, report_poses
+from icalib.tools.simulation.sensors.motion import exact_motion, reference_motion
 from icalib.tools.simulation.sensors.tracks import SimulatedTracks, TrackTruth, follow
-from icalib.tools.simulation.sensors.wheels import WheelTruth, read_wheels
 
 Progress = Callable[[str, float], None]  # what is being done, and the share of all that is done
-_LIDAR_STREAM, _WHEEL_STREAM, _POSE_STREAM = 1000, 2000, 4000  # of random numbers; those of cameras count from 2
+_CAMERA_STREAM = 2  # of random numbers of the first camera; the next ones count from there
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,27 +42,18 @@ class Truth:
     accel_bias: np.ndarray  # (N, 3) m/s^2
     imu_intrinsics: np.ndarray  # (24,)
     target_size: float
-    scale: dict[str, float]  # of pose sensors
     gravity: np.ndarray  # (3,) m/s^2, world
     T_world_bodies: np.ndarray  # (bodies, 4, 4), in the order of the target's bodies
     bow: np.ndarray  # (3,) m
-    T_imu_cam: dict[str, np.ndarray]
+    values: dict[str, dict[str, np.ndarray]]  # of each parameter, by its name in results, of each sensor and the board
+    T_imu_sensor: dict[str, np.ndarray]
     time_offset: dict[str, float]  # s, between raw stamps: t_imu = t_sensor + time_offset
-    intrinsics: dict[str, np.ndarray]
-    distortion: dict[str, np.ndarray]
-    bloom: dict[str, float]  # px
     corners: dict[str, CornerTruth]
     trajectory: TrueTrajectory
     tracks: dict[str, TrackTruth] = field(default_factory=dict)
-    wheels: dict[str, WheelTruth] = field(default_factory=dict)
+    reported: dict[str, Any] = field(default_factory=dict)  # without noise, in the form of the sensor's kind
     points: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))  # (F, 3) m, world, by number of the feature
     planes: np.ndarray = field(default_factory=lambda: np.empty((0, 4)))  # (P, 4) n, d: n . p = d, world
-    T_imu_lidar: dict[str, np.ndarray] = field(default_factory=dict)
-    T_imu_wheel: dict[str, np.ndarray] = field(default_factory=dict)
-    drive: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)  # of wheels, see `SimWheels.drive`
-    T_imu_pose: dict[str, np.ndarray] = field(default_factory=dict)  # of pose sensors
-    T_world_frame: dict[str, np.ndarray] = field(default_factory=dict)  # of theirs
-    poses: dict[str, PoseTruth] = field(default_factory=dict)
 
     @property
     def T_world_board(self) -> np.ndarray:
@@ -92,7 +74,7 @@ class Simulation:
     truth: Truth
 
 
-def raw_time_offset(scenario: Scenario, sensor: SimCamera | SimLidar | SimWheels | SimPoses) -> float:
+def raw_time_offset(scenario: Scenario, sensor: SimCamera | SimSensor) -> float:
     """Seconds to add to the sensor's raw stamps to get the IMU's: the offset and the distance of the clock origins."""
     return sensor.time_offset_s + (scenario.imu_clock_origin_ns - sensor.clock_origin_ns) * 1e-9
 
@@ -116,10 +98,8 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     progress("images", 0.1)
     corners, corner_truth = _corners(scenario, trajectory, seed)
     followed = _tracks(scenario, trajectory, seed)
-    lidars = _scans(scenario, trajectory, seed, progress)
-    progress("wheels", 0.95)
-    wheels, wheel_truth = _wheels(scenario, trajectory, seconds, seed)
-    poses, pose_truth = _poses(scenario, trajectory, seconds, seed)
+    scene = SimScene(trajectory, seconds, scenario.duration_s, scenario.room, scenario.robot_noise_enabled)
+    reports = _reports(scenario, scene, seed, progress)
     truth = Truth(
         **_motion_truth(scenario, trajectory, seconds[kept]),
         **_rig_truth(scenario),
@@ -127,12 +107,18 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
         accel_bias=readings.accel_bias[kept],
         corners=corner_truth,
         tracks={s.name: t for s, t in zip(followed.streams, followed.truths, strict=True)},
-        wheels=wheel_truth,
-        poses=pose_truth,
+        reported={name: report.truth for name, report in reports.items()},
         points=followed.points,
     )
-    measured = Measurements.of_streams(imu, *corners, *followed.streams, *lidars, *wheels, *poses)
+    streams = (report.stream for report in reports.values())
+    measured = Measurements.of_streams(imu, *corners, *followed.streams, *streams)
     return Simulation(scenario, measured, truth)
+
+
+def true_values(scenario: Scenario, sensor: SimCamera | SimSensor) -> dict[str, np.ndarray]:
+    """The parameters of a sensor by their names in the rig."""
+    T, offset = sensor.T_imu_sensor, np.array([raw_time_offset(scenario, sensor)])
+    return mounted(T[:3, :3], T[:3, 3], offset) | sensor.values()
 
 
 def _motion(scenario: Scenario, seed: int, seconds: np.ndarray) -> tuple[TrueTrajectory, np.ndarray]:
@@ -144,8 +130,8 @@ def _motion(scenario: Scenario, seed: int, seconds: np.ndarray) -> tuple[TrueTra
         reference = reference_motion(scenario, rng)
     else:
         assert scenario.room is not None  # `Scenario` sees to it
-        T_imu_wheel = scenario.wheels[0].T_imu_wheel if scenario.wheels else None
-        reference = drive_motion(motion, scenario.room, T_imu_wheel, scenario.duration_s, rng)
+        T_imu_rolling = next((s.T_imu_sensor for s in scenario.sensors if s.rolls), None)
+        reference = drive_motion(motion, scenario.room, T_imu_rolling, scenario.duration_s, rng)
     if motion.exact:
         trajectory = exact_motion(reference, seconds)
         return trajectory, trajectory.readings
@@ -158,7 +144,7 @@ def _corners(
     if not scenario.board:
         return (), {}
     seen = [
-        see_corners(scenario, camera, trajectory, np.random.default_rng([seed, 2 + i]))
+        see_corners(scenario, camera, trajectory, np.random.default_rng([seed, _CAMERA_STREAM + i]))
         for i, camera in enumerate(scenario.cameras)
     ]
     return tuple(stream for stream, _ in seen), {stream.name: truth for stream, truth in seen}
@@ -170,38 +156,20 @@ def _tracks(scenario: Scenario, trajectory: TrueTrajectory, seed: int) -> Simula
     return follow(scenario, scenario.room, scenario.features, trajectory, seed)
 
 
-def _scans(scenario: Scenario, trajectory: TrueTrajectory, seed: int, progress: Progress) -> tuple[LidarStream, ...]:
-    scans = []
-    for i, lidar in enumerate(scenario.lidars):
-        assert scenario.room is not None  # `Scenario` sees to it
-        share = (0.3 + 0.65 * i / len(scenario.lidars), 0.65 / len(scenario.lidars))
-        done = _shared(progress, lidar.name, *share)
-        scans.append(scan_room(scenario.room, lidar, trajectory, scenario, [seed, _LIDAR_STREAM + i], done))
-    return tuple(scans)
+def _reports(scenario: Scenario, scene: SimScene, seed: int, progress: Progress) -> dict[str, Report]:
+    """What each of the sensors beside IMU and cameras reports, by name."""
+    reports, of_kind, share = {}, Counter[int](), 0.7 / max(len(scenario.sensors), 1)
+    for i, sensor in enumerate(scenario.sensors):
+        number = sensor.random_stream + of_kind[sensor.random_stream]
+        of_kind[sensor.random_stream] += 1
+        progress(sensor.name, 0.3 + share * i)
+        done = _shared(progress, sensor.name, 0.3 + share * i, share)
+        reports[sensor.name] = sensor.report(scene, [seed, number], done)
+    return reports
 
 
 def _shared(progress: Progress, stage: str, before: float, share: float) -> Callable[[float], None]:
     return lambda done: progress(stage, before + share * done)
-
-
-def _wheels(
-    scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray, seed: int
-) -> tuple[tuple[WheelStream | WheelPoses, ...], dict[str, WheelTruth]]:
-    read = []
-    for i, wheels in enumerate(scenario.wheels):
-        rng = np.random.default_rng([seed, _WHEEL_STREAM + i])
-        read.append(read_wheels(wheels, trajectory, seconds, scenario.robot_noise_enabled, rng))
-    return tuple(stream for stream, _ in read), {stream.name: truth for stream, truth in read}
-
-
-def _poses(
-    scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray, seed: int
-) -> tuple[tuple[PoseStream, ...], dict[str, PoseTruth]]:
-    read = []
-    for i, sensor in enumerate(scenario.poses):
-        rng = np.random.default_rng([seed, _POSE_STREAM + i])
-        read.append(report_poses(sensor, trajectory, seconds, scenario.robot_noise_enabled, rng))
-    return tuple(stream for stream, _ in read), {stream.name: truth for stream, truth in read}
 
 
 def _motion_truth(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray) -> dict[str, Any]:
@@ -219,26 +187,19 @@ def _motion_truth(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.nd
 
 def _rig_truth(scenario: Scenario) -> dict[str, Any]:
     """The fields of `Truth` that the scenario states."""
-    cameras, lidars, wheels, poses = scenario.cameras, scenario.lidars, scenario.wheels, scenario.poses
-    lenses = {name: {c.name: np.array(getattr(c, name)) for c in cameras} for name in LENS}
-    blooms = {BLOOM.name: {c.name: c.bloom_px for c in cameras}}
-    return (
-        lenses
-        | blooms
-        | {
-            "T_imu_cam": {c.name: c.T_imu_cam for c in cameras},
-            "imu_intrinsics": scenario.imu_intrinsics,
-            "target_size": scenario.target_size,
-            "scale": {s.name: s.scale for s in poses},
-            "gravity": GRAVITY_WORLD,
-            "T_world_bodies": scenario.body_poses,
-            "bow": np.array(scenario.bow),
-            "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
-            "time_offset": {s.name: raw_time_offset(scenario, s) for s in (*cameras, *lidars, *wheels, *poses)},
-            "T_imu_lidar": {s.name: s.T_imu_lidar for s in lidars},
-            "T_imu_wheel": {s.name: s.T_imu_wheel for s in wheels},
-            "drive": {s.name: s.drive for s in wheels},
-            "T_imu_pose": {s.name: s.T_imu_sensor for s in poses},
-            "T_world_frame": {s.name: s.T_world_frame for s in poses},
-        }
-    )
+    sensors = scenario.mounted
+    return {
+        "imu_intrinsics": scenario.imu_intrinsics,
+        "target_size": scenario.target_size,
+        "gravity": GRAVITY_WORLD,
+        "T_world_bodies": scenario.body_poses,
+        "bow": np.array(scenario.bow),
+        "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
+        "values": {
+            "imu0": {"intrinsics": scenario.imu_intrinsics},
+            BOARD: {"size": np.array([scenario.target_size])},
+            **{sensor.name: true_values(scenario, sensor) for sensor in sensors},
+        },
+        "T_imu_sensor": {sensor.name: sensor.T_imu_sensor for sensor in sensors},
+        "time_offset": {sensor.name: raw_time_offset(scenario, sensor) for sensor in sensors},
+    }

@@ -12,8 +12,8 @@ from icalib.tools.simulation.scenario.projection import project, visible
 from icalib.tools.simulation.scenario.robot import Features
 from icalib.tools.simulation.scenario.room import Room, distances
 from icalib.tools.simulation.scenario.scenario import Scenario, SimCamera
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 from icalib.tools.simulation.sensors.corners import image_stamps
-from icalib.tools.simulation.sensors.motion import TrueTrajectory
 
 _NEAREST_M = 0.3
 _LOST_PERIODS = 1.5
@@ -77,9 +77,9 @@ def _view(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the points that are in the picture and not hidden, which is judged where they would be without relief,
     on the `surface`; and the pixels (N, 2) of all points."""
-    eye = position + rotation @ camera.T_imu_cam[:3, 3]
+    eye = position + rotation @ camera.T_imu_sensor[:3, 3]
     rays = points - eye
-    local = rays @ (rotation @ camera.T_imu_cam[:3, :3])
+    local = rays @ (rotation @ camera.T_imu_sensor[:3, :3])
     far = np.linalg.norm(rays, axis=1)
     near = (far > _NEAREST_M) & (far < features.range_m) & (local[:, 2] > 0.0)
     uv = np.full((len(points), 2), np.nan)

@@ -1,0 +1,197 @@
+"""A simulated LiDAR reports points of the room, each seen from the pose of the sensor at the point's own instant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.data.measurements import LidarStream
+from icalib.errors import RigError
+from icalib.sensors.lidar.spec import Lidar
+from icalib.tools.simulation.output.bag_writer import BagWriter
+from icalib.tools.simulation.scenario.fields import at_least, interval, mounted_fields
+from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
+from icalib.tools.simulation.scenario.robot import Drive
+from icalib.tools.simulation.scenario.room import Room, RoomSurfaces, nearest
+from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
+
+_FIRING_S = 2.304e-6  # between two lasers of a column, as in a VLP-16
+_POINTS = "sensor_msgs/msg/PointCloud2"
+_FLOAT32 = 7  # of PointField
+
+
+@dataclass(frozen=True, eq=False)
+class SimLidar(SimSensor):
+    """One true LiDAR that turns about its z axis, against the clock.
+
+    A scan has azimuth_steps columns of `rings` points, at elevations spread evenly over elevation_deg. The lasers of a
+    column fire one after another, 2.304 us apart, or closer where they would not fit. The scan is stamped at its first
+    point. Noise is along the beam.
+    """
+
+    sensor_type: ClassVar[str] = "lidar"
+    random_stream: ClassVar[int] = 1000
+    measures: ClassVar[str] = "scans"
+
+    rate_hz: float = 8.0
+    rings: int = 16
+    azimuth_steps: int = 1800
+    elevation_deg: tuple[float, float] = (-15.0, 15.0)
+    range_m: tuple[float, float] = (0.3, 100.0)
+    range_noise_m: float = 0.03
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimLidar:
+        options = ("rings", "azimuth_steps", "elevation_deg", "range", "noise")
+        found, common = mounted_fields(value, start_ns, options=options)
+        chosen: dict[str, Any] = {key: found[key].whole(1) for key in ("rings", "azimuth_steps") if key in found}
+        if "elevation_deg" in found:
+            chosen["elevation_deg"] = interval(found["elevation_deg"])
+        if "range" in found:
+            chosen["range_m"] = interval(found["range"])
+        if "noise" in found:
+            chosen["range_noise_m"] = at_least(found["noise"], 0.0)
+        return cls(name, **common, **chosen)
+
+    def check(self, room: Room | None, drive: Drive | None) -> None:
+        if room is None:
+            raise RigError(f"{self.name} needs a room; give the scenario one.")
+
+    @property
+    def points(self) -> int:
+        return self.rings * self.azimuth_steps
+
+    def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
+        """All scans of the room; each scan's noise is a random stream of its own."""
+        assert scene.room is not None  # `check` sees to it
+        stamps, seconds = stamped(self, scene.duration_s - LEAD_S - 1.0 / self.rate_hz)
+        noise_m = self.range_noise_m * float(scene.noisy)
+        start = np.zeros(len(stamps) + 1, dtype=np.int64)
+        xyz = np.empty((len(stamps) * self.points, 3), dtype=np.float32)  # what stays empty takes no memory
+        offset, plane = np.empty(len(xyz), dtype=np.float32), np.empty(len(xyz), dtype=np.int32)
+        column_s = 1.0 / (self.rate_hz * self.azimuth_steps)
+        for i, begin in enumerate(seconds):
+            noise = noise_m * np.random.default_rng([*seed, i]).standard_normal((self.azimuth_steps, self.rings))
+            sweep = _sweep(self, scene.trajectory, begin, noise)
+            free = slice(start[i], None)
+            into = _Points(xyz[free], offset[free], plane[free])
+            start[i + 1] = start[i] + _shoot(scene.room.surfaces, sweep, column_s, into)
+            progress((i + 1) / len(seconds))
+        n = start[-1]
+        return Report(LidarStream(self.name, stamps, start, offset[:n], xyz[:n], plane[:n]))
+
+    def rig_entry(self) -> Lidar:
+        near, far = self.range_m
+        return Lidar(self.name, f"{self.name}/scans.npz", self.range_noise_m, min_range_m=near, max_range_m=far)
+
+    def write_table(self, folder: Path, stream: LidarStream) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        arrays = {name: getattr(stream, name) for name in ("stamps_ns", "start", "offset_s", "xyz", "plane")}
+        np.savez(folder / "scans.npz", **arrays)
+
+    def bag_topic(self, stream: LidarStream, offset_ns: int) -> BagTopic:
+        """PointCloud2: x, y, z and `time` [s] from the stamp."""
+        return BagTopic(f"/{self.name}/points", _POINTS, _clouds(stream, offset_ns))
+
+
+SIMULATED = SimLidar
+
+
+def _clouds(lidar: LidarStream, offset_ns: int) -> Iterator[BagEvent]:
+    """A cloud is received when its last point was measured."""
+    for i, stamp_ns in enumerate(lidar.stamps_ns.tolist()):
+        points = slice(lidar.start[i], lidar.start[i + 1])
+        xyz, offset_s = lidar.xyz[points], lidar.offset_s[points]
+        lasted_ns = int(offset_s[-1] * 1e9) if len(offset_s) else 0
+        yield (
+            stamp_ns + offset_ns + lasted_ns,
+            lambda bag, stamp_ns=stamp_ns, xyz=xyz, offset_s=offset_s: _cloud(bag, stamp_ns, lidar.name, xyz, offset_s),
+        )
+
+
+def _cloud(bag: BagWriter, stamp_ns: int, frame: str, xyz: np.ndarray, offset_s: np.ndarray) -> Any:
+    """xyz (N, 3) [m] and `time` (N,) [s] from the stamp, float32 each."""
+    names = ("x", "y", "z", "time")
+    fields = [bag.make("sensor_msgs/msg/PointField", name, 4 * i, _FLOAT32, 1) for i, name in enumerate(names)]
+    rows = np.ascontiguousarray(np.column_stack([xyz, offset_s]), dtype="<f4")
+    data, size = rows.view(np.uint8).reshape(-1), 4 * len(names)
+    header = bag.header(stamp_ns, frame)
+    return bag.make(_POINTS, header, 1, len(rows), fields, False, size, size * len(rows), data, True)
+
+
+class _Sweep(NamedTuple):
+    """One turn of A columns of K lasers. The pose in the room is that of each column's beginning and of the end."""
+
+    rotation: np.ndarray  # (A + 1, 3, 3) R_world_lidar
+    position: np.ndarray  # (A + 1, 3)
+    beam: np.ndarray  # (A, K, 3) unit directions in the LiDAR's frame
+    firing: np.ndarray  # (K,) instants within a column, as a share of it
+    noise: np.ndarray  # (A, K) m
+    reach: tuple[float, float]  # m
+
+
+class _Points(NamedTuple):
+    """Where a sweep's points go, at most A K."""
+
+    xyz: np.ndarray
+    offset_s: np.ndarray
+    plane: np.ndarray
+
+
+def _sweep(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.ndarray) -> _Sweep:
+    steps, rings = lidar.azimuth_steps, lidar.rings
+    column_s = 1.0 / (lidar.rate_hz * steps)
+    rotation, position, _ = trajectory.pose_at(begin + column_s * np.arange(steps + 1))
+    firing = np.arange(rings) * min(_FIRING_S / column_s, 1.0 / rings)
+    return _Sweep(
+        rotation @ lidar.T_imu_sensor[:3, :3],
+        position + rotation @ lidar.T_imu_sensor[:3, 3],
+        _beams(lidar),
+        firing,
+        noise,
+        lidar.range_m,
+    )
+
+
+def _beams(lidar: SimLidar) -> np.ndarray:
+    azimuth = 2.0 * np.pi * np.arange(lidar.azimuth_steps)[:, None] / lidar.azimuth_steps
+    elevation = np.deg2rad(np.linspace(*lidar.elevation_deg, lidar.rings))
+    level, up = np.cos(elevation), np.sin(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up + 0.0 * azimuth], axis=2)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shoot(surfaces: RoomSurfaces, sweep: _Sweep, column_s: float, points: _Points) -> int:
+    """Fills the points in the order of their instants; returns how many there are.
+
+    Within a column, of some 0.1 ms, the pose runs straight: 5 m/s^2 and 2 rad/s bend it by 1e-8 m and rad.
+    """
+    count = 0
+    d, p = np.empty(3), np.empty(3)
+    for a in range(len(sweep.beam)):
+        R0, R1, p0, p1 = sweep.rotation[a], sweep.rotation[a + 1], sweep.position[a], sweep.position[a + 1]
+        for k in range(len(sweep.firing)):
+            s, x, y, z = sweep.firing[k], sweep.beam[a, k, 0], sweep.beam[a, k, 1], sweep.beam[a, k, 2]
+            for i in range(3):
+                before = R0[i, 0] * x + R0[i, 1] * y + R0[i, 2] * z
+                after = R1[i, 0] * x + R1[i, 1] * y + R1[i, 2] * z
+                d[i] = before + s * (after - before)
+                p[i] = p0[i] + s * (p1[i] - p0[i])
+            distance, face = nearest(surfaces, p[0], p[1], p[2], d[0], d[1], d[2])
+            if not (sweep.reach[0] <= distance <= sweep.reach[1]):
+                continue
+            measured = distance + sweep.noise[a, k]
+            points.xyz[count, 0] = measured * x
+            points.xyz[count, 1] = measured * y
+            points.xyz[count, 2] = measured * z
+            points.offset_s[count] = (a + s) * column_s
+            points.plane[count] = face
+            count += 1
+    return count

@@ -1,0 +1,143 @@
+"""A simulated pose sensor reports its pose in a frame of its own, as motion capture or an odometry does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.data.measurements import PoseStream
+from icalib.sensors.pose.spec import PoseSensor
+from icalib.tools.simulation.output.bag_writer import BagWriter
+from icalib.tools.simulation.output.csv_table import write_table
+from icalib.tools.simulation.scenario.fields import at_least, mounted_fields, pose
+from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
+from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
+from icalib.tools.simulation.sensors.imu import rotation_from_vector
+
+_POSE = "geometry_msgs/msg/PoseStamped"
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTruth:
+    """seconds (N,) on the IMU's clock of each stamp; rotation (N, 3, 3), position (N, 3) m: what is reported, without
+    noise."""
+
+    seconds: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SimPoses(SimSensor):
+    """One true sensor that reports its pose T_frame_sensor in a frame that stands at T_world_frame.
+
+    absolute: each pose has noise of its own, rotation_noise [rad] and position_noise [m] on each axis. relative: each
+    step from pose to pose has, which adds up to a drift: rad/sqrt(s) and m/sqrt(s). scale: true lengths over reported
+    ones.
+    """
+
+    sensor_type: ClassVar[str] = "pose"
+    random_stream: ClassVar[int] = 4000
+    effects: ClassVar[dict[str, str]] = {"pose_scale": "scale"}
+
+    rate_hz: float = 100.0
+    kind: Literal["absolute", "relative"] = "absolute"
+    T_world_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
+    rotation_noise: float = 2e-3
+    position_noise: float = 1e-3
+    scale: float = 1.0
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimPoses:
+        noises = ("rotation_noise", "position_noise")
+        found, common = mounted_fields(value, start_ns, options=("kind", "T_world_frame", *noises))
+        chosen: dict[str, Any] = {key: at_least(found[key], 0.0) for key in noises if key in found}
+        if "kind" in found:
+            chosen["kind"] = found["kind"].choice("kind", ("absolute", "relative"))
+        if "T_world_frame" in found:
+            chosen["T_world_frame"] = pose(found["T_world_frame"])
+        return cls(name, **common, **chosen)
+
+    def values(self) -> dict[str, np.ndarray]:
+        return {"scale": np.array([self.scale])}
+
+    def plain(self) -> dict[str, Any]:
+        return {"kind": self.kind, "T_world_frame": self.T_world_frame.tolist(), "scale": self.scale}
+
+    def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
+        """Its poses within the readings of the IMU."""
+        stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
+        R, p, _ = scene.trajectory.pose_at(seconds)
+        T = np.tile(np.eye(4), (len(seconds), 1, 1))
+        T[:, :3, :3], T[:, :3, 3] = R, p
+        seen = np.linalg.inv(self.T_world_frame) @ T @ self.T_imu_sensor
+        seen[:, :3, 3] /= self.scale
+        truth = PoseTruth(seconds, seen[:, :3, :3].copy(), seen[:, :3, 3].copy())
+        if scene.noisy:
+            rng = np.random.default_rng(seed)
+            seen = _scattered(self, seen, rng) if self.kind == "absolute" else _drifting(self, seen, seconds, rng)
+        return Report(PoseStream(self.name, stamps, seen[:, :3, :3].copy(), seen[:, :3, 3].copy()), truth)
+
+    def rig_entry(self) -> PoseSensor:
+        noise = self.rotation_noise, self.position_noise
+        return PoseSensor(self.name, f"{self.name}/poses.csv", self.kind, *noise, scale_sigma=0.0)
+
+    def write_table(self, folder: Path, stream: PoseStream) -> None:
+        header = "t [ns],x [m],y [m],z [m],qx,qy,qz,qw"
+        xyzw = np.array([quaternion(R) for R in stream.rotation])
+        write_table(folder / "poses.csv", header, stream.stamps_ns, stream.position, xyzw)
+
+    def bag_topic(self, stream: PoseStream, offset_ns: int) -> BagTopic:
+        """PoseStamped."""
+        return BagTopic(f"/{self.name}/pose", _POSE, _messages(stream, offset_ns))
+
+
+SIMULATED = SimPoses
+
+
+def _messages(poses: PoseStream, offset_ns: int) -> Iterator[BagEvent]:
+    frame = f"{poses.name}_frame"
+    for stamp_ns, R, position in zip(poses.stamps_ns.tolist(), poses.rotation, poses.position, strict=True):
+        yield (
+            stamp_ns + offset_ns,
+            lambda bag, stamp_ns=stamp_ns, R=R, position=position: _message(bag, stamp_ns, frame, position, R),
+        )
+
+
+def _message(bag: BagWriter, stamp_ns: int, frame: str, position: np.ndarray, R: np.ndarray) -> Any:
+    """position (3,) [m] and rotation (3, 3) of a sensor in `frame`."""
+    point = bag.make("geometry_msgs/msg/Point", *position.tolist())
+    turn = bag.make("geometry_msgs/msg/Quaternion", *quaternion(R).tolist())
+    return bag.make(_POSE, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Pose", point, turn))
+
+
+def _scattered(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Each pose (N, 4, 4) with an error of its own: its rotation in the sensor's axes, its position in the frame's."""
+    out = seen.copy()
+    for T in out:
+        T[:3, :3] = T[:3, :3] @ rotation_from_vector(sensor.rotation_noise * rng.standard_normal(3))
+        T[:3, 3] += sensor.position_noise * rng.standard_normal(3)
+    return out
+
+
+def _drifting(sensor: SimPoses, seen: np.ndarray, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Poses (N, 4, 4) whose steps have an error each, that adds up."""
+    out = seen.copy()
+    for k in range(1, len(seen)):
+        step, root = np.linalg.inv(seen[k - 1]) @ seen[k], np.sqrt(seconds[k] - seconds[k - 1])
+        step[:3, :3] = step[:3, :3] @ rotation_from_vector(sensor.rotation_noise * root * rng.standard_normal(3))
+        step[:3, 3] += sensor.position_noise * root * rng.standard_normal(3)
+        out[k] = out[k - 1] @ step
+    return out
+
+
+def quaternion(R: np.ndarray) -> np.ndarray:
+    """(4,) x, y, z, w of a rotation (3, 3): the eigenvector of Bar-Itzhack's matrix, which has no bad angles."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    K = [[a - e - i, b + d, c + g, h - f], [b + d, e - a - i, f + h, c - g], [c + g, f + h, i - a - e, d - b]]
+    return np.linalg.eigh(np.array([*K, [h - f, c - g, d - b, a + e + i]]) / 3.0)[1][:, -1]

@@ -1,0 +1,361 @@
+"""Simulated wheels report turning rates of encoders, speed and yaw rate, a steering angle, or relative poses of their
+frame as the paper's (27) has them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.data.measurements import WheelPoses, WheelStream
+from icalib.errors import RigError
+from icalib.sensors.wheels.spec import WheelKind, Wheels, drive_names
+from icalib.tools.simulation.output.bag_writer import BagWriter
+from icalib.tools.simulation.output.csv_table import write_table
+from icalib.tools.simulation.scenario.fields import at_least, mounted_fields
+from icalib.tools.simulation.scenario.instants import LEAD_S, check_enough, stamped
+from icalib.tools.simulation.scenario.robot import Drive
+from icalib.tools.simulation.scenario.room import Room
+from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
+
+_GAUSS = np.polynomial.legendre.leggauss(3)
+_STEEPEST_RAD = 1.3  # of front wheels: a car's turn by 0.7
+_SUBSTEPS = 12  # of an interval of (27), for its noise
+_AT_A_TIME = 100_000  # instants: motion and its derivatives take 2 kB each
+_KINDS: dict[str, WheelKind] = {"rates": "pair", "steering": "steered", "twist": "twist", "poses": "pair"}
+# Fields of a scenario file by what wheels report: those that they must have, and the noise that they may have.
+_FIELDS = {
+    "rates": (("radii", "baseline"), ("noise", "slip", "allowed_slip", "poses_every")),
+    "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
+    "twist": (("scales",), ("speed_noise", "yaw_noise", "allowed_slip")),
+    "steering": (("radius", "wheelbase"), ("steering_offset", "noise", "steering_noise", "allowed_slip")),
+}
+_COLUMNS = {
+    "pair": ("rates", "left [rad/s],right [rad/s]"),
+    "steered": ("rates", "wheel [rad/s],steering [rad]"),
+    "twist": ("twist", "v [m/s],w [rad/s]"),
+}
+_SAMPLING = {"interval-mean": "means since the stamp before", "instantaneous": "values at the stamp"}
+_JOINT_STATE, _TWIST = "sensor_msgs/msg/JointState", "geometry_msgs/msg/TwistStamped"
+_JOINTS = {"pair": ["left_wheel", "right_wheel"], "steered": ["wheel", "steering"]}
+
+
+@dataclass(frozen=True, eq=False)
+class WheelTruth:
+    """seconds (N,) on the IMU's clock of each stamp; value: (N, 2) as in `WheelStream`, or (N - 1, 3) relative poses,
+    both without noise."""
+
+    seconds: np.ndarray
+    value: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SimWheels(SimSensor):
+    """True wheels; their frame is the middle of the axle that is not steered, on the floor, x forwards, z up.
+
+    radii (left, right) [m], baseline [m]. noise: density of each wheel's rate [rad/s/sqrt(Hz)]; slip: density of a
+    lateral random path [m/sqrt(s)], in poses only. allowed_slip: density of slip [m/sqrt(s)] that the rig is told;
+    encoders simulated here know none, while a rig that is told nothing allows for what real wheels may have.
+
+    rates: what encoders report, by `sampling` as in `WheelStream`: (v_x -+ baseline/2 w_z) / radius. twist: forward
+    speed and yaw rate, v_x and w_z over their scales, by `sampling`, too. steering: the rate v_x / radius of a driven
+    wheel, and the angle by which front wheels a wheelbase ahead point to where they move, less steering_offset [rad].
+    poses: relative poses as the paper's (27) predicts them from the truth, one for every `poses_every` readings, with
+    the noise that integrating the readings would have.
+    """
+
+    sensor_type: ClassVar[str] = "wheels"
+    random_stream: ClassVar[int] = 2000
+    rolls: ClassVar[bool] = True
+
+    rate_hz: float = 70.0
+    radii: tuple[float, float] = (0.1, 0.1)
+    baseline: float = 0.4
+    noise: float = 0.03
+    slip: float = 0.0
+    allowed_slip: float | None = None
+    reports: Literal["rates", "twist", "steering", "poses"] = "rates"
+    sampling: Literal["interval-mean", "instantaneous"] = "interval-mean"
+    poses_every: int = 3
+    scales: tuple[float, float] = (1.0, 1.0)
+    speed_noise: float = 2e-3  # m/s/sqrt(Hz)
+    yaw_noise: float = 1e-2  # rad/s/sqrt(Hz)
+    radius: float = 0.1
+    wheelbase: float = 0.6
+    steering_offset: float = 0.0
+    steering_noise: float = 1e-3  # rad/sqrt(Hz)
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimWheels:
+        fields = value.entries()
+        reports = fields["reports"].choice("reports", tuple(_FIELDS)) if "reports" in fields else cls.reports
+        required, options = _FIELDS[reports]
+        found, common = mounted_fields(value, start_ns, required, (*options, "reports", "sampling"))
+        chosen: dict[str, Any] = {"reports": reports}
+        for key in found.keys() & {*required, *options}:
+            chosen[key] = _number(key, found[key])
+        if "sampling" in found:
+            chosen["sampling"] = found["sampling"].choice("sampling", ("interval-mean", "instantaneous"))
+        return cls(name, **common, **chosen)
+
+    def check(self, room: Room | None, drive: Drive | None) -> None:
+        if self.reports != "poses" and not (drive is not None and drive.on_ground):
+            raise RigError(
+                f"{self.name} cannot roll, because the motion is not that of wheels on a floor; use reports: "
+                "poses, or choose a motion on the ground."
+            )
+
+    def values(self) -> dict[str, np.ndarray]:
+        return {name: np.atleast_1d(np.array(getattr(self, name))) for name in drive_names(_KINDS[self.reports])}
+
+    def drawn_values(self, rng: np.random.Generator, relative_error: float) -> dict[str, np.ndarray]:
+        """Lengths and scales by a factor, an angle by as many radians."""
+        drawn, off = {}, relative_error * rng.standard_normal(3)
+        positive = {spec.name for spec in Wheels.parameters if spec.is_positive}
+        for name, value in self.values().items():
+            own, off = off[: value.size], off[value.size :]
+            drawn[name] = value + own * (value if name in positive else 1.0)
+        return drawn
+
+    def plain(self) -> dict[str, Any]:
+        return {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in self.values().items()}
+
+    def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
+        """Readings within those of the IMU. Raises RigError, too, where no front wheels can be steered so."""
+        rng = np.random.default_rng(seed)
+        stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
+        if self.reports == "poses":
+            stamps, seconds = stamps[:: self.poses_every], seconds[:: self.poses_every]
+            check_enough(self.name, stamps)
+            true, covariance = relative_poses(self, scene.trajectory, seconds)
+            measured = true + _drawn(covariance, rng) * float(scene.noisy)
+            return Report(WheelPoses(self.name, stamps, measured, covariance), WheelTruth(seconds, true))
+        true = _true_readings(self, scene, seconds)
+        noise = self._densities() * np.sqrt(self.rate_hz) * rng.standard_normal(true.shape)
+        measured = true + noise * float(scene.noisy)
+        stream = WheelStream(self.name, stamps[1:], measured, self.sampling, _KINDS[self.reports])
+        return Report(stream, WheelTruth(seconds[1:], true))
+
+    def _densities(self) -> np.ndarray:
+        """(2,) of the noise of the two columns."""
+        densities = {"twist": [self.speed_noise, self.yaw_noise], "steering": [self.noise, self.steering_noise]}
+        return np.array(densities.get(self.reports, [self.noise, self.noise]))
+
+    def rig_entry(self) -> Wheels:
+        measures = "rates" if self.reports == "steering" else self.reports
+        slip = Wheels.lateral_slip if self.allowed_slip is None else self.allowed_slip
+        return Wheels(
+            self.name,
+            f"{self.name}/{measures}.csv",
+            "ackermann" if self.reports == "steering" else "differential",
+            wheel_noise=self.noise,
+            speed_noise=self.speed_noise,
+            yaw_noise=self.yaw_noise,
+            steering_noise=self.steering_noise,
+            measures=measures,
+            sampling=self.sampling,
+            lateral_slip=slip,
+            vertical_slip=slip,
+        )
+
+    def write_table(self, folder: Path, stream: WheelStream | WheelPoses) -> None:
+        if isinstance(stream, WheelStream):
+            name, columns = _COLUMNS[stream.kind]
+            header = f"t [ns],{columns}; {_SAMPLING[stream.sampling]}"
+            write_table(folder / f"{name}.csv", header, stream.stamps_ns, stream.rate)
+            return
+        header = "from [ns],to [ns],yaw [rad],x [m],y [m],covariance: yaw yaw,yaw x,yaw y,x x,x y,y y"
+        stamps, upper = stream.stamps_ns, stream.covariance[:, *np.triu_indices(3)]
+        write_table(folder / "poses.csv", header, stamps[:-1], stamps[1:], stream.pose, upper)
+
+    def bag_topic(self, stream: WheelStream | WheelPoses, offset_ns: int) -> BagTopic | str:
+        """JointState or TwistStamped."""
+        if isinstance(stream, WheelPoses):
+            return f"{self.name} reports relative poses, which no driver sends; they are not written."
+        if stream.kind == "twist":
+            return BagTopic(f"/{self.name}/twist", _TWIST, _twists(stream, offset_ns))
+        return BagTopic(f"/{self.name}/joint_states", _JOINT_STATE, _joint_states(stream, offset_ns))
+
+
+SIMULATED = SimWheels
+
+
+def _number(key: str, value: YamlValue) -> Any:
+    """The value of a field of `SimWheels` in a scenario file."""
+    if key in ("radii", "scales"):
+        two = value.items()
+        if len(two) != 2:
+            words = "[left, right] in metres" if key == "radii" else "[speed, yaw rate]"
+            value.fail(f"must be {words}, but has {len(two)} entries.")
+        return two[0].positive(), two[1].positive()
+    if key == "poses_every":
+        return value.whole(1)
+    if key == "steering_offset":
+        return value.number()
+    return at_least(value, 0.0) if key == "slip" or key.endswith("noise") else value.positive()
+
+
+def _joint_states(wheels: WheelStream, offset_ns: int) -> Iterator[BagEvent]:
+    """Positions are the angles turned since the first stamp, where the readings are means; else there are none, but
+    steering angles, which have no velocity."""
+    angles, rates = np.full(wheels.rate.shape, np.nan), wheels.rate.copy()
+    if wheels.sampling == "interval-mean":
+        turned = wheels.rate[1:] * np.diff(wheels.stamps_ns)[:, None] * 1e-9
+        angles = np.concatenate([np.zeros((1, 2)), np.cumsum(turned, axis=0)])
+    if wheels.kind == "steered":
+        angles[:, 1], rates[:, 1] = wheels.rate[:, 1], np.nan
+    elif wheels.sampling == "instantaneous":
+        angles = np.empty((len(rates), 0))
+    names = _JOINTS[wheels.kind]
+    for stamp_ns, angle, rate in zip(wheels.stamps_ns.tolist(), angles, rates, strict=True):
+        yield (
+            stamp_ns + offset_ns,
+            lambda bag, stamp_ns=stamp_ns, angle=angle, rate=rate: bag.make(
+                _JOINT_STATE, bag.header(stamp_ns, wheels.name), names, angle, rate, np.empty(0)
+            ),
+        )
+
+
+def _twists(wheels: WheelStream, offset_ns: int) -> Iterator[BagEvent]:
+    for stamp_ns, (speed, yaw_rate) in zip(wheels.stamps_ns.tolist(), wheels.rate.tolist(), strict=True):
+        yield (
+            stamp_ns + offset_ns,
+            lambda bag, stamp_ns=stamp_ns, speed=speed, yaw_rate=yaw_rate: _twist(
+                bag, stamp_ns, wheels.name, speed, yaw_rate
+            ),
+        )
+
+
+def _twist(bag: BagWriter, stamp_ns: int, frame: str, speed: float, yaw_rate: float) -> Any:
+    """Forward speed [m/s] and yaw rate [rad/s]."""
+    linear, angular = (bag.make("geometry_msgs/msg/Vector3", *v) for v in ((speed, 0.0, 0.0), (0.0, 0.0, yaw_rate)))
+    return bag.make(_TWIST, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Twist", linear, angular))
+
+
+def _true_readings(wheels: SimWheels, scene: SimScene, seconds: np.ndarray) -> np.ndarray:
+    """(N - 1, 2) readings without noise at all instants (N,) but the first, as in `WheelStream`."""
+    if wheels.sampling == "instantaneous":
+        return reported(wheels, scene.trajectory, seconds[1:])
+    true = _means(wheels, scene.trajectory, seconds, scene.imu_seconds)
+    if wheels.reports == "steering":
+        true[:, 1] = reported(wheels, scene.trajectory, seconds[1:])[:, 1]
+    return true
+
+
+def reported(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> np.ndarray:
+    """(N, 2) at each instant, without noise, as in `WheelStream`. Of rates (v_x -+ baseline/2 w_z) / radius."""
+    some = np.split(seconds, range(_AT_A_TIME, len(seconds), _AT_A_TIME))
+    return np.concatenate([_reported(wheels, trajectory, s) for s in some])
+
+
+def _reported(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> np.ndarray:
+    velocity, rate = wheel_velocity(wheels.T_imu_sensor, trajectory, seconds)
+    ahead, turning = velocity[:, 0], rate[:, 2]
+    if wheels.reports == "twist":
+        return np.stack([ahead / wheels.scales[0], turning / wheels.scales[1]], axis=1)
+    if wheels.reports == "steering":
+        return np.stack([ahead / wheels.radius, _steering(wheels, ahead, turning)], axis=1)
+    half = 0.5 * wheels.baseline
+    left = (ahead - half * turning) / wheels.radii[0]
+    right = (ahead + half * turning) / wheels.radii[1]
+    return np.stack([left, right], axis=1)
+
+
+def _steering(wheels: SimWheels, ahead: np.ndarray, turning: np.ndarray) -> np.ndarray:
+    """(N,) rad: a point a wheelbase ahead moves at v_x forwards, or backwards, and at wheelbase w_z to the left. Raises
+    RigError where no front wheels can be steered so."""
+    angle = np.arctan2(np.copysign(wheels.wheelbase, ahead) * turning, np.abs(ahead))
+    if np.abs(angle).max() > _STEEPEST_RAD:
+        raise RigError(
+            f"{wheels.name} would have to steer by {np.rad2deg(np.abs(angle).max()):.0f} deg; choose a motion with "
+            "wider curves that never drives backwards, or a shorter wheelbase."
+        )
+    return angle - wheels.steering_offset
+
+
+def wheel_velocity(
+    T_imu_wheel: np.ndarray, trajectory: TrueTrajectory, seconds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) velocity [m/s] and angular rate [rad/s] of the wheel frame in its own axes."""
+    rotation, _, velocity = trajectory.pose_at(seconds)
+    rate = trajectory.rate_at(seconds)
+    in_imu = np.einsum("nji,nj->ni", rotation, velocity) + np.cross(rate, T_imu_wheel[:3, 3])
+    return in_imu @ T_imu_wheel[:3, :3], rate @ T_imu_wheel[:3, :3]
+
+
+def _means(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray, imu_seconds: np.ndarray) -> np.ndarray:
+    """(N - 1, 2) means between the instants, by Gauss's rule between all these and the IMU's, where rates may jump."""
+    within = imu_seconds[(imu_seconds > seconds[0]) & (imu_seconds < seconds[-1])]
+    cuts = np.union1d(seconds, within)
+    width = np.diff(cuts)
+    at = 0.5 * (cuts[:-1] + cuts[1:])[:, None] + 0.5 * width[:, None] * _GAUSS[0]
+    rates = reported(wheels, trajectory, at.ravel()).reshape(*at.shape, 2)
+    angle = 0.5 * width[:, None] * np.einsum("g,ngw->nw", _GAUSS[1], rates)
+    turned = np.concatenate([np.zeros((1, 2)), np.cumsum(angle, axis=0)])[np.searchsorted(cuts, seconds)]
+    return np.diff(turned, axis=0) / np.diff(seconds)[:, None]
+
+
+def relative_poses(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(K, 3) yaw, x, y between consecutive instants (K + 1,) by the paper's (27), without noise, and (K, 3, 3) the
+    covariance that integrating noisy readings would give them: yaw = e3 . Log(R_W(k)_W(k+1)), x and y of p_W(k)_W(k+1).
+    """
+    each = _AT_A_TIME // (2 * _SUBSTEPS + 1)
+    some = [seconds[k : k + each + 1] for k in range(0, len(seconds) - 1, each)]
+    poses, covariances = zip(*(_relative_poses(wheels, trajectory, s) for s in some), strict=True)
+    return np.concatenate(poses), np.concatenate(covariances)
+
+
+def _relative_poses(
+    wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    parts = np.linspace(seconds[:-1], seconds[1:], 2 * _SUBSTEPS + 1, axis=1)
+    rotation, position = _frames(wheels, trajectory, parts.ravel())
+    rotation, position = rotation.reshape(*parts.shape, 3, 3), position.reshape(*parts.shape, 3)
+    xy = np.einsum("kji,kmj->kmi", rotation[:, 0], position - position[:, :1])[..., :2]
+    yaw = _rotation_vectors(np.einsum("kji,kmjl->kmil", rotation[:, 0], rotation))[..., 2]
+    return np.column_stack([yaw[:, -1], xy[:, -1]]), _covariance(wheels, yaw, xy, np.diff(seconds))
+
+
+def _drawn(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(K, 3) normal vectors of the covariances (K, 3, 3), which may be singular."""
+    size, axes = np.linalg.eigh(covariance)
+    return (axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.standard_normal(size.shape))[..., None])[..., 0]
+
+
+def _frames(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R_world_wheel (N, 3, 3) and p_world_wheel (N, 3)."""
+    rotation, position, _ = trajectory.pose_at(seconds)
+    return rotation @ wheels.T_imu_sensor[:3, :3], position + rotation @ wheels.T_imu_sensor[:3, 3]
+
+
+def _rotation_vectors(rotation: np.ndarray) -> np.ndarray:
+    """(..., 3) Log of rotations (..., 3, 3) of less than half a turn: the axis from R - R^T, the angle from atan2."""
+    twice = np.stack([rotation[..., i, j] - rotation[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=-1)
+    sine = 0.5 * np.linalg.norm(twice, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(rotation, axis1=-2, axis2=-1) - 1.0))
+    return 0.5 * twice * np.where(sine > 0.0, angle / np.where(sine > 0.0, sine, 1.0), 1.0)[..., None]
+
+
+def _covariance(wheels: SimWheels, yaw: np.ndarray, xy: np.ndarray, duration: np.ndarray) -> np.ndarray:
+    """(K, 3, 3) of yaw, x, y: the noise of rates at each part, carried to the end of its interval.
+
+    yaw (K, M), xy (K, M, 2) along each interval, M odd: Simpson's rule. An error of the turning rate at one instant
+    turns the rest of the way about where the frame then was; one of the speed is along where it then points.
+    """
+    r_l, r_r = wheels.radii
+    speeds = np.array([[-r_l, r_r], [0.5 * r_l * wheels.baseline, 0.5 * r_r * wheels.baseline]]) / wheels.baseline
+    to_end = xy[:, -1:] - xy
+    c, s, none, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
+    by_turn = np.stack([one, -to_end[..., 1], to_end[..., 0]], axis=-1)
+    by_speed, by_slip = np.stack([none, c, s], axis=-1), np.stack([none, -s, c], axis=-1)
+    by_wheels = np.stack([by_turn, by_speed], axis=-1) @ speeds * wheels.noise
+    effect = np.concatenate([by_wheels, by_slip[..., None] * wheels.slip], axis=-1)
+    weight = np.where(np.arange(yaw.shape[1]) % 2, 4.0, 2.0)
+    weight[[0, -1]] = 1.0
+    weight = weight / weight.sum() * duration[:, None]
+    return np.einsum("km,kmin,kmjn->kij", weight, effect, effect)

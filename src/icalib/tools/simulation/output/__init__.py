@@ -1,0 +1,1 @@
+"""How simulated recordings are written: messages in bags, and tables."""

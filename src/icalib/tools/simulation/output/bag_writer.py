@@ -1,0 +1,81 @@
+"""Messages of the sensors, and the bags that hold them, by rosbags (extra `bags`)."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+
+from icalib.base.extras import install
+from icalib.errors import CalibrationError
+
+BagForm = Literal["ros1", "mcap", "sqlite3"]
+IMU_TOPIC = "/imu0"
+IMAGE, IMU = "sensor_msgs/msg/Image", "sensor_msgs/msg/Imu"
+
+
+class BagWriter:
+    """A bag that is being written. topics: the type of each. `imu`, `image` and `make` make messages."""
+
+    def __init__(self, form: BagForm, path: Path, topics: dict[str, str]) -> None:
+        typesys = package("rosbags.typesys", "bags")
+        self._ros1 = form == "ros1"
+        stores = typesys.Stores
+        self._store: Any = typesys.get_typestore(stores.ROS1_NOETIC if self._ros1 else stores.ROS2_HUMBLE)
+        if self._ros1:
+            self._writer = package("rosbags.rosbag1", "bags").Writer(path)
+        else:
+            rosbag2 = package("rosbags.rosbag2", "bags")
+            plugin = rosbag2.StoragePlugin[form.upper()]
+            self._writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        self._topics = topics
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> BagWriter:
+        self._writer.__enter__()
+        for topic, kind in self._topics.items():
+            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    def write(self, topic: str, message: Any, received_ns: int) -> None:
+        """received_ns: when the recorder received it, on the IMU's clock."""
+        serialise = self._store.serialize_ros1 if self._ros1 else self._store.serialize_cdr
+        self._writer.write(self._connections[topic], received_ns, serialise(message, self._topics[topic]))
+
+    def image(self, stamp_ns: int, frame: str, pixels: np.ndarray) -> Any:
+        """pixels (H, W) uint8, as mono8."""
+        height, width = pixels.shape
+        return self.make(IMAGE, self.header(stamp_ns, frame), height, width, "mono8", 0, width, pixels.ravel())
+
+    def imu(self, stamp_ns: int, values: list[float]) -> Any:
+        """values: gyro, then accel; the orientation is not known."""
+        unknown, turn = np.zeros(9), self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        w, f = (self.make("geometry_msgs/msg/Vector3", *v) for v in (values[:3], values[3:]))
+        return self.make(IMU, self.header(stamp_ns, "imu0"), turn, unknown, w, unknown, f, unknown)
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        """The header of a message."""
+        stamp = self.make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000))
+        return self.make("std_msgs/msg/Header", *([0] if self._ros1 else []), stamp, frame)
+
+    def make(self, kind: str, *values: Any) -> Any:
+        """A message of type `kind`; values: of its fields, in their order."""
+        return self._store.types[kind](*values)
+
+
+def package(name: str, extra: str) -> Any:
+    """A module that only writing needs. Raises CalibrationError where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise CalibrationError(
+            f"writing recordings needs {name}, which is not installed; run {install(extra)}."
+        ) from None
