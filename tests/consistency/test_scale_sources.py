@@ -55,9 +55,9 @@ def calibrated(
 @pytest.mark.parametrize(
     ("make", "source"),
     [
-        (lambda _: stereo(), "the size of the target alone: 1 % error there is 1 % in every translation here"),
-        (lambda p: p.camera_wheels(), "the size of the target alone: .* every translation and wheel size here"),
-        (lambda p: p.wheels_poses_imu(), "the positions of mocap0 alone: .* every translation and wheel size here"),
+        (lambda _: stereo(), "the size of the target alone: 1 % error there is 1 % in every length here"),
+        (lambda p: p.camera_wheels(), "the size of the target alone: .* every length here"),
+        (lambda p: p.wheels_poses_imu(), "the positions of mocap0 alone: .* every length here"),
     ],
 )
 def test_one_source_alone_is_named(program: ModuleType, make: Callable[[ModuleType], Scenario], source: str):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from icalib.rig import Settings
+from icalib.sensors.camera.assess import late_words
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.image_pairs import not_simultaneous
-from icalib.validation.notes import late_words
 
 NOISE_PX = 0.1
 

@@ -22,7 +22,7 @@ from icalib.report import report_html, robot_figures
 from icalib.result import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
 from icalib.result.quantities import rows
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels, by_name
-from icalib.validation.robot import robot_misfit
+from icalib.validation.misfit import misfit_words
 
 ROBOT_FIGURES = {"points-0", "distance-0", "wheels-0", "map-before", "map-after"}
 
@@ -227,7 +227,7 @@ def warnings(
 ) -> str:
     imu = ImuSensor("imu0", "imu0", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
     rig = Rig(by_name(imu, Lidar("lidar0", "lidar0", noise), Wheels("wheel0", "wheel0", **wheels)))
-    return robot_misfit(rig, SensorFit(sensor, kind, 400, dof, ratio * dof), white) or ""
+    return misfit_words(rig, SensorFit(sensor, kind, 400, dof, ratio * dof), white) or ""
 
 
 def test_more_slip_than_allowed_is_warned_of():

@@ -12,10 +12,10 @@ import yaml
 from icalib.cli import main
 from icalib.result import Calibration, load_calibration
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.lidar import assess
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Scenario, load_scenario, rig_for
-from icalib.validation import robot
 
 RAMP = Path(__file__).parents[2] / "examples" / "paper" / "table2-ramp.yaml"
 MOST = 5000
@@ -45,7 +45,7 @@ def out(scenario_file: Path, scenario: Scenario) -> Path:
     rig = folder / "rig.yaml"
     rig.write_text(yaml.safe_dump(rig_to_dict(rig_for(scenario))))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(robot, "MOST_POINTS", MOST)
+        patch.setattr(assess, "MOST_POINTS", MOST)
         assert main(["calibrate", str(rig), str(folder / "recording"), "-o", str(folder / "out"), "--quiet"]) == 0
     return folder / "out"
 

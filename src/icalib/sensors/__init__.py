@@ -6,6 +6,7 @@ A facet is a module of a fixed name in the folder of a kind, for one stage of th
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -14,6 +15,18 @@ from typing import Any
 SENSOR_KINDS = ("imu", "camera", "lidar", "wheels", "pose")
 # Levels of their own in tests/test_layers.py.
 FACETS = ("spec", "record", "stream", "read", "model", "initialize", "assess", "show", "simulate", "inspect")
+
+
+def ask(name: str, question: str, *arguments: Any) -> Iterator[Any]:
+    """What functions called `question` in the facets called `name` yield, kind by kind."""
+    for kind in SENSOR_KINDS:
+        yield from answer(kind, name, question, *arguments) or ()
+
+
+def answer(kind: str, name: str, question: str, *arguments: Any) -> Any:
+    """What the function `question` in the facet `name` of one kind returns; None where the kind has none."""
+    function = getattr(facet(kind, name), question, None)
+    return None if function is None else function(*arguments)
 
 
 def facet(kind: str, name: str) -> Any:

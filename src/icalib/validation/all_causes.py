@@ -18,13 +18,14 @@ from icalib.result import ParameterGroup, SensorFit
 from icalib.result.timeline import Timeline
 from icalib.result.verdict import AUXILIARY
 from icalib.rig import DRIVES, LENS
+from icalib.sensors.camera.assess import plane_warnings
 from icalib.sensors.camera.features.surfaces import ON_PLANES
-from icalib.validation.cameras import mixed_up, other_lens, plane_warnings
+from icalib.validation.cameras import mixed_up, other_lens
 from icalib.validation.causes import Cause, Misfit, changing, explaining, ranked
 from icalib.validation.lens_models import lens_warnings
 from icalib.validation.misfit import LARGE_FACTOR, misfit_causes
 from icalib.validation.size import felt_size, is_certain, scale_causes, scale_notes, size_words
-from icalib.validation.stated import absurd_wheels, stated_words
+from icalib.validation.stated import absurd_values, stated_words
 
 SEEN = ("corners", "features")
 WHEEL_LENGTHS = tuple(drive[0].name for drive in DRIVES.values())
@@ -100,7 +101,7 @@ def _contradicted(
         gain = np.inf if stated is None else float(((c.off / (c.sigma / scale)) ** 2).max())
         moves = stated is not None and _moves_others(judged, stated, c.key)
         yield Cause(stated_words(judged.inputs, c), gain, grave or moves)
-    yield from (Cause(s, 0.0, grave) for s in absurd_wheels(judged.inputs, against, judged.groups))
+    yield from (Cause(s, 0.0, grave) for s in absurd_values(judged.inputs, against, judged.groups))
 
 
 def _moves_others(judged: AssessedEstimate, stated: Relaxed, key: Key) -> bool:

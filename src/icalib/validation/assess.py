@@ -29,11 +29,8 @@ from icalib.optim.calib_block import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (
     Calibration,
-    ImuResiduals,
     Iteration,
     ParameterGroup,
-    Residuals,
-    RowResiduals,
     SensorFit,
     Trajectory,
     Verdict,
@@ -43,27 +40,16 @@ from icalib.result import (
 from icalib.result.provenance import versions
 from icalib.result.timeline import Timeline
 from icalib.result.verdict import by_size
-from icalib.rig import drive_names
+from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
+from icalib.sensors import ask
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
-from icalib.sensors.pose.spec import SCALE
 from icalib.validation.all_causes import AssessedEstimate, all_causes
-from icalib.validation.cameras import plane_warnings
 from icalib.validation.guesses import guess_notes
 from icalib.validation.held_out import held_out
-from icalib.validation.images import corner_residuals, track_residuals
 from icalib.validation.misfit import scatter_warnings
 from icalib.validation.notes import notes
-from icalib.validation.robot import (
-    lidar_residuals,
-    lidar_warnings,
-    planes,
-    pose_residuals,
-    pose_warnings,
-    wheel_residuals,
-)
 from icalib.validation.twin_lenses import twin_lens_notes
-from icalib.validation.upwards import upwards_warnings
 
 ENOUGH_PARTS = 8  # from so many on, t differs from the normal distribution by 8 % at most
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
@@ -87,13 +73,12 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     timeline = Timeline.of(inputs.parts, image_times(inputs, state.values))
     factors = _factors(inputs, groups)
     factor = factors.max(initial=1.0)
-    trajectory, poses = _trajectory(inputs, state, timeline), pose_residuals(inputs, found, timeline)
     causes, size_notes = all_causes(AssessedEstimate(inputs, found, groups, judged, factor, parts, timeline), against)
     wrong = tuple(c.sentence for c in causes if c.grave)
     warnings = (
         *wrong,
         *(c.sentence for c in causes if not c.grave),
-        *_warnings(inputs, found, groups, poses),
+        *_warnings(inputs, found, groups),
         *scatter_warnings(factors, parts is not None, held),
     )
     return Calibration(
@@ -102,8 +87,8 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         covariance_names=names,
         undetermined=seen.undetermined,
         fits=tuple(judged),
-        residuals=by_key(_residuals(inputs, found, timeline, trajectory, poses)),
-        trajectory=trajectory,
+        residuals=by_key(ask("assess", "residuals", inputs, found, timeline)),
+        trajectory=_trajectory(inputs, state, timeline),
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
@@ -120,7 +105,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         rates=_rates(inputs),
         versions=versions(),
         recordings=timeline.spans,
-        planes=planes(inputs, state),
+        planes=tuple(ask("assess", "planes", inputs, state)),
         cross_validation=held,
         wrong=wrong,
     )
@@ -203,10 +188,10 @@ def _groups(
     overall = float(np.sqrt(np.mean(noise.ratio[own] ** 2))) if len(own) else 1.0
     groups = []
     for block in inputs.layout.blocks:
-        if block.name in IN_THE_WORLD or _unheard_of(inputs, block) or _is_assumed(inputs, block.sensor):
+        if block.name in IN_THE_WORLD or _is_assumed(inputs, block.sensor):
             continue
         spec = inputs.specs[block.key]
-        if block.start is None and (spec.is_auxiliary or spec == SCALE):
+        if block.start is None and not _is_shown(inputs, block, spec):
             continue
         zeros = np.zeros(block.size)
         if block.start is None:
@@ -235,10 +220,14 @@ def _groups(
     return tuple(groups)
 
 
-def _unheard_of(inputs: Inputs, block: Block) -> bool:
-    """Whether it belongs to wheels that report poses, in which it has no part."""
-    wheels = [w.name for w in inputs.rig.wheels if w.measures == "poses"]
-    return block.sensor in wheels and block.name in drive_names("pair")
+def _is_shown(inputs: Inputs, block: Block, spec: ParameterSpec) -> bool:
+    """Whether a group that is not estimated is of interest: the rig file can state it, and measurements depend on it,
+    unlike radii if wheels report poses."""
+    sensor = inputs.rig.sensors.get(block.sensor)
+    if spec.is_auxiliary or sensor is None:
+        return not spec.is_auxiliary
+    stated = spec.name in [s.name for s in sensor.stated()]
+    return stated and (sensor.is_estimated(spec) or getattr(sensor, spec.name).mode == "fixed")
 
 
 def _final_verdict(formal: Verdict, size: float) -> Verdict:
@@ -302,36 +291,11 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
     return recording[order][np.searchsorted(times[order], state.seconds)]
 
 
-def _residuals(
-    inputs: Inputs, found: Estimate, timeline: Timeline, trajectory: Trajectory, poses: tuple[RowResiduals, ...]
-) -> Iterator[Residuals]:
-    """In the order of `SENSOR_KINDS`."""
-    if inputs.imu is not None:
-        yield _imu_residuals(found, trajectory)
-    yield from corner_residuals(found, timeline)
-    yield from track_residuals(found, timeline)
-    yield from lidar_residuals(inputs, found, timeline)
-    yield from wheel_residuals(inputs, found, timeline)
-    yield from poses
-
-
-def _imu_residuals(found: Estimate, trajectory: Trajectory) -> ImuResiduals:
-    """Of all intervals but those between recordings, which hold nothing."""
-    chain = found.problem.chain
-    out, seams = found.outcome.residuals[chain.key], np.array(chain.starts[1:], dtype=np.int64) - 1
-    return ImuResiduals(chain.name, np.delete(trajectory.seconds[:-1], seams), np.delete(out.residual, seams, axis=0))
-
-
-def _warnings(
-    inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...], poses: tuple[RowResiduals, ...]
-) -> Iterator[str]:
+def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...]) -> Iterator[str]:
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
-    yield from plane_warnings(inputs.rig, found.problem.factors)
-    yield from pose_warnings(poses, inputs.rig)
-    yield from upwards_warnings(inputs, found)
-    yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
+    yield from ask("assess", "warnings", inputs, found)
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"

@@ -7,8 +7,9 @@ from itertools import permutations, product
 import numpy as np
 
 from icalib.geometry import so3
-from icalib.rig import Rig, Wheels
+from icalib.rig import Rig
 from icalib.rig.kinds import SPECS
+from icalib.sensors import answer
 
 NEAR_RAD = 0.15  # by which a rotation is off that another frame explains
 NEARLY = 0.1  # of a number in another unit
@@ -18,7 +19,6 @@ TURNS = [  # about right angles, and reflections
     for axes in (np.diag(signs) for signs in product((1.0, -1.0), repeat=3))
 ]
 LENGTHS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
-RATES = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
 IMAGE_SIZES = (2.0, 0.5, 4.0, 0.25)
 
 
@@ -43,8 +43,9 @@ def looks_like(
         for size in IMAGE_SIZES:
             if _is_near(found[:2], size * value[:2]):
                 return f" The focal length is {size:g} times that: was it of images of another size?"
-    wheels = next((w for w in rig.wheels if w.name == key[0]), None)
-    return "" if wheels is None or name not in ("radii", "radius") else _rolling(wheels, value, found)
+    sensor = rig.sensors.get(key[0])
+    own = None if sensor is None else answer(sensor.sensor_type, "assess", "looks_like", sensor, name, value, found)
+    return own or ""
 
 
 def _frames(value: np.ndarray, found: np.ndarray) -> str:
@@ -52,17 +53,6 @@ def _frames(value: np.ndarray, found: np.ndarray) -> str:
         return " It looks like the inverse, as in Kalibr's T_cam_imu: icalib wants R_imu_sensor."
     if min(_angle(value @ turn, found) for turn in TURNS if np.linalg.det(turn) > 0.0) < NEAR_RAD:
         return " It looks like that of a frame whose axes are named otherwise, as a link's and a camera's are."
-    return ""
-
-
-def _rolling(wheels: Wheels, value: np.ndarray, found: np.ndarray) -> str:
-    if _is_near(found, 0.5 * value):
-        return " It looks like a diameter: write the radius."
-    if wheels.measures == "ticks" and wheels.counts_per_turn is not None:
-        return f" With it counts_per_turn would be {wheels.counts_per_turn * float(np.median(value / found)):.0f}."
-    for size, unit in RATES.items() if wheels.measures == "rates" else ():
-        if _is_near(found, size * value):
-            return f" Its readings look like {unit}: write rate_unit: {unit}."
     return ""
 
 

@@ -11,10 +11,11 @@ from icalib.estimate.noise_size import are_noise, fitting_noise
 from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.factor import rows_of
 from icalib.result import CrossValidation, SensorFit
-from icalib.result.excess import FAR_BEYOND, dof_known, excess
-from icalib.validation.cameras import camera_misfit, rejected_words
+from icalib.result.excess import FAR_BEYOND, dof_known, excess, times
+from icalib.rig import Rig
+from icalib.sensors import facet
+from icalib.sensors.camera.assess import rejected_words
 from icalib.validation.causes import INERTIAL, Cause, Misfit, noise_words, unknown_words
-from icalib.validation.robot import robot_misfit
 
 SMALL_CHI2 = 0.5  # per post-fit degree of freedom: below this it is worth a warning
 LARGE_FACTOR = 3.0
@@ -34,8 +35,24 @@ def misfit_causes(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], 
         return
     yield from _of_imu(inputs, found, judged, misfit)
     for f in judged:
-        if sentence := camera_misfit(inputs.rig, f) or robot_misfit(inputs.rig, f, _is_noise(found, f)):
+        if sentence := misfit_words(inputs.rig, f, _is_noise(found, f)):
             yield Cause(sentence, max(f.chi2 - f.dof, 0.0), excess(f) >= FAR_BEYOND)
+
+
+def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
+    """A sentence on residuals that do not fit what the rig file states, by the kind of the sensor. Kinds without one
+    of their own get one that fits all. is_noise: residuals are white and constant over the recording; only then another
+    size of the noise is advised."""
+    sensor = rig.sensors.get(f.sensor)
+    if sensor is None:
+        return None
+    own = facet(sensor.sensor_type, "assess")
+    if hasattr(own, "misfit"):
+        return own.misfit(sensor, f, is_noise)
+    if excess(f) == 1.0:
+        return None
+    advice = "state a larger one" if is_noise else "they are no white noise, so check its clock and its mount"
+    return f"{f.kind} residuals of {f.sensor} are {times(f)} larger than its stated noise predicts; {advice}."
 
 
 def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit: Misfit) -> Iterator[Cause]:

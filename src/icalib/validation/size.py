@@ -11,13 +11,14 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.evidence.target_size import TargetSize, target_size
 from icalib.estimate.problem.inputs import Inputs
 from icalib.result import ParameterGroup
-from icalib.rig import Camera, Wheels
+from icalib.sensors import answer
 from icalib.sensors.camera.bodies import SIZE
 from icalib.validation.causes import Cause
 
 WRONG = 0.02  # of the size: more than a ruler or a good accelerometer is off by
 BEYOND = 0.05  # accelerometers are off by 3 % at most
 CLEARLY = 5.0  # standard deviations
+SCALE = "scale"  # of all lengths that a sensor reports; its prior is `scale_sigma`
 
 
 def felt_size(found: Estimate, factor: float) -> TargetSize | None:
@@ -43,7 +44,7 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...]
         return (), ()
     rig, digits = inputs.rig, max(2, 1 - int(np.floor(np.log10(size.std))))
     ratio = f"{size.ratio:.{digits}f} +- {size.std:.{digits}f}"
-    others = rig.lidars or rig.wheels or rig.poses or any(c.translation.mode != "free" for c in rig.cameras)
+    others = len(rig.mounted) > len(rig.cameras) or any(c.translation.mode != "free" for c in rig.cameras)
     by = "the accelerometer" + (" and what else shows it" if others else "")
     words = f"by {by} the target is {ratio} times the size that the rig file says"
     if abs(size.ratio - 1.0) <= max(WRONG, CLEARLY * size.std):
@@ -59,8 +60,7 @@ def scale_notes(inputs: Inputs, size: TargetSize | None) -> Iterator[str]:
     """What all lengths rest on, where that is one thing only."""
     sources = scale_sources(inputs, size)
     if len(sources) == 1:
-        lengths = "translation and wheel size" if inputs.rig.wheels else "translation"
-        yield f"every length comes from {sources[0]} alone: 1 % error there is 1 % in every {lengths} here."
+        yield f"every length comes from {sources[0]} alone: 1 % error there is 1 % in every length here."
 
 
 def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
@@ -69,30 +69,19 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
     target = rig.has_target and bool(rig.cameras)
     has_imu = rig.imu is not None and not rig.imu.assumed
     sources = ["the size of the target"] if target else []
-    sources += [f"the positions of {p.name}" for p in rig.poses]
-    sources += [f"the ranges of {lidar.name}" for lidar in rig.lidars]
-    sources += [f"the stated sizes of {w.name}" for w in rig.wheels if _has_scale(w)]
-    sources += [f"the stated translation of {c.name}" for c in rig.cameras if _is_stated(c, rig.body)]
+    found = (answer(sensor.sensor_type, "assess", "length", sensor, rig) for sensor in rig.mounted)
+    sources += [source for source in found if source]
     if has_imu and (size is not None or not target):
         sources.append("the accelerometer")
     return sources
 
 
-def _has_scale(wheels: Wheels) -> bool:
-    """Whether what they report is in metres, or in turns of wheels of a known size."""
-    return wheels.measures == "poses" or getattr(wheels, wheels.drive_specs[0].name).mode != "free"
-
-
-def _is_stated(camera: Camera, body: str) -> bool:
-    p = camera.translation
-    return camera.name != body and p.mode != "free" and p.value is not None and bool(np.any(p.value))
-
-
 def scale_causes(inputs: Inputs, groups: Sequence[ParameterGroup], size: TargetSize | None) -> Iterator[Cause]:
-    """Sizes of the target and scales of pose sensors that the others contradict. Each has a prior about 1, and is
+    """Sizes of the target and scales of sensors that the others contradict. Each has a prior about 1, and is
     pulled from it by less than all disagree, as both ends give way."""
     sigmas = {SIZE: inputs.rig.target.size_sigma} if size is None else {}
-    sigmas |= {(p.name, "scale"): p.scale_sigma for p in inputs.rig.poses}
+    sensors = inputs.rig.sensors.values()
+    sigmas |= {(s.name, SCALE): sigma for s in sensors if (sigma := getattr(s, "scale_sigma", 0.0)) > 0.0}
     off = {k: float(g.value[0]) - 1.0 for g in groups if (k := (g.sensor, g.name)) in sigmas and g.columns is not None}
     away = {key: abs(d) / sigmas[key] for key, d in off.items()}
     if max(away.values(), default=0.0) <= CLEARLY:

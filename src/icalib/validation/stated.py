@@ -9,20 +9,17 @@ import numpy as np
 from icalib.estimate.problem.inputs import Inputs
 from icalib.observability.contradictions import Contradiction
 from icalib.result import ParameterGroup
-from icalib.rig import Wheels
+from icalib.sensors import answer
 from icalib.validation.looks_like import looks_like
 
-# Radii over baseline: from 1/15 of a floor robot to 1 of a toy; rates in rpm make 1/3 a 1/30.
-SMALLEST_SHARE, LARGEST_SHARE = 1.0 / 25.0, 4.0
 
-
-def absurd_wheels(inputs: Inputs, against: Sequence[Contradiction], groups: Sequence[ParameterGroup]) -> Iterator[str]:
-    """One sentence for each set of wheels whose size cannot be, where it contradicts no stated value."""
+def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequence[ParameterGroup]) -> Iterator[str]:
+    """Sentences on sensors with values that cannot be, where they contradict no stated value."""
     found = {(g.sensor, g.name): g for g in groups}
     named = {c.key[0] for c in against}
-    for wheels in inputs.rig.wheels:
-        if wheels.kind == "pair" and wheels.name not in named:
-            yield from _absurd(wheels, found)
+    for sensor in inputs.rig.sensors.values():
+        if sensor.name not in named:
+            yield from answer(sensor.sensor_type, "assess", "absurd", sensor, found) or ()
 
 
 def stated_words(inputs: Inputs, c: Contradiction) -> str:
@@ -60,20 +57,3 @@ def _rounded(value: float, sigma: float) -> str:
     """To a tenth of its standard deviation."""
     digits = 1 - int(np.floor(np.log10(sigma))) if sigma > 0.0 else 6
     return f"{value:.{min(max(digits, 0), 12)}f}"
-
-
-def _absurd(wheels: Wheels, found: dict[tuple[str, str], ParameterGroup]) -> Iterator[str]:
-    """Wheels that are tiny or huge beside what is between them: readings in another unit."""
-    radii, baseline = found.get((wheels.name, "radii")), found.get((wheels.name, "baseline"))
-    if radii is None or baseline is None:
-        return
-    share = float(radii.value.mean() / baseline.value[0])
-    if SMALLEST_SHARE < share < LARGEST_SHARE:
-        return
-    cause = {"ticks": "its counts_per_turn", "rates": "its rate_unit"}.get(
-        wheels.measures, "whether its angles are in radians"
-    )
-    yield (
-        f"the wheels of {wheels.name} come out with a radius of {1e3 * radii.value.mean():.3g} mm and "
-        f"{1e3 * baseline.value[0]:.4g} mm between them, which no vehicle has; check {cause}."
-    )

@@ -12,8 +12,8 @@ from icalib.geometry.planes import plane_of
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import make_layout
 from icalib.rig import Ground
+from icalib.sensors.wheels.assess import ground_warnings
 from icalib.sensors.wheels.ground_factor import GroundFactor, floors
-from icalib.validation.robot import ground_warnings
 
 KEY = ("plane 0", "plane")
 LEVEL, FLOOR = Ground("level", 0.01, 0.0, 0.004, 0.002), Ground("floor", 0.01, 0.0, 0.004, 0.002)

@@ -1,0 +1,253 @@
+"""What a result keeps and says of cameras: corners, tracked points, and how well both fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.corner_noise import NoiseModel
+from icalib.estimate.problem.inputs import Inputs
+from icalib.motion.clocks import instants
+from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
+from icalib.motion.nodes import usable
+from icalib.result import CornerResiduals, SensorFit, TrackResiduals
+from icalib.result.excess import excess, times
+from icalib.result.timeline import Timeline
+from icalib.rig import Camera, Rig
+from icalib.sensors.camera.bodies import words_on_left_out
+from icalib.sensors.camera.circle_centres import centre_shifts
+from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.surfaces import ON_PLANES
+
+MOST_NAMED = 10  # images
+GROWN_VIEWS = 10  # after which the noise of tracks is told once more
+POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images by half
+MANY_REJECTED = 0.05  # of the corners or tracks of a camera
+FEW_ON_PLANES = 0.1  # of the tracks: rough walls have as many where they should have two thirds
+
+
+def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[CornerResiduals | TrackResiduals]:
+    """Corners of each camera; then tracked points of each, where there are any."""
+    yield from _corner_residuals(found, timeline)
+    yield from _track_residuals(found, timeline)
+
+
+def _corner_residuals(found: Estimate, timeline: Timeline) -> Iterator[CornerResiduals]:
+    """By camera; those that saw no target have no corners in any image."""
+    for i, (camera, corners) in enumerate(pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)):
+        stream = camera.stream
+        yield CornerResiduals(
+            camera.name,
+            _seconds(found, timeline, i),
+            stream.start,
+            stream.point,
+            stream.uv,
+            corners.residual,
+            camera.noise.sigma,
+            corners.root == 0.0,
+        )
+
+
+def _track_residuals(found: Estimate, timeline: Timeline) -> Iterator[TrackResiduals]:
+    """By camera, where any of them tracks points."""
+    pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
+    if not pairs:
+        return
+    factor, left = pairs[0]
+    for i, (camera, stream) in enumerate(zip(factor.cameras, factor.streams, strict=True)):
+        unused = (left.root[i] == 0.0)[:, None]
+        residual = np.where(unused, np.nan, left.residual[i]).astype(np.float32)
+        own = np.linalg.norm(left.points[factor.tracks.camera == i], axis=1)
+        yield TrackResiduals(
+            camera.name,
+            float(np.median(own)) if len(own) else None,
+            _seconds(found, timeline, i),
+            stream.start,
+            stream.feature,
+            stream.uv,
+            residual,
+            factor.sigmas[i].astype(np.float32),
+            factor.outliers[i],
+        )
+
+
+def _seconds(found: Estimate, timeline: Timeline, index: int) -> np.ndarray:
+    """(M,) of the images of a camera."""
+    times = instants(of_type(found.problem.factors, CornerFactor)[index].stream, found.outcome.state.values)
+    return timeline.shown(times, timeline.of_images(index))
+
+
+def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+    """Noise and outliers of corners and tracks, and images that are left out."""
+    if words := words_on_left_out(inputs.bodies):
+        yield words
+    factors = of_type(found.problem.factors, CornerFactor)
+    yield from _outside_imu_notes(inputs, found, factors)
+    apart = found.judged.apart or tuple(np.zeros(len(c.node), dtype=bool) for c in factors)
+    for camera, factor, model, late in zip(inputs.rig.cameras, factors, found.judged.models, apart, strict=True):
+        yield from _corner_notes(camera, factor, model, late, found)
+    if words := late_words(factors, apart):
+        yield words
+    yield from _feature_notes(found)
+
+
+def _outside_imu_notes(inputs: Inputs, found: Estimate, factors: Sequence[CornerFactor]) -> Iterator[str]:
+    """Of images that were taken while the IMU was not running."""
+    if inputs.imu is None or inputs.rig.assumes_motion:
+        return
+    for camera in factors:
+        t = instants(camera.stream, found.outcome.state.values)
+        left_out = int((~usable(inputs.imu, t, inputs.rig.settings.max_gap_s)).sum())
+        if left_out:
+            yield f"{left_out} images of {camera.name} are left out: {inputs.imu.name} was not running then."
+
+
+def _corner_notes(
+    camera: Camera, factor: CornerFactor, model: NoiseModel, late: np.ndarray, found: Estimate
+) -> Iterator[str]:
+    """late (M,) bool: images that are rejected as a whole."""
+    if not len(factor.stream.uv):
+        return
+    yield f"{camera.name}: {_noise_words(model)}."
+    if words := _rejected_words(factor.keep[~late[factor.stream.image]]):
+        yield f"{camera.name}: {words}"
+    if factor.bodies.target.radii.any():
+        size = np.linalg.norm(centre_shifts(factor, found.outcome.state), axis=1)
+        yield (
+            f"{camera.name}: ellipses have their centres {np.sqrt((size**2).mean()):.3f} px (RMS, {size.max():.2f} px "
+            "at most) beside the projected centres of their circles; the estimate takes it into account."
+        )
+
+
+def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> str:
+    """A sentence on the images that were rejected because they are not simultaneous; "" if there are none.
+
+    apart: by camera (M,) bool. The images at one keyframe are a set, which is named by its first image.
+    """
+    first_of, names = {}, []
+    for camera, late in zip(cameras, apart, strict=True):
+        if late.any():
+            names.append(camera.name)
+        for node, stamp in zip(camera.node[late].tolist(), camera.stream.stamps_ns[late].tolist(), strict=True):
+            first_of.setdefault(node, camera.stream.which(stamp))
+    if not first_of:
+        return ""
+    named = ", ".join(first_of[node] for node in sorted(first_of)[:MOST_NAMED])
+    which = f", the first {MOST_NAMED}" if len(first_of) > MOST_NAMED else ""
+    return (
+        f"{len(first_of)} sets of images of {' and '.join(names)} were not exposed together, or the rig moved between, "
+        f"and are left out{which}: {named}."
+    )
+
+
+def _rejected_words(keep: np.ndarray) -> str:
+    """`keep` (N,) bool: corners in use, of images that are not rejected as a whole."""
+    count = int((~keep).sum())
+    if not count:
+        return ""
+    share = f"{count} of {len(keep)} corners ({100.0 * count / len(keep):.2g} %)"
+    return (
+        f"{share} are rejected as outliers: their residuals are far larger than those of the same image and of corners "
+        "nearby."
+    )
+
+
+def _noise_words(model: NoiseModel) -> str:
+    words = f"corner noise {model.base:.3f} px"
+    if model.misfit > 0.0:
+        words += f", {model.misfit:.2g} px that the lens model does not follow"
+    if model.exposure > 0.0:
+        words += f", {1e3 * model.exposure:.2f} px of motion blur at 1000 px/s of image speed"
+    if model.tau:
+        words += f", {' and '.join(f'{t:.3f}' for t in model.tau)} px common to an image"
+    return words
+
+
+def _feature_notes(found: Estimate) -> Iterator[str]:
+    pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
+    if not pairs:
+        return
+    factor, out = pairs[0]
+    all_of_them = len(np.unique(np.concatenate([s.feature for s in factor.streams])))
+    yield (
+        f"{all_of_them} points of the scene were followed, in {factor.tracks.count} tracks that show where they are; "
+        "tracks that do not, for lack of parallax, are left out."
+    )
+    if factor.surfaces is not None:
+        plane = factor.on.plane[factor.on.plane >= 0]
+        yield (
+            f"{len(plane)} of the tracks lie on {len(np.unique(plane))} planes that LiDARs see, to within "
+            f"{1e3 * factor.surfaces.noise:.1f} mm, as the rig file has it."
+        )
+    for camera, noise, root, stream in zip(factor.cameras, factor.noise, out.root, factor.streams, strict=True):
+        share = f"{int((root > 0.0).sum())} of {len(stream.uv)}"
+        grows = ""
+        if noise.growth > 0.0:
+            last = float(noise.sigma * np.sqrt(1.0 + noise.growth * GROWN_VIEWS))
+            grows = f" in the first view, {last:.3f} px after {GROWN_VIEWS} more"
+        yield f"{camera.name}: track noise {noise.sigma:.3f} px{grows}; {share} observations of tracks are in use."
+
+
+def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+    """Where tracked points do not lie on planes that they should lie on."""
+    yield from plane_warnings(inputs.rig, found.problem.factors)
+
+
+def plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[str]:
+    """Where points should lie on planes, and none do, or so few that it may be chance."""
+    if rig.settings.points_on_planes_m == 0.0:
+        return
+    features = of_type(factors, FeatureFactor)
+    on, tracks = sum(int((f.on.plane >= 0).sum()) for f in features), sum(f.tracks.count for f in features)
+    if on == 0:
+        yield (
+            "no tracked points lie on planes of the LiDARs, so points_on_planes_m in the rig file has no effect; make "
+            "it larger, or remove it if little is flat."
+        )
+    elif on < FEW_ON_PLANES * tracks:
+        yield (
+            f"only {on} of the {tracks} tracks that cameras follow lie on planes of the LiDARs, so few that it may be "
+            "chance; make points_on_planes_m in the rig file larger, or take it out where little is flat."
+        )
+
+
+def rejected_words(f: SensorFit) -> str | None:
+    """A sentence where many corners or tracks of a camera are rejected."""
+    if f.kind not in ("corners", "features") or f.rejected <= MANY_REJECTED * 0.5 * f.count:
+        return None
+    share = f.rejected / (f.rejected + 0.5 * f.count)
+    return f"{share:.0%} of the {f.kind} of {f.sensor} are rejected as outliers; look at its residuals in the report."
+
+
+def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> str | None:
+    """A sentence where corners, or points on planes, leave more than is stated, or than detectors are off by."""
+    if f.kind == ON_PLANES and excess(f) > 1.0:
+        return (
+            f"tracked points of {f.sensor} lie {times(f)} farther from planes of the LiDARs than points_on_planes_m "
+            "predicts; make it larger, or take it out where little is flat."
+        )
+    if f.kind != "corners":
+        return None
+    if f.rms is not None and f.rms > POOR_FIT_PX:
+        return (
+            f"the corners of {f.sensor} fit to {f.rms:.1f} px only, ten times the error of a detector, and the cause "
+            "is unknown. Check its camera model, fixed intrinsics, its topic, the target in the rig file, jumps of its "
+            "clock, and blur of its images."
+        )
+    if excess(f) > 1.0 and camera.corner_noise_px is not None:
+        return (
+            f"residuals of the corners of {f.sensor} are {times(f)} larger than its corner_noise predicts, and the "
+            "cause is unknown. Check its camera model, fixed intrinsics and its topic; if all are right, leave "
+            "corner_noise out, and it is estimated."
+        )
+    return None
+
+
+def length(camera: Camera, rig: Rig) -> str | None:
+    """What shows how long a metre is: a translation that the rig file states."""
+    p = camera.translation
+    stated = camera.name != rig.body and p.mode != "free" and p.value is not None and bool(np.any(p.value))
+    return f"the stated translation of {camera.name}" if stated else None

@@ -1,0 +1,68 @@
+"""What a result keeps and says of the IMU: residuals of its intervals, its noise, and its gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.problem.inputs import Inputs
+from icalib.result import ImuResiduals, SensorFit
+from icalib.result.timeline import Timeline
+from icalib.rig import ImuSensor
+from icalib.sensors.imu.spec import INTRINSICS_LABELS, class_of_sigma
+
+
+def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[ImuResiduals]:
+    """Of all intervals but those between recordings, which hold no data."""
+    if inputs.imu is None or inputs.rig.assumes_motion:
+        return
+    chain, state = found.problem.chain, found.outcome.state
+    recording = np.repeat(np.arange(len(state.starts)), np.diff((*state.starts, len(state.seconds))))
+    seconds, seams = timeline.shown(state.seconds, recording)[:-1], np.array(chain.starts[1:], dtype=np.int64) - 1
+    whitened = found.outcome.residuals[chain.key].residual
+    yield ImuResiduals(chain.name, np.delete(seconds, seams), np.delete(whitened, seams, axis=0))
+
+
+def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+    """Its noise, the prior of its intrinsics, and gaps; or what is assumed in place of an IMU."""
+    imu = inputs.imu
+    if imu is None:
+        return
+    assert inputs.rig.imu is not None
+    n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
+    if inputs.rig.assumes_motion:
+        yield (
+            f"there is no IMU: the motion is assumed to be smooth, in a second its rate to change by {n.gyro_walk:.2g} "
+            f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis), as poses show."
+        )
+        return
+    yield (
+        f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
+        f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
+    )
+    if words := _intrinsics_words(inputs.rig.imu):
+        yield words
+    for a, b in imu.gaps:
+        how = "bridged" if b - a <= most else "left out, with the images in it"
+        yield f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}."
+
+
+def _intrinsics_words(imu: ImuSensor) -> str:
+    """What was assumed of the IMU's scale and misalignment, where they are estimated; else empty."""
+    if imu.intrinsics.mode != "prior" or imu.intrinsics.sigma is None:
+        return ""
+    sigma = dict(zip(INTRINSICS_LABELS, imu.intrinsics.sigma.tolist(), strict=True))
+    name = class_of_sigma(imu.intrinsics.sigma)
+    whose = "from the rig file" if name is None else f"of {'an' if name[0] in 'aeiou' else 'a'} {name} IMU"
+    turn = np.rad2deg(sigma["gyro_rotation_x"])
+    return (
+        f"prior of IMU intrinsics {whose}: scale {100.0 * sigma['accel_xx']:.2g} % (accelerometer), "
+        f"{100.0 * sigma['gyro_xx']:.2g} % (gyroscope), rotation between them {turn:.2g} deg (standard deviations)."
+    )
+
+
+def misfit(imu: ImuSensor, f: SensorFit, is_noise: bool) -> str | None:
+    """Nothing: the noise of the IMU has tests of its own, as all other sensors depend on it."""
+    return None
