@@ -28,8 +28,7 @@ def rig_of_result(c: Calibration, treatment: Treatment) -> tuple[Rig, tuple[str,
     if treatment not in TREATMENTS:
         raise RigError(f"values of a result become {', '.join(TREATMENTS)}, not {treatment!r}; use one of these.")
     rig, sentences = rig_from_dict(c.rig, "the rig of the result"), []
-    sensors = (*(() if rig.imu is None else (rig.imu,)), *rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)
-    for sensor in sensors:
+    for sensor in rig.sensors.values():
         fields: dict[str, Any] = {}
         for g in c.groups:
             old = getattr(sensor, g.name, None)

@@ -51,12 +51,10 @@ class RelativePose:
 
 
 def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
-    """Of every pair of sensors other than the IMU, as seen from the first of both: cameras, LiDARs, wheels, pose
-    sensors; several of one kind are pairs among cameras only."""
+    """Of every pair of mounted sensors, as seen from the first of both. Of one kind only cameras are paired."""
+    kinds = {name: sensor["type"] for name, sensor in c.rig["sensors"].items()}
     pairs = list(combinations(c.cameras, 2))
-    pairs += [(frame, sensor) for frame in c.cameras for sensor in (*c.lidars, *c.wheels, *c.pose_sensors)]
-    pairs += [(frame, sensor) for frame in c.lidars for sensor in (*c.wheels, *c.pose_sensors)]
-    pairs += [(frame, sensor) for frame in c.wheels for sensor in c.pose_sensors]
+    pairs += [(a, b) for a, b in combinations(c.mounted, 2) if kinds[a] != kinds[b]]
     return tuple(relative_pose(c, frame, sensor) for frame, sensor in pairs)
 
 

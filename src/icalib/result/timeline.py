@@ -22,11 +22,11 @@ class Timeline:
     moved: np.ndarray
 
     @classmethod
-    def of(cls, parts: tuple[Part, ...], image_times: list[np.ndarray]) -> Timeline:
-        """image_times: of each camera's images, on the joined clock."""
+    def of(cls, parts: tuple[Part, ...], image_times: list[np.ndarray], body: str) -> Timeline:
+        """image_times: of each camera's images, on the joined clock. body: the sensor whose clock that is."""
         spans, moved = [], np.zeros(len(parts))
         for k, part in enumerate(parts):
-            first, last = _extent(part, image_times)
+            first, last = _extent(part, image_times, body)
             moved[k] = spans[-1].end + PAUSE_S - first if spans else 0.0
             origin_ns = part.measurements.origin_ns + round(1e9 * (first - part.begin))
             spans.append(RecordingSpan(part.name, first + moved[k], last + moved[k], origin_ns))
@@ -52,9 +52,10 @@ class Timeline:
         return own if len(self.parts) == 1 else f"{own} of {self.parts[k].name}"
 
 
-def _extent(part: Part, image_times: list[np.ndarray]) -> tuple[float, float]:
+def _extent(part: Part, image_times: list[np.ndarray], body: str) -> tuple[float, float]:
     """The first and the last instant of a recording at which anything was measured, on the joined clock."""
     images = [t[own] for t, own in zip(image_times, part.images, strict=True)]
-    body = part.measurements.imu or (None if images else part.measurements.poses[0])
-    times = np.concatenate([*images, *([] if body is None else [part.begin + body.seconds])])
+    if not images or part.measurements.imu is not None:  # else the clock is that of a camera
+        images.append(part.begin + part.measurements.streams[body].seconds)
+    times = np.concatenate(images)
     return float(times.min()), float(times.max())

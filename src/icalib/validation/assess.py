@@ -70,7 +70,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     groups = _groups(inputs, determined, seen, noise)
     judged = _sensor_fits([f for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
-    timeline = Timeline.of(inputs.parts, image_times(inputs, state.values))
+    timeline = Timeline.of(inputs.parts, image_times(inputs, state.values), inputs.rig.body)
     factors = _factors(inputs, groups)
     factor = factors.max(initial=1.0)
     causes, size_notes = all_causes(AssessedEstimate(inputs, found, groups, judged, factor, parts, timeline), against)
@@ -114,7 +114,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
 def _rates(inputs: Inputs) -> dict[str, float]:
     """Hz of each sensor, from the median step of its stamps."""
     m = inputs.measurements
-    streams = (*(() if m.imu is None else (m.imu,)), *m.cameras, *m.lidars, *m.wheels, *m.poses)
+    streams = (m.streams[name] for name in inputs.rig.sensors if name in m.streams)
     own = (s for s in streams if len(s.stamps_ns) > 1 and not _is_assumed(inputs, s.name))
     return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in own}
 

@@ -200,7 +200,7 @@ def _stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, float]
 
 def _sight_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """Where LiDARs alone show the motion, and not all of it."""
-    if inputs.rig.cameras or inputs.rig.poses:
+    if any(s.gives_motion for s in inputs.rig.mounted if not isinstance(s, Lidar)):
         return
     normals = np.array([found.outcome.state.values[key][:3] for key in inputs.clouds.keys])
     if count_of(facing(normals, inputs.clouds.points)) < 3:
