@@ -13,7 +13,7 @@ from icalib.data.measurements import PoseStream
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.model.sensor_model import Pass
-from icalib.motion.pose_rows import Frame, Mount, absolute_rows, relative_rows
+from icalib.motion.pose_rows import Frame, absolute_residuals, relative_residuals
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import State
 from icalib.rig import PoseSensor
@@ -153,20 +153,17 @@ def test_each_recording_has_a_frame_of_its_own(world):
     assert np.abs(residual).max() < 1e-7
 
 
-def test_rows_are_those_of_matrices():
+def test_residuals_are_those_of_matrices():
     """Against 4 x 4 matrices multiplied out."""
     rng = np.random.default_rng(0)
-    T0, T1, T_is, T_wf, Z = (pose(rng.normal(size=3), rng.normal(size=3)) for _ in range(5))
-    mount, frame = Mount(T_is[:3, :3], T_is[:3, 3]), Frame(T_wf[:3, :3], T_wf[:3, 3])
-    found = absolute_rows(T0[None, :3, :3], T0[None, :3, 3], mount, frame, Z[None, :3, :3], Z[None, :3, 3])
-    expected = np.linalg.inv(T_wf) @ T0 @ T_is
-    turn = Rotation.from_matrix(Z[:3, :3].T @ expected[:3, :3]).as_rotvec()
-    np.testing.assert_allclose(found.residual[0], [*turn, *(expected[:3, 3] - Z[:3, 3])], atol=1e-12)
-    ends = (T0[None, :3, :3], T1[None, :3, :3]), (T0[None, :3, 3], T1[None, :3, 3])
-    found = relative_rows(*ends, mount, Z[None, :3, :3], Z[None, :3, 3])
-    expected = np.linalg.inv(T0 @ T_is) @ T1 @ T_is
-    turn = Rotation.from_matrix(Z[:3, :3].T @ expected[:3, :3]).as_rotvec()
-    np.testing.assert_allclose(found.residual[0], [*turn, *(expected[:3, 3] - Z[:3, 3])], atol=1e-12)
+    T0, T1, T_wf, Z = (pose(rng.normal(size=3), rng.normal(size=3)) for _ in range(4))
+    R, p = (T0[None, :3, :3], T1[None, :3, :3]), (T0[None, :3, 3], T1[None, :3, 3])
+    measured = Z[None, :3, :3], Z[None, :3, 3]
+    absolute = absolute_residuals(R[0], p[0], Frame(T_wf[:3, :3], T_wf[:3, 3]), *measured)
+    for found, base, end in ((absolute, T_wf, T0), (relative_residuals(R, p, *measured), T0, T1)):
+        expected = np.linalg.inv(base) @ end
+        turn = Rotation.from_matrix(Z[:3, :3].T @ expected[:3, :3]).as_rotvec()
+        np.testing.assert_allclose(found.residual[0], [*turn, *(expected[:3, 3] - Z[:3, 3])], atol=1e-12)
 
 
 def test_noise_that_is_given_stays():

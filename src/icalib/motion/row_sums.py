@@ -9,11 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.motion.factor import Whitened
-from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece
-from icalib.optim.interval_sums import Rows, accumulate_rows
 from icalib.optim.robust_weights import LOSSES, Loss
-from icalib.optim.state import Layout
+from icalib.optim.rows import Rows, accumulate_rows
 
 # Rows of a factor that are made at once: their Jacobians stay in the processor's cache.
 CHUNK = 256
@@ -42,24 +40,11 @@ def in_chunks(own: slice) -> Iterator[slice]:
         yield slice(start, min(start + CHUNK, own.stop))
 
 
-def add_rows(
-    rows: Rows,
-    own: slice,
-    node: np.ndarray,
-    columns: np.ndarray,
-    layout: Layout,
-    imu: ImuData | None,
-    by: RobustNoise,
-    into: Into,
-) -> float:
-    """Adds the rows `own` of a factor, each to the interval that begins at its `node`, and fills `into.out`; returns
-    half the robust chi^2. columns (c,): of the calibration parameters; those of the IMU's intrinsics follow where rows
-    have them."""
-    if imu is not None and rows.J_calib.shape[2] > len(columns):
-        columns = np.concatenate([columns, layout.columns(imu.name, "intrinsics")])
-    free = np.flatnonzero(columns >= 0)
-    loss = Loss(LOSSES[by.loss], by.loss_scale, into.curved)
+def add_rows(rows: Rows, own: slice, node: np.ndarray, columns: np.ndarray, noise: RobustNoise, into: Into) -> float:
+    """Adds the rows `own` of a factor, each to the interval that begins at its keyframe `node` (n,), and fills
+    `into.out`; returns half the robust chi^2. columns (c,): calibration columns of rows.J, -1 where fixed."""
+    loss = Loss(LOSSES[noise.loss], noise.loss_scale, into.curved)
     return accumulate_rows(
-        rows, node, by.whitening, loss, free, columns[free], into.piece.sums(into.sums), into.out.residual[own],
+        rows, node, noise.whitening, loss, columns, into.piece.sums(into.sums), into.out.residual[own],
         into.out.root[own],
     )  # fmt: skip

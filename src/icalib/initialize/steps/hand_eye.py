@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.geometry import so3
-from icalib.motion.pose_rows import Frame, Mount, absolute_rows
+from icalib.motion.pose_rows import Frame, Mount, absolute_residuals
 
 MOST_PAIRS = 2000  # of instants between which turns are compared
 ONE_AXIS = 0.1  # of the turns about the main axis: below, those about a second axis may be noise
@@ -133,11 +133,14 @@ def _refined(pairs: PosePairs, start: Mount, held: tuple[bool, bool]) -> HandEye
     prior = np.repeat([1.0 / TURN_SIGMA, 1.0 / ARM_SIGMA], 3)
     residual = np.zeros((len(pairs.p_body), 6))
     for _ in range(ROUNDS):
-        rows = absolute_rows(pairs.R_body, pairs.p_body, mount, frame, pairs.R_sensor, pairs.p_sensor)
+        R, p = pairs.R_body @ mount.R, pairs.p_body + pairs.R_body @ mount.p
+        rows = absolute_residuals(R, p, frame, pairs.R_sensor, pairs.p_sensor)
         residual, scales = rows.residual, _scales(rows.residual)
         weight = 1.0 / (1.0 + _squares(residual, scales).sum(axis=1) / (2.0 * 3.0 * BEND**2))
         root = np.sqrt(weight)[:, None] / np.repeat(scales, 3)
-        J = np.concatenate([rows.J_mount, rows.J_frame], axis=2) * root[:, :, None]
+        (J_pose,) = rows.J_pose
+        J_arm = J_pose[:, :, 3:] @ mount.R.T
+        J = np.concatenate([J_pose[:, :, :3], J_arm, rows.J_frame], axis=2) * root[:, :, None]
         away = np.concatenate([so3.log(np.ascontiguousarray(start.R.T @ mount.R)), mount.p - start.p])
         A = np.concatenate([J.reshape(-1, 12), np.eye(6, 12) * prior[:, None]])[:, free]
         b = np.concatenate([(residual * root).ravel(), prior * away])

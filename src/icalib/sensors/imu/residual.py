@@ -16,9 +16,9 @@ from icalib.motion.integration import Increment, bias_of, integrate, integration
 from icalib.motion.integration_step import COVARIANCE, correction
 from icalib.optim import pages
 from icalib.optim.arrowhead import Piece, in_parallel
-from icalib.optim.interval_sums import add_interval
 from icalib.optim.prior_factor import accumulate_bias_prior
-from icalib.optim.state import State
+from icalib.optim.rows import KEYFRAMES, add_product, whiten
+from icalib.optim.state import NODE, State
 
 ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS)}
@@ -97,43 +97,26 @@ def _residual(k, chain, made, change, R01, hv, hp, r):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _jacobians(k, chain, made, change, R01, hv, hp, r, J0, J1, Jc):
-    """Fills d r / d node k, d r / d node k + 1 (15, 15) and d r / d intrinsics (15, 24 or 0)."""
+def _jacobians(k, chain, made, change, R01, hv, hp, r, J):
+    """J (15, 30 + 24 or 0): d r / d keyframe k, d r / d keyframe k + 1, d r / d intrinsics. What no interval changes is
+    there already: 1 and -1 of the biases, zeros."""
     Jr_inv, R0 = so3.right_jacobian_inverse(r[:3]), chain.R[k]
-    turned, by_v, by_p = mul3(Jr_inv, tmul3(chain.R[k + 1], R0)), so3.hat(hv), so3.hat(hp)
+    turned, J_v, J_p = mul3(Jr_inv, tmul3(chain.R[k + 1], R0)), so3.hat(hv), so3.hat(hp)
     for i in range(3):
         for j in range(3):
-            J0[i, j], J0[3 + i, j], J0[6 + i, j] = -turned[i, j], by_v[i, j], by_p[i, j]
-            J0[3 + i, 6 + j], J0[6 + i, 3 + j] = -R0[j, i], -R0[j, i]
-            J0[6 + i, 6 + j] = (chain.seconds[k] - chain.seconds[k + 1]) * R0[j, i]
-            J1[i, j], J1[3 + i, 6 + j], J1[6 + i, 3 + j] = Jr_inv[i, j], R0[j, i], R0[j, i]
-    for i in range(6):
-        J0[9 + i, 9 + i] = -1.0
-        J1[9 + i, 9 + i] = 1.0
-    by_turn = mul3(Jr_inv, tmul3(so3.exp(r[:3]), so3.right_jacobian(change[:3])))
+            J[i, j], J[3 + i, j], J[6 + i, j] = -turned[i, j], J_v[i, j], J_p[i, j]
+            J[3 + i, 6 + j], J[6 + i, 3 + j] = -R0[j, i], -R0[j, i]
+            J[6 + i, 6 + j] = (chain.seconds[k] - chain.seconds[k + 1]) * R0[j, i]
+            J[i, NODE + j], J[3 + i, NODE + 6 + j], J[6 + i, NODE + 3 + j] = Jr_inv[i, j], R0[j, i], R0[j, i]
+    J_turn = mul3(Jr_inv, tmul3(so3.exp(r[:3]), so3.right_jacobian(change[:3])))
     for i in range(3):
-        for j in range(6 + Jc.shape[1]):
+        for j in range(6 + J.shape[1] - KEYFRAMES):
             turn = 0.0
             for m in range(3):
-                turn -= by_turn[i, m] * made.J[k, m, j]
-            if j < 6:
-                J0[i, 9 + j] = turn
-                J0[3 + i, 9 + j], J0[6 + i, 9 + j] = -made.J[k, 3 + i, j], -made.J[k, 6 + i, j]
-            else:
-                Jc[i, j - 6] = turn
-                Jc[3 + i, j - 6], Jc[6 + i, j - 6] = -made.J[k, 3 + i, j], -made.J[k, 6 + i, j]
-
-
-@njit(cache=True, nogil=True)
-def _whiten(W, M, out):
-    """out = W M for lower triangular W."""
-    out[:] = 0.0
-    for i in range(W.shape[0]):
-        for k in range(i + 1):
-            f = W[i, k]
-            if f != 0.0:
-                for j in range(M.shape[1]):
-                    out[i, j] += f * M[k, j]
+                turn -= J_turn[i, m] * made.J[k, m, j]
+            c = 9 + j if j < 6 else KEYFRAMES + j - 6
+            J[i, c] = turn
+            J[3 + i, c], J[6 + i, c] = -made.J[k, 3 + i, j], -made.J[k, 6 + i, j]
 
 
 @njit(cache=True, nogil=True)
@@ -142,31 +125,26 @@ def _accumulate(k1, chain, made, dx, columns, sums, out):
 
     dx, columns (24 or 0,): change and calibration columns of the intrinsics. Returns half the chi^2.
     """
-    n_x = len(columns)
-    r, change = np.zeros(ROWS), np.zeros(9)
-    J0, J1, Jc = np.zeros((ROWS, ROWS)), np.zeros((ROWS, ROWS)), np.zeros((ROWS, n_x))
-    A0, A1, Ac = np.empty((ROWS, ROWS)), np.empty((ROWS, ROWS)), np.empty((ROWS, n_x + 1))
-    Jcr = np.zeros((ROWS, n_x + 1))
+    width = KEYFRAMES + len(columns)
+    r, change, J, whitened = np.zeros(ROWS), np.zeros(9), np.zeros((ROWS, width)), np.empty((ROWS, width + 1))
+    for i in range(9, ROWS):
+        J[i, i], J[i, NODE + i] = -1.0, 1.0
     wanted = len(sums.diagonal) > 0
     cost = 0.0
     for k in range(sums.first, k1):
         R01, hv, hp = _motion(k, chain)
         _correction(k, chain, made, dx, change)
         _residual(k, chain, made, change, R01, hv, hp, r)
-        if wanted:
-            _jacobians(k, chain, made, change, R01, hv, hp, r, J0, J1, Jc)
         for i in range(ROWS):
-            for j in range(n_x):
-                Jcr[i, j] = Jc[i, j]
-            Jcr[i, n_x] = r[i]
-        _whiten(made.W[k], Jcr, Ac)
-        for i in range(ROWS):
-            out[k, i] = Ac[i, n_x]
-            cost += 0.5 * Ac[i, n_x] * Ac[i, n_x]
+            s = 0.0
+            for m in range(i + 1):
+                s += made.W[k, i, m] * r[m]
+            out[k, i] = whitened[i, width] = s
+            cost += 0.5 * s * s
         if wanted:
-            _whiten(made.W[k], J0, A0)
-            _whiten(made.W[k], J1, A1)
-            add_interval(k - sums.first, A0, A1, Ac, columns, sums)
+            _jacobians(k, chain, made, change, R01, hv, hp, r, J)
+            whiten(made.W[k], J, whitened)
+            add_product(k - sums.first, KEYFRAMES, width, whitened, whitened, columns, sums)
     return cost
 
 

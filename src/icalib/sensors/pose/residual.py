@@ -12,24 +12,25 @@ frame_translation (R_world_frame, p_world_frame), in each recording its own.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from icalib.data.measurements import PoseStream
 from icalib.model.frames import FRAME, frame_of
-from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
+from icalib.motion.clocks import by_clock, instants
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.nodes import MERGED_WITHIN_S, usable
-from icalib.motion.pose_rows import Frame, Mount, PoseRows, absolute_rows, add_chain_rule, relative_rows
-from icalib.motion.poses import Poses, assign_nodes, poses_alone, poses_at, poses_of_nodes
+from icalib.motion.pose_rows import Frame, PoseResiduals, absolute_residuals, relative_residuals
+from icalib.motion.poses import assign_nodes
 from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
+from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
 from icalib.motion.stamp_intervals import StampIntervals, choose_intervals
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece
-from icalib.optim.interval_sums import Rows
-from icalib.optim.state import NODE, Layout, State
+from icalib.optim.rows import Rows
+from icalib.optim.state import Layout, State
 
 NEAR_NODE_S = 0.05  # a pose further from all nodes is left out: the IMU alone would carry it there
 KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
@@ -80,7 +81,7 @@ class _PoseFactor(RowFactor):
 
 @dataclass(frozen=True)
 class AbsolutePoseFactor(_PoseFactor):
-    """n poses of one sensor in its frame, see `pose_rows.absolute_rows`. node (n,), in order: of each; sigma: of its
+    """n poses of one sensor in its frame, see `absolute_residuals`. node (n,), in order: of each; sigma: of its
     rotation [rad] and position [m]. imu: None where poses were taken at nodes, which nothing ties to each other."""
 
     name: str
@@ -140,42 +141,32 @@ class AbsolutePoseFactor(_PoseFactor):
         for k in range(len(self.starts)):
             own = slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))
             for some in in_chunks(own):
-                cost += self._of_recording(k, some, at[some], state, Into(piece, out, sums, curved))
+                cost += self._of_recording(k, some, state, Into(piece, out, sums, curved))
         return cost
 
-    def _of_recording(self, recording: int, own: slice, at: np.ndarray, state: State, into: Into) -> float:
-        """Adds the poses `own`, of one recording; at: the first node of the interval that each is added to."""
+    def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
+        """Adds the poses `own`, of one recording."""
         frame = frame_of(self.name, recording)
-        v, node = state.values, self.node[own]
-        found = Frame(v[frame, FRAME[0]], v[frame, FRAME[1]])
-        poses = _poses(self, self.seconds[own], node, state, into.sums)
-        rows = absolute_rows(
-            poses.rotation,
-            poses.position,
-            _mount(self.name, state),
-            found,
+        v, node, kinematics = state.values, self.node[own], _kinematics(self)
+        at = SensorPose.at(kinematics, self.seconds[own], node, state, into.sums)
+        found = absolute_residuals(
+            at.rotation,
+            at.position,
+            Frame(v[frame, FRAME[0]], v[frame, FRAME[1]]),
             self.rotation[own],
             v[self.name, "scale"][0] * self.position[own],
             into.sums,
         )
-        made = _chained(rows, _Scaling.of(self, state, own), (poses,))
-        if into.sums:
-            last = node > at
-            made.J_next[last] = made.J_node[last]
-            made.J_node[last] = 0.0
-        columns = np.concatenate(
-            [
-                mounted_columns(self.layout, self.name, recording),
-                self.layout.columns(frame, *FRAME),
-                self.layout.columns(self.name, "scale"),
-            ]
-        )
-        return _add(self, own, made, columns, at, into)
+        rows = _rows(found, (at,), self, state, own)
+        frame_columns = self.layout.columns(frame, *FRAME)
+        columns = [kinematics.columns(recording), frame_columns, self.layout.columns(self.name, "scale")]
+        interval = rows.on_intervals(node, self.n_nodes)
+        return add_rows(rows, own, interval, np.concatenate(columns), _noise(self, own), into)
 
 
 @dataclass(frozen=True)
 class RelativePosesFactor(_PoseFactor):
-    """n ways of one sensor, see `pose_rows.relative_rows`, each between two of its stamps about from node to node;
+    """n ways of one sensor, see `relative_residuals`, each between two of its stamps about from node to node;
     duration (n,) s. Their noise is that of a random walk, and independent."""
 
     name: str
@@ -223,19 +214,18 @@ class RelativePosesFactor(_PoseFactor):
     def _of_clock(self, clock: int, own: slice, state: State, into: Into) -> float:
         """Adds the ways `own`, which go by one time offset."""
         first, last, node = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.node))
-        a = _poses(self, self.seconds[first], node, state, into.sums)
-        b = _poses(self, self.seconds[last], node + 1, state, into.sums)
-        rows = relative_rows(
+        kinematics = _kinematics(self)
+        a = SensorPose.at(kinematics, self.seconds[first], node, state, into.sums)
+        b = SensorPose.at(kinematics, self.seconds[last], node + 1, state, into.sums)
+        found = relative_residuals(
             (a.rotation, b.rotation),
             (a.position, b.position),
-            _mount(self.name, state),
             self.rotation[own],
             state.values[self.name, "scale"][0] * self.position[own],
             into.sums,
         )
-        made = _chained(rows, _Scaling.of(self, state, own), (a, b))
-        columns = np.append(mounted_columns(self.layout, self.name, clock), self.layout.columns(self.name, "scale"))
-        return _add(self, own, made, columns, node, into)
+        columns = np.append(kinematics.columns(clock), self.layout.columns(self.name, "scale"))
+        return add_rows(_rows(found, (a, b), self, state, own), own, node, columns, _noise(self, own), into)
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor
@@ -245,52 +235,25 @@ def _rms(out: Whitened, sigma: np.ndarray, rows: slice) -> float:
     return float(np.sqrt(np.mean((out.residual * sigma)[:, rows] ** 2)))
 
 
-def _mount(name: str, state: State) -> Mount:
-    return Mount(state.values[name, "rotation"], state.values[name, "translation"])
+def _kinematics(factor: PoseFactor) -> Kinematics:
+    return Kinematics(factor.name, factor.layout, factor.imu, factor.gravity)
 
 
-def _poses(factor: PoseFactor, seconds: np.ndarray, node: np.ndarray, state: State, jacobians: bool) -> Poses:
-    if factor.imu is None:
-        return poses_of_nodes(node, state)
-    times = seconds + offset_at(state, factor.name, node)
-    if not jacobians:
-        return poses_alone(times, node, state, factor.imu, factor.gravity)
-    imu_free = factor.layout.is_free(factor.imu.name, "intrinsics")
-    return poses_at("inertial", times, node, state, factor.imu, factor.gravity, imu_free)
-
-
-class _Scaling(NamedTuple):
-    """True lengths over reported ones, and the positions (n, 3) m that are reported."""
-
-    scale: float
-    reported: np.ndarray
-
-    @classmethod
-    def of(cls, factor: PoseFactor, state: State, own: slice) -> _Scaling:
-        return cls(float(state.values[factor.name, "scale"][0]), factor.position[own])
-
-
-def _chained(rows: PoseRows, scaling: _Scaling, ends: tuple[Poses, ...]) -> Rows:
-    """The rows, of reported positions times their scale, as rows of reported ones; by the nodes of each of their
-    `ends`, and by the calibration parameters: mount, time, frame, scale, IMU intrinsics."""
-    n, own = rows.J_mount.shape[0], rows.J_mount.shape[2]
-    time = slice(own, own + 1)
-    frame = slice(time.stop, time.stop + rows.J_frame.shape[2])
-    imu = slice(frame.stop + 1, frame.stop + 1 + ends[0].J_imu.shape[2])
-    J_calib = np.zeros((n, 6, imu.stop))
-    J_calib[:, :, :own], J_calib[:, :, frame] = rows.J_mount, rows.J_frame
-    J_nodes = np.zeros((2, n, 6, NODE))
-    for J_pose, poses, J_node in zip(rows.J_pose, ends, J_nodes, strict=False):
-        moved = poses.J_node, poses.J_imu, poses.rate, poses.velocity
-        add_chain_rule(J_pose, moved, J_node, J_calib[:, :, own], J_calib[:, :, imu])
-    for x in (rows.residual, *J_nodes, J_calib):
-        x[:, 3:] /= scaling.scale
+def _rows(found: PoseResiduals, ends: tuple[SensorPose, ...], factor: PoseFactor, state: State, own: slice) -> Rows:
+    """Rows of reported positions from residuals `found` of those times their scale; by calibration parameters of the
+    pose, then frame and scale."""
+    scale, reported = float(state.values[factor.name, "scale"][0]), factor.position[own]
+    found.residual[:, 3:] /= scale
+    n = len(found.J_frame)
+    J_own = np.zeros((n, 6, found.J_frame.shape[2] + 1))
+    J_own[:, :, :-1] = found.J_frame
+    for J in (J_own, *found.J_pose):
+        J[:, 3:] /= scale
     if n:
-        J_calib[:, 3:, frame.stop] = -(rows.residual[:, 3:] + scaling.reported) / scaling.scale
-    return Rows(rows.residual, J_nodes[0], J_nodes[1], J_calib)
+        J_own[:, 3:, -1] = -(found.residual[:, 3:] + reported) / scale
+    return rows_at(found.residual, found.J_pose, ends, J_own)
 
 
-def _add(factor: PoseFactor, own: slice, rows: Rows, columns: np.ndarray, node: np.ndarray, into: Into) -> float:
-    """Adds the rows `own`, each to the interval that begins at its `node`."""
-    by = RobustNoise(np.eye(6) / factor.sigma[own][:, :, None], factor.noise.loss, factor.noise.loss_scale)
-    return add_rows(rows, own, node, columns, factor.layout, factor.imu, by, into)
+def _noise(factor: PoseFactor, own: slice) -> RobustNoise:
+    whitening = np.eye(6) / factor.sigma[own][:, :, None]
+    return RobustNoise(whitening, factor.noise.loss, factor.noise.loss_scale)

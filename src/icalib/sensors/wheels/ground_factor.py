@@ -25,7 +25,7 @@ from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.row_sums import Into, RobustNoise, add_rows
 from icalib.optim.arrowhead import Piece
-from icalib.optim.interval_sums import Rows
+from icalib.optim.rows import Rows
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Ground
 from icalib.sensors.wheels.spec import GROUND_HEIGHT
@@ -127,7 +127,7 @@ class GroundFactor(RowFactor):
             whitening = np.tile(np.diag(1.0 / self.sigma), (high - low, 1, 1))
             by = RobustNoise(whitening, "none", 1.0)
             into = Into(piece, out, sums, curved)
-            cost += add_rows(rows, own, self.nodes[own], self._columns(key), self.layout, self.imu, by, into)
+            cost += add_rows(rows, own, self.nodes[own], self._columns(key), by, into)
         return cost
 
     def _columns(self, key: Key | None) -> np.ndarray:
@@ -148,8 +148,9 @@ class GroundFactor(RowFactor):
         R_k = state.rotation[nodes]
         up = np.einsum("kji,j->ki", R_k, n)  # in the axes of the IMU
         way = state.position[nodes] + R_k @ p - plane[3:]
-        own = np.zeros((len(nodes), 4, N_COLUMNS))
-        J_node = np.zeros((len(nodes), 4, 15))
+        h = state.values.get((self.name, GROUND_HEIGHT.name), np.zeros(1))[0]
+        rows = Rows.empty(len(nodes), 4, N_COLUMNS, True)
+        own, J_node = rows.J_calib, rows.J_node
         tilt = up @ R
         # R_k <- R_k Exp(d) takes up to up + up x d, and R <- R Exp(d) the tilt to tilt + tilt x d.
         J_node[:, :2, :3] = np.cross(R[:, :2].T, up[:, None])
@@ -161,7 +162,5 @@ class GroundFactor(RowFactor):
         own[:, 2, 7:9] = way @ across.T
         own[:, 2, 9] = -sign
         own[:, 2:, 6] = [-1.0, 1.0]
-        h = state.values.get((self.name, GROUND_HEIGHT.name), np.zeros(1))[0]
-        height = way @ n - h
-        residual = np.column_stack([tilt[:, :2], height, np.full(len(nodes), h - self.ground.height)])
-        return Rows(residual, J_node, np.zeros_like(J_node), own)
+        rows.residual[:] = np.column_stack([tilt[:, :2], way @ n - h, np.full(len(nodes), h - self.ground.height)])
+        return rows

@@ -20,21 +20,25 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.data.measurements import WheelPoses
-from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
+from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
+from icalib.motion.pose_rows import relative_residuals
 from icalib.motion.poses import Poses, Velocities, motion_at, poses_alone, poses_at
 from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
+from icalib.motion.sensor_pose import N_MOUNTED, Kinematics, SensorPose, rows_at
 from icalib.motion.stamp_intervals import StampIntervals, choose_intervals, pose_intervals
 from icalib.optim.arrowhead import Piece
-from icalib.optim.interval_sums import Rows
+from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 from icalib.rig import WheelKind, drive_names
 from icalib.sensors.wheels.quadrature import Instants, quadrature
 from icalib.sensors.wheels.wheel_carry import carried_noise
 from icalib.sensors.wheels.wheel_drives import KINDS, N_DRIVE, UNITS, Kinds, coefficients
-from icalib.sensors.wheels.wheel_kernels import N_OWN, Track, Wheels, increment_rows, relative_rows
+from icalib.sensors.wheels.wheel_kernels import Track, Wheels, increment_rows
 from icalib.sensors.wheels.wheel_poses import RelativePoses, preintegrated
+
+YAW_X_Y = slice(2, 5)  # of the rows of a relative pose
 
 
 @dataclass(frozen=True)
@@ -143,14 +147,14 @@ class IncrementFactor(RowFactor):
         node = self.instants.node[seen]
         times = self.instants.times[seen] + offset_at(state, self.name, node)
         poses, moving = _motion(self, times, node, state, into.sums)
-        rows = Rows.empty(len(start) - 1, 4, N_OWN + poses.J_imu.shape[2], into.sums)
+        rows = Rows.empty(len(start) - 1, 4, N_MOUNTED + poses.J_imu.shape[2] + N_DRIVE, into.sums)
         wheels = _wheels(self.name, state, self.kind)
         c = coefficients(self.kind, wheels.drive, self.mean[own])
         increment_rows(
             start - start[0], self.instants.weight[seen], _track(node, poses), moving, wheels, c, self.measured[own],
             rows,
         )  # fmt: skip
-        return _add(self, own, rows, self.whitening, state, into)
+        return _add(self, own, rows, state, into)
 
 
 @dataclass(frozen=True)
@@ -242,18 +246,21 @@ class RelativePoseFactor(RowFactor):
 
     def _added(self, own: slice, state: State, into: Into) -> float:
         """Adds the intervals `own`; returns half their robust chi^2."""
-        i, z = self.intervals, self.poses
-        node = np.concatenate([i.node[own], i.node[own] + 1])
-        seconds = np.concatenate([self.seconds[i.first[own]], self.seconds[i.last[own]]])
-        times = seconds + offset_at(state, self.name, node)
-        if into.sums:
-            free = self.layout.is_free(self.imu.name, "intrinsics")
-            poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
-        else:
-            poses = poses_alone(times, node, state, self.imu, self.gravity)
-        rows = Rows.empty(len(times) // 2, 3, N_OWN + poses.J_imu.shape[2], into.sums)
-        relative_rows(_track(node, poses), _wheels(self.name, state, self.kind), z.z[own], z.J[own], z.drive0, rows)
-        return _add(self, own, rows, z.W, state, into)
+        i, z, kinematics = self.intervals, self.poses, _kinematics(self)
+        first = SensorPose.at(kinematics, self.seconds[i.first[own]], i.node[own], state, into.sums)
+        last = SensorPose.at(kinematics, self.seconds[i.last[own]], i.node[own] + 1, state, into.sums)
+        n, drive = len(z.z[own]), drive_of(self.name, state, self.kind)
+        found = relative_residuals(
+            (first.rotation, last.rotation),
+            (first.position, last.position),
+            np.broadcast_to(np.eye(3), (n, 3, 3)),
+            np.zeros((n, 3)),
+            into.sums,
+        )
+        residual = found.residual[:, YAW_X_Y] - z.z[own] - z.J[own] @ (drive - z.drive0)
+        J_pose = [np.ascontiguousarray(J[:, YAW_X_Y]) for J in found.J_pose]
+        rows = rows_at(residual, J_pose, (first, last), -z.J[own] if into.sums else z.J[:0])
+        return _add(self, own, rows, state, into)
 
 
 def wheel_intervals(
@@ -318,21 +325,18 @@ def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
     return slice(int(i0), int(i1))
 
 
-def _add(
-    factor: IncrementFactor | RelativePoseFactor,
-    own: slice,
-    rows: Rows,
-    whitening: np.ndarray,
-    state: State,
-    into: Into,
-) -> float:
-    """Adds the rows of intervals `own`."""
+def _kinematics(factor: IncrementFactor | RelativePoseFactor) -> Kinematics:
+    return Kinematics(factor.name, factor.layout, factor.imu, factor.gravity)
+
+
+def _add(factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, state: State, into: Into) -> float:
+    """Adds the rows of intervals `own`, by calibration parameters of the pose, then those of the drive."""
     cost, node, layout = 0.0, factor.intervals.node[own], factor.layout
     drive = layout.columns(factor.name, *drive_names(factor.kind))
+    drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])
     for clock, part in by_clock(state, factor.name, node):
-        columns = np.concatenate([mounted_columns(layout, factor.name, clock), drive])
-        columns = np.concatenate([columns, np.full(N_OWN - len(columns), -1)])
+        columns = np.concatenate([_kinematics(factor).columns(clock), drive])
         mine = slice(own.start + part.start, own.start + part.stop)
-        by = RobustNoise(whitening[mine], factor.noise.loss, factor.noise.loss_scale)
-        cost += add_rows(Rows(*(x[part] for x in rows)), mine, node[part], columns, layout, factor.imu, by, into)
+        noise = RobustNoise(factor.whitening[mine], factor.noise.loss, factor.noise.loss_scale)
+        cost += add_rows(Rows(rows.residual[part], rows.J[part]), mine, node[part], columns, noise, into)
     return cost

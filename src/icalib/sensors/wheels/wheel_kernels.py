@@ -1,6 +1,6 @@
-"""Rows of the wheel factors: residuals and Jacobians between two instants.
+"""Rows of the increments of wheels: residuals and Jacobians between two instants.
 
-Both factors compare (X, T), a displacement and a turn in wheel axes, made of (Y, Theta) in the axes of the IMU:
+An increment is compared with (X, T), a displacement and a turn in wheel axes, made of (Y, Theta) in those of the IMU:
 
     X = R_imu_wheel^T Y,  T = R_imu_wheel^T Theta,  Theta = Log(R(s_0)^T R(s_1))
 
@@ -16,8 +16,10 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
-
-N_OWN = 10  # calibration columns of the wheels: rotation 3, translation 3, time offset 1, up to three of the drive
+from icalib.motion.sensor_pose import N_MOUNTED, OFFSET
+from icalib.optim.rows import KEYFRAMES
+from icalib.optim.state import NODE
+from icalib.sensors.wheels.wheel_drives import N_DRIVE
 
 
 class Wheels(NamedTuple):
@@ -65,7 +67,7 @@ def _turn(a, b, track, M0, M1, Mc, wanted):
     for i in range(3):
         for j in range(3):
             Mc[3 + i, 0] += after[i, j] * track.rate[b, j] - before[i, j] * track.rate[a, j]
-            for c in range(15):
+            for c in range(NODE):
                 M0[3 + i, c] -= before[i, j] * track.J_node[a, j, c]
                 M1[3 + i, c] += after[i, j] * track.J_node[b, j, c]
             for c in range(track.J_imu.shape[2]):
@@ -89,42 +91,10 @@ def _add_travel(j, w, track, moving, D, M, Mc, wanted):
     for i in range(3):
         Mc[i, 0] += w * (spin[i] + pull[i])
         for k in range(3):
-            for c in range(15):
+            for c in range(NODE):
                 M[i, c] += w * (U[i, k] * track.J_node[j, k, c] + R[k, i] * moving.J_node[j, k, c])
             for c in range(track.J_imu.shape[2]):
                 Mc[i, 1 + c] += w * (U[i, k] * track.J_imu[j, k, c] + R[k, i] * moving.J_imu[j, k, c])
-
-
-@njit(cache=True, nogil=True)
-def _shift(a, b, track, p, Y, M0, M1, Mc, wanted):
-    """Y = R_a^T (p_b - p_a) + R_a^T R_b p - p for a lever arm p (3,), and where `wanted` its derivatives into the first
-    rows."""
-    Ra, d = track.rotation[a], track.position[b] - track.position[a]
-    R01 = tmul3(Ra, track.rotation[b])
-    before, speed = np.zeros(3), np.zeros(3)
-    _add(Ra, d, 1.0, -1, before)
-    _add(R01, p, 1.0, 1, before)
-    for i in range(3):
-        Y[i] = before[i] - p[i]
-    if not wanted:
-        return
-    _add(Ra, track.velocity[b] - track.velocity[a], 1.0, -1, speed)
-    A, B = so3.hat(before), np.zeros((3, 3))
-    lever = so3.hat(p)
-    for i in range(3):
-        Mc[i, 0] += speed[i]
-        for k in range(3):
-            for m in range(3):
-                B[i, k] -= R01[i, m] * lever[m, k]
-    for i in range(3):
-        for k in range(3):
-            Mc[i, 0] += A[i, k] * track.rate[a, k] + B[i, k] * track.rate[b, k]
-            for c in range(15):
-                M0[i, c] += A[i, k] * track.J_node[a, k, c] - Ra[k, i] * track.J_node[a, 3 + k, c]
-                M1[i, c] += B[i, k] * track.J_node[b, k, c] + Ra[k, i] * track.J_node[b, 3 + k, c]
-            for c in range(track.J_imu.shape[2]):
-                Mc[i, 1 + c] += A[i, k] * track.J_imu[a, k, c] - Ra[k, i] * track.J_imu[a, 3 + k, c]
-                Mc[i, 1 + c] += B[i, k] * track.J_imu[b, k, c] + Ra[k, i] * track.J_imu[b, 3 + k, c]
 
 
 @njit(cache=True, nogil=True)
@@ -133,14 +103,14 @@ def _fill_row(i, q, gX, gT, aY, aT, X, T, M0, M1, Mc, rows):
     # R <- R Exp(d) turns X and T by -d: d X = X x d.
     x, t = _cross(gX, X), _cross(gT, T)
     for c in range(3):
-        rows.J_calib[i, q, c] = x[c] + t[c]
+        rows.J[i, q, KEYFRAMES + c] = x[c] + t[c]
     for k in range(3):
-        for c in range(15):
-            rows.J_node[i, q, c] += aY[k] * M0[k, c] + aT[k] * M0[3 + k, c]
-            rows.J_next[i, q, c] += aY[k] * M1[k, c] + aT[k] * M1[3 + k, c]
-        rows.J_calib[i, q, 6] += aY[k] * Mc[k, 0] + aT[k] * Mc[3 + k, 0]
+        for c in range(NODE):
+            rows.J[i, q, c] += aY[k] * M0[k, c] + aT[k] * M0[3 + k, c]
+            rows.J[i, q, NODE + c] += aY[k] * M1[k, c] + aT[k] * M1[3 + k, c]
+        rows.J[i, q, KEYFRAMES + OFFSET] += aY[k] * Mc[k, 0] + aT[k] * Mc[3 + k, 0]
         for c in range(Mc.shape[1] - 1):
-            rows.J_calib[i, q, N_OWN + c] += aY[k] * Mc[k, 1 + c] + aT[k] * Mc[3 + k, 1 + c]
+            rows.J[i, q, KEYFRAMES + N_MOUNTED + c] += aY[k] * Mc[k, 1 + c] + aT[k] * Mc[3 + k, 1 + c]
 
 
 @njit(cache=True, nogil=True)
@@ -160,7 +130,7 @@ def _by_drive(i, q, by_X, by_T, X, T, rows):
         s = 0.0
         for k in range(3):
             s += by_X[d, k] * X[k] + by_T[d, k] * T[k]
-        rows.J_calib[i, q, 7 + d] = s
+        rows.J[i, q, rows.J.shape[2] - N_DRIVE + d] = s
 
 
 @njit(cache=True, nogil=True)
@@ -170,9 +140,9 @@ def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
     start (n + 1,), weights (m,): see Instants; track, moving: motion at these instants; c: Coefficients; measured
     (n, 4).
     """
-    wanted = len(rows.J_node) > 0
+    wanted = len(rows.J) > 0
     n_c = 1 + track.J_imu.shape[2]
-    M0, M1, Mc, D = np.empty((6, 15)), np.empty((6, 15)), np.empty((6, n_c)), np.empty(3)
+    M0, M1, Mc, D = np.empty((6, NODE)), np.empty((6, NODE)), np.empty((6, n_c)), np.empty(3)
     X, T, aY, aT = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(len(start) - 1):
         a, b, g = start[i], start[i + 1] - 1, min(i, len(c.X) - 1)
@@ -196,41 +166,5 @@ def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
             _fill_row(i, q, c.X[g, q], c.T[g, q], aY, aT, X, T, M0, M1, Mc, rows)
             lever = _cross(aY, theta)
             for k in range(3):
-                rows.J_calib[i, q, 3 + k] = lever[k]
+                rows.J[i, q, KEYFRAMES + 3 + k] = lever[k]
             _by_drive(i, q, c.by_X[g, q], c.by_T[g, q], X, T, rows)
-
-
-@njit(cache=True, nogil=True)
-def relative_rows(track, wheels, z, J, drive0, rows):
-    """Rows of n relative poses, not whitened: yaw, x, y (paper (27); as printed, its yaw has the other sign
-    and its lever arm at k + 1 is turned by the wrong rotation).
-
-    track: motion at 2 n instants, first all begins, then all ends; z, J, drive0: see RelativePoses.
-    """
-    n, n_c = len(z), 1 + track.J_imu.shape[2]
-    wanted = len(rows.J_node) > 0
-    M0, M1, Mc, Y = np.empty((6, 15)), np.empty((6, 15)), np.empty((6, n_c)), np.empty(3)
-    X, T, none, axes = np.empty(3), np.empty(3), np.zeros(3), np.eye(3)
-    for i in range(n):
-        M0[:], M1[:], Mc[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0
-        theta = _turn(i, n + i, track, M0, M1, Mc, wanted)
-        _shift(i, n + i, track, wheels.p, Y, M0, M1, Mc, wanted)
-        _add(wheels.R, Y, 1.0, -1, X)
-        _add(wheels.R, theta, 1.0, -1, T)
-        R01 = tmul3(track.rotation[i], track.rotation[n + i])
-        for q in range(3):
-            measured = z[i, q]
-            for k in range(3):
-                measured += J[i, q, k] * (wheels.drive[k] - drive0[k])
-            rows.residual[i, q] = (T[2] if q == 0 else X[q - 1]) - measured
-            if not wanted:
-                continue
-            if q == 0:
-                _fill_row(i, q, none, axes[2], none, wheels.R[:, 2], X, T, M0, M1, Mc, rows)
-            else:
-                aY = wheels.R[:, q - 1]
-                _fill_row(i, q, axes[q - 1], none, aY, none, X, T, M0, M1, Mc, rows)
-                for k in range(3):
-                    rows.J_calib[i, q, 3 + k] = aY[0] * R01[0, k] + aY[1] * R01[1, k] + aY[2] * R01[2, k] - aY[k]
-            for k in range(3):
-                rows.J_calib[i, q, 7 + k] = -J[i, q, k]

@@ -1,0 +1,172 @@
+"""Poses of a sensor at its own instants, and the chain rule from its pose to all that the pose depends on.
+
+    R_world_sensor = R_world_imu(t) R_imu_sensor        p_world_sensor = p_world_imu(t) + R_world_imu(t) p_imu_sensor
+
+t: the sensor's instant plus its time offset. Perturbations of a sensor's pose d = (d_R, d_p), 6, are along its own
+axes: R <- R Exp(d_R), p <- p + R d_p. A factor differentiates its residual by d, and `add_chain` gives the derivatives
+by
+
+    keyframe 15 | next keyframe 15 | R_imu_sensor 3, p_imu_sensor 3, time offset 1, IMU intrinsics 24 or 0
+
+The last ones are calibration parameters, in this order (`Kinematics.columns`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.base.compiled import njit
+from icalib.motion.clocks import mounted_columns, offset_at
+from icalib.motion.imu_data import ImuData
+from icalib.motion.poses import Poses, poses_alone, poses_at, poses_of_nodes
+from icalib.optim.rows import KEYFRAMES, Rows
+from icalib.optim.state import NODE, Layout, State
+from icalib.rig import Scheme
+
+OFFSET = 6  # number of the time offset among the calibration parameters of a pose
+N_MOUNTED = 7  # extrinsics and time offset; the IMU intrinsics follow
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """What the pose of a sensor depends on beside a state. imu: None where measurements are taken at keyframes; gravity
+    [m/s^2]; scheme: how poses between keyframes are found, see `poses`."""
+
+    sensor: str
+    layout: Layout
+    imu: ImuData | None
+    gravity: float
+    scheme: Scheme = "inertial"
+
+    def columns(self, clock: int = 0) -> np.ndarray:
+        """(7 + 24 or 0,) calibration columns of the sensor's pose, -1 where fixed; `clock`: number of its time
+        offset."""
+        own = mounted_columns(self.layout, self.sensor, clock)
+        return np.concatenate([own, self.layout.columns(self._imu, "intrinsics")]) if self._imu else own
+
+    @property
+    def _imu(self) -> str:
+        """The IMU whose intrinsics are estimated; empty where there is none."""
+        return self.imu.name if self.imu is not None and self.layout.is_free(self.imu.name, "intrinsics") else ""
+
+    def imu_poses(self, seconds: np.ndarray, node: np.ndarray, state: State, jacobians: bool = True) -> Poses:
+        """Poses of the IMU at `seconds` (n,) on the sensor's clock, each from its keyframe `node` (n,)."""
+        if self.imu is None:
+            return poses_of_nodes(node, state)
+        times = seconds + offset_at(state, self.sensor, node)
+        if self.scheme == "inertial" and not jacobians:
+            return poses_alone(times, node, state, self.imu, self.gravity)
+        return poses_at(self.scheme, times, node, state, self.imu, self.gravity, bool(self._imu))
+
+
+class SensorPose(NamedTuple):
+    """n poses of a sensor, and of the IMU what `Poses` has: rate, velocity, Jacobians by keyframe, next keyframe and
+    intrinsics."""
+
+    R_imu_sensor: np.ndarray
+    p_imu_sensor: np.ndarray
+    R_sensor_world: np.ndarray
+    p_world_sensor: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+    J_node: np.ndarray
+    J_next: np.ndarray
+    J_imu: np.ndarray
+
+    @classmethod
+    def at(
+        cls, kinematics: Kinematics, seconds: np.ndarray, node: np.ndarray, state: State, jacobians: bool = True
+    ) -> SensorPose:
+        """At `seconds` (n,) on the sensor's clock, each from its keyframe `node` (n,). Without `jacobians` these may be
+        of length 0."""
+        name, imu = kinematics.sensor, kinematics.imu_poses(seconds, node, state, jacobians)
+        R_is, p_is = np.ascontiguousarray(state.values[name, "rotation"]), state.values[name, "translation"]
+        R_sw = np.ascontiguousarray((imu.rotation @ R_is).transpose(0, 2, 1))
+        p_ws = imu.position + imu.rotation @ p_is
+        return cls(R_is, p_is, R_sw, p_ws, imu.rate, imu.velocity, imu.J_node, imu.J_next, imu.J_imu)
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(n, 3, 3) R_world_sensor."""
+        return self.R_sensor_world.transpose(0, 2, 1)
+
+    @property
+    def position(self) -> np.ndarray:
+        """(n, 3) p_world_sensor [m]."""
+        return self.p_world_sensor
+
+    @property
+    def n_calib(self) -> int:
+        """How many calibration parameters the poses depend on."""
+        return N_MOUNTED + self.J_imu.shape[2]
+
+
+def rows_at(residual: np.ndarray, J_pose: Sequence[np.ndarray], ends: Sequence[SensorPose], J_own: np.ndarray) -> Rows:
+    """Rows of n residuals (n, m) whose derivatives by sensor poses are J_pose (n, m, 6).
+
+    Of one pose each, by its keyframe and the one after; of two, the earlier by its keyframe, the later by the one
+    after. J_own (n, m, c): by calibration parameters of the residual itself, which follow those of the pose.
+    """
+    n, m, n_pose = *residual.shape, ends[0].n_calib
+    if not len(J_own):
+        return Rows(residual, np.zeros((0, m, KEYFRAMES + n_pose)))
+    J = np.zeros((n, m, KEYFRAMES + n_pose + J_own.shape[2]))
+    J[:, :, KEYFRAMES + n_pose :] = J_own
+    for k, (by_pose, at) in enumerate(zip(J_pose, ends, strict=True)):
+        _chain_rows(by_pose, at, NODE * k, J)
+    return Rows(residual, J)
+
+
+@njit(cache=True, nogil=True)
+def fill_imu_pose(i, at, A):
+    """A (6, 6): pose i of the sensor by that of the IMU (rotation on the right, position in the world)."""
+    R, p, R_sw = at.R_imu_sensor, at.p_imu_sensor, at.R_sensor_world
+    for a in range(3):
+        r0, r1, r2 = R[0, a], R[1, a], R[2, a]
+        for c in range(3):
+            A[a, c], A[a, 3 + c], A[3 + a, 3 + c] = R[c, a], 0.0, R_sw[i, a, c]
+        A[3 + a, 0], A[3 + a, 1], A[3 + a, 2] = r2 * p[1] - r1 * p[2], r0 * p[2] - r2 * p[0], r1 * p[0] - r0 * p[1]
+
+
+@njit(cache=True, nogil=True)
+def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
+    """Adds to T (m, w) the derivatives of m rows through pose i of the sensor, J_pose (m, 6), or through that of the
+    IMU, J_imu_pose (m, 6): by its keyframe from column `first` on, by calibration parameters from column `calib` on."""
+    R, rate, velocity, J_node, J_next, J_imu = at.R_imu_sensor, at.rate, at.velocity, at.J_node, at.J_next, at.J_imu
+    n_imu, has_next = J_imu.shape[2], len(J_next) > 0
+    for r in range(T.shape[0]):
+        for k in range(6):
+            f = J_imu_pose[r, k]
+            if f != 0.0:
+                for j in range(NODE):
+                    T[r, first + j] += f * J_node[i, k, j]
+                if has_next:
+                    for j in range(NODE):
+                        T[r, first + NODE + j] += f * J_next[i, k, j]
+                for j in range(n_imu):
+                    T[r, calib + N_MOUNTED + j] += f * J_imu[i, k, j]
+        for k in range(3):
+            T[r, calib + OFFSET] += J_imu_pose[r, k] * rate[i, k] + J_imu_pose[r, 3 + k] * velocity[i, k]
+        for j in range(3):
+            T[r, calib + j] += J_pose[r, j]
+            for k in range(3):
+                T[r, calib + 3 + j] += J_pose[r, 3 + k] * R[j, k]
+
+
+@njit(cache=True, nogil=True)
+def _chain_rows(J_pose, at, first, J):
+    """Adds to J (n, m, w) the derivatives of rows through the poses `at`, J_pose (n, m, 6)."""
+    m = J_pose.shape[1]
+    A, B = np.empty((6, 6)), np.empty((m, 6))
+    for i in range(len(J_pose)):
+        fill_imu_pose(i, at, A)
+        for q in range(m):
+            for c in range(6):
+                B[q, c] = 0.0
+                for k in range(6):
+                    B[q, c] += J_pose[i, q, k] * A[k, c]
+        add_chain(i, at, J_pose[i], B, first, KEYFRAMES, J[i])

@@ -1,0 +1,172 @@
+"""Rows of measurements in the normal equations: whitened, weighed, and added to the sums of a piece."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.base.compiled import njit
+from icalib.optim.robust_weights import weight
+from icalib.optim.state import NODE
+
+KEYFRAMES = 2 * NODE  # columns of a row by its keyframe and the next one
+
+
+class Rows(NamedTuple):
+    """n measurements of m rows: residual (n, m), predicted - measured, and J (n, m, 30 + c): by keyframe, next keyframe
+    and calibration parameters. J is of length 0 where it is not wanted."""
+
+    residual: np.ndarray
+    J: np.ndarray
+
+    @classmethod
+    def empty(cls, n: int, m: int, n_columns: int, jacobians: bool) -> Rows:
+        """To be filled: residuals, and zeros for Jacobians by `n_columns` calibration parameters."""
+        return cls(np.empty((n, m)), np.zeros((n if jacobians else 0, m, KEYFRAMES + n_columns)))
+
+    @property
+    def J_node(self) -> np.ndarray:
+        """(n, m, 15) by the keyframe."""
+        return self.J[:, :, :NODE]
+
+    @property
+    def J_next(self) -> np.ndarray:
+        """(n, m, 15) by the next keyframe."""
+        return self.J[:, :, NODE:KEYFRAMES]
+
+    @property
+    def J_calib(self) -> np.ndarray:
+        """(n, m, c) by calibration parameters."""
+        return self.J[:, :, KEYFRAMES:]
+
+    def on_intervals(self, node: np.ndarray, n_nodes: int) -> np.ndarray:
+        """(n,) the interval between keyframes that each measurement at keyframe `node` (n,) is added to. The last
+        keyframe ends one: Jacobians by it move to where those by the next keyframe are."""
+        interval = np.minimum(node, n_nodes - 2)
+        if len(self.J):
+            last = node > interval
+            self.J_next[last] = self.J_node[last]
+            self.J_node[last] = 0.0
+        return interval
+
+
+@njit(cache=True, nogil=True)
+def add_product(k, n_chain, width, A, B, columns, sums):
+    """Adds A^T B to the sums of keyframe k of the piece, of the next one, and of the calibration parameters.
+
+    The first `width` columns of A are by keyframe k and, where n_chain is 30 and not 15, the next one, then by
+    calibration parameters. B (m, n_chain + c + 1): the same columns, perhaps those of more calibration parameters, and
+    the residual. columns (c,): calibration columns of B, -1 where fixed; no two are the same."""
+    diagonal, upper, side, calib = sums.diagonal, sums.upper, sums.side, sums.calib
+    n_c, n_b, last = len(columns), calib.shape[0] - 1, n_chain + len(columns)
+    row = np.empty(last + 1)
+    for i in range(n_chain):
+        h, r = i // NODE, i % NODE
+        own, node, has_next = h * NODE, k + h, i < n_chain - NODE
+        for j in range(NODE):
+            row[own + j] = diagonal[node, r, j]
+        if has_next:
+            for j in range(NODE):
+                row[NODE + j] = upper[k, r, j]
+        for j in range(n_c):
+            row[n_chain + j] = side[node, r, columns[j]] if columns[j] >= 0 else 0.0
+        row[last] = side[node, r, n_b]
+        for q in range(len(A)):
+            f = A[q, i]
+            if f == 0.0:
+                continue
+            for j in range(NODE):
+                row[own + j] += f * B[q, own + j]
+            if has_next:
+                for j in range(NODE, KEYFRAMES):
+                    row[j] += f * B[q, j]
+            for j in range(n_chain, last + 1):
+                row[j] += f * B[q, j]
+        for j in range(NODE):
+            diagonal[node, r, j] = row[own + j]
+        if has_next:
+            for j in range(NODE):
+                upper[k, r, j] = row[NODE + j]
+        for j in range(n_c):
+            if columns[j] >= 0:
+                side[node, r, columns[j]] = row[n_chain + j]
+        side[node, r, n_b] = row[last]
+    for i in range(n_chain, width):
+        if columns[i - n_chain] >= 0:
+            _add_calib(i, n_chain, width, A, B, columns, calib, row)
+
+
+@njit(cache=True, nogil=True)
+def _add_calib(i, n_chain, width, A, B, columns, calib, row):
+    """Adds row i of A^T B, by a calibration parameter; what A has no column of also across the diagonal."""
+    a, n_c, n_b, last = columns[i - n_chain], len(columns), calib.shape[0] - 1, n_chain + len(columns)
+    for j in range(n_c):
+        row[n_chain + j] = calib[a, columns[j]] if columns[j] >= 0 else 0.0
+    row[last] = calib[a, n_b]
+    for q in range(len(A)):
+        f = A[q, i]
+        if f != 0.0:
+            for j in range(n_chain, last + 1):
+                row[j] += f * B[q, j]
+    for j in range(n_c):
+        if columns[j] >= 0:
+            calib[a, columns[j]] = row[n_chain + j]
+            if n_chain + j >= width:
+                calib[columns[j], a] = row[n_chain + j]
+    calib[a, n_b] = calib[n_b, a] = row[last]
+
+
+@njit(cache=True, nogil=True)
+def _weigh(r, loss, scaled, root):
+    """root (m,): square roots of the weights of whitened residuals r (m,); scaled (2, m): factors of Jacobian and
+    residual that make J^T J, J^T r those of the weights or, curved, of the loss. Returns half the robust chi^2."""
+    cost = 0.0
+    for q in range(len(r)):
+        w, c, curvature = weight(loss.kind, loss.scale, r[q] * r[q])
+        bend = np.sqrt(curvature) if loss.curved else 1.0
+        root[q] = np.sqrt(w)
+        scaled[0, q], scaled[1, q] = root[q] * bend, root[q] / bend
+        cost += c
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def whiten(W, M, out):
+    """The first columns of out (m, .) = W M of lower triangular W (m, m) and M (m, w)."""
+    for q in range(len(W)):
+        for j in range(M.shape[1]):
+            out[q, j] = 0.0
+        for k in range(q + 1):
+            f = W[q, k]
+            if f != 0.0:
+                for j in range(M.shape[1]):
+                    out[q, j] += f * M[k, j]
+
+
+@njit(cache=True, nogil=True)
+def accumulate_rows(rows, node, W, loss, columns, sums, residual, root):
+    """Whitens rows by W (n, m, m), weighs them, and adds each to the interval that begins at its keyframe `node` (n,),
+    where sums are wanted.
+
+    columns (c,): of the calibration parameters in rows.J, -1 where fixed. residual, root (n, m): whitened residuals and
+    square roots of their weights, out. Returns half the robust chi^2.
+    """
+    m, width = W.shape[1], rows.J.shape[2]
+    whitened, scaled = np.empty((m, width + 1)), np.empty((2, m))
+    cost = 0.0
+    for i in range(len(W)):
+        for q in range(m):
+            residual[i, q] = 0.0
+            for k in range(q + 1):
+                residual[i, q] += W[i, q, k] * rows.residual[i, k]
+        cost += _weigh(residual[i], loss, scaled, root[i])
+        if len(sums.diagonal) == 0:
+            continue
+        whiten(W[i], rows.J[i], whitened)
+        for q in range(m):
+            for j in range(width):
+                whitened[q, j] *= scaled[0, q]
+            whitened[q, width] = scaled[1, q] * residual[i, q]
+        add_product(node[i] - sums.first, KEYFRAMES, width, whitened, whitened, columns, sums)
+    return cost
