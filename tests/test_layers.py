@@ -48,6 +48,7 @@ ORDER = (
     ("estimate",),
     ("result",),
     ("observability", "initialize.steps"),
+    ("initialize.paths",),
     ("initialize.lidar",),
     ("initialize.poses", "initialize.tracks", "initialize.wheels"),
     ("initialize.boards",),

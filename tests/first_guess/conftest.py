@@ -13,7 +13,7 @@ from tests.typed import not_none
 
 from icalib.data.measurements import LidarStream
 from icalib.geometry import so3
-from icalib.initialize.lidar.lidar import LidarGuess
+from icalib.initialize.paths.path import ExtrinsicsGuess
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.sensors.lidar.simulate import SimLidar
@@ -36,11 +36,11 @@ class Robot:
     def streams(self) -> tuple[LidarStream, ...]:
         return self.sim.measurements.lidars
 
-    def truth(self, k: int = 0) -> LidarGuess:
+    def truth(self, k: int = 0) -> ExtrinsicsGuess:
         stream, truth = self.streams[k], self.sim.truth
         T = truth.T_imu_sensor[stream.name]
         origins_s = (stream.origin_ns - not_none(self.sim.measurements.imu).origin_ns) * 1e-9
-        return LidarGuess(T[:3, :3].copy(), T[:3, 3].copy(), truth.time_offset[stream.name] + origins_s)
+        return ExtrinsicsGuess(T[:3, :3].copy(), T[:3, 3].copy(), truth.time_offset[stream.name] + origins_s)
 
     def pose_at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """At seconds since the IMU's first stamp."""
@@ -54,7 +54,7 @@ class Robot:
             values |= self.truth(k).values(stream.name)
         return State(nodes, *self.pose_at(nodes), np.tile(bias, (len(nodes), 1)), values)
 
-    def errors(self, found: LidarGuess, k: int = 0) -> tuple[np.ndarray, np.ndarray, float]:
+    def errors(self, found: ExtrinsicsGuess, k: int = 0) -> tuple[np.ndarray, np.ndarray, float]:
         """Of rotation [deg], position [m], time offset [s]."""
         true = self.truth(k)
         turn = so3.log(np.ascontiguousarray(true.rotation.T @ found.rotation))

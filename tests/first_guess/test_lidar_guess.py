@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icalib.geometry import so3
-from icalib.initialize.lidar.lidar import LidarGuess
+from icalib.initialize.paths.path import ExtrinsicsGuess
 from icalib.initialize.start import start
 from icalib.sensors.parameter import Mode, Parameter
 from icalib.tools.simulation import rig_for
@@ -43,7 +43,7 @@ def started(robot, rig):
 def test_turns_show_where_to_start_and_the_guess_stays(free_robot):
     rig, given = guessed(free_robot)
     (rotation, offset), (guess, clock) = started(free_robot, rig)
-    turn, _, late = free_robot.errors(LidarGuess(rotation, np.zeros(3), offset[0]))
+    turn, _, late = free_robot.errors(ExtrinsicsGuess(rotation, np.zeros(3), offset[0]))
     assert np.linalg.norm(turn) < 0.2
     assert abs(late) < 1e-3
     np.testing.assert_array_equal(guess, given)

@@ -12,9 +12,7 @@ from tests.typed import random_rotations
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.initialize.lidar import lidar_odometry
-from icalib.initialize.lidar.lidar_arm import against_motion, against_readings
 from icalib.initialize.lidar.lidar_map import ScanPose, VoxelMap, insert, moved, sums
-from icalib.initialize.lidar.lidar_motion import ImuMotion, Integrals
 from icalib.initialize.lidar.lidar_odometry import lidar_path, scans_of
 from icalib.initialize.lidar.lidar_registration import (
     ACCELERATION,
@@ -29,6 +27,8 @@ from icalib.initialize.lidar.lidar_registration import (
     add_expected,
     expected_pose,
 )
+from icalib.initialize.paths.imu_motion import ImuMotion, Integrals
+from icalib.initialize.paths.lever_arm_rows import against_motion, against_readings
 from icalib.initialize.steps.gyro import GyroRotation
 
 SCALE = 0.3

@@ -12,9 +12,10 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
-from icalib.initialize.lidar.lidar import LidarGuess, lidar_and_motion, lidar_on_motion
+from icalib.initialize.lidar.lidar import lidar_and_motion, lidar_on_motion
 from icalib.initialize.lidar.lidar_planes import ROUNDS, associate, round_search
 from icalib.initialize.lidar.lidar_rounds import check_shares
+from icalib.initialize.paths.path import ExtrinsicsGuess
 from icalib.motion.factor import keyed
 from icalib.motion.nodes import place_nodes
 from icalib.motion.sweep import Motion
@@ -79,7 +80,7 @@ def errors(r, state, k=0):
     name = r.streams[k].name
     parts = (state.values[name, part] for part in ("rotation", "translation", "time_offset"))
     R, p, offset = parts
-    turn, way, late = r.errors(LidarGuess(R, p, float(offset[0])), k)
+    turn, way, late = r.errors(ExtrinsicsGuess(R, p, float(offset[0])), k)
     print(turn, way, late)
     return np.abs(turn).max(), np.abs(way).max(), abs(late)
 

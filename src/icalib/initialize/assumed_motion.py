@@ -21,12 +21,12 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.lidar.lidar_rounds import given
 from icalib.initialize.poses.pose_ways import TURNED, WAYS
-from icalib.initialize.poses.poses import NAMES, check_rate, pose_values
+from icalib.initialize.poses.poses import check_rate, pose_values
 from icalib.initialize.robot import wheel_values
 from icalib.initialize.several import initial_guesses
 from icalib.initialize.steps.keyframe_spacing import keyframe_spacing
+from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import FEWEST, BodyPoses, SmoothPath
 from icalib.initialize.stop_and_go import is_stop_and_go, start_from_pairs
 from icalib.initialize.tracks.tracks_on_motion import track_camera_values
@@ -230,7 +230,7 @@ def _identity(inputs: Inputs) -> dict[Key, np.ndarray]:
     """The body is where the assumed IMU is, and its target or its frame is the world."""
     rig, n = inputs.rig, len(inputs.parts)
     sensor = (rig.poses if rig.moves_by_poses else rig.cameras)[0]
-    out = given(inputs, sensor, NAMES)
+    out = given(inputs, sensor)
     if not rig.moves_by_poses:
         return out | {(in_recording(BOARD, k), "tilt"): np.eye(3) for k in range(n) if rig.has_target}
     for k in range(n):

@@ -11,10 +11,11 @@ from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.lidar.lidar_rounds import NAMES, given, lidar_values, with_lidars
+from icalib.initialize.lidar.lidar_rounds import lidar_values, with_lidars
 from icalib.initialize.poses.poses import pose_values
 from icalib.initialize.steps.by_recording import alone, each_clock
 from icalib.initialize.steps.contradicted import has_guesses, is_contradicted, refuse_far_off, settled
+from icalib.initialize.steps.known_values import given
 from icalib.initialize.wheels.wheel_poses import mount_guess, poses_offset
 from icalib.initialize.wheels.wheels import OPPOSITE, SidewaysError, WheelRates, drive_guess, wheel_offset, wheel_rates
 from icalib.motion.clocks import instants
@@ -50,7 +51,7 @@ def with_robot(inputs: Inputs, settled: State) -> tuple[Inputs, State, dict[Key,
     """
     found = lidar_values(inputs, settled) | wheel_values(inputs, settled) | pose_values(inputs, settled)
     state = replace(settled, values=settled.values | found)
-    guess = state.values | {k: v for x in inputs.rig.lidars for k, v in given(inputs, x, NAMES).items()}
+    guess = state.values | {k: v for x in inputs.rig.lidars for k, v in given(inputs, x).items()}
     if inputs.rig.lidars:
         inputs, state = with_lidars(inputs, state)
         inputs = replace(inputs, guess=replace(settled, values=guess))

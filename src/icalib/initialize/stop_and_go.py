@@ -18,16 +18,17 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.lidar.lidar_rounds import NAMES, given
 from icalib.initialize.poses.pose_pairs import partners
 from icalib.initialize.poses.pose_ways import placed
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
+from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.motion.pose_rows import Mount
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.parameter import fixed
 from icalib.sensors.pose.residual import FRAME, frame_of
+from icalib.sensors.sensor import MOUNTED_NAMES
 
 FEWEST_PAIRS = 3  # of one recording
 NO_TURN_DEG = 1e-3  # between poses, which has no noise even: of a sensor without rotations
@@ -65,7 +66,7 @@ def start_from_pairs(
         found |= values
     inputs = replace(inputs_for(still, at), asked=rig)
     for sensor in still.poses:
-        found |= given(inputs, sensor, NAMES if sensor.name == rig.body else ("time_offset",))
+        found |= given(inputs, sensor, MOUNTED_NAMES if sensor.name == rig.body else ("time_offset",))
     for k in range(len(recordings)):
         frame = frame_of(rig.body, k)
         world = {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}

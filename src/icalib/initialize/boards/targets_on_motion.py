@@ -11,12 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.data.measurements import PoseStream
+from icalib.data.measurements import seconds_since
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.boards.scene import scene_poses
 from icalib.initialize.boards.scene_lens import find_scene, lens_of
-from icalib.initialize.poses.poses import on_motion
+from icalib.initialize.paths.on_motion import path_on_motion
+from icalib.initialize.paths.path import SensorPath
 from icalib.initialize.steps.by_recording import Held, alone, motion_alone, naming_recording
 from icalib.optim.state import State
 from icalib.rig import Camera, Parameter, Rig
@@ -37,11 +38,13 @@ def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) ->
         best = int(np.argmax([len(r.cameras[number].uv) for r in recordings]))
         stream, own = recordings[best].cameras[number], alone(others, best)
         poses = scene_poses(stream, camera_model(camera.model), lens_of(camera, stream, rig.target, scene), scene)
-        path = PoseStream(camera.name, stream.stamps_ns[poses.ok], poses.rotation[poses.ok], poses.position[poses.ok])
+        ok, stamps = poses.ok, stream.stamps_ns[poses.ok]
+        seconds = seconds_since(stamps, int(stamps[0]))
+        path = SensorPath(seconds, poses.rotation[ok], poses.position[ok], np.ones(len(stamps), dtype=bool))
         assert own.imu is not None
         with naming_recording(others, best):
-            found, _ = on_motion(own.imu, path, motion_alone(others, best, state), Held())
-        offset = found.offset - 1e-9 * (path.origin_ns - recordings[best].origin_ns)
+            found, _ = path_on_motion(own.imu, camera.name, path, motion_alone(others, best, state), Held())
+        offset = found.offset - 1e-9 * (int(stamps[0]) - recordings[best].origin_ns)
         guess = mounted(found.rotation, found.position, np.array([offset]))
         return replace(
             camera, **{k: Parameter("free", v) for k, v in guess.items() if getattr(camera, k).value is None}

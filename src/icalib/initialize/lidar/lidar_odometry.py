@@ -17,6 +17,7 @@ from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.initialize.lidar.lidar_map import ScanPose, VoxelMap, insert, pick, turn_back
 from icalib.initialize.lidar.lidar_registration import Expected, expected_pose, register
+from icalib.initialize.paths.path import SensorPath
 from icalib.optim.arrowhead import THREADS
 
 MOST_MATCHED, MOST_MAPPED = 1500, 6000  # points of a scan
@@ -46,17 +47,6 @@ Moving = Callable[[np.ndarray], np.ndarray]  # -> p_start_lidar (n, 3) m, roughl
 
 
 @dataclass(frozen=True)
-class LidarPath:
-    """A LiDAR at the middles of its scans: seconds (n,) on its clock since its first stamp; R_map_lidar (n, 3, 3),
-    p_map_lidar (n, 3) m; ok (n,) whether it was found there. The map is where the LiDAR first stood."""
-
-    seconds: np.ndarray
-    rotation: np.ndarray
-    position: np.ndarray
-    ok: np.ndarray
-
-
-@dataclass(frozen=True)
 class Scan:
     """middle [s]; points xyz (n, 3) and instants tau (n,) s from the middle, in an order that spreads them."""
 
@@ -80,7 +70,7 @@ def scans_of(stream: LidarStream) -> list[Scan]:
 
 def lidar_path(
     name: str, scans: list[Scan], turning: Turning | None = None, moving: Moving | None = None, whole: bool = True
-) -> LidarPath:
+) -> SensorPath:
     """Of LiDAR `name`. `turning`: how it turned, where that is known, and `moving`: how it moved. Unless it is to be
     `whole`, a path that lost its way goes on in another map: LONGEST_STEP_S lie between what is ok in one and in the
     next. A whole one is of one map, which begins later where hardly any scan fits that of the first.
@@ -104,7 +94,7 @@ def lidar_path(
         raise EstimationError(
             f"{name}: only {ok.sum()} of {len(scans)} scans match the surfaces of other scans; {why}."
         )
-    return LidarPath(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
+    return SensorPath(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
 
 
 def _share_on_lines(scan: Scan, edge_m: float) -> float:

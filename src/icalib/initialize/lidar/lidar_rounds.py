@@ -16,12 +16,11 @@ from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.assembly import host_times, motion_of, nodes_for, start_values
-from icalib.estimate.problem.inputs import Inputs, origin_difference, with_clouds
+from icalib.estimate.problem.inputs import Inputs, with_clouds
 from icalib.geometry.planes import plane_of
 from icalib.initialize.lidar.lidar import lidar_and_motion, lidar_on_motion
 from icalib.initialize.lidar.lidar_planes import ROUNDS, Association, associate, odd_step, round_search
 from icalib.initialize.lidar.lidar_sight import naming_sight
-from icalib.initialize.steps.align_camera import trusted
 from icalib.initialize.steps.by_recording import (
     Held,
     alone,
@@ -34,32 +33,18 @@ from icalib.initialize.steps.by_recording import (
     points_by_recording,
 )
 from icalib.initialize.steps.contradicted import settled
+from icalib.initialize.steps.known_values import given, held_of, trusted_names
 from icalib.motion.clocks import instants
 from icalib.motion.clouds import Clouds, joined_clouds, known_planes
 from icalib.motion.known_motion import near_nodes
 from icalib.motion.point_planes import are_somewhere, thinned
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.state import Key, State
-from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 from icalib.sensors.lidar.lidar_binning import COARSE_BIN_S, Associated, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.model import FIRST_RANGE_M
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
-NAMES = MOUNTED_NAMES
-
-
-def given(inputs: Inputs, sensor: Camera | Lidar | Wheels | PoseSensor, names: Sequence[str]) -> dict[Key, np.ndarray]:
-    """What the rig gives of a sensor, time offsets between clocks that start at their first stamps."""
-    out: dict[Key, np.ndarray] = {}
-    for name in names:
-        value = getattr(sensor, name).value
-        if value is not None:
-            shift = origin_difference(inputs.measurements, inputs.stream(sensor.name)) if name == "time_offset" else 0.0
-            out[sensor.name, name] = np.array(value, dtype=np.float64) + shift
-    if (offset := out.get((sensor.name, "time_offset"))) is not None:
-        out[sensor.name, "time_offset"] = np.repeat(offset, inputs.clocks_of(sensor))
-    return out
 
 
 def state_from_lidar(inputs: Inputs) -> State:
@@ -89,7 +74,7 @@ def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
         # The motion shows too little; the rig file's guess stands in.
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
     # What turns show is nearer than a guess, with which planes would be thick, and steps towards them lead astray.
-    names = ("translation", *_trusted(lidar)) if guess.turned else NAMES
+    names = ("translation", *trusted_names(lidar)) if guess.turned else MOUNTED_NAMES
     own, known = guess.values(lidar.name), given(inputs, lidar, names)
     values = start_values(inputs, settled(lidar, known, own) if guess.turned else own | known)
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
@@ -221,10 +206,10 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     out: dict[Key, np.ndarray] = {}
     for i, lidar in enumerate(inputs.rig.lidars):
         if (lidar.name, "rotation") in state.values:
-            out |= given(inputs, lidar, _trusted(lidar))
+            out |= given(inputs, lidar, trusted_names(lidar))
             continue
-        known = given(inputs, lidar, NAMES)
-        if len(known) < len(NAMES):
+        known = given(inputs, lidar)
+        if len(known) < len(MOUNTED_NAMES):
             k = most_points(inputs, i)
             own, motion = alone(inputs, k), motion_alone(inputs, k, state)
             assert own.imu is not None
@@ -248,22 +233,6 @@ def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: Held, reco
     stream = own.measurements.lidars[lidar]
     with naming_sight([stream]):
         return lidar_on_motion(own.imu, stream, motion, held).offset
-
-
-def _trusted(sensor: Lidar | PoseSensor) -> list[str]:
-    """What else may rest on of how a sensor stands."""
-    return [name for name in NAMES if trusted(getattr(sensor, name)) is not None]
-
-
-def held_of(inputs: Inputs, lidar: Lidar | PoseSensor, guesses: bool = False) -> Held:
-    """What the rig trusts of a LiDAR or a pose sensor, and with `guesses` what it guesses."""
-    known = given(inputs, lidar, NAMES if guesses else _trusted(lidar))
-    offset = known.get((lidar.name, "time_offset"))
-    return Held(
-        known.get((lidar.name, "rotation")),
-        known.get((lidar.name, "translation")),
-        None if offset is None else float(offset[0]),
-    )
 
 
 def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.ndarray]:

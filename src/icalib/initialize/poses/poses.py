@@ -16,44 +16,34 @@ from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.lidar.lidar import (
-    G_TOLERANCE,
-    FromPath,
-    Held,
-    LidarGuess,
-    align_path,
-    motion_of_path,
-    poses_in,
-    where,
-)
-from icalib.initialize.lidar.lidar_arm import (
-    WAY_SIGMA,
-    LeverArmRows,
-    against_motion,
-    against_readings,
-    arm_prior,
-    left_over,
-    solve,
-)
-from icalib.initialize.lidar.lidar_odometry import LidarPath
-from icalib.initialize.lidar.lidar_rounds import NAMES, given, held_of
+from icalib.initialize.paths.alignment import align_path
+from icalib.initialize.paths.lever_arm_rows import LeverArmRows, against_motion, against_readings
+from icalib.initialize.paths.on_motion import path_on_motion, path_rates, poses_in, too_short
+from icalib.initialize.paths.path import ExtrinsicsGuess, SensorPath
+from icalib.initialize.paths.with_imu import G_TOLERANCE, PathMotion, motion_of_path
 from icalib.initialize.poses.pose_frames import turn_of_positions
 from icalib.initialize.poses.pose_ways import placed
-from icalib.initialize.steps.by_recording import alone, each_clock, from_the_best, motion_alone, naming_recording
-from icalib.initialize.steps.clock_shifts import LEAST_CORRELATION, CameraRates, longest_step
+from icalib.initialize.steps.by_recording import (
+    Held,
+    alone,
+    each_clock,
+    from_the_best,
+    motion_alone,
+    naming_recording,
+)
+from icalib.initialize.steps.clock_shifts import CameraRates
 from icalib.initialize.steps.clocks import Alignment
 from icalib.initialize.steps.contradicted import has_guesses, settled
 from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.known_values import given, held_of
 from icalib.initialize.steps.lever_arm import SIZE_TOLERANCE, size_of
-from icalib.initialize.steps.rate_windows import rate_window, window_rates
 from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import Key, State
 from icalib.rig import PoseSensor
+from icalib.rig.sensor import MOUNTED_NAMES
 from icalib.sensors.pose.residual import FRAME, frame_of
 
-WINDOW_S = 0.1  # of a mean rate, at least
-FEWEST_WINDOWS = 20
 LEAST_RATE_HZ = 2.0  # of poses of something that moves
 APART_S = 0.4  # of poses that show whether they fit: next to each other they differ by little but noise
 G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
@@ -65,8 +55,8 @@ def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     assert inputs.imu is not None
     out: dict[Key, np.ndarray] = {}
     for sensor, stream in zip(inputs.rig.poses, inputs.measurements.poses, strict=True):
-        known = given(inputs, sensor, NAMES)
-        if len(known) < len(NAMES):
+        known = given(inputs, sensor)
+        if len(known) < len(MOUNTED_NAMES):
             known = settled(sensor, known, _placed(inputs, state, sensor, stream))
         elif has_guesses(sensor, known):
             with suppress(EstimationError):
@@ -83,13 +73,13 @@ def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream
     if not sensor.clock_restarts:
         known = {"known": state, "held": held}
         turn = partial(_turn_on_motion, inputs.imu, **known)
-        return placed(stream, partial(on_motion, inputs.imu, **known), turn).values(sensor.name)
+        return placed(stream, partial(_on_motion, inputs.imu, **known), turn).values(sensor.name)
     streams = [_alone(inputs, k, sensor.name) for k in range(len(inputs.parts))]
     k = int(np.argmax([len(own.stamps_ns) for _, own in streams]))
     imu, own = streams[k]
     with naming_recording(inputs, k):
         known = {"known": motion_alone(inputs, k, state), "held": held}
-        found = placed(own, partial(on_motion, imu, **known), partial(_turn_on_motion, imu, **known))
+        found = placed(own, partial(_on_motion, imu, **known), partial(_turn_on_motion, imu, **known))
 
     def offset(recording: int) -> float:
         return _aligned(*streams[recording], Held(found.rotation))[0].offset
@@ -121,7 +111,7 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
     sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
     known = held or held_of(inputs, sensor)
     found = placed(stream, lambda x: _with_motion(imu, x, gravity, known), lambda x: _turn_alone(imu, x, known))
-    own = settled(sensor, given(inputs, sensor, NAMES), found.guess.values(sensor.name))
+    own = settled(sensor, given(inputs, sensor), found.guess.values(sensor.name))
     values = start_values(inputs, own)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
     nodes = nodes_for(inputs, host_times(inputs, hosts))
@@ -130,22 +120,8 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
 
 
 def pose_rates(stream: PoseStream) -> CameraRates:
-    """Mean angular rates over windows of WINDOW_S or more, as the poses' noise asks for, one from each pose. Raises
-    EstimationError where there are hardly any."""
-    t, R = stream.seconds, stream.rotation
-    longest = longest_step(stream.name, t, "poses")
-    a, b, rate = window_rates(t, R, rate_window(t, R, WINDOW_S, longest), longest)
-    if len(a) < FEWEST_WINDOWS:
-        raise EstimationError(
-            f"{stream.name}: only {len(a)} pairs of its {len(t)} poses are at most {longest:.3g} s apart, and "
-            f"{FEWEST_WINDOWS} are needed; record for longer."
-        )
-    if not np.linalg.norm(rate, axis=1).max() > 0.0:
-        raise EstimationError(
-            f"{stream.name}: its rotation is the same in all poses, as if only positions were measured; a pose "
-            "sensor needs both."
-        )
-    return CameraRates(t[a], t[b], rate, LEAST_CORRELATION, longest)
+    """See `path_rates`."""
+    return path_rates(stream.name, _path(stream))
 
 
 def check_rate(stream: PoseStream) -> None:
@@ -159,8 +135,8 @@ def check_rate(stream: PoseStream) -> None:
         )
 
 
-def _path(stream: PoseStream) -> LidarPath:
-    return LidarPath(stream.seconds, stream.rotation, stream.position, np.ones(len(stream.stamps_ns), dtype=bool))
+def _path(stream: PoseStream) -> SensorPath:
+    return SensorPath(stream.seconds, stream.rotation, stream.position, np.ones(len(stream.stamps_ns), dtype=bool))
 
 
 def _aligned(imu: ImuData, stream: PoseStream, held: Held) -> tuple[Alignment, CameraRates]:
@@ -168,16 +144,16 @@ def _aligned(imu: ImuData, stream: PoseStream, held: Held) -> tuple[Alignment, C
     return align_path(imu, stream.name, rates, held), rates
 
 
-def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -> tuple[FromPath, float]:
+def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -> tuple[PathMotion, float]:
     """What the poses show with the IMU alone, and what is left of them. Raises EstimationError where they do not."""
     aligned, rates = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
-    path = where(path, (t > imu.seconds[0]) & (t < imu.seconds[-1]))
+    path = path.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
     gyro, R_is = GyroRotation.integrate(imu, aligned.gyro_bias), aligned.rotation
     path = replace(path, rotation=gyro.smoothed(path.seconds + aligned.offset, path.rotation @ R_is.T) @ R_is)
     found = motion_of_path(imu, path, rates, aligned, gravity, held)
     if found is None:
-        raise _too_short(stream)
+        raise too_short(stream.name)
     off = abs(found.gravity / gravity - 1.0)
     if off <= G_OTHER_UNITS:
         _check_size(imu, stream.name, path, aligned, found)
@@ -188,7 +164,7 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
             f"positions of {stream.name} in metres."
         )
     step = max(1, round(APART_S / float(np.median(np.diff(path.seconds)))))
-    apart = motion_of_path(imu, where(path, np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
+    apart = motion_of_path(imu, path.only(np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
     return found, 0.0 if apart is None else apart.left
 
 
@@ -196,7 +172,7 @@ def _turn_alone(imu: ImuData, stream: PoseStream, held: Held) -> np.ndarray | No
     """See `turn_of_positions`: by the IMU's readings."""
     aligned, _ = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
-    path = where(path, (t > imu.seconds[0]) & (t < imu.seconds[-1]))
+    path = path.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
     carry = partial(GyroRotation.integrate(imu, aligned.gyro_bias).carry, path.seconds + aligned.offset, to=imu.seconds)
     system = against_readings(imu, carry, path.seconds + aligned.offset, path.rotation, path.position)
     return turn_of_positions(system(aligned.rotation, np.zeros(3)))
@@ -206,7 +182,7 @@ def _turn_on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) 
     """See `turn_of_positions`: by a motion that others showed."""
     aligned, _ = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
-    path = where(path, (t >= known.seconds[0]) & (t <= known.seconds[-1]))
+    path = path.only((t >= known.seconds[0]) & (t <= known.seconds[-1]))
     t = path.seconds + aligned.offset
     if not len(t):
         return None
@@ -216,7 +192,7 @@ def _turn_on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) 
     return turn_of_positions(rows, U @ Vt)
 
 
-def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, found: FromPath) -> None:
+def _check_size(imu: ImuData, name: str, path: SensorPath, aligned: Alignment, found: PathMotion) -> None:
     """Raises EstimationError where the accelerometer contradicts the size of the motion: the rows of `against_readings`
     with what it felt as one more column, as of a target in `lever_arm`."""
     gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
@@ -234,21 +210,9 @@ def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, fo
         )
 
 
-def on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> tuple[LidarGuess, float]:
-    """From the motion of the IMU in `known`, and what is left of the poses. Raises EstimationError as above."""
-    aligned, rates = _aligned(imu, stream, held)
-    path, t = _path(stream), stream.seconds + aligned.offset
-    path = where(path, (t >= known.seconds[0]) & (t <= known.seconds[-1]))
-    if not len(path.seconds):
-        raise _too_short(stream)
-    t = path.seconds + aligned.offset
-    R, p = poses_in(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t)
-    prior = arm_prior(np.zeros(0), rates.rate, WAY_SIGMA, held.rotation is not None, held.position)
-    system = against_motion(R, p, t, path.rotation, path.position)
-    found = solve(system, prior, aligned.rotation, rates.rate)
-    if found is None:
-        raise _too_short(stream)
-    return LidarGuess(found[0], found[1][3:6], aligned.offset), left_over(system, *found)
+def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> tuple[ExtrinsicsGuess, float]:
+    """See `path_on_motion`."""
+    return path_on_motion(imu, stream.name, _path(stream), known, held)
 
 
 def _frames(
@@ -256,13 +220,13 @@ def _frames(
 ) -> dict[Key, np.ndarray]:
     """Where the frame of absolute poses stands in each recording's world: the mean of what the poses say."""
     out: dict[Key, np.ndarray] = {}
-    R_is, p_is, _ = (values[sensor.name, name] for name in NAMES)
+    R_is, p_is, _ = (values[sensor.name, name] for name in MOUNTED_NAMES)
     t = instants(stream, values)
     for k, nodes in enumerate(known.recordings if sensor.kind == "absolute" else ()):
         part = _nodes(known, nodes)
         own = np.flatnonzero((t >= part.seconds[0]) & (t <= part.seconds[-1]))
         if not len(own):
-            raise _too_short(stream)
+            raise too_short(stream.name)
         R, p = poses_in(part, GyroRotation.integrate(imu, part.bias[:, :3].mean(axis=0)), t[own])
         U, _, Vt = np.linalg.svd((R @ R_is @ stream.rotation[own].transpose(0, 2, 1)).sum(axis=0))
         R_wf = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
@@ -275,10 +239,3 @@ def _frames(
 def _nodes(state: State, own: slice) -> State:
     columns = {name: getattr(state, name)[own] for name in ("seconds", "rotation", "position", "velocity", "bias")}
     return replace(state, **columns, starts=(0,))
-
-
-def _too_short(stream: PoseStream) -> EstimationError:
-    return EstimationError(
-        f"{stream.name}: too few of its poses fall within the recording of the other sensors to estimate its "
-        "lever arm; check that the clocks overlap, or record for longer."
-    )

@@ -10,18 +10,18 @@ import numpy as np
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.lidar.lidar_rounds import NAMES, given
 from icalib.initialize.steps.align_camera import trusted
 from icalib.initialize.steps.by_recording import alone, each_clock, motion_alone, naming_recording, other_clocks
 from icalib.initialize.steps.clocks import main_axis, rough_alignments
 from icalib.initialize.steps.guess import relative_offset
+from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.rate_shifts import telling_rates
 from icalib.initialize.tracks.from_tracks import lens_start
 from icalib.initialize.tracks.track_mount import CameraExtrinsics, ImagePairs, place_on_motion
 from icalib.optim.arrowhead import THREADS
 from icalib.optim.state import Key, State
 from icalib.rig import Camera
-from icalib.sensors.sensor import mounted
+from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 
 
 def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
@@ -34,9 +34,9 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
         camera, best = inputs.rig.cameras[number], _most_seen(inputs, number)
         with naming_recording(inputs, best):
             lens = _lens(inputs, number, best)
-        known = given(inputs, camera, NAMES)
+        known = given(inputs, camera)
         guessed = {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]}
-        return guessed | (_placed(inputs, state, number, lens) if len(known) < len(NAMES) else {}) | known
+        return guessed | (_placed(inputs, state, number, lens) if len(known) < len(MOUNTED_NAMES) else {}) | known
 
     with ThreadPoolExecutor(THREADS) as pool:  # its own: what it does may use the solver's
         return {k: v for own in pool.map(values, range(len(inputs.rig.cameras))) for k, v in own.items()}
@@ -76,7 +76,7 @@ def _mount_in(
     own, camera = alone(inputs, recording), inputs.rig.cameras[number]
     assert own.imu is not None
     stream, model = own.measurements.tracks[number], camera_model(camera.model)
-    known = {name: value for (_, name), value in given(own, camera, NAMES).items()}
+    known = {name: value for (_, name), value in given(own, camera).items()}
     if placed is not None:
         known |= {"rotation": placed.rotation, "translation": placed.position}
     offsets = [float(known["time_offset"][0])] if "time_offset" in known else None
@@ -90,7 +90,7 @@ def _mount_in(
         )
     ]
     motion = motion_of(own, motion_alone(inputs, recording, state))
-    held = np.repeat([name in known for name in NAMES], [3, 3, 1])
+    held = np.repeat([name in known for name in MOUNTED_NAMES], [3, 3, 1])
     axis = None if "rotation" in known else main_axis(own.imu.gyro)
     found = place_on_motion(followed, motion, starts, axis, held)
     return found, followed.lens_of(found)

@@ -11,11 +11,12 @@ from icalib.data.measurements import Measurements, PoseStream, WheelPoses, Wheel
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
-from icalib.initialize.lidar.lidar_rounds import NAMES, given
 from icalib.initialize.steps.contradicted import settled
+from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.optim.state import Key
 from icalib.rig import Parameter, PoseSensor, Rig, Wheels
+from icalib.rig.sensor import MOUNTED_NAMES
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
 
@@ -66,7 +67,7 @@ def _size(wheels: Wheels, name: str) -> np.ndarray:
 
 def in_place_of_wheels(rig: Rig, wheels: Wheels) -> Rig:
     """The rig with a pose sensor in place of its wheels; nothing is known of where its cameras stand."""
-    free = dict.fromkeys(NAMES, Parameter())
+    free = dict.fromkeys(MOUNTED_NAMES, Parameter())
     cameras = tuple(replace(c, clock_restarts=False, **free) for c in rig.cameras)
     return rig.with_(cameras=cameras, wheels=(), poses=(PoseSensor(wheels.name, "", "absolute"),))
 
@@ -80,7 +81,7 @@ def camera_paths(
 ) -> list[BodyPoses]:
     """The first camera's poses, on its own clock, where wheels were `shown`; `values`: where cameras stand on these."""
     first = rig.cameras[0].name
-    R, p, offset = (values[first, name] for name in NAMES)
+    R, p, offset = (values[first, name] for name in MOUNTED_NAMES)
     between = [(m.tracks[0].origin_ns - m.wheels[0].origin_ns) * 1e-9 for m in recordings]
     return [
         BodyPoses(w.seconds - offset[0] + between[0] - b, w.rotation @ R, w.position + w.rotation @ p)
@@ -91,10 +92,10 @@ def camera_paths(
 def seen_from_first(rig: Rig, values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
     """Where cameras and the first wheels stand seen from the first camera, from `values` on the wheels; and lenses."""
     wheels, (first, *others) = rig.wheels[0], rig.cameras
-    R, p, offset = (values[first.name, name] for name in NAMES)
+    R, p, offset = (values[first.name, name] for name in MOUNTED_NAMES)
     out = {key: value for key, value in values.items() if key[1] in ("intrinsics", "distortion")}
     mounts = {wheels.name: (np.eye(3), np.zeros(3), np.zeros(1))}
-    mounts |= {c.name: tuple(values[c.name, name] for name in NAMES) for c in others}
+    mounts |= {c.name: tuple(values[c.name, name] for name in MOUNTED_NAMES) for c in others}
     for name, (Q, q, dt) in mounts.items():
         out |= {(name, "rotation"): R.T @ Q, (name, "translation"): R.T @ (q - p), (name, "time_offset"): dt - offset}
     for spec in wheels.drive_specs:
@@ -109,7 +110,7 @@ def as_given(inputs: Inputs, found: dict[Key, np.ndarray]) -> dict[Key, np.ndarr
     shows how high wheels are on a floor: that is as given."""
     wheels, (_, *others) = inputs.rig.wheels[0], inputs.rig.cameras
     out, drive = dict(found), [spec.name for spec in wheels.drive_specs]
-    for sensor, names in (*((c, NAMES) for c in others), (wheels, (*NAMES, *drive))):
+    for sensor, names in (*((c, MOUNTED_NAMES) for c in others), (wheels, (*MOUNTED_NAMES, *drive))):
         known, own = given(inputs, sensor, names), {k: v for k, v in found.items() if k[0] == sensor.name}
         arm = wheels.name, "translation"
         if arm in known and arm in own:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.geometry import so3
-from icalib.initialize.lidar.lidar_motion import Integrals
+from icalib.initialize.paths.imu_motion import Integrals
 from icalib.initialize.steps.clocks import only_axis
 from icalib.motion.imu_data import ImuData, clear_of
 

@@ -1,0 +1,43 @@
+"""The trajectory of a sensor by its own measurements, and the guess of its extrinsics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.optim.state import Key
+
+
+@dataclass(frozen=True)
+class SensorPath:
+    """Poses of a sensor in a frame of its own, the map: seconds (n,) on its clock since its first stamp, R_map_sensor
+    (n, 3, 3), p_map_sensor (n, 3) m; ok (n,): whether the pose is known."""
+
+    seconds: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    ok: np.ndarray
+
+    def only(self, chosen: np.ndarray) -> SensorPath:
+        """The poses that are `chosen` (n,)."""
+        return SensorPath(self.seconds[chosen], self.rotation[chosen], self.position[chosen], self.ok[chosen])
+
+
+@dataclass(frozen=True)
+class ExtrinsicsGuess:
+    """R_imu_sensor (3, 3), p_imu_sensor (3,) m; offset: t_imu - t_sensor, both since their clocks' first stamps [s];
+    turned: whether the sensor turned about more than one axis, which shows all of its rotation."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    offset: float
+    turned: bool = False
+
+    def values(self, name: str) -> dict[Key, np.ndarray]:
+        """As calibration parameters of the sensor `name`."""
+        return {
+            (name, "rotation"): self.rotation,
+            (name, "translation"): self.position,
+            (name, "time_offset"): np.array([self.offset]),
+        }

@@ -1,0 +1,46 @@
+"""What the rig file gives of a sensor, in the clocks of the first stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from icalib.estimate.problem.inputs import Inputs, origin_difference
+from icalib.initialize.steps.align_camera import trusted
+from icalib.initialize.steps.by_recording import Held
+from icalib.optim.state import Key
+from icalib.rig import Camera, Lidar, PoseSensor, Wheels
+from icalib.rig.sensor import MOUNTED_NAMES
+
+
+def given(
+    inputs: Inputs, sensor: Camera | Lidar | Wheels | PoseSensor, names: Sequence[str] = MOUNTED_NAMES
+) -> dict[Key, np.ndarray]:
+    """The values of the parameters `names` that the rig file gives; time offsets between first stamps, one for each
+    recording where the clock restarts."""
+    out: dict[Key, np.ndarray] = {}
+    for name in names:
+        value = getattr(sensor, name).value
+        if value is not None:
+            shift = origin_difference(inputs.measurements, inputs.stream(sensor.name)) if name == "time_offset" else 0.0
+            out[sensor.name, name] = np.array(value, dtype=np.float64) + shift
+    if (offset := out.get((sensor.name, "time_offset"))) is not None:
+        out[sensor.name, "time_offset"] = np.repeat(offset, inputs.clocks_of(sensor))
+    return out
+
+
+def trusted_names(sensor: Lidar | PoseSensor | Camera | Wheels) -> list[str]:
+    """The extrinsics and time offset that are fixed or have a prior: other guesses may rest on them."""
+    return [name for name in MOUNTED_NAMES if trusted(getattr(sensor, name)) is not None]
+
+
+def held_of(inputs: Inputs, sensor: Lidar | PoseSensor, guesses: bool = False) -> Held:
+    """What the rig file fixes of a sensor's extrinsics or gives as a prior; with `guesses` its guesses too."""
+    known = given(inputs, sensor, MOUNTED_NAMES if guesses else trusted_names(sensor))
+    offset = known.get((sensor.name, "time_offset"))
+    return Held(
+        known.get((sensor.name, "rotation")),
+        known.get((sensor.name, "translation")),
+        None if offset is None else float(offset[0]),
+    )
