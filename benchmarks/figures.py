@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from icalib.sensors.camera.initialize.trajectory import first_state
 
 import icalib
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
@@ -22,10 +23,9 @@ from icalib.data.recordings import open_recording, read_measurements
 from icalib.estimate.evidence.corner_noise import first_noise
 from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
-from icalib.initialize import initial_guess
-from icalib.initialize.start import first_state
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
+from icalib.sensors.camera.initialize.with_imu import initial_guess
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "euroc"
 PLAIN_CORNER_NOISE_PX = 0.3

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import Measurements
-from icalib.initialize import initial_guess
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Rig
+from icalib.sensors.camera.initialize.with_imu import initial_guess
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
 

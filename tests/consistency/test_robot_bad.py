@@ -14,10 +14,10 @@ from tests.typed import not_none
 from icalib.data.measurements import LidarStream, Measurements, WheelStream
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry import so3
-from icalib.initialize.lidar import lidar_rounds
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Rig
+from icalib.sensors.lidar.initialize import rounds
 from icalib.tools.montecarlo.truth import true_value
 from icalib.tools.simulation import Simulation, rig_for, simulate, with_drawn_guess
 
@@ -181,7 +181,7 @@ def test_a_corridor_is_told_where_no_plane_is_found_any_more(drive, monkeypatch)
     def nothing(*_):
         raise EstimationError("lidar0 saw no flat surface of 0.7 m^2 or more.")
 
-    monkeypatch.setattr(lidar_rounds, "associate", nothing)
+    monkeypatch.setattr(rounds, "associate", nothing)
     assert "surfaces that lidar0 sees face two directions only" in refusal(guessed(simulation), corridor)
     assert "lidar0 saw no flat surface" in refusal(guessed(simulation), simulation.measurements.unassociated())
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.sensors.camera.initialize.trajectory import first_state
 from scipy.spatial.transform import Rotation
 from tests.typed import not_none
 
@@ -17,10 +18,9 @@ from icalib.estimate.problem.assembly import assemble, image_times, nodes_for, r
 from icalib.estimate.problem.inputs import inputs_for, origin_difference
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import NoTarget
-from icalib.initialize.several import initial_guesses
-from icalib.initialize.start import first_state
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
+from icalib.sensors.camera.initialize.recordings import initial_guesses
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"

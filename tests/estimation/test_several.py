@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from icalib.sensors.camera.initialize.trajectory import first_state
 from tests.typed import not_none
 
 from icalib.data.joining import PAUSE_NS, join
@@ -17,13 +18,12 @@ from icalib.estimate.evidence.parts import segment_ends
 from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.geometry import so3
-from icalib.initialize.several import initial_guesses
-from icalib.initialize.start import first_state
 from icalib.motion.factor import of_type
 from icalib.motion.nodes import first_nodes, place_nodes, usable
 from icalib.optim.state import NODE, State
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.initialize.recordings import initial_guesses
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.parameter import fixed
 from icalib.tools.simulation import handheld, rig_for, simulate

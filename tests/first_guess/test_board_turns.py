@@ -10,9 +10,9 @@ import pytest
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.geometry import so3
 from icalib.geometry.targets import Checkerboard, Circles, Target
-from icalib.initialize.boards.board_turns import number_alike
 from icalib.initialize.start import start
 from icalib.rig import Rig
+from icalib.sensors.camera.initialize.boards.numbering import number_alike
 from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow

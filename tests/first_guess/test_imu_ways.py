@@ -11,8 +11,8 @@ import pytest
 from icalib.data.checks.imu_units import in_si
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.initialize import initial_guess
 from icalib.rig import Axes, ImuSensor, Rig
+from icalib.sensors.camera.initialize.with_imu import initial_guess
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow

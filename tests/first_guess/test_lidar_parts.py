@@ -11,10 +11,12 @@ from tests.typed import random_rotations
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.lidar import lidar_odometry
-from icalib.initialize.lidar.lidar_map import ScanPose, VoxelMap, insert, moved, sums
-from icalib.initialize.lidar.lidar_odometry import lidar_path, scans_of
-from icalib.initialize.lidar.lidar_registration import (
+from icalib.initialize.paths.imu_motion import ImuMotion, Integrals
+from icalib.initialize.paths.lever_arm_rows import against_motion, against_readings
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.sensors.lidar.initialize import odometry
+from icalib.sensors.lidar.initialize.odometry import lidar_path, scans_of
+from icalib.sensors.lidar.initialize.registration import (
     ACCELERATION,
     ANGULAR_ACCELERATION,
     GYRO_SIGMA,
@@ -27,9 +29,7 @@ from icalib.initialize.lidar.lidar_registration import (
     add_expected,
     expected_pose,
 )
-from icalib.initialize.paths.imu_motion import ImuMotion, Integrals
-from icalib.initialize.paths.lever_arm_rows import against_motion, against_readings
-from icalib.initialize.steps.gyro import GyroRotation
+from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert, moved, sums
 
 SCALE = 0.3
 
@@ -217,7 +217,7 @@ def test_a_long_path_is_followed_in_two_parts_at_once(free_robot, monkeypatch):
     """As good as in one, but for a second between the two maps."""
     scans = scans_of(free_robot.streams[0])
     one = lidar_path("lidar0", scans, whole=False)
-    monkeypatch.setattr(lidar_odometry, "MANY", len(scans))
+    monkeypatch.setattr(odometry, "MANY", len(scans))
     two = lidar_path("lidar0", scans, whole=False)
     assert one.ok.all()
     n = len(scans) // 2
@@ -239,10 +239,10 @@ def poses_in_first(path):
 def test_parts_of_a_path_that_is_to_be_whole_are_joined(free_robot, monkeypatch):
     scans = scans_of(free_robot.streams[0])
     one = lidar_path("lidar0", scans)
-    monkeypatch.setattr(lidar_odometry, "MANY", len(scans))
+    monkeypatch.setattr(odometry, "MANY", len(scans))
     joined = lidar_path("lidar0", scans)
     assert joined.ok.all() and len(joined.seconds) == len(scans)
-    n = len(scans) // 2 + lidar_odometry.SHARED
+    n = len(scans) // 2 + odometry.SHARED
     np.testing.assert_array_equal(joined.rotation[:n], one.rotation[:n])
     assert not np.array_equal(joined.rotation[n:], one.rotation[n:])  # of another map
     (R, p), (R_one, p_one) = poses_in_first(joined), poses_in_first(one)
@@ -256,9 +256,9 @@ def test_parts_that_share_too_little_are_not_joined(free_robot, monkeypatch, man
     """The scans that both would share are of elsewhere, where the first map ends: the second is worth nothing."""
     scans = scans_of(free_robot.streams[0])
     middle = len(scans) // 2
-    away = slice(middle, middle + lidar_odometry.SHARED)
+    away = slice(middle, middle + odometry.SHARED)
     scans[away] = [replace(s, xyz=s.xyz * [-1.0, -1.0, 1.0] + [3.0, 0.0, 1.0]) for s in scans[away]]
-    monkeypatch.setattr(lidar_odometry, "MANY", many)
+    monkeypatch.setattr(odometry, "MANY", many)
     with pytest.raises(EstimationError, match=f"only {middle} of {len(scans)} scans match"):
         lidar_path("lidar0", scans)
 

@@ -12,9 +12,6 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
-from icalib.initialize.lidar.lidar import lidar_and_motion, lidar_on_motion
-from icalib.initialize.lidar.lidar_planes import ROUNDS, associate, round_search
-from icalib.initialize.lidar.lidar_rounds import check_shares
 from icalib.initialize.paths.path import ExtrinsicsGuess
 from icalib.motion.factor import keyed
 from icalib.motion.nodes import place_nodes
@@ -23,6 +20,9 @@ from icalib.optim.state import State, make_layout
 from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
+from icalib.sensors.lidar.initialize.association import ROUNDS, associate, round_search
+from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
+from icalib.sensors.lidar.initialize.rounds import check_shares
 from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.lidar.residual import LidarFactor
 

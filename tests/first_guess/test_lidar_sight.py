@@ -9,8 +9,8 @@ import pytest
 
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.initialize.lidar.lidar_odometry import lidar_path, scans_of
-from icalib.initialize.lidar.lidar_sight import count_of, directions, facing, naming_sight
+from icalib.sensors.lidar.initialize.degeneracy import count_of, directions, facing, naming_sight
+from icalib.sensors.lidar.initialize.odometry import lidar_path, scans_of
 
 
 def seeing(stream: LidarStream, faces: list[int]) -> LidarStream:

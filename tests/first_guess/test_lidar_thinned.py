@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import LidarStream, Measurements
-from icalib.initialize.lidar import lidar_planes, lidar_rounds
-from icalib.initialize.lidar.lidar_planes import Association, odd_step
-from icalib.initialize.lidar.lidar_rounds import _firsts, _of_all
 from icalib.motion.clouds import Clouds
 from icalib.pipeline import calibrate_measurements
+from icalib.sensors.lidar.initialize import association, rounds
+from icalib.sensors.lidar.initialize.association import Association, odd_step
+from icalib.sensors.lidar.initialize.rounds import _firsts, _of_all
 from icalib.tools.simulation import rig_for
 
 pytestmark = pytest.mark.slow
@@ -47,9 +47,9 @@ def test_what_was_found_of_some_points_is_put_where_they_were(step):
 
 
 def test_steps_are_odd_and_long_enough():
-    for points in (0, 1, lidar_planes.MOST_POINTS, lidar_planes.MOST_POINTS + 1, 10 * lidar_planes.MOST_POINTS):
+    for points in (0, 1, association.MOST_POINTS, association.MOST_POINTS + 1, 10 * association.MOST_POINTS):
         step = odd_step(points)
-        assert step % 2 == 1 and points <= step * lidar_planes.MOST_POINTS
+        assert step % 2 == 1 and points <= step * association.MOST_POINTS
 
 
 def test_the_result_is_that_of_all_points(robot, monkeypatch):
@@ -61,7 +61,7 @@ def test_the_result_is_that_of_all_points(robot, monkeypatch):
 
     recordings, rig = [raw(s.measurements) for s in sims], rig_for(sims[0].scenario)
     whole = calibrate_measurements(rig, recordings)
-    monkeypatch.setattr(lidar_rounds, "odd_step", lambda points: 7)
+    monkeypatch.setattr(rounds, "odd_step", lambda points: 7)
     thinned = calibrate_measurements(rig, recordings)
     assert whole.converged and thinned.converged
     counts = [c.lidar_residuals[0].points_used for c in (whole, thinned)]

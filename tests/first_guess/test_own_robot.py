@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import LidarStream, Measurements
-from icalib.initialize import own_robot
-from icalib.initialize.own_robot import _Near, own_points, without_own_robot
+from icalib.sensors.lidar.initialize import self_returns
+from icalib.sensors.lidar.initialize.self_returns import _Near, own_points, without_own_robot
 
 pytestmark = pytest.mark.slow
 
@@ -65,15 +65,15 @@ def test_what_stays_in_place_but_is_not_the_robot_s(robot, example, changes):
 
 def test_that_the_floor_is_seen_from_afar_is_what_saves_it(robot, monkeypatch):
     stream = raw(robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0])
-    monkeypatch.setattr(own_robot, "SEEN_FROM_AFAR", 2.0)
+    monkeypatch.setattr(self_returns, "SEEN_FROM_AFAR", 2.0)
     assert own_points(stream) is not None
 
 
 def test_of_a_long_recording_its_middle_tells(robot, monkeypatch):
     """And the robot is found in all of it."""
-    monkeypatch.setattr(own_robot, "MOST_SCANS", 70)
+    monkeypatch.setattr(self_returns, "MOST_SCANS", 70)
     whole = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0]
-    assert len(whole.stamps_ns) > 1.5 * own_robot.MOST_SCANS
+    assert len(whole.stamps_ns) > 1.5 * self_returns.MOST_SCANS
     stream, hit = with_panel(whole, *PANELS["panel ahead"])
     own = own_points(stream)
     assert own is not None and own[hit].mean() > 0.99 and own[~hit].mean() < 0.01

@@ -13,10 +13,10 @@ from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import NoTarget
 from icalib.initialize.steps.track_rotation import start_direction, track_rates, turn_information
-from icalib.initialize.tracks.track_lens import find_lens
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Parameter
+from icalib.sensors.camera.initialize.tracks.lens import find_lens
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Drive, Simulation, load_scenario, rig_for, simulate
 

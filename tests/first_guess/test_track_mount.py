@@ -15,11 +15,11 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.by_recording import one_after_another
-from icalib.initialize.tracks.track_mount import NEAREST_M, _misses, lens_slopes
-from icalib.initialize.tracks.tracks_on_motion import track_camera_values
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.rig import Parameter
+from icalib.sensors.camera.initialize.tracks.extrinsics import NEAREST_M, _misses, lens_slopes
+from icalib.sensors.camera.initialize.tracks.on_motion import track_camera_values
 from icalib.tools.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow

@@ -10,8 +10,8 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.wheels.wheel_poses import intervals_inside, mount_guess, poses_offset
 from icalib.motion.imu_data import ImuData
+from icalib.sensors.wheels.initialize.relative_poses import intervals_inside, mount_guess, poses_offset
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, simulate
 

@@ -21,16 +21,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.poses.pose_ways import TURNED, WAYS
-from icalib.initialize.poses.poses import check_rate, pose_values
-from icalib.initialize.robot import wheel_values
-from icalib.initialize.several import initial_guesses
-from icalib.initialize.steps.keyframe_spacing import keyframe_spacing
-from icalib.initialize.steps.known_values import given
-from icalib.initialize.steps.smooth_path import FEWEST, BodyPoses, SmoothPath
-from icalib.initialize.stop_and_go import is_stop_and_go, start_from_pairs
-from icalib.initialize.tracks.tracks_on_motion import track_camera_values
-from icalib.initialize.wheels.wheel_path import (
+from icalib.initialize.dead_reckoning import (
     as_given,
     camera_paths,
     in_place_of_wheels,
@@ -38,13 +29,22 @@ from icalib.initialize.wheels.wheel_path import (
     seen_from_first,
     wheel_path,
 )
-from icalib.initialize.wheels.wheels import SidewaysError
+from icalib.initialize.robot import wheel_values
+from icalib.initialize.steps.keyframe_spacing import keyframe_spacing
+from icalib.initialize.steps.known_values import given
+from icalib.initialize.steps.smooth_path import FEWEST, BodyPoses, SmoothPath
 from icalib.motion.nodes import first_nodes
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import ImuNoise, ImuSensor, Rig
+from icalib.sensors.camera.initialize.recordings import initial_guesses
+from icalib.sensors.camera.initialize.tracks.on_motion import track_camera_values
 from icalib.sensors.parameter import Parameter, fixed
+from icalib.sensors.pose.initialize.conventions import TURNED, WAYS
+from icalib.sensors.pose.initialize.extrinsics import check_rate, pose_values
+from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, start_from_pairs
 from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.sensor import mounted
+from icalib.sensors.wheels.initialize.drive import SidewaysError
 
 ASSUMPTION = "assumed motion"  # no sensor is called so
 STEP_S = 0.01  # between readings

@@ -19,8 +19,6 @@ from icalib.estimate.problem.groups import groups_of, with_groups
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Step, Visit
 from icalib.estimate.problem.problem import Problem
-from icalib.initialize.lidar.lidar_sight import naming_sight
-from icalib.initialize.parallax import no_parallax
 from icalib.initialize.start import start
 from icalib.initialize.steps.contradicted import FarOffError, is_contradicted, refusing_far_off
 from icalib.observability.contradictions import Contradiction, contradicted_by
@@ -28,6 +26,8 @@ from icalib.observability.determination import Determined, determine
 from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.pages import give_back
 from icalib.rig import LENS, Parameter, Rig, Sensor
+from icalib.sensors.camera.initialize.parallax import no_parallax
+from icalib.sensors.lidar.initialize.degeneracy import naming_sight
 
 POOR_FIT = 4.0  # times as large as their noise are the residuals of some sensor
 CLEARLY = 0.5  # times the misfit of another estimate

@@ -11,20 +11,27 @@ from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.lidar.lidar_rounds import lidar_values, with_lidars
-from icalib.initialize.poses.poses import pose_values
 from icalib.initialize.steps.by_recording import alone, each_clock
 from icalib.initialize.steps.contradicted import has_guesses, is_contradicted, refuse_far_off, settled
 from icalib.initialize.steps.known_values import given
-from icalib.initialize.wheels.wheel_poses import mount_guess, poses_offset
-from icalib.initialize.wheels.wheels import OPPOSITE, SidewaysError, WheelRates, drive_guess, wheel_offset, wheel_rates
 from icalib.motion.clocks import instants
 from icalib.motion.imu_data import clear_of
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
+from icalib.sensors.lidar.initialize.rounds import lidar_values, with_lidars
+from icalib.sensors.pose.initialize.extrinsics import pose_values
 from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.sensor import mounted
+from icalib.sensors.wheels.initialize.drive import (
+    OPPOSITE,
+    SidewaysError,
+    WheelRates,
+    drive_guess,
+    wheel_offset,
+    wheel_rates,
+)
+from icalib.sensors.wheels.initialize.relative_poses import mount_guess, poses_offset
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
 LEVEL = 0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level

@@ -14,23 +14,23 @@ from icalib.estimate.problem.assembly import host_times, nodes_for, resample, st
 from icalib.estimate.problem.inputs import Inputs, inputs_for, with_clouds
 from icalib.geometry.targets import NoTarget
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize import Guess, initial_trajectory
 from icalib.initialize.assumed_motion import start_without_imu
-from icalib.initialize.boards.board_turns import number_alike
-from icalib.initialize.boards.scene_growth import UntiedBodiesError
-from icalib.initialize.boards.targets_on_motion import with_mounts_guessed
-from icalib.initialize.lidar.lidar_rounds import state_from_lidar
-from icalib.initialize.own_robot import without_own_robot
-from icalib.initialize.poses.poses import pose_values, state_from_poses
 from icalib.initialize.robot import wheel_values, with_robot
-from icalib.initialize.several import initial_guesses
 from icalib.initialize.steps.by_recording import each_clock
 from icalib.initialize.steps.clocks import OneAxisError
-from icalib.initialize.tracks.tracks_on_motion import track_camera_values
 from icalib.motion.nodes import first_nodes
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import Rig
 from icalib.sensors.camera.bodies import without_bodies
+from icalib.sensors.camera.initialize.boards.numbering import number_alike
+from icalib.sensors.camera.initialize.boards.on_motion import with_mounts_guessed
+from icalib.sensors.camera.initialize.boards.scene_growth import UntiedBodiesError
+from icalib.sensors.camera.initialize.recordings import initial_guesses
+from icalib.sensors.camera.initialize.tracks.on_motion import track_camera_values
+from icalib.sensors.camera.initialize.with_imu import Guess, initial_trajectory
+from icalib.sensors.lidar.initialize.rounds import state_from_lidar
+from icalib.sensors.lidar.initialize.self_returns import without_own_robot
+from icalib.sensors.pose.initialize.extrinsics import pose_values, state_from_poses
 
 
 def start(

@@ -19,9 +19,9 @@ from icalib.initialize.steps.clocks import (
     turns_about_two_axes,
 )
 from icalib.initialize.steps.contradicted import is_contradicted, nearest_about
-from icalib.initialize.steps.guess import relative_offset
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera, Parameter
+from icalib.sensors.camera.initialize.guess import relative_offset
 
 
 def trusted(parameter: Parameter) -> np.ndarray | None:

@@ -11,7 +11,7 @@ from icalib.initialize.steps.align_camera import trusted
 from icalib.initialize.steps.by_recording import Held
 from icalib.optim.state import Key
 from icalib.rig import Camera, Lidar, PoseSensor, Wheels
-from icalib.rig.sensor import MOUNTED_NAMES
+from icalib.sensors.sensor import MOUNTED_NAMES
 
 
 def given(

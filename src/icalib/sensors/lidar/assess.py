@@ -12,7 +12,6 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.geometry.planes import plane_of
-from icalib.initialize.lidar.lidar_sight import count_of, facing
 from icalib.motion.clocks import instants
 from icalib.motion.factor import of_type
 from icalib.motion.nodes import usable
@@ -21,6 +20,7 @@ from icalib.result import Plane, SensorFit
 from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import Lidar, Rig
+from icalib.sensors.lidar.initialize.degeneracy import count_of, facing
 from icalib.sensors.lidar.lidar_binning import LidarNoise, in_world
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor

@@ -9,7 +9,6 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.robot import level_sensor
-from icalib.initialize.wheels.wheels import OPPOSITE
 from icalib.motion.clocks import instants
 from icalib.motion.factor import of_type
 from icalib.result import ParameterGroup, RowResiduals, SensorFit
@@ -17,6 +16,7 @@ from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
+from icalib.sensors.wheels.initialize.drive import OPPOSITE
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor
 
 LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical slip": ("vertical",)} | {

@@ -18,8 +18,6 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.poses.pose_pairs import partners
-from icalib.initialize.poses.pose_ways import placed
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import BodyPoses
@@ -27,6 +25,8 @@ from icalib.motion.pose_rows import Mount
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.parameter import fixed
+from icalib.sensors.pose.initialize.conventions import placed
+from icalib.sensors.pose.initialize.pairs import partners
 from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.sensor import MOUNTED_NAMES
 

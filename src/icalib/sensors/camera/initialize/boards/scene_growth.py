@@ -16,12 +16,19 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.boards.scene import Placed, body_poses, poses_by_bodies
-from icalib.initialize.boards.scene_bundle import UNSEEN_PX, CameraIntrinsics, SceneState, SceneViews, adjust, errors
 from icalib.initialize.steps.target_poses import LARGEST_RMS_PX, MOST_CORNERS, TargetPoses
 from icalib.optim.state import Key
 from icalib.sensors.camera.bodies import Bodies
 from icalib.sensors.camera.corner_factor import Views
+from icalib.sensors.camera.initialize.boards.scene import Placed, body_poses, poses_by_bodies
+from icalib.sensors.camera.initialize.boards.scene_bundle import (
+    UNSEEN_PX,
+    CameraIntrinsics,
+    SceneState,
+    SceneViews,
+    adjust,
+    errors,
+)
 
 MOST_IMAGES = 60  # spread over the recording
 OF_EACH_PAIR = 4  # images that tie two bodies

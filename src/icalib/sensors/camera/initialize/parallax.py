@@ -10,10 +10,10 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.track_rotation import start_turn, turn_between, turn_error
-from icalib.initialize.tracks.from_tracks import lens_start
-from icalib.initialize.tracks.track_alignment import Pair, pairs_of
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Rig
+from icalib.sensors.camera.initialize.tracks.alignment import Pair, pairs_of
+from icalib.sensors.camera.initialize.tracks.from_tracks import lens_start
 
 # Times the error of rays: what is left of two images by rotation alone is two errors on two axes, and that by epipolar
 # geometry one on one axis, so that noise alone makes up to 2.3.

@@ -15,10 +15,10 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.evidence.corner_noise import SMALLEST_BASE_PX
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.boards.scene import Placed, poses_by_bodies
-from icalib.initialize.boards.scene_growth import fixed_lens, grow
 from icalib.rig import Rig
 from icalib.sensors.camera.bodies import restrict
+from icalib.sensors.camera.initialize.boards.scene import Placed, poses_by_bodies
+from icalib.sensors.camera.initialize.boards.scene_growth import fixed_lens, grow
 
 # Ratio of the errors of median images. At 1.5 the movement adds as much again to the errors that single recordings
 # leave. At twice that, movements by two standard deviations of the corners would pass.

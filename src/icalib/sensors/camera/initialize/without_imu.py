@@ -7,11 +7,11 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.steps.guess import CameraGuess, Guess, relative_offset
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.optim.state import Key
 from icalib.rig import Rig
 from icalib.sensors.camera.bodies import taken_at_once
+from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 
 MOST_PAIRS = 200  # of images taken together; more do not make a first guess better
 Scene = dict[Key, np.ndarray]

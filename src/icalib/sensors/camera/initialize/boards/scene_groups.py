@@ -18,14 +18,14 @@ import numpy as np
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.boards.scene import Placed, scene_poses
-from icalib.initialize.boards.scene_growth import UntiedBodiesError, place_bodies
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, PosePairs, hand_eye, left_over
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.motion.pose_rows import Frame, Mount
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.bodies import FEWEST_TOGETHER, Bodies, camera_times, restrict, taken_at_once, tied_by_images
+from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
+from icalib.sensors.camera.initialize.boards.scene_growth import UntiedBodiesError, place_bodies
 
 
 def place_groups(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]) -> Placed:

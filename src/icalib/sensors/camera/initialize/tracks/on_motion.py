@@ -13,14 +13,14 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.align_camera import trusted
 from icalib.initialize.steps.by_recording import alone, each_clock, motion_alone, naming_recording, other_clocks
 from icalib.initialize.steps.clocks import main_axis, rough_alignments
-from icalib.initialize.steps.guess import relative_offset
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.rate_shifts import telling_rates
-from icalib.initialize.tracks.from_tracks import lens_start
-from icalib.initialize.tracks.track_mount import CameraExtrinsics, ImagePairs, place_on_motion
 from icalib.optim.arrowhead import THREADS
 from icalib.optim.state import Key, State
 from icalib.rig import Camera
+from icalib.sensors.camera.initialize.guess import relative_offset
+from icalib.sensors.camera.initialize.tracks.extrinsics import CameraExtrinsics, ImagePairs, place_on_motion
+from icalib.sensors.camera.initialize.tracks.from_tracks import lens_start
 from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.initialize.lidar.lidar_map import ScanPose, VoxelMap, insert
+from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert
 
 SCANS = 20
 MOST_POINTS = 6000  # of a scan

@@ -21,8 +21,6 @@ from icalib.initialize.paths.lever_arm_rows import LeverArmRows, against_motion,
 from icalib.initialize.paths.on_motion import path_on_motion, path_rates, poses_in, too_short
 from icalib.initialize.paths.path import ExtrinsicsGuess, SensorPath
 from icalib.initialize.paths.with_imu import G_TOLERANCE, PathMotion, motion_of_path
-from icalib.initialize.poses.pose_frames import turn_of_positions
-from icalib.initialize.poses.pose_ways import placed
 from icalib.initialize.steps.by_recording import (
     Held,
     alone,
@@ -41,8 +39,10 @@ from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import Key, State
 from icalib.rig import PoseSensor
-from icalib.rig.sensor import MOUNTED_NAMES
+from icalib.sensors.pose.initialize.conventions import placed
+from icalib.sensors.pose.initialize.position_frame import turn_of_positions
 from icalib.sensors.pose.residual import FRAME, frame_of
+from icalib.sensors.sensor import MOUNTED_NAMES
 
 LEAST_RATE_HZ = 2.0  # of poses of something that moves
 APART_S = 0.4  # of poses that show whether they fit: next to each other they differ by little but noise

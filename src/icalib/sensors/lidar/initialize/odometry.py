@@ -15,10 +15,10 @@ import numpy as np
 
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.initialize.lidar.lidar_map import ScanPose, VoxelMap, insert, pick, turn_back
-from icalib.initialize.lidar.lidar_registration import Expected, expected_pose, register
 from icalib.initialize.paths.path import SensorPath
 from icalib.optim.arrowhead import THREADS
+from icalib.sensors.lidar.initialize.registration import Expected, expected_pose, register
+from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert, pick, turn_back
 
 MOST_MATCHED, MOST_MAPPED = 1500, 6000  # points of a scan
 MOST_WIDE = 500  # while the pose is rough, and every point looks into many voxels

@@ -16,7 +16,7 @@ from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.optim.state import Key
 from icalib.rig import Parameter, PoseSensor, Rig, Wheels
-from icalib.rig.sensor import MOUNTED_NAMES
+from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
 

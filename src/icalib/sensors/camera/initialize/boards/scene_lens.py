@@ -13,13 +13,13 @@ from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import Target
-from icalib.initialize.boards.intrinsics import camera_params
-from icalib.initialize.boards.scene import Placed
-from icalib.initialize.boards.scene_bundle import CameraIntrinsics
-from icalib.initialize.boards.scene_groups import place_groups
-from icalib.initialize.boards.scene_growth import grow, place_bodies
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict, tied_by_images
+from icalib.sensors.camera.initialize.boards.intrinsics import camera_params
+from icalib.sensors.camera.initialize.boards.scene import Placed
+from icalib.sensors.camera.initialize.boards.scene_bundle import CameraIntrinsics
+from icalib.sensors.camera.initialize.boards.scene_groups import place_groups
+from icalib.sensors.camera.initialize.boards.scene_growth import grow, place_bodies
 
 TRIAL_WIDTHS = (0.6, 1.0, 0.35)  # focal lengths to try, in image widths: views of 80, 53 and 110 degrees
 JUDGED_SHARE = 0.9  # of the images tell whether a scene fits: where a part of it stands wrongly, most still do

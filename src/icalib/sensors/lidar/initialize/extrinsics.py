@@ -12,7 +12,6 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.lidar.lidar_odometry import Scan, lidar_path, scans_of
 from icalib.initialize.paths.alignment import align_path
 from icalib.initialize.paths.imu_motion import LONGEST_STEP_S, ImuMotion
 from icalib.initialize.paths.lever_arm_rows import (
@@ -33,6 +32,7 @@ from icalib.initialize.steps.clocks import Alignment, only_axis
 from icalib.initialize.steps.gyro import GyroRotation
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
+from icalib.sensors.lidar.initialize.odometry import Scan, lidar_path, scans_of
 
 LEAST_CORRELATION = 0.6  # of turning rates with the IMU's
 ARM_ROUNDS = 2  # each brings the path nearer to the known motion

@@ -18,9 +18,6 @@ from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.assembly import host_times, motion_of, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, with_clouds
 from icalib.geometry.planes import plane_of
-from icalib.initialize.lidar.lidar import lidar_and_motion, lidar_on_motion
-from icalib.initialize.lidar.lidar_planes import ROUNDS, Association, associate, odd_step, round_search
-from icalib.initialize.lidar.lidar_sight import naming_sight
 from icalib.initialize.steps.by_recording import (
     Held,
     alone,
@@ -40,6 +37,9 @@ from icalib.motion.known_motion import near_nodes
 from icalib.motion.point_planes import are_somewhere, thinned
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.state import Key, State
+from icalib.sensors.lidar.initialize.association import ROUNDS, Association, associate, odd_step, round_search
+from icalib.sensors.lidar.initialize.degeneracy import naming_sight
+from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.lidar_binning import COARSE_BIN_S, Associated, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.model import FIRST_RANGE_M
 from icalib.sensors.sensor import MOUNTED_NAMES

@@ -10,16 +10,16 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize import initial_guess
-from icalib.initialize.boards.scene import Placed, scene_poses
-from icalib.initialize.boards.scene_changes import check_scene
-from icalib.initialize.boards.scene_lens import find_scene
 from icalib.initialize.steps.clocks import OneAxisError, better_offset, camera_rates
-from icalib.initialize.steps.guess import CameraGuess, Guess
-from icalib.initialize.tracks.from_tracks import guess_from_tracks
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.bodies import Bodies
+from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
+from icalib.sensors.camera.initialize.boards.scene_changes import check_scene
+from icalib.sensors.camera.initialize.boards.scene_lens import find_scene
+from icalib.sensors.camera.initialize.guess import CameraGuess, Guess
+from icalib.sensors.camera.initialize.tracks.from_tracks import guess_from_tracks
+from icalib.sensors.camera.initialize.with_imu import initial_guess
 from icalib.sensors.parameter import fixed
 
 

@@ -31,10 +31,10 @@ from icalib.initialize.steps.gyro import GyroRotation
 from icalib.initialize.steps.mean_rates import MeanRates
 from icalib.initialize.steps.rate_shifts import best_regressions, telling_rates
 from icalib.initialize.steps.track_rotation import track_rates, turns_information
-from icalib.initialize.tracks.track_alignment import gyro_turns
-from icalib.initialize.tracks.track_mount import ImagePairs, lens_slopes
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
+from icalib.sensors.camera.initialize.tracks.alignment import gyro_turns
+from icalib.sensors.camera.initialize.tracks.extrinsics import ImagePairs, lens_slopes
 
 ANY_LENS = "pinhole-equidistant"  # its start, r = f theta, is near every lens, wide and narrow
 STARTS = (1.0, 0.35)  # of the image width: near a usual lens, and a fisheye one

@@ -14,15 +14,15 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.align_camera import align_camera, chosen_offset, trusted
 from icalib.initialize.steps.clocks import Alignment
 from icalib.initialize.steps.contradicted import chosen
-from icalib.initialize.steps.guess import CameraGuess, Guess, relative_offset
 from icalib.initialize.steps.gyro import GyroRotation
 from icalib.initialize.steps.rate_shifts import telling_rates
 from icalib.initialize.steps.target_poses import TargetPoses
-from icalib.initialize.tracks.track_alignment import align_together, pairs_of
-from icalib.initialize.tracks.track_lens import find_lens
-from icalib.initialize.tracks.track_motion import Rays, WindowMotion, track_motion
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
+from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
+from icalib.sensors.camera.initialize.tracks.alignment import align_together, pairs_of
+from icalib.sensors.camera.initialize.tracks.lens import find_lens
+from icalib.sensors.camera.initialize.tracks.motion import Rays, WindowMotion, track_motion
 
 APART_S, FEWEST_SEEN = 0.15, 3
 LEAST_FELT = 0.7  # of gravity; half the time a rig is not thrown about

@@ -14,8 +14,8 @@ import numpy as np
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.lidar.lidar_odometry import MOST_MAPPED, lidar_path, scans_of
 from icalib.initialize.paths.path import SensorPath
+from icalib.sensors.lidar.initialize.odometry import MOST_MAPPED, lidar_path, scans_of
 
 REACH_M = 2.5  # a robot does not reach further from its LiDAR
 VOXEL_M = 0.1

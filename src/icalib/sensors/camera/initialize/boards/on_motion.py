@@ -11,17 +11,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.data.measurements import seconds_since
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.boards.scene import scene_poses
-from icalib.initialize.boards.scene_lens import find_scene, lens_of
 from icalib.initialize.paths.on_motion import path_on_motion
 from icalib.initialize.paths.path import SensorPath
 from icalib.initialize.steps.by_recording import Held, alone, motion_alone, naming_recording
 from icalib.optim.state import State
 from icalib.rig import Camera, Parameter, Rig
+from icalib.sensors.camera.initialize.boards.scene import scene_poses
+from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, lens_of
 from icalib.sensors.sensor import mounted
+from icalib.sensors.stream import seconds_since
 
 
 def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) -> Rig:

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, solve_definite, tmul3
-from icalib.initialize.lidar.lidar_map import UNKNOWNS, ScanPose, moved, sums
+from icalib.sensors.lidar.initialize.voxel_map import UNKNOWNS, ScanPose, moved, sums
 
 ROUNDS = 14
 WIDE_ROUNDS = 4  # that look into voxels around

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from icalib.data.measurements import PoseStream
 from icalib.data.tables.axes import in_axes
 from icalib.errors import EstimationError
-from icalib.initialize.poses.pose_frames import words_for
 from icalib.rig import Axes
+from icalib.sensors.pose.initialize.position_frame import words_for
 
 Way = Callable[[PoseStream], PoseStream]
 T = TypeVar("T")

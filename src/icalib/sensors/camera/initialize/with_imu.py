@@ -1,0 +1,165 @@
+"""The first guess, from nothing: intrinsics, poses, clocks, rotation, gravity, lever arms. What the rig gives is
+used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.data.measurements import Measurements
+from icalib.errors import EstimationError
+from icalib.geometry.cameras import camera_model
+from icalib.initialize.paths.imu_axes import refuse_other_axes
+from icalib.initialize.steps.align_camera import align_camera, chosen_offset, trusted
+from icalib.initialize.steps.clocks import Alignment, camera_rates
+from icalib.initialize.steps.contradicted import chosen, chosen_along
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.lever_arm import LeverArm, check_gravity, check_size, lever_arm
+from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.motion.imu_data import ImuData, imu_data
+from icalib.optim.state import Key
+from icalib.rig import Camera, Rig
+from icalib.sensors.camera.bodies import choose_bodies, restrict
+from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
+from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, lens_of
+from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
+from icalib.sensors.camera.initialize.without_imu import guess_without_imu, trajectory_without_imu
+
+__all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
+
+VELOCITY_STEP_S = 0.04
+
+
+def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = None) -> Guess:
+    """`scene`: where the bodies of the target stand, if that is known already, and all streams hold only theirs.
+
+    Raises EstimationError, one sentence, where the recording does not carry a guess.
+    """
+    if scene is None:
+        bodies = choose_bodies(rig.target, [measurements], bent=False, rig=rig)
+        measurements = restrict(bodies, measurements)
+        scene = find_scene(rig, bodies, [measurements])
+    params = [lens_of(c, s, rig.target, scene) for c, s in zip(rig.cameras, measurements.cameras, strict=True)]
+    poses = [
+        scene_poses(s, camera_model(c.model), p, scene)
+        for c, s, p in zip(rig.cameras, measurements.cameras, params, strict=True)
+    ]
+    imu = imu_data(rig, measurements)
+    if imu is None:
+        return guess_without_imu(rig, measurements, params, poses, scene.values)
+    assert rig.imu is not None
+    seen = _TargetViews(rig, measurements, params, poses, scene.values)
+    try:
+        guess, unlike = seen.guess(imu)
+    except EstimationError as error:
+        refuse_other_axes(rig.imu, imu, seen.left, error)
+        raise
+    if unlike:
+        refuse_other_axes(rig.imu, imu, seen.left, None)
+    return guess
+
+
+@dataclass(frozen=True)
+class _TargetViews:
+    """What cameras saw of the target: params (P,) and poses of each; scene: poses of the target's bodies."""
+
+    rig: Rig
+    measurements: Measurements
+    params: list[np.ndarray]
+    poses: list[TargetPoses]
+    scene: dict[Key, np.ndarray]
+
+    def guess(self, imu: ImuData) -> tuple[Guess, bool]:
+        """By the IMU's readings; and whether the accelerometer felt another motion than a camera saw."""
+        best = self._best
+        aligned = [self._aligned(imu, k) for k in range(len(self.poses))]
+        gyro = GyroRotation.integrate(imu, aligned[best].gyro_bias)
+        arms = [self._arm(imu, k, a, gyro) for k, a in enumerate(aligned)]
+        self._check_gravity(imu, arms[best], aligned[best])
+        for c, arm, a in zip(self.rig.cameras, arms, aligned, strict=True):
+            check_size(arm, c.name, a.given)
+        cameras = {
+            c.name: _camera_guess(c, self._offset(imu, k, a), self.params[k], a, arm, self.poses[k])
+            for k, (c, a, arm) in enumerate(zip(self.rig.cameras, aligned, arms, strict=True))
+        }
+        guess = Guess(cameras, aligned[best].gyro_bias, _mean_bias(arms), _level(arms[best].gravity), self.scene)
+        return guess, arms[best].unlike
+
+    def left(self, imu: ImuData) -> float:
+        """What readings leave of the acceleration that the camera with most poses saw. Raises EstimationError where
+        they do not fit it at all."""
+        a = self._aligned(imu, self._best)
+        arm = self._arm(imu, self._best, a, GyroRotation.integrate(imu, a.gyro_bias))
+        self._check_gravity(imu, arm, a)
+        return arm.left
+
+    @property
+    def _best(self) -> int:
+        return int(np.argmax([q.ok.sum() for q in self.poses]))
+
+    def _aligned(self, imu: ImuData, k: int) -> Alignment:
+        stream = self.measurements.cameras[k]
+        return align_camera(self.rig.cameras[k], stream, camera_rates(stream, self.poses[k]), imu, self.measurements)
+
+    def _offset(self, imu: ImuData, k: int, found: Alignment) -> float:
+        camera, stream = self.rig.cameras[k], self.measurements.cameras[k]
+        raw = camera.time_offset.value
+        given = None if raw is None else relative_offset(raw, stream, self.measurements)
+        return chosen_offset(camera, camera_rates(stream, self.poses[k]), imu, given, found)
+
+    def _arm(self, imu: ImuData, k: int, aligned: Alignment, gyro: GyroRotation) -> LeverArm:
+        t, known = self.measurements.cameras[k].seconds + aligned.offset, trusted(self.rig.cameras[k].translation)
+        return lever_arm(imu, t, self.poses[k], aligned.rotation, gyro, known)
+
+    def _check_gravity(self, imu: ImuData, arm: LeverArm, aligned: Alignment) -> None:
+        check_gravity(float(np.linalg.norm(arm.gravity)), self.rig.gravity, imu.name, aligned.given)
+
+
+def _camera_guess(
+    camera: Camera, offset: float, params: np.ndarray, aligned: Alignment, arm: LeverArm, poses: TargetPoses
+) -> CameraGuess:
+    """What was found, and in its place what the rig gives, but guesses that it contradicts."""
+    p = camera.translation.value
+    if p is not None and camera.translation.mode == "free":
+        p = chosen_along(p, arm.position, arm.covariance)
+    return CameraGuess(
+        params,
+        offset,
+        chosen("rotation", camera.rotation, camera.rotation.value, aligned.rotation),
+        arm.position if p is None else p,
+        poses,
+    )
+
+
+def _mean_bias(arms: list[LeverArm]) -> np.ndarray:
+    return np.mean([a.accel_bias for a in arms], axis=0)
+
+
+def _level(gravity_board: np.ndarray) -> np.ndarray:
+    """R_world_board with z against gravity and x along the horizontal direction nearest to the board's x (or y)."""
+    up = -gravity_board / np.linalg.norm(gravity_board)
+    reference = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
+    x = reference - (reference @ up) * up
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])
+
+
+def initial_trajectory(
+    guess: Guess, rig: Rig, measurements: Measurements, nodes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """R_world_imu (K, 3, 3), position and velocity (K, 3) at `nodes` [s on the imu clock since its first stamp].
+
+    From the nearest camera pose, rotation carried by the gyroscope, position interpolated.
+    """
+    imu = imu_data(rig, measurements)
+    if imu is None:
+        return trajectory_without_imu(guess, measurements, nodes)
+    t, R, p = guess.body_poses(measurements)
+
+    def position(s: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(s, t, p[:, k]) for k in range(3)], axis=1)
+
+    rotation = GyroRotation.integrate(imu, guess.gyro_bias).carry(t, R, nodes)
+    velocity = (position(nodes + VELOCITY_STEP_S) - position(nodes - VELOCITY_STEP_S)) / (2.0 * VELOCITY_STEP_S)
+    return np.ascontiguousarray(rotation), position(nodes), velocity
