@@ -15,7 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from icalib.sensors.camera.initialize.trajectory import first_state
 
 import icalib
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
@@ -25,6 +24,7 @@ from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
+from icalib.sensors.camera.initialize.trajectory import first_state
 from icalib.sensors.camera.initialize.with_imu import initial_guess
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "euroc"

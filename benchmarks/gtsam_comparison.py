@@ -19,13 +19,13 @@ import gtsam
 import gtsam_unstable
 import numpy as np
 from gtsam.symbol_shorthand import B, L, T, V, X
-from icalib.sensors.camera.initialize.trajectory import first_state
 
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.estimate.estimate import Estimate, estimate
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.optim.state import State
 from icalib.rig import Rig
+from icalib.sensors.camera.initialize.trajectory import first_state
 from icalib.sensors.camera.initialize.with_imu import initial_guess
 from icalib.sensors.parameter import fixed
 

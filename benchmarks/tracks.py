@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from icalib.sensors.camera.initialize.trajectory import first_state
 from threadpoolctl import threadpool_limits
 
 from icalib.estimate.estimate import Estimate, estimate
@@ -25,6 +24,7 @@ from icalib.optim.arrowhead import Piece, solve
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.sensors.camera.initialize.recordings import initial_guesses
+from icalib.sensors.camera.initialize.trajectory import first_state
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 
 SCENARIO = Path(__file__).parents[1] / "examples" / "paper" / "table2-3d.yaml"

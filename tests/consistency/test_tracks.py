@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icalib.sensors.camera.initialize.trajectory import first_state
 from scipy.spatial.transform import Rotation
 from tests.typed import not_none
 
@@ -21,6 +20,7 @@ from icalib.geometry.targets import NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.sensors.camera.initialize.recordings import initial_guesses
+from icalib.sensors.camera.initialize.trajectory import first_state
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"

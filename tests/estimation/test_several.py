@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from icalib.sensors.camera.initialize.trajectory import first_state
 from tests.typed import not_none
 
 from icalib.data.joining import PAUSE_NS, join
@@ -24,6 +23,7 @@ from icalib.optim.state import NODE, State
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.initialize.recordings import initial_guesses
+from icalib.sensors.camera.initialize.trajectory import first_state
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.parameter import fixed
 from icalib.tools.simulation import handheld, rig_for, simulate

@@ -14,7 +14,7 @@ from icalib.estimate.problem.inputs import inputs_for
 from icalib.optim.state import State
 from icalib.sensors.pose.initialize.extrinsics import pose_values, state_from_poses
 from icalib.sensors.pose.simulate import SimPoses
-from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
+from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 
@@ -98,7 +98,7 @@ def test_written_another_way(sim, way, words):
     with pytest.raises(EstimationError, match=words):
         state_from_poses(inputs)
     with pytest.raises(EstimationError, match=words):
-        pose_values(inputs, state_of(sim))
+        pose_values(inputs, state_of(sim), inputs.rig.poses)
 
 
 def test_on_a_floor_inverted_poses_fit_by_their_rates_alone():

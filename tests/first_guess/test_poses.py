@@ -77,7 +77,7 @@ def test_with_the_imu_alone(sim):
 
 def test_on_a_motion_that_is_known(sim):
     inputs = inputs_for(rig_for(sim.scenario), [sim.measurements])
-    found = pose_values(inputs, truth_at(sim, np.arange(0.0, 14.9, 0.05)))
+    found = pose_values(inputs, truth_at(sim, np.arange(0.0, 14.9, 0.05)), inputs.rig.poses)
     assert (np.array(errors(sim, found)) < KNOWN[sim.scenario.of(SimPoses)[0].kind]).all()
     frame = frame_of("mocap0", 0)
     if sim.scenario.of(SimPoses)[0].kind == "relative":

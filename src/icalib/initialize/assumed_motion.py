@@ -29,7 +29,7 @@ from icalib.initialize.dead_reckoning import (
     seen_from_first,
     wheel_path,
 )
-from icalib.initialize.robot import wheel_values
+from icalib.initialize.steps.initializer import placed
 from icalib.initialize.steps.keyframe_spacing import keyframe_spacing
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import FEWEST, BodyPoses, SmoothPath
@@ -40,7 +40,7 @@ from icalib.sensors.camera.initialize.recordings import initial_guesses
 from icalib.sensors.camera.initialize.tracks.on_motion import track_camera_values
 from icalib.sensors.parameter import Parameter, fixed
 from icalib.sensors.pose.initialize.conventions import TURNED, WAYS
-from icalib.sensors.pose.initialize.extrinsics import check_rate, pose_values
+from icalib.sensors.pose.initialize.extrinsics import check_rate
 from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, start_from_pairs
 from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.sensor import mounted
@@ -105,9 +105,8 @@ def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
     elif not (rig.has_target or rig.moves_by_poses):
         cameras = as_given(inputs, cameras)
     moving, turned = _moving(inputs, shown, cameras)
-    placed = pose_values(felt, moving) | moving.values
-    known = all((w.name, "rotation") in placed for w in rig.wheels)
-    values = placed if known else wheel_values(felt, replace(moving, values=placed)) | placed
+    others = [s for s in body.mounted if (s.name, "rotation") not in moving.values]
+    values = placed(felt, moving, others) | moving.values
     return inputs, replace(moving, bias=-turned, values=values), values
 
 

@@ -7,6 +7,7 @@ it spoils the estimate, the one without says which of it contradicts the data.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -21,13 +22,12 @@ from icalib.estimate.problem.outcome import Step, Visit
 from icalib.estimate.problem.problem import Problem
 from icalib.initialize.start import start
 from icalib.initialize.steps.contradicted import FarOffError, is_contradicted, refusing_far_off
+from icalib.initialize.steps.initializer import kinds_of, motion_kinds
 from icalib.observability.contradictions import Contradiction, contradicted_by
 from icalib.observability.determination import Determined, determine
 from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.pages import give_back
 from icalib.rig import LENS, Parameter, Rig, Sensor
-from icalib.sensors.camera.initialize.parallax import no_parallax
-from icalib.sensors.lidar.initialize.degeneracy import naming_sight
 
 POOR_FIT = 4.0  # times as large as their noise are the residuals of some sensor
 CLEARLY = 0.5  # times the misfit of another estimate
@@ -101,20 +101,11 @@ def _or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] 
 def explained(
     rig: Rig, recordings: Sequence[Measurements], make: Callable[[Rig], Attempt], failed: EstimationError
 ) -> EstimationError:
-    """Why an estimate `failed`: where points alone show the motion and it breaks down, whether these move at all beside
-    rotation; where relative poses do, whether it does not with the same poses as absolute ones."""
-    if isinstance(failed, NotDefiniteError) and rig.cameras and not (rig.has_target or rig.lidars):
-        return no_parallax(rig, recordings) or failed
-    alone = rig.poses and rig.poses[0].kind == "relative" and not (rig.cameras or rig.lidars)
-    if not (alone and isinstance(failed, NotDefiniteError)):
+    """Why an estimate `failed`, as the kind of sensor that gave the motion explains a breakdown; else `failed`."""
+    if not isinstance(failed, NotDefiniteError):
         return failed
-    first, *others = rig.poses
-    if _converged(rig.with_sensors(replace(first, kind="absolute")), make) is None:
-        return failed
-    return EstimationError(
-        f"{first.name}: with kind: relative its poses are too noisy to give the motion, with kind: absolute "
-        "they are not; write kind: absolute if they hardly drift over the recording."
-    )
+    source = motion_kinds(rig)[0]
+    return source.explained(rig, recordings, lambda changed: _converged(changed, make) is not None) or failed
 
 
 def _made(
@@ -126,7 +117,9 @@ def _made(
 ) -> Attempt:
     inputs, state, guess = start(rig, recordings, lap)
     give_back()
-    with naming_sight(() if rig.cameras else inputs.measurements.lidars):
+    with ExitStack() as explaining:
+        for kind in kinds_of(rig):
+            explaining.enter_context(kind.explaining(inputs))
         found = determine(inputs, state, on_step, partial(on_visit, inputs), guess)
     return Attempt(inputs, found)
 

@@ -7,11 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from icalib.estimate.problem.inputs import Inputs, origin_difference
-from icalib.initialize.steps.align_camera import trusted
 from icalib.initialize.steps.by_recording import Held
 from icalib.optim.state import Key
-from icalib.rig import Camera, Lidar, PoseSensor, Wheels
+from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
 from icalib.sensors.sensor import MOUNTED_NAMES
+
+
+def trusted(parameter: Parameter) -> np.ndarray | None:
+    """The value of a parameter that is fixed or has a prior: other guesses may rest on it. A guess may be far off."""
+    return None if parameter.mode == "free" else parameter.value
 
 
 def given(

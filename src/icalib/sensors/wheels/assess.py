@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.robot import level_sensor
+from icalib.initialize.steps.vertical import level_sensor
 from icalib.motion.clocks import instants
 from icalib.motion.factor import of_type
 from icalib.result import ParameterGroup, RowResiduals, SensorFit

@@ -1,1 +1,70 @@
-"""Initial guess of cameras."""
+"""Initial guess of cameras: lens, poses or tracks, extrinsics, and the motion that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from icalib.data.measurements import Measurements
+from icalib.errors import EstimationError
+from icalib.estimate.estimate import first_pass
+from icalib.estimate.problem.inputs import Inputs
+from icalib.initialize.steps.clocks import OneAxisError
+from icalib.initialize.steps.initializer import BY_TARGET, BY_TRACKS, Initializer, Moving, Values
+from icalib.optim.state import State
+from icalib.rig import Camera, Rig
+from icalib.sensors.camera.initialize.boards.on_motion import with_mounts_guessed
+from icalib.sensors.camera.initialize.guess import Guess
+from icalib.sensors.camera.initialize.parallax import no_parallax
+from icalib.sensors.camera.initialize.recordings import initial_guesses
+from icalib.sensors.camera.initialize.tracks.on_motion import track_camera_values
+from icalib.sensors.camera.initialize.trajectory import first_state
+
+
+class CameraInitializer(Initializer[Camera]):
+    """Cameras that see a target give the motion before all others; those with feature tracks after LiDARs, or they are
+    placed on a motion."""
+
+    hosts_keyframes = True
+    refined_alone = False  # the estimate begins with the same pass
+
+    def motion_rank(self, rig: Rig) -> int | None:
+        if not rig.cameras:
+            return None
+        return BY_TARGET if rig.has_target else BY_TRACKS
+
+    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+        return first_state(inputs, *_guesses(inputs, other))
+
+    def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+        return inputs, first_pass(inputs, state), state.values
+
+    def place(self, inputs: Inputs, state: State, sensors: Sequence[Camera]) -> Values:
+        """Cameras with feature tracks."""
+        del sensors
+        return track_camera_values(inputs, state)
+
+    def explained(
+        self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
+    ) -> EstimationError | None:
+        """Of feature tracks: whether they have parallax."""
+        del converges
+        return None if rig.has_target else no_parallax(rig, recordings)
+
+
+def _guesses(inputs: Inputs, other: Callable[[], Moving]) -> tuple[Guess, ...]:
+    """A guess for each recording. If the rig turned about one axis only, the motion of `other` kinds shows the rotation
+    about it."""
+    rig, seen = inputs.rig, [m.measurements for m in inputs.motions]
+    try:
+        return initial_guesses(rig, inputs.bodies, seen)
+    except OneAxisError as error:
+        if not rig.has_target:
+            raise
+        try:
+            rig = with_mounts_guessed(rig, inputs, *other())
+        except EstimationError:
+            raise error from None
+        return initial_guesses(rig, inputs.bodies, seen)
+
+
+INITIALIZER = CameraInitializer()

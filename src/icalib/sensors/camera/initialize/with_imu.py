@@ -11,7 +11,6 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.paths.imu_axes import refuse_other_axes
-from icalib.initialize.steps.align_camera import align_camera, chosen_offset, trusted
 from icalib.initialize.steps.clocks import Alignment, camera_rates
 from icalib.initialize.steps.contradicted import chosen, chosen_along
 from icalib.initialize.steps.gyro import GyroRotation
@@ -21,6 +20,7 @@ from icalib.motion.imu_data import ImuData, imu_data
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.bodies import choose_bodies, restrict
+from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, trusted
 from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
 from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, lens_of
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset

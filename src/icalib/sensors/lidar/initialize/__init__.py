@@ -1,1 +1,60 @@
-"""Initial guess from point clouds."""
+"""Initial guess of LiDARs: a trajectory by registration of scans, extrinsics, and points on planes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+
+from icalib.data.measurements import Measurements
+from icalib.estimate.problem.inputs import Inputs, with_clouds
+from icalib.initialize.steps.initializer import BY_SCANS, Initializer, Moving, Values
+from icalib.initialize.steps.known_values import given
+from icalib.optim.state import State
+from icalib.rig import Lidar, Rig
+from icalib.sensors.lidar.initialize.degeneracy import naming_sight
+from icalib.sensors.lidar.initialize.rounds import lidar_values, state_from_lidar, with_lidars
+from icalib.sensors.lidar.initialize.self_returns import without_own_robot
+
+
+class LidarInitializer(Initializer[Lidar]):
+    """The first LiDAR gives the motion where no camera sees a target; all others are placed on it."""
+
+    moves_keyframes = True
+
+    def motion_rank(self, rig: Rig) -> int | None:
+        return BY_SCANS if rig.lidars else None
+
+    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+        del other
+        return state_from_lidar(inputs)
+
+    def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+        state = replace(state, values=state.values | self.place(inputs, state, inputs.rig.lidars))
+        inputs, associated, changed = self.associated(inputs, state)
+        return inputs, associated, state.values | changed
+
+    def adopted(self, whole: Inputs, own: Inputs) -> Inputs:
+        measured = replace(whole.measurements.with_streams(*own.measurements.lidars), notes=own.measurements.notes)
+        return replace(with_clouds(replace(whole, measurements=measured), own.clouds), guess=own.guess)
+
+    def place(self, inputs: Inputs, state: State, sensors: Sequence[Lidar]) -> Values:
+        del sensors
+        return lidar_values(inputs, state)
+
+    def associated(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+        """The points on planes. The rounds of association may stray from the guess where the motion shows nothing, so
+        that the guess is kept as it was before."""
+        known = {key: value for lidar in inputs.rig.lidars for key, value in given(inputs, lidar).items()}
+        guess = replace(state, values=state.values | known)
+        inputs, state = with_lidars(inputs, state)
+        return replace(inputs, guess=guess), state, known
+
+    def cleaned(self, recording: Measurements) -> Measurements:
+        return without_own_robot(recording)
+
+    def explaining(self, inputs: Inputs) -> AbstractContextManager[None]:
+        return naming_sight(() if inputs.rig.cameras else inputs.measurements.lidars)
+
+
+INITIALIZER = LidarInitializer()

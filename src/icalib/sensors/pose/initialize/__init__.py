@@ -1,1 +1,62 @@
-"""Initial guess from poses."""
+"""Initial guess of pose sensors: a trajectory with the IMU, extrinsics, and the frame of absolute poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.data.measurements import Measurements
+from icalib.errors import EstimationError
+from icalib.estimate.estimate import first_pass
+from icalib.estimate.problem.inputs import Inputs
+from icalib.initialize.steps.initializer import BY_POSES, Initializer, Moving, Values
+from icalib.optim.state import State
+from icalib.rig import PoseSensor, Rig
+from icalib.sensors.pose.initialize.extrinsics import pose_values, state_from_poses
+from icalib.sensors.pose.residual import FRAME, frame_of
+
+
+class PoseInitializer(Initializer[PoseSensor]):
+    """The first pose sensor gives the motion where neither cameras nor LiDARs do; all others are placed on it."""
+
+    def motion_rank(self, rig: Rig) -> int | None:
+        return BY_POSES if rig.poses else None
+
+    def sources(self, rig: Rig) -> tuple[str, ...]:
+        return (rig.poses[0].name,)
+
+    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+        del other
+        return state_from_poses(inputs)
+
+    def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+        """After a pass of the estimate, the sensor is placed anew on the better motion."""
+        sensors = inputs.rig.poses
+        state = first_pass(inputs, replace(state, values=state.values | self.place(inputs, state, sensors)))
+        state = replace(state, values=state.values | self.place(inputs, state, sensors))
+        return inputs, state, state.values
+
+    def place(self, inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> Values:
+        return pose_values(inputs, state, sensors)
+
+    def vertical(self, state: State, sensor: PoseSensor) -> np.ndarray | None:
+        frame = state.values.get((frame_of(sensor.name, 0), FRAME[0]))
+        return frame[:, 2] if sensor.level and sensor.kind == "absolute" and frame is not None else None
+
+    def explained(
+        self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
+    ) -> EstimationError | None:
+        """Of relative poses: whether the same poses would do as absolute ones."""
+        del recordings
+        first = rig.poses[0]
+        if first.kind != "relative" or not converges(rig.with_sensors(replace(first, kind="absolute"))):
+            return None
+        return EstimationError(
+            f"{first.name}: with kind: relative its poses are too noisy to give the motion, with kind: absolute "
+            "they are not; write kind: absolute if they hardly drift over the recording."
+        )
+
+
+INITIALIZER = PoseInitializer()

@@ -6,6 +6,7 @@ is known.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -49,12 +50,16 @@ APART_S = 0.4  # of poses that show whether they fit: next to each other they di
 G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
 
 
-def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
-    """Of all pose sensors, `state` having the motion: what the rig gives, or what their poses show, and where their
-    frames stand. Raises EstimationError where neither shows it."""
+def pose_values(inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> dict[Key, np.ndarray]:
+    """Parameters of `sensors` and of their frames, as the rig file gives them or as the motion in `state` shows them.
+
+    Raises EstimationError where neither does.
+    """
     assert inputs.imu is not None
     out: dict[Key, np.ndarray] = {}
-    for sensor, stream in zip(inputs.rig.poses, inputs.measurements.poses, strict=True):
+    for sensor in sensors:
+        stream = inputs.stream(sensor.name)
+        assert isinstance(stream, PoseStream)
         known = given(inputs, sensor)
         if len(known) < len(MOUNTED_NAMES):
             known = settled(sensor, known, _placed(inputs, state, sensor, stream))

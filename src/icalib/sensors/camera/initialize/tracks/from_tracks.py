@@ -11,7 +11,6 @@ import numpy as np
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.align_camera import align_camera, chosen_offset, trusted
 from icalib.initialize.steps.clocks import Alignment
 from icalib.initialize.steps.contradicted import chosen
 from icalib.initialize.steps.gyro import GyroRotation
@@ -19,6 +18,7 @@ from icalib.initialize.steps.rate_shifts import telling_rates
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
+from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, trusted
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 from icalib.sensors.camera.initialize.tracks.alignment import align_together, pairs_of
 from icalib.sensors.camera.initialize.tracks.lens import find_lens

@@ -10,10 +10,9 @@ import numpy as np
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.align_camera import trusted
 from icalib.initialize.steps.by_recording import alone, each_clock, motion_alone, naming_recording, other_clocks
 from icalib.initialize.steps.clocks import main_axis, rough_alignments
-from icalib.initialize.steps.known_values import given
+from icalib.initialize.steps.known_values import given, trusted
 from icalib.initialize.steps.rate_shifts import telling_rates
 from icalib.optim.arrowhead import THREADS
 from icalib.optim.state import Key, State

@@ -1,8 +1,8 @@
-"""First guesses of what stands on a robot beside its cameras, once these have given its motion."""
+"""Wheels placed on a known motion: time offset, direction of travel, sizes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -14,14 +14,12 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.by_recording import alone, each_clock
 from icalib.initialize.steps.contradicted import has_guesses, is_contradicted, refuse_far_off, settled
 from icalib.initialize.steps.known_values import given
+from icalib.initialize.steps.vertical import verticals
 from icalib.motion.clocks import instants
 from icalib.motion.imu_data import clear_of
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
-from icalib.sensors.lidar.initialize.rounds import lidar_values, with_lidars
-from icalib.sensors.pose.initialize.extrinsics import pose_values
-from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.sensor import mounted
 from icalib.sensors.wheels.initialize.drive import (
     OPPOSITE,
@@ -34,35 +32,20 @@ from icalib.sensors.wheels.initialize.drive import (
 from icalib.sensors.wheels.initialize.relative_poses import mount_guess, poses_offset
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
-LEVEL = 0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
-SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
+SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of start, middle and end of a span
 
 
-def wheel_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
-    """Where the solver starts with the wheels, `state` having the motion. What the rig gives is used.
+def wheel_values(inputs: Inputs, state: State, sensors: Sequence[Wheels]) -> dict[Key, np.ndarray]:
+    """Parameters of `sensors`, as the rig file gives them or as the motion in `state` shows them.
 
-    Raises EstimationError where neither the rig nor the motion shows it.
+    Raises EstimationError where neither does.
     """
     out: dict[Key, np.ndarray] = {}
-    for wheels, stream in zip(inputs.rig.wheels, inputs.measurements.wheels, strict=True):
+    for wheels in sensors:
+        stream = inputs.stream(wheels.name)
+        assert isinstance(stream, (WheelStream, WheelPoses))
         out |= _wheels(inputs, state, wheels, stream)
     return out
-
-
-def with_robot(inputs: Inputs, settled: State) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
-    """`inputs` with the points of its LiDARs on planes, where the solver starts with them, the wheels and the pose
-    sensors, `settled` having the motion, and the guess of all: what the rig gives, and else what the motion shows.
-
-    The start is where rounds of association lead, which may stray from the guess where the motion shows nothing.
-    Raises EstimationError where a sensor shows no guess, and the rig has none.
-    """
-    found = lidar_values(inputs, settled) | wheel_values(inputs, settled) | pose_values(inputs, settled)
-    state = replace(settled, values=settled.values | found)
-    guess = state.values | {k: v for x in inputs.rig.lidars for k, v in given(inputs, x).items()}
-    if inputs.rig.lidars:
-        inputs, state = with_lidars(inputs, state)
-        inputs = replace(inputs, guess=replace(settled, values=guess))
-    return inputs, state, guess
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
@@ -96,7 +79,7 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
 
 def _as_high(inputs: Inputs, state: State, arm: np.ndarray, found: np.ndarray) -> np.ndarray:
     """The lever arm that was `found`, as high as `arm`: on a floor wheels do not show their height."""
-    up = _ways_up(inputs, state).ways[0]
+    up = verticals(inputs, state).ways[0]
     up = up / np.linalg.norm(up)
     return found + up * (up @ (arm - found))
 
@@ -113,7 +96,7 @@ def _found(
     if isinstance(stream, WheelPoses):
         return _posing(inputs, state, stream, offset)
     rates = wheel_rates(wheels.name, stream.seconds, integrals_of(stream), stream.kind)
-    up = _ways_up(inputs, state)
+    up = verticals(inputs, state)
     failed: list[EstimationError] = []
     for way in up.ways:
         found = _try(inputs, state, stream, rates, way, offset)
@@ -138,45 +121,6 @@ def _try(
         return _turning(inputs, state, stream, rates, up, offset)
     except EstimationError as error:
         return error
-
-
-@dataclass(frozen=True)
-class Upwards:
-    """ways: upwards (3,) in the IMU's axes, the likely one first; level: the pose sensor whose frame says so, if one
-    does."""
-
-    ways: tuple[np.ndarray, ...]
-    level: str | None = None
-
-
-def _ways_up(inputs: Inputs, state: State) -> Upwards:
-    """By gravity. Where it is not known, along the axis that the vehicle turns about most; which way, the level frame
-    of a pose sensor says. Without one it may be either: then a vehicle whose left and right are mixed up is one that
-    drives on the ceiling."""
-    if not inputs.rig.assumes_motion:
-        return Upwards((np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0]),))
-    assert inputs.imu is not None
-    axis = np.linalg.svd(inputs.imu.gyro.T @ inputs.imu.gyro)[0][:, 0]
-    along, level = _level(inputs, state, axis)
-    return Upwards((np.sign(along) * axis,), level) if level else Upwards((axis, -axis))
-
-
-def level_sensor(inputs: Inputs, state: State) -> str | None:
-    """The pose sensor whose frame is level and shows which way is up, where no gravity does."""
-    turns = state.bias[:, :3]  # of an assumed motion: minus the angular rate
-    return _level(inputs, state, np.linalg.svd(turns.T @ turns)[0][:, 0])[1]
-
-
-def _level(inputs: Inputs, state: State, axis: np.ndarray) -> tuple[float, str | None]:
-    """How far upwards the `axis` (3,) points that the body turns about, and the pose sensor whose frame says so."""
-    in_world = np.einsum("nij,j->i", state.rotation, axis) / len(state.rotation)
-    for sensor in inputs.rig.poses:
-        frame = state.values.get((frame_of(sensor.name, 0), FRAME[0]))
-        if sensor.level and sensor.kind == "absolute" and frame is not None:
-            along = float(in_world @ frame[:, 2])
-            if abs(along) > LEVEL:
-                return along, sensor.name
-    return 0.0, None
 
 
 def _turning(

@@ -19,14 +19,10 @@ from icalib.initialize.steps.clocks import (
     turns_about_two_axes,
 )
 from icalib.initialize.steps.contradicted import is_contradicted, nearest_about
+from icalib.initialize.steps.known_values import trusted
 from icalib.motion.imu_data import ImuData
-from icalib.rig import Camera, Parameter
+from icalib.rig import Camera
 from icalib.sensors.camera.initialize.guess import relative_offset
-
-
-def trusted(parameter: Parameter) -> np.ndarray | None:
-    """A value that what else is guessed may rest on; one that is only a place to start from may be far off."""
-    return None if parameter.mode == "free" else parameter.value
 
 
 def chosen_offset(camera: Camera, rates: CameraRates, imu: ImuData, given: float | None, found: Alignment) -> float:
