@@ -95,10 +95,10 @@ def test_what_can_be_calibrated_is_not_refused(everything, tmp_path, parts, sens
     ("parts", "words"),
     [
         ("imu0", "There is only an IMU"),
-        ("imu0 wheel0", "Wheels and an IMU do not determine the motion"),
-        ("wheel0", "Wheels alone do not determine the motion"),
-        ("mocap0", "There are only poses"),
-        ("lidar0", "A LiDAR without an IMU does not determine the motion"),
+        ("imu0 wheel0", "wheel0 and imu0 do not determine the motion"),
+        ("wheel0", "Without an IMU the motion is unknown from wheel0"),
+        ("mocap0", "Beside mocap0 there is no sensor that can be calibrated without an IMU"),
+        ("lidar0", "Without an IMU lidar0 cannot be calibrated"),
     ],
 )
 def test_what_cannot_be_calibrated_is_named(everything, tmp_path, parts, words):

@@ -64,8 +64,8 @@ def test_lidars_and_wheels():
         "wheel1/ticks.csv": "wheels",
     }
     found = find_sources([TopicInfo(name, "", kind, 10, 0, 1) for name, kind in given.items()])
-    assert list(found.imus) == ["imu0"] and list(found.lidars) == ["top", "velodyne_points", "lidar0"]
-    assert {name: t.name for name, t in found.wheels.items()} == {
+    assert list(found.imus) == ["imu0"] and list(found.of("lidar")) == ["top", "velodyne_points", "lidar0"]
+    assert {name: t.name for name, t in found.of("wheels").items()} == {
         "wheel0": "/joint_states",
         "wheel1": "wheel1/ticks.csv",
     }
@@ -74,7 +74,7 @@ def test_lidars_and_wheels():
 def test_poses_and_odometry():
     given = {"/imu0": "imu", "/vrpn/robot/pose": "pose", "/odom": "odometry", "odom0/poses.tum": "pose"}
     found = find_sources([TopicInfo(name, "", kind, 10, 0, 1) for name, kind in given.items()])
-    assert {name: t.name for name, t in found.poses.items()} == {
+    assert {name: t.name for name, t in found.of("pose").items()} == {
         "robot": "/vrpn/robot/pose",
         "pose0": "/odom",
         "odom0": "odom0/poses.tum",

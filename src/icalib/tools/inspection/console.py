@@ -44,8 +44,8 @@ def streams_table(found: Inspection) -> Table:
     """One row for each topic."""
     names = {c.images.name: c.name for c in found.sources.cameras if c.images}
     names |= {c.corners.name: c.name for c in found.sources.cameras if c.corners}
-    others = (found.sources.imus, found.sources.lidars, found.sources.wheels, found.sources.poses)
-    names |= {t.name: name for sensors in others for name, t in sensors.items()}
+    names |= {t.name: name for name, t in found.sources.imus.items()}
+    names |= {source.topic.name: name for name, source in found.sources.others.items()}
     table = _table(
         f"Topics of {found.recording}",
         ("topic", "type", "sensor", "count", "rate [Hz]", "jitter [ms]", "gaps (longest)", "from to [s]"),

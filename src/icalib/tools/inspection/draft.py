@@ -5,27 +5,24 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from icalib.base.staging import staged
 from icalib.base.text_files import write_text
-from icalib.data.recordings import TopicInfo
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import Scene
 from icalib.rig import TwoSources
 from icalib.sensors.imu.spec import DEFAULT_CLASS, IMU_CLASSES
 from icalib.tools.inspection.facts import CameraSource, Inspection
-from icalib.tools.inspection.frames import frame_lines
 from icalib.tools.inspection.inspect import resolution_of
 from icalib.tools.inspection.kalibr import KalibrImu
+from icalib.tools.inspection.kinds import inspectors, moves_without_imu, moving, nouns
 from icalib.tools.inspection.lens import LensStart, lens_start
-from icalib.tools.inspection.lidar import timing_lines
+from icalib.tools.inspection.rig_lines import comment, in_frame, name_text, number, numbers, place_line
 
-_PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _TEMPLATE = """\
 # FILL IN the target: count, and measure the print itself with a ruler or a caliper, over as many tags or squares as you
 # can and divided by their number. Printers scale, and an error of 1 % in the target is one of 1 % in every translation.
@@ -49,13 +46,11 @@ def draft_rig(found: Inspection) -> str:
     poses beside an IMU, and no poses beside wheels or other poses."""
     broken = {c.name: problem for c in found.sources.cameras if (problem := found.stream(c.topic).problem)}
     cameras = [c for c in found.sources.cameras if c.name not in broken]
-    sources = found.sources
-    beside_imu = sources.imus and (sources.lidars or sources.poses or found.moving_frames)
-    beside_poses = sources.poses and len(sources.poses) + len(sources.wheels) > 1
-    if not (cameras or beside_imu or beside_poses):
+    moved = moving(found) or found.moving_frames
+    if not (cameras or (found.sources.imus and moved) or moves_without_imu(found)):
         raise RecordingError(
-            f"{found.recording} holds no camera that can be read, no LiDAR or poses beside an IMU, and no poses beside "
-            "wheels, so there is no rig to draft; record one, too."
+            f"{found.recording} holds no camera that can be read, no {nouns()} beside an IMU, and no "
+            f"{nouns(alone=True)} beside other sensors, so there is no rig to draft; record one, too."
         )
     lines = [
         f"# Draft by icalib inspect from {json.dumps(found.recording)}. Check every line (docs/rig-file.md).",
@@ -65,9 +60,9 @@ def draft_rig(found: Inspection) -> str:
     ]
     for camera in cameras:
         lines += _camera(found, camera)
-    lines += _robot(found, shown=not (cameras or (sources.imus and sources.lidars)))
+    lines += _others(found, bool(cameras))
     left_out = {**broken, **found.sources.left_out}
-    lines += [f"  # Not used: {_comment(topic)} ({_comment(why)})" for topic, why in left_out.items()]
+    lines += [f"  # Not used: {comment(topic)} ({comment(why)})" for topic, why in left_out.items()]
     blind = any(c.tracks is None and not (found.without_target and c.images) for c in cameras)
     aimed = found.target is not None or blind
     return "\n".join([*lines, _target(found) if cameras and aimed else ""])
@@ -117,7 +112,7 @@ def _imu(found: Inspection) -> list[str]:
     topic = found.sources.imus[name]
     facts = found.imus.get(name)
     frame, halves = facts.frame if facts else "", found.sources.halves.get(name)
-    place = _place(topic.name, topic.type, frame) if halves is None else _places(halves, topic.type, frame)
+    place = "    " + place_line(topic.name, topic.type, frame) if halves is None else _places(halves, topic.type, frame)
     lines = [f"  {name}:", "    type: imu", place]
     kalibr = _kalibr_imu(found, topic.name)
     if kalibr is None:
@@ -130,42 +125,32 @@ def _imu(found: Inspection) -> list[str]:
         ]
     else:
         noise = dataclasses.asdict(kalibr.noise)
-        values = ", ".join(f"{k}: {_number(v)}" for k, v in noise.items() if k != "source")
+        values = ", ".join(f"{k}: {number(v)}" for k, v in noise.items() if k != "source")
         lines.append(
-            f"    noise: {{{values}, source: {json.dumps(kalibr.noise.source)}}}  # from {_comment(kalibr.file)}"
+            f"    noise: {{{values}, source: {json.dumps(kalibr.noise.source)}}}  # from {comment(kalibr.file)}"
         )
     others = [f"{n} ({t.name})" for n, t in found.sources.imus.items() if n != name]
     if others:
-        lines.append(f"  # Also recorded: {_comment(', '.join(others))}; a rig has one IMU, choose the best.")
+        lines.append(f"  # Also recorded: {comment(', '.join(others))}; a rig has one IMU, choose the best.")
     return lines
 
 
-def _robot(found: Inspection, shown: bool) -> Iterable[str]:
-    """LiDARs, which need an IMU, wheels and poses. The latter are comments unless they are `shown`, because nothing
-    else shows the motion: joints may be an arm's, poses what came of these very sensors."""
-    for name, topic in found.sources.lidars.items() if found.sources.imus else ():
-        yield from (f"  {name}:", "    type: lidar", _place(topic.name, topic.type, ""))
-        yield from timing_lines(found.lidars.get(name))
-    mark = "" if shown else "# "
-    for name, topic in found.sources.wheels.items():
-        if not shown:
-            yield "  # Are these wheels? Then remove the #, and give what they measure (docs/rig-file.md#wheels)."
-        lines = [f"{name}:", "  type: wheels", _place(topic.name, topic.type, "")[2:]]
-        for line in lines + (["  measures: twist"] if topic.kind == "twist" or "twist" in topic.type else []):
-            yield f"  {mark}{line}"
-    for name, topic in found.sources.poses.items():
-        if not shown:
-            yield "  # Poses of something on the robot, and not computed from the sensors above? Then remove the #;"
-            yield "  # absolute is motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor)."
-        # Without an IMU the first pose sensor shows the motion, which must not drift.
-        kind = _kind(topic) if found.sources.imus else "absolute"
-        for line in (f"{name}:", "  type: pose", _place(topic.name, topic.type, "")[2:], f"  kind: {kind}"):
-            yield f"  {mark}{line}"
-    yield from frame_lines(found.frames, shown and not found.sources.poses)
-
-
-def _kind(topic: TopicInfo) -> str:
-    return "relative" if topic.kind == "odometry" or "odom" in topic.name else "absolute"
+def _others(found: Inspection, has_cameras: bool) -> Iterator[str]:
+    """Sensors that are neither IMU nor camera. Those that may be no sensors on the robot are comments, unless nothing
+    else gives the motion."""
+    kinds, imus = inspectors(), found.sources.imus
+    sure = [n for n in moving(found) if kinds[found.sources.others[n].kind].is_certain]
+    shown = not (has_cameras or (imus and sure))
+    for kind, inspector in kinds.items():
+        for name, topic in found.sources.of(kind).items():
+            if inspector.sensor.needs_imu and not imus:
+                continue
+            is_shown = shown or inspector.is_certain
+            yield from (f"  # {line}" for line in inspector.doubt if not is_shown)
+            fields = (f"type: {kind}", place_line(topic.name, topic.type), *inspector.lines(found, name, topic))
+            for line in (f"{name}:", *(f"  {field}" for field in fields)):
+                yield f"  {'' if is_shown else '# '}{line}"
+        yield from (f"  {line}" for line in inspector.more_lines(found, shown))
 
 
 def _kalibr_imu(found: Inspection, topic: str) -> KalibrImu | None:
@@ -184,50 +169,37 @@ def _camera(found: Inspection, camera: CameraSource) -> list[str]:
     frame = found.images[camera.name].frame if camera.images else ""
     lines = [f"  {camera.name}:", "    type: camera"]
     if camera.corners:
-        lines.append(_place(camera.corners.name, camera.corners.type, ""))
+        lines.append(f"    {place_line(camera.corners.name, camera.corners.type)}")
     if camera.images:
-        lines.append(_place(camera.images.name, camera.images.type if camera.corners is None else "images", frame))
+        kind = camera.images.type if camera.corners is None else "images"
+        lines.append(f"    {place_line(camera.images.name, kind, frame)}")
     if camera.tracks:
-        lines.append(f"    tracks: {_name(camera.tracks.name)}  # {_comment(camera.tracks.type)}")
+        lines.append(f"    tracks: {name_text(camera.tracks.name)}  # {comment(camera.tracks.type)}")
     elif found.without_target and camera.images:
         lines.append("    tracks: images  # points of the scene; a few images show no tags and no checkerboard")
-    lines.append(f"    model: {lens.model}  # {_comment(lens.why)}")
+    lines.append(f"    model: {lens.model}  # {comment(lens.why)}")
     lines.append(
         f"    resolution: [{resolution[0]}, {resolution[1]}]"
         if resolution
         else "    resolution:  # FILL IN: [width, height] of the images, px"
     )
     lines += _starts(lens)
-    lines += [f"    # {_comment(note)}" for note in lens.notes]
+    lines += [f"    # {comment(note)}" for note in lens.notes]
     return lines
 
 
 def _starts(lens: LensStart) -> Iterable[str]:
     if lens.intrinsics is not None:
-        yield f"    intrinsics: {{guess: {_numbers(lens.intrinsics)}}}  # fx, fy, cx, cy from {_comment(lens.source)}"
+        yield f"    intrinsics: {{guess: {numbers(lens.intrinsics)}}}  # fx, fy, cx, cy from {comment(lens.source)}"
     if lens.distortion is not None:
         names = ", ".join(CAMERA_MODELS[lens.model].parameter_names[4:])
-        yield f"    distortion: {{guess: {_numbers(lens.distortion)}}}  # {names} from {_comment(lens.source)}"
-
-
-def _place(name: str, kind: str, frame: str) -> str:
-    """`topic` of a bag or a folder of images; `path` of a table."""
-    field = "path" if name.endswith((".csv", ".csv.gz", ".npz", ".tum", ".txt")) else "topic"
-    return f"    {field}: {_name(name)}  # {_comment(kind)}" + _in_frame(frame)
+        yield f"    distortion: {{guess: {numbers(lens.distortion)}}}  # {names} from {comment(lens.source)}"
 
 
 def _places(halves: TwoSources, kind: str, frame: str) -> str:
     """`topic` of an IMU on two of them."""
-    shown = f"{{gyro: {_name(halves.gyro)}, accel: {_name(halves.accel)}}}"
-    return f"    topic: {shown}  # {_comment(kind)}" + _in_frame(frame)
-
-
-def _name(name: str) -> str:
-    return name if _PLAIN.fullmatch(name) else json.dumps(name)
-
-
-def _in_frame(frame: str) -> str:
-    return f", frame {json.dumps(frame)}" if frame else ""
+    shown = f"{{gyro: {name_text(halves.gyro)}, accel: {name_text(halves.accel)}}}"
+    return f"    topic: {shown}  # {comment(kind)}" + in_frame(frame)
 
 
 def _target(found: Inspection) -> str:
@@ -238,22 +210,9 @@ def _target(found: Inspection) -> str:
         lines = ["targets:", *(f"  {name}: {_fields(fields)}" for name, fields in target.plain().items())]
     else:
         lines = [f"target: {_fields(target.plain())}"]
-    head = f"# The target is from {_comment(found.target.file)}; check its sizes with a ruler."
+    head = f"# The target is from {comment(found.target.file)}; check its sizes with a ruler."
     return "\n".join([head, *lines, ""])
 
 
 def _fields(plain: dict[str, Any]) -> str:
-    return f"{{{', '.join(f'{k}: {_number(v) if isinstance(v, float) else v}' for k, v in plain.items())}}}"
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return f"[{', '.join(map(_number, values))}]"
-
-
-def _number(value: float) -> str:
-    return repr(float(value))
-
-
-def _comment(text: str) -> str:
-    """`text` on one line."""
-    return " ".join(text.split())
+    return f"{{{', '.join(f'{k}: {number(v) if isinstance(v, float) else v}' for k, v in plain.items())}}}"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from icalib.data.checks.imu_checks import Saturation
 from icalib.data.messages.streams import CameraInfo
 from icalib.data.recordings import TopicInfo
 from icalib.geometry.targets import Target
-from icalib.rig import TimeUnit, TwoSources
+from icalib.rig import TwoSources
 from icalib.tools.inspection.kalibr import KalibrFiles
 
 Severity = Literal["problem", "warning", "hint"]
@@ -135,28 +135,28 @@ class CameraSource:
 
 
 @dataclass(frozen=True)
+class SensorSource:
+    """A topic that may be a sensor's. kind: type of the sensor in a rig file."""
+
+    kind: str
+    topic: TopicInfo
+
+
+@dataclass(frozen=True)
 class Sources:
     """The sensors of a recording by name; left_out: topics of images that are no camera's to calibrate, and why.
-    wheels: also joints that may be of anything else; poses: also those that are of no sensor on the robot. halves: both
+    others: of all other kinds, sorted by kind; some topics may be of something that is not on the robot. halves: both
     topics of an IMU whose gyroscope and accelerometer report apart; in `imus` stands the gyroscope's."""
 
     cameras: tuple[CameraSource, ...]
     imus: Mapping[str, TopicInfo]
     left_out: Mapping[str, str]
-    lidars: Mapping[str, TopicInfo] = field(default_factory=dict)
-    wheels: Mapping[str, TopicInfo] = field(default_factory=dict)
-    poses: Mapping[str, TopicInfo] = field(default_factory=dict)
+    others: Mapping[str, SensorSource] = field(default_factory=dict)
     halves: Mapping[str, TwoSources] = field(default_factory=dict)
 
-
-@dataclass(frozen=True)
-class LidarFacts:
-    """point_time_field and point_time_unit that the rig file must give, None where the data tell; problem: why
-    `calibrate` would refuse its clouds."""
-
-    field: str | None = None
-    unit: TimeUnit | None = None
-    problem: str = ""
+    def of(self, kind: str) -> dict[str, TopicInfo]:
+        """Those of `others` that are of one kind, by name."""
+        return {name: source.topic for name, source in self.others.items() if source.kind == kind}
 
 
 @dataclass(frozen=True)
@@ -183,9 +183,9 @@ class GivenTarget:
 
 @dataclass(frozen=True)
 class Inspection:
-    """All that was found. images, infos and views are by camera, imus by IMU, lidars by LiDAR; imu: the one to
-    calibrate with. shown: where no target is known, the tags or the board that a few images of each camera show, in
-    words, "" for neither."""
+    """All that was found. images, infos and views are by camera, imus by IMU, facts by name of other sensors, each of
+    a class of its kind, or None; imu: the one to calibrate with. shown: where no target is known, the tags or the board
+    that a few images of each camera show, in words, "" for neither."""
 
     recording: str
     sources: Sources
@@ -199,7 +199,7 @@ class Inspection:
     views: Mapping[str, TargetView] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
-    lidars: Mapping[str, LidarFacts] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
     frames: tuple[FramePair, ...] = ()
     shown: Mapping[str, str] = field(default_factory=dict)
 

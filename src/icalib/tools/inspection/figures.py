@@ -24,7 +24,10 @@ def figures(found: Inspection) -> dict[str, Any]:
         "cameras": {c.name: _camera(found, c.name) for c in found.sources.cameras},
         "imus": {n: {"topic": t.name} | _plain(found.imus.get(n)) for n, t in found.sources.imus.items()},
         "imu": found.imu,
-        "lidars": {n: {"topic": t.name} | _plain(found.lidars.get(n)) for n, t in found.sources.lidars.items()},
+        "others": {
+            n: {"type": s.kind, "topic": s.topic.name} | _plain(found.facts.get(n))
+            for n, s in found.sources.others.items()
+        },
         "frames": [dataclasses.asdict(f) for f in found.frames],
         "left_out": dict(found.sources.left_out),
         "target": _target(found),

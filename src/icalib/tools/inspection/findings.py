@@ -9,7 +9,7 @@ import numpy as np
 from icalib.data.recordings import TopicInfo
 from icalib.motion.axes import axis_words, other_axes
 from icalib.tools.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
-from icalib.tools.inspection.lidar import untimed
+from icalib.tools.inspection.kinds import inspectors, moving, rolls
 from icalib.tools.inspection.sensors import missing_sensors
 from icalib.tools.inspection.timing import overlap_s
 from icalib.tools.inspection.unread import unread
@@ -36,7 +36,7 @@ def findings(found: Inspection) -> tuple[Finding, ...]:
     every = [
         *missing_sensors(found),
         *unread(found),
-        *untimed(found),
+        *(f for inspector in inspectors().values() for f in inspector.findings(found)),
         *_broken(found),
         *_few_stills(found),
         *_imu(found),
@@ -86,7 +86,7 @@ def _unfit(found: Inspection, camera: CameraSource) -> str:
 
 def _fewest_images(found: Inspection) -> tuple[int, str]:
     """How many images `calibrate` asks of a camera, and how to get them."""
-    if found.sources.imus or found.sources.wheels:
+    if found.sources.imus or rolls(found):
         return FEWEST_IMAGES, "record for 30 to 90 s, with 10 to 30 images per second"
     return FEWEST_STILLS, "take 20 to 60 images of the target from all sides"
 
@@ -144,14 +144,14 @@ def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
         )
     elif second < SECOND_AXIS * strongest or second < STILL_RAD_S:
         # Without a guess `calibrate` finds the rotation of cameras from turns alone, that of others from the path, too.
-        alone = not (found.sources.lidars or found.sources.poses)
+        alone = not moving(found)
         rest = other_axes(name, facts.principal[0])
         yield Finding(
             "problem" if alone else "warning",
             f"{name} turns about {axis_words(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; "
             f"{second:.2f} and {weakest:.2f} about the perpendicular axes), so some parameters are "
             "unobservable; "
-            f"{'drive over ramps' if found.sources.wheels else f'turn the rig about {rest} as well'}.",
+            f"{'drive over ramps' if rolls(found) else f'turn the rig about {rest} as well'}.",
         )
     else:
         for rms, direction in zip(facts.principal_rms, facts.principal, strict=True):

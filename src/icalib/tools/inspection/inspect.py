@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,7 @@ from icalib.tools.inspection.findings import findings
 from icalib.tools.inspection.frames import frame_pairs
 from icalib.tools.inspection.imu import imu_facts, read_imu
 from icalib.tools.inspection.kalibr import KalibrFiles, find_kalibr_files
-from icalib.tools.inspection.lidar import lidar_facts
+from icalib.tools.inspection.kinds import inspectors
 from icalib.tools.inspection.sources import find_sources
 from icalib.tools.inspection.timing import timing_of
 from icalib.tools.inspection.views import target_in, target_view
@@ -76,7 +77,7 @@ def inspect_recording(
     streams, images, imus = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
     infos, imu = _infos(recording, sources), _choose(imus, sources, kalibr)
     found = Inspection(str(path), sources, streams, images, infos, imus, imu, target, kalibr)
-    found = dataclasses.replace(found, lidars=lidar_facts(recording, sources.lidars))
+    found = dataclasses.replace(found, facts=_facts(recording, sources))
     frames, unread = frame_pairs(recording)
     views = _views(recording, found, lambda what, done: progress(what, share + (1.0 - share) * done))
     notes = tuple(dict.fromkeys(recording.notes() + unread)) + kalibr.notes
@@ -127,9 +128,15 @@ def _joined_imu(recording: Recording, sources: Sources) -> Sources:
         return sources
     gyro = next(t for t in sources.imus.values() if t.name == pair.gyro)
     others = {name: t for name, t in sources.imus.items() if t.name not in (pair.gyro, pair.accel)}
-    taken = {*others, *(c.name for c in sources.cameras), *sources.lidars, *sources.wheels, *sources.poses}
+    taken = {*others, *(c.name for c in sources.cameras), *sources.others}
     name = next(n for k in itertools.count() if (n := f"imu{k}") not in taken)
     return dataclasses.replace(sources, imus={name: gyro, **others}, halves={name: pair})
+
+
+def _facts(recording: Recording, sources: Sources) -> dict[str, Any]:
+    """Of the sensors that are neither IMU nor camera, by name."""
+    kinds = inspectors()
+    return {name: kinds[s.kind].facts(recording, name, s.topic) for name, s in sources.others.items()}
 
 
 def _read_images(recording: Recording, topic: TopicInfo) -> tuple[StreamFacts, ImageFacts]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from icalib.data.images.topics import listing
 from icalib.tools.inspection.facts import Finding, Inspection
+from icalib.tools.inspection.kinds import inspectors, moves_without_imu, moving, nouns, without_imu
 
 
 def missing_sensors(found: Inspection) -> Iterator[Finding]:
@@ -15,42 +16,43 @@ def missing_sensors(found: Inspection) -> Iterator[Finding]:
         yield from _beside_an_imu(found, held)
     elif sources.cameras:
         yield _cameras_without_imu(found, held)
-    elif len(sources.poses) + len(sources.wheels) > 1 and sources.poses:
+    elif moves_without_imu(found):
         yield Finding(
             "hint",
             "There is no IMU, so smooth motion is assumed, and all other sensors are calibrated relative to "
-            f"{next(iter(sources.poses))}.",
+            f"{without_imu(found)[0]}.",
         )
     else:
-        yield Finding("problem", f"{_alone(found)}: {held}; {_WANTED}.")
+        yield Finding("problem", f"{_alone(found)}: {held}; {_wanted()}.")
     for stream in found.streams:
         if stream.topic.kind in ("image", "imu") and not stream.topic.count:
             yield Finding("warning", f"{stream.topic.name} holds no messages; check that this sensor was running.")
 
 
-_WANTED = "record the images of a camera, or an IMU with a LiDAR, poses or odometry, or poses with wheels"
+def _wanted() -> str:
+    return (
+        f"record the images of a camera, or an IMU with a {nouns()}, or a {nouns(alone=True)} with the sensors to "
+        "calibrate"
+    )
 
 
 def _beside_an_imu(found: Inspection, held: str) -> Iterator[Finding]:
     sources = found.sources
-    if sources.cameras or sources.lidars or sources.poses or found.moving_frames:
+    if sources.cameras or moving(found) or found.moving_frames:
         return
-    if sources.wheels:
-        yield Finding(
-            "problem",
-            f"Wheels and an IMU do not determine the motion: {held}; record a camera, a LiDAR or poses as well.",
-        )
+    if sources.others:
+        there = " and ".join([*sources.others, *sources.imus])
+        sentence = f"{there} do not determine the motion: {held}; record a camera, a {nouns()} as well."
     else:
-        yield Finding(
-            "problem",
-            f"There is only an IMU: {held}; record the images of a camera, a LiDAR, or poses. `icalib allan` "
-            "estimates the noise of an IMU at rest.",
+        sentence = (
+            f"There is only an IMU: {held}; record the images of a camera, or a {nouns()}. `icalib allan` "
+            "estimates the noise of an IMU at rest."
         )
+    yield Finding("problem", sentence)
 
 
 def _cameras_without_imu(found: Inspection, held: str) -> Finding:
-    frames = [f"frames of {topic}" for topic in found.moving_frames]
-    others = [*found.sources.poses, *found.sources.wheels, *frames]
+    others = [*without_imu(found), *(f"frames of {topic}" for topic in found.moving_frames)]
     if others:
         return Finding(
             "hint",
@@ -64,10 +66,13 @@ def _cameras_without_imu(found: Inspection, held: str) -> Finding:
 
 
 def _alone(found: Inspection) -> str:
-    if found.sources.lidars:
-        return "A LiDAR without an IMU does not determine the motion"
-    if found.sources.poses:
-        return "There are only poses, and nothing to calibrate with them"
-    if found.sources.wheels:
-        return "Wheels alone do not determine the motion"
-    return "There is no sensor to calibrate"
+    """Why the sensors, without IMU and camera, cannot be calibrated."""
+    kinds, others = inspectors(), found.sources.others
+    if not others:
+        return "There is no sensor to calibrate"
+    names = " and ".join(others)
+    if all(kinds[source.kind].sensor.needs_imu for source in others.values()):
+        return f"Without an IMU {names} cannot be calibrated"
+    if any(kinds[source.kind].moves_alone for source in others.values()):
+        return f"Beside {without_imu(found)[0]} there is no sensor that can be calibrated without an IMU"
+    return f"Without an IMU the motion is unknown from {names}"

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import PurePosixPath
 
 from icalib.data.images.unreadable import VIDEO_FILE
 from icalib.data.recordings import TopicInfo
-from icalib.tools.inspection.facts import CameraSource, Sources
+from icalib.tools.inspection.facts import CameraSource, SensorSource, Sources
+from icalib.tools.inspection.kinds import inspectors
 
-# Parts of a topic's name that say what it carries, not whose it is.
-_WHAT = re.compile(
-    r"(image(_(raw|color|mono|rect|rect_raw|rect_color))?|compressed|raw|camera_info|data(_raw)?|sample"
-    r"|(data|corners|tracks|rates|angles|ticks|poses)\.csv|poses\.(tum|txt)|scans\.npz|points(_raw)?|joint_states|pose|odom(etry)?)"
+# Parts of a topic's name that say what it carries, not whose it is; those of other kinds are `plain_names`.
+_WHAT = (
+    r"image(_(raw|color|mono|rect|rect_raw|rect_color))?|compressed|raw|camera_info|data(_raw)?|sample"
+    r"|(data|corners|tracks)\.csv"
 )
 _UNNAMEABLE = re.compile(r"[^A-Za-z0-9_-]+")
 Key = tuple[str, ...]
@@ -27,21 +29,23 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
         kind: _by_key([t for t in filled if t.kind == kind and t not in depth])
         for kind in ("image", "corners", "tracks", "camera info")
     }
-    others = {
-        "imu": ("imu",),
-        "lidar": ("points",),
-        "wheel": ("joints", "twist", "wheels"),
-        "pose": ("pose", "odometry"),
-    }
+    kinds = inspectors()
+    others = {"imu": ("imu",)} | {kind: inspector.topic_kinds for kind, inspector in kinds.items()}
+    prefixes = {"imu": "imu"} | {kind: inspector.prefix for kind, inspector in kinds.items()}
     found = [(t, what) for what, kinds in others.items() for t in filled if t.kind in kinds]
     keys = sorted({*seen["image"], *seen["corners"], *seen["tracks"]})
-    names = _names([(k, "cam") for k in keys] + [(_key(t), what) for t, what in found])
+    names = _names([(k, "cam") for k in keys] + [(_key(t), prefixes[what]) for t, what in found])
     cameras = tuple(_camera(n, k, seen) for n, k in zip(names, keys, strict=False))
     left_out = {t.name: "depth images" for t in depth}
     left_out |= {other: f"the images of {c.name} once more" for c in cameras for other in c.others}
     named = [(name, *of) for name, of in zip(names[len(keys) :], found, strict=True)]
-    imus, lidars, wheels, poses = ({name: t for name, t, kind in named if kind == what} for what in others)
-    return Sources(cameras, imus, left_out, lidars, wheels, poses)
+    imus = {name: t for name, t, kind in named if kind == "imu"}
+    return Sources(cameras, imus, left_out, {n: SensorSource(kind, t) for n, t, kind in named if kind != "imu"})
+
+
+@cache
+def _plain_names() -> re.Pattern[str]:
+    return re.compile("|".join(f"({names})" for names in (_WHAT, *(k.plain_names for k in inspectors().values()))))
 
 
 def _camera(name: str, key: Key, seen: Mapping[str, Mapping[Key, list[TopicInfo]]]) -> CameraSource:
@@ -63,7 +67,7 @@ def _by_key(topics: list[TopicInfo]) -> dict[Key, list[TopicInfo]]:
 
 def _key(topic: TopicInfo) -> Key:
     ending = PurePosixPath(topic.name).suffix if topic.type == VIDEO_FILE else ".csv"
-    return tuple(p.removesuffix(ending) for p in topic.name.split("/") if p and not _WHAT.fullmatch(p))
+    return tuple(p.removesuffix(ending) for p in topic.name.split("/") if p and not _plain_names().fullmatch(p))
 
 
 def _names(sensors: list[tuple[Key, str]]) -> list[str]:

@@ -1,0 +1,66 @@
+"""LiDARs in a recording: how their points are timed, and what the rig file must say of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+from icalib.data.messages.clouds import timing_fields
+from icalib.data.messages.streams import point_clouds
+from icalib.data.recordings import BagRecording, Recording, TopicInfo
+from icalib.errors import RecordingError
+from icalib.sensors.lidar.spec import Lidar
+from icalib.sensors.sensor import Sensor, TimeUnit
+from icalib.tools.inspection.facts import Finding, Inspection
+from icalib.tools.inspection.kinds import KindInspector, moving
+
+
+@dataclass(frozen=True)
+class LidarFacts:
+    """point_time_field and point_time_unit that the rig file must give, None where the data tell; problem: why
+    `calibrate` would refuse its clouds."""
+
+    field: str | None = None
+    unit: TimeUnit | None = None
+    problem: str = ""
+
+
+class LidarInspector(KindInspector):
+    """Point clouds are always a LiDAR's on the robot."""
+
+    sensor: ClassVar[type[Sensor]] = Lidar
+    topic_kinds: ClassVar[tuple[str, ...]] = ("points",)
+    prefix: ClassVar[str] = "lidar"
+    plain_names: ClassVar[str] = r"scans\.npz|points(_raw)?"
+    is_certain: ClassVar[bool] = True
+
+    def facts(self, recording: Recording, name: str, topic: TopicInfo) -> LidarFacts | None:
+        """By the first clouds of a bag."""
+        if not isinstance(recording, BagRecording):
+            return None
+        try:
+            what = f"{recording.root} {topic.name} ({name})"
+            lidar = Lidar(name, "", topic=topic.name)
+            return LidarFacts(*timing_fields(point_clouds(recording, topic.name), lidar, what))
+        except RecordingError as error:
+            return LidarFacts(problem=str(error))
+
+    def findings(self, found: Inspection) -> Iterator[Finding]:
+        """LiDARs that `calibrate` would refuse: a problem where nothing else gives the motion."""
+        own = found.sources.of(Lidar.sensor_type)
+        others = found.sources.cameras or set(moving(found)) - own.keys()
+        for name in own:
+            if (facts := found.facts.get(name)) is not None and facts.problem:
+                yield Finding("warning" if others else "problem", facts.problem)
+
+    def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
+        facts = found.facts.get(name)
+        if facts is not None and facts.field is not None:
+            yield f"point_time_field: {json.dumps(facts.field)}  # looks like the time of each point"
+        if facts is not None and facts.unit is not None:
+            yield f"point_time_unit: {facts.unit}  # the only unit that fits the time between clouds"
+
+
+INSPECTOR = LidarInspector()

@@ -1,0 +1,66 @@
+"""Poses in a recording: topics and tables of poses, odometry, and frames of transforms."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import ClassVar
+
+from icalib.data.recordings import TopicInfo
+from icalib.sensors.pose.spec import PoseSensor
+from icalib.sensors.sensor import Sensor
+from icalib.tools.inspection.facts import FramePair, Inspection
+from icalib.tools.inspection.kinds import KindInspector
+
+
+class PoseInspector(KindInspector):
+    """Poses may be computed from the very sensors that were recorded."""
+
+    sensor: ClassVar[type[Sensor]] = PoseSensor
+    topic_kinds: ClassVar[tuple[str, ...]] = ("pose", "odometry")
+    prefix: ClassVar[str] = "pose"
+    plain_names: ClassVar[str] = r"poses\.(csv|tum|txt)|pose|odom(etry)?"
+    doubt: ClassVar[tuple[str, ...]] = (
+        "Poses of something on the robot, and not computed from the sensors above? Then remove the #;",
+        "absolute is motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor).",
+    )
+    moves_alone: ClassVar[bool] = True
+
+    def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
+        """Without an IMU the first pose sensor gives the motion, which must not drift."""
+        drifts = topic.kind == "odometry" or "odom" in topic.name
+        yield f"kind: {'relative' if drifts and found.sources.imus else 'absolute'}"
+
+    def more_lines(self, found: Inspection, shown: bool) -> Iterator[str]:
+        """A pose sensor of the two frames with most motion between them, where there is motion."""
+        shown = shown and not found.sources.of(PoseSensor.sensor_type)
+        chain = _most_motion(found.frames)
+        if not chain:
+            return
+        topic, frames = chain[0].topic, [chain[0].parent, chain[-1].child]
+        kind = "relative" if "odom" in frames[0] else "absolute"
+        if not shown:
+            yield "# Poses from transforms, as of a robot arm? Then remove the #. Choose any two of the frames"
+            yield "# listed, the fixed one (base) and the moving one (docs/rig-file.md#pose-sensor)."
+        place = (f"  topic: {json.dumps(topic)}", f"  frames: {json.dumps(frames)}")
+        for line in ("tf0:", "  type: pose", *place, f"  kind: {kind}"):
+            yield f"{'' if shown else '# '}{line}"
+
+
+INSPECTOR = PoseInspector()
+
+
+def _most_motion(pairs: Sequence[FramePair]) -> list[FramePair]:
+    """From parent to child the pairs with most moving ones in a row of one topic, which begins and ends with such."""
+    above = {(p.topic, p.child): p for p in pairs}
+    best: list[FramePair] = []
+    for last in pairs:
+        if not last.moves:
+            continue
+        chain, seen = [last], {last.child}
+        while (pair := above.get((last.topic, chain[0].parent))) is not None and pair.child not in seen:
+            seen.add(pair.child)
+            chain.insert(0, pair)
+        first = next(k for k, pair in enumerate(chain) if pair.moves)
+        best = max(best, chain[first:], key=lambda c: sum(pair.moves for pair in c))
+    return best

@@ -1,0 +1,32 @@
+"""Wheels in a recording: joints, twists, and tables of what wheels report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar
+
+from icalib.data.recordings import TopicInfo
+from icalib.sensors.sensor import Sensor
+from icalib.sensors.wheels.spec import Wheels
+from icalib.tools.inspection.facts import Inspection
+from icalib.tools.inspection.kinds import KindInspector
+
+
+class WheelInspector(KindInspector):
+    """Joints may be an arm's as well."""
+
+    sensor: ClassVar[type[Sensor]] = Wheels
+    topic_kinds: ClassVar[tuple[str, ...]] = ("joints", "twist", "wheels")
+    prefix: ClassVar[str] = "wheel"
+    plain_names: ClassVar[str] = r"(rates|angles|ticks|poses)\.csv|joint_states"
+    doubt: ClassVar[tuple[str, ...]] = (
+        "Are these wheels? Then remove the #, and give what they measure (docs/rig-file.md#wheels).",
+    )
+    rolls: ClassVar[bool] = True
+
+    def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
+        if topic.kind == "twist" or "twist" in topic.type:
+            yield "measures: twist"
+
+
+INSPECTOR = WheelInspector()
