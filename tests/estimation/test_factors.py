@@ -25,6 +25,7 @@ from icalib.data.measurements import PoseStream
 from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
 from icalib.motion.clocks import offset_at
+from icalib.motion.factor import look
 from icalib.motion.poses import poses_at
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece, make_pieces
@@ -33,6 +34,7 @@ from icalib.optim.robust_weights import LEAST_CURVATURE
 from icalib.optim.state import NODE, State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
@@ -53,6 +55,7 @@ class Sample:
     weights: Callable[[State], tuple[np.ndarray, Any]]
     tolerance: float = 1e-6  # of the gradient, where weights are found by iteration
     potential: Callable[[State], float] = lambda at: 0.0
+    made: Any = None  # the factor; priors have no rows
 
 
 def white(residual):
@@ -76,7 +79,7 @@ def imu_sample(unlike, setup_of, imu_free):
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, factor.output(), sums)
 
-    return Sample("ImuFactor", setup, state, accumulate, residual, white(residual))
+    return Sample("ImuFactor", setup, state, accumulate, residual, white(residual), made=factor)
 
 
 LOSS_SCALE = 1.5
@@ -170,7 +173,7 @@ def corner_sample(
         return factor.accumulate(at, piece, factor.output(np.float64), sums, curved)
 
     tolerance = 1e-3 if field and loss != "none" else 1e-6
-    return Sample("CornerFactor", setup, state, accumulate, residual, weights, tolerance)
+    return Sample("CornerFactor", setup, state, accumulate, residual, weights, tolerance, made=factor)
 
 
 def feature_sample(
@@ -259,7 +262,7 @@ def feature_sample(
         return factor.accumulate(at, piece, factor.output(), sums, curved)
 
     # Points rest within 1e-12 of their least cost; the gradient is that of points which are there.
-    return Sample("FeatureFactor", setup, state, accumulate, residual, weights, 5e-6)
+    return Sample("FeatureFactor", setup, state, accumulate, residual, weights, 5e-6, made=factor)
 
 
 def lidar_sample(
@@ -310,7 +313,7 @@ def lidar_sample(
     cost = sum(accumulate(state, p, False) for p in make_pieces(len(state.seconds), setup.layout.size))
     assert cost == pytest.approx(0.5 * (float(r @ r) - explained) + turned(state), rel=1e-7)
     assert (explained > 0.1 * noisy) == (scheme == "inertial")
-    return Sample("LidarFactor", setup, state, accumulate, residual, weights, potential=turned)
+    return Sample("LidarFactor", setup, state, accumulate, residual, weights, potential=turned, made=factor)
 
 
 def lidar_walks(factor, at):
@@ -447,7 +450,7 @@ def wheel_sample(
     def accumulate(at, piece, sums):
         return made.accumulate(at, piece, made.output(), sums, curved)
 
-    return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights)
+    return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
 
 
 def ground_sample(unlike, setup_of, plane, seen=True):
@@ -473,7 +476,7 @@ def ground_sample(unlike, setup_of, plane, seen=True):
     def accumulate(at, piece, sums):
         return made.accumulate(at, piece, made.output(), sums)
 
-    return Sample("GroundFactor", setup, at, accumulate, residual, white(residual))
+    return Sample("GroundFactor", setup, at, accumulate, residual, white(residual), made=made)
 
 
 def with_poses(setup, starts):
@@ -530,7 +533,7 @@ def pose_sample(
     def accumulate(at, piece, sums):
         return made.accumulate(at, piece, made.output(), sums, curved)
 
-    return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights)
+    return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
 
 
 SAMPLES = {
@@ -754,3 +757,27 @@ def test_gradient_is_the_slope_of_the_cost(sample, dense):
 
 def test_cost_without_sums_is_the_cost_with_them(sample, dense):
     assert cost_at(sample, np.zeros(len(scales(sample)))) == pytest.approx(sums_of(sample, dense)[0], rel=1e-13)
+
+
+def test_rows_are_the_residuals_by_kind(sample):
+    """Number, chi^2, RMS and unit are those that the factor gives for each kind; times are those of the keyframes."""
+    if sample.made is None:
+        assert sample.factor in ("Prior", "accumulate_bias_prior")
+        return
+    made, state = sample.made, sample.state
+    out = look(made, state)
+    rows, squares, sizes = made.rows(out, state), made.squares(out), made.sizes(out)
+    common = {kind for _, kind in squares if kind.startswith("common")}
+    assert {(r.sensor, r.kind) for r in rows} >= {key for key in squares if key[1] not in {*common, ON_PLANES}}
+    for r in rows:
+        assert r.residual.shape == r.sigma.shape == r.whitened.shape == r.root.shape
+        assert len(r.seconds) == len(r.residual) > 0
+        assert state.seconds[0] - 0.1 < r.seconds.min() and r.seconds.max() < state.seconds[-1] + 0.1
+        if not common:  # these have a part of the corners' residuals
+            assert (r.weighted**2).sum() == pytest.approx(squares[r.sensor, r.kind].chi2, rel=1e-4)
+        size = sizes[r.sensor, r.kind]
+        if size.rms is not None and r.unit:
+            assert (np.sqrt(np.mean(r.residual[r.root > 0.0] ** 2)), r.unit) == (pytest.approx(size.rms), size.unit)
+    if hasattr(made, "whitening"):  # jointly
+        variance = np.diagonal(np.linalg.inv(made.whitening.transpose(0, 2, 1) @ made.whitening), axis1=1, axis2=2)
+        np.testing.assert_allclose(np.concatenate([r.sigma for r in rows], axis=1) ** 2, variance)

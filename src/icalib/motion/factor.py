@@ -34,6 +34,31 @@ class RawSize(NamedTuple):
     rejected: int = 0
 
 
+@dataclass(frozen=True)
+class ResidualRows:
+    """Residuals (predicted - measured) of one kind by one sensor: n measurements with m columns each.
+
+    seconds (n,): on the body's clock since its first stamp, of the measurement, or of the start of the interval that it
+    spans. residual, sigma (n, m) in `unit`, SI or px; whitened (n, m): jointly where errors of columns correlate;
+    root (n, m): square root of the robust weight, 0 for outliers. Where the rows are whitened combinations of
+    measurements and nothing else, residual is whitened, sigma 1 and unit empty.
+    """
+
+    sensor: str
+    kind: str
+    unit: str
+    seconds: np.ndarray
+    residual: np.ndarray
+    sigma: np.ndarray
+    whitened: np.ndarray
+    root: np.ndarray
+
+    @property
+    def weighted(self) -> np.ndarray:
+        """(n, m) whitened, with the roots of the robust weights."""
+        return np.where(self.root > 0.0, self.whitened * self.root, 0.0)
+
+
 class Along(NamedTuple):
     """`share` of a step, from the state `start` to `end`: small enough for residuals to be linear."""
 
@@ -78,6 +103,10 @@ class Factor(Protocol):
 
     def sizes(self, out: Any) -> dict[FitKey, RawSize]:
         """RMS of each kind of residual."""
+        ...
+
+    def rows(self, out: Any, state: State) -> list[ResidualRows]:
+        """The residuals of each kind, `out` at `state`."""
         ...
 
     def spent(self, out: Any, along: Along) -> dict[FitKey, float]:
@@ -166,7 +195,9 @@ class Whitened:
 
 
 class _HasRows(Protocol):
-    """What `RowFactor` asks of the factor. kinds: columns of its rows by kind of residual."""
+    """What `RowFactor` asks of the factor. kinds: columns of its rows by kind of residual; units: by kind, SI."""
+
+    units: ClassVar[Mapping[str, str]]
 
     @property
     def name(self) -> str: ...
@@ -180,6 +211,12 @@ class _HasRows(Protocol):
 
     def output(self) -> Whitened: ...
 
+    def raw(self, out: Whitened) -> np.ndarray | None: ...
+
+    def raw_sigma(self) -> np.ndarray: ...
+
+    def times(self, state: State) -> np.ndarray: ...
+
     def count(self, out: Whitened, kind: str) -> int: ...
 
     def rms(self, out: Whitened, kind: str) -> tuple[float | None, str]: ...
@@ -189,6 +226,39 @@ class RowFactor(FactorDefaults):
     """A factor whose output are `Whitened` rows, of which some columns are of one kind."""
 
     is_sparse: ClassVar[bool] = True
+    units: ClassVar[Mapping[str, str]] = {}
+
+    def times(self, state: State) -> np.ndarray:
+        """(n,) of the rows, see `ResidualRows.seconds`."""
+        raise NotImplementedError
+
+    def raw(self, out: Whitened) -> np.ndarray | None:
+        """(n, m) residuals before whitening; None where they have no meaning one by one."""
+        del out
+        return None
+
+    def raw_sigma(self) -> np.ndarray:
+        """(n, m) standard deviations of `raw`."""
+        raise NotImplementedError
+
+    def rows(self: _HasRows, out: Whitened, state: State) -> list[ResidualRows]:
+        """See `Factor`."""
+        raw, seconds, found = self.raw(out), self.times(state) if self.kinds else np.zeros(0), []
+        sigma = np.ones_like(out.residual) if raw is None else self.raw_sigma()
+        for kind, c in self.kinds.items():
+            white = out.residual[:, c]
+            own = white if raw is None else raw[:, c]
+            unit = self.units.get(kind, "")
+            found.append(ResidualRows(self.name, kind, unit, seconds, own, sigma[:, c], white, out.root[:, c]))
+        return found
+
+    def rms(self: _HasRows, out: Whitened, kind: str) -> tuple[float | None, str]:
+        """Of the residuals of `kind` before whitening, and its unit; None where these have no meaning one by one."""
+        raw = self.raw(out)
+        if raw is None:
+            return None, ""
+        own = raw[:, self.kinds[kind]]
+        return float(np.sqrt(np.mean(own**2))) if own.size else 0.0, self.units[kind]
 
     def count(self: _HasRows, out: Whitened, kind: str) -> int:
         """How many rows of a kind are in use, times their columns."""
@@ -206,15 +276,6 @@ class RowFactor(FactorDefaults):
         """See `Factor`."""
         slope = (look(self, along.end).residual - out.residual) / along.share * out.root
         return {(self.name, kind): float((slope[:, r] ** 2).sum()) for kind, r in self.kinds.items()}
-
-
-def rows_of(factors: Mapping[FactorKey, Factor], outputs: Residuals, kind: FitKey) -> np.ndarray | None:
-    """(n, m) whitened and weighted residuals of one kind; None where no `RowFactor` has it."""
-    for key, factor in factors.items():
-        rows: Any = factor if isinstance(factor, RowFactor) and factor.name == kind[0] else None
-        if rows is not None and kind[1] in rows.kinds:
-            return (outputs[key].residual * outputs[key].root)[:, rows.kinds[kind[1]]]
-    return None
 
 
 def look(factor: Any, state: State) -> Any:

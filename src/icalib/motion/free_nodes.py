@@ -47,11 +47,6 @@ class FreeNodes(RowFactor):
         """Rows (K - 1, 15) that stay empty."""
         return Whitened.without_loss(self.n_nodes - 1, NODE)
 
-    def rms(self, out: Whitened, kind: str) -> tuple[float | None, str]:
-        """None: there are no kinds."""
-        del out, kind
-        return None, ""
-
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """Defines what corners leave open in the nodes of `piece`. Returns half a chi^2 of nothing."""
         del state, out, curved

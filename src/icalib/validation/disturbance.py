@@ -9,11 +9,11 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
-from icalib.motion.clocks import instants
 from icalib.motion.factor import pairs_of
 from icalib.sensors.camera.corner_factor import CornerFactor
 
 BINS, WINDOW = 64, 3  # of the recording; a shock reaches a few keyframes beyond itself
+SHAKEN = ("gyroscope", "accelerometer", "corners")  # kinds of residuals that a knock on the rig enlarges
 AT_ONE_TIME = 0.5  # of the misfit
 LARGE = 3.0  # times the usual chi^2 of a window: the number of measurements varies, too
 FASTEST_GAP_S = 1.0  # between images, beyond which their difference says nothing of image speed
@@ -57,18 +57,14 @@ def disturbance(found: Estimate, misfit: float, misfits: Collection[str]) -> Dis
 
 
 def _chi2_over_time(found: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By sensor: seconds (n,) on the joined clock and chi^2 (n,), of the IMU's intervals and of images."""
-    problem, state, out = found.problem, found.outcome.state, found.outcome.residuals
-    rows = {}
-    inertial = out[problem.chain.key].residual[:, :9]
-    if inertial.size:
-        rows[problem.chain.name] = state.seconds[:-1], (inertial**2).sum(axis=1)
-    for camera, corners in pairs_of(problem.factors, out, CornerFactor):
-        if len(camera.stream.uv):
-            times = instants(camera.stream, state.values)[camera.stream.image]
-            square = (corners.residual.astype(np.float64) ** 2).sum(axis=1) * corners.root.astype(np.float64) ** 2
-            rows[camera.name] = times, square
-    return rows
+    """By sensor: seconds (n,) on the joined clock and chi^2 (n,), of the kinds `SHAKEN`."""
+    outcome = found.outcome
+    factors = outcome.problem.factors.items()
+    rows = [r for key, f in factors for r in f.rows(outcome.residuals[key], outcome.state) if r.kind in SHAKEN]
+    chi2: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {r.sensor: [] for r in rows}
+    for r in rows:
+        chi2[r.sensor].append((r.seconds, (r.weighted.astype(np.float64) ** 2).sum(axis=1)))
+    return {s: (np.concatenate([t for t, _ in own]), np.concatenate([c for _, c in own])) for s, own in chi2.items()}
 
 
 @dataclass(frozen=True)

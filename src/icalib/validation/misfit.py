@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.evidence import rows_of
 from icalib.estimate.noise_size import are_noise, fitting_noise
 from icalib.estimate.problem.inputs import Inputs
-from icalib.motion.factor import rows_of
 from icalib.result import CrossValidation, SensorFit
 from icalib.result.excess import FAR_BEYOND, dof_known, excess, times
 from icalib.rig import Rig
@@ -103,8 +103,8 @@ def _times(f: SensorFit) -> float:
 
 def _is_noise(found: Estimate, f: SensorFit) -> bool:
     """Whether residuals of wheels or poses are white, and constant over the recording."""
-    rows = rows_of(found.problem.factors, found.outcome.residuals, (f.sensor, f.kind))
-    return rows is not None and are_noise(rows)
+    rows = rows_of(found.outcome, f.sensor, f.kind)
+    return rows is not None and are_noise(rows.weighted)
 
 
 def _is_small(f: SensorFit) -> bool:

@@ -8,7 +8,7 @@ from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.outcome import Outcome, posterior
 from icalib.estimate.problem.problem import Problem
 from icalib.model.statistics import Fit
-from icalib.motion.factor import Along, FitKey, RawSize, Residuals, Squares
+from icalib.motion.factor import Along, FitKey, RawSize, ResidualRows, Residuals, Squares
 from icalib.optim.arrowhead import Draw
 from icalib.optim.calib_block import restricted_inverse
 
@@ -37,6 +37,15 @@ def chi2_by_kind(problem: Problem, at: Residuals) -> dict[FitKey, Squares]:
 def raw_sizes(problem: Problem, at: Residuals) -> dict[FitKey, RawSize]:
     """RMS of each kind of residual as it was before whitening, its unit, and the number of outliers."""
     return {kind: own for key, f in problem.factors.items() for kind, own in f.sizes(at[key]).items()}
+
+
+def rows_of(outcome: Outcome, sensor: str, kind: str) -> ResidualRows | None:
+    """Residuals of one kind by one sensor; None if no factor has any."""
+    for key, factor in outcome.problem.factors.items():
+        for rows in factor.rows(outcome.residuals[key], outcome.state):
+            if (rows.sensor, rows.kind) == (sensor, kind):
+                return rows
+    return None
 
 
 def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[FitKey, float]:

@@ -22,7 +22,7 @@ from icalib.data.measurements import CornerStream
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import BOARD
 from icalib.motion.clocks import mounted_columns, offset_at
-from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, Squares
+from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import Poses, poses_at, poses_of_nodes
 from icalib.optim import pages
@@ -42,7 +42,7 @@ from icalib.sensors.camera.corner_kernels import (
     accumulate_clusters,
     camera_points,
 )
-from icalib.sensors.camera.corner_statistics import corner_squares, rms_px, spent_by_corners
+from icalib.sensors.camera.corner_statistics import CORNERS, corner_squares, image_rows, rms_px, spent_by_corners
 from icalib.sensors.camera.views import Views
 
 BLOCK = 256  # images at a time, where nothing is summed
@@ -170,6 +170,10 @@ class CornerFactor(FactorDefaults):
             X, R_cam_body = self.points_in_camera(state, v0, v1)
             yield self.corners_of(v0, v1), X, R_cam_body[self.views.of_corners(v0, v1) - v0]
 
+    def instants(self, state: State) -> np.ndarray:
+        """(M,) of the images, s on the body's clock since its first stamp."""
+        return self.times + offset_at(state, self.name, self.node)
+
     def lens(self, state: State) -> np.ndarray:
         """(P,) parameters of the camera model."""
         return np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
@@ -210,6 +214,12 @@ class CornerFactor(FactorDefaults):
         """See `Factor`; that of the corners stands for the errors that images share, too."""
         size = RawSize(rms_px(out.residual, out.root), "px", int((out.root == 0.0).sum()))
         return dict.fromkeys(self.squares(out), size)
+
+    def rows(self, out: CornerOutput, state: State) -> list[ResidualRows]:
+        """See `Factor`: of the corners."""
+        seconds = self.instants(state)[self.stream.image]
+        rows = image_rows(self.name, CORNERS, seconds, out.residual, self.noise.sigma, out.root)
+        return [rows] if len(seconds) else []
 
     def spent(self, out: CornerOutput, along: Along) -> dict[FitKey, float]:
         """See `Factor`. A few images at a time: residuals of all at another state would fill the memory."""

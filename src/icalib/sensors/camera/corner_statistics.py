@@ -7,20 +7,31 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icalib.motion.factor import Along, FitKey, Squares
+from icalib.motion.factor import Along, FitKey, ResidualRows, Squares
 from icalib.optim.arrowhead import in_parallel
 
 if TYPE_CHECKING:
     from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
+CORNERS = "corners"  # the kind of their rows
+
 
 def corner_squares(camera: CornerFactor, out: CornerOutput) -> dict[FitKey, Squares]:
     """Number and chi^2 of the corners' rows and of each kind of common error's rows."""
-    found = {(camera.name, "corners"): Squares(2 * int(np.count_nonzero(out.root)), camera.chi2(out))}
+    found = {(camera.name, CORNERS): Squares(2 * int(np.count_nonzero(out.root)), camera.chi2(out))}
     for k, tau in enumerate(camera.noise.tau):
         rows = out.shared[:, :, k] / tau
         found[camera.name, f"common error {k}"] = Squares(rows.size, float((rows**2).sum()))
     return found
+
+
+def image_rows(
+    sensor: str, kind: str, seconds: np.ndarray, residual: np.ndarray, sigma: np.ndarray, root: np.ndarray
+) -> ResidualRows:
+    """Of residuals (n, 2) px with sigma (n,) px per axis; root (n,): of the robust weights over sigma^2."""
+    two = residual.shape
+    sigma, root = np.broadcast_to(sigma[:, None], two), np.broadcast_to((root * sigma)[:, None], two)
+    return ResidualRows(sensor, kind, "px", seconds, residual, sigma, residual / sigma, root)
 
 
 def rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
@@ -42,7 +53,7 @@ def _spent_by_views(camera: CornerFactor, at: CornerOutput, step: Along, views: 
     root, view = at.root[own], camera.views.of_corners(*views) - views[0]
     along = (up - down) / step.share * root[:, None]
     if m == 0:
-        return {"corners": float((along**2).sum())}
+        return {CORNERS: float((along**2).sum())}
     # An error c takes what is least: |along + f c|^2 + |c / tau|^2; about that its covariance is M^-1, on each axis.
     f = camera.noise.field[own] * root[:, None]
     M, rhs = np.zeros((n, m, m)), np.zeros((n, m, 2))
@@ -54,4 +65,4 @@ def _spent_by_views(camera: CornerFactor, at: CornerOutput, step: Along, views: 
     total = float(((along + np.einsum("ik,ikj->ij", f, shared[view])) ** 2).sum())
     total += 2.0 * float(np.einsum("ik,ikl,il->", f, inverse[view], f))
     spent = ((shared**2).sum(axis=2) + 2.0 * np.diagonal(inverse, axis1=1, axis2=2)).sum(axis=0) / camera.noise.tau**2
-    return {"corners": total} | {f"common error {k}": float(spent[k]) for k in range(m)}
+    return {CORNERS: total} | {f"common error {k}": float(spent[k]) for k in range(m)}

@@ -190,10 +190,9 @@ class ImuFactor(RowFactor):
         rows = out.residual[:, self.kinds[kind]]
         return rows.size - (len(self.starts) - 1) * rows.shape[1]
 
-    def rms(self, out: Whitened, kind: str) -> tuple[float | None, str]:
-        """None: rows of an interval are whitened jointly."""
-        del out, kind
-        return None, ""
+    def times(self, state: State) -> np.ndarray:
+        """(K - 1,) the keyframe at which each interval starts."""
+        return state.seconds[:-1]
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """The broad prior on the biases of the recordings' first nodes in `piece`, about those of the pass's start.

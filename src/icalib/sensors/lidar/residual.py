@@ -122,6 +122,11 @@ class LidarFactor(RowFactor):
         del out, kind
         return int(self.moments.count.sum())
 
+    def times(self, state: State) -> np.ndarray:
+        """(E,) the middle of the bin of each plane's rows."""
+        at = self.moments.seconds + offset_at(state, self.name, self.node)
+        return np.repeat(at, np.diff(self.moments.start))
+
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
         """Of the points' distances to their planes, weighted as they are."""
         del kind

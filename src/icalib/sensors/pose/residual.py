@@ -11,6 +11,7 @@ frame_translation (R_world_frame, p_world_frame), in each recording its own.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from icalib.data.measurements import PoseStream
 from icalib.model.frames import FRAME, frame_of
-from icalib.motion.clocks import by_clock, instants
+from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.nodes import MERGED_WITHIN_S, usable
@@ -51,7 +52,7 @@ class PoseNoise:
 class _PoseFactor(RowFactor):
     """What both factors of poses share: three rows of rotation and three of position each. name: of the sensor."""
 
-    units: ClassVar[dict[str, str]] = UNITS
+    units: ClassVar[Mapping[str, str]] = UNITS
 
     name: str
     rotation: np.ndarray
@@ -74,9 +75,27 @@ class _PoseFactor(RowFactor):
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.rotation), 6)
 
-    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
-        """Of the residuals of `kind`."""
-        return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
+    @property
+    def instants(self) -> np.ndarray:
+        """(n,) that the rows are at, on the sensor's clock since its first stamp."""
+        raise NotImplementedError
+
+    @property
+    def keyframes(self) -> np.ndarray:
+        """(n,) that the rows hang on, the first of two."""
+        raise NotImplementedError
+
+    def times(self, state: State) -> np.ndarray:
+        """See `RowFactor`."""
+        return self.instants + offset_at(state, self.name, self.keyframes)
+
+    def raw(self, out: Whitened) -> np.ndarray:
+        """(n, 6) rad and m."""
+        return out.residual * self.sigma
+
+    def raw_sigma(self) -> np.ndarray:
+        """(n, 6) rad and m."""
+        return self.sigma
 
 
 @dataclass(frozen=True)
@@ -125,8 +144,13 @@ class AbsolutePoseFactor(_PoseFactor):
 
     @property
     def instants(self) -> np.ndarray:
-        """(n,) that the rows are at, on the sensor's clock."""
+        """See `_PoseFactor`."""
         return self.seconds
+
+    @property
+    def keyframes(self) -> np.ndarray:
+        """See `_PoseFactor`."""
+        return self.node
 
     @property
     def sigma(self) -> np.ndarray:
@@ -197,6 +221,11 @@ class RelativePosesFactor(_PoseFactor):
         return self.seconds[self.intervals.first]
 
     @property
+    def keyframes(self) -> np.ndarray:
+        """See `_PoseFactor`."""
+        return self.intervals.node
+
+    @property
     def sigma(self) -> np.ndarray:
         """(n, 6) of each row."""
         duration = self.seconds[self.intervals.last] - self.seconds[self.intervals.first]
@@ -229,10 +258,6 @@ class RelativePosesFactor(_PoseFactor):
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor
-
-
-def _rms(out: Whitened, sigma: np.ndarray, rows: slice) -> float:
-    return float(np.sqrt(np.mean((out.residual * sigma)[:, rows] ** 2)))
 
 
 def _kinematics(factor: PoseFactor) -> Kinematics:

@@ -16,7 +16,9 @@ nearly level and below the IMU, in each recording its own.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -59,6 +61,8 @@ class GroundFactor(RowFactor):
     """Rows of the wheels `name` at n nodes: tilt about both level axes, height, and what was measured of it; those that
     `ground` does not ask for weigh nothing. floor: the key of the plane in each recording; None: the horizon's, or none
     where `ground` asks for a floor that is not seen."""
+
+    units: ClassVar[Mapping[str, str]] = {TILT: "rad", HEIGHT: "m"}
 
     name: str
     ground: Ground
@@ -108,11 +112,17 @@ class GroundFactor(RowFactor):
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.nodes), 4)
 
-    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
-        """Of the residuals of `kind`."""
-        rows = self.kinds[kind]
-        r = out.residual[:, rows] * self.sigma[rows]
-        return float(np.sqrt(np.mean(r**2))) if r.size else 0.0, "rad" if kind == TILT else "m"
+    def times(self, state: State) -> np.ndarray:
+        """(n,) of the keyframes."""
+        return state.seconds[self.nodes]
+
+    def raw(self, out: Whitened) -> np.ndarray:
+        """(n, 4) rad and m; 0 in rows that are not asked for."""
+        return out.residual * np.where(np.isfinite(self.sigma), self.sigma, 0.0)
+
+    def raw_sigma(self) -> np.ndarray:
+        """(n, 4) rad and m."""
+        return np.tile(self.sigma, (len(self.nodes), 1))
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""

@@ -14,6 +14,7 @@ their kind: of a pair radii (left, right) and baseline, the distance between the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -70,6 +71,8 @@ class IncrementFactor(RowFactor):
     where a vehicle on a ramp turns at 1 rad/s and pitches at 1 rad/s^2, over 50 ms.
     """
 
+    units: ClassVar[Mapping[str, str]] = UNITS
+
     name: str
     kind: WheelKind
     intervals: StampIntervals
@@ -89,10 +92,6 @@ class IncrementFactor(RowFactor):
     @property
     def kinds(self) -> Kinds:
         return KINDS[self.kind]
-
-    @property
-    def units(self) -> dict[str, str]:
-        return UNITS
 
     @classmethod
     def build(
@@ -128,9 +127,17 @@ class IncrementFactor(RowFactor):
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.measured), 4)
 
-    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
-        """Of the residuals of `kind`."""
-        return _rms(out, self.whitening, self.kinds[kind]), self.units[kind]
+    def times(self, state: State) -> np.ndarray:
+        """See `RowFactor`."""
+        return self.instants.times[self.instants.start[:-1]] + offset_at(state, self.name, self.intervals.node)
+
+    def raw(self, out: Whitened) -> np.ndarray:
+        """See `RowFactor`."""
+        return _unwhitened(out, self.whitening)
+
+    def raw_sigma(self) -> np.ndarray:
+        """See `RowFactor`."""
+        return _raw_sigma(self.whitening)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """Fills `out` for the intervals in `piece`, and adds them to its sums where `sums` are wanted.
@@ -171,7 +178,7 @@ class RelativePoseFactor(RowFactor):
     """
 
     kind: ClassVar[WheelKind] = "pair"
-    units: ClassVar[dict[str, str]] = {"yaw": "rad", "path": "m"}
+    units: ClassVar[Mapping[str, str]] = {"yaw": "rad", "path": "m"}
 
     name: str
     seconds: np.ndarray  # (N,) stamps since the first on the wheels' clock
@@ -235,9 +242,17 @@ class RelativePoseFactor(RowFactor):
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.poses.z), 3)
 
-    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
-        """Of the residuals of `kind`."""
-        return _rms(out, self.whitening, self.kinds[kind]), self.units[kind]
+    def times(self, state: State) -> np.ndarray:
+        """See `RowFactor`."""
+        return self.seconds[self.intervals.first] + offset_at(state, self.name, self.intervals.node)
+
+    def raw(self, out: Whitened) -> np.ndarray:
+        """See `RowFactor`."""
+        return _unwhitened(out, self.whitening)
+
+    def raw_sigma(self) -> np.ndarray:
+        """See `RowFactor`."""
+        return _raw_sigma(self.whitening)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See IncrementFactor.accumulate."""
@@ -314,9 +329,14 @@ def _track(node: np.ndarray, poses: Poses) -> Track:
     return Track(node, poses.rotation, poses.position, poses.rate, poses.velocity, poses.J_node, poses.J_imu)
 
 
-def _rms(out: Whitened, whitening: np.ndarray, rows: slice) -> float:
-    residual = np.linalg.solve(whitening, out.residual[:, :, None])[:, rows, 0]
-    return float(np.sqrt(np.mean(residual**2)))
+def _unwhitened(out: Whitened, whitening: np.ndarray) -> np.ndarray:
+    """(n, m) residuals in their own units."""
+    return np.linalg.solve(whitening, out.residual[:, :, None])[:, :, 0]
+
+
+def _raw_sigma(whitening: np.ndarray) -> np.ndarray:
+    """(n, m) marginal standard deviations: the covariance is (W^T W)^-1."""
+    return np.linalg.norm(np.linalg.inv(whitening), axis=2)
 
 
 def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:

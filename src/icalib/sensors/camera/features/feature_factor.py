@@ -17,7 +17,7 @@ import numpy as np
 
 from icalib.data.measurements import TrackStream
 from icalib.motion.clocks import clock_of, mounted_columns
-from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, Squares
+from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece
 from icalib.optim.front import Features
@@ -40,6 +40,7 @@ from icalib.sensors.camera.features.feature_kernels import (
 )
 from icalib.sensors.camera.features.feature_statistics import (
     FeatureOutput,
+    feature_rows,
     feature_sizes,
     feature_squares,
     spent_by_features,
@@ -214,6 +215,10 @@ class FeatureFactor(FactorDefaults):
     def sizes(self, out: FeatureOutput) -> dict[FitKey, RawSize]:
         """See `Factor`."""
         return feature_sizes(self, out)
+
+    def rows(self, out: FeatureOutput, state: State) -> list[ResidualRows]:
+        """See `Factor`: of each camera's features."""
+        return feature_rows(self, out, state)
 
     def spent(self, out: FeatureOutput, along: Along) -> dict[FitKey, float]:
         """See `Factor`."""

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icalib.motion.factor import Along, FitKey, RawSize, Squares, look
-from icalib.sensors.camera.corner_statistics import rms_px
+from icalib.motion.factor import Along, FitKey, RawSize, ResidualRows, Squares, look
+from icalib.optim.state import State
+from icalib.sensors.camera.corner_statistics import image_rows, rms_px
 from icalib.sensors.camera.features.surfaces import ON_PLANES, Distances
 
 if TYPE_CHECKING:
@@ -49,6 +50,17 @@ def feature_sizes(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, Raw
         found[camera.name, FEATURES] = RawSize(rms_px(out.residual[i], out.root[i]), "px", rejected)
         if len(own := factor.on_planes_of(i)):
             found[camera.name, ON_PLANES] = RawSize(float(np.sqrt(np.mean(out.off.residual[own] ** 2))), "m")
+    return found
+
+
+def feature_rows(factor: FeatureFactor, out: FeatureOutput, state: State) -> list[ResidualRows]:
+    """Of each camera's features."""
+    found = []
+    for camera, stream, sigma, residual, root in zip(
+        factor.cameras, factor.streams, factor.sigmas, out.residual, out.root, strict=True
+    ):
+        seconds = camera.instants(state)[stream.image]
+        found.append(image_rows(camera.name, FEATURES, seconds, residual, sigma, root))
     return found
 
 
