@@ -18,11 +18,12 @@ from scipy.spatial.transform import Rotation
 from icalib.cli.console import print_result
 from icalib.errors import CalibrationError
 from icalib.export.outputs import write_outputs
-from icalib.report import report_html, robot_figures
+from icalib.report import report_html, sections
 from icalib.result import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
 from icalib.result.quantities import rows
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels, by_name
-from icalib.validation.misfit import misfit_words
+from icalib.sensors.lidar import show
+from icalib.validation import misfit
 
 ROBOT_FIGURES = {"points-0", "distance-0", "wheels-0", "map-before", "map-after"}
 
@@ -149,7 +150,7 @@ def test_tables_show_radii_in_millimetres(robot: Calibration):
 
 
 def test_points_in_space_are_coloured_by_their_residual(robot: Calibration):
-    maps = robot_figures.plane_maps(robot)
+    maps = show.plane_maps(robot)
     r, (before, after) = robot.lidar_residuals[0], (maps[f"map-{x}"]["data"][0] for x in ("before", "after"))
     np.testing.assert_allclose(after["marker"]["color"], np.minimum(1e3 * np.abs(r.residual), 4 * 30.2), atol=0.3)
     assert np.mean(before["marker"]["color"]) > 2.5 * np.mean(after["marker"]["color"])
@@ -166,7 +167,7 @@ def test_each_recording_has_a_map_of_its_own(robot: Calibration, assert_drawn: C
         for name, own in (("hall", first), ("yard", second))
     )
     several = dataclasses.replace(robot, recordings=spans)
-    maps = robot_figures.plane_maps(several)
+    maps = show.plane_maps(several)
     one, other = (t for t in maps["map-after"]["data"] if t["name"] == "points")
     np.testing.assert_allclose(one["x"], r.world[first, 0], atol=1e-3)
     np.testing.assert_allclose(other["x"], r.world[second, 0], atol=1e-3)
@@ -175,12 +176,12 @@ def test_each_recording_has_a_map_of_its_own(robot: Calibration, assert_drawn: C
     assert [b["label"] for b in menu["buttons"]] == ["hall", "yard"]
     assert menu["buttons"][1]["args"] == ["visible", [False, False, True, True]]
     assert [len(m["data"]) for m in maps.values()] == [2, 4]
-    assert "updatemenus" not in robot_figures.plane_maps(robot)["map-after"]["layout"]
+    assert "updatemenus" not in show.plane_maps(robot)["map-after"]["layout"]
     assert_drawn(report_html(several), {"map-before", "map-after"})
 
 
 def test_outlines_lie_in_their_planes_about_their_points(robot: Calibration):
-    pen = robot_figures.plane_maps(robot)["map-after"]["data"][1]
+    pen = show.plane_maps(robot)["map-after"]["data"][1]
     corners = np.array([pen[k] for k in "xyz"], dtype=float).T.reshape(-1, 6, 3)[:, :5]
     for plane, rectangle in zip(robot.planes, corners, strict=True):
         np.testing.assert_allclose((rectangle - plane.point) @ plane.normal, 0.0, atol=1e-3)
@@ -192,7 +193,7 @@ def test_means_over_distance_show_a_pattern(robot: Calibration):
     """A range that is 1 % too long."""
     r = robot.lidar_residuals[0]
     long = dataclasses.replace(r, residual=(r.residual + 0.01 * r.distance).astype(np.float32))
-    trace = robot_figures.residuals_over_distance(long)["data"][2]
+    trace = show.residuals_over_distance(long)["data"][2]
     x, y = (np.array(trace[k], dtype=float) for k in "xy")
     slope = np.polyfit(x[np.isfinite(y)], y[np.isfinite(y)], 1)[0]
     assert slope == pytest.approx(10.0, abs=1.0)
@@ -227,7 +228,20 @@ def warnings(
 ) -> str:
     imu = ImuSensor("imu0", "imu0", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
     rig = Rig(by_name(imu, Lidar("lidar0", "lidar0", noise), Wheels("wheel0", "wheel0", **wheels)))
-    return misfit_words(rig, SensorFit(sensor, kind, 400, dof, ratio * dof), white) or ""
+    return misfit.misfit_words(rig, SensorFit(sensor, kind, 400, dof, ratio * dof), white) or ""
+
+
+def test_kinds_without_views_and_words_of_their_own_get_general_ones(
+    robot: Calibration, monkeypatch: pytest.MonkeyPatch
+):
+    for module in (sections, misfit):
+        monkeypatch.setattr(module, "facet", lambda kind, name: None)
+    (section,) = sections.sections(robot)
+    assert (section.name, section.title) == ("wheels", "Wheels")
+    assert [t["name"] for t in section.figures["wheels-0"]["data"]] == ["left", "right", "lateral", "vertical"]
+    words = "yaw residuals of wheel0 are 2x larger than its stated noise predicts"
+    assert warnings("yaw", 4.0) == f"{words}; state a larger one."
+    assert "no white noise" in warnings("yaw", 4.0, white=False) and warnings("yaw", 1.5) == ""
 
 
 def test_more_slip_than_allowed_is_warned_of():

@@ -14,8 +14,7 @@ from icalib.result import Calibration
 
 
 def rig_picture(c: Calibration) -> Figure:
-    """Frames of all sensors, the cameras' fields of view, rings about LiDARs, and wheels in the imu frame, and how well
-    their places are known."""
+    """Frames and shapes of all sensors in the imu frame, and how well their places are known."""
     frames, spread = rig_shapes.frames(c), rig_shapes.spread(c)
     origins = np.array([T[:3, 3] for T in frames.values()])
     traces = [
@@ -24,10 +23,8 @@ def rig_picture(c: Calibration) -> Figure:
         )
         for i in range(3)
     ]
-    shapes = {name: _frustum(c, name, 0.45 * spread) for name in c.cameras}
-    shapes |= {name: rig_shapes.rings(0.3 * spread) for name in c.lidars}
-    shapes |= {name: rig_shapes.axle(c, name) for name in c.wheels}
-    for i, (name, pen) in enumerate(shapes.items()):
+    shapes = [(name, pen) for name in c.mounted if (pen := rig_shapes.shape(c, name)) is not None]
+    for i, (name, pen) in enumerate(shapes):
         color, T = COLORS[i % len(COLORS)], frames[name]
         traces.append(path_3d(pen @ T[:3, :3].T + T[:3, 3], name, color, line={"color": color, "width": 2}))
     factor = magnification(c)
@@ -51,18 +48,6 @@ def _axis_line(frames: dict[str, np.ndarray], i: int, length: float) -> np.ndarr
 def _uncertainty(e: Ellipsoid, origin: np.ndarray, factor: float) -> dict[str, Any]:
     color = VERDICT_COLORS[e.verdict]
     return path_3d(outline(e, factor) + origin, f"{e.sensor}: {e.verdict}", color, line={"color": color, "width": 3})
-
-
-def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:
-    """Edges of the field of view to `depth`, in the camera's frame, without distortion, inside 60 deg of the axis."""
-    fx, fy, cx, cy = c.group(name, "intrinsics").value
-    width, height = c.rig["sensors"][name]["resolution"]
-    u, v = np.array([0, width, width, 0]) - 0.5, np.array([0, 0, height, height]) - 0.5
-    widest = np.tan(np.deg2rad(60.0))
-    a, b = np.clip((u - cx) / fx, -widest, widest), np.clip((v - cy) / fy, -widest, widest)
-    corners = depth * np.stack([a, b, np.ones(4)], axis=1)
-    origin = np.zeros(3)
-    return np.vstack([corners, corners[:1], PEN_UP, *(np.stack([origin, p, PEN_UP[0]]) for p in corners)])
 
 
 def correlation(c: Calibration) -> Figure:

@@ -6,6 +6,7 @@ import numpy as np
 
 from icalib.geometry.targets import Target
 from icalib.result import Calibration
+from icalib.sensors import SENSOR_KINDS, answer, facet
 
 PEN_UP = np.full((1, 3), np.nan)  # a row between two lines
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 41)
@@ -24,26 +25,15 @@ def spread(c: Calibration) -> float:
     return max(float(np.ptp(np.vstack([origins, np.zeros(3)]), axis=0).max()), _LEAST_SPREAD_M)
 
 
-def rings(radius: float) -> np.ndarray:
-    """Three circles about z, as a spinning LiDAR looks level, up and down."""
-    x, y = CIRCLE.T
-    tilted = ((np.cos(e), np.sin(e)) for e in np.deg2rad([-15.0, 0.0, 15.0]))
-    circles = [radius * np.stack([a * x, a * y, np.full_like(x, b)], axis=1) for a, b in tilted]
-    return np.vstack([part for circle in circles for part in (circle, PEN_UP)])
+def shape(c: Calibration, name: str) -> np.ndarray | None:
+    """(n, 3) lines of a sensor in its own frame [m]; None where its kind has no shape."""
+    return answer(c.rig["sensors"][name]["type"], "show", "shape", c, name, spread(c))
 
 
-def axle(c: Calibration, name: str) -> np.ndarray:
-    """The two wheels as discs, and the axle between them; nothing where radii and baseline are not known."""
-    known = {g.name: g.value for g in c.groups if g.sensor == name}
-    if "radii" not in known:
-        return PEN_UP
-    left, right = (np.array([0.0, s * 0.5 * known["baseline"][0], 0.0]) for s in (1.0, -1.0))
-    rim = np.insert(CIRCLE, 1, 0.0, axis=1)
-    discs = [(hub + r * rim, hub + r * rim[::5]) for hub, r in zip((left, right), known["radii"], strict=True)]
-    pen = [left, right, PEN_UP]
-    for hub, (circle, ends) in zip((left, right), discs, strict=True):
-        pen += [circle, PEN_UP, *(np.stack([hub, end, PEN_UP[0]]) for end in ends)]
-    return np.vstack(pen)
+def legends(c: Calibration) -> list[str]:
+    """What the shapes of the kinds in the rig are."""
+    own = (getattr(facet(kind, "show"), "LEGEND", "") for kind in SENSOR_KINDS if c.of_type(kind))
+    return [legend for legend in own if legend]
 
 
 def body_outline(target: Target, body: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from icalib.result import Calibration, relative_poses
 from icalib.result.quantities import chi2_words, dof_words, rms_words, rows, rpy_deg, shown
 from icalib.result.verdict import Usability, worst
+from icalib.sensors import ask
 
 TRUST: dict[Usability, str] = {
     "usable": "good",
@@ -17,7 +18,6 @@ TRUST: dict[Usability, str] = {
     "partly usable": "bad",
     "not usable": "wrong",
 }
-_SEEN = {"corners": "corners", "observations": "observations of points that were followed"}
 
 
 class Html(str):
@@ -157,14 +157,4 @@ def size_words(c: Calibration) -> str:
     several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
     span = sum(r.end - r.start for r in c.recordings) if several else whole
     parts = [f"{several}{span:.1f} s"]
-    if c.cameras:
-        images = sum(len(r.seconds) for r in c.corner_residuals)
-        counts = {kind: sum(len(r.uv) for r in c.image_residuals if r.kind == kind) for kind in _SEEN}
-        seen = " and ".join(f"{n} {_SEEN[kind]}" for kind, n in counts.items() if n)
-        parts.append(f"{images} images with {seen or 'nothing in them'}")
-    if c.lidar_residuals:
-        points = sum(r.points_used for r in c.lidar_residuals)
-        parts.append(f"{sum(r.scans for r in c.lidar_residuals)} scans with {points} points on {len(c.planes)} planes")
-    if c.wheel_residuals:
-        parts.append(f"{sum(len(r.seconds) for r in c.wheel_residuals)} stretches of wheel turns")
-    return ", ".join([*parts, f"{len(c.trajectory.seconds)} keyframes"])
+    return ", ".join([*parts, *ask("show", "amounts", c), f"{len(c.trajectory.seconds)} keyframes"])

@@ -30,7 +30,7 @@ def spans(c: Calibration) -> tuple[RecordingSpan, ...]:
 
 
 def log_rig(s: RerunStream, c: Calibration) -> None:
-    """Frames of all sensors, fields of view, rings about LiDARs, wheels; all but the body stand still on it."""
+    """Frames and shapes of all sensors; all but the body are fixed to it."""
     spread = rig_shapes.spread(c)
     for name, T in rig_shapes.frames(c).items():
         s.still(place(c, name), s.rr.TransformAxes3D(0.25 * spread))
@@ -38,9 +38,9 @@ def log_rig(s: RerunStream, c: Calibration) -> None:
             s.still(place(c, name), s.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
     for name in c.cameras:
         s.still(f"{place(c, name)}/image", _pinhole(s, c, name, 0.45 * spread))
-    shapes = {name: rig_shapes.rings(0.3 * spread) for name in c.lidars}
-    shapes |= {name: rig_shapes.axle(c, name) for name in c.wheels}
-    for i, (name, pen) in enumerate(shapes.items()):
+    others = [name for name in c.mounted if name not in c.cameras]
+    shapes = [(name, pen) for name in others if (pen := rig_shapes.shape(c, name)) is not None]
+    for i, (name, pen) in enumerate(shapes):
         strips = s.rr.LineStrips3D(_strips(pen), colors=rgb(COLORS[i % len(COLORS)]))
         s.still(f"{place(c, name)}/shape", strips)
 

@@ -1,26 +1,17 @@
-"""Residuals of LiDARs' points, of wheels and of poses, and the planes that LiDARs see."""
+"""What report and 3D view show of LiDARs: points on planes, before and after, and residuals over time and distance."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from icalib.report.plot import (
-    COLORS,
-    VIEW,
-    Figure,
-    axis,
-    dots,
-    figure,
-    line,
-    numbers,
-    path_3d,
-    stacked_axes,
-    thin,
-    y_of,
-)
-from icalib.result import Calibration, Plane, RowResiduals
+from icalib.report.plot import VIEW, Figure, axis, dots, figure, line, numbers, path_3d, thin
+from icalib.report.rig_shapes import CIRCLE, PEN_UP
+from icalib.report.sections import Section, plot_place
+from icalib.report.tables import Html, element, html
+from icalib.result import Calibration, Plane
 from icalib.sensors.lidar.record import LidarResiduals
 
 MOST_DOTS = 2500  # in a figure of residuals
@@ -31,6 +22,53 @@ WIDEST = 4.0  # of a scale of colours, in RMS of the result
 TOP = 5.0  # of a scale of residuals, in their RMS
 NEARLY_LEVEL = 0.1  # sine of a slope; below it a plane lies along the axes of the world
 _WALL = "#64748b"
+_MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-after"))
+_WORDS = (
+    "Where planes are in the world, and how far points lie off them. A good calibration leaves thin planes, one "
+    "colour all over, and a mean without a pattern in time and distance. As the first guess had them planes are "
+    "those that fit its points best. Each recording has a world of its own; of several the menu above each map "
+    f"chooses one. At most {MOST_IN_SPACE} points are drawn in space, {MOST_DOTS} of a kind below, evenly picked."
+)
+LEGEND = "rings are LiDARs"
+
+
+def sections(c: Calibration) -> Iterator[Section]:
+    """The planes before and after, then each LiDAR."""
+    if not c.lidar_residuals:
+        return
+    maps = [element("div", [element("h3", title), plot_place(name, "")]) for title, name in _MAPS]
+    parts, figures = [element("div", maps, "pair")], plane_maps(c)
+    for i, r in enumerate(c.lidar_residuals):
+        first, now = (1e3 * float(np.sqrt(np.mean(x.astype(np.float64) ** 2))) for x in (r.first_residual, r.residual))
+        counts = (
+            f"{r.points_used} of {r.points_read} points used; off their planes {first:.1f} mm RMS at first, "
+            f"{now:.1f} mm now"
+        )
+        head = element("h3", [html(r.sensor), element("small", f" {counts}")])
+        plots = [plot_place(f"points-{i}", ""), plot_place(f"distance-{i}", "")]
+        parts.append(Html(head + element("div", plots, "pair")))
+        figures |= {f"points-{i}": residuals_over_time(r), f"distance-{i}": residuals_over_distance(r)}
+    yield Section("points", "LiDAR points on planes", _WORDS, Html("".join(parts)), figures)
+
+
+def amounts(c: Calibration) -> Iterator[str]:
+    """How much was used."""
+    if c.lidar_residuals:
+        points = sum(r.points_used for r in c.lidar_residuals)
+        yield f"{sum(r.scans for r in c.lidar_residuals)} scans with {points} points on {len(c.planes)} planes"
+
+
+def shape(c: Calibration, name: str, spread: float) -> np.ndarray:
+    """Rings about a LiDAR, in its frame; spread: of the rig [m]."""
+    return rings(0.3 * spread)
+
+
+def rings(radius: float) -> np.ndarray:
+    """Three circles about z, as a spinning LiDAR looks level, up and down."""
+    x, y = CIRCLE.T
+    tilted = ((np.cos(e), np.sin(e)) for e in np.deg2rad([-15.0, 0.0, 15.0]))
+    circles = [radius * np.stack([a * x, a * y, np.full_like(x, b)], axis=1) for a, b in tilted]
+    return np.vstack([part for circle in circles for part in (circle, PEN_UP)])
 
 
 def residuals_over_time(r: LidarResiduals) -> Figure:
@@ -64,25 +102,6 @@ def _residuals_over(r: LidarResiduals, x: np.ndarray, title: str) -> Figure:
         xaxis=axis(title),
         yaxis=axis("residual [mm]"),
     )
-
-
-def panels(r: RowResiduals) -> Figure:
-    """What each wheel turned, and slip, or rotation and position of poses, over time."""
-    keep = thin(len(r.seconds), MOST_DOTS)
-    units = ["mrad" if unit == "rad" else "mm" for unit in r.units]
-    traces = [
-        line(
-            r.seconds[keep],
-            1e3 * r.residual[keep, k],
-            label,
-            COLORS[k % len(COLORS)],
-            yaxis=y_of(k),
-            line={"color": COLORS[k % len(COLORS)], "width": 1},
-        )
-        for k, label in enumerate(r.labels)
-    ]
-    titles = [f"{label} [{unit}]" for label, unit in zip(r.labels, units, strict=True)]
-    return figure(traces, 130 * len(titles) + 90, **stacked_axes(titles))
 
 
 def plane_maps(c: Calibration) -> dict[str, Figure]:

@@ -1,0 +1,28 @@
+"""Residuals of rows over time, one panel for each column."""
+
+from __future__ import annotations
+
+from icalib.report.plot import COLORS, Figure, figure, line, stacked_axes, thin, y_of
+from icalib.result import RowResiduals
+
+MOST_ROWS = 2500  # in a figure
+SHOWN_UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
+
+
+def panels(r: RowResiduals) -> Figure:
+    """A panel for each column, which share the axis of time; radians and metres in thousandths."""
+    keep = thin(len(r.seconds), MOST_ROWS)
+    shown = [SHOWN_UNITS.get(unit, (unit, 1.0)) for unit in r.units]
+    traces = [
+        line(
+            r.seconds[keep],
+            scale * r.residual[keep, k],
+            label,
+            COLORS[k % len(COLORS)],
+            yaxis=y_of(k),
+            line={"color": COLORS[k % len(COLORS)], "width": 1},
+        )
+        for k, (label, (_, scale)) in enumerate(zip(r.labels, shown, strict=True))
+    ]
+    titles = [f"{label} [{unit}]" for label, (unit, _) in zip(r.labels, shown, strict=True)]
+    return figure(traces, 130 * len(titles) + 90, **stacked_axes(titles))

@@ -1,0 +1,53 @@
+"""Sections of the report about the residuals of one kind of sensor each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from icalib.report.panels import panels
+from icalib.report.plot import Figure
+from icalib.report.tables import Html, element, html
+from icalib.result import Calibration, RowResiduals
+from icalib.sensors import SENSOR_KINDS, facet
+
+
+@dataclass(frozen=True)
+class Section:
+    """name: its anchor in the page; words: what it shows, in a paragraph; body: HTML with a place for each of the
+    `figures`, which are found there by their names."""
+
+    name: str
+    title: str
+    words: str
+    body: Html
+    figures: dict[str, Figure] = field(default_factory=dict)
+
+    @property
+    def html(self) -> Html:
+        content = [element("h2", self.title), element("p", self.words), self.body]
+        return Html(f'<section id="{html(self.name)}">{html(content)}</section>')
+
+
+def sections(c: Calibration) -> list[Section]:
+    """By kind of sensor in the order of `SENSOR_KINDS`, but the IMU last. A kind that has none of its own gets the
+    panels of its rows."""
+    found = []
+    for kind in (*SENSOR_KINDS[1:], SENSOR_KINDS[0]):
+        own = facet(kind, "show")
+        found += own.sections(c) if hasattr(own, "sections") else row_sections(c, kind, kind, kind.capitalize(), "")
+    return found
+
+
+def row_sections(c: Calibration, kind: str, name: str, title: str, words: str) -> Iterator[Section]:
+    """One with the panels of each sensor of a type of the rig file that has rows; none without any."""
+    own = [r for r in c.residuals.values() if isinstance(r, RowResiduals) and r.sensor in c.of_type(kind)]
+    if own:
+        figures = {f"{name}-{i}": panels(r) for i, r in enumerate(own)}
+        parts = [element("h3", r.sensor) + plot_place(place) for place, r in zip(figures, own, strict=True)]
+        yield Section(name, title, f"Predicted - measured. {words}".strip(), Html("".join(parts)), figures)
+
+
+def plot_place(name: str, css: str = "") -> Html:
+    """Where the figure `name` is drawn."""
+    return Html(f'<div class="plot {css}" id="{html(name)}"></div>')

@@ -1,0 +1,21 @@
+"""What the report shows of the IMU: its residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from icalib.report import motion_figures
+from icalib.report.sections import Section, plot_place
+from icalib.result import Calibration
+
+_WORDS = (
+    f"Whitened: between two keyframes, in units of what the IMU's noise allows. At most {motion_figures.MOST_NODES} "
+    "intervals are drawn."
+)
+
+
+def sections(c: Calibration) -> Iterator[Section]:
+    """Residuals of the intervals between keyframes."""
+    if c.imu is not None:
+        figures = {"imu-residuals": motion_figures.imu_residuals(c)}
+        yield Section("inertial", "IMU residuals", _WORDS, plot_place("imu-residuals"), figures)

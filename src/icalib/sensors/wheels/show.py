@@ -1,0 +1,48 @@
+"""What report and 3D view show of wheels: residuals over time, and two discs on an axle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icalib.report.rig_shapes import CIRCLE, PEN_UP
+from icalib.report.sections import Section, row_sections
+from icalib.result import Calibration
+
+LEGEND = "pairs of discs are wheels"
+_WORDS = (
+    "The angle that each wheel turned from one keyframe to the next, or the way and the turn that were reported, "
+    "and how far the axle moved sideways and off the ground, which should be nothing; of steering angles, how far "
+    "the front axle moved across its wheels."
+)
+
+
+def sections(c: Calibration) -> Iterator[Section]:
+    """Residuals of each set of wheels."""
+    yield from row_sections(c, "wheels", "wheels", "Wheel residuals", _WORDS)
+
+
+def amounts(c: Calibration) -> Iterator[str]:
+    """How much was used."""
+    if c.wheel_residuals:
+        yield f"{sum(len(r.seconds) for r in c.wheel_residuals)} stretches of wheel turns"
+
+
+def shape(c: Calibration, name: str, spread: float) -> np.ndarray:
+    """The wheels of a set, in its frame."""
+    return axle(c, name)
+
+
+def axle(c: Calibration, name: str) -> np.ndarray:
+    """The two wheels as discs, and the axle between them; nothing where radii and baseline are not known."""
+    known = {g.name: g.value for g in c.groups if g.sensor == name}
+    if "radii" not in known:
+        return PEN_UP
+    left, right = (np.array([0.0, s * 0.5 * known["baseline"][0], 0.0]) for s in (1.0, -1.0))
+    rim = np.insert(CIRCLE, 1, 0.0, axis=1)
+    discs = [(hub + r * rim, hub + r * rim[::5]) for hub, r in zip((left, right), known["radii"], strict=True)]
+    pen = [left, right, PEN_UP]
+    for hub, (circle, ends) in zip((left, right), discs, strict=True):
+        pen += [circle, PEN_UP, *(np.stack([hub, end, PEN_UP[0]]) for end in ends)]
+    return np.vstack(pen)
