@@ -29,6 +29,7 @@ from icalib.rig import Scheme
 
 OFFSET = 6  # number of the time offset among the calibration parameters of a pose
 N_MOUNTED = 7  # extrinsics and time offset; the IMU intrinsics follow
+ITSELF = np.eye(6)  # a pose by itself
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,11 @@ class SensorPose(NamedTuple):
         """(n, 3) p_world_sensor [m]."""
         return self.p_world_sensor
 
+    def part(self, own: slice | np.ndarray) -> SensorPose:
+        """Some of the poses."""
+        R_is, p_is, *each = self
+        return SensorPose(R_is, p_is, *(x[own] if len(x) else x for x in each))
+
     @property
     def n_calib(self) -> int:
         """How many calibration parameters the poses depend on."""
@@ -155,6 +161,23 @@ def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
             T[r, calib + j] += J_pose[r, j]
             for k in range(3):
                 T[r, calib + 3 + j] += J_pose[r, 3 + k] * R[j, k]
+
+
+@njit(cache=True, nogil=True)
+def fill_chain(i, at, A, T):
+    """T (6, w), the first columns: pose i of the sensor by keyframe, next keyframe where this counts, and calibration
+    parameters. A (6, 6): by the pose of the IMU, out."""
+    fill_imu_pose(i, at, A)
+    for r in range(6):
+        for j in range(T.shape[1]):
+            T[r, j] = 0.0
+    add_chain(i, at, ITSELF, A, 0, chain_width(at), T)
+
+
+@njit(cache=True, nogil=True)
+def chain_width(at):
+    """How many columns keyframes have: 30 where poses depend on two, else 15."""
+    return KEYFRAMES if len(at.J_next) else NODE
 
 
 @njit(cache=True, nogil=True)

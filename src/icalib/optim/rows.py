@@ -118,6 +118,55 @@ def _add_calib(i, n_chain, width, A, B, columns, calib, row):
 
 
 @njit(cache=True, nogil=True)
+def add_gram(k, n_chain, G, T, columns, F, sums):
+    """Adds measurements that share a pose, of which only their Gram matrix by the pose is known.
+
+    G (6 + d + 1, 6 + d + 1): by the pose, by d calibration parameters beside it, residual; its first 6 rows are enough
+    where d is 0. T (6, n_chain + c): the pose by keyframes and calibration parameters. columns (c + d,): as in
+    `add_product`. F (6, n_chain + c + d + 1): work space.
+    """
+    calib, width, n_d = sums.calib, T.shape[1], G.shape[1] - 7
+    n_c, n_b = width - n_chain, calib.shape[0] - 1
+    for i in range(6):
+        for j in range(width):
+            F[i, j] = 0.0
+        for q in range(6):
+            g = G[i, q]
+            for j in range(width):
+                F[i, j] += g * T[q, j]
+        for j in range(n_d + 1):
+            F[i, width + j] = G[i, 6 + j]
+    add_product(k, n_chain, width, T, F, columns, sums)
+    for i in range(n_d):
+        a = columns[n_c + i]
+        if a < 0:
+            continue
+        for j in range(n_d):
+            if columns[n_c + j] >= 0:
+                calib[a, columns[n_c + j]] += G[6 + i, 6 + j]
+        calib[a, n_b] += G[6 + i, 6 + n_d]
+        calib[n_b, a] += G[6 + i, 6 + n_d]
+
+
+@njit(cache=True, nogil=True)
+def add_gradients(k, n_chain, G, T, columns, first, sums):
+    """Adds gradients G (6 + d, m), by a pose and d calibration parameters, to columns `first` and on of the sums; the
+    others as in `add_gram`."""
+    side, calib, n_c = sums.side, sums.calib, T.shape[1] - n_chain
+    for g in range(G.shape[1]):
+        for d in range(6):
+            f = G[d, g]
+            for i in range(n_chain):
+                side[k + i // NODE, i % NODE, first + g] += T[d, i] * f
+            for i in range(n_c):
+                if columns[i] >= 0:
+                    calib[columns[i], first + g] += T[d, n_chain + i] * f
+        for i in range(n_c, len(columns)):
+            if columns[i] >= 0:
+                calib[columns[i], first + g] += G[6 + i - n_c, g]
+
+
+@njit(cache=True, nogil=True)
 def _weigh(r, loss, scaled, root):
     """root (m,): square roots of the weights of whitened residuals r (m,); scaled (2, m): factors of Jacobian and
     residual that make J^T J, J^T r those of the weights or, curved, of the loss. Returns half the robust chi^2."""

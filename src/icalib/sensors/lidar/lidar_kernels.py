@@ -11,7 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.motion.pose_chain import by_imu_pose
+from icalib.motion.sensor_pose import chain_width, fill_chain, fill_imu_pose
+from icalib.optim.rows import add_gram, add_product
+from icalib.optim.state import NODE
 from icalib.sensors.lidar.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, columns_of, no_walk, taken_off
 
 ROWS = 4  # whitened residuals of a plane in a bin
@@ -32,53 +34,6 @@ class Bins(NamedTuple):
     slant: np.ndarray
     turned: np.ndarray
     slope: np.ndarray
-
-
-class Motion(NamedTuple):
-    """LiDAR in the IMU, its poses (n, ...) in the world, and of the IMU what `Poses` holds; columns (c,): those of the
-    calibration parameters that act through the pose: rotation, translation, time offset, IMU intrinsics; -1 where
-    fixed."""
-
-    R_imu_lidar: np.ndarray
-    p_imu_lidar: np.ndarray
-    R_lidar_world: np.ndarray
-    p_world_lidar: np.ndarray
-    rate: np.ndarray
-    velocity: np.ndarray
-    J_node: np.ndarray
-    J_next: np.ndarray
-    J_imu: np.ndarray
-    columns: np.ndarray
-
-
-@njit(cache=True, nogil=True)
-def _pose_chain(i, motion, T):
-    """T (6, nodes + c): LiDAR pose (right rotation, position in its axes) by the nodes, then by `motion.columns`.
-    Returns (6, 6): by the IMU's pose."""
-    R_il = motion.R_imu_lidar
-    A = by_imu_pose(R_il, motion.p_imu_lidar, motion.R_lidar_world[i])
-    n_nodes = T.shape[1] - len(motion.columns)
-    for r in range(POSE):
-        for j in range(15):
-            T[r, j] = 0.0
-            for k in range(POSE):
-                T[r, j] += A[r, k] * motion.J_node[i, k, j]
-        for j in range(n_nodes - 15):
-            T[r, 15 + j] = 0.0
-            for k in range(POSE):
-                T[r, 15 + j] += A[r, k] * motion.J_next[i, k, j]
-        o = n_nodes
-        for j in range(3):
-            T[r, o + j] = 1.0 if r == j else 0.0
-            T[r, o + 3 + j] = R_il[j, r - 3] if r >= 3 else 0.0
-        T[r, o + 6] = 0.0
-        for k in range(3):
-            T[r, o + 6] += A[r, k] * motion.rate[i, k] + A[r, 3 + k] * motion.velocity[i, k]
-        for j in range(motion.J_imu.shape[2]):
-            T[r, o + 7 + j] = 0.0
-            for k in range(POSE):
-                T[r, o + 7 + j] += A[r, k] * motion.J_imu[i, k, j]
-    return A
 
 
 @njit(cache=True, nogil=True)
@@ -138,7 +93,7 @@ def _add_to_pose(B, A, slant, G):
 @njit(cache=True, nogil=True, inline="always")
 def _add_plane(k, B, T, columns, own, sums, V):
     """What the columns `own` of one plane in one bin share in, to the sums; V (3, w): work space."""
-    n_b, n_nodes = sums.calib.shape[0] - 1, T.shape[1] - len(columns)
+    n_b, n_chain = sums.calib.shape[0] - 1, T.shape[1] - len(columns)
     V[:] = 0.0
     for i in range(POSE):
         for t in range(PLANE):
@@ -146,15 +101,15 @@ def _add_plane(k, B, T, columns, own, sums, V):
             v = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
             for j in range(T.shape[1]):
                 V[t, j] += v * T[i, j]
-    for h in range(n_nodes // 15):
-        for r in range(15):
+    for h in range(n_chain // NODE):
+        for r in range(NODE):
             for t in range(PLANE):
-                sums.side[k + h, r, own[t]] += V[t, 15 * h + r]
+                sums.side[k + h, r, own[t]] += V[t, NODE * h + r]
     for j in range(len(columns)):
         if columns[j] >= 0:
             for t in range(PLANE):
-                sums.calib[columns[j], own[t]] += V[t, n_nodes + j]
-                sums.calib[own[t], columns[j]] += V[t, n_nodes + j]
+                sums.calib[columns[j], own[t]] += V[t, n_chain + j]
+                sums.calib[own[t], columns[j]] += V[t, n_chain + j]
     for t in range(PLANE):
         b = B[POSE + t]
         for c in range(PLANE + 1):
@@ -175,67 +130,13 @@ def _add_slant(A, slant, own, sums):
         sums.calib[n_b, own[t]] += s
 
 
-@njit(cache=True, nogil=True)
-def _add_row(k, i, n_nodes, row, columns, sums):
-    """Row i of a bin's sums, by nodes, calibration parameters and gradient, into those of node k, the next one, or the
-    calibration parameters."""
-    n_b, n_c = sums.calib.shape[0] - 1, len(columns)
-    if i < n_nodes:
-        h, r = i // 15, i % 15
-        for j in range(15):
-            sums.diagonal[k + h, r, j] += row[15 * h + j]
-        if h == 0 and n_nodes > 15:
-            for j in range(15):
-                sums.upper[k, r, j] += row[15 + j]
-        for j in range(n_c):
-            if columns[j] >= 0:
-                sums.side[k + h, r, columns[j]] += row[n_nodes + j]
-        sums.side[k + h, r, n_b] += row[n_nodes + n_c]
-        return
-    a = columns[i - n_nodes]
-    for j in range(n_c):
-        if columns[j] >= 0:
-            sums.calib[a, columns[j]] += row[n_nodes + j]
-    sums.calib[a, n_b] += row[n_nodes + n_c]
-    sums.calib[n_b, a] += row[n_nodes + n_c]
-
-
-@njit(cache=True, nogil=True)
-def _add_pose(k, G, T, columns, sums, F, row):
-    """A bin's pose part G (6, 7) through T into nodes and calibration parameters; F (6, w + 1), row (w + 1,): work
-    space."""
-    width, n_nodes = T.shape[1], T.shape[1] - len(columns)
-    for i in range(POSE):
-        for j in range(width + 1):
-            F[i, j] = G[i, POSE] if j == width else 0.0
-        for c in range(POSE):
-            g = G[i, c]
-            for j in range(width):
-                F[i, j] += g * T[c, j]
-    for i in range(width):
-        if i >= n_nodes and columns[i - n_nodes] < 0:
-            continue
-        row[:] = 0.0
-        for c in range(POSE):
-            t = T[c, i]
-            if t != 0.0:
-                for j in range(width + 1):
-                    row[j] += t * F[c, j]
-        _add_row(k, i, n_nodes, row, columns, sums)
-
-
 @njit(cache=True, nogil=True, inline="always")
-def _take_off(k, walk, n_nodes, columns, of_plane, sums):
-    """Ends a walk from node k; returns what it takes off the chi^2."""
+def _take_off(k, walk, n_chain, columns, of_plane, sums):
+    """Ends a walk from keyframe k; returns what it takes off the chi^2."""
     own, V = columns_of(walk, columns, of_plane), taken_off(walk)
     last = V.shape[1] - 1
-    row = np.empty(last + 1)
-    for i in range(last if len(sums.diagonal) > 0 else 0):
-        if i >= n_nodes and own[i - n_nodes] < 0:
-            continue
-        for j in range(last + 1):
-            row[j] = -(V[0, i] * V[0, j] + V[1, i] * V[1, j] + V[2, i] * V[2, j])
-        _add_row(k, i, n_nodes, row, own, sums)
+    if len(sums.diagonal) > 0:
+        add_product(k, n_chain, last, V, -V, own, sums)
     return V[0, last] ** 2 + V[1, last] ** 2 + V[2, last] ** 2
 
 
@@ -248,11 +149,12 @@ def _ends_here(i, bins):
 
 
 class _Work(NamedTuple):
-    """Work space of `accumulate`. T: see `_pose_chain`; m: see `_distances`; A, B (10, 4): derivatives of an entry, and
-    these times its root; G (6, 7), W (3, 6): what a bin's pose shares with itself and the residual, and with the turn
-    that noise makes; F, V, row: room for sums."""
+    """Work space of `accumulate`. T, A_imu: see `fill_chain`; m: see `_distances`; A, B (10, 4): derivatives of an
+    entry, and these times its root; G (6, 7), W (3, 6): products of a bin's derivatives by its pose with themselves and
+    the residual, and with those by the turn that noise makes; F, V: room for sums."""
 
     T: np.ndarray
+    A_imu: np.ndarray
     m: np.ndarray
     A: np.ndarray
     B: np.ndarray
@@ -260,23 +162,23 @@ class _Work(NamedTuple):
     W: np.ndarray
     F: np.ndarray
     V: np.ndarray
-    row: np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _work_space(motion):
-    width = (30 if len(motion.J_next) else 15) + len(motion.columns)
+def _work_space(at, n_columns):
+    width = chain_width(at) + n_columns
     return _Work(
-        np.empty((POSE, width)), np.empty(ROWS), np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)),
-        np.empty((POSE, POSE + 1)), np.empty((3, POSE)), np.empty((POSE, width + 1)), np.empty((PLANE, width)),
-        np.empty(width + 1),
+        np.empty((POSE, width)), np.empty((POSE, POSE)), np.empty(ROWS), np.empty((RESIDUAL + 1, ROWS)),
+        np.empty((RESIDUAL + 1, ROWS)), np.empty((POSE, POSE + 1)), np.empty((3, POSE)), np.empty((POSE, width + 1)),
+        np.empty((PLANE, width)),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _see(e, i, bins, motion, planes, work, rows):
-    """Whitened residuals of entry e, in bin i. Returns half their chi^2 and what their variances add as beams turn."""
-    _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m)
+def _see(e, R_lw, p_wl, bins, planes, work, rows):
+    """Whitened residuals of entry e, the LiDAR at R_lw, p_wl. Returns half their chi^2 and what their variances add as
+    beams turn."""
+    _distances(R_lw, p_wl, bins.plane[e], planes, work.m)
     for c in range(ROWS):
         work.A[0, c] = work.m[c]
     _times_root(work.A, bins.root[e], rows[e : e + 1])
@@ -288,55 +190,58 @@ def _see(e, i, bins, motion, planes, work, rows):
 
 
 @njit(cache=True, nogil=True)
-def turn_by_noise(bins, motion, planes):
+def turn_by_noise(bins, at, columns, planes):
     """Fills `turned` and `slope` of the bins, which are empty."""
-    work = _work_space(motion)
+    work = _work_space(at, len(columns))
     for i in range(len(bins.node)):
-        J_imu_pose = _pose_chain(i, motion, work.T)
+        R_lw, p_wl = at.R_sensor_world[i], at.p_world_sensor[i]
+        fill_imu_pose(i, at, work.A_imu)
         for e in range(bins.start[i], bins.start[i + 1]):
-            _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m)
-            _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m, work.A)
+            _distances(R_lw, p_wl, bins.plane[e], planes, work.m)
+            _jacobian(R_lw, p_wl, bins.plane[e], planes, work.m, work.A)
             _times_root(work.A, bins.root[e], work.B[:POSE])
             for a in range(3):
                 for j in range(POSE):
-                    w = bins.walked[i] * J_imu_pose[j, a]
+                    w = bins.walked[i] * work.A_imu[j, a]
                     for c in range(ROWS):
                         bins.turned[e, a, c] += w * work.B[j, c]
                         bins.slope[e, a] += w * work.A[j, c] * bins.slant[e, c] if c else 0.0
 
 
 @njit(cache=True, nogil=True)
-def accumulate(bins, motion, planes, sums, rows):
-    """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted.
+def accumulate(bins, at, columns, planes, sums, rows):
+    """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted. at: poses of the
+    LiDAR at the bins; columns (c,): calibration columns of these.
 
     Returns half the chi^2, less what the gyroscope's noise explains, and what the variances add as beams turn.
     """
-    wanted, work, cost = len(sums.diagonal) > 0, _work_space(motion), 0.0
+    wanted, work, cost = len(sums.diagonal) > 0, _work_space(at, len(columns)), 0.0
     T, A, B, G, W = work.T, work.A, work.B, work.G, work.W
-    n_nodes, walk = T.shape[1] - len(motion.columns), no_walk(T.shape[1], len(planes.normal))
+    n_chain, walk = chain_width(at), no_walk(T.shape[1], len(planes.normal))
     for i in range(len(bins.node)):
         k, walks = bins.node[i] - sums.first, bins.walked[i] != 0.0
+        R_lw, p_wl = at.R_sensor_world[i], at.p_world_sensor[i]
         if wanted:
-            _pose_chain(i, motion, T)
+            fill_chain(i, at, work.A_imu, T)
         B[:], G[:], W[:] = 0.0, 0.0, 0.0
         for e in range(bins.start[i], bins.start[i + 1]):
             q = bins.plane[e]
-            cost += _see(e, i, bins, motion, planes, work, rows)
+            cost += _see(e, R_lw, p_wl, bins, planes, work, rows)
             if wanted:
-                _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, work.m, A)
+                _jacobian(R_lw, p_wl, q, planes, work.m, A)
                 _times_root(A, bins.root[e], B)
                 _add_to_pose(B, A, bins.slant[e], G)
             if walks:
                 add_entry(bins.turned[e], bins.slope[e], rows[e], B, W, walk)
             if wanted and planes.columns[q, 0] >= 0:
-                _add_plane(k, B, T, motion.columns, planes.columns[q], sums, work.V)
+                _add_plane(k, B, T, columns, planes.columns[q], sums, work.V)
                 _add_slant(A, bins.slant[e], planes.columns[q], sums)
                 if walks:
                     add_plane(bins.turned[e], B, q, walk)
         if wanted:
-            _add_pose(k, G, T, motion.columns, sums, work.F, work.row)
+            add_gram(k, n_chain, G, T, columns, work.F, sums)
         if wanted and walks:
             add_pose(W, T, walk)
         if walks and _ends_here(i, bins):
-            cost -= 0.5 * _take_off(k, walk, n_nodes, motion.columns, planes.columns, sums)
+            cost -= 0.5 * _take_off(k, walk, n_chain, columns, planes.columns, sums)
     return cost

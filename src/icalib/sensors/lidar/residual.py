@@ -16,10 +16,11 @@ from itertools import pairwise
 import numpy as np
 
 from icalib.data.measurements import LidarStream
-from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
+from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import assign_nodes, poses_at
+from icalib.motion.poses import assign_nodes
+from icalib.motion.sensor_pose import Kinematics, SensorPose
 from icalib.motion.sweep import Motion as ImuMotion
 from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.planes import Planes
@@ -27,7 +28,7 @@ from icalib.optim.state import Key, Layout, State
 from icalib.rig import Scheme
 from icalib.sensors.lidar import lidar_kernels
 from icalib.sensors.lidar.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
-from icalib.sensors.lidar.lidar_kernels import ROWS, Bins, Motion
+from icalib.sensors.lidar.lidar_kernels import ROWS, Bins
 
 CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 
@@ -85,8 +86,8 @@ class LidarFactor(RowFactor):
         """Fills `turned` and `slope`, on two threads."""
 
         def turn(ends: tuple[int, int]) -> None:
-            for bins, moving, at in self._chunks(state, *ends):
-                lidar_kernels.turn_by_noise(bins, moving, at)
+            for bins, at, columns, planes in self._chunks(state, *ends):
+                lidar_kernels.turn_by_noise(bins, at, columns, planes)
 
         middle = len(self.node) // 2
         in_parallel(turn, [(0, middle), (middle, len(self.node))])
@@ -113,8 +114,8 @@ class LidarFactor(RowFactor):
         """See `Factor`. `curved` changes nothing: within a pass weights are constant."""
         del curved
         into, total = piece.sums(sums), 0.0
-        for bins, motion, planes in self._chunks(state, *self._bins_of(piece)):
-            total += lidar_kernels.accumulate(bins, motion, planes, into, out.residual)
+        for bins, at, columns, planes in self._chunks(state, *self._bins_of(piece)):
+            total += lidar_kernels.accumulate(bins, at, columns, planes, into, out.residual)
         return total
 
     def count(self, out: Whitened, kind: str) -> int:
@@ -133,40 +134,25 @@ class LidarFactor(RowFactor):
         weight = float((self.moments.root[:, 0] ** 2).sum())
         return float(np.sqrt((out.residual**2).sum() / weight)), "m"
 
-    def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, Motion, Planes]]:
-        """Bins b0..b1 by the chunk, with their motion and the planes."""
-        planes = Planes.of(self.planes, state, self._of_planes)
-        R_il = np.ascontiguousarray(state.values[self.name, "rotation"])
-        p_il = state.values[self.name, "translation"]
-        imu_free = self.layout.is_free(self.imu.name, "intrinsics")
-        m = self.moments
-        for through_pose, a, b in self._stretches(state, b0, b1):
+    def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, SensorPose, np.ndarray, Planes]]:
+        """Bins b0..b1 by the chunk, with the LiDAR's poses, their calibration columns (c,), and the planes."""
+        planes, m = Planes.of(self.planes, state, self._of_planes), self.moments
+        kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
+        for clock, a, b in self._stretches(state, b0, b1):
             node = self.node[a:b]
-            times = m.seconds[a:b] + offset_at(state, self.name, node)
-            poses = poses_at(self.scheme, times, node, state, self.imu, self.gravity, imu_free)
-            R_lw = np.ascontiguousarray((poses.rotation @ R_il).transpose(0, 2, 1))
-            motion = Motion(
-                R_il, p_il, R_lw, poses.position + poses.rotation @ p_il, poses.rate, poses.velocity,
-                poses.J_node, poses.J_next, poses.J_imu, through_pose,
-            )  # fmt: skip
-            yield (
-                Bins(node, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant, self.turned, self.slope),
-                motion,
-                planes,
-            )
+            bins = Bins(node, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant, self.turned, self.slope)
+            yield bins, SensorPose.at(kinematics, m.seconds[a:b], node, state), kinematics.columns(clock), planes
 
-    def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[np.ndarray, int, int]]:
-        """Bins b0..b1 by the chunk, each with its calibration columns that act through the pose (c,)."""
-        imu = self.layout.columns(self.imu.name, "intrinsics")
+    def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[int, int, int]]:
+        """Bins b0..b1 by the chunk, each with the number of its time offset."""
         for clock, own in by_clock(state, self.name, self.node[b0:b1]):
-            through_pose = np.concatenate([mounted_columns(self.layout, self.name, clock), imu[imu >= 0]])
             first, last = b0 + own.start, b0 + own.stop
             # Bins on one side of a node stay together.
             sides = np.flatnonzero(np.diff(2 * self.node[first:last] + (self.walked[first:last] >= 0.0))) + 1
             sides = np.append(sides, last - first)
             ends = sides[np.searchsorted(sides, np.arange(CHUNK, last - first, CHUNK))]
             for a, b in pairwise(np.unique([0, *ends, last - first])):
-                yield through_pose, first + int(a), first + int(b)
+                yield clock, first + int(a), first + int(b)
 
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
         """The bins that belong to `piece`: nodes from first to before last, the chain's very last node included."""
