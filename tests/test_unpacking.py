@@ -15,8 +15,8 @@ import pytest
 from icalib.base.extras import load_lz4, load_zstd
 from icalib.base.unpacking import FREE_BYTES, TooLargeError, gunzipped, load_arrays, unpacked
 from icalib.data.recordings import open_recording
-from icalib.data.tables.scans import read_scans
 from icalib.errors import RecordingError
+from icalib.sensors.lidar.read.scans import read_scans
 
 LARGE = bytes(3 * FREE_BYTES)
 

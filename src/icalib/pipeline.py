@@ -29,6 +29,7 @@ from icalib.result.provenance import provenance
 from icalib.rig import Camera, Rig
 from icalib.rig.complete import check_complete
 from icalib.rig.file import load_rig
+from icalib.sensors.camera.read import has_corners
 from icalib.validation import assess, stated_words, visited
 
 READING_SHARE, IMAGES_SHARE = 0.1, 0.8  # of the time, without images and with
@@ -84,14 +85,14 @@ def measure(
 def _reading_share(rig: Rig, opened: Mapping[str, Recording]) -> float:
     """Of the time of a calibration, what reading takes."""
     seeing = rig.cameras if rig.has_target else ()
-    pictured = any(not r.has_corners(c) for r in opened.values() for c in seeing)
+    pictured = any(not has_corners(r, c) for r in opened.values() for c in seeing)
     return IMAGES_SHARE if pictured or any(c.tracks_images for c in rig.cameras) else READING_SHARE
 
 
 def _measure_all(rig: Rig, opened: Mapping[str, Recording], progress: Progress) -> list[Measurements]:
     measurements = []
     for one in opened.values():
-        one.use_layouts(rig.poses)
+        one.use_layouts(tuple(rig.sensors.values()))
     for k, (name, one) in enumerate(opened.items()):
 
         def show(stage: str, done: float, k: int = k) -> None:

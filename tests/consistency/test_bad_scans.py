@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import LidarStream
-from icalib.data.messages.lidar_checks import Sieve, checked_lidar, sifted
-from icalib.data.messages.scan_order import selected
-from icalib.data.tables.scans import in_seconds
 from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Lidar
+from icalib.sensors.lidar.read.checks import Sieve, checked_lidar, sifted
+from icalib.sensors.lidar.read.scan_order import selected
+from icalib.sensors.lidar.read.scans import in_seconds
 from icalib.tools.simulation import Simulation, rig_for, simulate
 
 RNG = np.random.default_rng(0)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.data.checks.imu_units import in_si
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
 from icalib.rig import Axes, ImuSensor, Rig
 from icalib.sensors.camera.initialize.with_imu import initial_guess
+from icalib.sensors.imu.read.units import in_si
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow

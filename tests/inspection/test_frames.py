@@ -10,6 +10,7 @@ import pytest
 from icalib.cli import main
 from icalib.data.recordings import open_recording
 from icalib.rig.file import load_rig
+from icalib.sensors.pose.read import readings as pose_readings
 from icalib.tools.inspection import inspect_recording
 
 STEP = 20_000_000
@@ -70,7 +71,7 @@ def test_a_pose_sensor_is_suggested(arm, tmp_path):
     path.write_text(text.replace("\n".join(commented), "\n".join("  " + line[4:] for line in commented)))
     (sensor,) = load_rig(path).poses
     assert (sensor.name, sensor.topic, sensor.frames, sensor.kind) == ("tf0", "/arm/tf", ("base", "flange"), "absolute")
-    assert len(open_recording(arm).poses(sensor).stamps_ns) == 50
+    assert len(pose_readings(open_recording(arm), sensor).stamps_ns) == 50
 
 
 def test_beside_an_imu_frames_are_enough(bags, brief, tmp_path):

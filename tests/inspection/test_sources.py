@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from icalib.data.images.topics import KINDS
 from icalib.data.recordings import TopicInfo
+from icalib.data.topics import message_types
 from icalib.tools.inspection.sources import find_sources
 
 
@@ -21,7 +21,7 @@ def topics(*names: str) -> list[TopicInfo]:
             return "camera info"
         return "imu" if re.search("imu|mavros", name) else "image"
 
-    types = {k: t for t, k in KINDS.items()}
+    types = {known.kind: name for name, known in message_types().items()}
     return [TopicInfo(n, types.get(kind(n), "table"), kind(n), 10, 0, 1) for n in names]
 
 

@@ -12,11 +12,12 @@ import pytest
 from tests.typed import instance
 
 from icalib.data.bags.ros1 import Ros1Storage
-from icalib.data.checks.imu_checks import checked_imu
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import Recording, open_recording
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
+from icalib.sensors.imu.read import readings as imu_readings
+from icalib.sensors.imu.read.checks import checked_imu
 from icalib.sensors.imu.spec import class_noise
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
@@ -78,7 +79,7 @@ class TestCutOff:
             assert [f.stamp_ns for f in frames] == truth.image_stamps[:images]
             assert all((f.image == i).all() for f, i in zip(frames, truth.images, strict=False))
         if "imu" in kinds:
-            imu = recording.imu(IMU)
+            imu = imu_readings(recording, IMU)
             readings = len(instance(imu, ImuStream).stamps_ns)
             assert instance(imu, ImuStream).stamps_ns.tolist() == truth.imu_stamps[:readings]
             np.testing.assert_allclose(imu.gyro, truth.gyro[:readings], rtol=1e-15)
@@ -146,7 +147,7 @@ class TestCutOff:
         (tmp_path / "run_1.mcap").write_bytes(b"")
         recording = open_recording(tmp_path)
         assert recording.notes() == (f"{tmp_path / 'run_1.mcap'} is empty; record or copy it again.",)
-        assert 0 < len(instance(recording.imu(IMU), ImuStream).stamps_ns) < 70
+        assert 0 < len(instance(imu_readings(recording, IMU), ImuStream).stamps_ns) < 70
 
     def test_no_part_can_be_read(self, tmp_path):
         for k in range(2):
@@ -159,7 +160,8 @@ class TestCutOff:
         (folder / "metadata.yaml").unlink()
         recording = open_recording(folder)
         assert (
-            len(instance(recording.imu(IMU), ImuStream).stamps_ns) == len(truth.imu_stamps) and recording.notes() == ()
+            len(instance(imu_readings(recording, IMU), ImuStream).stamps_ns) == len(truth.imu_stamps)
+            and recording.notes() == ()
         )
 
     def test_part_that_metadata_names_is_missing(self, tmp_path, truth, write):
@@ -180,7 +182,7 @@ class TestDamaged:
             damaged = bytearray(whole)
             damaged[at : at + 8] = rng.bytes(8)
             path.write_bytes(damaged)
-            for read in (lambda r: list(r.images("/cam0/image_raw")), lambda r: r.imu(IMU)):
+            for read in (lambda r: list(r.images("/cam0/image_raw")), lambda r: imu_readings(r, IMU)):
                 try:
                     read(open_recording(path))
                 except RecordingError as error:
@@ -195,7 +197,7 @@ class TestDamaged:
         damaged[len(damaged) // 2] ^= 0xFF
         path.write_bytes(damaged)
         recording = open_recording(path)
-        stamps = instance(recording.imu(IMU), ImuStream).stamps_ns.tolist()
+        stamps = instance(imu_readings(recording, IMU), ImuStream).stamps_ns.tolist()
         assert set(stamps) < set(truth.imu_stamps) and len(stamps) > 90 and stamps[-1] == truth.imu_stamps[-1]
         assert "is damaged; the messages after the damage were ignored" in recording.notes()[0]
 
@@ -205,7 +207,7 @@ class TestDamaged:
         path = write.mcap(tmp_path / "a.mcap", [message], enable_crcs=False)
         path.write_bytes(path.read_bytes().replace(b"std_msgs/msg/String", b"sensor_msgs/msg/Imu"))
         recording = open_recording(path)
-        sentence = complaint(lambda: recording.imu(IMU))
+        sentence = complaint(lambda: imu_readings(recording, IMU))
         assert f"a.mcap /imu: the message received at {5 * S} ns is damaged" in sentence
 
     @pytest.mark.parametrize("kind", ["ros1", "ros2"])
@@ -221,7 +223,7 @@ class TestDamaged:
         lost = {topic: [m[2] for m in messages if m[0] == topic and "String" in m[1]] for topic in kinds}
         assert len(lost["/imu0"]) > 3
         left = [t for t in truth.imu_stamps if t + write.delay_ns not in lost["/imu0"]]
-        assert instance(recording.imu(IMU), ImuStream).stamps_ns.tolist() == left
+        assert instance(imu_readings(recording, IMU), ImuStream).stamps_ns.tolist() == left
         frames = [f.stamp_ns for f in recording.images("/cam0/image_raw")]
         assert frames == [t for t in truth.image_stamps if t + write.delay_ns not in lost["/cam0/image_raw"]]
         counted = f"/imu0: {len(lost['/imu0'])} of 120 messages are damaged and were left out, the first received at "
@@ -275,7 +277,7 @@ class TestNoBag:
         imu = write.maker().imu(5, np.ones(3), np.ones(3))
         path = write.mcap(tmp_path / "a.mcap", [("/imu", "sensor_msgs/msg/Imu", 5, imu)], enable_crcs=False)
         path.write_bytes(path.read_bytes().replace(b"\x03\0\0\0cdr", b"\x03\0\0\0xml"))
-        sentence = complaint(lambda: open_recording(path).imu(IMU))
+        sentence = complaint(lambda: imu_readings(open_recording(path), IMU))
         assert "/imu: messages have the encoding 'xml', which is not one of ROS" in sentence
 
     def test_without_rosbags_the_sentence_names_the_extra(self, tmp_path, truth, write, monkeypatch):
@@ -285,13 +287,13 @@ class TestNoBag:
         monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
         bag._stores.cache_clear()
         assert 'need the package rosbags, which is not installed; run pip install ".[bags]"' in complaint(
-            lambda: recording.imu(IMU)
+            lambda: imu_readings(recording, IMU)
         )
 
     def test_unknown_compression(self, tmp_path, truth, write):
         path = write.small("mcap compressed lz4", tmp_path, truth)
         path.write_bytes(path.read_bytes().replace(b"\x03\0\0\0lz4", b"\x03\0\0\0lzo"))
-        sentence = complaint(lambda: open_recording(path).imu(IMU))
+        sentence = complaint(lambda: imu_readings(open_recording(path), IMU))
         assert "run.mcap is compressed by 'lzo'" in sentence
 
 
@@ -308,14 +310,16 @@ class TestClocks:
 
     def test_no_stamp_in_the_header(self, tmp_path, write):
         bag = self.bag(tmp_path, write, [0] * 20)
-        assert instance(bag.imu(IMU), ImuStream).stamps_ns.tolist() == [9 * S + k * 5_000_000 for k in range(20)]
+        assert instance(imu_readings(bag, IMU), ImuStream).stamps_ns.tolist() == [
+            9 * S + k * 5_000_000 for k in range(20)
+        ]
         assert "/imu: 20 messages have no stamp in their header. Their receive times are used instead" in bag.notes()[0]
 
     def test_readings_that_overtook_each_other_are_sorted(self, tmp_path, write):
         stamps = [S + k * 5_000_000 for k in range(20)]
         stamps[7], stamps[9] = stamps[9], stamps[7]
         bag = self.bag(tmp_path, write, stamps)
-        imu = bag.imu(IMU)
+        imu = imu_readings(bag, IMU)
         assert instance(imu, ImuStream).stamps_ns.tolist() == sorted(stamps)
         rng = np.random.default_rng(0)
         written = np.array([[rng.normal(size=3), rng.normal(size=3)] for _ in stamps])[:, 0]
@@ -325,7 +329,7 @@ class TestClocks:
     def test_clock_that_was_set_back_is_refused(self, tmp_path, write):
         stamps = [S + k * 5_000_000 for k in range(10)] + [5 + k * 5_000_000 for k in range(10)]
         bag = self.bag(tmp_path, write, [100 * S + t for t in stamps[:10]] + stamps[10:])
-        sentence = complaint(lambda: checked_imu(instance(bag.imu(IMU), ImuStream), bag.where(IMU)))
+        sentence = complaint(lambda: checked_imu(instance(imu_readings(bag, IMU), ImuStream), bag.where(IMU)))
         assert f"run.mcap /imu (imu0): the reading at 5 ns comes after the one at {101 * S + 45_000_000} ns" in sentence
 
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import LidarStream
-from icalib.data.messages.lidar_checks import checked_lidar
 from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
 from icalib.rig.file import load_rig
+from icalib.sensors.lidar.read import scans as recorded_scans
+from icalib.sensors.lidar.read.checks import checked_lidar
 from icalib.tools.inspection import inspect_recording
 from icalib.tools.inspection.draft import draft_rig
 
@@ -82,7 +83,7 @@ def read(tmp_path, write):
         place = tmp_path / f"run{len(list(tmp_path.iterdir()))}"
         path = write.ros2(place, [("/lidar0/points", POINTS, t + 5, m) for t, m in messages])
         bag, lidar = BagRecording(path), Lidar("lidar0", "", **fields)
-        stream, notes = checked_lidar(bag.lidar(lidar), bag.where(lidar))
+        stream, notes = checked_lidar(recorded_scans(bag, lidar), bag.where(lidar))
         return stream, bag.notes() + notes
 
     return build
@@ -374,7 +375,7 @@ def test_inspect_drafts_what_the_rig_file_must_say(tmp_path, write, dtype, times
     (tmp_path / "rig.yaml").write_text(draft)
     (lidar,) = load_rig(tmp_path / "rig.yaml").lidars
     assert [lidar.point_time_field, lidar.point_time_unit] == lines
-    check(BagRecording(path).lidar(lidar), scans(), 1010)
+    check(recorded_scans(BagRecording(path), lidar), scans(), 1010)
     assert ("point_time" in draft) == (lines != [None, None])
 
 
@@ -512,6 +513,6 @@ def test_the_topic_is_chosen_as_that_of_cameras(tmp_path, write):
     bag = BagRecording(write.ros2(tmp_path / "run", both))
     assert bag.where(Lidar("rear", "")).endswith("run /rear/points")
     with pytest.raises(RecordingError, match="top may be any of /front/points, /rear/points; set `topic` of top"):
-        bag.lidar(Lidar("top", ""))
+        recorded_scans(bag, Lidar("top", ""))
     with pytest.raises(RecordingError, match="has no topic /top; it holds /front/points \\(sensor_msgs"):
-        bag.lidar(Lidar("top", "", topic="/top"))
+        recorded_scans(bag, Lidar("top", "", topic="/top"))

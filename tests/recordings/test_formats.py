@@ -16,12 +16,14 @@ import pytest
 from tests.typed import instance
 
 from icalib.data.bags.opening import bag_files
-from icalib.data.checks.imu_checks import checked_imu
 from icalib.data.measurements import ImuStream
-from icalib.data.recordings import BagRecording, Recording, decode, image_topics, open_recording, read_measurements
+from icalib.data.recordings import BagRecording, Recording, decode, open_recording, read_measurements
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import Camera, ImuSensor, Rig, by_name
+from icalib.sensors.camera.read import image_topics
+from icalib.sensors.imu.read import readings as imu_readings
+from icalib.sensors.imu.read.checks import checked_imu
 from icalib.sensors.imu.spec import class_noise
 
 FORMS = [
@@ -67,7 +69,7 @@ def test_streams_are_those_that_were_written(form, tmp_path, truth, write):
         for frame, image in zip(frames, truth.images, strict=True):
             assert frame.image.dtype == np.uint8 and frame.image.flags.writeable
             np.testing.assert_array_equal(frame.image, image[::step])
-    imu = recording.imu(IMU)
+    imu = imu_readings(recording, IMU)
     assert instance(imu, ImuStream).stamps_ns.tolist() == truth.imu_stamps
     np.testing.assert_allclose(imu.gyro, truth.gyro, rtol=1e-15)
     np.testing.assert_allclose(imu.accel, truth.accel, rtol=1e-15)
@@ -129,7 +131,7 @@ def test_folder_of_split_bags_is_one_recording(tmp_path, truth, write):
     recording = open_recording(tmp_path)
     assert [p.name for p in recording.files()] == ["run_1.mcap", "run_2.mcap", "run_10.mcap"]
     assert [f.stamp_ns for f in recording.images("/cam0/image_raw")] == truth.image_stamps
-    assert instance(recording.imu(IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
+    assert instance(imu_readings(recording, IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
 
 
 def test_single_database_and_odd_names(tmp_path, truth, write):
@@ -154,7 +156,7 @@ def test_database_whose_recorder_crashed(tmp_path, truth, write):
 def test_mav0_itself_may_be_given(tmp_path, truth, write):
     recording = open_recording(write.euroc(tmp_path, truth) / "mav0")
     assert len(list(recording.images(recording.image_topic(CAM1)))) == len(truth.images)
-    assert instance(recording.imu(IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
+    assert instance(imu_readings(recording, IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
 
 
 def test_a_folder_of_tables_beside_its_bag_is_tables(tmp_path, truth, write):
@@ -213,7 +215,9 @@ class TestChoice:
 
     def test_none(self, tmp_path, write):
         bag = self.bag(tmp_path, write, ["/left"])
-        assert "run.mcap has no imu for imu0; it holds /left (sensor_msgs/msg/Image)" in complaint(lambda: bag.imu(IMU))
+        assert "run.mcap has no imu for imu0; it holds /left (sensor_msgs/msg/Image)" in complaint(
+            lambda: imu_readings(bag, IMU)
+        )
 
     def test_missing(self, tmp_path, write):
         bag = self.bag(tmp_path, write, ["/left"])

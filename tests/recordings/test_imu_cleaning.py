@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.data.checks.imu_checks import checked_imu
 from icalib.data.measurements import ImuStream
 from icalib.data.stamps.even_stamps import even_stamps
+from icalib.sensors.imu.read.checks import checked_imu
 from icalib.tools.simulation import handheld, simulate
 
 

@@ -10,13 +10,17 @@ from tests.typed import instance
 
 from icalib.data.recordings import FolderRecording, read_measurements
 from icalib.data.stamps.clocks import unit_of_stamps, usual_step
-from icalib.data.tables.columns import IMU, TableKind
+from icalib.data.tables.columns import TableKind
 from icalib.data.tables.table import holds, named, read_table
-from icalib.data.tables.wheels import WheelReadings
 from icalib.errors import RecordingError, RigError
 from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels, by_name
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
+from icalib.sensors.camera.read import tracks as recorded_tracks
+from icalib.sensors.imu.read.imu_tables import IMU
 from icalib.sensors.imu.spec import class_noise
+from icalib.sensors.pose.read import readings as pose_readings
+from icalib.sensors.wheels.read import readings as wheel_readings
+from icalib.sensors.wheels.read.wheel_readings import WheelReadings
 
 ORIGIN, STEP, N = 1_700_000_000_123_456_789, 5_000_000, 60
 STAMPS = ORIGIN + STEP * np.arange(N)
@@ -209,22 +213,22 @@ def test_wheels_corners_tracks_and_poses_by_name(tmp_path):
         tmp_path, "wheel0/rates.csv", "t;right_wheel;left_wheel;load\n" + "".join(f"{t};2;1;9\n" for t in STAMPS)
     )
     folder = FolderRecording(tmp_path)
-    read_wheels = folder.wheels(Wheels("wheel0", "wheel0/rates.csv"))
+    read_wheels = wheel_readings(folder, Wheels("wheel0", "wheel0/rates.csv"))
     assert instance(read_wheels, WheelReadings).value.tolist() == [[1.0, 2.0]] * N
     write_table(
         tmp_path, "odom0/twist.csv", "w,v,t\n" + "".join(f"0.5,1.5,{t / 1e9:.9f}\n" for t in 20_000_000 * np.arange(N))
     )
-    twist = folder.wheels(Wheels("odom0", "odom0/twist.csv", measures="twist"))
+    twist = wheel_readings(folder, Wheels("odom0", "odom0/twist.csv", measures="twist"))
     assert instance(twist, WheelReadings).value.tolist() == [[1.5, 0.5]] * N and twist.stamps_ns[1] == 20_000_000
     write_table(tmp_path, "cam0/tracks.csv", "v,u,id,t\n" + "".join(f"2,1,7,{t}\n" for t in 20 * np.arange(200)))
     camera = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", (64, 48), tracks="cam0/tracks.csv")
-    tracks = folder.tracks(camera)
+    tracks = recorded_tracks(folder, camera)
     assert tracks.uv.tolist() == [[1.0, 2.0]] * 200 and tracks.stamps_ns[1] == 20_000_000
     head = (
         "timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v_RS_R_x,b_w_RS_S_x"
     )
     write_table(tmp_path, "mocap0/poses.csv", head + "\n" + "".join(f"{t},1,2,3,1,0,0,0,8,9\n" for t in STAMPS))
-    poses = folder.poses(PoseSensor("mocap0", "mocap0/poses.csv"))
+    poses = pose_readings(folder, PoseSensor("mocap0", "mocap0/poses.csv"))
     assert poses.position.tolist() == [[1.0, 2.0, 3.0]] * N
     np.testing.assert_array_equal(poses.rotation[0], np.eye(3))
     kinds = {t.name: t.kind for t in folder.topics()}
@@ -353,8 +357,8 @@ def test_poses_and_wheels_with_stamps_in_two_columns(tmp_path):
     )
     (tmp_path / "a" / "rates.csv").write_text("secs,nsecs,left,right\n" + "".join(f"{s},1.5,2\n" for s in stamps))
     recording = FolderRecording(tmp_path)
-    assert recording.poses(PoseSensor("a", "a/poses.csv")).stamps_ns.tolist() == STAMPS.tolist()
-    wheels = recording.wheels(Wheels("a", "a/rates.csv"))
+    assert pose_readings(recording, PoseSensor("a", "a/poses.csv")).stamps_ns.tolist() == STAMPS.tolist()
+    wheels = wheel_readings(recording, Wheels("a", "a/rates.csv"))
     assert wheels.stamps_ns.tolist() == STAMPS.tolist()
     assert instance(wheels, WheelReadings).value[5].tolist() == [1.5, 2.0]
     assert {t.name: t.first_ns for t in recording.topics()} == {"a/poses.csv": ORIGIN, "a/rates.csv": ORIGIN}

@@ -11,6 +11,7 @@ import pytest
 from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
 from icalib.rig import Camera, PoseSensor, TableLayout
+from icalib.sensors.pose.read import readings as pose_readings
 
 START, STEP = 1_700_000_000_500_000_000, 2_000_000_000
 HAND = PoseSensor("hand", "hand/poses.csv")
@@ -58,7 +59,7 @@ def test_as_many_pictures_as_poses(tmp_path, name, place, first):
     poses(tmp_path / "hand" / "poses.csv", 12)
     assert row_of_each(tmp_path) == list(range(12))
     recording = open_recording(tmp_path)
-    assert recording.poses(HAND).stamps_ns.tolist() == recording.stamps("cam0").tolist()
+    assert pose_readings(recording, HAND).stamps_ns.tolist() == recording.stamps("cam0").tolist()
     list(recording.images("cam0"))
     (note,) = [n for n in recording.notes() if "have no timestamps" in n]
     assert "12 images have no timestamps. Each takes that of its row of" in note and "in order" in note
@@ -87,7 +88,7 @@ def test_a_row_that_is_no_pose_counts_as_one(tmp_path):
     lines[5] = lines[5].replace("0.3", "nan")
     path.write_text("\n".join(lines) + "\n")
     assert row_of_each(tmp_path) == list(range(20))
-    assert len(open_recording(tmp_path).poses(HAND).stamps_ns) == 19
+    assert len(pose_readings(open_recording(tmp_path), HAND).stamps_ns) == 19
 
 
 @pytest.mark.parametrize("kept", [range(12), [0, 1, 2, 5, 8, 9, 11]])
@@ -145,7 +146,7 @@ def test_stamps_are_read_as_the_rig_file_describes_the_poses(tmp_path, unit, pla
     recording = open_recording(tmp_path)
     recording.use_layouts([hand])
     found = recording.stamps(recording.image_topic(CAMERA))
-    np.testing.assert_array_equal(found, recording.poses(hand).stamps_ns)
+    np.testing.assert_array_equal(found, pose_readings(recording, hand).stamps_ns)
     scale = {"s": 10**9, "ms": 10**6, "us": 10**3}[unit]
     assert np.diff(found).tolist() == [2 * 10**9 if split else scale * 1_000_000] * 7
 

@@ -13,6 +13,7 @@ from icalib.data.measurements import ImuStream
 from icalib.data.recordings import FolderRecording, PictureFolder, open_recording
 from icalib.errors import RecordingError
 from icalib.rig import Camera, ImuNoise, ImuSensor
+from icalib.sensors.imu.read import readings as imu_readings
 from icalib.tools.inspection.sources import find_sources
 
 
@@ -115,8 +116,8 @@ def test_single_pictures_that_are_odd_are_left_out_and_named(tmp_path):
 
 def test_an_imu_needs_a_clock(tmp_path):
     picture(tmp_path / "1.png", 1)
-    with pytest.raises(RecordingError, match="Remove the IMU from the rig file"):
-        open_recording(tmp_path).imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
+    with pytest.raises(RecordingError, match="Remove imu0 from the rig file"):
+        imu_readings(open_recording(tmp_path), ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
 
 
 STAMPS = [1_700_000_000_123_456_789 + 100_000_000 * k for k in range(4)]
@@ -137,8 +138,8 @@ def test_names_that_are_stamps(tmp_path, unit):
     recording = open_recording(tmp_path)
     for side in ("left", "right"):
         assert recording.stamps(side).tolist() == [t // digits * digits for t in STAMPS]
-    with pytest.raises(RecordingError, match=r"holds images, and no readings of imu0; add imu0\.csv beside"):
-        recording.imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
+    with pytest.raises(RecordingError, match=r"holds images, and no data of imu0; add the table imu0/data\.csv"):
+        imu_readings(recording, ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
     picture(tmp_path / "left" / f"x{NAMES[unit][0].removeprefix('left-').removeprefix('frame_')}.png", 1)
     with pytest.raises(RecordingError, match="have the same stamp, 1"):
         recording.stamps("left")
@@ -165,7 +166,7 @@ def test_kalibrs_folder(tmp_path):
     recording = open_recording(tmp_path)
     assert isinstance(recording, FolderRecording)
     assert [f.stamp_ns for f in recording.images("cam0")] == STAMPS
-    imu = recording.imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
+    imu = imu_readings(recording, ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
     assert instance(imu, ImuStream).stamps_ns.tolist() == STAMPS and imu.accel[0].tolist() == [4, 5, 6]
     assert [(t.name, t.kind, t.count) for t in recording.topics()] == [("cam0", "image", 4), ("imu0.csv", "imu", 4)]
     assert recording.stamps("imu0.csv").tolist() == STAMPS

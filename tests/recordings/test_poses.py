@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.data.checks.pose_checks import checked_poses
 from icalib.data.measurements import PoseStream
 from icalib.data.recordings import BagRecording, FolderRecording, open_recording, read_measurements
-from icalib.data.tables.poses import PoseReadings, as_frame_sensor
 from icalib.errors import RecordingError
 from icalib.rig import PoseSensor
 from icalib.rig.file import rig_from_dict, rig_to_dict
+from icalib.sensors.pose.read import readings as pose_readings
+from icalib.sensors.pose.read.checks import checked_poses
+from icalib.sensors.pose.read.pose_tables import PoseReadings, as_frame_sensor
 
 N, STEP, ORIGIN = 300, 20_000_000, 1_700_000_000_123_456_789
 STAMPS = ORIGIN + STEP * np.arange(N)
@@ -35,7 +36,7 @@ def table(folder: Path, stamps=STAMPS, position=POSITION, xyzw=XYZW, header="#t,
 
 def read(folder: Path, sensor: PoseSensor = ABSOLUTE) -> tuple[PoseStream, tuple[str, ...]]:
     recording = FolderRecording(folder)
-    return checked_poses(recording.poses(sensor), sensor, recording.where(sensor))
+    return checked_poses(pose_readings(recording, sensor), sensor, recording.where(sensor))
 
 
 def refused(folder: Path, sensor: PoseSensor = ABSOLUTE) -> str:
@@ -88,7 +89,7 @@ def test_tums_text(tmp_path):
     np.testing.assert_array_equal(FolderRecording(tmp_path).stamps("mocap0/poses.tum"), STAMPS)
     for stamp, ns in (("-1.5", -1_500_000_000), ("1.7e9", 1_700_000_000_000_000_000), ("12", 12_000_000_000)):
         (tmp_path / "mocap0" / "poses.tum").write_text(f"{stamp} 0 0 0 0 0 0 1\n")
-        assert FolderRecording(tmp_path).poses(sensor).stamps_ns.tolist() == [ns]
+        assert pose_readings(FolderRecording(tmp_path), sensor).stamps_ns.tolist() == [ns]
 
 
 @pytest.mark.parametrize("line", ["1.0 2 3 4 0 0 0", "1.0 2 3 4 0 0 0 x", "1.0 2 3 nan 0 0 0 1", "a 2 3 4 0 0 0 1"])
@@ -124,7 +125,7 @@ def test_inverted_and_in_other_axes(tmp_path):
     written = -back.apply(POSITION)
     table(tmp_path, position=written[:, [1, 0, 2]] * [-1.0, 1.0, 1.0], xyzw=back.as_quat())
     sensor = PoseSensor("mocap0", "mocap0/poses.csv", inverted=True, position_axes=("y", "-x", "z"))
-    found = as_frame_sensor(FolderRecording(tmp_path).poses(sensor), sensor)
+    found = as_frame_sensor(pose_readings(FolderRecording(tmp_path), sensor), sensor)
     np.testing.assert_allclose(found.position, POSITION, atol=1e-14)
     np.testing.assert_allclose(found.rotation, TURNS.as_matrix(), atol=1e-14)
 
@@ -132,7 +133,7 @@ def test_inverted_and_in_other_axes(tmp_path):
 def test_positions_in_other_axes(tmp_path):
     table(tmp_path, position=POSITION[:, [0, 2, 1]] * [1.0, 1.0, -1.0])
     sensor = PoseSensor("mocap0", "mocap0/poses.csv", position_axes=("x", "-z", "y"))
-    written = FolderRecording(tmp_path).poses(sensor)
+    written = pose_readings(FolderRecording(tmp_path), sensor)
     np.testing.assert_allclose(as_frame_sensor(written, sensor).position, POSITION, rtol=1e-15)
 
 
@@ -376,7 +377,7 @@ def test_bags(tmp_path, write, kind):
     name = f"{'nav' if kind == 'Odometry' else 'geometry'}_msgs/msg/{kind}"
     path = write.ros2(tmp_path / "run", [("/vrpn/robot", name, int(t) + 5, message(k)) for k, t in enumerate(STAMPS)])
     recording, sensor = BagRecording(path), PoseSensor("mocap0", "mocap0/poses.csv")
-    stream, _ = checked_poses(recording.poses(sensor), sensor, recording.where(sensor))
+    stream, _ = checked_poses(pose_readings(recording, sensor), sensor, recording.where(sensor))
     np.testing.assert_array_equal(stream.stamps_ns, STAMPS)
     np.testing.assert_array_equal(stream.position, POSITION)
     np.testing.assert_allclose(stream.rotation, TURNS.as_matrix(), atol=1e-14)
@@ -388,8 +389,8 @@ def test_a_table_beside_a_bag(tmp_path, write):
     make = write.maker("ros2")
     imu = [("/imu", "sensor_msgs/msg/Imu", int(t), make.imu(int(t), np.zeros(3), np.zeros(3))) for t in STAMPS[:3]]
     recording, path = BagRecording(write.ros2(tmp_path / "run", imu)), table(tmp_path)
-    np.testing.assert_allclose(recording.poses(ABSOLUTE).position, POSITION, rtol=1e-15)
+    np.testing.assert_allclose(pose_readings(recording, ABSOLUTE).position, POSITION, rtol=1e-15)
     assert recording.where(ABSOLUTE) == str(path) and path in recording.files()
     path.unlink()
     with pytest.raises(RecordingError, match="has no pose for mocap0"):
-        recording.poses(ABSOLUTE)
+        pose_readings(recording, ABSOLUTE)

@@ -10,12 +10,13 @@ import pytest
 
 from icalib.cli import main
 from icalib.data.measurements import LidarStream
-from icalib.data.messages.lidar_checks import checked_lidar
 from icalib.data.recordings import FolderRecording, open_recording
 from icalib.data.recordings.reading import read_measurements
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
 from icalib.rig.file import load_rig
+from icalib.sensors.lidar.read import scans
+from icalib.sensors.lidar.read.checks import checked_lidar
 
 LIDAR = Lidar("lidar0", "lidar0/scans.npz")
 RNG = np.random.default_rng(2)
@@ -31,7 +32,7 @@ def read(tmp_path, arrays: dict[str, Any]) -> tuple[LidarStream, tuple[str, ...]
     (tmp_path / "lidar0").mkdir(exist_ok=True)
     np.savez(tmp_path / "lidar0" / "scans.npz", **arrays)
     folder = FolderRecording(tmp_path)
-    stream, notes = checked_lidar(folder.lidar(LIDAR), folder.where(LIDAR))
+    stream, notes = checked_lidar(scans(folder, LIDAR), folder.where(LIDAR))
     assert folder.files() == [tmp_path / "lidar0" / "scans.npz"]
     return stream, folder.notes() + notes
 
@@ -270,13 +271,13 @@ def test_files_that_are_none(tmp_path):
     ):
         path.write_bytes(damaged)
         with pytest.raises(RecordingError, match=words):
-            FolderRecording(tmp_path).lidar(LIDAR)
+            scans(FolderRecording(tmp_path), LIDAR)
     np.save(tmp_path / "lidar0" / "scans.npy", GOOD["xyz"])
     with pytest.raises(RecordingError, match="is not a file of arrays"):
-        FolderRecording(tmp_path).lidar(Lidar("lidar0", "lidar0/scans.npy"))
+        scans(FolderRecording(tmp_path), Lidar("lidar0", "lidar0/scans.npy"))
 
 
 def test_there_are_no_scans_among_pictures(tmp_path):
     (tmp_path / "0001.png").write_bytes(b"")
-    with pytest.raises(RecordingError, match="holds images, and no scans of lidar0"):
-        open_recording(tmp_path).lidar(LIDAR)
+    with pytest.raises(RecordingError, match="holds images without timestamps, and lidar0 needs them. Remove lidar0"):
+        scans(open_recording(tmp_path), LIDAR)

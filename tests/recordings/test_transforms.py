@@ -14,6 +14,7 @@ from icalib.errors import RecordingError
 from icalib.pipeline import calibrate
 from icalib.rig import PoseSensor
 from icalib.rig.file import rig_from_dict
+from icalib.sensors.pose.read import readings as pose_readings
 
 START, STEP, COUNT = 1_700_000_000_123_456_789, 20_000_000, 40
 SECONDS = np.arange(COUNT) * STEP * 1e-9
@@ -96,15 +97,15 @@ def check(found, stamps, T):
 def test_chain(bag_of, topic):
     bag = bag_of(MOVING, STATIC)
     stamps = [START + k * STEP for k in range(COUNT)]
-    check(bag.poses(sensor("world", "/tool", topic=topic)), stamps, WORLD_TOOL)
-    check(bag.poses(sensor("tool", "world", topic=topic)), stamps, np.linalg.inv(WORLD_TOOL))
+    check(pose_readings(bag, sensor("world", "/tool", topic=topic)), stamps, WORLD_TOOL)
+    check(pose_readings(bag, sensor("tool", "world", topic=topic)), stamps, np.linalg.inv(WORLD_TOOL))
     assert bag.notes() == ()
 
 
 def test_between_branches(one_bag):
     """From one branch of the tree to another: up, then down."""
     static = [*STATIC, (0, "base", "camera", *TOOL)]
-    found = one_bag(MOVING, static).poses(sensor("camera", "flange"))
+    found = pose_readings(one_bag(MOVING, static), sensor("camera", "flange"))
     check(
         found,
         [START + k * STEP for k in range(COUNT)],
@@ -119,14 +120,14 @@ def test_a_slower_edge_is_interpolated(one_bag):
     inside = slice(0, last + 1)
     turned = Slerp(SECONDS[::3], SHOULDER[0][::3])(SECONDS[inside])
     expected = matrix(turned, SHOULDER[1][inside]) @ matrix(*WRIST)[inside]
-    check(bag.poses(sensor("base", "flange")), [START + k * STEP for k in range(last + 1)], expected)
+    check(pose_readings(bag, sensor("base", "flange")), [START + k * STEP for k in range(last + 1)], expected)
 
 
 def test_over_gaps_nothing_is_interpolated(one_bag):
     """Over three periods it is, over more it is not."""
     rare = [row for k, row in enumerate(sent("base", "shoulder", SHOULDER)) if k not in (5, 6, 20, 21, 22, 23)]
     bag = one_bag([*rare, *sent("shoulder", "flange", WRIST)], STATIC)
-    found = bag.poses(sensor("base", "flange"))
+    found = pose_readings(bag, sensor("base", "flange"))
     assert found.stamps_ns.tolist() == [START + k * STEP for k in range(COUNT) if k not in (20, 21, 22, 23)]
     (note,) = bag.notes()
     assert f"4 of {COUNT} poses base -> flange were removed, the first at {START + 20 * STEP} ns" in note
@@ -137,7 +138,9 @@ def test_transforms_that_are_sent_again_count_once(one_bag):
     tool = ([TOOL[0]] * COUNT, [TOOL[1]] * COUNT)
     moving = [*MOVING, *MOVING[::2], *sent("flange", "tool", tool, every=7)]
     check(
-        one_bag(moving, STATIC[:1]).poses(sensor("world", "tool")), [START + k * STEP for k in range(COUNT)], WORLD_TOOL
+        pose_readings(one_bag(moving, STATIC[:1]), sensor("world", "tool")),
+        [START + k * STEP for k in range(COUNT)],
+        WORLD_TOOL,
     )
 
 
@@ -146,7 +149,7 @@ def test_a_quaternion_that_is_none(one_bag):
     moving = sent("base", "flange", WRIST)
     moving[7] = (*moving[7][:4], np.array([np.nan, 0.0, 0.0]))
     bag = one_bag(moving)
-    assert bag.poses(sensor("base", "flange")).stamps_ns.tolist() == stamps[:7] + stamps[8:]
+    assert pose_readings(bag, sensor("base", "flange")).stamps_ns.tolist() == stamps[:7] + stamps[8:]
     assert "1 of 40 transforms base -> flange are not finite" in bag.notes()[0]
 
 
@@ -155,15 +158,15 @@ def test_wrong_frames(bag_of):
     with pytest.raises(
         RecordingError, match="no frame hand; there are base, cart, flange, map, shoulder, tool, world;"
     ):
-        bag.poses(sensor("base", "hand"))
+        pose_readings(bag, sensor("base", "hand"))
     with pytest.raises(RecordingError, match="no transforms connect base and cart; base is connected with flange, "):
-        bag.poses(sensor("base", "cart"))
+        pose_readings(bag, sensor("base", "cart"))
     with pytest.raises(RecordingError, match="nothing moves between the frames flange -> tool"):
-        bag.poses(sensor("flange", "tool"))
+        pose_readings(bag, sensor("flange", "tool"))
     with pytest.raises(RecordingError, match=r"/tf holds transforms of many frames; set `frames: \[parent, child\]`"):
-        bag.poses(sensor(topic="/tf"))
+        pose_readings(bag, sensor(topic="/tf"))
     with pytest.raises(RecordingError, match=r"/tf holds transforms of many frames; set `frames: \[parent, child\]`"):
-        bag.poses(sensor())
+        pose_readings(bag, sensor())
 
 
 def test_clock_set_back(one_bag):
@@ -181,7 +184,7 @@ def test_clock_set_back(one_bag):
         for k in range(COUNT)
     ]
     with pytest.raises(RecordingError, match="the stamps of base -> flange go back by 5.0 s"):
-        one_bag((), (), messages).poses(sensor("base", "flange"))
+        pose_readings(one_bag((), (), messages), sensor("base", "flange"))
 
 
 def test_frames_of_other_topics(one_bag, tmp_path):
@@ -194,13 +197,13 @@ def test_frames_of_other_topics(one_bag, tmp_path):
     with pytest.raises(
         RecordingError, match="/arm holds geometry_msgs/msg/PoseStamped, but `frames` of arm needs transforms"
     ):
-        bag.poses(sensor("base", "flange", topic="/arm"))
+        pose_readings(bag, sensor("base", "flange", topic="/arm"))
     with pytest.raises(RecordingError, match="has no topic /tf; it holds /arm"):
-        bag.poses(sensor("base", "flange"))
+        pose_readings(bag, sensor("base", "flange"))
     (tmp_path / "folder/arm").mkdir(parents=True)
     (tmp_path / "folder/arm/poses.csv").write_text("#t [ns],x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
     with pytest.raises(RecordingError, match="is a folder, but `frames` of arm needs the transforms"):
-        FolderRecording(tmp_path / "folder").poses(sensor("base", "flange"))
+        pose_readings(FolderRecording(tmp_path / "folder"), sensor("base", "flange"))
 
 
 MOUNTED = matrix(Rotation.from_euler("xyz", [0.4, -0.3, 0.9]), np.array([0.05, -0.02, 0.1]))[0]  # tool -> tracked body

@@ -9,12 +9,15 @@ import pytest
 from mcap.writer import Writer as McapWriter
 from tests.typed import instance
 
-from icalib.data.images.unreadable import type_not_read
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
+from icalib.data.topics import type_not_read
 from icalib.errors import RecordingError
 from icalib.rig import Camera, ImuSensor, Lidar
+from icalib.sensors.camera.read import has_corners
+from icalib.sensors.imu.read import readings as imu_readings
 from icalib.sensors.imu.spec import class_noise
+from icalib.sensors.lidar.read import scans
 from icalib.tools.inspection import inspect_recording
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
@@ -71,14 +74,14 @@ def test_packets_of_a_lidar(tmp_path, kind):
     )
     bag = open_recording(path)
     assert f"run.mcap has no points for lidar0: /lidar/packets ({bag.topics()[0].type}) holds {words}" in complaint(
-        lambda: bag.lidar(LIDAR)
+        lambda: scans(bag, LIDAR)
     )
     given = Lidar("lidar0", "", topic="/lidar/packets")
     assert f"has no points in /lidar/packets: /lidar/packets ({bag.topics()[0].type}) holds {words}" in complaint(
-        lambda: bag.lidar(given)
+        lambda: scans(bag, given)
     )
     assert any(f"/lidar/packets holds {words}" in f.sentence for f in inspect_recording(path).findings)
-    assert "raw packets" not in complaint(lambda: bag.imu(IMU))
+    assert "raw packets" not in complaint(lambda: imu_readings(bag, IMU))
 
 
 @pytest.mark.parametrize("kind", VIDEOS)
@@ -120,7 +123,7 @@ def test_tables_and_scans_that_are_pointers(tmp_path):
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_bytes(POINTER)
     folder = open_recording(tmp_path)
-    for read in (lambda: folder.imu(IMU), lambda: folder.lidar(LIDAR)):
+    for read in (lambda: imu_readings(folder, IMU), lambda: scans(folder, LIDAR)):
         assert "is a pointer to a file that was not downloaded; run `git lfs pull`" in complaint(read)
 
 
@@ -150,7 +153,7 @@ def test_a_video_beside_tables(tmp_path, write, truth):
             image.unlink()
     (root / "mav0" / "cam0.MP4").write_bytes(MP4)
     recording = open_recording(root)
-    assert not recording.has_corners(CAMERA)
+    assert not has_corners(recording, CAMERA)
     assert recording.image_topic(CAMERA) == "mav0/cam0.MP4"
     words = "mav0/cam0.MP4 cannot be decoded as a video"
     assert words in complaint(lambda: list(recording.payloads("mav0/cam0.MP4")))
@@ -161,4 +164,4 @@ def test_numbers_are_no_pointers(tmp_path):
     (tmp_path / "imu0").mkdir()
     rows = np.hstack([1e6 * np.arange(20)[:, None], np.random.default_rng(1).normal(size=(20, 6))])
     np.savetxt(tmp_path / "imu0" / "data.csv", rows, delimiter=",", fmt=["%d"] + ["%.6f"] * 6)
-    assert len(instance(open_recording(tmp_path).imu(IMU), ImuStream).stamps_ns) == 20
+    assert len(instance(imu_readings(open_recording(tmp_path), IMU), ImuStream).stamps_ns) == 20

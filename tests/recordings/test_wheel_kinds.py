@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.typed import instance
 
-from icalib.data.checks.wheel_checks import checked_wheels
 from icalib.data.measurements import WheelStream
 from icalib.data.recordings import BagRecording, FolderRecording
 from icalib.errors import RecordingError
 from icalib.rig import Wheels
+from icalib.sensors.wheels.read import readings as wheel_readings
+from icalib.sensors.wheels.read.checks import checked_wheels
+from icalib.sensors.wheels.read.wheel_readings import WheelReadings
 
 N, STEP, ORIGIN = 400, 20_000_000, 1_700_000_000_000_000_000
 STAMPS = ORIGIN + STEP * np.arange(N)
@@ -27,7 +30,7 @@ def from_table(tmp_path, values: np.ndarray, **fields: Any) -> tuple[WheelStream
     rows = (f"{t},{','.join(map(repr, row))}\n" for t, row in zip(STAMPS.tolist(), values.tolist(), strict=True))
     (tmp_path / "wheel0" / "data.csv").write_text("#t\n" + "".join(rows))
     folder = FolderRecording(tmp_path)
-    stream, notes = checked_wheels(folder.wheels(wheels), wheels, folder.where(wheels))
+    stream, notes = checked_wheels(wheel_readings(folder, wheels), wheels, folder.where(wheels))
     assert isinstance(stream, WheelStream)
     return stream, notes
 
@@ -134,11 +137,11 @@ def odometry(make, k, t):
 )
 def test_twists_of_bags(bag_of, kind, content):
     bag, wheels = bag_of(kind, content), Wheels("wheel0", "", measures="twist")
-    stream, notes = checked_wheels(bag.wheels(wheels), wheels, bag.where(wheels))
+    stream, notes = checked_wheels(wheel_readings(bag, wheels), wheels, bag.where(wheels))
     assert isinstance(stream, WheelStream) and (stream.kind, notes) == ("twist", ())
     np.testing.assert_array_equal(stream.rate, TWIST)
     with pytest.raises(RecordingError, match="has no joints for wheel0"):
-        bag.wheels(Wheels("wheel0", ""))
+        wheel_readings(bag, Wheels("wheel0", ""))
 
 
 def test_twists_in_the_axes_of_the_world(bag_of):
@@ -159,7 +162,7 @@ def test_twists_in_the_axes_of_the_world(bag_of):
     wheels = Wheels("wheel0", "", measures="twist")
     bag = bag_of("geometry_msgs/msg/TwistStamped", content(heading))
     with pytest.raises(RecordingError, match="is in the world frame, not in the vehicle's. .*type: pose, kind: rel"):
-        bag.wheels(wheels)
+        wheel_readings(bag, wheels)
 
 
 def joints(names, position, velocity):
@@ -181,11 +184,11 @@ def test_joints_of_four_wheels(bag_of):
     names = ["rear_right", "front_left", "rear_left", "front_right"]
     content = joints(names, lambda k: [], lambda k: FOUR[k, [3, 0, 1, 2]])
     bag, wheels = bag_of("sensor_msgs/msg/JointState", content), Wheels("wheel0", "", drive="skid-steer")
-    np.testing.assert_array_equal(bag.wheels(wheels).value, FOUR)
+    np.testing.assert_array_equal(instance(wheel_readings(bag, wheels), WheelReadings).value, FOUR)
     with pytest.raises(
         RecordingError, match="the joints .* do not tell which are the wheel, the steering.*joints: .WHEEL, STE"
     ):
-        bag.wheels(Wheels("wheel0", "", drive="ackermann"))
+        wheel_readings(bag, Wheels("wheel0", "", drive="ackermann"))
 
 
 def test_joints_of_front_wheels_that_steer(bag_of):
@@ -200,8 +203,8 @@ def test_joints_of_front_wheels_that_steer(bag_of):
     )
     bag = bag_of("sensor_msgs/msg/JointState", content)
     wheels = Wheels("wheel0", "", drive="ackermann", joints=("rl", "rr", "sl", "sr"))
-    stream, _ = checked_wheels(bag.wheels(wheels), wheels, bag.where(wheels))
+    stream, _ = checked_wheels(wheel_readings(bag, wheels), wheels, bag.where(wheels))
     assert isinstance(stream, WheelStream) and stream.kind == "steered"
     np.testing.assert_allclose(stream.rate, STEERING, atol=1e-12)
     with pytest.raises(RecordingError, match="rl has no position; record the steering angle"):
-        bag.wheels(Wheels("wheel0", "", drive="ackermann", joints=("rr", "rl")))
+        wheel_readings(bag, Wheels("wheel0", "", drive="ackermann", joints=("rr", "rl")))

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from tests.typed import instance
 
-from icalib.data.checks.wheel_checks import checked_wheels
 from icalib.data.measurements import WheelStream
 from icalib.data.recordings import BagRecording, FolderRecording
-from icalib.data.tables.wheels import WheelReadings
 from icalib.errors import RecordingError
 from icalib.rig import Wheels
+from icalib.sensors.wheels.read import readings as wheel_readings
+from icalib.sensors.wheels.read.checks import checked_wheels
+from icalib.sensors.wheels.read.wheel_readings import WheelReadings
 
 N, STEP, ORIGIN = 400, 20_000_000, 1_700_000_000_000_000_000
 STAMPS = ORIGIN + STEP * np.arange(N) + np.random.default_rng(1).integers(-(10**6), 10**6, N)
@@ -34,7 +35,7 @@ def from_table(
     rows = zip(stamps.tolist(), values.tolist(), strict=True)
     (path / "data.csv").write_text("#t,left,right\n" + "".join(f"{t},{a!r},{b!r}\n" for t, (a, b) in rows))
     folder = FolderRecording(tmp_path)
-    stream, notes = checked_wheels(folder.wheels(wheels), wheels, folder.where(wheels))
+    stream, notes = checked_wheels(wheel_readings(folder, wheels), wheels, folder.where(wheels))
     assert isinstance(stream, WheelStream)
     assert folder.files() == [path / "data.csv"]
     return stream, notes
@@ -220,7 +221,7 @@ def test_the_table_that_is_not_there(tmp_path):
     (tmp_path / "imu0").mkdir()
     (tmp_path / "imu0" / "data.csv").write_text("1,2\n")
     with pytest.raises(RecordingError, match="has no wheel0/rates.csv .* it holds imu0/data.csv; set `path`"):
-        FolderRecording(tmp_path).wheels(Wheels("wheel0", "wheel0/rates.csv"))
+        wheel_readings(FolderRecording(tmp_path), Wheels("wheel0", "wheel0/rates.csv"))
 
 
 POSES = "0,10,0.1,1,0,1e-4,0,0,1e-4,0,1e-4\n"
@@ -245,7 +246,7 @@ def test_relative_poses_that_are_none(tmp_path, rows, words):
     (tmp_path / "wheel0").mkdir()
     (tmp_path / "wheel0" / "poses.csv").write_text(rows)
     with pytest.raises(RecordingError, match=words):
-        FolderRecording(tmp_path).wheels(Wheels("wheel0", "wheel0/poses.csv", measures="poses"))
+        wheel_readings(FolderRecording(tmp_path), Wheels("wheel0", "wheel0/poses.csv", measures="poses"))
 
 
 @pytest.fixture
@@ -276,7 +277,7 @@ def arm_and_wheels(k: int) -> tuple[list[str], list[float], list[float]]:
 @pytest.mark.parametrize("joints", [None, ("wheel_left", "wheel_right")])
 def test_joints(bag_of, measures, joints):
     bag, wheels = bag_of(arm_and_wheels), Wheels("wheel0", "", measures=measures, joints=joints)
-    stream, notes = checked_wheels(bag.wheels(wheels), wheels, bag.where(wheels))
+    stream, notes = checked_wheels(wheel_readings(bag, wheels), wheels, bag.where(wheels))
     sent = np.arange(N) % 3 != 2
     assert isinstance(stream, WheelStream) and notes == ()
     np.testing.assert_array_equal(stream.stamps_ns, STAMPS[sent])
@@ -291,26 +292,27 @@ def test_joints_that_do_not_do(bag_of, tmp_path):
     bag = bag_of(lambda k: (["left", "right"], [1.0 * k, 2.0 * k], []))
     wheels = Wheels("wheel0", "")
     with pytest.raises(RecordingError, match="left and right have no velocity; set `measures` of wheel0 to angles"):
-        bag.wheels(wheels)
+        wheel_readings(bag, wheels)
     with pytest.raises(RecordingError, match="has no joint rear; it has left, right; correct `joints` of wheel0"):
-        bag.wheels(replace(wheels, joints=("left", "rear")))
+        wheel_readings(bag, replace(wheels, joints=("left", "rear")))
     with pytest.raises(RecordingError, match="a bag holds no relative planar poses; set another `measures`"):
-        bag.wheels(replace(wheels, measures="poses"))
+        wheel_readings(bag, replace(wheels, measures="poses"))
     with pytest.raises(RecordingError, match="has no topic /wheels; it holds /joint_states"):
-        bag.wheels(replace(wheels, topic="/wheels"))
+        wheel_readings(bag, replace(wheels, topic="/wheels"))
 
 
 def test_joints_without_names_that_tell(bag_of):
     bag = bag_of(lambda k: (["a", "b"], [], [1.0, 2.0]))
     with pytest.raises(RecordingError, match="the joints a, b do not tell which are the left and the right wheel"):
-        bag.wheels(Wheels("wheel0", ""))
-    assert bag.wheels(Wheels("wheel0", "", joints=("b", "a"))).value[0].tolist() == [2.0, 1.0]
+        wheel_readings(bag, Wheels("wheel0", ""))
+    read = wheel_readings(bag, Wheels("wheel0", "", joints=("b", "a")))
+    assert instance(read, WheelReadings).value[0].tolist() == [2.0, 1.0]
 
 
 def test_joints_one_at_a_time(bag_of):
     bag = bag_of(lambda k: ([["left"], ["right"]][k % 2], [], [1.0]))
     with pytest.raises(RecordingError, match=f"the message at {STAMPS[0]} ns has only one of left and right"):
-        bag.wheels(Wheels("wheel0", ""))
+        wheel_readings(bag, Wheels("wheel0", ""))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
@@ -325,7 +327,7 @@ def test_single_messages_with_one_joint_that_is_none(bag_of, measures, column, b
         return ["left", "right"], position, rate
 
     wheels = Wheels("wheel0", "", measures=measures)
-    stream, notes = checked_wheels(bag_of(content).wheels(wheels), wheels, "here")
+    stream, notes = checked_wheels(wheel_readings(bag_of(content), wheels), wheels, "here")
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [0, 33, 150]))
     assert f"3 of {N} readings are not finite and were removed, the first at {STAMPS[0]} ns" in notes[0]
     assert np.isfinite(instance(stream, WheelStream).rate).all()
@@ -344,5 +346,5 @@ def test_what_a_driver_fills_with_zeros(bag_of, measures):
     with pytest.raises(
         RecordingError, match=f"the {zero} of left and right is always 0, the {other} is not; .* {advice}"
     ):
-        bag.wheels(Wheels("wheel0", "", measures=measures))  # type: ignore[arg-type]
-    assert isinstance(bag.wheels(Wheels("wheel0", "", measures=advice)), WheelReadings)
+        wheel_readings(bag, Wheels("wheel0", "", measures=measures))  # type: ignore[arg-type]
+    assert isinstance(wheel_readings(bag, Wheels("wheel0", "", measures=advice)), WheelReadings)

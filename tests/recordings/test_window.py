@@ -12,7 +12,6 @@ import pytest
 from tests.typed import instance
 
 from icalib.cli import main
-from icalib.data.checks.imu_halves import ImuHalves
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
 from icalib.data.recordings.several import open_all
@@ -20,7 +19,12 @@ from icalib.data.stamps.window import Window, start_of
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate
 from icalib.rig import Camera, ImuSensor, PoseSensor, TwoSources, Wheels
+from icalib.sensors.camera.read import tracks as recorded_tracks
+from icalib.sensors.imu.read import readings as imu_readings
+from icalib.sensors.imu.read.halves import ImuHalves
 from icalib.sensors.imu.spec import class_noise
+from icalib.sensors.pose.read import readings as pose_readings
+from icalib.sensors.wheels.read import readings as wheel_readings
 from icalib.tools.inspection import inspect_recording
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
@@ -33,7 +37,7 @@ def test_of_folders_and_bags(form, tmp_path, truth, write):
     start = truth.imu_stamps[0]
     begin, end = (truth.image_stamps[3] - start) * 1e-9, (truth.image_stamps[7] - start) * 1e-9
     recording = open_recording(path, begin, end)
-    imu = recording.imu(IMU)
+    imu = imu_readings(recording, IMU)
     inside = [t for t in truth.imu_stamps if truth.image_stamps[3] <= t < truth.image_stamps[7]]
     assert instance(imu, ImuStream).stamps_ns.tolist() == inside and len(imu.gyro) == len(inside)
     camera = Camera("cam0", "cam0/corners.csv", "eucm", (8, 6))
@@ -41,13 +45,13 @@ def test_of_folders_and_bags(form, tmp_path, truth, write):
     assert [f.stamp_ns for f in recording.images(topic)] == truth.image_stamps[3:7]
     assert recording.stamps(topic).tolist() == truth.image_stamps[3:7]
     assert f"only the part from {begin:g} s after its start to {end:g} s is used" in recording.notes()[0]
-    assert instance(open_recording(path).imu(IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
-    late = open_recording(path, begin).imu(IMU)
+    assert instance(imu_readings(open_recording(path), IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
+    late = imu_readings(open_recording(path, begin), IMU)
     assert instance(late, ImuStream).stamps_ns.tolist() == [t for t in truth.imu_stamps if t >= truth.image_stamps[3]]
     with pytest.raises(
         RecordingError, match=r"there is nothing from 900 s to the end, the whole lasts .* correct --from"
     ):
-        open_recording(path, 900.0).imu(IMU)
+        imu_readings(open_recording(path, 900.0), IMU)
 
 
 def write_tables(folder: Path, origin: int, apart: int) -> None:
@@ -81,15 +85,15 @@ def test_every_table_and_clocks_of_other_origins(tmp_path):
     recording = open_recording(tmp_path, 2.0, 4.0)
     camera = Camera("cam0", "cam0/corners.csv", "eucm", (8, 6), tracks="cam0/tracks.csv")
     streams = {
-        "imu0": recording.imu(IMU),
-        "tracks": recording.tracks(camera),
-        "wheel0": recording.wheels(Wheels("wheel0", "wheel0/rates.csv")),
-        "mocap0": recording.poses(PoseSensor("mocap0", "mocap0/poses.csv")),
+        "imu0": imu_readings(recording, IMU),
+        "tracks": recorded_tracks(recording, camera),
+        "wheel0": wheel_readings(recording, Wheels("wheel0", "wheel0/rates.csv")),
+        "mocap0": pose_readings(recording, PoseSensor("mocap0", "mocap0/poses.csv")),
     }
     for name, stream in streams.items():
         own = origin + (apart if name in ("wheel0", "mocap0") else 0)
         assert (stream.stamps_ns[0] - own, stream.stamps_ns[-1] - own) == (2 * S, 39 * S // 10), name
-    halves = recording.imu(dataclasses.replace(IMU, path=TwoSources("imu0/gyro.csv", "imu0/accel.csv")))
+    halves = imu_readings(recording, dataclasses.replace(IMU, path=TwoSources("imu0/gyro.csv", "imu0/accel.csv")))
     assert isinstance(halves, ImuHalves)
     assert halves.gyro_ns.tolist() == halves.accel_ns.tolist() == streams["imu0"].stamps_ns.tolist()
     assert len(halves.gyro) == len(halves.accel) == 20

@@ -15,6 +15,7 @@ from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
 from icalib.errors import CalibrationError, RecordingError, RigError
 from icalib.rig import ImuSensor
+from icalib.sensors.imu.read import readings as imu_readings
 from icalib.tools.simulation import ADIS16448, Film, Imaging, Scenario, film, handheld, simulate, write_film
 from icalib.tools.simulation.writing import FORMS, Form
 
@@ -96,7 +97,7 @@ def test_every_format_holds_the_same_images_and_readings(filmed: Film, tmp_path:
     sensor = ImuSensor("imu0", "imu0/data.csv", ADIS16448)
     for form, path in paths.items():
         recording = open_recording(path)
-        imu = recording.imu(sensor)
+        imu = imu_readings(recording, sensor)
         np.testing.assert_array_equal(instance(imu, ImuStream).stamps_ns, filmed.imu.stamps_ns)
         for name in ("gyro", "accel"):  # tables are read to the last bit but one
             np.testing.assert_allclose(getattr(imu, name), getattr(filmed.imu, name), rtol=1e-15, err_msg=form)

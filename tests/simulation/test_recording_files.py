@@ -11,13 +11,16 @@ from tests.typed import instance, not_none
 
 from icalib.cli import main
 from icalib.data.measurements import ImuStream, WheelPoses
-from icalib.data.messages.streams import point_clouds, read_joints
 from icalib.data.recordings import open_recording
 from icalib.data.recordings.bag import BagRecording
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import ImuSensor
+from icalib.sensors.camera.read import corners as recorded_corners
+from icalib.sensors.imu.read import readings as imu_readings
+from icalib.sensors.lidar.read.clouds import point_clouds
 from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.wheels.read.joints import read_joints
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import ADIS16448, handheld, rig_for, simulate, write_sensors, write_tables
 
@@ -52,12 +55,12 @@ def test_tables_read_back_exactly(simulation, folder):
     measured = simulation.measurements
     rig = rig_for(simulation.scenario)
     recording = open_recording(folder)
-    imu = recording.imu(not_none(rig.imu))
+    imu = imu_readings(recording, not_none(rig.imu))
     np.testing.assert_array_equal(instance(imu, ImuStream).stamps_ns, measured.imu.stamps_ns)
     np.testing.assert_allclose(imu.accel, measured.imu.accel, rtol=1e-15)
     corners = measured.cameras[0]
     assert len(corners.uv) > 100
-    found = recording.corners(rig.cameras[0], rig.target)
+    found = recorded_corners(recording, rig.cameras[0], rig.target)
     for name in ("stamps_ns", "start", "point"):
         np.testing.assert_array_equal(getattr(found, name), getattr(corners, name))
     np.testing.assert_allclose(found.uv, corners.uv, rtol=1e-15)
@@ -116,7 +119,7 @@ def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name, monkeypatch
     monkeypatch.setattr("icalib.tools.simulation.sensor_bag._AT_A_TIME", 70)
     write_sensors(simulation, 3, tmp_path / name)
     bag, measured = BagRecording(tmp_path / name), simulation.measurements
-    imu = bag.imu(ImuSensor("imu0", "", ADIS16448))
+    imu = imu_readings(bag, ImuSensor("imu0", "", ADIS16448))
     np.testing.assert_array_equal(instance(imu, ImuStream).stamps_ns, measured.imu.stamps_ns)
     np.testing.assert_array_equal(imu.gyro, measured.imu.gyro)
     lidar = measured.lidars[0]

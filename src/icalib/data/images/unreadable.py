@@ -1,8 +1,7 @@
-"""Files and topics that hold no measurements icalib could read, though they look like it: what they are, what to do."""
+"""Files that hold no measurements icalib could read, though they look like it: what they are, what to do."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 VIDEO_FILE = "video file"  # the type of a topic
@@ -10,12 +9,6 @@ HEAD_BYTES = 64  # that `not_data` needs
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".h264", ".h265", ".mjpeg", ".insv", ".360")
 _POINTERS = {b"version https://git-lfs.github.com/spec": "git lfs pull", b"/annex/objects/": "git annex get"}
 _CONTAINERS = ((4, b"ftyp"), (0, b"\x1aE\xdf\xa3"), (8, b"AVI "))  # MP4 and MOV, Matroska and WebM, AVI
-_PACKETS = re.compile(
-    r"(velodyne|ouster|hesai|pandar|rslidar|robosense|nebula|lslidar|seyond|innovusion|vanjee)\w*/msg/"
-    r"\w*(scan|packets?|packetmsg|udpframe)",
-    re.IGNORECASE,
-)
-_VIDEO = re.compile(r"\w+/msg/(CompressedVideo|FFMPEGPacket|H26[45]\w*)|theora_image_transport/msg/Packet")
 
 
 def not_data(path: Path, head: bytes) -> str | None:
@@ -31,16 +24,3 @@ def not_data(path: Path, head: bytes) -> str | None:
 def is_video(path: Path) -> bool:
     """By its name."""
     return path.suffix.lower() in VIDEO_SUFFIXES
-
-
-def type_not_read(kind: str) -> tuple[str, str] | None:
-    """What a topic of type `kind` would have to be (points, image), and a phrase on what it holds instead and what to
-    do, where it holds raw packets of a LiDAR or a video; None of other types."""
-    if _PACKETS.fullmatch(kind):
-        return "points", (
-            "raw packets of a LiDAR; replay the recording with the LiDAR's driver, and record the "
-            "sensor_msgs/PointCloud2 that it sends"
-        )
-    if _VIDEO.fullmatch(kind):
-        return "image", "compressed video; decode it by its image transport, and record sensor_msgs/Image"
-    return None

@@ -13,9 +13,9 @@ import numpy as np
 from icalib.base.extras import load_cv2
 from icalib.data.images.euroc_images import unit_of_texts
 from icalib.data.images.images import Payload
-from icalib.data.images.topics import TopicInfo
 from icalib.data.images.unreadable import VIDEO_FILE, is_video
 from icalib.data.stamps.clocks import nanoseconds
+from icalib.data.topics import TopicInfo
 from icalib.errors import RecordingError
 
 _TABLES = (".csv", ".txt")

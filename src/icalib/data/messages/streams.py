@@ -1,4 +1,4 @@
-"""What a bag holds beside images and IMU readings, in arrays: camera parameters, poses, twists, joints, points."""
+"""Messages that several kinds of sensors are read from, in arrays: poses, odometry, twists."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from icalib.data.messages.clouds import PointCloud
-from icalib.data.messages.livox import LivoxCloud
 from icalib.errors import RecordingError
 
 
@@ -20,16 +18,6 @@ class HasMessages(Protocol):
     root: Path
 
     def messages(self, topic: str, kind: str, convert: Callable[[Any], Any] = ...) -> Iterator[tuple[int, Any]]: ...
-
-
-@dataclass(frozen=True)
-class CameraInfo:
-    """What the driver says of its camera: resolution (width, height) px, distortion model as ROS calls it, K (3, 3)."""
-
-    resolution: tuple[int, int]
-    model: str
-    distortion: np.ndarray
-    K: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -61,28 +49,10 @@ class OdometryStream:
     twist: TwistStream
 
 
-@dataclass(frozen=True)
-class JointStream:
-    """Joints by name: stamps_ns (N,) int64; position [rad or m], velocity, effort (N, names), NaN where not sent."""
-
-    names: tuple[str, ...]
-    stamps_ns: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    effort: np.ndarray
-
-
-def read_camera_info(bag: HasMessages, topic: str) -> CameraInfo:
-    """The first CameraInfo of `topic`. Raises RecordingError as `BagRecording.messages`."""
-    _, m = next(bag.messages(topic, "camera info"))
-    d, k = (m.D, m.K) if hasattr(m, "K") else (m.d, m.k)  # ROS 1, ROS 2
-    return CameraInfo((m.width, m.height), m.distortion_model, np.array(d), np.array(k).reshape(3, 3))
-
-
 def read_poses(bag: HasMessages, topic: str) -> PoseMessages:
     """All PoseStamped, PoseWithCovarianceStamped or TransformStamped of `topic`. Raises RecordingError as
     `BagRecording.messages`, and for a frame that changes."""
-    stamps_ns, found = _all(bag, topic, "pose")
+    stamps_ns, found = all_messages(bag, topic, "pose")
     if found and hasattr(found[0], "child_frame_id"):
         _frame(bag, topic, found, lambda m: m.child_frame_id)
     return _poses(bag, topic, _frame(bag, topic, found), stamps_ns, [_pose_of(m) for m in found])
@@ -104,13 +74,13 @@ def _pose_of(message: Any) -> Any:
 
 def read_twists(bag: HasMessages, topic: str) -> TwistStream:
     """All TwistStamped of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
-    stamps_ns, found = _all(bag, topic, "twist")
+    stamps_ns, found = all_messages(bag, topic, "twist")
     return _twists(_frame(bag, topic, found), stamps_ns, [m.twist for m in found])
 
 
 def read_odometry(bag: HasMessages, topic: str) -> OdometryStream:
     """All Odometry of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
-    stamps_ns, found = _all(bag, topic, "odometry")
+    stamps_ns, found = all_messages(bag, topic, "odometry")
     pose = _poses(bag, topic, _frame(bag, topic, found), stamps_ns, [m.pose.pose for m in found])
     body = _frame(bag, topic, found, lambda m: m.child_frame_id)
     return OdometryStream(pose, _twists(body, stamps_ns, [m.twist.twist for m in found]))
@@ -118,71 +88,12 @@ def read_odometry(bag: HasMessages, topic: str) -> OdometryStream:
 
 def read_odometry_twists(bag: HasMessages, topic: str) -> TwistStream:
     """The velocities of all Odometry of `topic`, whatever its poses are. Raises RecordingError as `read_twists`."""
-    stamps_ns, found = _all(bag, topic, "odometry")
+    stamps_ns, found = all_messages(bag, topic, "odometry")
     return _twists(_frame(bag, topic, found, lambda m: m.child_frame_id), stamps_ns, [m.twist.twist for m in found])
 
 
-def read_joints(bag: HasMessages, topic: str) -> JointStream:
-    """All JointState of `topic`; a message may name some of the joints only. Raises RecordingError as
-    `BagRecording.messages`, and for an array that is not as long as the names."""
-    stamps_ns, found = _all(bag, topic, "joints")
-    names = tuple(dict.fromkeys(name for m in found for name in m.name))
-    column = {name: k for k, name in enumerate(names)}
-    values = np.full((3, len(found), len(names)), np.nan)
-    for row, m in enumerate(found):
-        there = [column[name] for name in m.name]
-        for quantity, array in enumerate((m.position, m.velocity, m.effort)):
-            if len(array) not in (0, len(there)):
-                raise RecordingError(
-                    f"{bag.root} {topic}: the message at {stamps_ns[row]} ns has {len(there)} joints, but "
-                    f"{len(array)} values; correct the driver."
-                )
-            if len(array):
-                values[quantity, row, there] = array
-    return JointStream(names, stamps_ns, *values)
-
-
-def point_clouds(bag: HasMessages, topic: str) -> Iterator[PointCloud]:
-    """The PointCloud2, or Livox's CustomMsg, of `topic`, one at a time; those shorter than their points are left out as
-    damaged messages. Raises RecordingError as `BagRecording.messages`."""
-    for stamp_ns, (frame, points, height) in bag.messages(topic, "points", _points_of):
-        yield PointCloud(stamp_ns, frame, points, height)
-
-
-def _points_of(message: Any) -> tuple[str, np.ndarray, int]:
-    """Frame, points and rows of a message. Raises ValueError where it is shorter than its points."""
-    m = message
-    if isinstance(m, LivoxCloud):
-        return m.header.frame_id, m.points, 1
-    if len(m.data) < m.row_step * m.height or m.row_step < m.point_step * m.width:
-        raise ValueError(f"{m.width * m.height} points do not fit {len(m.data)} bytes")
-    kind = _point_type(m)
-    rows = m.data[: m.row_step * m.height].reshape(m.height, m.row_step)[:, : m.point_step * m.width]
-    points = np.ascontiguousarray(rows).reshape(-1).view(kind) if rows.size else np.empty(0, kind)
-    return m.header.frame_id, points, m.height
-
-
-_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
-
-
-def _point_type(message: Any) -> np.dtype:
-    """Raises ValueError where the fields do not fit a point."""
-    order = ">" if message.is_bigendian else "<"
-    unknown = [f.name for f in message.fields if f.datatype not in _FIELD_TYPES]
-    if unknown or message.point_step < 1:
-        raise ValueError(f"its point fields cannot be read: {', '.join(unknown) or 'they have 0 bytes'}")
-    formats = [(order + _FIELD_TYPES[f.datatype], (f.count,) if f.count > 1 else ()) for f in message.fields]
-    return np.dtype(
-        {
-            "names": [f.name for f in message.fields],
-            "formats": formats,
-            "offsets": [f.offset for f in message.fields],
-            "itemsize": message.point_step,
-        }
-    )
-
-
-def _all(bag: HasMessages, topic: str, kind: str) -> tuple[np.ndarray, list[Any]]:
+def all_messages(bag: HasMessages, topic: str, kind: str) -> tuple[np.ndarray, list[Any]]:
+    """(N,) stamps [ns] and N messages. Raises RecordingError as `BagRecording.messages`."""
     found = list(bag.messages(topic, kind))
     return np.array([stamp_ns for stamp_ns, _ in found], np.int64), [message for _, message in found]
 

@@ -1,13 +1,13 @@
 """Recordings: what was recorded -> images, and checked measurements."""
 
 from icalib.data.images.images import DamagedImageError, DecodedImage, Payload, decode
-from icalib.data.images.topics import TopicInfo, image_topics
 from icalib.data.recordings.bag import BagRecording
 from icalib.data.recordings.base import Recording
 from icalib.data.recordings.folder import FolderRecording
 from icalib.data.recordings.opening import open_recording
 from icalib.data.recordings.pictures import PictureFolder
 from icalib.data.recordings.reading import read_measurements
+from icalib.data.topics import TopicInfo
 
 __all__ = [
     "BagRecording",
@@ -19,7 +19,6 @@ __all__ = [
     "Recording",
     "TopicInfo",
     "decode",
-    "image_topics",
     "open_recording",
     "read_measurements",
 ]

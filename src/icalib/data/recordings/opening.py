@@ -9,14 +9,14 @@ from icalib.data.bags.opening import bag_files
 from icalib.data.images.unreadable import HEAD_BYTES, is_video, not_data
 from icalib.data.recordings.bag import BagRecording
 from icalib.data.recordings.base import Recording
-from icalib.data.recordings.folder import FolderRecording, has_named_table
+from icalib.data.recordings.folder import FolderRecording
 from icalib.data.recordings.pictures import PictureFolder, has_pictures
 from icalib.data.stamps.window import Window
-from icalib.data.tables.poses import FILES as POSE_FILES
+from icalib.data.tables.files import named_tables, table_files
 from icalib.errors import RecordingError
 
 _MAX_LISTED = 12
-_OF_TABLES = ("*/*.csv", "*/*.csv.gz", "mav0", "*/data", *(f"*/{name}" for name in POSE_FILES))
+_OF_TABLES = ("*/*.csv", "*/*.csv.gz", "mav0", "*/data")
 
 
 def open_recording(path: str | Path, start_s: float = 0.0, end_s: float = inf) -> Recording:
@@ -59,6 +59,5 @@ def _holds_bags(folder: Path) -> bool:
 
 
 def _holds_tables(folder: Path) -> bool:
-    if any(p for pattern in _OF_TABLES for p in folder.glob(pattern)):
-        return True
-    return has_named_table(folder)
+    patterns = (*_OF_TABLES, *(f"*/{table.name}" for table in table_files()))
+    return any(p for pattern in patterns for p in folder.glob(pattern)) or bool(named_tables(folder))

@@ -7,23 +7,21 @@ Pictures of the same stamp or number were taken together.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
 from icalib.data.images.euroc_images import SUFFIXES, file_payloads, pictures_in, stamped_by_name
-from icalib.data.images.image_checks import checked_payloads, frames
-from icalib.data.images.images import DecodedImage, Payload
-from icalib.data.images.topics import TopicInfo, choose_topic
-from icalib.data.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
-from icalib.data.stamps.window import WHOLE, Window, stamps_inside
-from icalib.data.tables.poses import PoseReadings
-from icalib.data.tables.wheels import WheelReadings
+from icalib.data.images.image_checks import checked_payloads
+from icalib.data.images.images import Payload
+from icalib.data.recordings.base import Recording
+from icalib.data.stamps.window import WHOLE, Window
+from icalib.data.topics import TopicInfo, choose_topic
 from icalib.errors import RecordingError
-from icalib.geometry.targets import Target
-from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
+from icalib.rig import Camera
+from icalib.sensors.sensor import Sensor
 
 APART_NS = 1_000_000_000  # from one number to the next
 MOST = 9_000_000_000  # beyond, nanoseconds do not fit
@@ -37,7 +35,7 @@ def has_pictures(root: Path) -> bool:
 
 
 @final
-class PictureFolder:
+class PictureFolder(Recording):
     """A folder of pictures, or of one folder of pictures for each camera.
 
     A topic is the name of such a folder, `.` for the root itself, or a pattern of files as `images/*_0.jpg`, in which
@@ -46,16 +44,15 @@ class PictureFolder:
     """
 
     def __init__(self, root: Path, window: Window = WHOLE) -> None:
-        self.root = root
-        self._window = window
-        self._read: list[Path] = []
-        self._notes: list[str] = [] if window.is_all else [window.note(str(root))]
+        super().__init__(root, window)
+        if not window.is_all:
+            self.note(window.note(str(root)))
 
     def topics(self) -> tuple[TopicInfo, ...]:
         return tuple(self._info(name) for name in _topics(self.root))
 
     def stamps(self, topic: str) -> np.ndarray:
-        return np.array([stamp for stamp, _ in self._inside(topic)], np.int64)
+        return np.array([stamp for stamp, _ in self._files_inside(topic)], np.int64)
 
     def image_topic(self, camera: Camera) -> str:
         if camera.topic is not None and "*" in camera.topic:
@@ -66,70 +63,29 @@ class PictureFolder:
             named = [name for name in patterns if word in name.lower()]
             if len(named) == 1:
                 return named[0]
-        return choose_topic(str(self.root), topics, "image", camera.name, camera.topic).name
+        return choose_topic(str(self.root), topics, camera.name, camera.topic, "image").name
 
     def payloads(self, topic: str) -> Iterator[Payload]:
-        files, where = self._inside(topic), f"{self.root}/{topic}"
-        self._read += [path for _, path in files if path not in self._read]
-        return checked_payloads(file_payloads(files, where, self._note), where, self._note)
+        files, where = self._files_inside(topic), f"{self.root}/{topic}"
+        for _, path in files:
+            self._remember(path)
+        return checked_payloads(file_payloads(files, where, self.note), where, self.note)
 
-    def images(self, topic: str) -> Iterator[DecodedImage]:
-        return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
+    def find(self, path: str) -> None:
+        """There are no tables."""
 
-    def imu(self, sensor: ImuSensor) -> ImuStream:
-        where, (name, *_) = str(self.root), _topics(self.root)
-        if stamped_by_name(pictures_in(self.root / name)):
+    def table(self, sensor: Sensor, path: str, field: str = "path") -> Path:
+        del field
+        name, (folder, *_) = sensor.name, _topics(self.root)
+        if stamped_by_name(pictures_in(self.root / folder)):
             raise RecordingError(
-                f"{where} holds images, and no readings of {sensor.name}; add {sensor.name}.csv beside the "
-                "image folders, or remove the IMU from the rig file to calibrate the cameras alone."
+                f"{self.root} holds images, and no data of {name}; add the table {path}, or remove {name} from the rig "
+                "file."
             )
         raise RecordingError(
-            f"{where} holds images without timestamps, and {sensor.name} needs them. Remove the IMU from the "
-            "rig file to calibrate the cameras alone, or add data.csv with the stamps of the images."
+            f"{self.root} holds images without timestamps, and {name} needs them. Remove {name} from the rig file, or "
+            "add data.csv with the stamps of the images."
         )
-
-    def use_layouts(self, sensors: Sequence[PoseSensor]) -> None:
-        """Nothing here is a table."""
-
-    def has_corners(self, camera: Camera) -> bool:
-        return False
-
-    def corners(self, camera: Camera, target: Target) -> CornerStream:
-        raise RecordingError(
-            f"{self.root} holds images of {camera.name}, not corners; detect the corners in its images first."
-        )
-
-    def sees(self, camera: Camera) -> bool:
-        del camera
-        return True
-
-    def tracks(self, camera: Camera) -> TrackStream:
-        raise RecordingError(
-            f"{self.root} holds images without timestamps, and the tracks of {camera.name} need them; add "
-            "data.csv with the stamps of the images, or remove `tracks`."
-        )
-
-    def lidar(self, sensor: Lidar) -> LidarStream:
-        raise RecordingError(f"{self.root} holds images, and no scans of {sensor.name}; remove it from the rig file.")
-
-    def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
-        raise RecordingError(f"{self.root} holds images, and no data of {sensor.name}; remove it from the rig file.")
-
-    def poses(self, sensor: PoseSensor) -> PoseReadings:
-        raise RecordingError(f"{self.root} holds images, and no data of {sensor.name}; remove it from the rig file.")
-
-    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
-        return f"{self.root}/{self.image_topic(sensor)}" if isinstance(sensor, Camera) else str(self.root)
-
-    def files(self) -> list[Path]:
-        return list(self._read)
-
-    def notes(self) -> tuple[str, ...]:
-        return tuple(self._notes)
-
-    def _note(self, sentence: str) -> None:
-        if sentence not in self._notes:
-            self._notes.append(sentence)
 
     def _info(self, name: str) -> TopicInfo:
         try:
@@ -138,14 +94,13 @@ class PictureFolder:
             return TopicInfo(name, "pictures", "image", len(pictures_in(self.root / name)), None, None)
         return TopicInfo(name, "pictures", "image", len(stamps), stamps[0], stamps[-1])
 
-    def _inside(self, topic: str) -> list[tuple[int, Path]]:
+    def _files_inside(self, topic: str) -> list[tuple[int, Path]]:
         """Those of `_files` in the window."""
         files = self._files(topic)
-        if self._window.is_all:
+        if self.window.is_all:
             return files
         stamps_ns = np.array([stamp for stamp, _ in files], np.int64)
-        spans = [(t.first_ns, t.last_ns) for t in self.topics() if t.first_ns is not None and t.last_ns is not None]
-        inside = stamps_inside(self._window, stamps_ns, f"{self.root}/{topic}", spans)
+        inside = self._inside(stamps_ns, f"{self.root}/{topic}")
         return [file for file, used in zip(files, inside.tolist(), strict=True) if used]
 
     def _files(self, topic: str) -> list[tuple[int, Path]]:
@@ -161,7 +116,7 @@ class PictureFolder:
             raise RecordingError(f"{self.root} has no images {topic}; correct `topic` of the camera in the rig file.")
         found = stamped_by_name(paths, keys)
         what = "number" if found is None else "stamp"
-        if found is None and not self._window.is_all:
+        if found is None and not self.window.is_all:
             raise RecordingError(
                 f"{self.root} holds images without timestamps, so --from and --to cannot be used; leave them out."
             )

@@ -15,8 +15,6 @@ _UNIT = re.compile(r"\[[^]]*\]|\([^)]*\)")
 _CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 # Where a column is from, not what it is: prefixes of rostopic, and of sensors.
 _FROM = re.compile(r"(field|msg|data|imu|imu\d+|odom|pose\d*|transform|twist|sensor|world)_(?=[a-z])")
-GYRO = r"w|omega|g|gyro|gyr|gyros|gyroscope|angular_(velocity|vel|rate)|ang_?vel|rotation_rate|w_rs_s"
-ACCEL = r"a|acc|accel|acceleration|accelerometer|alpha|linear_(acceleration|accel|acc)|lin_acc|specific_force|f|a_rs_s"
 STAMP = (r"(header_)?stamp(_ns|_nsec)?", r"time_?stamp(_ns|_us|_ms|_s)?", r"(time|t|ts)(_ns|_us|_ms|_s)?")
 # A stamp in two columns, as of messages of ROS: whole seconds, and nanoseconds beyond them.
 _OF_STAMP = r"((header_)?stamp_|time_?stamp_|time_|ros_?time_)?"
@@ -55,24 +53,6 @@ class TableKind:
 def vector_names(quantities: str, axes: str = "xyz") -> tuple[tuple[str, ...], ...]:
     """Names of the components of a vector; quantities: a regular expression of what it may be called."""
     return tuple((rf"({quantities})_?{axis}", rf"{axis}_?({quantities})") for axis in axes)
-
-
-IMU = TableKind(
-    ("t [ns]",),
-    ("wx [rad/s]", "wy [rad/s]", "wz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]"),
-    (STAMP, *vector_names(GYRO), *vector_names(ACCEL)),
-    (10.0, 20_000.0),
-)
-# Of an IMU whose two sensors have a table each.
-IMU_GYRO, IMU_ACCEL = (
-    TableKind(
-        IMU.integers,
-        decimals,
-        (STAMP, *((*names, axis) for names, axis in zip(known, "xyz", strict=True))),
-        IMU.rate_hz,
-    )
-    for decimals, known in ((IMU.decimals[:3], IMU.known[1:4]), (IMU.decimals[3:], IMU.known[4:]))
-)
 
 
 def places_by_name(kind: TableKind, header: Sequence[str]) -> np.ndarray | None:

@@ -6,7 +6,7 @@ A robot stops, takes a picture, and writes a pose: picture and row belong togeth
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +14,9 @@ import numpy as np
 from icalib.data.images.euroc_images import pictures_in, stamped_by_name
 from icalib.data.images.image_checks import Note
 from icalib.data.stamps.clocks import is_rate
-from icalib.data.tables.columns import STAMP, TableKind, split_kind
-from icalib.data.tables.poses import POSES, RATE_HZ, is_tum_text
-from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
-from icalib.rig import TableLayout
 
 _IMAGE_RATE_HZ = (1e-3, 1000.0)  # names are stamps only if they make an image rate within this range
-# The stamps alone: a row whose pose cannot be read keeps its place in the order.
-_STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=RATE_HZ, more=True)
 
 
 def numbered_pictures(folder: Path) -> list[tuple[int, Path]]:
@@ -45,14 +39,14 @@ def numbered_pictures(folder: Path) -> list[tuple[int, Path]]:
 
 
 def stamped_by_rows(
-    found: list[tuple[int, Path]], table: Path, layout: TableLayout, note: Note
+    found: list[tuple[int, Path]], table: Path, read: Callable[[], tuple[dict[int, int], int]], note: Note
 ) -> list[tuple[int, Path]]:
     """Stamp [ns] and file of each picture in `found`, as `numbered_pictures` gives them: that of its row of `table`.
 
     With as many pictures as rows, they belong together in order. Otherwise the number of a picture is its row, counted
-    from 0 if there is a picture 0, else from 1. `note` is told which. Rows that cannot be read are counted, and their
-    pictures are left out with a note. `layout` is that of a table of poses. Raises RecordingError where two pictures
-    have the same number, where one has no row, and where many rows cannot be read.
+    from 0 if there is a picture 0, else from 1. `note` is told which. read: of the table, as `TableFile.rows`. Rows
+    that cannot be read are counted, and their pictures are left out with a note. Raises RecordingError where two
+    pictures have the same number, where one has no row, and where many rows cannot be read.
     """
     folder, numbers = found[0][1].parent, [number for number, _ in found]
     twice = next((k for k in range(1, len(numbers)) if numbers[k] == numbers[k - 1]), None)
@@ -61,7 +55,7 @@ def stamped_by_rows(
             f"{found[twice - 1][1]} and {found[twice][1].name} have the same number, {numbers[twice]}; number "
             "each image as the row of its pose."
         )
-    stamp_of, count = _stamps_by_row(table, layout, note)
+    stamp_of, count = read()
     in_order = len(numbers) == count
     first = min(1, numbers[0])  # the number of the first row
     rows = list(range(len(numbers))) if in_order else [n - first for n in numbers]
@@ -83,11 +77,3 @@ def stamped_by_rows(
             f"of its pose in {table} cannot be read."
         )
     return [(stamp_of[row], path) for row, path in zip(rows, own, strict=True) if row in stamp_of]
-
-
-def _stamps_by_row(table: Path, layout: TableLayout, note: Note) -> tuple[dict[int, int], int]:
-    """The stamp [ns] of each row that can be read, by the row's number from 0 on, and how many rows there are."""
-    kind = replace(_STAMPS, unit="s") if is_tum_text(table) else _STAMPS
-    stamps = 1 if split_kind(POSES, layout.columns) is None else 2  # the first columns of a pose
-    read = read_table(table, kind, replace(layout, columns=layout.columns[:stamps]), note)
-    return dict(zip(read.numbers.tolist(), read.integers[:, 0].tolist(), strict=True)), read.written

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-from icalib.data.messages.clouds import timing_fields
-from icalib.data.messages.streams import point_clouds
 from icalib.data.recordings import BagRecording, Recording, TopicInfo
 from icalib.errors import RecordingError
+from icalib.sensors.lidar.read.clouds import point_clouds, timing_fields
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.sensor import Sensor, TimeUnit
 from icalib.tools.inspection.facts import Finding, Inspection

@@ -28,8 +28,8 @@ _FIELDS = (
 class Lidar(Sensor):
     """One LiDAR. Points nearer than min_range_m or farther than max_range_m are left out.
 
-    point_time: what a point's time is counted from; see `data.messages.point_times`. point_time_field, point_time_unit:
-    where the time of a point stands, and in what unit; None: told from the data.
+    point_time: what a point's time is counted from; see `read.point_times`. point_time_field, point_time_unit: where
+    the time of a point stands, and in what unit; None: told from the data.
     """
 
     sensor_type: ClassVar[str] = "lidar"

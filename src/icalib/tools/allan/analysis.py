@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.checks.imu_checks import read_imu
-from icalib.data.checks.imu_halves import pair_of
-from icalib.data.checks.imu_units import DEGREE
-from icalib.data.images.topics import find_topic, listing
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import BagRecording, Recording, TopicInfo, open_recording
 from icalib.data.stamps.jumps import ClockJumps
+from icalib.data.topics import find_topic, listing
 from icalib.errors import RecordingError
 from icalib.rig import AccelUnit, GyroUnit, ImuSensor
+from icalib.sensors.imu.read import read_imu
+from icalib.sensors.imu.read.halves import pair_of
+from icalib.sensors.imu.read.units import DEGREE
 from icalib.sensors.imu.spec import DEFAULT_CLASS, class_noise
 from icalib.tools.allan.deviation import Deviation, allan_deviation_of_all
 from icalib.tools.allan.fit import AllanFit, bands_of_all, fit_noise, pooled
@@ -80,7 +80,7 @@ def study_recording(
         topic.name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name, accel_unit=accel_unit, gyro_unit=gyro_unit
     )
     jumps = ClockJumps()
-    stream, notes = read_imu(recording, sensor, jumps)
+    stream, notes = read_imu(recording, sensor, jumps.cut)
     return study_imu(stream, recording.where(sensor), recording.notes() + jumps.notes + notes)
 
 

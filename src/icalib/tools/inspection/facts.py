@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from icalib.data.checks.imu_checks import Saturation
-from icalib.data.messages.streams import CameraInfo
 from icalib.data.recordings import TopicInfo
 from icalib.geometry.targets import Target
 from icalib.rig import TwoSources
+from icalib.sensors.camera.read.camera_info import CameraInfo
+from icalib.sensors.imu.read.checks import Saturation
 from icalib.tools.inspection.kalibr import KalibrFiles
 
 Severity = Literal["problem", "warning", "hint"]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from icalib.data.recordings import BagRecording, Recording
-from icalib.data.recordings.transforms import TRANSFORMS, read_edges, transform_topics
 from icalib.errors import RecordingError
+from icalib.sensors.pose.read.transforms import TRANSFORMS, read_edges, transform_topics
 from icalib.tools.inspection.facts import FramePair
 
 

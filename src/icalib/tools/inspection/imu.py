@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.data.checks.gravity_turns import gravity_spread
-from icalib.data.checks.imu_checks import checked_imu, saturations
-from icalib.data.checks.imu_halves import one_stream
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import Recording
 from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor, TwoSources
+from icalib.sensors.imu.read import readings
+from icalib.sensors.imu.read.checks import checked_imu, saturations
+from icalib.sensors.imu.read.gravity_turns import gravity_spread
+from icalib.sensors.imu.read.halves import one_stream
 from icalib.sensors.imu.spec import DEFAULT_CLASS, class_noise
 from icalib.tools.inspection.facts import ImuFacts, Vector
 
@@ -23,7 +24,7 @@ def read_imu(recording: Recording, name: str, topic: str | TwoSources) -> tuple[
     Raises RecordingError."""
     sensor = ImuSensor(name, topic, class_noise(DEFAULT_CLASS), topic=topic)
     where = recording.where(sensor)
-    imu, notes = one_stream(recording.imu(sensor), f"{where} ({name})")
+    imu, notes = one_stream(readings(recording, sensor), f"{where} ({name})")
     return imu, where, notes
 
 

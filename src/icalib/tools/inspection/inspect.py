@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from icalib.data.checks.imu_halves import pair_of
-from icalib.data.messages.streams import CameraInfo, read_camera_info
 from icalib.data.recordings import (
     BagRecording,
     DamagedImageError,
@@ -22,10 +20,12 @@ from icalib.data.recordings import (
     decode,
     open_recording,
 )
-from icalib.data.recordings.transforms import TRANSFORMS
 from icalib.detection.images.image_work import spread_images
 from icalib.errors import RecordingError
 from icalib.rig import TwoSources
+from icalib.sensors.camera.read.camera_info import CameraInfo, read_camera_info
+from icalib.sensors.imu.read.halves import pair_of
+from icalib.sensors.pose.read.transforms import TRANSFORMS
 from icalib.tools.inspection.facts import (
     CameraSource,
     GivenTarget,

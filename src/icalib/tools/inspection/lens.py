@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.messages.streams import CameraInfo
 from icalib.geometry.cameras import camera_model
+from icalib.sensors.camera.read.camera_info import CameraInfo
 from icalib.tools.inspection.facts import CameraSource, Inspection
 from icalib.tools.inspection.kalibr import KalibrCamera
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.data.images.topics import listing
+from icalib.data.topics import listing
 from icalib.tools.inspection.facts import Finding, Inspection
 from icalib.tools.inspection.kinds import inspectors, moves_without_imu, moving, nouns, without_imu
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.data.images.unreadable import type_not_read
+from icalib.data.topics import type_not_read
 from icalib.tools.inspection.facts import Finding, Inspection
 
 

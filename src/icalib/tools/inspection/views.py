@@ -14,6 +14,7 @@ from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.rig import Camera
+from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.tools.inspection.facts import CameraSource, TargetView
 
 GRID = (8, 5)  # columns and rows of cells over the image
@@ -36,7 +37,7 @@ def target_view(
     tabled = source.corners is not None
     try:
         if tabled:
-            corners, notes = recording.corners(camera, target), ()
+            corners, notes = recorded_corners(recording, camera, target), ()
         else:
             corners, notes = find_corners(recording, camera, target, progress=progress)
     except RecordingError as error:

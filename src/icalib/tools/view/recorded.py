@@ -9,13 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.checks.imu_checks import read_imu
 from icalib.data.measurements import LidarStream
-from icalib.data.recordings import DamagedImageError, Recording, decode, image_topics
+from icalib.data.recordings import DamagedImageError, Recording, decode
 from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import CalibrationError, RecordingError
 from icalib.result import Calibration, RecordingSpan
 from icalib.rig import Camera, ImuSensor, Lidar, Rig
+from icalib.sensors.camera.read import has_corners, image_topics, sees
+from icalib.sensors.imu.read import read_imu
+from icalib.sensors.lidar.read import scans
 from icalib.tools.view.colors import by_value
 from icalib.tools.view.path import CubicPath
 from icalib.tools.view.scene import POINT, place
@@ -86,7 +88,7 @@ class Recorded:
         for sensor in (*([self.rig.imu] if self.rig.imu else []), *mounted):
             self.recording.where(sensor)
         for camera in self.rig.cameras:
-            if camera.tracks is None or self.recording.sees(camera):
+            if camera.tracks is None or sees(self.recording, camera):
                 self.recording.where(camera)
 
     def log(self, s: RerunStream, progress: Progress) -> list[str]:
@@ -110,7 +112,7 @@ class Recorded:
         except RecordingError:
             return False
         named = camera.topic is not None or camera.name in topic.split("/")
-        return named or not self.recording.has_corners(camera)
+        return named or not has_corners(self.recording, camera)
 
     def _clock(self, sensor: str) -> Clock:
         return Clock.of(self.calibration, self.span, sensor)
@@ -126,7 +128,7 @@ class Recorded:
         return inside
 
     def _readings(self, s: RerunStream, sensor: ImuSensor) -> list[str]:
-        imu, _ = read_imu(self.recording, sensor, ClockJumps())
+        imu, _ = read_imu(self.recording, sensor, ClockJumps().cut)
         seconds = self._clock(sensor.name).seconds(imu.stamps_ns)
         inside = self._during(sensor.name, seconds)
         keep = inside[:: _stride(len(inside), MOST_READINGS)]
@@ -153,7 +155,7 @@ class Recorded:
         return notes + _thinned(name, count, MOST_IMAGES, "images")
 
     def _scans(self, s: RerunStream, sensor: Lidar) -> list[str]:
-        stream = self.recording.lidar(sensor)
+        stream = scans(self.recording, sensor)
         seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
         inside = self._during(sensor.name, seconds)
         heights, path = None, CubicPath.of(self.calibration)

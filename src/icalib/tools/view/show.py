@@ -45,7 +45,7 @@ def view(
 def _recorded(c: Calibration, folder: Path, recording: Path) -> Recorded:
     opened_recording = open_recording(recording)
     rig = rig_from_dict(c.rig, str(folder / "result.json"))
-    opened_recording.use_layouts(rig.poses)
+    opened_recording.use_layouts(tuple(rig.sensors.values()))
     found = Recorded(c, rig, opened_recording, span_of(c, recording), recording)
     found.check()
     return found

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from icalib.data.images.image_checks import Note
 from icalib.data.measurements import WheelPoses
+from icalib.data.messages.streams import TwistStream
 from icalib.data.tables.columns import STAMP, TableKind
 from icalib.data.tables.table import Table, read_table
 from icalib.errors import RecordingError
 from icalib.rig import WheelDrive, WheelMeasure, Wheels
+from icalib.sensors.wheels.read.joints import JointStream
 
 RATE_HZ = (1e-2, 10_000.0)
 STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=RATE_HZ, more=True)
@@ -64,30 +65,6 @@ def value_columns(wheels: Wheels) -> tuple[str, ...]:
     return tuple(f"{side} [{'rad' if side == 'steering' else unit}]" for side in SIDES[wheels.drive])
 
 
-class Twists(Protocol):
-    """See `streams.TwistStream`."""
-
-    @property
-    def stamps_ns(self) -> np.ndarray: ...
-    @property
-    def linear(self) -> np.ndarray: ...
-    @property
-    def angular(self) -> np.ndarray: ...
-
-
-class Joints(Protocol):
-    """See `streams.JointStream`."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def stamps_ns(self) -> np.ndarray: ...
-    @property
-    def position(self) -> np.ndarray: ...
-    @property
-    def velocity(self) -> np.ndarray: ...
-
-
 def read_wheel_table(wheels: Wheels, path: Path, note: Note) -> WheelReadings | WheelPoses:
     """The table at `path`; `note` is told what was left out. Raises RecordingError naming file and line where it cannot
     be read, and the instant where relative poses do not follow one another."""
@@ -122,7 +99,7 @@ def _relative_poses(name: str, path: Path, table: Table) -> WheelPoses:
     return WheelPoses(name, np.append(begin, end[-1]), table.decimals[:, :3].copy(), covariance)
 
 
-def read_wheel_twists(wheels: Wheels, twists: Twists, what: str) -> WheelReadings:
+def read_wheel_twists(wheels: Wheels, twists: TwistStream, what: str) -> WheelReadings:
     """Forward speed and yaw rate. Raises RecordingError naming the topic (`what`) where velocities are in the axes of
     the world."""
     if _in_the_world(twists):
@@ -135,7 +112,7 @@ def read_wheel_twists(wheels: Wheels, twists: Twists, what: str) -> WheelReading
     return WheelReadings(wheels.name, twists.stamps_ns, value)
 
 
-def _in_the_world(twists: Twists) -> bool:
+def _in_the_world(twists: TwistStream) -> bool:
     """Whether velocities keep their direction once turned back by the yaw rate, and do not as they are. Directions are
     doubled, so that forwards and backwards are one."""
     across, rate = twists.linear[:, 0] + 1j * twists.linear[:, 1], twists.angular[:, 2]
@@ -150,7 +127,7 @@ def _in_the_world(twists: Twists) -> bool:
     return bool(back > _ALIGNED and as_they_are < _SCATTERED)
 
 
-def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReadings:
+def read_wheel_joints(wheels: Wheels, joints: JointStream, what: str) -> WheelReadings:
     """The wheels' joints. Raises RecordingError naming the topic (`what`): relative poses, which joints do not have,
     joints that are not there or not sent together, and what they do not say. Single messages where some are NaN stay,
     to be left out with a note."""
@@ -185,7 +162,7 @@ def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReading
     return WheelReadings(wheels.name, joints.stamps_ns[some], value[some])
 
 
-def _refuse_zeros(wheels: Wheels, joints: Joints, own: tuple[str, ...], what: str) -> None:
+def _refuse_zeros(wheels: Wheels, joints: JointStream, own: tuple[str, ...], what: str) -> None:
     """Where velocities of the joints `own` are always 0 and positions are not, or the other way round: a driver fills
     what it does not have."""
     turning = own[: len(own) // 2] if wheels.drive == "ackermann" else own

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.data.checks.bad_poses import are_poses, path_of, stale_copies
-from icalib.data.checks.single_poses import single_wrong
 from icalib.data.checks.stops import stands_still_between
 from icalib.data.measurements import PoseStream
 from icalib.data.stamps.ordered import kept_readings
-from icalib.data.tables.poses import RATE_HZ, PoseReadings
 from icalib.errors import RecordingError
 from icalib.geometry import so3
 from icalib.rig import PoseSensor
+from icalib.sensors.pose.read.bad_poses import are_poses, path_of, stale_copies
+from icalib.sensors.pose.read.pose_tables import RATE_HZ, PoseReadings
+from icalib.sensors.pose.read.single_poses import single_wrong
 from icalib.sensors.stream import seconds_since
 
 _FASTEST_M_S = 100.0

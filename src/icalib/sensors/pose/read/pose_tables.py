@@ -10,7 +10,7 @@ import numpy as np
 from icalib.data.images.image_checks import Note, ignore
 from icalib.data.messages.streams import unit_rotations
 from icalib.data.tables.axes import in_axes
-from icalib.data.tables.columns import STAMP, TableKind, vector_names
+from icalib.data.tables.columns import STAMP, TableKind, split_kind, vector_names
 from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, PoseSensor, TableLayout
@@ -26,7 +26,8 @@ POSES = TableKind(
     ),
     RATE_HZ,
 )
-FILES = ("poses.csv", "poses.tum", "poses.txt")  # that a folder's sensor may have
+# The stamps alone: a row whose pose cannot be read keeps its place in the order.
+_STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=RATE_HZ, more=True)
 _TEXTS = (".tum", ".txt")
 _UNIT = 1e-2  # of the length of a quaternion: of few digits
 
@@ -75,3 +76,11 @@ def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, not
             "no better; check the order of the columns, x, y, z, qx, qy, qz, qw."
         )
     return PoseReadings(name, stamps_ns, unit_rotations(xyzw, ~wrong), values[:, :3].copy())
+
+
+def stamps_by_row(table: Path, layout: TableLayout, note: Note) -> tuple[dict[int, int], int]:
+    """The stamp [ns] of each row that can be read, by the row's number from 0 on, and how many rows there are."""
+    kind = replace(_STAMPS, unit="s") if is_tum_text(table) else _STAMPS
+    stamps = 1 if split_kind(POSES, layout.columns) is None else 2  # the first columns of a pose
+    read = read_table(table, kind, replace(layout, columns=layout.columns[:stamps]), note)
+    return dict(zip(read.numbers.tolist(), read.integers[:, 0].tolist(), strict=True)), read.written

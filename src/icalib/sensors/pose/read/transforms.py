@@ -12,12 +12,12 @@ from typing import Protocol
 import numpy as np
 
 from icalib.data.images.image_checks import Note
-from icalib.data.images.topics import TopicInfo, find_topic
 from icalib.data.messages.streams import HasMessages, unit_rotations
-from icalib.data.tables.poses import PoseReadings
+from icalib.data.topics import TopicInfo, find_topic
 from icalib.errors import RecordingError
 from icalib.geometry import so3
 from icalib.rig import PoseSensor
+from icalib.sensors.pose.read.pose_tables import PoseReadings
 
 TRANSFORMS = "transforms"  # the kind of such a topic
 DEFAULT_TOPIC = "/tf"

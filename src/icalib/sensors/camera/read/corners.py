@@ -5,8 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.data.measurements import CornerStream
+from icalib.data.tables.columns import STAMP, TableKind
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
+
+CORNERS = TableKind(
+    ("t [ns]", "tag id", "corner"),
+    ("u [px]", "v [px]"),
+    (
+        STAMP,
+        (r"(tag|marker)(_?id)?|id",),
+        (r"corner(_?(id|index))?",),
+        (r"u(_?px)?|x(_?px)?",),
+        (r"v(_?px)?|y(_?px)?",),
+    ),
+    (1e-3, 1000.0),
+)
 
 
 def group_corners(

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.data.checks.gravity_turns import WINDOW_S, gravity_size
 from icalib.data.measurements import ImuStream
 from icalib.data.tables.axes import in_axes
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
+from icalib.sensors.imu.read.gravity_turns import WINDOW_S, gravity_size
 
 G_M_S2 = 9.80665
 DEGREE = np.pi / 180.0

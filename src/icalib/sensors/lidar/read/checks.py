@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.data.measurements import LidarStream
-from icalib.data.messages.scan_order import at_even_steps, in_order, selected, without_repeats
 from icalib.data.stamps.clocks import rate_sentence
 from icalib.errors import RecordingError
+from icalib.sensors.lidar.read.scan_order import at_even_steps, in_order, selected, without_repeats
 
 _RATE_HZ = (0.1, 1000.0)
 _FARTHEST_PERIODS = 2.0  # of a point from its scan's stamp

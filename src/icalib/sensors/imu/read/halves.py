@@ -9,15 +9,24 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from icalib.data.images.topics import TopicInfo, choose_topic
 from icalib.data.measurements import ImuStream
 from icalib.data.stamps.ordered import kept_readings
+from icalib.data.topics import TopicInfo, choose_topic
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor, TwoSources
+from icalib.sensors.imu.read.imu_tables import RATE_HZ
 
-RATE_HZ = (10.0, 20_000.0)
 _LOOKED_AT = 50  # readings that tell which sensor a topic carries; a driver leaves the other at zero or NaN
 _LEAST_COMMON_S = 1.0
+
+
+@dataclass(frozen=True)
+class ImuHalf:
+    """stamps_ns (N,), values (N, 3) of the gyroscope or the accelerometer, as they were written."""
+
+    name: str
+    stamps_ns: np.ndarray
+    values: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -47,13 +56,13 @@ def imu_source(where: str, bag: HasImuMessages, topics: Sequence[TopicInfo], sen
     """The topic of the IMU, or its two where one has the gyroscope's readings only and exactly one other has the
     accelerometer's. Raises RecordingError as `choose_topic`."""
     if isinstance(sensor.topic, TwoSources):
-        gyro, accel = (choose_topic(where, topics, "imu", sensor.name, t).name for t in _both(sensor.topic))
+        gyro, accel = (choose_topic(where, topics, sensor.name, t, "imu").name for t in both(sensor.topic))
         return TwoSources(gyro, accel)
     pair = pair_of(bag, topics)
     if pair is not None and sensor.topic is None and sum(t.kind == "imu" and t.count > 0 for t in topics) == 2:
         return pair
-    chosen = choose_topic(where, topics, "imu", sensor.name, sensor.topic).name
-    return pair if pair is not None and chosen in _both(pair) else chosen
+    chosen = choose_topic(where, topics, sensor.name, sensor.topic, "imu").name
+    return pair if pair is not None and chosen in both(pair) else chosen
 
 
 def pair_of(bag: HasImuMessages, topics: Sequence[TopicInfo]) -> TwoSources | None:
@@ -65,7 +74,8 @@ def pair_of(bag: HasImuMessages, topics: Sequence[TopicInfo]) -> TwoSources | No
     return TwoSources(gyros[0], accels[0]) if len(gyros) == len(accels) == 1 else None
 
 
-def _both(pair: TwoSources) -> tuple[str, str]:
+def both(pair: TwoSources) -> tuple[str, str]:
+    """The gyroscope's, and the accelerometer's."""
     return pair.gyro, pair.accel
 
 

@@ -7,15 +7,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from typing import Any
 
 import numpy as np
 
 from icalib.data.measurements import LidarStream
-from icalib.data.messages.lidar_checks import Sieve
-from icalib.data.messages.point_times import PointTimes, clock_note, find_point_times, likely_fields
-from icalib.data.messages.sweeps import SweepOrder, find_sweep, sweep_share
+from icalib.data.messages.streams import HasMessages
 from icalib.errors import RecordingError
 from icalib.rig import Lidar, TimeUnit
+from icalib.sensors.lidar.read.checks import Sieve
+from icalib.sensors.lidar.read.livox import LivoxCloud
+from icalib.sensors.lidar.read.point_times import PointTimes, clock_note, find_point_times, likely_fields
+from icalib.sensors.lidar.read.sweeps import SweepOrder, find_sweep, sweep_share
 
 _AHEAD = 8  # clouds with points that tell how points are timed
 
@@ -194,3 +197,43 @@ def _joined(lidar: Lidar, stamps_ns: np.ndarray, parts: list[tuple[np.ndarray, n
     xyz = np.concatenate(points)
     points.clear()
     return LidarStream(lidar.name, stamps_ns, start, np.concatenate(offsets), xyz, np.full(len(xyz), -1, np.int32))
+
+
+def point_clouds(bag: HasMessages, topic: str) -> Iterator[PointCloud]:
+    """The PointCloud2, or Livox's CustomMsg, of `topic`, one at a time; those shorter than their points are left out as
+    damaged messages. Raises RecordingError as `BagRecording.messages`."""
+    for stamp_ns, (frame, points, height) in bag.messages(topic, "points", _points_of):
+        yield PointCloud(stamp_ns, frame, points, height)
+
+
+def _points_of(message: Any) -> tuple[str, np.ndarray, int]:
+    """Frame, points and rows of a message. Raises ValueError where it is shorter than its points."""
+    m = message
+    if isinstance(m, LivoxCloud):
+        return m.header.frame_id, m.points, 1
+    if len(m.data) < m.row_step * m.height or m.row_step < m.point_step * m.width:
+        raise ValueError(f"{m.width * m.height} points do not fit {len(m.data)} bytes")
+    kind = _point_type(m)
+    rows = m.data[: m.row_step * m.height].reshape(m.height, m.row_step)[:, : m.point_step * m.width]
+    points = np.ascontiguousarray(rows).reshape(-1).view(kind) if rows.size else np.empty(0, kind)
+    return m.header.frame_id, points, m.height
+
+
+_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
+
+
+def _point_type(message: Any) -> np.dtype:
+    """Raises ValueError where the fields do not fit a point."""
+    order = ">" if message.is_bigendian else "<"
+    unknown = [f.name for f in message.fields if f.datatype not in _FIELD_TYPES]
+    if unknown or message.point_step < 1:
+        raise ValueError(f"its point fields cannot be read: {', '.join(unknown) or 'they have 0 bytes'}")
+    formats = [(order + _FIELD_TYPES[f.datatype], (f.count,) if f.count > 1 else ()) for f in message.fields]
+    return np.dtype(
+        {
+            "names": [f.name for f in message.fields],
+            "formats": formats,
+            "offsets": [f.offset for f in message.fields],
+            "itemsize": message.point_step,
+        }
+    )

@@ -8,12 +8,12 @@ import numpy as np
 
 from icalib.data.images.image_checks import Note, ignore
 from icalib.data.measurements import TrackStream
-from icalib.data.stamps.camera_checks import in_image, outside_note
 from icalib.data.stamps.clocks import rate_sentence
 from icalib.data.tables.columns import STAMP, TableKind
 from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, TableLayout
+from icalib.sensors.camera.read.checks import in_image, outside_note
 
 _RATE_HZ = (1e-3, 1000.0)
 _KIND = TableKind(

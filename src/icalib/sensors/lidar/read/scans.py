@@ -11,9 +11,9 @@ import numpy as np
 from icalib.base.unpacking import load_arrays
 from icalib.data.images.unreadable import HEAD_BYTES, not_data
 from icalib.data.measurements import LidarStream
-from icalib.data.messages.point_times import LONGEST_PERIODS, UNIT_NS, unit_of_offsets, within_scan
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
+from icalib.sensors.lidar.read.point_times import LONGEST_PERIODS, UNIT_NS, unit_of_offsets, within_scan
 
 _REQUIRED = {"stamps_ns": np.int64, "start": np.int64, "offset_s": np.float32, "xyz": np.float32}
 _OPTIONAL = {"plane": np.int32}

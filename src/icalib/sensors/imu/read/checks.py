@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
-from icalib.data.checks.imu_cleaning import in_time, without_wrong
-from icalib.data.checks.imu_halves import RATE_HZ, ImuHalves, one_stream
-from icalib.data.checks.imu_units import in_si, recognised_unit
 from icalib.data.measurements import ImuStream
-from icalib.data.stamps.jumps import ClockJumps
 from icalib.data.stamps.ordered import kept_readings, longest_run
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
+from icalib.sensors.imu.read.cleaning import in_time, without_wrong
+from icalib.sensors.imu.read.imu_tables import RATE_HZ
+from icalib.sensors.imu.read.units import in_si, recognised_unit
 
 _SATURATED_RUN = 5
 # No sensor's range is narrower (125 deg/s, 2 g); below it, equal readings are coarse quantisation, not saturation.
@@ -30,23 +28,6 @@ class Saturation:
     limit: float
     count: int
     stamp_ns: int
-
-
-class HasImu(Protocol):
-    """The part of a recording that is needed here."""
-
-    def imu(self, sensor: ImuSensor) -> ImuStream | ImuHalves: ...
-    def where(self, sensor: ImuSensor) -> str: ...
-
-
-def read_imu(recording: HasImu, sensor: ImuSensor, jumps: ClockJumps) -> tuple[ImuStream, tuple[str, ...]]:
-    """All good readings of the IMU in SI units, those of the part of its clock that `jumps` keeps, and notes. Raises
-    RecordingError as the readers, `one_stream` and `checked_imu`."""
-    where = recording.where(sensor)
-    what = f"{where} ({sensor.name})"
-    imu, joined = one_stream(recording.imu(sensor), what)
-    imu, notes = checked_imu(jumps.cut(imu, what), where, sensor)
-    return imu, joined + notes
 
 
 def checked_imu(imu: ImuStream, where: str, sensor: ImuSensor | None = None) -> tuple[ImuStream, tuple[str, ...]]:

@@ -1,0 +1,143 @@
+"""What cameras see: images, tables of corners and of feature tracks -> checked streams."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from icalib.data.recordings.base import Reading, ReadStream, Recording
+from icalib.data.tables.files import TableFile
+from icalib.data.tables.table import read_table
+from icalib.data.topics import MessageType, UnreadType
+from icalib.errors import RecordingError
+from icalib.geometry.targets import Target
+from icalib.sensors.camera.read.checks import checked_corners
+from icalib.sensors.camera.read.corners import CORNERS, group_corners
+from icalib.sensors.camera.read.tracks import read_track_stamps, read_tracks
+from icalib.sensors.camera.spec import Camera
+from icalib.sensors.camera.stream import CornerStream, TrackStream
+from icalib.sensors.sensor import TableLayout
+
+MESSAGES = (
+    MessageType("sensor_msgs/msg/Image", "image"),
+    MessageType("sensor_msgs/msg/CompressedImage", "image"),
+    MessageType("sensor_msgs/msg/CameraInfo", "camera info", lasting=""),
+)
+UNREAD = (
+    UnreadType(
+        r"\w+/msg/(CompressedVideo|FFMPEGPacket|H26[45]\w*)|theora_image_transport/msg/Packet",
+        "image",
+        "compressed video; decode it by its image transport, and record sensor_msgs/Image",
+    ),
+)
+
+
+def _corner_stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    del layout
+    return np.unique(read_table(path, CORNERS).integers[:, 0])
+
+
+def _track_stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    del layout
+    return read_track_stamps(path)
+
+
+TABLES = (
+    TableFile("corners.csv", "table of corners", "corners", _corner_stamps),
+    TableFile("tracks.csv", "table of tracks", "tracks", _track_stamps),
+)
+
+
+def read(recording: Recording, sensors: Sequence[Camera], reading: Reading) -> list[ReadStream]:
+    """The feature tracks of each camera that has some, and the corners of each that sees the target, both from its
+    table or its images; and notes. Raises RecordingError as the readers do, and where cameras share images."""
+    return _tracks(recording, sensors, reading) + _corners(recording, sensors, reading)
+
+
+def where(recording: Recording, camera: Camera) -> str:
+    """How a sentence names the place of the corners, or of the images."""
+    if has_corners(recording, camera):
+        return str(recording.table(camera, camera.path))
+    return recording.place(recording.image_topic(camera))
+
+
+def has_corners(recording: Recording, camera: Camera) -> bool:
+    """Whether the camera's corners are there as a table; else they are to be found in its images."""
+    # Where there are neither corners nor images, the sentence on the missing table is the better one.
+    return not recording.has_messages and (recording.find(camera.path) is not None or not recording.image_topics())
+
+
+def sees(recording: Recording, camera: Camera) -> bool:
+    """Whether there are images or corners of the camera at all."""
+    return bool(recording.image_topics()) or (
+        has_corners(recording, camera) and recording.find(camera.path) is not None
+    )
+
+
+def corners(recording: Recording, camera: Camera, target: Target) -> CornerStream:
+    """All corners of the camera's table, grouped by image, images in order.
+
+    Raises RecordingError naming file and line or instant where the data are missing or cannot be read, where images are
+    out of order, where a corner appears twice in an image, and where it is not on the target.
+    """
+    layout = camera.layout if camera.tracks is None else TableLayout(time_unit=camera.layout.time_unit)
+    path = recording.table(camera, camera.path)
+    table = read_table(path, CORNERS, layout, recording.note)
+    stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))
+    return recording.inside(group_corners(camera.name, str(path), stamps, tag, corner, table.decimals, target), path)
+
+
+def tracks(recording: Recording, camera: Camera) -> TrackStream:
+    """The points of the scene that the camera followed, from the table at its `tracks`.
+
+    Raises RecordingError as `read_tracks`, and where there is no such table.
+    """
+    assert camera.tracks is not None
+    path = recording.table(camera, camera.tracks, "tracks")
+    return recording.inside(read_tracks(camera.name, path, camera.resolution, camera.layout, recording.note), path)
+
+
+def image_topics(recording: Recording, cameras: Sequence[Camera]) -> dict[str, str]:
+    """The topic of each camera's images, by the camera's name. Raises RecordingError where two would share one."""
+    chosen: dict[str, str] = {}
+    for camera in cameras:
+        topic = recording.image_topic(camera)
+        for other, taken in chosen.items():
+            if taken == topic:
+                raise RecordingError(
+                    f"{camera.name} and {other} both match {topic}; set `topic` of each in the rig file."
+                )
+        chosen[camera.name] = topic
+    return chosen
+
+
+def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadStream]:
+    pictured = [c for c in cameras if c.tracks_images]
+    tables = {c.name: tracks(recording, c) for c in cameras if c.tracks is not None and not c.tracks_images}
+    image_topics(recording, pictured)
+    above = 1 + max((int(t.feature.max(initial=-1)) for t in tables.values()), default=-1)
+    seen = reading.follow(recording, pictured) if pictured else ()
+    of_images = {stream.name: (replace(stream, feature=stream.feature + above), notes) for stream, notes in seen}
+    by_name = {name: (stream, ()) for name, stream in tables.items()} | of_images
+    found = [by_name[c.name] for c in cameras if c.name in by_name]
+    return [(reading.cut(stream, f"the tracks of {stream.name}"), notes) for stream, notes in found]
+
+
+def _corners(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadStream]:
+    target = reading.rig.target
+    seeing = [c for c in cameras if reading.rig.has_target and (c.tracks is None or sees(recording, c))]
+    pictured = [c for c in seeing if not has_corners(recording, c)]
+    image_topics(recording, pictured)
+    streams = []
+    for camera in seeing:
+        found, notes = (
+            reading.find(recording, camera) if camera in pictured else (corners(recording, camera, target), ())
+        )
+        where = recording.where(camera)
+        cut = reading.cut(found, f"{where} ({camera.name})")
+        stream, dropped = checked_corners(cut, where, camera.resolution)
+        streams.append((stream, notes + dropped))
+    return streams

@@ -1,0 +1,26 @@
+"""What a driver says of its camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.data.messages.streams import HasMessages
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """What the driver says of its camera: resolution (width, height) px, distortion model as ROS calls it, K (3, 3)."""
+
+    resolution: tuple[int, int]
+    model: str
+    distortion: np.ndarray
+    K: np.ndarray
+
+
+def read_camera_info(bag: HasMessages, topic: str) -> CameraInfo:
+    """The first CameraInfo of `topic`. Raises RecordingError as `BagRecording.messages`."""
+    _, m = next(bag.messages(topic, "camera info"))
+    d, k = (m.D, m.K) if hasattr(m, "K") else (m.d, m.k)  # ROS 1, ROS 2
+    return CameraInfo((m.width, m.height), m.distortion_model, np.array(d), np.array(k).reshape(3, 3))

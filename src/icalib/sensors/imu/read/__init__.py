@@ -1,0 +1,99 @@
+"""Readings of an IMU: tables, topics -> a checked stream."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from icalib.data.recordings.base import Cut, Reading, ReadStream, Recording
+from icalib.data.tables.files import TableFile
+from icalib.data.tables.table import holds, read_table
+from icalib.data.topics import MessageType
+from icalib.sensors.imu.read.checks import checked_imu
+from icalib.sensors.imu.read.halves import ImuHalf, ImuHalves, both, imu_source, one_stream, values_of
+from icalib.sensors.imu.read.imu_tables import IMU, IMU_ACCEL, IMU_GYRO
+from icalib.sensors.imu.spec import ImuSensor, TwoSources
+from icalib.sensors.imu.stream import ImuStream
+from icalib.sensors.sensor import TableLayout
+
+MESSAGES = (MessageType("sensor_msgs/msg/Imu", "imu"),)
+
+
+def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    del layout
+    return read_table(path, IMU).integers[:, 0].copy()
+
+
+def _is_one(path: Path) -> bool:
+    return holds(path, IMU)
+
+
+TABLES = (TableFile("data.csv", "table of readings", "imu", _stamps, _is_one, IMU),)
+
+
+def read(recording: Recording, sensors: Sequence[ImuSensor], reading: Reading) -> list[ReadStream]:
+    """The checked streams, and notes. Raises RecordingError as `read_imu`."""
+    return [read_imu(recording, sensor, reading.cut) for sensor in sensors]
+
+
+def read_imu(recording: Recording, sensor: ImuSensor, cut: Cut) -> tuple[ImuStream, tuple[str, ...]]:
+    """All good readings of the IMU in SI units, those of the part of its clock that `cut` keeps, and notes. Raises
+    RecordingError as `readings`, `one_stream` and `checked_imu`."""
+    where = recording.where(sensor)
+    what = f"{where} ({sensor.name})"
+    imu, joined = one_stream(readings(recording, sensor), what)
+    imu, notes = checked_imu(cut(imu, what), where, sensor)
+    return imu, joined + notes
+
+
+def readings(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
+    """All readings as they were written, or of the two sensors of an IMU where they report apart: stamps may still
+    repeat or run backwards.
+
+    Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read.
+    """
+    return _from_messages(recording, sensor) if recording.has_messages else _from_tables(recording, sensor)
+
+
+def _from_messages(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
+    def rows(topic: str) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) stamps [ns] and (N, 6) rates and forces, by stamp."""
+        found = [(stamp, values_of(message)) for stamp, message in recording.messages(topic, "imu")]
+        stamps_ns = np.array([stamp for stamp, _ in found], np.int64)
+        values = np.array([row for _, row in found], np.float64).reshape(-1, 6)
+        order = recording.by_stamp(topic, stamps_ns)
+        return stamps_ns[order], values[order]
+
+    topic = imu_source(str(recording.root), recording, recording.topics(), sensor)
+    if isinstance(topic, TwoSources):
+        (gyro_ns, gyro), (accel_ns, accel) = rows(topic.gyro), rows(topic.accel)
+        return ImuHalves(sensor.name, gyro_ns, gyro[:, :3].copy(), accel_ns, accel[:, 3:].copy())
+    stamps_ns, values = rows(topic)
+    return ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy())
+
+
+def _from_tables(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
+    if isinstance(sensor.path, TwoSources):
+        layout, halves = TableLayout(time_unit=sensor.layout.time_unit), []
+        for name, kind in ((sensor.path.gyro, IMU_GYRO), (sensor.path.accel, IMU_ACCEL)):
+            path = recording.table(sensor, name)
+            table = read_table(path, kind, layout, recording.note)
+            half = ImuHalf(sensor.name, table.integers[:, 0].copy(), table.decimals)
+            halves.append(recording.inside(half, path))
+        gyro, accel = halves
+        return ImuHalves(sensor.name, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values)
+    path = recording.table(sensor, sensor.path)
+    table = read_table(path, IMU, sensor.layout, recording.note)
+    stamps_ns, values = table.integers[:, 0].copy(), table.decimals
+    return recording.inside(ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy()), path)
+
+
+def where(recording: Recording, sensor: ImuSensor) -> str:
+    """How a sentence names the place of the readings."""
+    if recording.has_messages:
+        topic = imu_source(str(recording.root), recording, recording.topics(), sensor)
+        return recording.place(" and ".join(both(topic)) if isinstance(topic, TwoSources) else topic)
+    names = both(sensor.path) if isinstance(sensor.path, TwoSources) else (sensor.path,)
+    return " and ".join(str(recording.table(sensor, name)) for name in names)

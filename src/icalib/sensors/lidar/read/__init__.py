@@ -1,0 +1,84 @@
+"""Scans of a LiDAR: arrays in a file, topics of point clouds -> a checked stream."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from icalib.data.recordings.base import Reading, ReadStream, Recording
+from icalib.data.tables.files import TableFile
+from icalib.data.topics import MessageType, UnreadType
+from icalib.sensors.lidar.read import livox
+from icalib.sensors.lidar.read.checks import Sieve, checked_lidar, sifted
+from icalib.sensors.lidar.read.clouds import point_clouds, read_clouds
+from icalib.sensors.lidar.read.scans import in_seconds, read_scan_stamps, read_scans
+from icalib.sensors.lidar.spec import Lidar
+from icalib.sensors.lidar.stream import LidarStream
+from icalib.sensors.sensor import TableLayout
+
+MESSAGES = (
+    MessageType("sensor_msgs/msg/PointCloud2", "points"),
+    *(MessageType(t, "points", parsers={"ros1": livox.parse_ros1, "cdr": livox.parse_cdr}) for t in livox.TYPES),
+)
+UNREAD = (
+    UnreadType(
+        r"(velodyne|ouster|hesai|pandar|rslidar|robosense|nebula|lslidar|seyond|innovusion|vanjee)\w*/msg/"
+        r"\w*(scan|packets?|packetmsg|udpframe)",
+        "points",
+        "raw packets of a LiDAR; replay the recording with the LiDAR's driver, and record the sensor_msgs/PointCloud2 "
+        "that it sends",
+    ),
+)
+
+
+def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    del layout
+    return read_scan_stamps(path)
+
+
+TABLES = (TableFile("scans.npz", "scans", "points", _stamps),)
+
+
+def read(recording: Recording, sensors: Sequence[Lidar], reading: Reading) -> list[ReadStream]:
+    """The checked streams, and notes. Raises RecordingError as `scans` and `checked_lidar`."""
+    found = []
+    for sensor in sensors:
+        where = recording.where(sensor)
+        # Checked before it is cut: a single wrong stamp is no jump of the clock.
+        stream, notes = checked_lidar(scans(recording, sensor), where)
+        found.append((reading.cut(stream, f"{where} ({sensor.name})"), notes))
+    return found
+
+
+def scans(recording: Recording, sensor: Lidar) -> LidarStream:
+    """All scans, without points that cannot be used, which the recording's notes say; a scan may have none.
+
+    Raises RecordingError naming file or topic where the data are missing or cannot be read, and where the times of
+    points are not known.
+    """
+    if recording.has_messages:
+        topic = _topic(recording, sensor)
+        what = f"{recording.place(topic)} ({sensor.name})"
+        stream, notes = read_clouds(point_clouds(recording, topic), sensor, what)
+    else:
+        path = recording.table(sensor, sensor.path)
+        sieve, what = Sieve(sensor.min_range_m, sensor.max_range_m), f"{path} ({sensor.name})"
+        stream, notes = in_seconds(recording.inside(read_scans(sensor.name, path), path), sensor, what)
+        stream = sifted(stream, sieve)
+        notes += (sieve.note(what),)
+    for note in filter(None, notes):
+        recording.note(note)
+    return stream
+
+
+def where(recording: Recording, sensor: Lidar) -> str:
+    """How a sentence names the place of the scans."""
+    if recording.has_messages:
+        return recording.place(_topic(recording, sensor))
+    return str(recording.table(sensor, sensor.path))
+
+
+def _topic(recording: Recording, sensor: Lidar) -> str:
+    return recording.topic(sensor.name, sensor.topic, "points").name

@@ -1,0 +1,117 @@
+"""Poses: tables, topics of poses or odometry, chains of transforms -> a checked stream."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from icalib.data.messages.streams import read_odometry, read_poses
+from icalib.data.recordings.base import Reading, ReadStream, Recording
+from icalib.data.tables.files import TableFile
+from icalib.data.tables.table import holds
+from icalib.data.topics import MessageType, TopicInfo
+from icalib.errors import RecordingError
+from icalib.sensors.pose.read.checks import checked_poses
+from icalib.sensors.pose.read.pose_tables import (
+    POSES,
+    PoseReadings,
+    as_frame_sensor,
+    is_tum_text,
+    read_pose_file,
+    stamps_by_row,
+)
+from icalib.sensors.pose.read.transforms import (
+    DEFAULT_TOPIC,
+    MESSAGE,
+    MESSAGE_TYPE,
+    TRANSFORMS,
+    read_transform_poses,
+    refuse_without_frames,
+)
+from icalib.sensors.pose.spec import PoseSensor
+from icalib.sensors.sensor import TableLayout
+
+_TRANSFORMS = MessageType(
+    MESSAGE_TYPE, TRANSFORMS, stamped=False, lasting="tf_static", read_as=MESSAGE_TYPE, ros1=MESSAGE
+)
+MESSAGES = (
+    MessageType("geometry_msgs/msg/PoseStamped", "pose"),
+    MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", "pose"),
+    MessageType("geometry_msgs/msg/TransformStamped", "pose"),
+    MessageType("nav_msgs/msg/Odometry", "odometry"),
+    _TRANSFORMS,
+    replace(_TRANSFORMS, name="tf/msg/tfMessage"),
+)
+
+
+def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    return read_pose_file(path.parent.name, path, layout).stamps_ns
+
+
+def _is_one(path: Path) -> bool:
+    """Whether a `poses.csv` has poses in a frame: other sensors have tables of that name."""
+    return is_tum_text(path) or holds(path, POSES)
+
+
+TABLES = (
+    TableFile("poses.csv", "table of poses", "pose", _stamps, _is_one, POSES, stamps_by_row),
+    TableFile("poses.tum", "table of poses", "pose", _stamps, rows=stamps_by_row),
+    TableFile("poses.txt", "table of poses", "pose", _stamps, rows=stamps_by_row),
+)
+
+
+def read(recording: Recording, sensors: Sequence[PoseSensor], reading: Reading) -> list[ReadStream]:
+    """The checked streams, and notes. Raises RecordingError as `readings` and `checked_poses`."""
+    found = []
+    for sensor in sensors:
+        where = recording.where(sensor)
+        written = reading.cut(readings(recording, sensor), f"{where} ({sensor.name})")
+        found.append(checked_poses(as_frame_sensor(written, sensor), sensor, where))
+    return found
+
+
+def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
+    """All poses as they were written: stamps may still repeat or run backwards. They come from a chain of transforms, a
+    table, which may lie beside a bag, or a topic.
+
+    Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read, and the instant
+    of a rotation that is none.
+    """
+    if sensor.frames is not None:
+        if not recording.has_messages:
+            raise RecordingError(
+                f"{recording.root} is a folder, but `frames` of {sensor.name} needs the transforms (/tf) of a bag; "
+                "give the bag, or remove `frames` from the rig file."
+            )
+        return read_transform_poses(recording, sensor, recording.note)
+    if _is_table(recording, sensor):
+        path = recording.table(sensor, sensor.path)
+        return recording.inside(read_pose_file(sensor.name, path, sensor.layout, recording.note), path)
+    topic = _topic(recording, sensor)
+    found = read_odometry(recording, topic.name).pose if topic.kind == "odometry" else read_poses(recording, topic.name)
+    order = recording.by_stamp(topic.name, found.stamps_ns)
+    return PoseReadings(sensor.name, found.stamps_ns[order], found.rotation[order], found.position[order])
+
+
+def where(recording: Recording, sensor: PoseSensor) -> str:
+    """How a sentence names the place of the poses."""
+    if _is_table(recording, sensor):
+        return str(recording.table(sensor, sensor.path))
+    return recording.place(_topic(recording, sensor).name)
+
+
+def _is_table(recording: Recording, sensor: PoseSensor) -> bool:
+    if not recording.has_messages:
+        return True
+    return sensor.topic is None and sensor.frames is None and recording.find(sensor.path) is not None
+
+
+def _topic(recording: Recording, sensor: PoseSensor) -> TopicInfo:
+    """An odometry's will do, too."""
+    if sensor.frames is not None:
+        return recording.topic(sensor.name, sensor.topic or DEFAULT_TOPIC, TRANSFORMS)
+    refuse_without_frames(recording.root, recording.topics(), sensor)
+    return recording.topic(sensor.name, sensor.topic, "pose", "odometry")

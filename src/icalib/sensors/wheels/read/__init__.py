@@ -1,0 +1,86 @@
+"""Readings of wheels, or velocities of a vehicle: tables, joints of a robot, odometry -> a checked stream."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from icalib.data.messages.streams import read_odometry_twists, read_twists
+from icalib.data.recordings.base import Reading, ReadStream, Recording
+from icalib.data.tables.files import TableFile
+from icalib.data.tables.table import holds, read_table
+from icalib.data.topics import MessageType, TopicInfo
+from icalib.sensors.sensor import TableLayout
+from icalib.sensors.wheels.read.checks import checked_wheels
+from icalib.sensors.wheels.read.joints import read_joints
+from icalib.sensors.wheels.read.wheel_readings import (
+    RELATIVE_POSES,
+    STAMPS,
+    UNITS,
+    WheelReadings,
+    read_wheel_joints,
+    read_wheel_table,
+    read_wheel_twists,
+)
+from icalib.sensors.wheels.spec import Wheels
+from icalib.sensors.wheels.stream import WheelPoses
+
+MESSAGES = (
+    MessageType("sensor_msgs/msg/JointState", "joints"),
+    MessageType("nav_msgs/msg/Odometry", "odometry"),
+    MessageType("geometry_msgs/msg/TwistStamped", "twist"),
+)
+
+
+def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    del layout
+    kind = RELATIVE_POSES if holds(path, RELATIVE_POSES) else STAMPS
+    return read_table(path, kind).integers[:, 0].copy()
+
+
+TABLES = tuple(TableFile(f"{m}.csv", f"table of {m}", "wheels", _stamps) for m in (*UNITS, "twist", "poses"))
+
+
+def read(recording: Recording, sensors: Sequence[Wheels], reading: Reading) -> list[ReadStream]:
+    """The checked streams, and notes. Raises RecordingError as `readings` and `checked_wheels`."""
+    found = []
+    for sensor in sensors:
+        where = recording.where(sensor)
+        written = reading.cut(readings(recording, sensor), f"{where} ({sensor.name})")
+        found.append(checked_wheels(written, sensor, where))
+    return found
+
+
+def readings(recording: Recording, sensor: Wheels) -> WheelReadings | WheelPoses:
+    """All readings as they were written: stamps may still repeat or run backwards.
+
+    Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read.
+    """
+    if not recording.has_messages:
+        path = recording.table(sensor, sensor.path)
+        return recording.inside(read_wheel_table(sensor, path, recording.note), path)
+    topic = _topic(recording, sensor)
+    what = f"{recording.place(topic.name)} ({sensor.name})"
+    if topic.kind == "odometry":
+        read = read_wheel_twists(sensor, read_odometry_twists(recording, topic.name), what)
+    elif topic.kind == "twist":
+        read = read_wheel_twists(sensor, read_twists(recording, topic.name), what)
+    else:
+        read = read_wheel_joints(sensor, read_joints(recording, topic.name), what)
+    order = recording.by_stamp(topic.name, read.stamps_ns)
+    return WheelReadings(sensor.name, read.stamps_ns[order], read.value[order])
+
+
+def where(recording: Recording, sensor: Wheels) -> str:
+    """How a sentence names the place of the readings."""
+    if recording.has_messages:
+        return recording.place(_topic(recording, sensor).name)
+    return str(recording.table(sensor, sensor.path))
+
+
+def _topic(recording: Recording, sensor: Wheels) -> TopicInfo:
+    """Joints; of a twist its own, or that of an odometry."""
+    kinds = ("twist", "odometry") if sensor.measures == "twist" else ("joints",)
+    return recording.topic(sensor.name, sensor.topic, *kinds)
