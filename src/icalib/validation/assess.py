@@ -31,6 +31,7 @@ from icalib.result import (
     Calibration,
     Iteration,
     ParameterGroup,
+    Residuals,
     SensorFit,
     Trajectory,
     Verdict,
@@ -38,11 +39,12 @@ from icalib.result import (
     by_key,
 )
 from icalib.result.provenance import versions
+from icalib.result.row_records import row_record
 from icalib.result.timeline import Timeline
 from icalib.result.verdict import by_size
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
-from icalib.sensors import ask
+from icalib.sensors import SENSOR_KINDS, ask, facet
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.guesses import guess_notes
@@ -87,7 +89,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         covariance_names=names,
         undetermined=seen.undetermined,
         fits=tuple(judged),
-        residuals=by_key(ask("assess", "residuals", inputs, found, timeline)),
+        residuals=by_key(_residuals(inputs, found, timeline)),
         trajectory=_trajectory(inputs, state, timeline),
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
@@ -289,6 +291,21 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
     recording = np.concatenate([timeline.of_images(i) for i in range(len(inputs.measurements.cameras))])
     order = np.argsort(times, kind="stable")
     return recording[order][np.searchsorted(times[order], state.seconds)]
+
+
+def _residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[Residuals]:
+    """Those that the kinds of sensors keep; by default all rows of all factors of a sensor."""
+    outcome = found.outcome
+    for kind in SENSOR_KINDS:
+        own = facet(kind, "assess")
+        if hasattr(own, "residuals"):
+            yield from own.residuals(inputs, found, timeline)
+            continue
+        names = [s.name for s in inputs.rig.sensors.values() if s.sensor_type == kind]
+        for key, factor in found.problem.factors.items():
+            rows = factor.rows(outcome.residuals[key], outcome.state) if factor.name in names else []
+            if rows:
+                yield row_record(key[1], rows, timeline)
 
 
 def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...]) -> Iterator[str]:

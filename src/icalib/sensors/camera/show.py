@@ -22,10 +22,10 @@ _IMAGE_WORDS = (
 )
 _LENS_WORDS = (
     "Standard deviation, in its worst direction, of where a camera projects points, from the covariance of its "
-    "intrinsics and distortion, empirical factors included. Taken off is the motion of the camera that makes up "
-    "best for an error of the lens, over the region where it saw points (dots): whoever uses this lens with the "
-    "extrinsics found beside it does not meet that part. What no lens of this model can follow is not in it; that "
-    "shows in the residuals."
+    "intrinsics and distortion, empirical factors included. The pose change that best absorbs an error of the lens "
+    "over the region where the camera saw points (dots) is removed first. Users of this lens with the extrinsics "
+    "found beside it do not meet that part. Errors that no lens of this model can follow are not in it; they show in "
+    "the residuals."
 )
 
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
-from icalib.motion.clocks import instants
 from icalib.motion.factor import Whitened
-from icalib.result import RowResiduals, SensorFit
+from icalib.result import SensorFit
 from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import PoseSensor, Rig
@@ -20,18 +19,6 @@ from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, Relative
 CORRELATED, ALTERNATING = 0.5, 0.35
 CLIP = 4.0  # standard deviations
 UNKNOWN = "they are no white noise, and the cause is unknown: check its clock and mount, and record again, slower"
-
-
-def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
-    """Of each pose sensor: rotation about its own axes, position along those in which it was measured. A row is a pose,
-    or of relative poses a stretch between two."""
-    labels = tuple(f"{kind} {axis}" for kind in ("rotation", "position") for axis in "xyz")
-    for factor, rows in _pose_factors(found):
-        seconds = instants(inputs.stream(factor.name), found.outcome.state.values, factor.instants)
-        shown = timeline.shown(seconds, timeline.recording_of(seconds))
-        units = ("rad",) * 3 + ("m",) * 3
-        whitened = rows.residual.copy()
-        yield RowResiduals(factor.name, "poses", labels, units, shown, whitened * factor.sigma, whitened)
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:

@@ -9,10 +9,10 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.vertical import level_sensor
-from icalib.motion.clocks import instants
 from icalib.motion.factor import of_type
 from icalib.result import ParameterGroup, RowResiduals, SensorFit
 from icalib.result.excess import excess, times
+from icalib.result.row_records import row_record
 from icalib.result.timeline import Timeline
 from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
@@ -44,17 +44,11 @@ NEARLY = 0.1  # of a number in another unit
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
-    """Of each set of wheels; slip is measured to be 0. A row is a stretch between keyframes."""
+    """Of each set of wheels; slip is measured to be 0. A row is an interval between keyframes."""
     for key, factor in found.problem.factors.items():
-        if not isinstance(factor, IncrementFactor | RelativePoseFactor):
-            continue
-        rows = found.outcome.residuals[key]
-        seconds = instants(inputs.stream(factor.name), found.outcome.state.values)[factor.intervals.first]
-        residual = np.linalg.solve(factor.whitening, rows.residual[:, :, None])[:, :, 0]
-        labels = [(label, factor.units[kind]) for kind in factor.kinds for label in LABELS[kind]]
-        names, units = zip(*labels, strict=True)
-        shown = timeline.shown(seconds, timeline.recording_of(seconds))
-        yield RowResiduals(factor.name, "increments", names, units, shown, residual, rows.residual.copy())
+        if isinstance(factor, IncrementFactor | RelativePoseFactor):
+            rows = factor.rows(found.outcome.residuals[key], found.outcome.state)
+            yield row_record("increments", rows, timeline, LABELS)
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:

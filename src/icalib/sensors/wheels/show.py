@@ -12,9 +12,9 @@ from icalib.result import Calibration
 
 LEGEND = "pairs of discs are wheels"
 _WORDS = (
-    "The angle that each wheel turned from one keyframe to the next, or the way and the turn that were reported, "
-    "and how far the axle moved sideways and off the ground, which should be nothing; of steering angles, how far "
-    "the front axle moved across its wheels."
+    "The angle that each wheel turned from one keyframe to the next, or the distance and the rotation that were "
+    "reported. Slip is how far the axle moved sideways and off the ground, which should be zero. With steering "
+    "angles it is how far the front axle moved across its wheels."
 )
 
 

@@ -1,0 +1,39 @@
+"""Residuals of a factor as a record that the result keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from icalib.motion.factor import ResidualRows
+from icalib.result.timeline import Timeline
+from icalib.sensors.parameter_spec import AXES
+from icalib.sensors.records import RowResiduals
+
+
+def row_record(
+    kind: str, rows: Sequence[ResidualRows], timeline: Timeline, labels: Mapping[str, tuple[str, ...]] | None = None
+) -> RowResiduals:
+    """One record of all `rows`, which are the kinds of residuals of one factor, at the same times. kind: of the record.
+    labels: of the columns by kind of residual; by default the kind itself, with an axis where there are three."""
+    names = {r.kind: _labels(r) for r in rows} | dict(labels or {})
+    columns = [(label, r.unit) for r in rows for label in names[r.kind]]
+    seconds = timeline.shown(rows[0].seconds, timeline.recording_of(rows[0].seconds))
+    residual, whitened = (np.hstack([getattr(r, name) for r in rows]) for name in ("residual", "whitened"))
+    return RowResiduals(
+        rows[0].sensor,
+        kind,
+        tuple(label for label, _ in columns),
+        tuple(unit for _, unit in columns),
+        seconds,
+        residual,
+        whitened,
+    )
+
+
+def _labels(r: ResidualRows) -> tuple[str, ...]:
+    n = r.residual.shape[1]
+    if n == 1:
+        return (r.kind,)
+    return tuple(f"{r.kind} {mark}" for mark in (AXES if n == len(AXES) else range(1, n + 1)))
