@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from icalib.result import Calibration, joint_covariance, relative_pose
-from icalib.rig import DRIVES, LENS, Camera, Lidar, Parameter, ParameterSpec, PoseSensor, Wheels
+from icalib.rig import LENS, Camera, Parameter, ParameterSpec, Sensor
 from icalib.rig.file import load_rig
-from icalib.rig.kinds import SPECS
-from icalib.sensors.sensor import TIME_OFFSET
+from icalib.rig.kinds import SENSOR_TYPES
+from icalib.sensors.sensor import ROTATION, TIME_OFFSET, TRANSLATION
 from icalib.tools.comparison.sides import LensSide, Quantity, Side, unknown
 
 DENSITIES = {
@@ -20,8 +20,12 @@ DENSITIES = {
     "accel": "noise density of the accelerometer",
     "accel_walk": "bias walk of the accelerometer",
 }
-# What has a difference of its own: all but poses, which are seen from other sensors, and lenses, which are projected.
-_COMPARED = (TIME_OFFSET, *(spec for drive in DRIVES.values() for spec in drive))
+
+
+def compared_specs(kind: type[Sensor]) -> dict[str, ParameterSpec]:
+    """The parameters of a kind of sensor that have a difference of their own, by name: all but extrinsics, which are
+    seen from other sensors, and those of a lens, which are projected."""
+    return {s.name: s for s in kind.stated() if s not in (ROTATION, TRANSLATION) and not s.by_images}
 
 
 def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Quantity]:
@@ -38,9 +42,11 @@ def side_of_result(c: Calibration, path: str) -> Side:
     quantities = {}
     for g in c.groups:
         # A clock that restarts has no time offset that another result could have, too.
-        several = g.name == "time_offset" and len(g.value) > 1
-        if g.sensor in c.mounted and SPECS.get(g.name) in _COMPARED and not several:
-            quantities[g.sensor, g.name] = quantity(SPECS[g.name], g.value, joint_covariance(c, [g]), g in bad)
+        several = g.name == TIME_OFFSET.name and len(g.value) > 1
+        if g.sensor in c.mounted and not several:
+            spec = compared_specs(SENSOR_TYPES[c.rig["sensors"][g.sensor]["type"]]).get(g.name)
+            if spec is not None:
+                quantities[g.sensor, g.name] = quantity(spec, g.value, joint_covariance(c, [g]), g in bad)
     if c.imu is not None:
         quantities |= noise_quantities(c.imu, c.rig["sensors"][c.imu]["noise"])
         own = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics") and g.columns is not None]
@@ -76,15 +82,14 @@ def _lens_of_result(c: Calibration, name: str) -> LensSide:
 def side_of_rig(path: Path) -> Side:
     """Values that a rig file gives, whether guessed, fixed or prior; priors with their sigma. Raises RigError."""
     rig = load_rig(path)
-    sensors = {s.name: s for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)}
-    poses = {name: _pose(s) for name, s in sensors.items()} | {rig.body: np.eye(4)}
+    poses = {s.name: _pose(s) for s in rig.mounted} | {rig.body: np.eye(4)}
     quantities = {}
-    for name, s in sensors.items():
-        for spec in _COMPARED:
-            p = getattr(s, spec.name, None)
-            if p is not None and p.value is not None:
+    for s in rig.mounted:
+        for spec in compared_specs(type(s)).values():
+            p: Parameter = getattr(s, spec.name)
+            if p.value is not None:
                 value = np.atleast_1d(p.value)
-                quantities[name, spec.name] = quantity(spec, value, _covariance(p, value.size))
+                quantities[s.name, spec.name] = quantity(spec, value, _covariance(p, value.size))
     if rig.imu is not None:
         noise = {key: getattr(rig.imu.noise, key) for key in DENSITIES}
         quantities |= noise_quantities(rig.imu.name, noise)
@@ -92,8 +97,8 @@ def side_of_rig(path: Path) -> Side:
     def covariance(frame: str, sensor: str) -> np.ndarray:
         out = unknown(6)
         if frame == rig.body:
-            out[:3, :3] = _covariance(sensors[sensor].rotation, 3)
-            out[3:, 3:] = _covariance(sensors[sensor].translation, 3)
+            rotation, translation = _extrinsics(rig.sensors[sensor])
+            out[:3, :3], out[3:, 3:] = _covariance(rotation, 3), _covariance(translation, 3)
         return out
 
     return Side(
@@ -115,10 +120,16 @@ def quantity(spec: ParameterSpec, value: np.ndarray, covariance: np.ndarray, is_
     return Quantity(what, labels, value, covariance, is_open, spec.unit, spec.is_positive)
 
 
-def _pose(sensor: Camera | Lidar | Wheels | PoseSensor) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = np.nan if sensor.rotation.value is None else sensor.rotation.value
-    T[:3, 3] = np.nan if sensor.translation.value is None else sensor.translation.value
+def _extrinsics(sensor: Sensor) -> tuple[Parameter, Parameter]:
+    """Rotation and translation."""
+    return getattr(sensor, ROTATION.name), getattr(sensor, TRANSLATION.name)
+
+
+def _pose(sensor: Sensor) -> np.ndarray:
+    """(4, 4) T_body_sensor; NaN where the rig file gives no value."""
+    (rotation, translation), T = _extrinsics(sensor), np.eye(4)
+    T[:3, :3] = np.nan if rotation.value is None else rotation.value
+    T[:3, 3] = np.nan if translation.value is None else translation.value
     return T
 
 
