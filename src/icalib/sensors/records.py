@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
 
 # By the name of an array: kinds of numpy's dtypes that it may have, then its axes. An axis is a length or a name; equal
 # names are equal lengths. "labels" is the number of labels, "edges" is "images" + 1.
 Shapes = dict[str, tuple[str | int, ...]]
+
+
+class Successive(NamedTuple):
+    """whitened (n, d): one row a measurement. follows (n - 1,) bool: row k + 1 is the next in time after row k, of the
+    same measured thing."""
+
+    whitened: np.ndarray
+    follows: np.ndarray
 
 
 class Residuals(Protocol):
@@ -36,6 +43,10 @@ class Residuals(Protocol):
         """(n,) residuals in use over their standard deviation, by name: standard normal numbers if all is well."""
         ...
 
+    def successive(self) -> dict[str, Successive]:
+        """Residuals in use over their standard deviation and which of them follow each other in time, by name."""
+        ...
+
 
 @dataclass(frozen=True)
 class RowResiduals:
@@ -58,3 +69,14 @@ class RowResiduals:
     def normalised(self) -> dict[str, np.ndarray]:
         """By column."""
         return {label: self.whitened[:, k] for k, label in enumerate(self.labels)}
+
+    def successive(self) -> dict[str, Successive]:
+        """By column; each row follows the one before."""
+        return successive_rows(self.labels, self.whitened)
+
+
+def successive_rows(names: tuple[str, ...], whitened: np.ndarray) -> dict[str, Successive]:
+    """Each row of whitened (n, d) follows the one before; its columns in as many blocks as there are names."""
+    blocks = np.split(whitened, len(names), axis=1)
+    every = np.ones(max(len(whitened) - 1, 0), bool)
+    return {name: Successive(block, every) for name, block in zip(names, blocks, strict=True)}

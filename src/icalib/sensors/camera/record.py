@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from icalib.sensors.records import Shapes
+from icalib.sensors.records import Shapes, Successive
 
 _IMAGES: Shapes = {
     "seconds": ("f", "images"),
@@ -50,6 +50,10 @@ class CornerResiduals:
         """Of both coordinates together."""
         return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
 
+    def successive(self) -> dict[str, Successive]:
+        """Of the same point, from one image to the next."""
+        return _of_points(self)
+
 
 @dataclass(frozen=True)
 class TrackResiduals:
@@ -87,6 +91,19 @@ class TrackResiduals:
     def normalised(self) -> dict[str, np.ndarray]:
         """Of both coordinates together."""
         return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
+
+    def successive(self) -> dict[str, Successive]:
+        """Of the same point, from one image to the next."""
+        return _of_points(self)
+
+
+def _of_points(r: CornerResiduals | TrackResiduals) -> dict[str, Successive]:
+    """Of a corner or tracked point, from one image to the next."""
+    image, point = image_of(r), r.point
+    order = np.lexsort((image, point))
+    order = order[r.used[order]]
+    follows = (np.diff(point[order]) == 0) & (np.diff(image[order]) == 1)
+    return {r.kind: Successive(r.whitened[order].astype(np.float64), follows)}
 
 
 RECORDS = (CornerResiduals, TrackResiduals)

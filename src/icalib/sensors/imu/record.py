@@ -7,7 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from icalib.sensors.records import Shapes
+from icalib.sensors.records import Shapes, Successive, successive_rows
+
+# Of columns of residuals, three each.
+BLOCKS = ("rotation", "velocity", "position", "gyroscope walk", "accelerometer walk")
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,10 @@ class ImuResiduals:
     def normalised(self) -> dict[str, np.ndarray]:
         """Nothing: states between two keyframes follow the IMU, so that residuals are smaller than their noise."""
         return {}
+
+    def successive(self) -> dict[str, Successive]:
+        """By what is integrated, or walks; each interval follows the one before."""
+        return successive_rows(BLOCKS, self.whitened)
 
 
 RECORDS = (ImuResiduals,)

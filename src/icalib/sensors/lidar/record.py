@@ -7,7 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from icalib.sensors.records import Shapes
+from icalib.sensors.records import Shapes, Successive
+
+SAME_WALL_S = 0.3  # within which two points of a plane are neighbours in time; a LiDAR turns several times a second
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,12 @@ class LidarResiduals:
     def normalised(self) -> dict[str, np.ndarray]:
         """Of all points."""
         return {"points": self.residual / self.sigma}
+
+    def successive(self) -> dict[str, Successive]:
+        """A point's next one is on the same plane, and soon after."""
+        order = np.lexsort((self.seconds, self.plane))
+        follows = (np.diff(self.plane[order]) == 0) & (np.diff(self.seconds[order]) < SAME_WALL_S)
+        return {self.kind: Successive((self.residual[order] / self.sigma[order])[:, None], follows)}
 
 
 RECORDS = (LidarResiduals,)
