@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import ImuStream
-from icalib.data.stamps.even_stamps import even_stamps
 from icalib.sensors.imu.read.checks import checked_imu
+from icalib.sensors.imu.read.even_stamps import even_stamps
 from icalib.tools.simulation import handheld, simulate
 
 

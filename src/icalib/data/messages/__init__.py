@@ -1,1 +1,1 @@
-"""Messages of bags: point clouds, poses, wheels."""
+"""Messages that several kinds of sensors are read from."""

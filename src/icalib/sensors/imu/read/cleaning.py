@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.data.measurements import ImuStream
-from icalib.data.stamps.copies import copies, held
-from icalib.data.stamps.even_stamps import EvenStamps, even_stamps
-from icalib.data.stamps.spikes import impossible, spikes, stuck
+from icalib.sensors.imu.read.copies import copies, held
+from icalib.sensors.imu.read.even_stamps import EvenStamps, even_stamps
+from icalib.sensors.imu.read.spikes import impossible, spikes, stuck
 
 _BEYOND = 1e12  # in any unit of any sensor; squares of what is below do not overflow
 _SENSORS = ("gyroscope", "accelerometer")
