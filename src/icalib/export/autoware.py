@@ -8,11 +8,11 @@ import numpy as np
 
 from icalib.export.common import (
     Export,
-    drives,
     guesses,
     imu_intrinsics,
     inverse,
     no_place_for,
+    own_parameters,
     rpy,
     time_offsets,
     yaml_text,
@@ -28,7 +28,7 @@ def autoware(c: Calibration, frames: Mapping[str, str]) -> Export:
     """Poses of all sensors but wheels on the sensor kit, whose frame is the body's. frames: sensor -> frame."""
     names = [name for name in (c.body, *c.mounted) if name not in c.wheels]
     names = list(dict.fromkeys(names))
-    away = [*drives(c), *imu_intrinsics(c), *time_offsets(c, c.mounted), *c.wheels[1:]]
+    away = [*own_parameters(c), *imu_intrinsics(c), *time_offsets(c, c.mounted), *c.wheels[1:]]
     sentences = no_place_for("Autoware", [*away, *(f"the lens of {camera}" for camera in c.cameras)])
     sentences += guesses(c, c.mounted)
     comments = [

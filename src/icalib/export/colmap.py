@@ -16,6 +16,7 @@ from icalib.export.common import (
     lens_of,
     need,
     no_place_for,
+    others,
     quaternion,
     time_offsets,
 )
@@ -36,7 +37,7 @@ def colmap(c: Calibration) -> Export:
     need(c.cameras, "camera", "COLMAP")
     lenses = [lens_of(c, name, "COLMAP", tuple(_MODELS)) for name in c.cameras]
     imu = [] if c.imu is None else [c.imu]
-    away = [*imu, *c.lidars, *c.wheels, *c.pose_sensors, *time_offsets(c, c.cameras)]
+    away = [*imu, *others(c, *c.cameras), *time_offsets(c, c.cameras)]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence) + no_place_for("COLMAP", away)
     sentences += guesses(c, c.cameras)
     first = inverse(c.T_imu_sensor(c.cameras[0]))

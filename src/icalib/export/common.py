@@ -14,6 +14,7 @@ from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration
+from icalib.rig.kinds import SPECS
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 
@@ -91,6 +92,11 @@ def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
+def others(c: Calibration, *taken: str) -> list[str]:
+    """Names of all mounted sensors but those that a format has taken."""
+    return [name for name in c.mounted if name not in taken]
+
+
 def no_place_for(program: str, things: Sequence[str]) -> tuple[str, ...]:
     """One sentence for what a format cannot hold; none where there is nothing."""
     if not things:
@@ -125,11 +131,12 @@ def _time_offset_words(name: str, value: np.ndarray) -> str:
     return f"the time offset of {name} ({1e3 * value[0]:+.3f} ms)"
 
 
-def drives(c: Calibration) -> list[str]:
-    """What wheels have beside pose and clock, as "radii and baseline of wheel0"."""
+def own_parameters(c: Calibration) -> list[str]:
+    """What mounted sensors other than cameras have beside pose and clock, as "radii and baseline of wheel0"."""
     found = []
-    for name in c.wheels:
+    for name in others(c, *c.cameras):
         own = [g.name for g in c.groups if g.sensor == name and g.name not in MOUNTED_NAMES]
+        own = [group for group in own if SPECS[group].manifold != "nuisance"]
         words = [group.replace("_", " ") for group in own]
         found += [f"{', '.join(words[:-1])}{' and ' if words[1:] else ''}{words[-1]} of {name}"] if words else []
     return found

@@ -9,7 +9,7 @@ from icalib.base.suggestion import suggestion
 from icalib.errors import CalibrationError
 from icalib.export.autoware import autoware
 from icalib.export.colmap import colmap
-from icalib.export.common import Export, guesses, no_place_for
+from icalib.export.common import Export, guesses, no_place_for, others
 from icalib.export.kalibr import camchain, camchain_name, imu_yaml
 from icalib.export.lidar_odometry import fast_lio, fast_livo2, lio_sam
 from icalib.export.mins import mins
@@ -51,7 +51,7 @@ def export(
 
 def kalibr(c: Calibration) -> Export:
     """Kalibr's camchain, and its imu.yaml where there is an IMU."""
-    sentences = no_place_for("Kalibr", [*c.lidars, *c.wheels, *c.pose_sensors]) + guesses(c, c.cameras)
+    sentences = no_place_for("Kalibr", others(c, *c.cameras)) + guesses(c, c.cameras)
     said = "".join(f"# {sentence}\n" for sentence in sentences)
     files = {camchain_name(c): said + camchain(c)} if c.cameras else {}
     if c.imu is not None:

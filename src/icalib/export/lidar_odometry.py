@@ -14,6 +14,7 @@ from icalib.export.common import (
     need,
     need_imu,
     no_place_for,
+    others,
     time_offset,
     time_offsets,
     topic,
@@ -33,7 +34,7 @@ def fast_lio(c: Calibration) -> Export:
     """A file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "FAST-LIO")
     need(c.lidars, "LiDAR", "FAST-LIO")
-    away = [*c.cameras, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
+    away = [*others(c, *c.lidars), *imu_intrinsics(c)]
     sentences = no_place_for("FAST-LIO", away) + guesses(c, c.lidars)
     comments = [
         _MERGE.format("FAST-LIO"),
@@ -58,7 +59,7 @@ def fast_livo2(c: Calibration) -> Export:
     camera = c.cameras[0]
     lens = lens_of(c, camera, "FAST-LIVO2", tuple(_LENSES))
     sentences = (lens.sentence,) if lens.sentence else ()
-    away = [*c.cameras[1:], *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
+    away = [*others(c, camera, *c.lidars), *imu_intrinsics(c)]
     sentences += no_place_for("FAST-LIVO2", away) + guesses(c, [camera, *c.lidars])
     comments = [
         _MERGE.format("FAST-LIVO2"),
@@ -90,7 +91,7 @@ def lio_sam(c: Calibration) -> Export:
     """A file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "LIO-SAM")
     need(c.lidars, "LiDAR", "LIO-SAM")
-    away = [*c.cameras, *c.wheels, *c.pose_sensors, *imu_intrinsics(c), *time_offsets(c, c.lidars)]
+    away = [*others(c, *c.lidars), *imu_intrinsics(c), *time_offsets(c, c.lidars)]
     sentences = no_place_for("LIO-SAM", away) + guesses(c, c.lidars)
     comments = [
         _MERGE.format("LIO-SAM"),

@@ -11,6 +11,7 @@ from icalib.export.common import (
     lens_of,
     need_imu,
     no_place_for,
+    others,
     time_offset,
     topic,
     yaml_text,
@@ -29,9 +30,8 @@ def mins(c: Calibration) -> Export:
     lenses = {name: lens_of(c, name, "MINS", tuple(MODELS)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
     pairs = [name for name in c.wheels if (name, "radii") in ((g.sensor, g.name) for g in c.groups)]
-    away = [name for name in c.wheels if name not in pairs[:1]]
-    sentences += no_place_for("MINS", [*imu_intrinsics(c), *away, *c.pose_sensors])
-    sentences += guesses(c, [*c.cameras, *c.lidars, *pairs[:1]])
+    taken = [*c.cameras, *c.lidars, *pairs[:1]]
+    sentences += no_place_for("MINS", [*imu_intrinsics(c), *others(c, *taken)]) + guesses(c, taken)
     noise = c.rig["sensors"][imu]["noise"]
     fields = {"accel_noise": "accel", "accel_bias": "accel_walk", "gyro_noise": "gyro", "gyro_bias": "gyro_walk"}
     imu_data = {theirs: float(noise[ours]) for theirs, ours in fields.items()} | {"topic": topic(c, imu, f"/{imu}")}

@@ -15,6 +15,7 @@ from icalib.export.common import (
     need,
     need_imu,
     no_place_for,
+    others,
     time_offset,
     topic,
     yaml_text,
@@ -36,7 +37,7 @@ def openvins(c: Calibration) -> Export:
         raise CalibrationError(f"the rate of {imu} is not known, and OpenVINS wants one; calibrate again.")
     lenses = [lens_of(c, name, "OpenVINS", tuple(MODELS)) for name in c.cameras]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence)
-    sentences += _offsets(c) + no_place_for("OpenVINS", [*c.lidars, *c.wheels, *c.pose_sensors]) + guesses(c, c.cameras)
+    sentences += _offsets(c) + no_place_for("OpenVINS", others(c, *c.cameras)) + guesses(c, c.cameras)
     overlaps = cam_overlaps(c)
     chain: dict[str, Any] = {}
     for i, (name, lens) in enumerate(zip(c.cameras, lenses, strict=True)):

@@ -15,6 +15,7 @@ from icalib.export.common import (
     need,
     no_place_for,
     opencv_matrix,
+    others,
     time_offsets,
 )
 from icalib.geometry.cameras import camera_model
@@ -40,7 +41,7 @@ def orb_slam3(c: Calibration) -> Export:
     lenses = [lens_of(c, name, "ORB-SLAM3", tuple(_TYPES)) for name in c.cameras[:_MOST]]
     names = c.cameras[: len(_alike(lenses))]
     lenses = lenses[: len(names)]
-    away = [*c.cameras[len(names) :], *c.lidars, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
+    away = [*others(c, *names), *imu_intrinsics(c)]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence)
     sentences += no_place_for("ORB-SLAM3", [*away, *time_offsets(c, names)]) + guesses(c, names)
     lines = [

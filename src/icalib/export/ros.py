@@ -9,12 +9,13 @@ import numpy as np
 from icalib.export.common import (
     CameraParameters,
     Export,
-    drives,
     guesses,
     imu_intrinsics,
     lens_of,
     need,
     no_place_for,
+    others,
+    own_parameters,
     quaternion,
     time_offsets,
     yaml_text,
@@ -60,8 +61,7 @@ def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
     """static_transforms.launch.py. frames: sensor -> frame, where the two differ."""
     others = [name for name in c.mounted if name != c.body]
     offsets, lenses = time_offsets(c, others), [f"the lens of {name}" for name in c.cameras]
-    wheels = drives(c)
-    sentences = no_place_for("tf", [*offsets, *lenses, *wheels, *imu_intrinsics(c)]) + guesses(c, c.mounted)
+    sentences = no_place_for("tf", [*offsets, *lenses, *own_parameters(c), *imu_intrinsics(c)]) + guesses(c, c.mounted)
     parent = frames.get(c.body, c.body)
     comments = [
         "Static transforms for ROS 2, by icalib.",
@@ -83,7 +83,7 @@ def camera_info(c: Calibration) -> Export:
     need(c.cameras, "camera", "CameraInfo")
     lenses = {name: lens_of(c, name, "CameraInfo", tuple(_DISTORTION)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
-    away = ["poses", *time_offsets(c, c.mounted), *c.lidars, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
+    away = ["poses", *time_offsets(c, c.mounted), *others(c, *c.cameras), *imu_intrinsics(c)]
     sentences += no_place_for("CameraInfo", away)
     return Export({f"{name}.yaml": _info(name, lens, sentences) for name, lens in lenses.items()}, sentences)
 

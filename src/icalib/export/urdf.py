@@ -10,7 +10,16 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from icalib.export.common import Export, drives, guesses, imu_intrinsics, inverse, no_place_for, rpy, time_offsets
+from icalib.export.common import (
+    Export,
+    guesses,
+    imu_intrinsics,
+    inverse,
+    no_place_for,
+    own_parameters,
+    rpy,
+    time_offsets,
+)
 from icalib.export.urdf_tree import Joint, UrdfTree, read_urdf
 from icalib.result import Calibration
 
@@ -130,7 +139,7 @@ def _attribute(tag: bytes, name: str, value: str) -> bytes:
 
 def _left_out(c: Calibration) -> tuple[str, ...]:
     away = time_offsets(c, c.mounted) + [f"the lens of {name}" for name in c.cameras]
-    away += drives(c) + imu_intrinsics(c)
+    away += own_parameters(c) + imu_intrinsics(c)
     return no_place_for("URDF", away) + guesses(c, c.mounted)
 
 

@@ -15,6 +15,7 @@ from icalib.export.common import (
     need_imu,
     no_place_for,
     opencv_matrix,
+    others,
     time_offset,
     topic,
 )
@@ -33,7 +34,7 @@ def vins_fusion(c: Calibration) -> Export:
     names = c.cameras[:_MOST]
     lenses = [lens_of(c, name, "VINS-Fusion", _MODELS) for name in names]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence) + _offset(c, names)
-    left = [*c.cameras[_MOST:], *c.lidars, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
+    left = [*others(c, *names), *imu_intrinsics(c)]
     sentences += no_place_for("VINS-Fusion", left) + guesses(c, names)
     files = {"vins.yaml": _main(c, imu, names, lenses, sentences)}
     for i, (name, lens) in enumerate(zip(names, lenses, strict=True)):
