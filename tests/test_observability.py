@@ -39,25 +39,25 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
         held = np.array([first, 0.1, last])[:, None]
         found = shared(50.0)
         found.held, found.spread, found.covariance = held / np.linalg.norm(held), np.full(3, 50.0), np.eye(3)
-        (sentence,) = observe(found, names, ("wheel0",)).undetermined
+        (sentence,) = observe(found, names, True).undetermined
         assert sentence.startswith("left_cam translation z with wheel0 baseline: not determined by this motion; ")
     found.held = np.array([0.0, 1.0, 0.0])[:, None]
     assert observe(found, names).undetermined[0].startswith("left_cam time offset: ")
 
 
 @pytest.mark.parametrize(
-    ("parameter", "wheels", "tracking", "advice"),
+    ("parameter", "on_wheels", "tracking", "advice"),
     [
-        ("cam0.distortion.k1", (), (), "by these images; show the target in the corners of the image"),
-        ("cam0.distortion.k1", (), ("cam0",), "points of the scene pass through the corners of the image"),
-        ("cam0.translation.x", (), ("cam0",), "turn the rig briskly about every axis"),
-        ("wheel0.translation.z", ("wheel0",), ("cam0",), "turn, and drive over ramps"),
+        ("cam0.distortion.k1", False, (), "by these images; show the target in the corners of the image"),
+        ("cam0.distortion.k1", False, ("cam0",), "points of the scene pass through the corners of the image"),
+        ("cam0.translation.x", False, ("cam0",), "turn the rig briskly about every axis"),
+        ("wheel0.translation.z", True, ("cam0",), "turn, and drive over ramps"),
     ],
 )
-def test_the_missing_motion_is_that_of_the_sensor(parameter, wheels, tracking, advice):
+def test_the_missing_motion_is_that_of_the_sensor(parameter, on_wheels, tracking, advice):
     found = shared(50.0)
     found.held, found.spread, found.covariance = np.ones((1, 1)), np.full(1, 50.0), np.eye(1)
-    (sentence,) = observe(found, (parameter,), wheels, tracking).undetermined
+    (sentence,) = observe(found, (parameter,), on_wheels, tracking).undetermined
     assert advice in sentence
 
 

@@ -36,14 +36,14 @@ class Observability:
 def observe(
     found: Determined,
     names: tuple[str, ...],
-    wheels: Collection[str] = (),
+    on_wheels: bool = False,
     tracking: Collection[str] = (),
     axes: str = "",
 ) -> Observability:
     """Verdicts by what the data alone say; undetermined throughout where the solver did not converge.
 
-    `names` (B,) as in "cam0.translation.x"; `wheels`: which sensors are wheels, on which the whole rig drives;
-    `tracking`: which are cameras without a target; `axes`: about which the rig hardly turned, in words, or empty.
+    names: (B,) as in "cam0.translation.x". on_wheels: the rig drives on one of its sensors. tracking: names of cameras
+    without a target. axes: about which the rig hardly turned, in words, or empty.
     """
     directions = sparse_basis(found.held)
     share = (directions**2).sum(axis=1)
@@ -56,7 +56,7 @@ def observe(
         words, first = _words_of(direction, names)
         sensor, kind, _ = first.rsplit(".", 2)
         spec = SPECS[kind]
-        motion = _missing_motion(spec, bool(wheels), sensor in tracking).format(axes=axes or EVERY_AXIS)
+        motion = _missing_motion(spec, on_wheels, sensor in tracking).format(axes=axes or EVERY_AXIS)
         by = "these images" if spec.by_images else "this motion"
         sentences.append(f"{words}: not determined by {by}; {motion}.")
     return Observability(found.covariance, tuple(verdicts), tuple(sentences), found.spread)

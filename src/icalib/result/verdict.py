@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
 from icalib.rig import LENS, Settings
-from icalib.rig.kinds import SPECS
+from icalib.rig.kinds import SENSOR_TYPES, SPECS
 from icalib.sensors.parameter_spec import shown_unit
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def _weak(c: Calibration) -> Iterator[str]:
 
 def _more(c: Calibration) -> str:
     """What makes standard deviations smaller, for this rig."""
-    if c.wheels:
+    if any(SENSOR_TYPES[s["type"]].drives for s in c.rig["sensors"].values()):
         return "drive longer, with turns both ways, and brake and speed up"
     if c.imu is None and c.cameras:
         images = sum(len(r.seconds) for r in c.image_residuals)

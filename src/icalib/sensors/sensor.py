@@ -82,7 +82,8 @@ class Sensor:
 
     A kind of sensor declares: sensor_type, its `type` in the rig file and its folder in `icalib.sensors`; noun, its
     name in sentences; parameters, all that sensors of this kind can have; gives_motion, whether such a sensor and an
-    IMU determine the motion of the rig; needs_imu; is_inertial; shows_planes.
+    IMU determine the motion of the rig; needs_imu; is_inertial; shows_planes; drives, whether the rig drives on it, so
+    that it hardly tilts.
     """
 
     sensor_type: ClassVar[str]
@@ -92,6 +93,7 @@ class Sensor:
     needs_imu: ClassVar[bool] = False
     is_inertial: ClassVar[bool] = False
     shows_planes: ClassVar[bool] = False
+    drives: ClassVar[bool] = False
     name: str
 
     def __post_init__(self) -> None:

@@ -17,7 +17,8 @@ from icalib.optim.state import Key
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.timeline import Timeline
 from icalib.result.verdict import AUXILIARY
-from icalib.rig import DRIVES, LENS
+from icalib.rig import LENS
+from icalib.sensors import answer
 from icalib.sensors.camera.assess import plane_warnings
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.validation.cameras import mixed_up, other_lens
@@ -28,7 +29,6 @@ from icalib.validation.size import felt_size, is_certain, scale_causes, scale_no
 from icalib.validation.stated import absurd_values, stated_words
 
 SEEN = ("corners", "features")
-WHEEL_LENGTHS = tuple(drive[0].name for drive in DRIVES.values())
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,10 @@ def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple
     causes += [Cause(sentence, gain, True) for _, sentence, gain in lenses]
     causes += [Cause(sentence, gain) for sentence, gain in lens_warnings(inputs, judged.found)]
     said = {(camera, name) for camera, *_ in lenses for name in LENS}
-    # Wheel sizes that contradict another length are named with it.
-    against = tuple(c for c in against if c.key not in said and not (scales and c.key[1] in WHEEL_LENGTHS))
+    # Sizes, such as those of wheels, that contradict another length are named with it.
+    sensors = inputs.rig.sensors.values() if scales else ()
+    said |= {(s.name, name) for s in sensors for name in answer(s.sensor_type, "assess", "sizes", s) or ()}
+    against = tuple(c for c in against if c.key not in said)
     causes += _contradicted(judged, against, scale, certain or given, None if given else stated)
     return causes, (*notes, *scale_notes(inputs, size))
 

@@ -66,7 +66,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
     state = outcome.state
     axes = hardly_turned(state.seconds, state.rotation, inputs.rig.body)
-    seen = observe(determined, names, [w.name for w in inputs.rig.wheels], tracking, axes)
+    seen = observe(determined, names, any(s.drives for s in inputs.rig.mounted), tracking, axes)
     parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
     noise = _NoiseShare.of(determined, seen.covariance, parts)
     groups = _groups(inputs, determined, seen, noise)

@@ -151,6 +151,11 @@ def length(wheels: Wheels, rig: Rig) -> str | None:
     return f"the stated sizes of {wheels.name}" if known else None
 
 
+def sizes(wheels: Wheels) -> tuple[str, ...]:
+    """The parameters that say how long a metre is."""
+    return (wheels.drive_specs[0].name,)
+
+
 def absurd(wheels: Wheels, found: dict[tuple[str, str], ParameterGroup]) -> Iterator[str]:
     """Wheels that are tiny or huge beside what is between them: readings in another unit."""
     if wheels.kind != "pair":

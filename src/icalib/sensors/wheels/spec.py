@@ -131,6 +131,7 @@ class Wheels(Sensor):
 
     sensor_type: ClassVar[str] = "wheels"
     noun: ClassVar[str] = "wheels"
+    drives: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (
         *MOUNTED,
         GROUND_HEIGHT,
