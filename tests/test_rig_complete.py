@@ -42,8 +42,8 @@ def test_what_cannot_be_calibrated_is_refused(rig: Rig, sentence: str):
 
 def test_a_camera_that_sees_a_target_stands_in_for_absolute_poses():
     rig = Rig(by_name(Camera("cam0", "", "eucm", (9, 9)), ODOMETRY), Checkerboard(6, 7, 0.1))
-    assert lack_of(rig) is None and rig.body == "cam0"
-    assert rig_from_dict(rig_to_dict(rig), "rig.yaml").body == "cam0"
+    assert lack_of(rig) is None and rig.reference == "cam0"
+    assert rig_from_dict(rig_to_dict(rig), "rig.yaml").reference == "cam0"
 
 
 @pytest.mark.parametrize(
@@ -52,6 +52,10 @@ def test_a_camera_that_sees_a_target_stands_in_for_absolute_poses():
         (Rig(by_name(IMU, ImuSensor("imu1", "", IMU.noise), LIDAR)), "^imu1 is a second IMU beside imu0"),
         (Rig(by_name(IMU, Camera("cam0", "", "eucm", (9, 9)))), "^target is missing; .* of cam0"),
         (Rig(by_name(IMU, MOCAP, Wheels("w", "", ground=Ground("floor", 0.1)))), "^w.ground.plane: a LiDAR determines"),
+        (
+            Rig(by_name(IMU, LIDAR), body="lidar"),
+            "^there is no sensor lidar, did you mean 'lidar0'; available",
+        ),
         (Rig(by_name(IMU, LIDAR), settings=Settings(points_on_planes_m=0.1)), "^points_on_planes_m needs a LiDAR"),
     ],
 )

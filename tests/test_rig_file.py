@@ -442,7 +442,7 @@ def test_without_an_imu_the_first_camera_is_the_body(tmp_path):
     cameras = "".join(f"  {n}: {{type: camera, model: eucm, resolution: [752, 480]}}\n" for n in ("left", "right"))
     path.write_text("sensors:\n" + cameras + f"target: {TARGET}\n")
     rig = load_rig(path)
-    assert rig.imu is None and rig.body == "left"
+    assert rig.imu is None and rig.reference == "left"
     again = tmp_path / "again.yaml"
     again.write_text(yaml.safe_dump(rig_to_dict(rig)))
     assert dataclasses.replace(load_rig(again), path=path) == rig
@@ -544,3 +544,12 @@ def test_a_rig_for_arrays_needs_no_paths(tmp_path: Path):
     loaded = load_rig(tmp_path / "rig.yaml")
     assert loaded.imu is not None and loaded.imu.path == "imu0/data.csv" and loaded.cameras[0].path
     assert rig_to_dict(loaded)["sensors"].keys() == rig_to_dict(rig)["sensors"].keys()
+
+
+def test_the_body_is_a_sensor_of_the_rig(tmp_path: Path):
+    text = "sensors:\n  imu0: {type: imu}\n  lidar0: {type: lidar}\nbody: lidar0\n"
+    rig = load(tmp_path, text)
+    assert (rig.body, rig.reference) == ("lidar0", "imu0") and rig_to_dict(rig)["body"] == "lidar0"
+    with pytest.raises(CalibrationError, match=r"rig\.yaml:4: body: there is no sensor lidar1, did you mean 'lidar0'"):
+        load(tmp_path, text.replace("body: lidar0", "body: lidar1"))
+    assert "body" not in rig_to_dict(load(tmp_path, text.replace("body: lidar0\n", "")))

@@ -93,7 +93,7 @@ def test_lidars_and_wheels_are_read(tmp_path):
     )
     assert (a.point_time, a.topic, a.time_offset.mode) == ("azimuth", "/lidar/points", "fixed")
     assert a.rotation == Parameter() and np.array_equal(not_none(a.translation.value), [0.1, 0, 0.3])
-    assert b == Lidar("lidar1", "top/scans.npz") and (rig.cameras, rig.body) == ((), "imu0")
+    assert b == Lidar("lidar1", "top/scans.npz") and (rig.cameras, rig.reference) == ((), "imu0")
     ticks, rates, poses = rig.wheels
     assert (ticks.measures, ticks.counts_per_turn, ticks.counter_size) == ("ticks", 4096.5, 65536)
     assert (ticks.path, ticks.topic, ticks.joints) == ("wheel0/ticks.csv", "/joints", ("l", "r"))

@@ -131,7 +131,7 @@ def in_body(rig: Rig, simulation: Simulation) -> Rig:
     T0, offset0 = body(rig, simulation)
 
     def moved(sensor: Any) -> Any:
-        if sensor.name == rig.body:
+        if sensor.name == rig.reference:
             return replace(sensor, **dict.fromkeys(EXTRINSICS, Parameter()))
         if sensor.rotation.value is None:
             return sensor
@@ -148,7 +148,7 @@ def body(rig: Rig, simulation: Simulation) -> tuple[np.ndarray, float]:
     if rig.imu is not None:
         return np.eye(4), 0.0
     truth = simulation.truth
-    return truth.T_imu_sensor[rig.body], float(truth.time_offset[rig.body])
+    return truth.T_imu_sensor[rig.reference], float(truth.time_offset[rig.reference])
 
 
 def wrong(result: Calibration, rig: Rig, simulation: Simulation) -> list[str]:
@@ -186,5 +186,5 @@ def test_correct_or_refused(recording, sees: str, imu: bool, others: str, known:
     assert result.converged, result.status
     assert wrong(result, rig, simulation) == []
     determined = {g.sensor for g in result.groups if "determined" in g.verdict}
-    placed = {s.name for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)} - {rig.body}
+    placed = {s.name for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)} - {rig.reference}
     assert placed <= determined

@@ -346,7 +346,7 @@ def test_a_draft_of_cameras_alone_loads(bags, tmp_path):
         text = text.replace(f"\n  {field}", f"\n  {field} {value}", 1)
     (tmp_path / "rig.yaml").write_text(text)
     rig = load_rig(tmp_path / "rig.yaml")
-    assert rig.imu is None and rig.body == rig.cameras[0].name
+    assert rig.imu is None and rig.reference == rig.cameras[0].name
 
 
 SCENE = """\

@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.export.common import (
     Export,
-    guesses,
+    guessed_poses,
     imu_intrinsics,
     inverse,
     no_place_for,
@@ -26,11 +26,10 @@ _OPTICAL_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 def autoware(c: Calibration, frames: Mapping[str, str]) -> Export:
     """Poses of all sensors but wheels on the sensor kit, whose frame is the body's. frames: sensor -> frame."""
-    names = [name for name in (c.body, *c.mounted) if name not in c.wheels]
-    names = list(dict.fromkeys(names))
+    names = [name for name in (c.body, *c.on_body) if name not in c.wheels]
     away = [*own_parameters(c), *imu_intrinsics(c), *time_offsets(c, c.mounted), *c.wheels[1:]]
     sentences = no_place_for("Autoware", [*away, *(f"the lens of {camera}" for camera in c.cameras)])
-    sentences += guesses(c, c.mounted)
+    sentences += guessed_poses(c)
     comments = [
         f"For Autoware, by icalib. {KIT} is the frame of {c.body}.",
         "Each entry places a frame on it: p_parent = T p_child, T = Rz(yaw) Ry(pitch) Rx(roll), m and rad.",
@@ -46,7 +45,7 @@ def autoware(c: Calibration, frames: Mapping[str, str]) -> Export:
 def _vehicle(c: Calibration, wheels: str, sentences: tuple[str, ...]) -> str:
     """The kit on base_link, which lies on the ground below the axle that is not steered."""
     radius = [g.value.mean() for g in c.groups if g.sensor == wheels and g.name in ("radii", "radius")]
-    T = inverse(c.T_imu_sensor(wheels))
+    T = inverse(c.T_body_sensor(wheels))
     T[2, 3] += radius[0] if radius else 0.0
     height = (
         f"one wheel radius below the axle of {wheels}"
@@ -65,7 +64,7 @@ def _frame(c: Calibration, name: str) -> str:
 
 
 def _pose(c: Calibration, name: str) -> np.ndarray:
-    T = np.eye(4) if name == c.body else np.array(c.T_imu_sensor(name))
+    T = np.array(c.T_body_sensor(name))
     if name in c.cameras:
         T[:3, :3] = T[:3, :3] @ _OPTICAL_BODY
     return T

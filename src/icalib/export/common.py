@@ -14,6 +14,7 @@ from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration
+from icalib.result.body_frame import in_body_frame
 from icalib.rig.kinds import SPECS
 from icalib.sensors.sensor import MOUNTED_NAMES
 
@@ -55,11 +56,6 @@ def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> Cam
     return CameraParameters(model, params[:4].tolist(), params[4:].tolist(), (width, height), sentence)
 
 
-def body_frame(c: Calibration) -> str:
-    """How files name the frame that all poses are seen from."""
-    return "imu" if c.imu else c.body
-
-
 def need_imu(c: Calibration, program: str) -> str:
     """Name of the IMU. Raises CalibrationError where there is none."""
     if c.imu is None:
@@ -90,6 +86,11 @@ def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
         if open_:
             found.append(f"{name}: {', '.join(open_)} was not determined by the data; the file has its initial guess.")
     return tuple(found)
+
+
+def guessed_poses(c: Calibration) -> tuple[str, ...]:
+    """`guesses` of all sensors, in files whose poses are relative to the body."""
+    return guesses(in_body_frame(c), tuple(dict.fromkeys((*c.mounted, *c.on_body))))
 
 
 def others(c: Calibration, *taken: str) -> list[str]:

@@ -70,7 +70,7 @@ def _check(
         raise CalibrationError(f"--urdf belongs to --to urdf, not to {to}; leave it out.")
     if joints and existing is None:
         raise CalibrationError("--joint names joints of an existing file; give it as --to urdf --urdf FILE.")
-    known = list(dict.fromkeys([c.body, *c.mounted]))
+    known = list(dict.fromkeys([c.reference, *c.mounted]))
     for sensor in (*frames, *joints):
         if sensor not in known:
             near = suggestion(sensor, known)

@@ -9,20 +9,20 @@ import numpy as np
 import yaml
 
 from icalib.base.text_files import printable
-from icalib.export.common import Export, body_frame, guesses, quaternion
+from icalib.export.common import Export, guessed_poses, quaternion
 from icalib.result import Calibration
-from icalib.result.summary import calibration_yaml, pose_key
+from icalib.result.summary import body_name, calibration_yaml, pose_key, reference_name
 
 
 def plain_json(c: Calibration) -> Export:
     """calibration.json, with everything of calibration.yaml."""
-    body, key = body_frame(c), pose_key(c)
+    body, key = body_name(c), pose_key(c)
     data: dict[str, Any] = {
         "conventions": {
             key: f"p_{body} = {key} p_sensor, 4 x 4, m",
             "quaternion_xyzw": f"the rotation of {key}",
             "translation": f"the sensor's origin in the {body} frame, m",
-            "time_offset": f"t_{body} = t_sensor + time_offset, s",
+            "time_offset": f"t_{reference_name(c)} = t_sensor + time_offset, s",
             "std": f"rotation about the sensor's axes, rad; translation along those of {body}, m",
             "relative": "T_a_b takes coordinates in the frame of b to that of a",
         }
@@ -32,5 +32,5 @@ def plain_json(c: Calibration) -> Export:
         T = np.array(sensor[key])
         sensor |= {"quaternion_xyzw": list(quaternion(T[:3, :3])), "translation": T[:3, 3].tolist()}
     return Export(
-        {"calibration.json": printable(json.dumps(data, indent=1, ensure_ascii=False)) + "\n"}, guesses(c, c.mounted)
+        {"calibration.json": printable(json.dumps(data, indent=1, ensure_ascii=False)) + "\n"}, guessed_poses(c)
     )

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.export.common import (
     CameraParameters,
     Export,
-    guesses,
+    guessed_poses,
     imu_intrinsics,
     lens_of,
     need,
@@ -59,9 +59,9 @@ def generate_launch_description():
 
 def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
     """static_transforms.launch.py. frames: sensor -> frame, where the two differ."""
-    others = [name for name in c.mounted if name != c.body]
-    offsets, lenses = time_offsets(c, others), [f"the lens of {name}" for name in c.cameras]
-    sentences = no_place_for("tf", [*offsets, *lenses, *own_parameters(c), *imu_intrinsics(c)]) + guesses(c, c.mounted)
+    offsets, lenses = time_offsets(c, c.mounted), [f"the lens of {name}" for name in c.cameras]
+    away = [*offsets, *lenses, *own_parameters(c), *imu_intrinsics(c)]
+    sentences = no_place_for("tf", away) + guessed_poses(c)
     parent = frames.get(c.body, c.body)
     comments = [
         "Static transforms for ROS 2, by icalib.",
@@ -70,8 +70,8 @@ def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
         *sentences,
     ]
     rows = []
-    for name in others:
-        T = c.T_imu_sensor(name)
+    for name in c.on_body:
+        T = c.T_body_sensor(name)
         values = [repr(float(v)) for v in (*T[:3, 3], *quaternion(T[:3, :3]))]
         rows.append(f"    {frames.get(name, name)!r}: {(parent, *values)!r},")
     text = _LAUNCH.format(comments="\n".join(f"# {line}" for line in comments), rows="\n".join(rows))

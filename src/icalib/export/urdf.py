@@ -12,7 +12,7 @@ import numpy as np
 
 from icalib.export.common import (
     Export,
-    guesses,
+    guessed_poses,
     imu_intrinsics,
     inverse,
     no_place_for,
@@ -38,10 +38,8 @@ def urdf(c: Calibration, frames: Mapping[str, str]) -> Export:
     ]
     lines = ['<?xml version="1.0"?>', *(f"<!-- {line.replace('--', '- -')} -->" for line in comments)]
     lines += ['<robot name="sensors">', f"  <link name={quoteattr(body)}/>"]
-    for name in c.mounted:
-        if name == c.body:
-            continue
-        link, T = frames.get(name, name), c.T_imu_sensor(name)
+    for name in c.on_body:
+        link, T = frames.get(name, name), c.T_body_sensor(name)
         lines += [
             f"  <link name={quoteattr(link)}/>",
             f'  <joint name={quoteattr(f"{link}_joint")} type="fixed">',
@@ -64,7 +62,7 @@ def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: 
     tree = read_urdf(path)
     body = frames.get(c.body, c.body)
     tree.check_link(body, c.body)
-    sensors = [name for name in c.mounted if name != c.body]
+    sensors = c.on_body
     for name in sensors:
         if name in frames:
             tree.check_link(frames[name], name)
@@ -73,7 +71,7 @@ def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: 
         tree.check_link(sensors[0] if sensors else "a sensor", sensors[0] if sensors else "it")
     # From the root downwards: a joint's new origin holds for all that is below.
     for name in sorted(links, key=lambda sensor: len(tree.chain(links[sensor]))):
-        tree = _set(tree, body, links[name], joints.get(name), c.T_imu_sensor(name))
+        tree = _set(tree, body, links[name], joints.get(name), c.T_body_sensor(name))
     absent = tuple(f"{path.name} has no link {n}, so {n} was left out." for n in sensors if n not in links)
     text = tree.content.decode("utf-8", "surrogateescape")
     return Export({path.name: text}, absent + _left_out(c))
@@ -140,7 +138,7 @@ def _attribute(tag: bytes, name: str, value: str) -> bytes:
 def _left_out(c: Calibration) -> tuple[str, ...]:
     away = time_offsets(c, c.mounted) + [f"the lens of {name}" for name in c.cameras]
     away += own_parameters(c) + imu_intrinsics(c)
-    return no_place_for("URDF", away) + guesses(c, c.mounted)
+    return no_place_for("URDF", away) + guessed_poses(c)
 
 
 def _text(values: object) -> str:

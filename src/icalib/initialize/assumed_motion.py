@@ -92,7 +92,9 @@ def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
     for own, m in zip(shown, recordings, strict=True):
         if len(own.seconds) < FEWEST:
             where = f"{m.name}: " if len(recordings) > 1 else ""
-            raise EstimationError(f"{where}{rig.body} has a pose at only {len(own.seconds)} instants; record more.")
+            raise EstimationError(
+                f"{where}{rig.reference} has a pose at only {len(own.seconds)} instants; record more."
+            )
     grids = [np.arange(0.0, own.seconds[-1], STEP_S) for own in shown]  # from the body's first stamp on
     paths = [own.at(grid) for own, grid in zip(shown, grids, strict=True)]
     # Densities come out too large rather than too small: a wide window would take motion from them.
@@ -189,7 +191,7 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
     if rig.moves_by_poses:
         spacing = keyframe_spacing(rig, recordings, paths, float(turning), float(jerking))
         imu = replace(imu, pose_keyframes_s=spacing)
-    return rig.with_sensors(imu, replace(rig.sensors[rig.body], **here), gravity=0.0)
+    return rig.with_sensors(imu, replace(rig.sensors[rig.reference], **here), gravity=0.0)
 
 
 def _changes(path: SmoothPath, what: str) -> np.ndarray:

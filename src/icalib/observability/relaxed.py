@@ -101,7 +101,7 @@ def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
         (s.name, name)
         for s, name, parameter in groups_of(asked)
         if s.name in used and _is_stated(parameter)
-        if not (s.name == asked.body and name in body)
+        if not (s.name == asked.reference and name in body)
         if any(b.key == (s.name, name) and b.start is not None for b in layout.blocks)
     ]
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.report.tables import Html, badge, element, html, table
 from icalib.result import Calibration, RelativePose, SensorFit, Verdict, relative_poses
+from icalib.result.body_frame import in_body_frame
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
 from icalib.result.verdict import AUXILIARY, by_size, lens_projection_px, lens_verdict, tolerance, worst
@@ -16,7 +17,7 @@ from icalib.rig import LENS
 
 def sensor_cards(c: Calibration) -> Html:
     """Of all sensors that have parameters or residuals, in the order of the rig file, but the IMU last."""
-    known = {g.sensor for g in shown_groups(c)} | {f.sensor for f in c.fits}
+    known = {g.sensor for g in shown_groups(in_body_frame(c))} | {f.sensor for f in c.fits}
     names = sorted((n for n in c.rig["sensors"] if n in known), key=lambda n: n == c.imu)
     return Html("".join(_card(c, name) for name in names))
 
@@ -48,7 +49,7 @@ def _card(c: Calibration, sensor: str) -> Html:
     """Red where a component is undetermined, residuals are far beyond the noise, or a reason says that the sensor is
     wrong; amber where something is weak, or residuals are large."""
     is_camera, own = sensor in c.cameras, [f for f in c.fits if f.sensor == sensor]
-    groups = [g for g in shown_groups(c) if g.sensor == sensor and g.name not in AUXILIARY]
+    groups = [g for g in shown_groups(in_body_frame(c)) if g.sensor == sensor and g.name not in AUXILIARY]
     judged: list[Verdict] = [v for g in groups if not (is_camera and g.name in LENS) for v in g.verdict]
     verdict = worst((*judged, *((lens_verdict(c, sensor),) if is_camera else ())))
     fit = max((excess(f) for f in own), default=1.0)

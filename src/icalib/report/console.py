@@ -8,6 +8,7 @@ from rich.text import Text
 
 from icalib.result import Calibration, relative_poses
 from icalib.result.quantities import rows, rpy_deg, shown
+from icalib.result.summary import body_name, reference_name
 from icalib.result.verdict import AUXILIARY, UNDETERMINED, tolerance
 from icalib.rig.kinds import SPECS
 
@@ -24,7 +25,8 @@ def table(calibration: Calibration) -> Table:
         out.add_column(header, justify="right" if header in ("value", "std") else "left", no_wrap=True)
     sensors = calibration.rig["sensors"]  # first, and the target's nuisance parameters last
     found = sorted(
-        (r for r in rows(calibration) if r.sensor not in calibration.bodies), key=lambda r: r.sensor not in sensors
+        (r for r in rows(calibration) if r.sensor not in calibration.bodies),
+        key=lambda r: r.sensor not in sensors,
     )
     for i, row in enumerate(found):
         first = i == 0 or found[i - 1].sensor != row.sensor
@@ -63,10 +65,10 @@ def relative_words(calibration: Calibration) -> list[str]:
 
 
 def _caption(calibration: Calibration) -> str:
-    body = "imu" if calibration.imu else calibration.body
+    body, reference = body_name(calibration), reference_name(calibration)
     text = (
-        f"T_{body}_sensor; rotation: Rz(yaw) Ry(pitch) Rx(roll), std about the sensor's axes; t_{body} = t_sensor + "
-        "time offset."
+        f"T_{body}_sensor; rotation: Rz(yaw) Ry(pitch) Rx(roll), std about the sensor's axes; t_{reference} = "
+        "t_sensor + time offset."
     )
     scaled = any(g.columns is not None and g.factor is not None for g in calibration.groups)
     text += f" std {SCALED if scaled else FORMAL}."

@@ -61,7 +61,7 @@ def trajectory(c: Calibration) -> Figure:
     color |= {"showscale": True, "colorbar": {"title": {"text": "time [s]"}, "thickness": 10}}
     ends = path.position[[0, -1]]
     traces = [
-        path_3d(_lifted(c, path.position)[keep], c.body, "", line=color, showlegend=False),
+        path_3d(_lifted(c, path.position)[keep], c.reference, "", line=color, showlegend=False),
         path_3d(
             ends, "ends", "#111827", mode="markers+text", text=["start", "end"], marker={"size": 3}, showlegend=False
         ),

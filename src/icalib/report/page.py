@@ -14,6 +14,7 @@ from icalib.report.plot import Figure
 from icalib.report.sections import plot_place, sections
 from icalib.report.tables import Html, element
 from icalib.result import Calibration
+from icalib.result.summary import body_name, reference_name
 from icalib.result.verdict import NEXT
 
 _NOT_HELD_OUT = (
@@ -29,7 +30,8 @@ def report_html(calibration: Calibration) -> str:
     words = {
         "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.mounted)),
         "size": tables.size_words(c),
-        "body": "imu" if c.imu else c.body,
+        "body": body_name(c),
+        "reference": reference_name(c),
         "status": c.status,
         "answer": f"{c.verdict[0].upper()}{c.verdict[1:]}. {NEXT[c.verdict]}",
         "ellipsoids": _ellipsoid_words(c),

@@ -35,7 +35,8 @@ def rig_picture(c: Calibration) -> Figure:
         )
     )
     scene = {
-        name: {"title": {"text": f"{name[0]} of {c.body} [m]"}, "nticks": 5} for name in ("xaxis", "yaxis", "zaxis")
+        name: {"title": {"text": f"{name[0]} of {c.reference} [m]"}, "nticks": 5}
+        for name in ("xaxis", "yaxis", "zaxis")
     }
     return figure(traces, 520, scene=scene | VIEW, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 

@@ -16,7 +16,7 @@ _LEAST_SPREAD_M = 0.02
 
 def frames(c: Calibration) -> dict[str, np.ndarray]:
     """T_imu_sensor (4, 4) of the body and of all that is mounted on it."""
-    return {c.body: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.mounted}
+    return {c.reference: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.mounted}
 
 
 def spread(c: Calibration) -> float:

@@ -99,8 +99,9 @@ def _body_row(c: Calibration, body: str) -> list[object]:
 
 
 def poses(c: Calibration) -> Html:
-    """T_imu_sensor of each sensor, as a matrix to copy."""
-    return element("div", [_matrix(f"T_{c.body}_{name}", c.T_imu_sensor(name)) for name in c.mounted], "matrices")
+    """T_body_sensor of each sensor, as a matrix to copy."""
+    shown = c.mounted if c.body == c.reference else c.on_body
+    return element("div", [_matrix(f"T_{c.body}_{name}", c.T_body_sensor(name)) for name in shown], "matrices")
 
 
 def _matrix(name: str, T: np.ndarray) -> Html:

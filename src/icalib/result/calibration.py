@@ -213,11 +213,17 @@ class Calibration:
         raise KeyError(f"no {name} of {sensor}; there are {', '.join(f'{g.sensor}.{g.name}' for g in self.groups)}")
 
     def T_imu_sensor(self, sensor: str) -> np.ndarray:
-        """4x4 pose of `sensor` in the imu frame; without an IMU in that of `body`."""
+        """4x4 pose of `sensor` in the imu frame; without an IMU in that of `reference`."""
         T = np.eye(4)
         T[:3, :3] = self.group(sensor, "rotation").value
         T[:3, 3] = self.group(sensor, "translation").value
         return T
+
+    def T_body_sensor(self, sensor: str) -> np.ndarray:
+        """4x4 pose of any sensor in the frame of `body`."""
+        if sensor == self.body:
+            return np.eye(4)
+        return self.T_imu_sensor(sensor) if self.body == self.reference else self.T(self.body, sensor).T
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -235,8 +241,13 @@ class Calibration:
 
     @property
     def body(self) -> str:
-        """Name of the sensor whose frame is the body frame: the IMU, or without one the first camera that sees a
-        target, or the first pose sensor."""
+        """Name of the sensor in whose frame `T_body_sensor` gives poses: `body` of the rig file, or `reference`."""
+        return self.rig.get("body") or self.reference
+
+    @property
+    def reference(self) -> str:
+        """Name of the sensor whose frame the groups and the trajectory are in: the IMU, or without one the first
+        camera that sees a target, or the first pose sensor."""
         if self.imu:
             return self.imu
         poses = self.of_type("pose")
@@ -272,6 +283,11 @@ class Calibration:
         """Names of all that have a pose on the body: all but the IMU, by kind in the order of `SENSOR_KINDS`."""
         return tuple(name for kind in SENSOR_KINDS for name in self.of_type(kind) if name != self.imu)
 
+    @property
+    def on_body(self) -> tuple[str, ...]:
+        """Names of all sensors but `body`, by kind in the order of `SENSOR_KINDS`."""
+        return tuple(name for name in (*self.of_type("imu"), *self.mounted) if name != self.body)
+
     def value(self, sensor: str, name: str) -> np.ndarray:
         """Value of the group `name` of `sensor`, SI: (3, 3) of a rotation R_imu_sensor, else (n,)."""
         return self.group(sensor, name).value
@@ -287,7 +303,7 @@ class Calibration:
         """
         from icalib.result.relative import relative_pose
 
-        known = list(dict.fromkeys([self.body, *self.mounted]))
+        known = list(dict.fromkeys([self.reference, *self.mounted]))
         for name in (frame, sensor):
             if name not in known:
                 raise KeyError(f"no sensor {name}; there are {', '.join(known)}")

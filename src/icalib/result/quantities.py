@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from icalib.result.body_frame import in_body_frame
 from icalib.result.verdict import worst
 from icalib.rig import LENS
 from icalib.rig.kinds import ONE
@@ -35,10 +36,10 @@ class Row:
 
 
 def rows(calibration: Calibration) -> list[Row]:
-    """Every parameter of every sensor, in the order of the groups. Of IMU intrinsics only what the recording sharpened,
-    and one row for the rest; an IMU taken for ideal has none."""
+    """Every parameter of every sensor, in the order of the groups; poses are relative to the body. Of IMU intrinsics
+    only what the recording sharpened, and one row for the rest; an IMU taken for ideal has none."""
     found = []
-    for group in shown_groups(calibration):
+    for group in shown_groups(in_body_frame(calibration)):
         own = _rows_of(group)
         sharpened = _sharpened(calibration, group)
         found += [row for row, shown in zip(own, sharpened, strict=True) if shown]
@@ -58,11 +59,13 @@ def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
 
 
 def shown_groups(calibration: Calibration) -> list[ParameterGroup]:
-    """The groups without those that are fixed at zero, and where the body is in itself, which say nothing."""
+    """The groups without those that are fixed at zero, and without the rotation of the body relative to itself."""
+    still = [(name, "rotation") for name in (calibration.body, calibration.reference)]
     return [
         g
         for g in calibration.groups
-        if g.columns is not None or (g.value.any() and not (g.sensor == calibration.body and g.name == "rotation"))
+        if g.columns is not None
+        or (g.value.any() and not ((g.sensor, g.name) in still and np.array_equal(g.value, np.eye(3))))
     ]
 
 

@@ -59,25 +59,43 @@ def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
 
 
 def relative_pose(c: Calibration, frame: str, sensor: str) -> RelativePose:
-    """Pose of `sensor` in the frame of another sensor; either may be the IMU. Raises KeyError naming what there is.
+    """Pose of `sensor` in the frame of another sensor; either may be the IMU. Raises KeyError naming what there is."""
+    T = np.linalg.inv(_pose(c, frame)) @ _pose(c, sensor)
+    J = relative_jacobian(c, frame, sensor)
+    return RelativePose(frame, sensor, T, J @ _joint_covariance(c, frame, sensor) @ J.T)
+
+
+def relative_jacobian(c: Calibration, frame: str, sensor: str) -> np.ndarray:
+    """(6, 12) of T_frame_sensor by rotation and translation of both sensors.
 
     With T_imu_frame = (R, p), T_imu_sensor = (Q, q) and the relative pose (S, s) = (R^T Q, R^T (q - p)), perturbations
     dR, dQ on the right, dp and dq give dS = dQ - S^T dR on the right and ds = R^T (dq - dp) + s x dR.
     """
-    T_imu_frame, T_imu_sensor = (np.eye(4) if name == c.imu else c.T_imu_sensor(name) for name in (frame, sensor))
-    T = np.linalg.inv(T_imu_frame) @ T_imu_sensor
+    T_imu_frame = _pose(c, frame)
+    T = np.linalg.inv(T_imu_frame) @ _pose(c, sensor)
     R, S, s = T_imu_frame[:3, :3], T[:3, :3], T[:3, 3]
     J = np.zeros((6, 12))
     J[:3, :3], J[:3, 6:9] = -S.T, np.eye(3)
     J[3:, :3] = [[0.0, -s[2], s[1]], [s[2], 0.0, -s[0]], [-s[1], s[0], 0.0]]
     J[3:, 3:6], J[3:, 9:] = -R.T, R.T
-    return RelativePose(frame, sensor, T, J @ _joint_covariance(c, frame, sensor) @ J.T)
+    return J
 
 
 def _joint_covariance(c: Calibration, *sensors: str) -> np.ndarray:
     """(6 n, 6 n) of rotation and translation of each of n sensors, empirical factors included; 0 where fixed."""
-    wanted = [(sensor, name) for sensor in sensors for name in ("rotation", "translation")]
-    return joint_covariance(c, [None if sensor == c.imu else c.group(sensor, name) for sensor, name in wanted], 3)
+    return joint_covariance(c, [g for sensor in sensors for g in pose_groups(c, sensor)], 3)
+
+
+def _pose(c: Calibration, sensor: str) -> np.ndarray:
+    return np.eye(4) if pose_groups(c, sensor)[0] is None else c.T_imu_sensor(sensor)
+
+
+def pose_groups(c: Calibration, sensor: str) -> tuple[ParameterGroup | None, ParameterGroup | None]:
+    """Rotation and translation of `sensor`; None of the IMU where poses are relative to it: exactly known."""
+    known = {g.name: g for g in c.groups if g.sensor == sensor}
+    if sensor == c.imu and "rotation" not in known:
+        return None, None
+    return c.group(sensor, "rotation"), c.group(sensor, "translation")
 
 
 def joint_covariance(c: Calibration, groups: Sequence[ParameterGroup | None], none: int = 0) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from icalib.result.body_frame import in_body_frame
 from icalib.result.calibration import Calibration, ParameterGroup, SensorFit
 from icalib.result.relative import RelativePose, relative_poses
 from icalib.rig.kinds import ONE
@@ -16,7 +17,7 @@ from icalib.sensors.sensor import MOUNTED, MOUNTED_NAMES, ROTATION, TRANSLATION
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
 # {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
-{kalibr}# time_offset: t_{body} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
+{kalibr}# time_offset: t_{reference} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor: the scatter of segments over the predicted one; formal = std / factor.
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
@@ -34,7 +35,8 @@ def calibration_yaml(calibration: Calibration) -> str:
     """Text of calibration.yaml; the format is in docs/files.md."""
     c = calibration
     names = list(dict.fromkeys([*c.rig["sensors"], *(g.sensor for g in c.groups)]))
-    sensors = {n: _sensor(c, n) for n in names if n in c.rig["sensors"]}
+    in_body = in_body_frame(c)
+    sensors = {n: _sensor(in_body, n) for n in names if n in c.rig["sensors"]}
     targets = {n: _target(c, n) for n in names if n not in c.rig["sensors"]}
     data = {
         "status": c.status,
@@ -49,10 +51,11 @@ def calibration_yaml(calibration: Calibration) -> str:
         "notes": list(c.notes),
         "fits": [_fit(f) for f in c.fits],
     }
-    body = c.body if c.imu is None else "imu"
     kalibr = KALIBR if c.cameras else ""
     version = c.versions.get("icalib", "of unknown version")
-    header = HEADER.format(version=version, key=pose_key(c), body=body, kalibr=kalibr)
+    header = HEADER.format(
+        version=version, key=pose_key(c), body=body_name(c), reference=reference_name(c), kalibr=kalibr
+    )
     return header + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
 
 
@@ -65,18 +68,29 @@ def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], 
 
 
 def pose_key(c: Calibration) -> str:
-    """T_imu_sensor, or without an IMU T_cam0_sensor, after the camera whose frame is the body's."""
-    return f"T_{'imu' if c.imu else c.body}_sensor"
+    """T_imu_sensor, or T_cam0_sensor where the frame of cam0 is the body's."""
+    return f"T_{body_name(c)}_sensor"
+
+
+def body_name(c: Calibration) -> str:
+    """How files name the frame that all poses are in: imu, or the sensor whose frame it is."""
+    return "imu" if c.body == c.imu else c.body
+
+
+def reference_name(c: Calibration) -> str:
+    """How files name the sensor whose clock is that of time offsets: imu, or `reference`."""
+    return "imu" if c.imu else c.reference
 
 
 def _sensor(c: Calibration, name: str) -> dict[str, Any]:
-    kind = c.rig["sensors"][name]["type"]
+    """The entry of a sensor of a result `in_body_frame`."""
+    kind, entry = c.rig["sensors"][name]["type"], _entry(c, name)
     if kind != "imu":
-        return {"type": kind, pose_key(c): c.T_imu_sensor(name).tolist()} | _entry(c, name)
-    entry = _entry(c, name)
+        return {"type": kind, pose_key(c): c.T_imu_sensor(name).tolist()} | entry
     still = {spec.name: [0.0] * spec.size if spec.size > 1 else 0.0 for spec in MOUNTED}
     fixed = {spec.name: ["fixed"] * spec.size if spec.size > 1 else "fixed" for spec in MOUNTED}
-    pose = {"type": kind, "T_imu_sensor": np.eye(4).tolist(), "time_offset": 0.0}
+    T = np.eye(4) if name == c.body else c.T_imu_sensor(name)
+    pose = {"type": kind, pose_key(c): T.tolist(), "time_offset": 0.0}
     return pose | entry | {"std": still | entry["std"], "verdict": fixed | entry["verdict"]}
 
 

@@ -144,7 +144,7 @@ def _more(c: Calibration) -> str:
     if c.imu is None and c.cameras:
         images = sum(len(r.seconds) for r in c.image_residuals)
         return f"the result rests on {images} images: take more, near and far, tilted, and in every part of the image"
-    axes = hardly_turned(c.trajectory.seconds, c.trajectory.rotation, c.body)
+    axes = hardly_turned(c.trajectory.seconds, c.trajectory.rotation, c.reference)
     if c.imu is None:
         return f"record more poses, turned about {axes or 'every axis'}"
     return f"record longer, and {f'turn the rig about {axes}' if axes else 'turn about and move along every axis'}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
 from icalib.rig.kinds import SENSOR_TYPES
 from icalib.rig.rig import Rig
@@ -26,6 +27,9 @@ def check_complete(rig: Rig) -> None:
 
 def _lacks(rig: Rig) -> Iterator[Lack]:
     yield from _second_imu(rig)
+    if rig.body and rig.body not in rig.sensors:
+        near = suggestion(rig.body, rig.sensors)
+        yield Lack(("body",), f"there is no sensor {rig.body}{near}; available are {', '.join(rig.sensors)}.")
     if not any(sensor.gives_motion for sensor in rig.mounted):
         yield Lack(("sensors",), _no_motion(rig))
     for sensor in rig.sensors.values():
@@ -44,7 +48,7 @@ def _second_imu(rig: Rig) -> Iterator[Lack]:
     """The only place that refuses a second IMU: the estimator integrates one."""
     first, *others = [s.name for s in rig.sensors.values() if s.is_inertial] or [""]
     for name in others:
-        yield Lack(("sensors", name), f"is a second IMU beside {first}; keep the one that is the body frame.")
+        yield Lack(("sensors", name), f"is a second IMU beside {first}; keep one of them.")
 
 
 def _no_motion(rig: Rig) -> str:
@@ -63,9 +67,9 @@ def _clocks_without_reference(rig: Rig) -> Iterator[Lack]:
         where = ("sensors", sensor.name, "clock_restarts")
         if rig.cameras_alone:
             yield Lack(where, "cameras alone have no time offsets; remove it, or add a sensor of type: imu.")
-        elif sensor.name == rig.body:
+        elif sensor.name == rig.reference:
             yield Lack(
                 where,
-                f"without an IMU the clock of {rig.body} is the reference clock; set clock_restarts of the other "
+                f"without an IMU the clock of {rig.reference} is the reference clock; set clock_restarts of the other "
                 "sensors instead, or write false.",
             )

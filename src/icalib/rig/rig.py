@@ -40,10 +40,10 @@ def by_name(*sensors: Sensor) -> dict[str, Sensor]:
 class Rig:
     """All sensors of a robot, what they see, and how they are calibrated.
 
-    sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind. gravity: m/s^2.
-    Without an IMU the body frame is that of the first camera, or of the first pose sensor if no camera sees a target.
-    Cameras alone have no motion model: images of the same stamp share a pose, and poses are independent. Any other
-    rig without an IMU assumes smooth motion.
+    sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind. gravity: m/s^2. body:
+    name of the sensor in whose frame results give poses; empty: `reference`. The reference is the IMU, or without one
+    the first camera, or the first pose sensor if no camera sees a target. Cameras alone have no motion model: images of
+    the same stamp share a pose, and poses are independent. Any other rig without an IMU assumes smooth motion.
     """
 
     sensors: Mapping[str, Sensor]
@@ -51,6 +51,7 @@ class Rig:
     gravity: float = 9.81
     settings: Settings = Settings()
     path: Path | None = None
+    body: str = ""
 
     def __post_init__(self) -> None:
         by_name(*self.sensors.values())
@@ -98,13 +99,13 @@ class Rig:
         return self.settings.bloom and self.target.blooms
 
     @property
-    def body(self) -> str:
-        """Name of the sensor whose frame is the body frame."""
+    def reference(self) -> str:
+        """Name of the sensor whose frame and clock the estimator uses: extrinsics of the rig are relative to it."""
         return self.first_seeing if self.imu is None else self.imu.name
 
     @property
     def first_seeing(self) -> str:
-        """Name of the sensor that is the body where there is no IMU: the first that determines the motion alone, or
+        """Name of the reference sensor of a rig without an IMU: the first that determines the motion alone, or
         else the first that does beside an IMU."""
         alone = (s for s in self.mounted if s.gives_motion_without_imu(self.has_target))
         return next(s.name for s in (*alone, *(s for s in self.mounted if s.gives_motion)))

@@ -65,14 +65,14 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     names = _column_names(inputs)
     tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
     state = outcome.state
-    axes = hardly_turned(state.seconds, state.rotation, inputs.rig.body)
+    axes = hardly_turned(state.seconds, state.rotation, inputs.rig.reference)
     seen = observe(determined, names, any(s.drives for s in inputs.rig.mounted), tracking, axes)
     parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
     noise = _NoiseShare.of(determined, seen.covariance, parts)
     groups = _groups(inputs, determined, seen, noise)
     judged = _sensor_fits([f for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
-    held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
-    timeline = Timeline.of(inputs.parts, image_times(inputs, state.values), inputs.rig.body)
+    held = held_out(parts, [s for s in (inputs.rig.reference,) if _is_assumed(inputs, s)])
+    timeline = Timeline.of(inputs.parts, image_times(inputs, state.values), inputs.rig.reference)
     factors = _factors(inputs, groups)
     factor = factors.max(initial=1.0)
     causes, size_notes = all_causes(AssessedEstimate(inputs, found, groups, judged, factor, parts, timeline), against)
@@ -123,7 +123,7 @@ def _rates(inputs: Inputs) -> dict[str, float]:
 
 def _is_assumed(inputs: Inputs, name: str) -> bool:
     """Whether it is no sensor, but what is assumed in the IMU's place."""
-    return inputs.rig.assumes_motion and name == inputs.rig.body
+    return inputs.rig.assumes_motion and name == inputs.rig.reference
 
 
 def _column_names(inputs: Inputs) -> tuple[str, ...]:

@@ -276,7 +276,7 @@ def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slic
 
 def _chain(inputs: Inputs, state: State) -> ChainFactor:
     if inputs.imu is None:
-        return FreeNodes(inputs.rig.body, len(state.seconds))
+        return FreeNodes(inputs.rig.reference, len(state.seconds))
     columns = inputs.layout.columns(inputs.imu.name, "intrinsics")
     return ImuFactor.build(inputs.imu, state, inputs.rig.gravity, columns[columns >= 0])
 

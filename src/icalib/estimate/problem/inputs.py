@@ -79,7 +79,7 @@ class Inputs:
 
     def is_sensor(self, name: str) -> bool:
         """Whether `name` is a sensor's, not a body's of the target or a plane's."""
-        return name == self.rig.body or name in [s.name for s in self.sensors]
+        return name == self.rig.reference or name in [s.name for s in self.sensors]
 
     @property
     def motions(self) -> tuple[Part, ...]:

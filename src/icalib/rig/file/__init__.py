@@ -31,12 +31,13 @@ def rig_from_dict(plain: dict[str, Any], source: str) -> Rig:
 
 
 def _rig(root: YamlValue) -> Rig:
-    found = root.record(("sensors",), ("target", "targets", "gravity", "settings"))
+    found = root.record(("sensors",), ("target", "targets", "gravity", "settings", "body"))
     rig = Rig(
         by_name(*(_sensor(name, value) for name, value in found["sensors"].entries().items())),
         target_or_targets(root) if "target" in found or "targets" in found else NoTarget(),
         gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
         settings=_settings(found["settings"]) if "settings" in found else Settings(),
+        body=found["body"].text() if "body" in found else "",
     )
     if (lack := lack_of(rig)) is not None:
         _place(root, lack).fail(lack.sentence)
@@ -84,6 +85,7 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
         **target,
         "gravity": rig.gravity,
         "settings": dataclasses.asdict(rig.settings),
+        **({"body": rig.body} if rig.body else {}),
     }
 
 

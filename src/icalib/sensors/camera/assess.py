@@ -249,5 +249,5 @@ def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> str | None:
 def length(camera: Camera, rig: Rig) -> str | None:
     """What shows how long a metre is: a translation that the rig file states."""
     p = camera.translation
-    stated = camera.name != rig.body and p.mode != "free" and p.value is not None and bool(np.any(p.value))
+    stated = camera.name != rig.reference and p.mode != "free" and p.value is not None and bool(np.any(p.value))
     return f"the stated translation of {camera.name}" if stated else None

@@ -18,7 +18,7 @@ class CameraModel(SensorModel[Camera, CornerNoise]):
 
     def is_estimated(self, sensor: Camera, spec: ParameterSpec, rig: Rig) -> bool:
         """See `SensorModel`; bloom only where the target has edges that it moves."""
-        if rig.imu is None and (spec == TIME_OFFSET or (sensor.name == rig.body and spec in MOUNTED)):
+        if rig.imu is None and (spec == TIME_OFFSET or (sensor.name == rig.reference and spec in MOUNTED)):
             return False
         return sensor.is_estimated(spec) and (spec != BLOOM or rig.blooms)
 

@@ -165,7 +165,9 @@ def _undetermined(c: Calibration) -> list[str]:
 def _fixed(c: Calibration) -> list[str]:
     """Names of groups that the rig file fixes, but for the pose of the body in itself."""
     own = [g for g in c.groups if g.columns is None and g.sensor in c.rig["sensors"] and g.name not in AUXILIARY]
-    fixed = [_block(c, g) for g in own if g.mode == "fixed" and not (g.sensor == c.body and g.name in MOUNTED_NAMES)]
+    fixed = [
+        _block(c, g) for g in own if g.mode == "fixed" and not (g.sensor == c.reference and g.name in MOUNTED_NAMES)
+    ]
     return list(dict.fromkeys(fixed))
 
 

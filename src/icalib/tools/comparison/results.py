@@ -37,7 +37,7 @@ def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Q
 
 def side_of_result(c: Calibration, path: str) -> Side:
     """All that was calibrated, with the joint covariance of it."""
-    poses = {name: c.T_imu_sensor(name) for name in c.mounted} | {c.body: np.eye(4)}
+    poses = {name: c.T_imu_sensor(name) for name in c.mounted} | {c.reference: np.eye(4)}
     bad = [g for g in c.groups if "undetermined" in g.verdict]
     quantities = {}
     for g in c.groups:
@@ -57,7 +57,7 @@ def side_of_result(c: Calibration, path: str) -> Side:
     return Side(
         path=path,
         kind="result",
-        body=c.body,
+        body=c.reference,
         has_imu=c.imu is not None,
         poses=poses,
         covariance=lambda frame, sensor: relative_pose(c, frame, sensor).covariance,
@@ -82,7 +82,7 @@ def _lens_of_result(c: Calibration, name: str) -> LensSide:
 def side_of_rig(path: Path) -> Side:
     """Values that a rig file gives, whether guessed, fixed or prior; priors with their sigma. Raises RigError."""
     rig = load_rig(path)
-    poses = {s.name: _pose(s) for s in rig.mounted} | {rig.body: np.eye(4)}
+    poses = {s.name: _pose(s) for s in rig.mounted} | {rig.reference: np.eye(4)}
     quantities = {}
     for s in rig.mounted:
         for spec in compared_specs(type(s)).values():
@@ -96,7 +96,7 @@ def side_of_rig(path: Path) -> Side:
 
     def covariance(frame: str, sensor: str) -> np.ndarray:
         out = unknown(6)
-        if frame == rig.body:
+        if frame == rig.reference:
             rotation, translation = _extrinsics(rig.sensors[sensor])
             out[:3, :3], out[3:, 3:] = _covariance(rotation, 3), _covariance(translation, 3)
         return out
@@ -104,7 +104,7 @@ def side_of_rig(path: Path) -> Side:
     return Side(
         path=str(path),
         kind="rig file",
-        body=rig.body,
+        body=rig.reference,
         has_imu=rig.imu is not None,
         poses=poses,
         covariance=covariance,

@@ -13,7 +13,7 @@ def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
     """The layout; `readings`: those of the IMU are shown."""
     b = rr.blueprint
     images = [b.Spatial2DView(origin=f"{place(c, name)}/image", name=name) for name in c.cameras]
-    rig = b.Spatial3DView(origin=f"world/{c.body}", name="rig")
+    rig = b.Spatial3DView(origin=f"world/{c.reference}", name="rig")
     shown = [b.TimeSeriesView(origin=f"residuals/{name}", name=f"residuals of {name}") for name in _measured(c)]
     if c.imu is not None:
         shown.append(b.TimeSeriesView(origin="motion", name="motion"))

@@ -20,7 +20,7 @@ _WORST_OF_SCALE = 4.0  # of a scale of colours, in RMS of the result
 
 def place(c: Calibration, sensor: str) -> str:
     """The entity of a sensor: the body is in the world, all else on the body."""
-    return f"world/{sensor}" if sensor == c.body else f"world/{c.body}/{sensor}"
+    return f"world/{sensor}" if sensor == c.reference else f"world/{c.reference}/{sensor}"
 
 
 def spans(c: Calibration) -> tuple[RecordingSpan, ...]:
@@ -34,7 +34,7 @@ def log_rig(s: RerunStream, c: Calibration) -> None:
     spread = rig_shapes.spread(c)
     for name, T in rig_shapes.frames(c).items():
         s.still(place(c, name), s.rr.TransformAxes3D(0.25 * spread))
-        if name != c.body:
+        if name != c.reference:
             s.still(place(c, name), s.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
     for name in c.cameras:
         s.still(f"{place(c, name)}/image", _pinhole(s, c, name, 0.45 * spread))
@@ -68,7 +68,7 @@ def log_uncertainty(s: RerunStream, c: Calibration) -> None:
             labels=[f"{e.sensor}: {SIGMAS:g} sigma x {factor:g}"],
             show_labels=False,
         )
-        s.still(f"world/{c.body}/uncertainty/{e.sensor}", ellipsoid)
+        s.still(f"world/{c.reference}/uncertainty/{e.sensor}", ellipsoid)
 
 
 def log_motion(s: RerunStream, c: Calibration) -> None:
@@ -76,7 +76,7 @@ def log_motion(s: RerunStream, c: Calibration) -> None:
     path = c.trajectory
     s.still("world", s.rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     s.over(
-        f"world/{c.body}",
+        f"world/{c.reference}",
         path.seconds,
         s.rr.Transform3D.columns(translation=path.position, mat3x3=path.rotation.reshape(-1, 9)),
     )

@@ -66,9 +66,9 @@ def start_from_pairs(
         found |= values
     inputs = replace(inputs_for(still, at), asked=rig)
     for sensor in still.poses:
-        found |= given(inputs, sensor, MOUNTED_NAMES if sensor.name == rig.body else ("time_offset",))
+        found |= given(inputs, sensor, MOUNTED_NAMES if sensor.name == rig.reference else ("time_offset",))
     for k in range(len(recordings)):
-        frame = frame_of(rig.body, k)
+        frame = frame_of(rig.reference, k)
         world = {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}
         found |= world if own else {(in_recording(BOARD, k), "tilt"): np.eye(3)}
     state = _state(inputs, shown, found)
@@ -137,14 +137,14 @@ def _notes(rig: Rig, sensor: PoseSensor, own: _Paired, bad: np.ndarray, m: Measu
     n = len(own.stream.stamps_ns)
     words = [
         f"{n} poses of {sensor.name} were taken at rest, each together with one of the {own.counts[0]} of "
-        f"{rig.body}. No motion is assumed in between, and its time_offset is not estimated."
+        f"{rig.reference}. No motion is assumed in between, and its time_offset is not estimated."
     ]
     if bad.any():
         seconds = own.stream.stamps_ns[bad][:3] - m.origin_ns
         at = ", ".join(f"{1e-9 * x:.3f} s" for x in seconds)
         words.append(
             f"{sensor.name}: {int(bad.sum())} of its {n} poses do not fit the others and were rejected, {at} after "
-            f"the first stamp of {rig.body}."
+            f"the first stamp of {rig.reference}."
         )
     return words
 
@@ -159,7 +159,7 @@ def _paired(rig: Rig, sensor: PoseSensor, m: Measurements, stream: PoseStream, s
     if len(i) < FEWEST_PAIRS:
         raise EstimationError(
             f"only {len(i)} of the {counts[1]} poses of {sensor.name} were taken together with one of the "
-            f"{counts[0]} of {rig.body}, and {FEWEST_PAIRS} are needed; {HOW}."
+            f"{counts[0]} of {rig.reference}, and {FEWEST_PAIRS} are needed; {HOW}."
         )
     stamps = m.origin_ns + np.round((shown.seconds[i] - offset) * 1e9).astype(np.int64)
     chosen = replace(stream, stamps_ns=stamps, rotation=stream.rotation[k], position=stream.position[k])
@@ -185,11 +185,11 @@ def _solved(rig: Rig, sensor: PoseSensor, own: _Paired) -> HandEye:
         seen, told = (np.rad2deg(np.median(np.linalg.norm(w, axis=1))) for w in (turns.body, turns.sensor))
         if told < NO_TURN_DEG < seen:
             raise EstimationError(
-                f"{sensor.name}: its rotation is the same in all poses, although {rig.body} turns by "
+                f"{sensor.name}: its rotation is the same in all poses, although {rig.reference} turns by "
                 f"{seen:.1f} deg (median); a pose sensor needs both position and rotation."
             )
         raise EstimationError(
-            f"{rig.body} and {sensor.name} do not move alike: {left:.0%} of the motion between "
+            f"{rig.reference} and {sensor.name} do not move alike: {left:.0%} of the motion between "
             f"{len(own.pairs.p_body)} pairs of poses is unexplained (median rotation {seen:.1f} and {told:.1f} "
             f"deg). Check that each pose of {sensor.name} belongs to the image with its stamp, and that one of "
             "the two is fixed to the other."
