@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-
-import numpy as np
 
 from icalib.data.measurements import Measurements
 from icalib.errors import RecordingError
@@ -21,13 +19,13 @@ PAUSE_NS = 10_000_000_000
 class Part:
     """One recording among those that were joined, as it was measured.
 
-    shift_ns: what was added to all its stamps; images: which of each camera's joined images are its own; begin: its
-    first stamp on the joined clock of the body [s].
+    shift_ns: what was added to all its stamps; own: which stamps of each joined stream are its own, by the stream's
+    key; begin: its first stamp on the joined clock of the body [s].
     """
 
     measurements: Measurements
     shift_ns: int
-    images: tuple[slice, ...]
+    own: Mapping[str, slice]
     begin: float
 
     @property
@@ -45,14 +43,12 @@ def join(
     recordings stay apart as long as the streams of each overlap: the pause between them is longer than both.
     """
     shifts = _shifts(rig, recordings) if shifts_ns is None else shifts_ns
-    ends = np.cumsum([[0] * len(rig.cameras), *([len(c.stamps_ns) for c in m.cameras] for m in recordings)], axis=0)
-    own = [tuple(slice(int(a), int(b)) for a, b in zip(*pair, strict=True)) for pair in pairwise(ends)]
-    first = recordings[0].origin_ns
-    parts = tuple(
-        Part(m, shift, images, (m.origin_ns + shift - first) * 1e-9)
-        for m, shift, images in zip(recordings, shifts, own, strict=True)
-    )
-    return (_joined(recordings, shifts) if len(recordings) > 1 else recordings[0]), parts
+    first, parts, ends = recordings[0].origin_ns, [], dict.fromkeys(recordings[0].streams, 0)
+    for m, shift in zip(recordings, shifts, strict=True):
+        own = {key: slice(ends[key], ends[key] + len(s.stamps_ns)) for key, s in m.streams.items()}
+        ends = {key: rows.stop for key, rows in own.items()}
+        parts.append(Part(m, shift, own, (m.origin_ns + shift - first) * 1e-9))
+    return (_joined(recordings, shifts) if len(recordings) > 1 else recordings[0]), tuple(parts)
 
 
 def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:

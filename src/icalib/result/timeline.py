@@ -36,9 +36,9 @@ class Timeline:
         """(n,) seconds of the result from joined ones, each of a recording (n,)."""
         return seconds + self.moved[recording]
 
-    def of_images(self, camera: int) -> np.ndarray:
-        """(M,) the recording of each image of a camera, given by its number."""
-        counts = [p.images[camera].stop - p.images[camera].start for p in self.parts]
+    def recordings_of(self, stream: str) -> np.ndarray:
+        """(N,) the recording of each stamp of a stream, given by its key."""
+        counts = [p.own[stream].stop - p.own[stream].start for p in self.parts]
         return np.repeat(np.arange(len(counts)), counts)
 
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
@@ -54,7 +54,8 @@ class Timeline:
 
 def _extent(part: Part, image_times: list[np.ndarray], body: str) -> tuple[float, float]:
     """The first and the last instant of a recording at which anything was measured, on the joined clock."""
-    images = [t[own] for t, own in zip(image_times, part.images, strict=True)]
+    own = [part.own[c.key] for c in part.measurements.cameras]
+    images = [t[rows] for t, rows in zip(image_times, own, strict=True)]
     if not images or part.measurements.imu is not None:  # else the clock is that of a camera
         images.append(part.begin + part.measurements.streams[body].seconds)
     times = np.concatenate(images)

@@ -288,7 +288,7 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
     if not inputs.rig.cameras:
         return timeline.recording_of(state.seconds)
     times = np.concatenate(image_times(inputs, state.values))
-    recording = np.concatenate([timeline.of_images(i) for i in range(len(inputs.measurements.cameras))])
+    recording = np.concatenate([timeline.recordings_of(c.key) for c in inputs.measurements.cameras])
     order = np.argsort(times, kind="stable")
     return recording[order][np.searchsorted(times[order], state.seconds)]
 

@@ -183,8 +183,8 @@ def assemble(
     factors = []
     scheme = rig.settings.scheme if inputs.imu is not None else "inertial"
     times = image_times(inputs, state.values)
-    for i, (camera, stream, t, k) in enumerate(zip(rig.cameras, inputs.measurements.cameras, times, keep, strict=True)):
-        own = [m.images[i] for m in inputs.motions]
+    for camera, stream, t, k in zip(rig.cameras, inputs.measurements.cameras, times, keep, strict=True):
+        own = [m.own[camera.name] for m in inputs.motions]
         node = _nodes_of(scheme, state, t, own, inputs.imu is not None and inputs.imu.forwards)
         seen = is_seen(inputs, t, state.seconds[node])
         factor = CornerFactor(

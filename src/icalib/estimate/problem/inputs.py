@@ -87,7 +87,7 @@ class Inputs:
         ties the instants of even one."""
         if self.imu is not None:
             return self.parts
-        everything = tuple(slice(0, len(c.stamps_ns)) for c in self.measurements.cameras)
+        everything = {key: slice(0, len(s.stamps_ns)) for key, s in self.measurements.streams.items()}
         return (Part(self.measurements, 0, everything, 0.0),)
 
 

@@ -76,8 +76,8 @@ def _track_residuals(found: Estimate, timeline: Timeline) -> Iterator[TrackResid
 
 def _seconds(found: Estimate, timeline: Timeline, index: int) -> np.ndarray:
     """(M,) of the images of a camera."""
-    times = instants(of_type(found.problem.factors, CornerFactor)[index].stream, found.outcome.state.values)
-    return timeline.shown(times, timeline.of_images(index))
+    stream = of_type(found.problem.factors, CornerFactor)[index].stream
+    return timeline.shown(instants(stream, found.outcome.state.values), timeline.recordings_of(stream.key))
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
