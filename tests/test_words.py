@@ -140,6 +140,7 @@ REVISED = (
     "export",
     "geometry",
     "report",
+    "result",
     "rig/file",
     "sensors/camera/read",
     "sensors/imu/read",

@@ -57,7 +57,7 @@ def rig_text(c: Calibration, treatment: Treatment) -> tuple[str, tuple[str, ...]
 
 
 def _is_derived(sensor: Any, g: ParameterGroup) -> bool:
-    """Whether the group is no field of the sensor, as the height of wheels over the ground is not."""
+    """Whether the group is no field of the sensor, such as the height of wheels over the ground."""
     return g.name not in {f.name for f in dataclasses.fields(sensor)}
 
 

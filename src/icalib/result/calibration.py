@@ -1,4 +1,4 @@
-"""What a run found, as frozen dataclasses."""
+"""The result of a calibration, as frozen dataclasses."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ Verdict = Literal["determined", "weak", "undetermined", "fixed"]
 class ParameterGroup:
     """One estimated group of parameters of one sensor.
 
-    value: rotations 3x3 (R_imu_sensor), else (n,). std_formal, std: (n,) (rotations: rad about the sensor's axes);
-    std = std_formal * factor, zeros where fixed. columns: where the group stands in the covariance, None where fixed.
+    value: rotations (3, 3) R_imu_sensor, else (n,). std_formal, std: (n,), of rotations about the sensor's axes [rad];
+    std = std_formal * factor, zero if fixed. columns: of the group in the covariance, None if fixed.
     """
 
     sensor: str  # "cam0", "imu0", "board0"
@@ -61,14 +61,15 @@ class SensorFit:
 
     @property
     def chi2_per_dof(self) -> float | None:
-        """Near 1 where residuals are as large as their noise says. None where the fit leaves next to no freedom: dof
-        are sampled, and good to the root of the count."""
+        """Near 1 if residuals are as large as the stated noise predicts. None without redundancy: dof are sampled, with
+        an error of about the square root of the count."""
         return float(self.chi2 / self.dof) if self.dof > np.sqrt(self.count) else None
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The nodes: where the IMU was. seconds since the first IMU stamp; world frame, z up, one for each recording."""
+    """State of the IMU at the K keyframes. seconds since the first IMU stamp; world frame, z up, one for each
+    recording."""
 
     seconds: np.ndarray  # (K,)
     rotation: np.ndarray  # (K, 3, 3) R_world_imu
@@ -80,7 +81,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class RecordingSpan:
-    """One of the recordings: when it was, on the clock of this result, on which recordings follow one another.
+    """Start and end of one recording on the clock of this result, on which recordings follow one another.
 
     start, end: its first and its last measurement [s]; origin_ns: `start` as a raw stamp of the body's clock, which at
     t seconds showed origin_ns + 1e9 (t - start).
@@ -106,7 +107,7 @@ class Iteration:
 @dataclass(frozen=True)
 class Visited:
     """A state from which the solver took a step: value and formal standard deviation of each estimated group (sensor,
-    name), as in `ParameterGroup`. The standard deviation of groups fixed at the guess is zero."""
+    name), as in `ParameterGroup`. The standard deviation of groups that are fixed at the initial guess is zero."""
 
     stage: str
     values: dict[tuple[str, str], np.ndarray]
@@ -115,19 +116,19 @@ class Visited:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Everything a run found, and what it was made from."""
+    """Everything that a run estimated, and the inputs that it used."""
 
     groups: tuple[ParameterGroup, ...]
     covariance: np.ndarray  # (B, B) formal covariance of all estimated parameters, SI, right perturbation
     covariance_names: tuple[str, ...]  # B names: "cam0.rotation.x", ...
-    undetermined: tuple[str, ...]  # sentences: combinations that the data do not determine, and the missing motion
+    undetermined: tuple[str, ...]  # sentences: unobservable combinations, and the missing motion
     fits: tuple[SensorFit, ...]
     residuals: dict[tuple[str, str], Residuals]  # (sensor, kind), such as ("cam0", "corners"); see `by_key`
     trajectory: Trajectory
     iterations: tuple[Iteration, ...]
     converged: bool
     status: str  # one sentence
-    warnings: tuple[str, ...]  # what to know before trusting the numbers, one sentence each
+    warnings: tuple[str, ...]  # one sentence each: reasons for care
     notes: tuple[str, ...]  # what was assumed, dropped, repaired
     rig: dict[str, Any] = field(default_factory=dict)  # the rig as plain data
     rates: dict[str, float] = field(default_factory=dict)  # sensor -> Hz, as recorded
@@ -138,7 +139,7 @@ class Calibration:
     recordings: tuple[RecordingSpan, ...] = ()  # in order; arrays of seconds run through all of them
     planes: tuple[Plane, ...] = ()  # that LiDARs see
     cross_validation: CrossValidation | None = None  # None where the recording could not be split
-    wrong: tuple[str, ...] = ()  # those of `warnings` by which something in the rig file must be wrong
+    wrong: tuple[str, ...] = ()  # those of `warnings` that show an error in the rig file
 
     def residuals_of(self, *kinds: str) -> tuple[Any, ...]:
         """The records of these kinds of measurement ("corners", "points", ...), kind by kind."""

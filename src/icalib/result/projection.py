@@ -1,15 +1,14 @@
-"""How far a calibrated camera's projection can be trusted over its image: what the uncertainty of its lens leaves, in
-pixels, once the camera is turned and moved as well as it can be to make up for it.
+"""Projection uncertainty of a camera over its image [px], from the covariance of its intrinsics and distortion.
 
-Focal length, principal point and distortion are known to some covariance P. An error of theirs is largely that of a
-camera which looks another way: a shift of the principal point is a turn. Whoever compares two calibrations, or uses one
-whose extrinsics were found with it, never meets that part. So of each error db the motion r of the camera that explains
-it best over the image is taken off, as mrcal does ("projection uncertainty", "implied rotation"; derived anew):
+A large part of an error of the lens is a pose change: a shift of the principal point is a rotation. Extrinsics that
+were estimated with the lens absorb that part. The pose change r that best absorbs each error db over the image is
+therefore removed first, as mrcal does ("projection uncertainty", "implied rotation"; derived anew). With the covariance
+P of the lens:
 
     r = K db,   K = -(sum Jr^T Jr)^-1 sum Jr^T Ji
     cov(q) = (Ji + Jr K) P (Ji + Jr K)^T
 
-Ji = d q / d b with the point where it is, Jr = d q / d r at the same pixel; sums run over a grid of pixels.
+Ji = d q / d b for a fixed point, and Jr = d q / d r at the same pixel. Sums run over a grid of pixels.
 """
 
 from __future__ import annotations
@@ -27,16 +26,16 @@ if TYPE_CHECKING:
     from icalib.result.calibration import Calibration
 
 COLUMNS = 36  # cells across the image
-FEWEST_SEEN = 12  # cells: fewer do not say how the camera moved, and the whole image is used
+FEWEST_SEEN = 12  # cells: fewer do not determine the pose change, so that the whole image is used
 
 
 @dataclass(frozen=True)
 class ProjectionMap:
-    """Standard deviation, in the worst direction, of where `camera` projects points at `range_m` [m] (inf: a rotation
-    alone is taken off; else a rotation and a translation).
+    """Standard deviation, in its worst direction, of the projection of points at `range_m` [m] by `camera`. A rotation
+    is removed, and at finite ranges a translation as well.
 
     u (n,), v (m,): middles of cells of the image [px]; sigma (m, n) [px], NaN where the model has no ray; seen (m, n):
-    cells in which it saw corners or tracked points. The motion was fitted over these; over all where there are none.
+    cells with corners or tracked points. The pose change is fitted over these, or over all if there are none.
     """
 
     camera: str
@@ -60,7 +59,7 @@ class ProjectionMap:
 
 
 def projection_uncertainty(c: Calibration, camera: str, range_m: float = np.inf) -> ProjectionMap | None:
-    """Of one camera, from the covariance of its intrinsics and distortion, empirical factors included.
+    """The map of one camera, from the covariance of its intrinsics and distortion, empirical factors included.
 
     None where the model has no ray in the whole image. Zero throughout where both are fixed by the rig file. Raises
     KeyError where `camera` was not calibrated.
@@ -118,8 +117,8 @@ def _moved_by(points: np.ndarray, near: bool) -> np.ndarray:
 
 
 def working_distance(c: Calibration, camera: str) -> float | None:
-    """m: median distance of `camera` from the target's first point while it saw the target, else from the points that
-    it followed; None where it saw neither."""
+    """m: median distance of `camera` from the target's first point while it saw the target, else from its tracked
+    points; None where it saw neither."""
     own = [r for r in c.corner_residuals if r.sensor == camera and len(r.uv)]
     if not own:
         return next((r.distance for r in c.track_residuals if r.sensor == camera), None)

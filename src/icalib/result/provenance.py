@@ -1,4 +1,4 @@
-"""What a result was made from: input files by hash, program versions."""
+"""Inputs of a result: hashes of files, versions of programs."""
 
 from __future__ import annotations
 

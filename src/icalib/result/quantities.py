@@ -1,4 +1,4 @@
-"""Parameters as people read them: degrees, millimetres, milliseconds, and no more digits than are known."""
+"""Parameters as text: degrees, millimetres, milliseconds, with digits down to the standard deviation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
 
 TURNS = ("roll", "pitch", "yaw")
-CLEARLY = 0.5  # of the standard deviation of a prior: a recording that shows a parameter so well says something of it
+SHARPENED = 0.5  # of the standard deviation of a prior: below it the recording contributes most of what is known
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Row:
 
 
 def rows(calibration: Calibration) -> list[Row]:
-    """Every parameter of every sensor, in the order of the groups; poses are relative to the body. Of IMU intrinsics
-    only what the recording sharpened, and one row for the rest; an IMU taken for ideal has none."""
+    """Every parameter of every sensor, in the order of the groups; poses are relative to the body. IMU intrinsics whose
+    prior the recording does not sharpen share one row; an ideal IMU has none."""
     found = []
     for group in shown_groups(in_body_frame(calibration)):
         own = _rows_of(group)
@@ -50,12 +50,12 @@ def rows(calibration: Calibration) -> list[Row]:
 
 
 def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
-    """Of IMU intrinsics, whether the standard deviation is clearly less than that of the prior; True of all else."""
+    """(n,) of IMU intrinsics, whether the standard deviation is below `SHARPENED` times the prior's; else True."""
     given = calibration.rig.get("sensors", {}).get(group.sensor, {})
     prior = given.get("intrinsics") if given.get("type") == "imu" else None
     if group.name != "intrinsics" or not isinstance(prior, dict) or "sigma" not in prior:
         return [True] * len(group.labels)
-    return (group.std < CLEARLY * np.array(prior["sigma"])).tolist()
+    return (group.std < SHARPENED * np.array(prior["sigma"])).tolist()
 
 
 def shown_groups(calibration: Calibration) -> list[ParameterGroup]:
@@ -85,17 +85,17 @@ def shown(value: float, digits: int = 2) -> str:
 
 
 def chi2_words(fit: SensorFit) -> str:
-    """chi^2 over the degrees of freedom that the fit left over."""
+    """Text of chi^2 over the post-fit degrees of freedom."""
     return "n/a (no redundancy)" if fit.chi2_per_dof is None else shown(fit.chi2_per_dof, 3)
 
 
 def dof_words(fit: SensorFit) -> str:
-    """Degrees of freedom that the fit left over; they are sampled, so that none may come out as less than none."""
+    """Text of the post-fit degrees of freedom. They are sampled, and may come out below zero."""
     return f"{max(fit.dof, 0.0):.0f}"
 
 
 def rms_words(fit: SensorFit) -> str:
-    """The RMS of what was measured, with its unit; empty where there is none. Angles here are small: mrad."""
+    """Text of the RMS before whitening, with its unit; empty without one. Angles are small: mrad."""
     if fit.rms is None:
         return ""
     unit, scale = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(fit.unit, (fit.unit, 1.0))

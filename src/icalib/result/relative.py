@@ -1,4 +1,4 @@
-"""Where one sensor is as seen from another: from the joint covariance of both."""
+"""Pose of one sensor relative to another, with its uncertainty from the joint covariance of both."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class RelativePose:
 
 
 def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
-    """Of every pair of mounted sensors, as seen from the first of both. Of one kind only cameras are paired."""
+    """Relative poses of all pairs of mounted sensors; of one kind only cameras are paired."""
     kinds = {name: sensor["type"] for name, sensor in c.rig["sensors"].items()}
     pairs = list(combinations(c.cameras, 2))
     pairs += [(a, b) for a, b in combinations(c.mounted, 2) if kinds[a] != kinds[b]]
@@ -99,8 +99,8 @@ def pose_groups(c: Calibration, sensor: str) -> tuple[ParameterGroup | None, Par
 
 
 def joint_covariance(c: Calibration, groups: Sequence[ParameterGroup | None], none: int = 0) -> np.ndarray:
-    """Of all entries of `groups`, one after the other, empirical factors included; 0 where fixed, and for each None in
-    place of a group `none` zeros: what is exactly known."""
+    """(n, n) covariance of all entries of `groups`, one after the other, empirical factors included; 0 if fixed. A None
+    in place of a group stands for `none` exactly known entries."""
     sizes = [none if g is None else len(g.labels) for g in groups]
     out, at, columns, scale = np.zeros((sum(sizes),) * 2), [], [], []
     for k, g in enumerate(groups):

@@ -15,8 +15,8 @@ from icalib.sensors.records import RowResiduals
 def row_record(
     kind: str, rows: Sequence[ResidualRows], timeline: Timeline, labels: Mapping[str, tuple[str, ...]] | None = None
 ) -> RowResiduals:
-    """One record of all `rows`, which are the kinds of residuals of one factor, at the same times. kind: of the record.
-    labels: of the columns by kind of residual; by default the kind itself, with an axis where there are three."""
+    """One record of all kinds of residuals of one factor, which have the same times. kind: of the record. labels: names
+    of the columns by kind of residual, by default the kind itself, with an axis if there are three."""
     names = {r.kind: _labels(r) for r in rows} | dict(labels or {})
     columns = [(label, r.unit) for r in rows for label in names[r.kind]]
     seconds = timeline.shown(rows[0].seconds, timeline.recording_of(rows[0].seconds))

@@ -175,7 +175,7 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
 
 
 def _residuals(plain: dict[str, Any], of: Callable[[type, str], dict[str, Any]]) -> Residuals:
-    """A record of its own class where a kind of sensor has one for this kind of measurement, else one of rows."""
+    """A record of the class that a kind of sensor has for this kind of measurement, by default `RowResiduals`."""
     own = {record.kind: record for kind in SENSOR_KINDS for record in getattr(facet(kind, "record"), "RECORDS", ())}
     fields = _tuples(plain)
     record = own.get(fields["kind"], RowResiduals)
@@ -208,7 +208,7 @@ def _group(plain: dict[str, Any]) -> ParameterGroup:
 
 
 def _check(c: Calibration) -> None:
-    """Raises ValueError where parts do not fit together."""
+    """Raises ValueError if parts do not fit together."""
     n = len(c.covariance_names)
     for name in c.rig["sensors"]:
         if not NAME.fullmatch(name):

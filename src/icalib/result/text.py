@@ -46,7 +46,7 @@ def summary_html(c: Calibration) -> str:
 
 
 def _rows(c: Calibration) -> list[Row]:
-    """Those of sensors; poses of a target's bodies are many, and stand in calibration.yaml."""
+    """Rows of sensors. The poses of a target's many bodies are in calibration.yaml only."""
     return [row for row in rows(c) if row.sensor not in c.bodies]
 
 

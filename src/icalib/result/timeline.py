@@ -1,4 +1,4 @@
-"""The clock of a result: recordings one after another with a second between them, whatever their own clocks say."""
+"""The clock of a result: recordings one after another with a second between them, whatever their own clocks show."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ PAUSE_S = 1.0
 
 @dataclass(frozen=True)
 class Timeline:
-    """Where recordings stand on the joined clock that was estimated on, and in the result. moved (n,): from the one to
-    the other [s], by recording."""
+    """The recordings on the joined clock of the estimate and on the clock of the result. moved (n,): what to add to
+    times of the first to get those of the second [s], by recording."""
 
     parts: tuple[Part, ...]
     spans: tuple[RecordingSpan, ...]
@@ -33,7 +33,7 @@ class Timeline:
         return cls(parts, tuple(spans), moved)
 
     def shown(self, seconds: np.ndarray, recording: np.ndarray) -> np.ndarray:
-        """(n,) seconds of the result from joined ones, each of a recording (n,)."""
+        """(n,) times of the result from joined times (n,) of the recordings (n,) [s]."""
         return seconds + self.moved[recording]
 
     def recordings_of(self, stream: str) -> np.ndarray:
@@ -46,7 +46,7 @@ class Timeline:
         return np.searchsorted([p.begin for p in self.parts[1:]], seconds, side="right")
 
     def words(self, second: float) -> str:
-        """How a sentence names an instant of the joined clock at which the IMU was running."""
+        """Name of an instant of the joined clock in a sentence. The IMU must have been running."""
         k = int(self.recording_of(np.array(second)))
         own = f"{second - self.parts[k].begin:.3f} s"
         return own if len(self.parts) == 1 else f"{own} of {self.parts[k].name}"

@@ -17,14 +17,14 @@ from icalib.sensors import facet
 from icalib.sensors.camera.assess import rejected_words
 from icalib.validation.causes import INERTIAL, Cause, Misfit, noise_words, unknown_words
 
-SMALL_CHI2 = 0.5  # per post-fit degree of freedom: below this it is worth a warning
-LARGE_FACTOR = 3.0
+SMALL_CHI2 = 0.5  # per post-fit degree of freedom: a warning below it
+LARGE_FACTOR = 3.0  # empirical factor: a warning above it
 BEYOND_FACTOR = 1.5  # times the largest factor: a cross-validation factor above this is a warning
 
 
 def misfit_causes(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], explained: bool) -> Iterator[Cause]:
-    """What is said of the misfit itself: that a cause which is named explains it, that the noise of the IMU is another
-    than stated, which field of the rig file it contradicts, or that the cause is unknown."""
+    """Sentences on the misfit itself. `explained`: a named cause explains it. If none does, the noise of the IMU may
+    differ from the stated one, or a field of the rig file is contradicted, or the cause is unknown."""
     for f in judged:
         if sentence := rejected_words(f):
             yield Cause(sentence, 0.0)
@@ -40,9 +40,8 @@ def misfit_causes(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], 
 
 
 def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
-    """A sentence on residuals that do not fit what the rig file states, by the kind of the sensor. Kinds without one
-    of their own get one that fits all. is_noise: residuals are white and constant over the recording; only then another
-    size of the noise is advised."""
+    """A sentence on residuals that contradict the rig file, by the kind of the sensor, or a general one. is_noise:
+    residuals are white and constant over the recording; only then another size of the noise is advised."""
     sensor = rig.sensors.get(f.sensor)
     if sensor is None:
         return None
@@ -102,7 +101,7 @@ def _times(f: SensorFit) -> float:
 
 
 def _is_noise(found: Estimate, f: SensorFit) -> bool:
-    """Whether residuals of wheels or poses are white, and constant over the recording."""
+    """Whether residuals are white and constant over the recording."""
     rows = rows_of(found.outcome, f.sensor, f.kind)
     return rows is not None and are_noise(rows.weighted)
 
@@ -112,7 +111,8 @@ def _is_small(f: SensorFit) -> bool:
 
 
 def scatter_warnings(factors: np.ndarray, split: bool, held: CrossValidation | None) -> Iterator[str]:
-    """`factors`: of what users take away; `split`: whether they are from segments of the recording."""
+    """Warnings on the scatter of segments. factors: empirical factors of the sensors' parameters; split: the recording
+    was cut into segments."""
     if len(factors) and factors.max() > LARGE_FACTOR:
         yield (
             f"estimates from segments of the recording scatter {factors.max():.1f}x more than predicted; the printed "

@@ -1,4 +1,4 @@
-"""What a reader should know of a result besides its numbers, one sentence each."""
+"""Notes: facts about a result besides its numbers, one sentence each."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from icalib.sensors import ask
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """Of the recordings, then of each kind of sensor."""
+    """Notes on the recordings, then on each kind of sensor."""
     for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
         number = f"recording {k}"
         name = number if span.name == number else f"{number}, {span.name}"

@@ -68,7 +68,7 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
 
 
 def ground_warnings(found: Estimate) -> Iterator[str]:
-    """Where wheels are said to stand on a floor that is not seen."""
+    """Warnings on ground constraints whose floor no LiDAR sees."""
     for factor in of_type(found.problem.factors, GroundFactor):
         if not len(factor.nodes):
             yield (
