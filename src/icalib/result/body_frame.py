@@ -15,7 +15,7 @@ from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 _POSE = (ROTATION, TRANSLATION)
 _NAMES = tuple(spec.name for spec in _POSE)
-_GOOD_PART = 0.1  # in squares 1 %; twice as much would call fewer components undetermined
+_GOOD_PART = 0.1  # 1 % of the variance; twice as much would call fewer components undetermined
 _SI = {"rotation_tolerance_deg": radians(1.0), "translation_tolerance_m": 1.0}  # of one unit of these settings
 
 
