@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.report import image_figures, projection_figures
+from icalib.report.residual_views import ResidualCurve
 from icalib.report.rig_shapes import PEN_UP
 from icalib.report.sections import Section, plot_place
 from icalib.report.tables import Html, element, html
-from icalib.result import Calibration, ImageResiduals
+from icalib.result import Calibration, ImageResiduals, rms_of_images
 
 LEGEND = "pyramids are fields of view"
 _SEEN = {"corners": "corners", "observations": "observations of points that were followed"}
@@ -70,6 +71,13 @@ def _projection_section(c: Calibration) -> Section:
         fixed = f"{name}: intrinsics and distortion are fixed by the rig file, and taken as exact."
         parts.append(element("div", own, "pair") if own else element("p", fixed, "quiet"))
     return Section("projection", "How well each lens is known", _LENS_WORDS, Html("".join(parts)), figures)
+
+
+def curves(r: ImageResiduals) -> Iterator[ResidualCurve]:
+    """RMS [px] of each image with points in use."""
+    rms = rms_of_images(r)
+    some = np.isfinite(rms)
+    yield ResidualCurve(r.kind, r.seconds[some], rms[some, None], (f"RMS of {r.kind} [px]",))
 
 
 def amounts(c: Calibration) -> Iterator[str]:

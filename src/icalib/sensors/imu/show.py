@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from icalib.report import motion_figures
+from icalib.report.residual_views import ResidualCurve
 from icalib.report.sections import Section, plot_place
-from icalib.result import Calibration
+from icalib.result import Calibration, ImuResiduals
 
 _WORDS = (
     f"Whitened: between two keyframes, in units of what the IMU's noise allows. At most {motion_figures.MOST_NODES} "
@@ -19,3 +20,9 @@ def sections(c: Calibration) -> Iterator[Section]:
     if c.imu is not None:
         figures = {"imu-residuals": motion_figures.imu_residuals(c)}
         yield Section("inertial", "IMU residuals", _WORDS, plot_place("imu-residuals"), figures)
+
+
+def curves(r: ImuResiduals) -> Iterator[ResidualCurve]:
+    """Whitened residuals of the intervals, three axes each."""
+    for b, block in enumerate(motion_figures.BLOCKS):
+        yield ResidualCurve(block, r.seconds, r.whitened[:, 3 * b : 3 * b + 3], ("x", "y", "z"))

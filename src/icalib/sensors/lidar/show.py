@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from icalib.report.plot import VIEW, Figure, axis, dots, figure, line, numbers, path_3d, thin
+from icalib.report.residual_views import ResidualCloud, ResidualCurve
 from icalib.report.rig_shapes import CIRCLE, PEN_UP
 from icalib.report.sections import Section, plot_place
 from icalib.report.tables import Html, element, html
@@ -18,6 +19,7 @@ MOST_DOTS = 2500  # in a figure of residuals
 MOST_IN_SPACE = 20_000  # points in a picture of the planes
 BINS = 60
 FEWEST_IN_BIN = 20
+BIN_S = 0.1  # of time in a curve: some thousand points of a usual LiDAR
 WIDEST = 4.0  # of a scale of colours, in RMS of the result
 TOP = 5.0  # of a scale of residuals, in their RMS
 NEARLY_LEVEL = 0.1  # sine of a slope; below it a plane lies along the axes of the world
@@ -49,6 +51,20 @@ def sections(c: Calibration) -> Iterator[Section]:
         parts.append(Html(head + element("div", plots, "pair")))
         figures |= {f"points-{i}": residuals_over_time(r), f"distance-{i}": residuals_over_distance(r)}
     yield Section("points", "LiDAR points on planes", _WORDS, Html("".join(parts)), figures)
+
+
+def curves(r: LidarResiduals) -> Iterator[ResidualCurve]:
+    """RMS [mm] of the points in each stretch of time."""
+    number, of = np.unique(np.floor(r.seconds / BIN_S).astype(np.int64), return_inverse=True)
+    total = np.bincount(of, r.residual.astype(np.float64) ** 2, len(number))
+    rms = np.sqrt(total / np.bincount(of, minlength=len(number)))
+    yield ResidualCurve("", BIN_S * (number + 0.5), 1e3 * rms[:, None], ("RMS [mm]",))
+
+
+def clouds(c: Calibration) -> Iterator[ResidualCloud]:
+    """Points on the planes that they were found to lie on."""
+    for r in c.lidar_residuals:
+        yield ResidualCloud(r.sensor, r.seconds, r.world, np.abs(r.residual.astype(np.float64)))
 
 
 def amounts(c: Calibration) -> Iterator[str]:

@@ -22,7 +22,7 @@ def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
     right = b.Vertical(b.Tabs(rig, b.TextDocumentView(origin="summary", name="summary")), *images[:2])
     # All points of all planes at once hide what moves among them.
     space = [b.Spatial3DView(origin="world", contents=["$origin/**", "- $origin/planes/**"], name="world")]
-    if c.lidar_residuals:
+    if c.planes:
         parts = [f"$origin/{part}/**" for part in ("planes", "target", "way")]
         space.append(b.Spatial3DView(origin="world", contents=parts, name="planes"))
     left = b.Vertical(b.Tabs(*space), b.Tabs(*shown), row_shares=[3, 1])
@@ -35,6 +35,6 @@ def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
 
 
 def _measured(c: Calibration) -> list[str]:
-    """Sensors of which something is left over time."""
-    residuals = (*c.image_residuals, *c.lidar_residuals, *c.wheel_residuals, *c.pose_residuals)
-    return list(dict.fromkeys([*(r.sensor for r in residuals), *([c.imu] if c.imu else [])]))
+    """Sensors with residuals over time, the IMU last."""
+    names = dict.fromkeys(r.sensor for r in c.residuals.values() if len(r.seconds))
+    return sorted(names, key=lambda name: name == c.imu)

@@ -6,18 +6,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
-from icalib.data.measurements import LidarStream
 from icalib.data.recordings import DamagedImageError, Recording, decode
 from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import CalibrationError, RecordingError
 from icalib.result import Calibration, RecordingSpan
-from icalib.rig import Camera, ImuSensor, Lidar, Rig
+from icalib.rig import Camera, ImuSensor, Rig
+from icalib.sensors import answer
 from icalib.sensors.camera.read import has_corners, image_topics, sees
 from icalib.sensors.imu.read import read_imu
-from icalib.sensors.lidar.read import scans
+from icalib.sensors.sensor import Sensor
 from icalib.tools.view.colors import by_value
 from icalib.tools.view.path import CubicPath
 from icalib.tools.view.scene import POINT, place
@@ -26,12 +27,25 @@ from icalib.tools.view.stream import RerunStream
 
 MOST_READINGS = 100_000
 MOST_IMAGES = 600  # of a camera
-MOST_SCANS, MOST_POINTS = 400, 15_000  # of a LiDAR, of a scan
+MOST_SCANS, MOST_POINTS = 400, 15_000  # of a sensor, of a scan
 JPEG_QUALITY = 75
 _EDGE_S = 1.0  # around the result, in which data still are of it
 _HEIGHTS = (2.0, 98.0)  # percentiles between which colours change
 
 Progress = Callable[[str, float], None]
+
+
+class ShownScans(Protocol):
+    """The part of a stream of scans that is shown: see `LidarStream`."""
+
+    @property
+    def stamps_ns(self) -> np.ndarray: ...
+    @property
+    def start(self) -> np.ndarray: ...
+    @property
+    def offset_s(self) -> np.ndarray: ...
+    @property
+    def xyz(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -84,19 +98,18 @@ class Recorded:
 
     def check(self) -> None:
         """Raises where a sensor of the result is not in the recording."""
-        mounted = (*self.rig.lidars, *self.rig.wheels, *self.rig.poses)
-        for sensor in (*([self.rig.imu] if self.rig.imu else []), *mounted):
-            self.recording.where(sensor)
-        for camera in self.rig.cameras:
-            if camera.tracks is None or sees(self.recording, camera):
-                self.recording.where(camera)
+        for sensor in self.rig.sensors.values():
+            if not (isinstance(sensor, Camera) and sensor.tracks is not None) or sees(self.recording, sensor):
+                self.recording.where(sensor)
 
     def log(self, s: RerunStream, progress: Progress) -> list[str]:
         """Logs all, and returns sentences on what was left out."""
         topics = image_topics(self.recording, [c for c in self.rig.cameras if self._pictured(c)])
         imus = () if self.rig.imu is None else (self.rig.imu,)
         work = [(sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in imus]
-        work += [(sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in self.rig.lidars]
+        work += [
+            (sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in self.rig.mounted if sensor.shows_planes
+        ]
         work += [(name, lambda n=name, t=topic: self._images(s, n, t)) for name, topic in topics.items()]
         notes = [f"{c.name}: the recording holds no images of it." for c in self.rig.cameras if c.name not in topics]
         for k, (name, do) in enumerate(work):
@@ -154,8 +167,8 @@ class Recorded:
         notes = [f"{name}: {damaged} damaged images are not shown."] if damaged else []
         return notes + _thinned(name, count, MOST_IMAGES, "images")
 
-    def _scans(self, s: RerunStream, sensor: Lidar) -> list[str]:
-        stream = scans(self.recording, sensor)
+    def _scans(self, s: RerunStream, sensor: Sensor) -> list[str]:
+        stream: ShownScans = answer(sensor.sensor_type, "read", "scans", self.recording, sensor)
         seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
         inside = self._during(sensor.name, seconds)
         heights, path = None, CubicPath.of(self.calibration)
@@ -173,7 +186,7 @@ class Recorded:
             *_thinned(sensor.name, most, MOST_POINTS, "points of a scan"),
         ]
 
-    def points_in_world(self, path: CubicPath, name: str, stream: LidarStream, scan: int, second: float) -> np.ndarray:
+    def points_in_world(self, path: CubicPath, name: str, stream: ShownScans, scan: int, second: float) -> np.ndarray:
         """(n, 3) float32 points of a scan in the world [m], each moved by the pose of the body at its own instant.
 
         They are thinned evenly to MOST_POINTS; those whose instant the trajectory does not reach are left out."""

@@ -9,11 +9,13 @@ from icalib.geometry.targets import target_from_plain
 from icalib.report import rig_shapes
 from icalib.report.ellipsoids import SIGMAS, VERDICT_COLORS, ellipsoids, magnification
 from icalib.report.plot import COLORS
+from icalib.report.residual_views import ResidualCloud
 from icalib.result import Calibration, RecordingSpan
+from icalib.sensors import ask
 from icalib.tools.view.colors import by_value, rgb
 from icalib.tools.view.stream import RerunStream
 
-POINT = 1.5  # radius of a point of a LiDAR, in points of the screen
+POINT = 1.5  # radius of a point of a scan, in points of the screen
 _TARGET, _WAY = "#be185d", "#64748b"
 _WORST_OF_SCALE = 4.0  # of a scale of colours, in RMS of the result
 
@@ -102,15 +104,16 @@ def log_target(s: RerunStream, c: Calibration) -> None:
 
 
 def log_planes(s: RerunStream, c: Calibration) -> None:
-    """Points of LiDARs on the planes that they were found to lie on, coloured by how far off they are."""
-    for r in c.lidar_residuals:
-        of, size = c.recording_of(r.seconds), np.abs(r.residual.astype(np.float64))
+    """Measured points on the planes that they were found to lie on, coloured by the size of their residuals."""
+    cloud: ResidualCloud
+    for cloud in ask("show", "clouds", c):
+        of, size = c.recording_of(cloud.seconds), cloud.size
         top = _WORST_OF_SCALE * float(np.sqrt(np.mean(size**2))) if len(size) else 1.0
         for k, span in enumerate(spans(c)):
             own = of == k
             colors, radius = by_value(size[own], 0.0, top), s.rr.Radius.ui_points(POINT)
-            points = s.rr.Points3D(r.world[own], colors=colors, radii=radius)
-            s.at(f"world/planes/{r.sensor}", span.start, points)
+            points = s.rr.Points3D(cloud.points[own], colors=colors, radii=radius)
+            s.at(f"world/planes/{cloud.sensor}", span.start, points)
 
 
 def _strips(pen: np.ndarray) -> list[np.ndarray]:

@@ -7,37 +7,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icalib.report.motion_figures import BLOCKS
 from icalib.report.plot import AXIS_COLORS, COLORS, REJECTED
-from icalib.result import Calibration, ImageResiduals, rms_of_images
-from icalib.sensors.lidar.record import LidarResiduals
+from icalib.report.residual_views import curves
+from icalib.result import Calibration, ImageResiduals
 from icalib.tools.view.colors import rgb
 from icalib.tools.view.scene import place
 from icalib.tools.view.stream import RerunStream
 
-BIN_S = 0.1  # over which points of a LiDAR are taken together
 _DOT = 3.0  # radius, in points of the screen
 _GOOD, _LEFT_OUT = "#22c55e", "#9ca3af"
 
 
 def log_residuals(s: RerunStream, c: Calibration) -> None:
-    """Of cameras the RMS of each image [px], of LiDARs that of each tenth of a second [mm], of all else whitened."""
+    """Residuals of all sensors over time, as each kind shows them; of images the measured points, too."""
+    for r in c.residuals.values():
+        for curve in curves(c, r):
+            name = re.sub(r"[^0-9a-zA-Z]+", "_", curve.name)
+            entity = f"residuals/{r.sensor}/{name}" if name else f"residuals/{r.sensor}"
+            log_lines(s, entity, curve.seconds, curve.values, curve.labels)
     for r in c.image_residuals:
-        rms = rms_of_images(r)
-        some = np.isfinite(rms)
-        log_lines(s, f"residuals/{r.sensor}/{r.kind}", r.seconds[some], rms[some, None], [f"RMS of {r.kind} [px]"])
         _log_seen(s, c, r)
-    for r in c.lidar_residuals:
-        seconds, rms = rms_of_bins(r)
-        log_lines(s, f"residuals/{r.sensor}", seconds, 1e3 * rms[:, None], ["RMS [mm]"])
-    if c.imu is not None:
-        for b, block in enumerate(BLOCKS):
-            columns = c.imu_residuals.whitened[:, 3 * b : 3 * b + 3]
-            log_lines(s, f"residuals/{c.imu}/{block.replace(' ', '_')}", c.imu_residuals.seconds, columns, "xyz")
-    for r in (*c.wheel_residuals, *c.pose_residuals):
-        for k, label in enumerate(r.labels):
-            entity = f"residuals/{r.sensor}/{re.sub(r'[^0-9a-zA-Z]+', '_', label)}"
-            log_lines(s, entity, r.seconds, r.whitened[:, k : k + 1], [f"{label}, whitened"])
 
 
 def log_states(s: RerunStream, c: Calibration) -> None:
@@ -56,13 +45,6 @@ def log_lines(s: RerunStream, entity: str, seconds: np.ndarray, values: np.ndarr
     s.still(entity, s.rr.SeriesLines(names=list(names), colors=rgb(*colors)))
     n, m = values.shape
     s.over(entity, seconds, s.rr.Scalars.columns(scalars=values.reshape(-1)).partition([m] * n))
-
-
-def rms_of_bins(r: LidarResiduals) -> tuple[np.ndarray, np.ndarray]:
-    """(m,) middle [s] and RMS [m] of the stretches of time in which there are points."""
-    number, of = np.unique(np.floor(r.seconds / BIN_S).astype(np.int64), return_inverse=True)
-    total = np.bincount(of, r.residual.astype(np.float64) ** 2, len(number))
-    return BIN_S * (number + 0.5), np.sqrt(total / np.bincount(of, minlength=len(number)))
 
 
 def _log_seen(s: RerunStream, c: Calibration, r: ImageResiduals) -> None:
