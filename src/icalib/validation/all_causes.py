@@ -1,4 +1,4 @@
-"""All that may be wrong with a result, ranked: what the rig file states, what changes, and the misfit itself."""
+"""Possible causes of a wrong result, ranked: statements of the rig file, changes over the recording, other misfit."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ SEEN = ("corners", "features")
 
 @dataclass(frozen=True)
 class AssessedEstimate:
-    """An estimate, and what is known of it. factor: the largest empirical one, times which formal standard deviations
-    count."""
+    """An estimate with its statistics. factor: the largest empirical one, which scales formal standard deviations."""
 
     inputs: Inputs
     found: Estimate
@@ -46,17 +45,17 @@ class AssessedEstimate:
 
     @property
     def misfit_factor(self) -> float:
-        """Times which the residuals of some sensor are as large as their noise says; at least 1."""
+        """Largest ratio of the residuals of a sensor to their stated noise; at least 1."""
         return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in self.fits)])))
 
 
 def all_causes(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
-    """The grave ones first, each kind by its gain; and notes on the size of the target. `against`: what the rig file
-    states and the data contradict so much that nothing else that is wrong with the estimate is news."""
+    """All causes, the grave ones first, each by its gain; and notes on the size of the target. against: statements of
+    the rig file that the data contradict so strongly that other faults of the estimate may follow from them."""
     inputs, found = judged.inputs, judged.found
     stated, notes = _stated(judged, against)
     few = any(plane_warnings(inputs.rig, found.problem.factors))
-    # How far off those are that lie on planes by chance means nothing.
+    # Residuals of points that lie on planes by chance mean nothing.
     fits = [f for f in judged.fits if (not against or f.kind in SEEN) and not (few and f.kind == ON_PLANES)]
     misfit = Misfit.of(fits)
     known = stated
@@ -71,7 +70,7 @@ def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple
     inputs, factor = judged.inputs, judged.factor
     size = None if inputs.rig.assumes_motion else felt_size(judged.found, factor)
     wrong_size, notes = ((), ()) if against else size_words(inputs, size)
-    # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
+    # Other contradictions may follow from a wrong size, or from the scale of the accelerometer.
     certain, given = is_certain(size), bool(against)
     stated = None if given else relaxed(inputs, judged.found)
     lenses = () if certain else tuple(other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor))
@@ -107,8 +106,8 @@ def _contradicted(
 
 
 def _moves_others(judged: AssessedEstimate, stated: Relaxed, key: Key) -> bool:
-    """Whether any other parameter of a sensor moves by more than four printed standard deviations where that group is
-    neither fixed nor has its prior: then what is stated makes the result wrong."""
+    """Whether the stated value of the group `key` makes the result wrong: without it, another parameter of a sensor
+    moves by more than four printed standard deviations."""
     step, _ = stated.step([key])
     for g in judged.groups:
         if g.columns is None or (g.sensor, g.name) == key or g.name in AUXILIARY:

@@ -53,13 +53,13 @@ from icalib.validation.misfit import scatter_warnings
 from icalib.validation.notes import notes
 from icalib.validation.twin_lenses import twin_lens_notes
 
-ENOUGH_PARTS = 8  # from so many on, t differs from the normal distribution by 8 % at most
-LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
+ENOUGH_PARTS = 8  # segments; with more, t differs from the normal distribution by 8 % at most
+LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of it
 
 
 def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()) -> Calibration:
-    """The result with everything that says how far to trust it. `against`: what the rig file states and the data
-    contradict so much that nothing else that is wrong with the estimate is news."""
+    """The result, with standard deviations, verdicts and warnings. against: statements of the rig file that the data
+    contradict so strongly that other faults of the estimate may follow from them."""
     found = determined.estimate
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
@@ -122,7 +122,7 @@ def _rates(inputs: Inputs) -> dict[str, float]:
 
 
 def _is_assumed(inputs: Inputs, name: str) -> bool:
-    """Whether it is no sensor, but what is assumed in the IMU's place."""
+    """Whether `name` stands for the motion that is assumed in place of an IMU."""
     return inputs.rig.assumes_motion and name == inputs.rig.reference
 
 
@@ -141,7 +141,7 @@ def _mode(inputs: Inputs, block: Block) -> str:
 
 
 def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visited:
-    """Where the solver stood, as users meet it."""
+    """A state of the solver, with values as in the result."""
     t = problem.tolerance
     covariance = restricted_inverse(visit.information * t[:, None] * t, problem.held)
     formal = t * np.sqrt(np.diag(covariance))
@@ -151,7 +151,7 @@ def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visit
 
 
 def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
-    """The value as users meet it: time offsets between raw stamps."""
+    """The value as in the result: time offsets are between raw stamps."""
     value = state.values[block.key]
     if block.name == "time_offset":
         return value - origin_difference(inputs.measurements, inputs.stream(block.sensor))
@@ -159,9 +159,9 @@ def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
 
 
 class _NoiseShare(NamedTuple):
-    """share (B,): of the formal variances that noise of the measurements contributes; ratio (B,): standard deviation
-    that the recording shows over this part. weight: the root of how many times priors on nuisance parameters count;
-    their errors contribute the rest, the same in all parts of a recording."""
+    """share (B,): part of the formal variances that noise of the measurements contributes; errors of nuisance
+    parameters contribute the rest, which is common to all segments. ratio (B,): empirical over formal standard
+    deviation of the first part. weight: square root of how many times priors on nuisance parameters count."""
 
     share: np.ndarray
     ratio: np.ndarray
@@ -233,14 +233,13 @@ def _is_shown(inputs: Inputs, block: Block, spec: ParameterSpec) -> bool:
 
 
 def _final_verdict(formal: Verdict, size: float) -> Verdict:
-    """By the printed standard deviation, `size` tolerances; a direction that the data leave open stays undetermined."""
+    """The verdict by the printed standard deviation, `size` tolerances; unobservable directions stay undetermined."""
     return formal if formal == "undetermined" else by_size(size)
 
 
 def _empirical_variance(found: Estimate, parts: Parts | None, white: np.ndarray) -> np.ndarray:
-    """(B,) variances as the spread over parts of the recording shows them, or over feature tracks where it is larger,
-    plus what places in the image and on the target show beyond `white` noise (B,); this where there is nothing to
-    split."""
+    """(B,) variances by the scatter of segments of the recording, or of feature tracks if that is larger, plus the
+    excess over `white` noise (B,) of regions of the image and of the target. Without segments and tracks: `white`."""
     if parts is None and not of_type(found.problem.factors, FeatureFactor):
         return white
     clusters = cluster_covariances(found.problem, found.outcome)
@@ -252,7 +251,7 @@ def _empirical_variance(found: Estimate, parts: Parts | None, white: np.ndarray)
 
 
 def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:
-    """How far the standard deviations rest on few parts, and what makes them more."""
+    """A note if standard deviations rest on few segments, with advice to get more."""
     if inputs.imu is not None:
         more = "record longer, and leave `segments` at 8 or more"
     else:
@@ -265,8 +264,8 @@ def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:
 
 
 def few_factor(parts: int) -> float:
-    """By how much a standard deviation from the spread of few parts is to be larger, so that 68 % lie within: Student's
-    t distribution with parts - 1 degrees of freedom."""
+    """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within: Student's t
+    distribution with parts - 1 degrees of freedom."""
     return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0
 
 
@@ -281,8 +280,7 @@ def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:
 
 
 def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.ndarray:
-    """(K,) the recording of each node; without an IMU, that of the image or the pose which is taken
-    there."""
+    """(K,) the recording of each keyframe; without an IMU, that of the image or the pose at it."""
     if inputs.imu is not None:
         return np.repeat(np.arange(len(state.starts)), np.diff((*state.starts, len(state.seconds))))
     if not inputs.rig.cameras:
@@ -294,7 +292,7 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
 
 
 def _residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[Residuals]:
-    """Those that the kinds of sensors keep; by default all rows of all factors of a sensor."""
+    """Records of residuals by kind of sensor; by default all rows of all factors of a sensor."""
     outcome = found.outcome
     for kind in SENSOR_KINDS:
         own = facet(kind, "assess")
@@ -323,6 +321,6 @@ def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...
 
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
-    """(n,) empirical factors of what users take away."""
+    """(n,) empirical factors of the parameters of sensors, without edge bloom."""
     own = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
     return np.concatenate([np.ones(0), *(g.factor for g in own if g.factor is not None)])

@@ -1,4 +1,4 @@
-"""Cameras that do not fit: taken for one another, or with the lens of another."""
+"""Cameras that are swapped, or that have the intrinsics of another."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from icalib.sensors.camera.spec import INTRINSICS
 from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 GIVEN = (ROTATION, TRANSLATION, INTRINSICS)
-FAR = 0.5  # of what guesses are worth: 5 cm, 3 deg, 8 px
-MUCH_NEARER = 0.3  # times as far, in all that is given
+FAR = 0.5  # prior standard deviations of initial guesses: 5 cm, 3 deg, 8 px
+MUCH_NEARER = 0.3  # ratio of distances
 OTHER_LENS, CLEARLY = 0.015, 3.0  # of the focal length; standard deviations
-NEARER = 0.5  # times as far, in fx, fy, cx and cy
+NEARER = 0.5  # ratio of distances, of fx, fy, cx and cy
 
 
 def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Iterator[str]:
-    """Pairs of which each is found about where the rig file has the other, and far from where it should be."""
+    """Sentences on pairs of cameras of which each has about the values that the rig file states for the other."""
     found = {(g.sensor, g.name): g.value for g in groups}
     for a, b in combinations(cameras, 2):
         own = _away(a, found, a.name), _away(b, found, b.name)
@@ -35,8 +35,8 @@ def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Ite
 
 
 def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: float) -> Iterator[tuple[str, str, float]]:
-    """Cameras whose intrinsics the rig file fixes at what cannot be theirs: name, sentence, and by how much chi^2 falls
-    without that. `factor`: the largest empirical one."""
+    """Cameras whose fixed intrinsics contradict the data: name, sentence, and the decrease of chi^2 without them.
+    factor: the largest empirical factor."""
     given = {c.name: c.intrinsics.value for c in cameras}
     for found in steps:
         value = given[found.camera]
@@ -61,7 +61,7 @@ def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: flo
 
 
 def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -> float:
-    """How far camera `name` is from what the rig file gives of `camera`, in what guesses are worth."""
+    """Distance of camera `name` from the stated values of `camera`, in prior standard deviations of initial guesses."""
     away = 0.0
     for spec in GIVEN:
         given, value = getattr(camera, spec.name).value, found.get((name, spec.name))

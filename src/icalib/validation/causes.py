@@ -1,8 +1,8 @@
-"""What may be wrong, ranked by how much of the misfit it explains.
+"""Possible causes, ranked by the part of the misfit that they explain.
 
-Each cause is a test with a gain: by how much chi^2 falls where the cause is taken into account. Causes that explain
-nothing of a misfit are not named, however significant they are. Where no cause explains it, the message says so and
-lists what was checked; another noise density is advised only where `fitting_noise` shows that it is all.
+Each cause is a test with a gain: the decrease of chi^2 if the cause is taken into account. Significant causes that
+explain nothing of the misfit are not named. If no cause explains the misfit, the message says so and lists the checks.
+Another noise density is advised only if `fitting_noise` shows that it explains all.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.timeline import Timeline
 from icalib.validation.disturbance import Disturbance, Lag, disturbance, lag_between_cameras
 
-# Of the misfit: robust weights hide some of a gain, and what is not the cause gains below 0.01.
+# Share of the misfit: robust weights hide part of a gain; others than the cause gain below 0.01.
 EXPLAINS = 0.1
 # Of what separate parameters for each segment gain. In simulation one change reaches 0.36 to 0.99, less the farther it
 # is from a boundary; on EuRoC, where lens and board do not follow the model, the best change reaches 0.04.
@@ -34,7 +34,7 @@ INERTIAL = ("gyroscope", "accelerometer")
 
 @dataclass(frozen=True)
 class Cause:
-    """sentence: what is wrong, and what to do; gain: the fall of chi^2; grave: the result is not to be used."""
+    """sentence: the fault, and what to do; gain: the decrease of chi^2; grave: the result must not be used."""
 
     sentence: str
     gain: float
@@ -43,7 +43,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Misfit:
-    """fits: those with residuals larger than the stated noise predicts; chi2: how much all are beyond their degrees of
+    """fits: those with residuals larger than the stated noise predicts; chi2: their sum beyond the degrees of
     freedom."""
 
     fits: tuple[SensorFit, ...]
@@ -83,8 +83,8 @@ def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
 def changing(
     inputs: Inputs, found: Estimate, parts: Parts | None, misfit: Misfit, scattering: bool, timeline: Timeline
 ) -> Iterator[Cause]:
-    """What changes over the recording, comes at one time, or follows the image speed. scattering: segments disagree
-    by more than noise predicts."""
+    """Causes that change over the recording, act at one time, or follow the image speed. scattering: segments scatter
+    more than noise predicts."""
     lag = lag_between_cameras(inputs, found)
     if lag is not None:
         yield Cause(_lag_words(lag), lag.gain, True)
@@ -113,7 +113,7 @@ def noise_words(inputs: Inputs, noise: NoiseFit) -> str:
 
 
 def unknown_words(misfit: Misfit, noise: NoiseFit | None) -> str:
-    """That the model lacks something, and what was checked."""
+    """A sentence that the model is incomplete, with the checks that were made."""
     pattern = ""
     if noise is not None and not noise.is_white:
         pattern = ", and are no white noise"

@@ -22,8 +22,8 @@ FOLLOWS_SPEED = 0.25  # of the squared residuals, in each of both cameras
 
 @dataclass(frozen=True)
 class Disturbance:
-    """start, end: of the window [s, joined clock]; share: of the misfit; gain: chi^2 beyond the usual in it; sensors:
-    those whose residuals are large in it."""
+    """start, end: of the window [s, joined clock]; share: of the misfit; gain: its chi^2 beyond that of a usual window;
+    sensors: those with large residuals in it."""
 
     start: float
     end: float
@@ -69,8 +69,8 @@ def _chi2_over_time(found: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class Lag:
-    """`second` is exposed `seconds` after `first`, by residuals that follow the image speed; share: of the squared
-    residuals that this explains; gain: of chi^2."""
+    """`second` is exposed `seconds` after `first`, according to residuals that follow the image speed. share: of the
+    squared residuals that the lag explains; gain: decrease of chi^2."""
 
     first: str
     second: str
@@ -80,7 +80,7 @@ class Lag:
 
 
 def lag_between_cameras(inputs: Inputs, found: Estimate) -> Lag | None:
-    """Of the first two cameras of a rig without an IMU, whose images are taken for simultaneous."""
+    """The lag between the first two cameras of a rig without an IMU, whose images count as simultaneous."""
     cameras = pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)
     if inputs.rig.imu is not None or len(cameras) < 2:
         return None
@@ -105,7 +105,7 @@ def lag_between_cameras(inputs: Inputs, found: Estimate) -> Lag | None:
 def _image_velocity(
     image: np.ndarray, point: np.ndarray, uv: np.ndarray, seconds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 2) px/s of each corner from the images before and after; (N,) whether both show it."""
+    """Velocity (N, 2) px/s of each corner from the images before and after; (N,) whether both show it."""
     count = int(point.max(initial=-1)) + 1
     table = np.full((len(seconds), count, 2), np.nan)
     table[image, point] = uv

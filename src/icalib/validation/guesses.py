@@ -22,7 +22,7 @@ GRID = 12  # rays of an image, each way
 
 
 def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[str]:
-    """One sentence for each group of a sensor whose guess is farther from the result than guesses are worth."""
+    """One sentence for each group whose initial guess is farther from the result than its prior uncertainty."""
     found = {(g.sensor, g.name): g for g in groups}
     for sensor, name, parameter in groups_of(inputs.asked or inputs.rig):
         group, guess = found.get((sensor.name, name)), parameter.value
@@ -39,7 +39,7 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
 
 
 def lens_off(camera: Camera, name: str, found: dict[tuple[str, str], ParameterGroup]) -> float:
-    """RMS of the pixels by which the lens that was found moves where its group `name` is as the rig guesses."""
+    """RMS [px] by which projections move if the group `name` of the estimated lens is replaced by its initial guess."""
     model, values = camera_model(camera.model), {own: found[camera.name, own].value for own in LENS}
     guess = np.concatenate(list((values | {name: getattr(camera, name).value}).values()))
     sides = [np.linspace(0.0, n - 1.0, GRID) for n in camera.resolution]

@@ -1,4 +1,4 @@
-"""Half of a recording predicted by the other, as users meet it."""
+"""Two-fold cross-validation, as in the result."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from icalib.result import CrossValidation, PredictedFit
 
 
 def held_out(parts: Parts | None, assumed: Collection[str]) -> CrossValidation | None:
-    """None where the recording cannot be split, or its halves share nothing that both know. Sensors that are `assumed`
-    have no fits; none has, where the solutions of the halves are too far apart for residuals to mean anything."""
+    """None if the recording cannot be split, or if no parameter is known to both halves. `assumed` sensors have no
+    fits; no sensor has if the solutions of the halves are too far apart to be linearised."""
     found = None if parts is None else predict(parts)
     if parts is None or found is None:
         return None

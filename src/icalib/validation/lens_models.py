@@ -1,6 +1,6 @@
 """Warns where the camera model of the rig file does not follow the lens, and names a model that does.
 
-Models are compared on held-out images. Each is fitted to every other image, with poses and board shape free. It is
+Models are compared on test images. Each is fitted to every other image, with poses and board shape free. It is
 judged by the residuals in the images between, where only poses are fitted. All models are given the same corners, as
 the detector found them: a corner is left out only where no model explains it.
 """
@@ -26,7 +26,7 @@ from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 from icalib.sensors.camera.corner_outliers import rejected
 
-MOST_IMAGES = 40  # that are compared, half of them held out; the time is proportional to it
+MOST_IMAGES = 40  # that are compared, half of them tested; the time is proportional to it
 FEWEST_IMAGES = 4  # in each half; with fewer no model is fitted
 FEWEST_CORNERS = 8  # in an image; its pose takes up six of their 16 coordinates
 BETTER = 0.9  # of the own model's RMS: another that leaves more is not named
@@ -35,28 +35,28 @@ SIGN_TEST_SIGMAS = 3.0  # of the number of images that another model fits better
 
 
 @dataclass(frozen=True)
-class _HeldOut:
-    """A model as adjusted to the `fitted` images, and what it leaves in the M `held_out` images."""
+class _Trial:
+    """A model as adjusted to the `fitted` images, and what it leaves in the M `tested` images."""
 
     model: CameraModel
     fitted: Adjusted
-    held_out: Adjusted
+    tested: Adjusted
 
     @property
     def residuals(self) -> np.ndarray:
-        """(N, 2) px: those of all corners, of the fitted and then of the held-out images."""
-        return np.concatenate([self.fitted.residual, self.held_out.residual])
+        """(N, 2) px: those of all corners, of the fitted and then of the test images."""
+        return np.concatenate([self.fitted.residual, self.tested.residual])
 
     @property
     def squared_error(self) -> np.ndarray:
-        """(M,) px^2: the sum over the used corners of each held-out image."""
-        seen, square = self.held_out.seen, (self.held_out.residual**2).sum(axis=1)
+        """(M,) px^2: the sum over the used corners of each test image."""
+        seen, square = self.tested.seen, (self.tested.residual**2).sum(axis=1)
         return seen.sum_by_image(np.where(seen.used, square, 0.0))
 
     @property
     def corners(self) -> int:
-        """The number of used corners in all held-out images."""
-        return int(self.held_out.seen.used.sum())
+        """The number of used corners in all test images."""
+        return int(self.tested.seen.used.sum())
 
     @property
     def rms(self) -> float:
@@ -103,7 +103,7 @@ def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, flo
 
 def compare_models(
     factor: CornerFactor, out: CornerOutput, state: State, settings: Settings
-) -> tuple[_HeldOut | None, _HeldOut | None]:
+) -> tuple[_Trial | None, _Trial | None]:
     """The camera's own model, and the plainest one that is clearly better. The factor's corners are the detector's.
 
     The first is None where there are too few images, or the own model cannot be fitted to them. The second is None
@@ -112,12 +112,12 @@ def compare_models(
     halves = _halves(with_circle_centres(factor, state), out, state)
     if halves is None:
         return None, None
-    rows, fitted, held_out = halves
+    rows, fitted, tested = halves
     params = factor.lens(state)
     models = [factor.model, *(camera_model(name) for name in CAMERA_MODELS if name != factor.model.name)]
     starts = [params, *(initial_parameters(m, factor.model, params, fitted) for m in models[1:])]
     pairs = [(m, start) for m, start in zip(models, starts, strict=True) if start is not None]
-    first = _found(_cross_validated(model, start, fitted, held_out) for model, start in pairs)
+    first = _found(_cross_validated(model, start, fitted, tested) for model, start in pairs)
     if not first:
         return None, None
     # Corners that the own model rejects may be those that another explains.
@@ -129,11 +129,11 @@ def compare_models(
     return own, None if own is None else _clearly_better(own, [fit for fit in second if fit is not own])
 
 
-def _found(fits: Iterable[_HeldOut | None]) -> list[_HeldOut]:
+def _found(fits: Iterable[_Trial | None]) -> list[_Trial]:
     return [fit for fit in fits if fit is not None]
 
 
-def _clearly_better(own: _HeldOut, others: list[_HeldOut]) -> _HeldOut | None:
+def _clearly_better(own: _Trial, others: list[_Trial]) -> _Trial | None:
     """The plainest of the others that are about as good as the best, if it is clearly better than the own model."""
     if not others:
         return None
@@ -146,30 +146,28 @@ def _clearly_better(own: _HeldOut, others: list[_HeldOut]) -> _HeldOut | None:
     return best if best.rms < BETTER * own.rms and not by_chance else None
 
 
-def _cross_validated(
-    model: CameraModel, params: np.ndarray, fitted: ImagePoints, held_out: ImagePoints
-) -> _HeldOut | None:
-    """The model, adjusted from `params` (P,) to the images `fitted`, in the images `held_out`.
+def _cross_validated(model: CameraModel, params: np.ndarray, fitted: ImagePoints, tested: ImagePoints) -> _Trial | None:
+    """The model, adjusted from `params` (P,) to the images `fitted`, in the images `tested`.
 
     None where an image does not determine its pose.
     """
     with suppress(np.linalg.LinAlgError):
         fit = adjust(model, params, fitted)
-        return _HeldOut(model, fit, adjust(model, fit.params, held_out, fit.shape))
+        return _Trial(model, fit, adjust(model, fit.params, tested, fit.shape))
     return None
 
 
-def _again(fit: _HeldOut, used: np.ndarray) -> _HeldOut | None:
+def _again(fit: _Trial, used: np.ndarray) -> _Trial | None:
     """The fit to the corners `used` (N,) bool of both halves, from where it is."""
     n = len(fit.fitted.residual)
-    fitted, held_out = replace(fit.fitted.seen, used=used[:n]), replace(fit.held_out.seen, used=used[n:])
-    return _cross_validated(fit.model, fit.fitted.params, fitted, held_out)
+    fitted, tested = replace(fit.fitted.seen, used=used[:n]), replace(fit.tested.seen, used=used[n:])
+    return _cross_validated(fit.model, fit.fitted.params, fitted, tested)
 
 
 def _halves(
     factor: CornerFactor, out: CornerOutput, state: State
 ) -> tuple[np.ndarray, ImagePoints, ImagePoints] | None:
-    """At most `MOST_IMAGES` images, spread over the recording: every other one to be fitted, the rest held out.
+    """At most `MOST_IMAGES` images, spread over the recording: every other one to be fitted, the rest tested.
 
     Returns the corners' rows (N,) int in the stream, and the points of both. All corners of the images are in them;
     those of the estimate are used. Points are in the camera frame, by lens and poses of `state`; uv is corrected for

@@ -1,4 +1,4 @@
-"""What a value of the rig file looks like that the data contradict: an inverse, another frame, another unit."""
+"""Likely mistakes behind a contradicted value of the rig file: an inverse, another frame, another unit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from icalib.rig import Rig
 from icalib.rig.kinds import SPECS
 from icalib.sensors import answer
 
-NEAR_RAD = 0.15  # by which a rotation is off that another frame explains
+NEAR_RAD = 0.15  # rad: largest error of a rotation that another frame explains
 NEARLY = 0.1  # of a number in another unit
 TURNS = [  # about right angles, and reflections
     np.array(axes, dtype=np.float64)[list(order)]
@@ -25,8 +25,8 @@ IMAGE_SIZES = (2.0, 0.5, 4.0, 0.25)
 def looks_like(
     rig: Rig, key: tuple[str, str], value: np.ndarray, found: np.ndarray, rotation: np.ndarray | None = None
 ) -> str:
-    """A sentence that begins with a space, or nothing. value: that of the rig file; found: by the data, which show the
-    sensor's `rotation` (3, 3), too."""
+    """A sentence that begins with a space, or an empty one. value: of the rig file; found: by the data, with the
+    sensor's `rotation` (3, 3)."""
     name = key[1]
     if name == "rotation":
         return _frames(value, found)

@@ -1,4 +1,4 @@
-"""Sensors whose residuals are not what the rig file says of their noise."""
+"""Sensors whose residuals contradict the stated noise."""
 
 from __future__ import annotations
 

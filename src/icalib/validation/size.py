@@ -1,4 +1,4 @@
-"""What is said of the size of the target, which the rig file gives and the accelerometer feels."""
+"""The size of the target: stated by the rig file, and shown by the accelerometer."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ SCALE = "scale"  # of all lengths that a sensor reports; its prior is `scale_sig
 
 
 def felt_size(found: Estimate, factor: float) -> TargetSize | None:
-    """Of the target, its standard deviation `factor` times the formal one; None where nothing shows it, or the solver
-    did not converge."""
+    """Size of the target by the accelerometer, with `factor` times its formal standard deviation. None if nothing shows
+    it, or if the solver did not converge."""
     if not found.outcome.converged:
         return None
     try:
         size = target_size(found.problem, found.outcome.state)
-    except EstimationError:  # the way to another size leads off the map
+    except EstimationError:  # a step to another size leaves the domain of the problem
         return None
     return None if size is None else TargetSize(size.ratio, factor * size.std)
 
 
 def is_certain(size: TargetSize | None) -> bool:
-    """Whether no accelerometer could be as wrong as the size that it shows."""
+    """Whether the size differs by more than any error of an accelerometer."""
     return size is not None and abs(size.ratio - 1.0) > max(BEYOND, CLEARLY * size.std)
 
 
 def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What to warn of, and what to note."""
+    """Warnings and notes."""
     if size is None:
         return (), ()
     rig, digits = inputs.rig, max(2, 1 - int(np.floor(np.log10(size.std))))
@@ -57,14 +57,15 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...]
 
 
 def scale_notes(inputs: Inputs, size: TargetSize | None) -> Iterator[str]:
-    """What all lengths rest on, where that is one thing only."""
+    """A note if all lengths come from a single source."""
     sources = scale_sources(inputs, size)
     if len(sources) == 1:
         yield f"every length comes from {sources[0]} alone: 1 % error there is 1 % in every length here."
 
 
 def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
-    """What shows how long a metre is. `size`: of the target by the accelerometer, None where that does not show it."""
+    """Sources of the metric scale, in words. size: of the target by the accelerometer, None if that does not show
+    it."""
     rig = inputs.asked or inputs.rig
     target = rig.has_target and bool(rig.cameras)
     has_imu = rig.imu is not None and not rig.imu.assumed
@@ -77,8 +78,8 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
 
 
 def scale_causes(inputs: Inputs, groups: Sequence[ParameterGroup], size: TargetSize | None) -> Iterator[Cause]:
-    """Sizes of the target and scales of sensors that the others contradict. Each has a prior about 1, and is
-    pulled from it by less than all disagree, as both ends give way."""
+    """Sizes of the target and scales of sensors that contradict one another. Each has a prior about 1, and differs from
+    it by less than the contradiction, as all of them give way."""
     sigmas = {SIZE: inputs.rig.target.size_sigma} if size is None else {}
     sensors = inputs.rig.sensors.values()
     sigmas |= {(s.name, SCALE): sigma for s in sensors if (sigma := getattr(s, "scale_sigma", 0.0)) > 0.0}

@@ -1,4 +1,4 @@
-"""Warnings of values that the rig file fixes or gives a prior, and that the data contradict."""
+"""Warnings on fixed values and priors of the rig file that the data contradict."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequ
 
 
 def stated_words(inputs: Inputs, c: Contradiction) -> str:
-    """Both values, their standard deviations, how far apart they are, and what would explain it."""
+    """A sentence with both values, their standard deviations, their distance, and a likely mistake."""
     spec = inputs.specs[c.key]
     labels, (unit, scale) = spec.labels, spec.shown_unit
     stated, unit = c.parameter.sigma, f" {unit}" if unit else ""
@@ -54,6 +54,6 @@ def scaled(values: np.ndarray, scale: float) -> str:
 
 
 def _rounded(value: float, sigma: float) -> str:
-    """To a tenth of its standard deviation."""
+    """Text of a value, with digits down to a tenth of its standard deviation."""
     digits = 1 - int(np.floor(np.log10(sigma))) if sigma > 0.0 else 6
     return f"{value:.{min(max(digits, 0), 12)}f}"

@@ -22,7 +22,7 @@ from icalib.sensors.camera.features.feature_factor import FeatureFactor
 
 MOST_POINTS = 400  # that lenses are compared at
 OTHER_FOCAL = 0.02  # of the focal length: sets that differ by less are one
-MOST_CHI2 = 16.0  # between two lenses, four standard deviations: noise explains less
+MOST_CHI2 = 16.0  # between two lenses, four standard deviations: noise causes less
 
 
 def twin_lens_notes(inputs: Inputs, found: Estimate, fits: list[SensorFit]) -> Iterator[str]:
