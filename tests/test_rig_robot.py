@@ -167,7 +167,7 @@ def test_an_imu_and_a_pose_sensor_are_enough(tmp_path):
 
 def test_without_an_imu_a_pose_sensor_shows_the_motion(tmp_path):
     mocap, wheels = "sensors:\n  mocap0: {type: pose}\n", "  wheel0: {type: wheels}\n"
-    assert load(tmp_path, mocap + wheels).body == "mocap0"
+    assert load(tmp_path, mocap + wheels).reference == "mocap0"
     assert load(tmp_path, mocap + "  slam0: {type: pose, kind: relative}\n").imu is None
     assert "sensors.mocap0: is the only sensor; add the sensors to calibrate" in complaint(tmp_path, mocap)
     relative = mocap.replace("pose}", "pose, kind: relative}")
@@ -371,7 +371,7 @@ def test_what_is_wrong_with_kinds_of_wheels_is_named(tmp_path, old, new, words):
 def test_examples_of_the_page_are_right(tmp_path):
     page = (Path(__file__).parents[1] / "docs/rig-file.md").read_text(encoding="utf-8")
     no_imu, *blocks = [block.split("```")[0] for block in page.split("```yaml\nsensors:\n")[2:]]
-    assert load(tmp_path, "sensors:\n" + no_imu).body == "mocap"
+    assert load(tmp_path, "sensors:\n" + no_imu).reference == "mocap"
     rig = load(tmp_path, "sensors:\n  imu0: {type: imu}\n" + "".join(blocks))
     assert ([s.name for s in rig.lidars], [w.name for w in rig.wheels]) == (["lidar0"], ["wheel0"])
     assert [s.name for s in rig.poses] == ["mocap0"]

@@ -186,5 +186,5 @@ def test_correct_or_refused(recording, sees: str, imu: bool, others: str, known:
     assert result.converged, result.status
     assert wrong(result, rig, simulation) == []
     determined = {g.sensor for g in result.groups if "determined" in g.verdict}
-    placed = {s.name for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)} - {rig.reference}
+    placed = {s.name for s in rig.mounted} - {rig.reference}
     assert placed <= determined

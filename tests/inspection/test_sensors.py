@@ -87,7 +87,7 @@ def test_what_can_be_calibrated_is_not_refused(everything, tmp_path, parts, sens
     assert found.verdict != "no", found.findings
     assert not any("no images" in f.sentence for f in found.findings)
     rig = drafted(folder)
-    every = (*((rig.imu,) if rig.imu else ()), *rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)
+    every = rig.sensors.values()
     assert [s.name for s in every] == sensors.split()
 
 

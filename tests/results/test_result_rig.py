@@ -22,7 +22,7 @@ ESTIMATED = [("cam0", "rotation"), ("cam0", "intrinsics"), ("lidar0", "translati
 
 
 def parameter(rig: Any, sensor: str, name: str) -> Parameter:
-    (found,) = (s for s in (*rig.cameras, *rig.lidars, *rig.wheels) if s.name == sensor)
+    found = rig.sensors[sensor]
     return getattr(found, name)
 
 

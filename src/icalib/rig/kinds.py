@@ -1,4 +1,4 @@
-"""All types of sensors, and all definitions of parameters, from the list of kinds."""
+"""All types of sensors and all definitions of parameters, from the list of kinds."""
 
 from __future__ import annotations
 

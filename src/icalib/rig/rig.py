@@ -1,4 +1,4 @@
-"""What is on the robot and what is to be calibrated: the rig."""
+"""The rig: all sensors of a robot, their target and the settings."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Rig:
 
     @property
     def has_target(self) -> bool:
-        """Whether there is a target; else all cameras have feature tracks."""
+        """Whether there is a target. Without one all cameras have feature tracks."""
         return len(self.target.bodies) > 0
 
     @property
@@ -101,10 +101,10 @@ class Rig:
     @property
     def reference(self) -> str:
         """Name of the sensor whose frame and clock the estimator uses: extrinsics of the rig are relative to it."""
-        return self.first_seeing if self.imu is None else self.imu.name
+        return self.reference_without_imu if self.imu is None else self.imu.name
 
     @property
-    def first_seeing(self) -> str:
+    def reference_without_imu(self) -> str:
         """Name of the reference sensor of a rig without an IMU: the first that determines the motion alone, or
         else the first that does beside an IMU."""
         alone = (s for s in self.mounted if s.gives_motion_without_imu(self.has_target))
@@ -112,7 +112,7 @@ class Rig:
 
     @property
     def moves_by_poses(self) -> bool:
-        """Whether without an IMU the first pose sensor shows the motion: no camera sees a target."""
+        """Whether a rig without an IMU takes its motion from the first pose sensor: no camera sees a target."""
         return bool(self.poses) and not (self.cameras and self.has_target)
 
     @property
@@ -122,7 +122,7 @@ class Rig:
 
     @property
     def assumes_motion(self) -> bool:
-        """Whether an assumption stands in for the IMU."""
+        """Whether an assumption of smooth motion replaces the IMU."""
         return self.imu is not None and self.imu.assumed
 
     def only(self, *names: str, **fields: Any) -> Rig:

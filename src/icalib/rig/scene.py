@@ -1,4 +1,4 @@
-"""Parameters of what the sensors see: the target, its bodies, planes, and the frames of pose sensors."""
+"""Parameters of the scene: the target, its bodies, planes, and the frames of absolute poses."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from math import radians
 from icalib.sensors.parameter_spec import AXES, ParameterSpec
 from icalib.sensors.sensor import ROTATION, TRANSLATION
 
-# True lengths of the target over those of the rig file.
+# Ratio of true lengths of the target to those in the rig file.
 SIZE = ParameterSpec("size", 1, "nuisance", "", ("size",), 1e-2, 0.1)
-# How a body departs from its drawing: see `sensors.camera.board.shape_basis`.
+# Deviation of a body from its design: see `sensors.camera.board.shape_basis`.
 BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
-# In the plane: what printing and mounting do to second order. A turn, a shift and the scale are left out: the first two
-# belong to the board's pose, and the scale is what tag_size says.
+# Deviations in the plane by printing and mounting, to second order. A rotation, a shift and the scale are left out: the
+# first two belong to the pose of the board, and the scale to its size.
 IN_PLANE_LABELS = ("stretch", "shear", "x_xx", "y_xx", "x_xy", "y_xy", "x_yy", "y_yy")
 SHAPE_LABELS = BOW_LABELS + IN_PLANE_LABELS
 SHAPE = ParameterSpec(
@@ -28,8 +28,8 @@ SHAPE = ParameterSpec(
     by_images=True,
     motion="show the target from more sides and closer",
 )
-# Nobody guesses which way is up in the scene, nor where walls and the frames of poses are: guesses of these have no
-# weight. If they moved with a sensor, a direction would keep little of the uncertainty of the sensor's guess.
+# The prior sigma of scene parameters is wide, as nobody guesses the vertical, walls or frames. A direction in which
+# they move with a sensor then keeps the prior uncertainty of the sensor.
 TILT = ParameterSpec(
     name="tilt",
     size=2,

@@ -16,12 +16,12 @@ TABLE = ("columns", "time_unit")
 
 
 def parameter_fields(sensor: type[Sensor]) -> tuple[str, ...]:
-    """The fields that `parameters` reads."""
+    """Names of the fields that `parameters` reads."""
     return (*(spec.name for spec in sensor.stated()), "clock_restarts")
 
 
 def parameters(found: dict[str, YamlValue], specs: Iterable[ParameterSpec]) -> dict[str, Any]:
-    """The parameters `specs` of a sensor and how its clock goes, as far as it is said."""
+    """Arguments of a sensor: the parameters of `specs` and clock_restarts, where the rig file has them."""
     groups: dict[str, Any] = {spec.name: parameter(found[spec.name], spec) for spec in specs if spec.name in found}
     if "clock_restarts" in found:
         groups["clock_restarts"] = found["clock_restarts"].boolean()
@@ -41,7 +41,7 @@ def choice_or(found: dict[str, YamlValue], name: str, kind: Any, default: Any) -
 
 
 def axes_or_none(found: dict[str, YamlValue], name: str) -> Axes | None:
-    """Three columns with their signs, each column once."""
+    """Three recorded columns with their signs, each column once; None if the field is missing."""
     if name not in found:
         return None
     entries = [entry.text() for entry in found[name].items()]
@@ -58,7 +58,7 @@ def path_or(found: dict[str, YamlValue], default: str) -> str:
 
 
 def table_layout(found: dict[str, YamlValue]) -> TableLayout:
-    """How the sensor's table is written, as far as it is said."""
+    """The layout of the sensor's table, by the fields of `TABLE`."""
     if not set(TABLE) & set(found):
         return PLAIN_TABLE
     columns = tuple(item.text() for item in found["columns"].items()) if "columns" in found else ()

@@ -1,4 +1,4 @@
-"""One group of parameters of a sensor, and how it is treated: free, a guess, fixed or a prior."""
+"""One group of parameters of a sensor and its treatment: free, a guess, fixed or a prior."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from icalib.errors import RigError
 from icalib.sensors.parameter_spec import ParameterSpec
 
 Mode = Literal["free", "fixed", "prior"]
-ROUNDING = 1e-3  # published rotations have few digits; an error of R R^T beyond it is a mistake
-_EXACT = 1e-12  # below, a rotation stays bit by bit as it is
+ROUNDING = 1e-3  # largest |R R^T - 1| of a rotation with few digits; beyond it is a mistake
+_EXACT = 1e-12  # |R R^T - 1| below which a rotation is kept bit by bit
 _ANY_VECTOR = "a vector of numbers, or a 3x3 rotation matrix"
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """How one group of parameters is treated. Made by `icalib.free`, `icalib.guess`, `icalib.fixed`, `icalib.prior`.
+    """The treatment of one group of parameters, made by `icalib.free`, `guess`, `fixed` and `prior`.
 
-    free: estimated, `value` (if given) is where the solver starts. fixed: kept at `value`. prior: estimated, with a
-    Gaussian prior of mean `value` and standard deviation `sigma`. value None: the program finds its own start.
-    Rotations are 3x3 matrices R_imu_sensor with sigma (3,) in rad about the sensor's axes (right perturbation); all
-    else are vectors with sigma of the same shape. Raises RigError where the value or sigma makes no sense.
+    free: estimated, with `value` (if given) as initial guess. fixed: constant at `value`. prior: estimated, with a
+    Gaussian prior of mean `value` and standard deviation `sigma`. value None: the program finds an initial guess.
+    Rotations are 3x3 matrices R_imu_sensor with sigma (3,) in rad about the sensor's axes (right perturbation). Other
+    values are vectors with sigma of the same shape. Raises RigError if the value or sigma makes no sense.
     """
 
     mode: Mode = "free"
@@ -51,7 +51,7 @@ class Parameter:
 
 
 def free() -> Parameter:
-    """Estimated; the program finds its own start."""
+    """Estimated; the program finds an initial guess."""
     return Parameter("free")
 
 
@@ -61,7 +61,7 @@ def guess(value: Any) -> Parameter:
 
 
 def fixed(value: Any) -> Parameter:
-    """Kept at `value`: a number, a vector, a 3x3 rotation matrix or a scipy Rotation."""
+    """Constant at `value`: a number, a vector, a 3x3 rotation matrix or a scipy Rotation."""
     return Parameter("fixed", _array(value))
 
 
@@ -74,7 +74,7 @@ def prior(value: Any, sigma: Any) -> Parameter:
 
 
 def check_sizes(sensor: Any, specs: Iterable[ParameterSpec]) -> None:
-    """Raises RigError where a group of `sensor` has a value of another size than its definition in `specs`."""
+    """Raises RigError if the value of a group of `sensor` has another size than `specs` define."""
     for spec in specs:
         p = getattr(sensor, spec.name, None)
         if p is None or p.value is None:
@@ -89,8 +89,8 @@ def check_sizes(sensor: Any, specs: Iterable[ParameterSpec]) -> None:
 
 
 def check_fields(where: str, old: Any, fields: dict[str, Any]) -> None:
-    """Raises RigError where the dataclass `old`, called `where` in sentences, has no field of a name in `fields`, where
-    a value is none of the choices of its field, or where it replaces a `Parameter` and is none."""
+    """Raises RigError if `fields` do not fit the dataclass `old`, which sentences call `where`: if it has no such
+    field, if a value is none of the choices of its field, or if a value replaces a `Parameter` and is none."""
     kinds = get_type_hints(type(old))
     for name, value in fields.items():
         if name not in kinds:
@@ -103,9 +103,8 @@ def check_fields(where: str, old: Any, fields: dict[str, Any]) -> None:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """(3, 3) `matrix` itself where it is a rotation to the last digits, else the nearest one.
-
-    Raises RigError where it is no rotation."""
+    """(3, 3) rotation nearest to `matrix`; `matrix` itself if it is one to the last digits. Raises RigError if it is no
+    rotation."""
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if not error <= ROUNDING:
         raise RigError(f"is not a rotation matrix (R R^T differs from the identity by {error:.2g})")
@@ -118,7 +117,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def _array(value: Any) -> np.ndarray:
-    """As float64; of a number a vector of one; of a scipy Rotation its matrix. Raises RigError."""
+    """`value` as a float64 array: a number as a vector of one, a scipy Rotation as its matrix. Raises RigError."""
     value = value.as_matrix() if hasattr(value, "as_matrix") else value
     try:
         return np.atleast_1d(np.asarray(value, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""One parameter group of the rig file: free, a guess, fixed or a prior; and back to plain data."""
+"""One parameter group of the rig file (free, a guess, fixed or a prior): parsed, and written back as plain data."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def rotation_parameter(value: YamlValue) -> Parameter:
 
 
 def parameter_to_plain(parameter: Parameter) -> Any:
-    """Lists, numbers and text that load back as `parameter`; None for a fixed group without a value (a default)."""
+    """`parameter` as lists, numbers and text of the rig file; None for a fixed group without a value (a default)."""
     if parameter.value is None:
         return "free" if parameter.mode == "free" else None
     key = "guess" if parameter.mode == "free" else parameter.mode
@@ -86,7 +86,7 @@ def _sigma(value: YamlValue, size: int) -> np.ndarray:
 
 
 def _rotation(value: YamlValue) -> np.ndarray:
-    """(3, 3) rotation, re-orthonormalised where its digits were rounded."""
+    """(3, 3) rotation; one with rounded digits is made orthonormal."""
     if value.is_list:
         return _matrix(value)
     if not value.is_mapping:

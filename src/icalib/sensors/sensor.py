@@ -12,7 +12,7 @@ from icalib.sensors.parameter_spec import AXES, ParameterSpec
 
 T = TypeVar("T")
 TimeUnit = Literal["s", "ms", "us", "ns"]
-Axes = tuple[str, str, str]  # the columns that become x, y, z, each with its sign: ("x", "-y", "-z")
+Axes = tuple[str, str, str]  # recorded columns that become x, y, z, with signs: ("x", "-y", "-z")
 
 ROTATION = ParameterSpec(
     name="rotation",
@@ -47,7 +47,7 @@ TIME_OFFSET = ParameterSpec(
     motion="turn or shake the rig faster, so that a time shift shows",
     motion_on_wheels="speed up, brake and turn more",
 )
-MOUNTED = (ROTATION, TRANSLATION, TIME_OFFSET)  # of every sensor on the body
+MOUNTED = (ROTATION, TRANSLATION, TIME_OFFSET)  # of every sensor but the IMU
 MOUNTED_NAMES = tuple(spec.name for spec in MOUNTED)
 
 
@@ -58,8 +58,11 @@ def mounted(rotation: T, translation: T, time_offset: T) -> dict[str, T]:
 
 @dataclass(frozen=True)
 class TableLayout:
-    """How a sensor's table is written. columns: names in its header, or numbers from 1 on, in icalib's order; empty:
-    told by the header, or in that order. time_unit: of its stamps; None: told by their rate."""
+    """The layout of a sensor's table.
+
+    columns: names in its header, or numbers from 1 on, in icalib's order; empty: found by the header, or in that order.
+    time_unit: of its stamps; None: found by their rate.
+    """
 
     columns: tuple[str, ...] = ()
     time_unit: TimeUnit | None = None
@@ -82,8 +85,8 @@ class Sensor:
 
     A kind of sensor declares: sensor_type, its `type` in the rig file and its folder in `icalib.sensors`; noun, its
     name in sentences; parameters, all that sensors of this kind can have; gives_motion, whether such a sensor and an
-    IMU determine the motion of the rig; needs_imu; is_inertial; shows_planes; drives, whether the rig drives on it, so
-    that it hardly tilts.
+    IMU determine the motion of the rig; needs_imu; is_inertial; shows_planes; drives, whether the rig drives on it
+    and hardly tilts.
     """
 
     sensor_type: ClassVar[str]

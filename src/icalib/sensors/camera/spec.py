@@ -34,7 +34,7 @@ INTRINSICS = ParameterSpec(
     motion="show the target at different distances, tilted, and in every part of the image",
     motion_without_target="move so that near and far points of the scene cross the whole image",
 )
-# Of a polynomial; `specs` has those of the camera's own model.
+# Of a polynomial model; `specs` gives those of the camera's own model.
 DISTORTION = ParameterSpec(
     name="distortion",
     size=4,
@@ -60,8 +60,8 @@ BLOOM = ParameterSpec(
     by_images=True,
     motion="show the target from more distances",
 )
-LENS = (INTRINSICS.name, DISTORTION.name)  # the groups that are the parameters of its model
-TRACK_IMAGES = "images"  # `tracks` of a camera whose feature tracks are found in its images
+LENS = (INTRINSICS.name, DISTORTION.name)  # the groups of parameters of the camera model
+TRACK_IMAGES = "images"  # value of `tracks`: feature tracks are found in the images
 
 
 @dataclass(frozen=True)
@@ -80,21 +80,21 @@ class Camera(Sensor):
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    clock_restarts: bool = False  # each recording has its own time offset
     intrinsics: Parameter = Parameter()
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()
     topic: str | None = None  # of its images; None: the one with the camera's name, or the only one
     tracks: str | None = None  # path of a table of feature tracks, or TRACK_IMAGES
     track_noise_px: float | None = None  # None: estimated from the residuals
-    layout: TableLayout = PLAIN_TABLE  # of its table of tracks, or without one of corners
+    layout: TableLayout = PLAIN_TABLE  # of its table of tracks, or else of corners
 
     def __post_init__(self) -> None:
-        known = self.model in CAMERA_MODELS  # an unknown one is named where it is used
+        known = self.model in CAMERA_MODELS  # an unknown model is refused where it is used
         check_sizes(self, self.specs() if known else MOUNTED)
 
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """As in `Sensor`, distortion as of the camera's model."""
+        """As in `Sensor`; labels, tolerance and prior of distortion follow from the camera model."""
         model = camera_model(self.model)
         names, scale = model.parameter_names[len(INTRINSICS.labels) :], model.distortion_scale
         assert isinstance(DISTORTION.tolerance, float)
@@ -109,7 +109,7 @@ class Camera(Sensor):
 
     @property
     def tracks_images(self) -> bool:
-        """Whether its feature tracks are found in its images."""
+        """Whether feature tracks are found in the images, not read from a table."""
         return self.tracks == TRACK_IMAGES
 
     @classmethod

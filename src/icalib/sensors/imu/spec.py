@@ -33,7 +33,7 @@ class ImuNoise:
         return np.array([self.gyro, self.gyro_walk, self.accel, self.accel_walk])
 
     def scaled(self, factor: float) -> ImuNoise:
-        """That of an IMU `factor` times as noisy."""
+        """The noise of an IMU `factor` times as noisy."""
         four = (float(factor * density) for density in self.densities)
         return replace(self, **dict(zip(("gyro", "gyro_walk", "accel", "accel_walk"), four, strict=True)))
 
@@ -69,11 +69,11 @@ INTRINSICS_LABELS = (
 )
 N_INTRINSICS = len(INTRINSICS_LABELS)
 
-# gyro, gyro_walk, accel, accel_walk in the units of ImuNoise. Where they come from:
+# gyro, gyro_walk, accel, accel_walk in the units of ImuNoise, from:
 # consumer: Bosch BMI160 of the TUM VI data set (Schubert et al., IROS 2018), as OpenVINS sets it for that data set.
 # industrial: Analog Devices ADIS16448 as the EuRoC data set publishes it (Burri et al., IJRR 2016).
-# tactical: Honeywell HG1700 data sheet, 0.125 deg/sqrt(h) and 0.065 ft/s/sqrt(h); its biases of 1 deg/h and 1 mg are
-# taken as what the walks reach in an hour.
+# tactical: Honeywell HG1700 data sheet, 0.125 deg/sqrt(h) and 0.065 ft/s/sqrt(h). The walks reach its biases of 1 deg/h
+# and 1 mg in an hour.
 _FIGURES = {
     "consumer": (1.6e-4, 2.2e-5, 2.8e-3, 8.6e-4),
     "industrial": (1.7e-4, 1.94e-5, 2.0e-3, 3.0e-3),
@@ -81,8 +81,8 @@ _FIGURES = {
 }
 IMU_CLASSES = tuple(_FIGURES)
 
-# Tolerances of data sheets are taken for two standard deviations, typical values for one. Gyroscope and accelerometer
-# are turned against each other by what both are off the case: no sheet says that they are off together.
+# Tolerances of data sheets count as two standard deviations, typical values as one. The rotation between gyroscope and
+# accelerometer has the misalignments of both to the case, as no sheet says that these are common.
 # consumer: InvenSense MPU-6050 (PS-MPU-6000A, tables 6.1 and 6.2): scales +-3 %, cross-axis sensitivity +-2 %, 0.1
 # deg/s/g typical. MPU-9250 (PS-MPU-9250A, tables 1 and 2): the same scales and cross-axis sensitivity.
 # industrial: Analog Devices ADIS16448: scales +-1 %, axes 0.2 deg (accelerometer) and 0.05 deg (gyroscope) from
@@ -95,31 +95,31 @@ _IMPERFECTIONS = {
     "industrial": Imperfections(0.005, 1.7e-3, 0.005, 4.4e-4, 6.2e-3, 2.7e-5),
     "tactical": Imperfections(3e-4, 1e-3, 5e-4, 1e-3, 1.4e-3, 4.9e-7),
 }
-# Of IMU intrinsics that are `free`: wider than any class, so that a first calibration is not led by its prior.
+# Prior of IMU intrinsics that are `free`: wider than any class, so that it hardly influences a calibration.
 FREE = Imperfections(0.05, 0.05, 0.05, 0.05, 0.05, 0.01)
-# An IMU is tactical if all its densities are at most so many times those of that class. Consumer and industrial IMUs
-# have the same noise, and differ by their factory calibration: noise alone never makes an IMU industrial.
-ALIKE = 2.0
+# Largest ratio of the densities of a tactical IMU to those of its class. Consumer and industrial IMUs have the same
+# noise and differ by their factory calibration, so that noise alone never makes an IMU industrial.
+_LARGEST_TACTICAL_RATIO = 2.0
 
 
 def class_noise(name: str) -> ImuNoise:
-    """The figures of one of IMU_CLASSES; their source says that they are defaults."""
+    """The noise of one of IMU_CLASSES; its source says that it is a default."""
     article = "an" if name[0] in "aeiou" else "a"
     return ImuNoise(*_FIGURES[name], source=f"default for {article} {name} IMU")
 
 
 def class_imperfections(name: str) -> Imperfections:
-    """Of one of IMU_CLASSES."""
+    """The imperfections of one of IMU_CLASSES."""
     return _IMPERFECTIONS[name]
 
 
 def class_of_noise(noise: ImuNoise) -> str:
-    """The class of an IMU by its noise: the one that the figures come from, or tactical if they are that small, or else
+    """The class of an IMU by its noise: the class whose default it is, or tactical if it is as small, or else
     consumer."""
     own = next((name for name in IMU_CLASSES if class_noise(name).source == noise.source), None)
     if own is not None:
         return own
-    is_tactical = bool((noise.densities <= ALIKE * np.array(_FIGURES["tactical"])).all())
+    is_tactical = bool((noise.densities <= _LARGEST_TACTICAL_RATIO * np.array(_FIGURES["tactical"])).all())
     return "tactical" if is_tactical else DEFAULT_CLASS
 
 
@@ -130,7 +130,7 @@ def class_of_sigma(sigma: np.ndarray) -> str | None:
 
 @dataclass(frozen=True)
 class TwoSources:
-    """Topics or tables of an IMU whose gyroscope and accelerometer report apart."""
+    """Topics or tables of an IMU with separate ones for gyroscope and accelerometer."""
 
     gyro: str
     accel: str
@@ -138,7 +138,7 @@ class TwoSources:
 
 AccelUnit = Literal["m/s^2", "g"]
 GyroUnit = Literal["rad/s", "deg/s"]
-BY_CLASS = Parameter("free")  # IMU intrinsics of which nothing is said; `free()` is another
+BY_CLASS = Parameter("free")  # IMU intrinsics without a field in the rig file; told from `free()` by identity
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")
@@ -146,11 +146,13 @@ _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")
 
 @dataclass(frozen=True)
 class ImuSensor(Sensor):
-    """The inertial sensor; its frame is the body frame. Units and axes: of the readings as they are recorded; None: SI
-    units (g is recognised), and the axes as they are. assumed: there is none, but an assumption of smooth motion in
-    its place (see `initialize.assumed_motion`). intrinsics (24,): see `motion.imu_model`. They always
-    have a prior: by default that of the IMU's class about the ideal IMU, a broad one where they are free, about the
-    guess. What is fixed without a value is the ideal IMU."""
+    """An IMU.
+
+    Units and axes are those of the recorded readings; None: SI units (g is recognised), and the axes as they are.
+    assumed: an assumption of smooth motion in place of an IMU (see `initialize.assumed_motion`). intrinsics (24,): see
+    `motion.imu_model`. They always have a prior: by default that of the IMU's class about the ideal IMU; if they are
+    free, a broad one about the guess. Fixed without a value they are those of the ideal IMU.
+    """
 
     sensor_type: ClassVar[str] = "imu"
     noun: ClassVar[str] = "IMU"
@@ -162,13 +164,13 @@ class ImuSensor(Sensor):
     path: str | TwoSources
     noise: ImuNoise
     intrinsics: Parameter = BY_CLASS
-    topic: str | TwoSources | None = None  # in a bag; None: those with the sensor's name, or the only ones
+    topic: str | TwoSources | None = None  # in a bag; None: the one with the sensor's name, or the only one
     accel_unit: AccelUnit | None = None
     gyro_unit: GyroUnit | None = None
     accel_axes: Axes | None = None
     gyro_axes: Axes | None = None
     assumed: bool = False
-    pose_keyframes_s: float = 0.02  # between keyframes that poses alone place
+    pose_keyframes_s: float = 0.02  # interval of keyframes where poses alone determine the motion
     layout: TableLayout = PLAIN_TABLE
 
     def __post_init__(self) -> None:
@@ -225,7 +227,7 @@ def _noise(value: YamlValue) -> ImuNoise:
 
 
 def _source(value: YamlValue) -> str | TwoSources:
-    """One name, or one for each of the two sensors."""
+    """One name, or one each for gyroscope and accelerometer."""
     if not value.is_mapping:
         return value.text()
     found = value.record(("gyro", "accel"))
@@ -237,8 +239,8 @@ def _plain_source(source: str | TwoSources) -> str | dict[str, str]:
 
 
 def _intrinsics(value: YamlValue) -> Parameter:
-    """24 numbers, zero for an ideal IMU. The name of a class is its prior about the ideal IMU, and `fixed` an ideal
-    IMU."""
+    """24 numbers, zero for an ideal IMU. The name of a class stands for its prior about the ideal IMU, and `fixed` for
+    the ideal IMU."""
     if value.is_mapping or value.is_list or value.text() == "free":
         return vector_parameter(value, N_INTRINSICS)
     name = value.choice("treatment of IMU intrinsics", ("free", "fixed", *IMU_CLASSES))

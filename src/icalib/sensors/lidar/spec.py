@@ -26,10 +26,10 @@ _FIELDS = (
 
 @dataclass(frozen=True)
 class Lidar(Sensor):
-    """One LiDAR. Points nearer than min_range_m or farther than max_range_m are left out.
+    """One LiDAR. Points closer than min_range_m or farther than max_range_m are not used.
 
-    point_time: what a point's time is counted from; see `read.point_times`. point_time_field, point_time_unit: where
-    the time of a point stands, and in what unit; None: told from the data.
+    point_time: the instant from which the times of points count; see `read.point_times`. point_time_field,
+    point_time_unit: field and unit of these times; None: found from the data.
     """
 
     sensor_type: ClassVar[str] = "lidar"
@@ -43,7 +43,7 @@ class Lidar(Sensor):
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    clock_restarts: bool = False  # each recording has its own time offset
     min_range_m: float = 0.5
     max_range_m: float = 100.0
     point_time: PointTime = "auto"
@@ -82,7 +82,7 @@ class Lidar(Sensor):
 
 
 def _point_time(found: dict[str, YamlValue]) -> PointTime:
-    """Fails where points would have a time of their own and none."""
+    """Raises RigError if fields of point times contradict point_time."""
     chosen = choice_or(found, "point_time", PointTime, Lidar.point_time)
     for name in ("point_time_field", "point_time_unit"):
         if name in found and chosen in ("azimuth", "snapshot"):

@@ -33,11 +33,11 @@ _NOISE = ("rotation_noise", "position_noise")
 
 @dataclass(frozen=True)
 class PoseSensor(Sensor):
-    """Something that says where it is: motion capture, or another program's odometry.
+    """A sensor of poses: motion capture, or the odometry of another program.
 
-    absolute: in a frame that stands still, whose place in the world is estimated; noise is white, rad and m. relative:
-    only the way from each pose to the next counts; noise is a random walk, rad/sqrt(s) and m/sqrt(s). level: z of its
-    frame points up, as far as the motion does not say otherwise; used where neither an IMU nor a target shows it.
+    absolute: poses in a static frame, whose pose in the world is estimated; the noise is white, rad and m. relative:
+    the motion from each pose to the next is used; the noise is a random walk, rad/sqrt(s) and m/sqrt(s). level: z of
+    the static frame points up; used if neither IMU nor target shows the vertical and the motion does not contradict.
     """
 
     sensor_type: ClassVar[str] = "pose"
@@ -47,19 +47,19 @@ class PoseSensor(Sensor):
 
     path: str
     kind: PoseKind = "absolute"
-    rotation_noise: float | None = None  # of each axis; None: estimated from the residuals
+    rotation_noise: float | None = None  # per axis; None: estimated from the residuals
     position_noise: float | None = None
     level: bool = True
-    position_axes: Axes | None = None  # of positions as recorded, in the order and with the signs of rotations
+    position_axes: Axes | None = None  # recorded columns that are x, y, z in the axes of the rotations
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    clock_restarts: bool = False  # each recording has its own time offset
     topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
-    inverted: bool = False  # what is recorded is T_sensor_frame
-    frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: it is not one
-    scale_sigma: float = 0.001  # of all its lengths, relative: true over reported ones is about 1; 0: exact
+    inverted: bool = False  # T_sensor_frame is recorded
+    frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: another topic
+    scale_sigma: float = 0.001  # prior sigma of scale, true lengths over reported ones; 0: exact
 
     @property
     def scale(self) -> Parameter:

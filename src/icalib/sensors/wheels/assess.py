@@ -116,7 +116,7 @@ def _stance(up: np.ndarray) -> str | None:
 
 
 def _body(inputs: Inputs) -> str:
-    return inputs.rig.first_seeing
+    return inputs.rig.reference_without_imu
 
 
 def _opposite(inputs: Inputs, name: str) -> str:

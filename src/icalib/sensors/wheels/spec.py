@@ -33,7 +33,7 @@ RateUnit = Literal["rad/s", "deg/s", "rpm"]
 RATE_UNITS: dict[RateUnit, float] = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}  # in rad/s
 WheelKind = Literal["pair", "steered", "twist"]  # what the two columns of a `WheelStream` are
 
-# The parameters of each kind of wheels beside pose and clock.
+# The parameters of each kind of wheels, beside pose and clock.
 DRIVES: dict[WheelKind, tuple[ParameterSpec, ...]] = {
     "pair": (
         ParameterSpec("radii", 2, "vector", "m", ("left", "right"), 1e-4, 0.01, True, "radius", motion="drive further"),
@@ -75,11 +75,11 @@ GroundPlane = Literal["floor", "level"]
 
 @dataclass(frozen=True)
 class Ground:
-    """What wheels stand on: the floor that LiDARs see, or a plane as level as the horizon through the world's origin.
+    """The ground: the floor that LiDARs see, or the horizontal plane through the origin of the world.
 
-    tilt_noise: of the wheels' frame on the plane, at each node, about each axis; None: it may be tilted anyhow. height:
-    of the frame's origin over the plane, with height_sigma, the same error all the time; None: it is not known.
-    bump_noise: of the height at each node.
+    tilt_noise: of the wheels' frame against the plane, per keyframe and axis; None: no constraint. height: of the
+    frame's origin over the plane, with height_sigma, a constant error; None: no constraint. bump_noise: of the height,
+    per keyframe.
     """
 
     plane: GroundPlane
@@ -102,7 +102,7 @@ _ONLY_OF: dict[str, tuple[str, ...]] = {
     "sampling": ("rates", "twist"), "counts_per_turn": ("ticks",), "counter_size": ("ticks",), "joints": _TURNED,
     "angle_range": ("angles",), "rate_unit": ("rates",), "signs": (*_TURNED, "twist"),
 }  # fmt: skip
-# And with some kinds of wheels only.
+# Fields that go with some kinds of wheels only.
 _ONLY_OF_KIND: dict[str, tuple[str, ...]] = {
     **{spec.name: (kind,) for kind, specs in DRIVES.items() for spec in specs},
     "wheel_noise": ("pair", "steered"), "speed_noise": ("twist",), "yaw_noise": ("twist",),
@@ -120,13 +120,13 @@ _JOINTS = {
 
 @dataclass(frozen=True)
 class Wheels(Sensor):
-    """What rolls on the ground. Its frame has x forward, y to the left, z up, its origin midway between the wheels of
-    the axle that is not steered.
+    """The odometry of one set of wheels. Frame: x forward, y to the left, z up; the origin is midway between the wheels
+    of the axle that is not steered.
 
-    drive: differential, two driven wheels of one axle; skid-steer, two pairs of which each turns alike; ackermann, the
+    drive: differential, two driven wheels of one axle; skid-steer, both wheels of a side turn alike; ackermann, the
     front wheels steer. measures: rates [rad/s], angles turned [rad], counts of encoders (ticks), relative planar poses
     (tables only), or twist, forward speed [m/s] and yaw rate [rad/s]. sampling: of rates and twist; see `WheelStream`.
-    Densities: of each wheel's angle, of speed and yaw rate, of the steering angle, and of slip.
+    Noise densities: of each wheel's angle, of speed and yaw rate, of the steering angle, and of slip.
     """
 
     sensor_type: ClassVar[str] = "wheels"
@@ -143,13 +143,13 @@ class Wheels(Sensor):
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    clock_restarts: bool = False  # each recording has its own time offset
     radii: Parameter = Parameter()  # (2,) left, right [m]
     baseline: Parameter = Parameter()  # (1,) between the wheels [m]; of skid-steer the effective one
     radius: Parameter = Parameter()  # (1,) of the driven wheel of ackermann [m]
     wheelbase: Parameter = Parameter()  # (1,) from rear to front axle [m]
-    steering_offset: Parameter = Parameter()  # (1,) what to add to the steering angle [rad]
-    scales: Parameter = Parameter()  # (2,) what to multiply speed and yaw rate by
+    steering_offset: Parameter = Parameter()  # (1,) added to the steering angle [rad]
+    scales: Parameter = Parameter()  # (2,) factors of speed and yaw rate
     wheel_noise: float = 0.03  # rad/sqrt(s): of rates at 70 Hz 0.25 rad/s each, as simulated wheels have it
     speed_noise: float = 2e-3  # m/sqrt(s)
     yaw_noise: float = 1e-2  # rad/sqrt(s)
@@ -162,18 +162,18 @@ class Wheels(Sensor):
     counts_per_turn: float | None = None  # of ticks, for one turn of the wheel
     signs: tuple[int, ...] | None = None  # 1 or -1 of each column of its table, or each joint; None: all 1
     rate_unit: RateUnit = "rad/s"  # of rates
-    angle_range: float | None = None  # angles [rad] start anew after so much; None: never, or where it is plain
-    counter_size: int | None = None  # the counters go back to zero after so many ticks; None: never
+    angle_range: float | None = None  # wrap-around of angles [rad]; None: none, or found from the data
+    counter_size: int | None = None  # encoder wrap-around [ticks]; None: none
     topic: str | None = None  # of its messages; None: the one with the wheels' name, or the only one
-    joints: tuple[str, ...] | None = None  # in JointState; None: told by "left" and "right" in the names
+    joints: tuple[str, ...] | None = None  # in JointState; None: found by "left" and "right" in the names
     ground: Ground | None = None
     layout: TableLayout = PLAIN_TABLE
 
     def __post_init__(self) -> None:
-        check_sizes(self, self.stated())  # those of other drives, too
+        check_sizes(self, self.stated())  # the parameters of other drives, too
 
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """As in `Sensor`: those of its drive, and the height where that is estimated."""
+        """As in `Sensor`: those of the drive, and the height if it is estimated."""
         return (*MOUNTED, *((GROUND_HEIGHT,) if self.knows_height else ()), *self.drive_specs)
 
     def is_estimated(self, spec: ParameterSpec) -> bool:
@@ -182,19 +182,19 @@ class Wheels(Sensor):
 
     @property
     def ground_height(self) -> Parameter:
-        """What the height over the ground starts from, where it is estimated."""
+        """Initial guess of the height over the ground [m], if it is estimated."""
         return Parameter("free", np.array([0.0 if self.ground is None else self.ground.height]))
 
     @property
     def kind(self) -> WheelKind:
-        """Which parameters it has: see `DRIVES`."""
+        """The kind by which `DRIVES` gives the parameters."""
         if self.measures == "twist":
             return "twist"
         return "steered" if self.drive == "ackermann" else "pair"
 
     @property
     def drive_specs(self) -> tuple[ParameterSpec, ...]:
-        """Its parameters beside pose, clock and height."""
+        """The parameters beside pose, clock and height."""
         return DRIVES[self.kind]
 
     @property
@@ -266,7 +266,7 @@ class Wheels(Sensor):
 
 
 def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], bare: Wheels) -> None:
-    """Fields that do not go with what the wheels measure or with how they are driven, or are missing."""
+    """Raises RigError if a field does not go with `measures` or `drive`, or is missing."""
     for name, measures in _ONLY_OF.items():
         if name in found and bare.measures not in measures:
             found[name].fail(

@@ -10,6 +10,7 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Target
 from icalib.rig import ImuNoise
+from icalib.sensors.camera.spec import BLOOM, DISTORTION, INTRINSICS
 from icalib.tools.simulation.scenario.fields import pose_from_rows
 from icalib.tools.simulation.scenario.image_faults import ImageFaults
 from icalib.tools.simulation.scenario.robot import Drive, Features
@@ -94,9 +95,9 @@ class SimCamera:
     def values(self) -> dict[str, np.ndarray]:
         """True values of its parameters by their names in the rig, except extrinsics and time offset."""
         return {
-            "intrinsics": np.array(self.intrinsics),
-            "distortion": np.array(self.distortion),
-            "bloom": np.array([self.bloom_px]),
+            INTRINSICS.name: np.array(self.intrinsics),
+            DISTORTION.name: np.array(self.distortion),
+            BLOOM.name: np.array([self.bloom_px]),
         }
 
 
