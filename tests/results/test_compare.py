@@ -22,6 +22,7 @@ from icalib.sensors.parameter_fields import parameter_to_plain
 from icalib.tools.comparison.compare import Comparison, ComparisonTolerances, Difference, compare_sides
 from icalib.tools.comparison.reading import compare_files
 from icalib.tools.comparison.results import side_of_result
+from icalib.tools.comparison.sides import Side
 from icalib.tools.comparison.significance import chi2_above, sigmas
 from icalib.tools.comparison.words import lines, sentence
 
@@ -258,6 +259,17 @@ def test_values_typed_into_a_rig_file(robot: Calibration, tmp_path: Path):
     assert only(found, "wheel0", "baseline").vector[0] == pytest.approx(100 * (0.5 / 0.42 - 1))
     assert not only(found, "wheel0", "radius").differs
     assert f"{tmp_path / 'cad.yaml'} gives only a part of the pose of cam0, wheel0." in found.notes
+
+
+def test_a_sensor_without_a_rotation_is_compared_by_its_position():
+    antenna = np.eye(4)
+    antenna[:3, :3] = np.nan
+    moved = antenna.copy()
+    moved[0, 3] = 0.02
+    a, b = (Side("", "result", "imu0", True, {"imu0": np.eye(4), "gnss0": T}) for T in (antenna, moved))
+    found = compare_sides(a, b)
+    (difference,) = found.differences
+    assert (difference.what, difference.size) == ("translation", pytest.approx(20.0)) and found.notes == ()
 
 
 def test_what_has_no_standard_deviation_is_held_to_the_tolerance(robot: Calibration, tmp_path: Path):

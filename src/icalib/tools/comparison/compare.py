@@ -150,7 +150,7 @@ def _notes(a: Side, b: Side, shared: list[str]) -> tuple[str, ...]:
         alone = [name for name in side.poses if name not in shared and name != side.body]
         if alone:
             notes.append(f"only {side.path} has {', '.join(alone)}.")
-        missing = [n for n in shared if n in other.poses and np.isnan(side.poses[n]).any()]
+        missing = [n for n in shared if (np.isnan(side.poses[n]) & ~np.isnan(other.poses[n])).any()]
         if missing:
             notes.append(f"{side.path} gives only a part of the pose of {', '.join(missing)}.")
     if a.has_imu != b.has_imu:

@@ -37,7 +37,7 @@ def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Q
 
 def side_of_result(c: Calibration, path: str) -> Side:
     """All that was calibrated, with the joint covariance of it."""
-    poses = {name: c.T_imu_sensor(name) for name in c.mounted} | {c.reference: np.eye(4)}
+    poses = {name: _pose_of_result(c, name) for name in c.mounted} | {c.reference: np.eye(4)}
     bad = [g for g in c.groups if "undetermined" in g.verdict]
     quantities = {}
     for g in c.groups:
@@ -65,6 +65,14 @@ def side_of_result(c: Calibration, path: str) -> Side:
         quantities=quantities,
         lenses={name: _lens_of_result(c, name) for name in c.cameras},
     )
+
+
+def _pose_of_result(c: Calibration, sensor: str) -> np.ndarray:
+    """(4, 4) T_body_sensor; the rotation is NaN where the sensor has none."""
+    T = c.T_imu_sensor(sensor)
+    if not any((g.sensor, g.name) == (sensor, ROTATION.name) for g in c.groups):
+        T[:3, :3] = np.nan
+    return T
 
 
 def _lens_of_result(c: Calibration, name: str) -> LensSide:
@@ -97,8 +105,8 @@ def side_of_rig(path: Path) -> Side:
     def covariance(frame: str, sensor: str) -> np.ndarray:
         out = unknown(6)
         if frame == rig.reference:
-            rotation, translation = _extrinsics(rig.sensors[sensor])
-            out[:3, :3], out[3:, 3:] = _covariance(rotation, 3), _covariance(translation, 3)
+            for block, p in zip((slice(3), slice(3, 6)), _extrinsics(rig.sensors[sensor]), strict=True):
+                out[block, block] = _covariance(p, 3)
         return out
 
     return Side(
@@ -121,8 +129,8 @@ def quantity(spec: ParameterSpec, value: np.ndarray, covariance: np.ndarray, is_
 
 
 def _extrinsics(sensor: Sensor) -> tuple[Parameter, Parameter]:
-    """Rotation and translation."""
-    return getattr(sensor, ROTATION.name), getattr(sensor, TRANSLATION.name)
+    """Rotation and translation; without a value where the sensor has none."""
+    return getattr(sensor, ROTATION.name, Parameter()), getattr(sensor, TRANSLATION.name, Parameter())
 
 
 def _pose(sensor: Sensor) -> np.ndarray:

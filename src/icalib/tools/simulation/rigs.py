@@ -106,8 +106,9 @@ def with_drawn_guess(
         sim = sims[sensor.name]
         drawn = _drawn_pose(sim.T_imu_sensor, raw_time_offset(scenario, sim), rng, spread)
         drawn |= _drawn_lens(sim, rng, spread) if isinstance(sim, SimCamera) else sim.drawn_values(rng, spread.relative)
-        free = {k: v for k, v in drawn.items() if getattr(sensor, k).mode == "free" and (only is None or k in only)}
-        return replace(sensor, **{name: Parameter("free", value) for name, value in free.items()})
+        names = [spec.name for spec in sensor.stated() if spec.name in drawn and (only is None or spec.name in only)]
+        free = [name for name in names if getattr(sensor, name).mode == "free"]
+        return replace(sensor, **{name: Parameter("free", drawn[name]) for name in free})
 
     return rig.with_sensors(*map(guessed, rig.mounted))
 
@@ -120,7 +121,7 @@ def _drawn_lens(sim: SimCamera, rng: np.random.Generator, error: GuessError) -> 
 def _drawn_pose(
     T_imu_sensor: np.ndarray, offset: float, rng: np.random.Generator, error: GuessError
 ) -> dict[str, np.ndarray]:
-    """What every sensor has, by the names of its groups."""
+    """Extrinsics and time offset, by the names of their groups; all are drawn, whether or not the sensor has them."""
     return mounted(
         T_imu_sensor[:3, :3] @ rotation_from_vector(error.rotation * rng.standard_normal(3)),
         T_imu_sensor[:3, 3] + error.translation * rng.standard_normal(3),
