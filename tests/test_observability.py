@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from icalib.observability.words import observe
+from icalib.rig import ParameterSpec
+from icalib.rig.kinds import ALL_SPECS
 
+SPECS = {spec.name: spec for spec in ALL_SPECS}  # a name that an IMU and a camera share is the camera's
 SENSORS = ("cam0", "cam1", "cam2", "lidar0", "wheel0")
+
+
+def specs_of(names: tuple[str, ...]) -> list[ParameterSpec]:
+    return [SPECS[name.rsplit(".", 2)[1]] for name in names]
 
 
 def shared(worth: float, converged: bool = True) -> Any:
@@ -27,7 +34,7 @@ def shared(worth: float, converged: bool = True) -> Any:
 def test_what_five_share_is_as_open_as_the_guess_is_wide(worth: float, verdict: str):
     """A fifth of a direction each: the share alone would let none of them be open."""
     names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
-    found = observe(shared(worth), names)
+    found = observe(shared(worth), names, specs_of(names))
     assert found.verdicts == (verdict,) * len(SENSORS) + ("determined",)
     (sentence,) = found.undetermined
     assert all(s in sentence for s in SENSORS[:4]) and "turn the rig" in sentence
@@ -39,10 +46,10 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
         held = np.array([first, 0.1, last])[:, None]
         found = shared(50.0)
         found.held, found.spread, found.covariance = held / np.linalg.norm(held), np.full(3, 50.0), np.eye(3)
-        (sentence,) = observe(found, names, True).undetermined
+        (sentence,) = observe(found, names, specs_of(names), True).undetermined
         assert sentence.startswith("left_cam translation z with wheel0 baseline: not determined by this motion; ")
     found.held = np.array([0.0, 1.0, 0.0])[:, None]
-    assert observe(found, names).undetermined[0].startswith("left_cam time offset: ")
+    assert observe(found, names, specs_of(names)).undetermined[0].startswith("left_cam time offset: ")
 
 
 @pytest.mark.parametrize(
@@ -57,10 +64,10 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
 def test_the_missing_motion_is_that_of_the_sensor(parameter, on_wheels, tracking, advice):
     found = shared(50.0)
     found.held, found.spread, found.covariance = np.ones((1, 1)), np.full(1, 50.0), np.eye(1)
-    (sentence,) = observe(found, (parameter,), on_wheels, tracking).undetermined
+    (sentence,) = observe(found, (parameter,), specs_of((parameter,)), on_wheels, tracking).undetermined
     assert advice in sentence
 
 
 def test_an_answer_that_did_not_converge_determines_nothing():
     names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
-    assert observe(shared(1.0, converged=False), names).verdicts == ("undetermined",) * 6
+    assert observe(shared(1.0, converged=False), names, specs_of(names)).verdicts == ("undetermined",) * 6

@@ -32,12 +32,12 @@ from icalib.rig import (
     by_name,
 )
 from icalib.rig.file import rig_from_dict, rig_to_dict
-from icalib.rig.kinds import SENSOR_TYPES, SPECS
+from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
 from icalib.sensors.fields import groups_to_plain, parameter_fields, parameters
 from icalib.sensors.imu.spec import class_noise
 
 SOURCE = Path(icalib.__file__).parent
-NAMES = {spec.name for own in SENSOR_TYPES.values() for spec in own.parameters} | set(SPECS)
+NAMES = {spec.name for spec in ALL_SPECS}
 SENSORS: tuple[Sensor, ...] = (
     ImuSensor("imu0", "a.csv", class_noise("industrial")),
     Camera("cam0", "a.csv", "pinhole-radtan", (640, 480)),

@@ -9,7 +9,7 @@ import yaml
 from icalib.pipeline import calibrate_measurements
 from icalib.result.summary import calibration_yaml, parameter_keys
 from icalib.result.verdict import by_size, worst
-from icalib.rig.kinds import SENSOR_TYPES, SPECS
+from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.sensor import MOUNTED
 from icalib.tools.comparison.compare import compare_sides
@@ -48,4 +48,4 @@ def test_every_parameter_of_a_robot_is_in_its_result(robot):
     compared = {(d.sensor, d.what) for d in compare_sides(side, side).differences}
     own = {(w.name, spec.one or spec.name.replace("_", " ")) for w in rig.wheels for spec in w.drive_specs}
     assert own | {(s.name, "time offset") for s in sensors[1:]} <= compared
-    assert set(SPECS) >= {name for sensor, name in found if sensor != rig.imu.name}
+    assert {spec.name for spec in ALL_SPECS} >= {name for _, name in found}

@@ -15,7 +15,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration
 from icalib.result.body_frame import in_body_frame
-from icalib.rig.kinds import SPECS
+from icalib.rig.kinds import SENSOR_TYPES
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 
@@ -136,8 +136,9 @@ def own_parameters(c: Calibration) -> list[str]:
     """What mounted sensors other than cameras have beside pose and clock, as "radii and baseline of wheel0"."""
     found = []
     for name in others(c, *c.cameras):
-        own = [g.name for g in c.groups if g.sensor == name and g.name not in MOUNTED_NAMES]
-        own = [group for group in own if SPECS[group].manifold != "nuisance"]
+        specs = SENSOR_TYPES[c.rig["sensors"][name]["type"]].parameters
+        without = {*MOUNTED_NAMES, *(spec.name for spec in specs if spec.manifold == "nuisance")}
+        own = [g.name for g in c.groups if g.sensor == name and g.name not in without]
         words = [group.replace("_", " ") for group in own]
         found += [f"{', '.join(words[:-1])}{' and ' if words[1:] else ''}{words[-1]} of {name}"] if words else []
     return found

@@ -135,7 +135,8 @@ def _from_nothing(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     def agreeing(sensor: Sensor, name: str, p: Parameter) -> Parameter:
         if p.mode != "free" or p.value is None or name == "time_offset":
             return Parameter() if p.mode == "free" else p
-        return Parameter() if is_contradicted(name, p.value, values.get((sensor.name, name), p.value)) else p
+        other = values.get((sensor.name, name), p.value)
+        return Parameter() if is_contradicted(sensor.spec(name), p.value, other) else p
 
     kept = with_groups(rig, agreeing)
     if found.found.held.size and _has(kept, "free") and (other := _converged(kept, make)) is not None:

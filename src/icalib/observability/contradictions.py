@@ -20,8 +20,7 @@ from icalib.observability.determination import Determined, determine, judge, sca
 from icalib.observability.relaxed import Relaxed, freed_inputs, stated_keys
 from icalib.optim.calib_block import restricted_root
 from icalib.optim.state import Block, Key, State
-from icalib.rig import Parameter
-from icalib.rig.kinds import SPECS
+from icalib.rig import Parameter, ParameterSpec
 
 SIGMAS = 4.0
 FAR = 0.5  # times the prior uncertainty: 3 deg, 5 cm, 10 ms; a linear step that long does not end where it says
@@ -32,10 +31,11 @@ class Contradiction:
     """A group `key` that the rig file states as `parameter` (mode fixed or prior), between raw stamps.
 
     off (n,): from the stated value to that of the data alone, rotations about the sensor's axes [rad]; sigma (n,): the
-    standard deviation of the latter; found: the latter.
+    standard deviation of the latter; found: the latter. spec: the definition of the group.
     """
 
     key: Key
+    spec: ParameterSpec
     parameter: Parameter
     found: np.ndarray
     off: np.ndarray
@@ -46,6 +46,11 @@ class Contradiction:
         """(n,) how far off in standard deviations of both together."""
         stated = 0.0 if self.parameter.sigma is None else self.parameter.sigma
         return np.abs(self.off) / np.maximum(np.sqrt(self.sigma**2 + stated**2), 1e-300)
+
+    @property
+    def in_prior_sigmas(self) -> float:
+        """How far off it is at most, in standard deviations of an initial guess for which the rig file gives none."""
+        return float(np.abs(self.off).max()) / self.spec.prior_sigma
 
     @property
     def worst(self) -> int:
@@ -71,12 +76,7 @@ def _standing_out(shown: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
 
 
 def _is_far(shown: Contradiction) -> bool:
-    return worst_off(shown.key[1], shown.off) > FAR
-
-
-def worst_off(name: str, off: np.ndarray) -> float:
-    """How far off a group is, in what guesses are worth."""
-    return float(np.abs(off).max()) / SPECS[name].prior_sigma
+    return shown.in_prior_sigmas > FAR
 
 
 def _linear(
@@ -111,7 +111,7 @@ def contradicted_by(inputs: Inputs, without: Determined) -> tuple[Contradiction,
     off first."""
     layout = without.estimate.problem.layout
     found = _standing_out(_by(inputs, without, stated_keys(inputs, layout)))
-    return tuple(sorted(found, key=lambda c: -worst_off(c.key[1], c.off)))
+    return tuple(sorted(found, key=lambda c: -c.in_prior_sigmas))
 
 
 def _by(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contradiction]:
@@ -138,4 +138,4 @@ def _shown(
         shift = origin_difference(inputs.measurements, inputs.stream(block.sensor))
         there = value + own - (shift if block.name == "time_offset" else 0.0)
         off = there - parameter.value
-    return Contradiction(block.key, parameter, there, off, factor * sigma[block.columns])
+    return Contradiction(block.key, sensor.spec(block.name), parameter, there, off, factor * sigma[block.columns])

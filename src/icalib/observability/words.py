@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,6 @@ from icalib.observability.determination import Determined
 from icalib.result import Verdict
 from icalib.result.verdict import by_size
 from icalib.rig import ParameterSpec
-from icalib.rig.kinds import SPECS
 
 SHARE = 0.25  # a parameter that makes up this much of an undetermined direction is undetermined itself
 NAMED = 0.2  # parts of a direction smaller than this are not named
@@ -36,14 +35,16 @@ class Observability:
 def observe(
     found: Determined,
     names: tuple[str, ...],
+    specs: Sequence[ParameterSpec],
     on_wheels: bool = False,
     tracking: Collection[str] = (),
     axes: str = "",
 ) -> Observability:
     """Verdicts by what the data alone say; undetermined throughout where the solver did not converge.
 
-    names: (B,) as in "cam0.translation.x". on_wheels: the rig drives on one of its sensors. tracking: names of cameras
-    without a target. axes: about which the rig hardly turned, in words, or empty.
+    names: (B,) as in "cam0.translation.x". specs: (B,) the definitions of their groups. on_wheels: the rig drives on
+    one of its sensors. tracking: names of cameras without a target. axes: about which the rig hardly turned, in words,
+    or empty.
     """
     directions = sparse_basis(found.held)
     share = (directions**2).sum(axis=1)
@@ -54,8 +55,7 @@ def observe(
     sentences = []
     for direction in directions.T:
         words, first = _words_of(direction, names)
-        sensor, kind, _ = first.rsplit(".", 2)
-        spec = SPECS[kind]
+        spec, sensor = specs[first], names[first].rsplit(".", 2)[0]
         motion = _missing_motion(spec, on_wheels, sensor in tracking).format(axes=axes or EVERY_AXIS)
         by = "these images" if spec.by_images else "this motion"
         sentences.append(f"{words}: not determined by {by}; {motion}.")
@@ -74,12 +74,12 @@ def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
     return directions @ turn if m else np.zeros((n, 0))
 
 
-def _words_of(direction: np.ndarray, names: tuple[str, ...]) -> tuple[str, str]:
-    """The parameters that a direction (B,) moves most, in words, and the name of the first."""
+def _words_of(direction: np.ndarray, names: tuple[str, ...]) -> tuple[str, int]:
+    """The parameters that a direction (B,) moves most, in words, and the column of the first."""
     order = np.argsort(-np.abs(direction))
     # By the rig, not by size: where all move alike, noise would decide which comes first.
     parts = sorted(i for i in order[:MOST_NAMED] if abs(direction[i]) >= NAMED) or [order[0]]
-    return " with ".join(_words(names[i]) for i in parts), names[order[0]]
+    return " with ".join(_words(names[i]) for i in parts), int(order[0])
 
 
 def _missing_motion(spec: ParameterSpec, on_wheels: bool, without_target: bool) -> str:

@@ -9,8 +9,8 @@ from rich.text import Text
 from icalib.result import Calibration, relative_poses
 from icalib.result.quantities import rows, rpy_deg, shown
 from icalib.result.summary import body_name, reference_name
-from icalib.result.verdict import AUXILIARY, UNDETERMINED, tolerance
-from icalib.rig.kinds import SPECS
+from icalib.result.verdict import UNDETERMINED, tolerance
+from icalib.rig.kinds import ALL_SPECS
 
 TOLERANCES = ("rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance")
 SCALED = "includes the empirical factor: how much more segments of the recording scatter than the noise predicts"
@@ -79,4 +79,4 @@ def _caption(calibration: Calibration) -> str:
             f"above {UNDETERMINED:g} of it undetermined."
         )
     names = {g.name for g in calibration.groups}
-    return " ".join([text, *(f"{name}: {SPECS[name].meaning}." for name in AUXILIARY if name in names)])
+    return " ".join([text, *(f"{s.name}: {s.meaning}." for s in ALL_SPECS if s.is_auxiliary and s.name in names)])

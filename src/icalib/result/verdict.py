@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
 from icalib.rig import LENS, Settings
-from icalib.rig.kinds import SENSOR_TYPES, SPECS
+from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
 from icalib.sensors.parameter_spec import shown_unit
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ NEXT: dict[Usability, str] = {
     ),
     "not usable": "Act on the first reason, then calibrate again.",
 }
-AUXILIARY = tuple(spec.name for spec in SPECS.values() if spec.is_auxiliary)
+AUXILIARY = tuple(spec.name for spec in ALL_SPECS if spec.is_auxiliary)
 WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
 UNDETERMINED = 10.0  # tolerances: a standard deviation above this says no more than a guess does
 MOST_NAMED = 6  # components in one sentence

@@ -8,7 +8,8 @@ from icalib.sensors.sensor import Sensor
 
 SENSOR_TYPES: dict[str, type[Sensor]] = {kind: facet(kind, "spec").SENSOR for kind in SENSOR_KINDS}
 MOUNTED_TYPES = tuple(t for t in SENSOR_TYPES.values() if not t.is_inertial)  # those with a pose relative to the IMU
-# By name: the parameters of mounted sensors and of the scene.
-SPECS = {spec.name: spec for own in (*(t.parameters for t in MOUNTED_TYPES), SCENE) for spec in own}
+_OWN = (spec for kind in SENSOR_TYPES.values() for spec in kind.parameters)
+ALL_SPECS = tuple(dict.fromkeys((*_OWN, *SCENE)))  # each once
+
 # Of groups with a plural name, the name of one number: radius of radii.
-ONE = {spec.name: spec.one for spec in SPECS.values() if spec.one}
+ONE = {spec.name: spec.one for spec in ALL_SPECS if spec.one}

@@ -115,6 +115,10 @@ class Sensor:
         """The parameters that this sensor has, in the order of the layout."""
         return self.parameters
 
+    def spec(self, name: str) -> ParameterSpec:
+        """The definition of a group of `parameters`, as this sensor has it."""
+        return next(spec for spec in (*self.specs(), *self.parameters) if spec.name == name)
+
     def is_estimated(self, spec: ParameterSpec) -> bool:
         """Whether the group is estimated, as far as the sensor alone says."""
         return getattr(self, spec.name).mode != "fixed"

@@ -10,7 +10,7 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.inputs import Inputs
-from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions, worst_off
+from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
 from icalib.observability.fixed_lens import lens_steps
 from icalib.observability.relaxed import Relaxed, relaxed
 from icalib.optim.state import Key
@@ -77,7 +77,7 @@ def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple
     scale = max(factor, judged.misfit_factor)
     against = against or contradictions(inputs, stated, scale)
     if certain:  # a wrong size moves lever arms by some of their length
-        against = tuple(c for c in against if worst_off(c.key[1], c.off) > 1.0)
+        against = tuple(c for c in against if c.in_prior_sigmas > 1.0)
     causes = [Cause(sentence, np.inf, True) for sentence in mixed_up(inputs.rig.cameras, judged.groups)]
     if size is not None:
         gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2

@@ -66,7 +66,8 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
     state = outcome.state
     axes = hardly_turned(state.seconds, state.rotation, inputs.rig.reference)
-    seen = observe(determined, names, any(s.drives for s in inputs.rig.mounted), tracking, axes)
+    on_wheels = any(s.drives for s in inputs.rig.mounted)
+    seen = observe(determined, names, _column_specs(inputs), on_wheels, tracking, axes)
     parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
     noise = _NoiseShare.of(determined, seen.covariance, parts)
     groups = _groups(inputs, determined, seen, noise)
@@ -128,6 +129,10 @@ def _is_assumed(inputs: Inputs, name: str) -> bool:
 
 def _column_names(inputs: Inputs) -> tuple[str, ...]:
     return tuple(f"{b.sensor}.{b.name}.{label}" for b in inputs.layout.free for label in inputs.specs[b.key].labels)
+
+
+def _column_specs(inputs: Inputs) -> tuple[ParameterSpec, ...]:
+    return tuple(spec for b in inputs.layout.free for spec in [inputs.specs[b.key]] * b.size)
 
 
 def _mode(inputs: Inputs, block: Block) -> str:

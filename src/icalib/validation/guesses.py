@@ -31,7 +31,7 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
         if isinstance(sensor, Camera) and name in LENS:
             far = lens_off(sensor, name, found) > INTRINSICS.prior_sigma
         else:
-            far = is_contradicted(name, guess, group.value)
+            far = is_contradicted(sensor.spec(name), guess, group.value)
         if far:
             rotation = found.get((sensor.name, "rotation"))
             there = None if rotation is None else rotation.value

@@ -8,7 +8,6 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.rig import Rig
-from icalib.rig.kinds import SPECS
 from icalib.sensors import answer
 
 NEAR_RAD = 0.15  # rad: largest error of a rotation that another frame explains
@@ -34,7 +33,8 @@ def looks_like(
         inverse = -rotation.T @ found
         if _is_near(value, inverse) and not _is_near(value, found):
             return " It looks like that of the inverse: icalib wants p_imu_sensor."
-    for size, unit in (LENGTHS if SPECS[name].unit == "m" else {}).items():
+    sensor = rig.sensors.get(key[0])
+    for size, unit in (LENGTHS if sensor is not None and sensor.spec(name).unit == "m" else {}).items():
         if _is_near(found, size * value):
             return f" It looks like {unit}: write metres."
     if name == "time_offset" and _is_near(found, 1e-3 * value):
@@ -43,7 +43,6 @@ def looks_like(
         for size in IMAGE_SIZES:
             if _is_near(found[:2], size * value[:2]):
                 return f" The focal length is {size:g} times that: was it of images of another size?"
-    sensor = rig.sensors.get(key[0])
     own = None if sensor is None else answer(sensor.sensor_type, "assess", "looks_like", sensor, name, value, found)
     return own or ""
 

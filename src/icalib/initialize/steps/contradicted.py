@@ -14,22 +14,20 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.optim.state import Key
-from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
-from icalib.rig.kinds import SPECS
+from icalib.rig import Camera, Lidar, Parameter, ParameterSpec, PoseSensor, Wheels
 from icalib.sensors.sensor import TRANSLATION
 
 SIGMAS = 4.0  # times what a guess is worth
 SHARE = 0.1  # of a length or factor, by which its guess is off
 
 
-def is_contradicted(name: str, guess: np.ndarray, found: np.ndarray) -> bool:
-    """Whether a guess of the group `name` is farther from what the data show than guesses are worth."""
-    return worst_off(name, guess, found) > SIGMAS
+def is_contradicted(spec: ParameterSpec, guess: np.ndarray, found: np.ndarray) -> bool:
+    """Whether a guess of a group is farther from what the data show than guesses are worth."""
+    return worst_off(spec, guess, found) > SIGMAS
 
 
-def worst_off(name: str, guess: np.ndarray, found: np.ndarray) -> float:
+def worst_off(spec: ParameterSpec, guess: np.ndarray, found: np.ndarray) -> float:
     """How far a guess is off, in what one is worth; infinite for a length of no size."""
-    spec = SPECS[name]
     if spec.manifold == "rotation":
         return float(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ found)))) / spec.prior_sigma
     if spec.is_positive:
@@ -39,10 +37,10 @@ def worst_off(name: str, guess: np.ndarray, found: np.ndarray) -> float:
     return float(np.abs(found - guess).max()) / spec.prior_sigma
 
 
-def chosen(name: str, parameter: Parameter, given: np.ndarray | None, found: np.ndarray) -> np.ndarray:
+def chosen(spec: ParameterSpec, parameter: Parameter, given: np.ndarray | None, found: np.ndarray) -> np.ndarray:
     """Where the solver starts: at the `given` value of the parameter, as a state has it, but at what was `found` where
     there is none, or a mere guess that this contradicts."""
-    if given is None or (parameter.mode == "free" and is_contradicted(name, given, found)):
+    if given is None or (parameter.mode == "free" and is_contradicted(spec, given, found)):
         return found
     return given
 
@@ -68,9 +66,9 @@ def refuse_far_off(wheels: Wheels, found: dict[Key, np.ndarray]) -> None:
     """Raises FarOffError where a length or a lever arm that is fixed is farther from what was `found` than first
     guesses are off."""
     for (sensor, name), value in found.items() if _REFUSING.get() else ():
-        stated = getattr(wheels, name)
-        checked = SPECS[name].is_positive or name == TRANSLATION.name
-        if checked and stated.mode == "fixed" and is_contradicted(name, stated.value, value):
+        stated, spec = getattr(wheels, name), wheels.spec(name)
+        checked = spec.is_positive or spec == TRANSLATION
+        if checked and stated.mode == "fixed" and is_contradicted(spec, stated.value, value):
             raise FarOffError(f"{sensor}: {name} in the rig file contradicts the data.")
 
 
@@ -79,18 +77,18 @@ def settled(
 ) -> dict[Key, np.ndarray]:
     """Where the solver starts with a sensor: at what the rig file gives of it, `known`, and else at what was `found`;
     there, too, where this contradicts a guess, or a prior of a length, from which the solver may not come back."""
-    kept = {
-        key: value
+    leaves = {
+        key
         for key, value in known.items()
-        if key not in found or not _gives_way(sensor, key[1]) or not is_contradicted(key[1], value, found[key])
+        if key in found and _gives_way(sensor, key[1]) and is_contradicted(sensor.spec(key[1]), value, found[key])
     }
-    return found | kept
+    return found | {key: value for key, value in known.items() if key not in leaves}
 
 
 def _gives_way(sensor: Camera | Lidar | Wheels | PoseSensor, name: str) -> bool:
     """Whether what the rig file gives of a group may be left for what the data show."""
     mode = getattr(sensor, name).mode
-    return mode == "free" or (mode == "prior" and SPECS[name].is_positive)
+    return mode == "free" or (mode == "prior" and sensor.spec(name).is_positive)
 
 
 def has_guesses(sensor: Camera | Lidar | Wheels | PoseSensor, known: dict[Key, np.ndarray]) -> bool:

@@ -23,6 +23,7 @@ from icalib.initialize.steps.known_values import trusted
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
 from icalib.sensors.camera.initialize.guess import relative_offset
+from icalib.sensors.sensor import TIME_OFFSET
 
 
 def chosen_offset(camera: Camera, rates: CameraRates, imu: ImuData, given: float | None, found: Alignment) -> float:
@@ -30,7 +31,7 @@ def chosen_offset(camera: Camera, rates: CameraRates, imu: ImuData, given: float
     what was found goes only where the two do not turn alike at it, for slow motion hardly shows an offset."""
     if given is None:
         return found.offset
-    far = is_contradicted("time_offset", np.array([given]), np.array([found.offset]))
+    far = is_contradicted(TIME_OFFSET, np.array([given]), np.array([found.offset]))
     if trusted(camera.time_offset) is not None or not far:
         return given
     try:

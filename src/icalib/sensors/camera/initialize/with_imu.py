@@ -25,6 +25,7 @@ from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
 from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, lens_of
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 from icalib.sensors.camera.initialize.without_imu import guess_without_imu, trajectory_without_imu
+from icalib.sensors.sensor import ROTATION
 
 __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
 
@@ -126,7 +127,7 @@ def _camera_guess(
     return CameraGuess(
         params,
         offset,
-        chosen("rotation", camera.rotation, camera.rotation.value, aligned.rotation),
+        chosen(ROTATION, camera.rotation, camera.rotation.value, aligned.rotation),
         arm.position if p is None else p,
         poses,
     )

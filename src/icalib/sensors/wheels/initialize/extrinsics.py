@@ -20,7 +20,7 @@ from icalib.motion.imu_data import clear_of
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
-from icalib.sensors.sensor import mounted
+from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION, mounted
 from icalib.sensors.wheels.initialize.drive import (
     OPPOSITE,
     SidewaysError,
@@ -60,7 +60,7 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     offset = known.get(clock)
     try:
         found = _found(inputs, state, wheels, stream, None if wheels.time_offset.mode == "free" else offset)
-        if not complete and offset is not None and not is_contradicted("time_offset", offset, found[clock]):
+        if not complete and offset is not None and not is_contradicted(TIME_OFFSET, offset, found[clock]):
             found = _found(inputs, state, wheels, stream, offset)
     except EstimationError:
         if complete:
@@ -72,7 +72,7 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     arm = known.get(mount)
     level = found[mount] if arm is None else _as_high(inputs, state, arm, found[mount])
     refuse_far_off(wheels, found | {mount: level})
-    if arm is not None and not is_contradicted("translation", arm, level):
+    if arm is not None and not is_contradicted(TRANSLATION, arm, level):
         found[mount] = arm
     return settled(wheels, known, found)
 

@@ -23,6 +23,7 @@ from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_
 from icalib.sensors.camera.initialize.tracks.alignment import align_together, pairs_of
 from icalib.sensors.camera.initialize.tracks.lens import find_lens
 from icalib.sensors.camera.initialize.tracks.motion import Rays, WindowMotion, track_motion
+from icalib.sensors.sensor import ROTATION
 
 APART_S, FEWEST_SEEN = 0.15, 3
 LEAST_FELT = 0.7  # of gravity; half the time a rig is not thrown about
@@ -52,7 +53,7 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
         raw = camera.time_offset.value
         given = None if raw is None else relative_offset(raw, stream, measurements)
         offset = chosen_offset(camera, rates[k], imu, given, found)
-        R = chosen("rotation", camera.rotation, camera.rotation.value, found.rotation)
+        R = chosen(ROTATION, camera.rotation, camera.rotation.value, found.rotation)
         p = motion.arms[k] if camera.translation.value is None else camera.translation.value
         cameras[camera.name] = CameraGuess(params[k], offset, R, p, _poses(motion, stream.seconds + offset, R, p))
     return Guess(cameras, gyro_bias=aligned[0].gyro_bias, accel_bias=motion.accel_bias, R_world_board=np.eye(3))
