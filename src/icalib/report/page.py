@@ -6,7 +6,7 @@ import json
 from importlib.resources import files
 from string import Template
 
-from icalib.report import held_out_figures, motion_figures, rig_figures, rig_shapes, tables
+from icalib.report import cross_validation_figures, motion_figures, rig_figures, rig_shapes, tables
 from icalib.report.cards import camera_pairs, sensor_cards
 from icalib.report.ellipsoids import SIGMAS, ellipsoids, magnification
 from icalib.report.histogram import normalised_histogram
@@ -91,7 +91,7 @@ def _figures(c: Calibration) -> dict[str, Figure]:
     if c.imu is None:
         del found["motion"]
     if c.cross_validation is not None:
-        found["held-out"] = held_out_figures.moved_without_parts(c, c.cross_validation)
+        found["held-out"] = cross_validation_figures.moved_without_parts(c, c.cross_validation)
     return found
 
 
@@ -99,8 +99,12 @@ def _held_out_section(c: Calibration) -> Html:
     held = c.cross_validation
     if held is None:
         return element("p", _NOT_HELD_OUT, "quiet")
-    rise, verdict, parts = held_out_figures.words(c, held)
-    found = [element("p", verdict, "answer"), element("p", f"{rise} {parts}"), held_out_figures.predicted_fits(held)]
+    rise, verdict, parts = cross_validation_figures.words(c, held)
+    found = [
+        element("p", verdict, "answer"),
+        element("p", f"{rise} {parts}"),
+        cross_validation_figures.predicted_fits(held),
+    ]
     return Html("".join((*found, element("h3", "Parameters without each part"), plot_place("held-out"))))
 
 

@@ -47,8 +47,8 @@ from icalib.rig.file import rig_to_dict
 from icalib.sensors import SENSOR_KINDS, ask, facet
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.validation.all_causes import AssessedEstimate, all_causes
+from icalib.validation.cross_validation import cross_validation
 from icalib.validation.guesses import guess_notes
-from icalib.validation.held_out import held_out
 from icalib.validation.misfit import scatter_warnings
 from icalib.validation.notes import notes
 from icalib.validation.twin_lenses import twin_lens_notes
@@ -72,7 +72,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     noise = _NoiseShare.of(determined, seen.covariance, parts)
     groups = _groups(inputs, determined, seen, noise)
     judged = _sensor_fits([f for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
-    held = held_out(parts, [s for s in (inputs.rig.reference,) if _is_assumed(inputs, s)])
+    held = cross_validation(parts, [s for s in (inputs.rig.reference,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, state.values), inputs.rig.reference)
     factors = _factors(inputs, groups)
     factor = factors.max(initial=1.0)

@@ -11,7 +11,7 @@ from icalib.estimate.problem.problem import Problem
 from icalib.result import CrossValidation, PredictedFit
 
 
-def held_out(parts: Parts | None, assumed: Collection[str]) -> CrossValidation | None:
+def cross_validation(parts: Parts | None, assumed: Collection[str]) -> CrossValidation | None:
     """None if the recording cannot be split, or if no parameter is known to both halves. `assumed` sensors have no
     fits; no sensor has if the solutions of the halves are too far apart to be linearised."""
     found = None if parts is None else predict(parts)
