@@ -47,7 +47,7 @@ def report_html(calibration: Calibration) -> str:
         "fits": tables.fits(c),
         "parameters": tables.parameters(c),
         "poses": Html(tables.poses(c) + tables.relative(c) + tables.bodies(c)),
-        "cross_validation": _held_out_section(c),
+        "cross_validation": _cross_validation_section(c),
         "sensor_sections": Html("\n".join(section.html for section in about_sensors)),
         "facts": tables.facts(c),
         "without_imu": "" if c.imu else " hidden",
@@ -95,7 +95,7 @@ def _figures(c: Calibration) -> dict[str, Figure]:
     return found
 
 
-def _held_out_section(c: Calibration) -> Html:
+def _cross_validation_section(c: Calibration) -> Html:
     held = c.cross_validation
     if held is None:
         return element("p", _NOT_HELD_OUT, "quiet")

@@ -11,7 +11,7 @@ from icalib.sensors.camera.spec import BLOOM
 from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 
 
-class CameraModel(SensorModel[Camera, CornerNoise]):
+class CameraSensorModel(SensorModel[Camera, CornerNoise]):
     """Without an IMU images at one stamp are simultaneous, and the first camera that sees a target is the body."""
 
     keyframes = "images"
@@ -29,4 +29,4 @@ class CameraModel(SensorModel[Camera, CornerNoise]):
         return super().start_value(sensor, spec, rig)
 
 
-MODEL = CameraModel()
+MODEL = CameraSensorModel()
