@@ -87,6 +87,13 @@ def test_the_parameters_of_a_sensor_are_its_fields(kind: type[Sensor]):
     assert len({spec.name for spec in kind.parameters}) == len(kind.parameters)
 
 
+def test_kinds_that_share_a_name_share_its_definition():
+    """Advice and units are looked up by the name of a parameter alone."""
+    mounted = {spec for kind in SENSOR_TYPES.values() if not kind.is_inertial for spec in kind.parameters}
+    assert len({spec.name for spec in mounted}) == len(mounted)
+    assert all(kind.sensor_type == name and kind.noun for name, kind in SENSOR_TYPES.items())
+
+
 @pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: s.name)
 def test_every_parameter_has_its_labels_and_a_tolerance(sensor: Sensor):
     for spec in sensor.specs():

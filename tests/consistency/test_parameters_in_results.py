@@ -28,7 +28,7 @@ def test_every_parameter_of_a_robot_is_in_its_result(robot):
     result = calibrate_measurements(rig, simulation.measurements)
     plain = yaml.safe_load(calibration_yaml(result))["sensors"]
     found = {(g.sensor, g.name): g for g in result.groups}
-    sensors = rig.sensors.values()
+    sensors = tuple(rig.sensors.values())
     assert {s.sensor_type for s in sensors} == set(SENSOR_TYPES)
     for sensor in sensors:
         for spec in sensor.specs():
