@@ -52,8 +52,9 @@ def by_clock(state: State, name: str, node: np.ndarray) -> Iterator[tuple[int, s
 
 
 def mounted_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
-    """(7,) calibration columns of a sensor's rotation, translation and the time offset number `clock`, or its only
-    one."""
+    """(7,) calibration columns of a sensor's rotation, -1 where it has none, translation and the time offset number
+    `clock`, or its only one."""
     offset = layout.columns(name, "time_offset")
     own = offset[clock if len(offset) > 1 else 0]
-    return np.append(layout.columns(name, "rotation", "translation"), own)
+    rotation = layout.columns(name, "rotation") if layout.has(name, "rotation") else np.full(3, -1)
+    return np.concatenate([rotation, layout.columns(name, "translation"), [own]])

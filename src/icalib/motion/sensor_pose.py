@@ -83,9 +83,10 @@ class SensorPose(NamedTuple):
         cls, kinematics: Kinematics, seconds: np.ndarray, node: np.ndarray, state: State, jacobians: bool = True
     ) -> SensorPose:
         """At `seconds` (n,) on the sensor's clock, each from its keyframe `node` (n,). Without `jacobians` these may be
-        of length 0."""
+        of length 0. A sensor without a rotation has the axes of the body."""
         name, imu = kinematics.sensor, kinematics.imu_poses(seconds, node, state, jacobians)
-        R_is, p_is = np.ascontiguousarray(state.values[name, "rotation"]), state.values[name, "translation"]
+        R_is = np.ascontiguousarray(state.values.get((name, "rotation"), np.eye(3)))
+        p_is = state.values[name, "translation"]
         R_sw = np.ascontiguousarray((imu.rotation @ R_is).transpose(0, 2, 1))
         p_ws = imu.position + imu.rotation @ p_is
         return cls(R_is, p_is, R_sw, p_ws, imu.rate, imu.velocity, imu.J_node, imu.J_next, imu.J_imu)

@@ -76,6 +76,10 @@ class Layout:
     def block(self, sensor: str, name: str) -> Block:
         return next(b for b in self.blocks if b.key == (sensor, name))
 
+    def has(self, sensor: str, name: str) -> bool:
+        """Whether there is such a block."""
+        return any(b.key == (sensor, name) for b in self.blocks)
+
     def is_free(self, sensor: str, name: str) -> bool:
         """Whether the block is estimated."""
         return self.block(sensor, name).start is not None

@@ -208,15 +208,20 @@ class Calibration:
 
     def group(self, sensor: str, name: str) -> ParameterGroup:
         """The group `name` of `sensor`. Raises KeyError naming what there is."""
-        for g in self.groups:
-            if g.sensor == sensor and g.name == name:
-                return g
+        if (found := self.group_or_none(sensor, name)) is not None:
+            return found
         raise KeyError(f"no {name} of {sensor}; there are {', '.join(f'{g.sensor}.{g.name}' for g in self.groups)}")
 
+    def group_or_none(self, sensor: str, name: str) -> ParameterGroup | None:
+        """The group `name` of `sensor`; None where the sensor has none."""
+        return next((g for g in self.groups if g.sensor == sensor and g.name == name), None)
+
     def T_imu_sensor(self, sensor: str) -> np.ndarray:
-        """4x4 pose of `sensor` in the imu frame; without an IMU in that of `reference`."""
+        """4x4 pose of `sensor` in the imu frame; without an IMU in that of `reference`. A sensor without a rotation,
+        such as an antenna, has the axes of that frame."""
         T = np.eye(4)
-        T[:3, :3] = self.group(sensor, "rotation").value
+        if (rotation := self.group_or_none(sensor, "rotation")) is not None:
+            T[:3, :3] = rotation.value
         T[:3, 3] = self.group(sensor, "translation").value
         return T
 

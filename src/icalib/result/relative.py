@@ -87,15 +87,16 @@ def _joint_covariance(c: Calibration, *sensors: str) -> np.ndarray:
 
 
 def _pose(c: Calibration, sensor: str) -> np.ndarray:
-    return np.eye(4) if pose_groups(c, sensor)[0] is None else c.T_imu_sensor(sensor)
+    return np.eye(4) if pose_groups(c, sensor)[1] is None else c.T_imu_sensor(sensor)
 
 
 def pose_groups(c: Calibration, sensor: str) -> tuple[ParameterGroup | None, ParameterGroup | None]:
-    """Rotation and translation of `sensor`; None of the IMU where poses are relative to it: exactly known."""
+    """Rotation and translation of `sensor`; None of what is exactly known: of the IMU where poses are relative to it,
+    and the rotation of a sensor that has none."""
     known = {g.name: g for g in c.groups if g.sensor == sensor}
     if sensor == c.imu and "rotation" not in known:
         return None, None
-    return c.group(sensor, "rotation"), c.group(sensor, "translation")
+    return c.group_or_none(sensor, "rotation"), c.group(sensor, "translation")
 
 
 def joint_covariance(c: Calibration, groups: Sequence[ParameterGroup | None], none: int = 0) -> np.ndarray:

@@ -70,8 +70,7 @@ class Inputs:
         return self.rig.sensors[name]
 
     def stream(self, name: str) -> Stream:
-        m = self.measurements
-        return next(s for s in (*m.cameras, *m.lidars, *m.wheels, *m.poses) if s.name == name)
+        return self.measurements.streams[name]
 
     def clocks_of(self, sensor: Sensor) -> int:
         """How many time offsets it has."""

@@ -13,7 +13,7 @@ from icalib.data.recordings.several import naming
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.motion.imu_data import imu_data
 from icalib.optim.state import Key, State
-from icalib.rig import Lidar, PoseSensor
+from icalib.rig import Sensor
 
 
 @dataclass(frozen=True)
@@ -70,21 +70,20 @@ def other_clocks(offset: float, sensor: str, before: Inputs, now: Inputs) -> flo
     return offset + next(shifts) - next(shifts)
 
 
-def from_the_best(
-    inputs: Inputs, sensor: Lidar | PoseSensor, best: int, state_of: Callable[[Inputs, Held | None], State]
-) -> State:
+def from_the_best(inputs: Inputs, sensor: Sensor, best: int, state_of: Callable[[Inputs, Held | None], State]) -> State:
     """All recordings' states, each by itself: of the `best` from nothing, and of the others as it has shown how the
     `sensor` stands, and how its clock goes, if that runs on."""
     recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
+    restarts = getattr(sensor, "clock_restarts", False)
     with naming_recording(inputs, best):
         states = {best: state_of(recordings[best], None)}
     values, name = dict(states[best].values), sensor.name
     for k, own in enumerate(recordings):
         if k != best:
-            there = None if sensor.clock_restarts else _own_offset(states[best], name, recordings[best], own)
+            there = None if restarts else _own_offset(states[best], name, recordings[best], own)
             with naming_recording(inputs, k):
-                states[k] = state_of(own, Held(values[name, "rotation"], values[name, "translation"], there))
-    clocks = range(len(recordings)) if sensor.clock_restarts else (best,)
+                states[k] = state_of(own, Held(values.get((name, "rotation")), values[name, "translation"], there))
+    clocks = range(len(recordings)) if restarts else (best,)
     offsets = [_own_offset(states[k], name, recordings[k], inputs) for k in clocks]
     values[name, "time_offset"] = np.array(offsets)
     return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)

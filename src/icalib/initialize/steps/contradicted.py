@@ -14,7 +14,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.optim.state import Key
-from icalib.rig import Camera, Lidar, Parameter, ParameterSpec, PoseSensor, Wheels
+from icalib.rig import Parameter, ParameterSpec, Sensor, Wheels
 from icalib.sensors.sensor import TRANSLATION
 
 SIGMAS = 4.0  # times what a guess is worth
@@ -72,9 +72,7 @@ def refuse_far_off(wheels: Wheels, found: dict[Key, np.ndarray]) -> None:
             raise FarOffError(f"{sensor}: {name} in the rig file contradicts the data.")
 
 
-def settled(
-    sensor: Camera | Lidar | Wheels | PoseSensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]
-) -> dict[Key, np.ndarray]:
+def settled(sensor: Sensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
     """Where the solver starts with a sensor: at what the rig file gives of it, `known`, and else at what was `found`;
     there, too, where this contradicts a guess, or a prior of a length, from which the solver may not come back."""
     leaves = {
@@ -85,13 +83,13 @@ def settled(
     return found | {key: value for key, value in known.items() if key not in leaves}
 
 
-def _gives_way(sensor: Camera | Lidar | Wheels | PoseSensor, name: str) -> bool:
+def _gives_way(sensor: Sensor, name: str) -> bool:
     """Whether what the rig file gives of a group may be left for what the data show."""
     mode = getattr(sensor, name).mode
     return mode == "free" or (mode == "prior" and sensor.spec(name).is_positive)
 
 
-def has_guesses(sensor: Camera | Lidar | Wheels | PoseSensor, known: dict[Key, np.ndarray]) -> bool:
+def has_guesses(sensor: Sensor, known: dict[Key, np.ndarray]) -> bool:
     """Whether some of the `known` values are mere guesses."""
     return any(getattr(sensor, name).mode == "free" for _, name in known)
 

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.initialize.steps.by_recording import Held
 from icalib.optim.state import Key
-from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
+from icalib.rig import Parameter, Sensor
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 
@@ -18,9 +18,7 @@ def trusted(parameter: Parameter) -> np.ndarray | None:
     return None if parameter.mode == "free" else parameter.value
 
 
-def given(
-    inputs: Inputs, sensor: Camera | Lidar | Wheels | PoseSensor, names: Sequence[str] = MOUNTED_NAMES
-) -> dict[Key, np.ndarray]:
+def given(inputs: Inputs, sensor: Sensor, names: Sequence[str] = MOUNTED_NAMES) -> dict[Key, np.ndarray]:
     """The values of the parameters `names` that the rig file gives; time offsets between first stamps, one for each
     recording where the clock restarts."""
     out: dict[Key, np.ndarray] = {}
@@ -34,12 +32,12 @@ def given(
     return out
 
 
-def trusted_names(sensor: Lidar | PoseSensor | Camera | Wheels) -> list[str]:
+def trusted_names(sensor: Sensor) -> list[str]:
     """The extrinsics and time offset that are fixed or have a prior: other guesses may rest on them."""
     return [name for name in MOUNTED_NAMES if trusted(getattr(sensor, name)) is not None]
 
 
-def held_of(inputs: Inputs, sensor: Lidar | PoseSensor, guesses: bool = False) -> Held:
+def held_of(inputs: Inputs, sensor: Sensor, guesses: bool = False) -> Held:
     """What the rig file fixes of a sensor's extrinsics or gives as a prior; with `guesses` its guesses too."""
     known = given(inputs, sensor, MOUNTED_NAMES if guesses else trusted_names(sensor))
     offset = known.get((sensor.name, "time_offset"))

@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
+from pathlib import PurePosixPath
+
+from icalib.data.tables.files import table_files
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 
 
 def place_line(name: str, kind: str, frame: str = "") -> str:
     """`topic` of a bag or a folder of images; `path` of a table. kind: of what is there, for a comment."""
-    field = "path" if name.endswith((".csv", ".csv.gz", ".npz", ".tum", ".txt")) else "topic"
+    endings = (".csv", *(PurePosixPath(table.name).suffix for table in table_files()))
+    field = "path" if name.removesuffix(".gz").endswith(endings) else "topic"
     return f"{field}: {name_text(name)}  # {comment(kind)}" + in_frame(frame)
 
 
