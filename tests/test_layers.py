@@ -40,7 +40,7 @@ ORDER = (
     ("optim",),
     ("motion",),
     ("model",),
-    ("sensors.camera", "sensors.imu", "sensors.lidar", "sensors.pose", "sensors.wheels"),
+    ("sensors.camera", "sensors.imu", "sensors.lidar", "sensors.pose", "sensors.position", "sensors.wheels"),
     ("sensors.camera.features",),
     ("sensors.*.model",),
     ("estimate.problem",),

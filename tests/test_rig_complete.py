@@ -21,12 +21,12 @@ EMPTY = Measurements.of_streams()
 @pytest.mark.parametrize(
     ("rig", "sentence"),
     [
-        (Rig(by_name(IMU)), "there is no camera, no LiDAR and no pose sensor"),
+        (Rig(by_name(IMU)), "there is no camera, no LiDAR, no pose sensor and no position sensor"),
         (
             Rig(by_name(IMU, WHEELS)),
             "wheel0 and imu0 do not determine the motion, and there is no camera",
         ),
-        (Rig(by_name(WHEELS)), "there is no camera, no LiDAR and no pose sensor"),
+        (Rig(by_name(WHEELS)), "there is no camera, no LiDAR, no pose sensor and no position sensor"),
         (Rig(by_name(LIDAR)), "lidar0 needs an IMU"),
         (Rig(by_name(LIDAR, MOCAP)), "lidar0 needs an IMU"),
         (Rig(by_name(LIDAR, WHEELS)), "lidar0 needs an IMU"),

@@ -428,9 +428,13 @@ def test_other_targets_are_read_and_written(tmp_path, text, target):
 def test_two_imus_no_camera(tmp_path):
     imu, rest = "  imu0: {type: imu}\n", f"target: {TARGET}\n"
     camera = "  cam0: {type: camera, model: pinhole-radtan, resolution: [752, 480]}\n"
-    assert "there is no camera, no LiDAR and no pose sensor" in complaint(tmp_path, "sensors:\n" + imu + rest)
+    assert "there is no camera, no LiDAR, no pose sensor and no position sensor" in complaint(
+        tmp_path, "sensors:\n" + imu + rest
+    )
     wheels = "  wheel0: {type: wheels}\n"
-    assert "there is no camera, no LiDAR and no pose sensor" in complaint(tmp_path, "sensors:\n" + imu + wheels + rest)
+    assert "there is no camera, no LiDAR, no pose sensor and no position sensor" in complaint(
+        tmp_path, "sensors:\n" + imu + wheels + rest
+    )
     lidar = "  lidar0: {type: lidar}\n"
     assert "sensors.lidar0: needs an IMU" in complaint(tmp_path, "sensors:\n" + camera + wheels + lidar + rest)
     second = complaint(tmp_path, "sensors:\n" + imu + "  imu1: {type: imu}\n" + camera + rest)

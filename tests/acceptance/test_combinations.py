@@ -42,7 +42,7 @@ SUBSETS = ["+".join(n for n, on in zip(OTHERS, bits, strict=True) if on) for bit
 def refusal(sees: str, imu: bool, others: str, known: str) -> str:
     """A part of the sentence that refuses a combination; empty where it is calibrated."""
     if not sees and others == "wheels":
-        return "there is no camera, no LiDAR and no pose sensor"
+        return "there is no camera, no LiDAR, no pose sensor and no position sensor"
     if not imu and "lidar" in others:
         return "lidar0 needs an IMU"
     if not imu and not sees and others == "pose":

@@ -58,6 +58,7 @@ TOLERANCE = {
     "ground_height": 5e-3,
     "plane": (2e-3, 2e-3, 5e-3),
     "frame_rotation": 2e-3,
+    "frame_yaw": 2e-3,
     "frame_translation": 5e-3,
     "size": 1e-2,
     "scale": 1e-2,

@@ -38,6 +38,8 @@ from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
+from icalib.sensors.position.residual import PositionFactor, PositionNoise
+from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.wheels.ground_factor import GroundFactor
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
 
@@ -536,6 +538,51 @@ def pose_sample(
     return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
 
 
+def position_sample(
+    unlike, setup_of, imu_free=False, levelled=True, loss="none", curved=False, starts=(0,), restarts=False, stated=True
+):
+    """Fixes that wander by 0.3 m, far from what the state predicts, with correlated covariances where they are
+    `stated`; the frame is levelled or turned anyhow."""
+    setup = with_poses(setup_of(unlike, imu_free=imu_free), starts)
+    blocks = [b for b in setup.layout.blocks if b.key not in (("mocap0", "rotation"), ("mocap0", "scale"))]
+    values = dict(setup.state.values)
+    entries = []
+    for b in blocks:
+        if levelled and b.name == "frame_rotation":
+            entries.append((b.sensor, "frame_yaw", "vector", 1, True))
+            values[b.sensor, "frame_yaw"] = np.array([2.0 + len(entries)])
+        else:
+            entries.append((b.sensor, b.name, b.kind, b.size, b.start is not None))
+    setup = replace(setup, layout=make_layout(entries), state=replace(setup.state, values=values))
+    setup = with_two_clocks(setup, starts[1]) if restarts else setup
+    rng = np.random.default_rng(8)
+    seconds = np.arange(0.0, setup.imu.seconds[-1], 1.0 / 25.0)
+    stamps = np.round(1e9 * seconds).astype(np.int64)
+    root = rng.normal(size=(len(seconds) if stated else 0, 3, 3)) + 2.0 * np.eye(3)
+    position = np.cumsum(0.3 * rng.normal(size=(len(seconds), 3)), axis=0)
+    joins = (int(stamps[len(stamps) // 2]),) if restarts else ()
+    stream = PositionStream("mocap0", stamps, position, root @ root.transpose(0, 2, 1), joins_ns=joins)
+    made = PositionFactor.build(
+        stream, Motion(setup.state, setup.imu, 9.81, 0.5), PositionNoise(0.3, 0.5, loss, LOSS_SCALE), setup.layout
+    )
+    state = setup.perturbed(rng, 0.3)
+
+    def run(at):
+        out = made.output()
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            made.accumulate(at, piece, out, sums=False)
+        return out.residual.ravel(), out.root.ravel()
+
+    def weights(at):
+        r, root = run(at)
+        return root**2 * r, np.diag(root**2 * slope_along(loss if curved else "none", np.abs(r)))
+
+    def accumulate(at, piece, sums):
+        return made.accumulate(at, piece, made.output(), sums, curved)
+
+    return Sample("PositionFactor", setup, state, accumulate, lambda at: run(at)[0], weights)
+
+
 SAMPLES = {
     "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
@@ -668,6 +715,15 @@ SAMPLES = {
     "relative poses, clock that restarts": (
         "RelativePosesFactor",
         lambda u, s, f: pose_sample(u, s, RelativePosesFactor, True, starts=(0, 5), restarts=True),
+    ),
+    "positions": ("PositionFactor", lambda u, s, f: position_sample(u, s)),
+    "positions, tilted frame, huber, intrinsics": (
+        "PositionFactor",
+        lambda u, s, f: position_sample(u, s, True, levelled=False, loss="huber", stated=False),
+    ),
+    "positions of two recordings, clock that restarts, cauchy, curved": (
+        "PositionFactor",
+        lambda u, s, f: position_sample(u, s, loss="cauchy", curved=True, starts=(0, 5), restarts=True),
     ),
     "bias prior": ("accumulate_bias_prior", lambda u, s, f: bias_prior_sample(u, s)),
 }

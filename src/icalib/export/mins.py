@@ -30,7 +30,8 @@ def mins(c: Calibration) -> Export:
     lenses = {name: lens_of(c, name, "MINS", tuple(MODELS)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
     pairs = [name for name in c.wheels if (name, "radii") in ((g.sensor, g.name) for g in c.groups)]
-    taken = [*c.cameras, *c.lidars, *pairs[:1]]
+    positions = c.of_type("position")
+    taken = [*c.cameras, *c.lidars, *pairs[:1], *positions]
     sentences += no_place_for("MINS", [*imu_intrinsics(c), *others(c, *taken)]) + guesses(c, taken)
     noise = c.rig["sensors"][imu]["noise"]
     fields = {"accel_noise": "accel", "accel_bias": "accel_walk", "gyro_noise": "gyro", "gyro_bias": "gyro_walk"}
@@ -53,6 +54,10 @@ def mins(c: Calibration) -> Export:
             for i, name in enumerate(c.lidars)
         }
         files["config_lidar.yaml"] = _file(_said("lidar", "LiDAR", c.lidars), lidars, sentences)
+    if positions:
+        gps = {f"gps{i}": _antenna(c, name) for i, name in enumerate(positions)}
+        said = ["pGinI: the antenna in the IMU's frame [m].", *_said("gps", "GPS", positions)[1:]]
+        files["config_gps.yaml"] = _file(said, gps, sentences)
     if pairs:
         files["config_wheel.yaml"] = _wheels(c, pairs[0], sentences)
     return Export(files, sentences)
@@ -61,6 +66,11 @@ def mins(c: Calibration) -> Export:
 def _placed(c: Calibration, name: str, kind: str) -> dict[str, Any]:
     offset = time_offset(c, name)
     return {"timeoffset": offset, f"T_imu_{kind}": c.T_imu_sensor(name).tolist()}
+
+
+def _antenna(c: Calibration, name: str) -> dict[str, Any]:
+    arm = c.group(name, "translation").value.tolist()
+    return {"timeoffset": time_offset(c, name), "pGinI": arm, "topic": topic(c, name, f"/{name}/fix")}
 
 
 def _said(kind: str, word: str, names: tuple[str, ...]) -> list[str]:

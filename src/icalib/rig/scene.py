@@ -48,7 +48,9 @@ PLANE = ParameterSpec(
     "plane", 3, "plane", "", ("turn 1", "turn 2", "distance"), (radians(10.0), radians(10.0), 0.5), 10.0
 )
 FRAME_ROTATION = ParameterSpec("frame_rotation", 3, "rotation", "rad", AXES, radians(10.0), 10.0)
+FRAME_YAW = ParameterSpec("frame_yaw", 1, "vector", "rad", ("frame_yaw",), radians(10.0), 10.0)
 FRAME_TRANSLATION = ParameterSpec("frame_translation", 3, "vector", "m", AXES, 0.5, 10.0)
 FRAME = (FRAME_ROTATION, FRAME_TRANSLATION)  # pose of a pose sensor's frame in the world
+LEVEL_FRAME = (FRAME_YAW, FRAME_TRANSLATION)  # the same of a frame that is as level as the world
 BODY = (ROTATION, TRANSLATION)  # pose of one of several bodies of a target in the scene
-SCENE = (SIZE, TILT, SHAPE, PLANE, *FRAME, *BODY)
+SCENE = (SIZE, TILT, SHAPE, PLANE, FRAME_YAW, *FRAME, *BODY)

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 
 # Sensors stand in this order in layouts and results; those of one kind in the order of the rig file.
-SENSOR_KINDS = ("imu", "camera", "lidar", "wheels", "pose")
+SENSOR_KINDS = ("imu", "camera", "lidar", "wheels", "pose", "position")
 # Levels of their own in tests/test_layers.py.
 FACETS = ("spec", "record", "stream", "read", "model", "initialize", "assess", "show", "simulate", "inspect")
 

@@ -1,0 +1,133 @@
+"""Initial guess of position sensors: a trajectory with the IMU alone, or lever arm, clock and frame on a known one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.estimate.estimate import first_pass
+from icalib.estimate.problem.assembly import host_times, motion_of, nodes_for, start_values
+from icalib.estimate.problem.inputs import Inputs
+from icalib.initialize.steps.by_recording import (
+    Held,
+    alone,
+    from_the_best,
+    motion_alone,
+    naming_recording,
+    other_clocks,
+)
+from icalib.initialize.steps.contradicted import settled
+from icalib.initialize.steps.initializer import BY_POSITIONS, Initializer, Moving, Values
+from icalib.initialize.steps.known_values import given, trusted
+from icalib.model.frames import frame_of
+from icalib.optim.state import State
+from icalib.rig import Rig
+from icalib.rig.scene import FRAME_ROTATION, FRAME_TRANSLATION, FRAME_YAW
+from icalib.sensors.position.initialize.attitude import Fix
+from icalib.sensors.position.initialize.placed import PlacedSensor, place
+from icalib.sensors.position.initialize.with_imu import motion_from_fixes
+from icalib.sensors.position.spec import PositionSensor
+from icalib.sensors.position.stream import PositionStream
+
+NAMES = ("translation", "time_offset")
+
+
+class PositionInitializer(Initializer[PositionSensor]):
+    """The first position sensor gives the motion where no other kind does; all others are placed on it."""
+
+    def motion_rank(self, rig: Rig) -> int | None:
+        return BY_POSITIONS if rig.of(PositionSensor) else None
+
+    def sources(self, rig: Rig) -> tuple[str, ...]:
+        return (rig.of(PositionSensor)[0].name,)
+
+    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+        del other
+        sensor = inputs.rig.of(PositionSensor)[0]
+        counts = [len(alone(inputs, k).stream(sensor.name).stamps_ns) for k in range(len(inputs.parts))]
+        state = from_the_best(inputs, sensor, int(np.argmax(counts)), _state_of_one)
+        frames = _frames(inputs, sensor, [(np.eye(3), np.zeros(3))] * len(inputs.parts))
+        return replace(state, values=state.values | frames)
+
+    def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+        state = first_pass(inputs, state)
+        return inputs, state, state.values
+
+    def place(self, inputs: Inputs, state: State, sensors: Sequence[PositionSensor]) -> Values:
+        out: Values = {}
+        for sensor in sensors:
+            out |= _on_motion(inputs, state, sensor)
+        return out
+
+
+INITIALIZER = PositionInitializer()
+
+
+def _state_of_one(inputs: Inputs, held: Held | None) -> State:
+    """Of one recording, in the frame of the fixes; `held`: what another recording has shown of the sensor."""
+    assert inputs.imu is not None
+    sensor = inputs.rig.of(PositionSensor)[0]
+    known = held or _held(inputs, sensor)
+    found = motion_from_fixes(inputs.imu, sensor.name, _fix(inputs, sensor), inputs.rig.gravity, known)
+    shown = {
+        (sensor.name, name): value
+        for name, value in zip(NAMES, (found.best.at.arm, np.array([found.best.at.offset])), strict=True)
+    }
+    values = start_values(inputs, settled(sensor, given(inputs, sensor, NAMES), shown))
+    nodes = nodes_for(inputs, host_times(inputs, values))
+    rotation, position, velocity, bias = found.at(nodes)
+    return State(nodes, rotation, position, velocity, bias, values)
+
+
+def _on_motion(inputs: Inputs, state: State, sensor: PositionSensor) -> Values:
+    """What one sensor shows on the motion of `state`. Of several recordings the one with most fixes gives the lever
+    arm, and the time offset if the clock runs on."""
+    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
+    best = int(np.argmax([len(own.stream(sensor.name).stamps_ns) for own in recordings]))
+    found: dict[int, PlacedSensor] = {}
+    for k in sorted(range(len(recordings)), key=lambda k: k != best):
+        known = _held(recordings[k], sensor)
+        if k != best:
+            offset = other_clocks(found[best].offset, sensor.name, recordings[best], recordings[k])
+            known = Held(position=found[best].arm, offset=known.offset if sensor.clock_restarts else offset)
+        with naming_recording(inputs, k):
+            motion = motion_of(recordings[k], motion_alone(inputs, k, state))
+            found[k] = place(motion, sensor.name, _fix(recordings[k], sensor), _is_levelled(inputs, sensor), known)
+    clocks = range(len(recordings)) if sensor.clock_restarts else (best,)
+    offsets = [other_clocks(found[k].offset, sensor.name, recordings[k], inputs) for k in clocks]
+    shown = {(sensor.name, NAMES[0]): found[best].arm, (sensor.name, NAMES[1]): np.array(offsets)}
+    frames = _frames(inputs, sensor, [(found[k].R_wf, found[k].p_wf) for k in range(len(recordings))])
+    return settled(sensor, given(inputs, sensor, NAMES), shown) | frames
+
+
+def _held(inputs: Inputs, sensor: PositionSensor) -> Held:
+    """What the rig file fixes of the sensor or gives as a prior."""
+    known = {name: value for (_, name), value in given(inputs, sensor, NAMES).items()}
+    known = {name: value for name, value in known.items() if trusted(getattr(sensor, name)) is not None}
+    offset = known.get("time_offset")
+    return Held(position=known.get("translation"), offset=None if offset is None else float(offset[0]))
+
+
+def _fix(inputs: Inputs, sensor: PositionSensor) -> Fix:
+    stream = inputs.stream(sensor.name)
+    assert isinstance(stream, PositionStream)
+    return Fix(stream.seconds, stream.position)
+
+
+def _is_levelled(inputs: Inputs, sensor: PositionSensor) -> bool:
+    """Whether its frame turns against the world about the vertical alone."""
+    return (frame_of(sensor.name, 0), FRAME_YAW.name) in {b.key for b in inputs.layout.blocks}
+
+
+def _frames(inputs: Inputs, sensor: PositionSensor, found: Sequence[tuple[np.ndarray, np.ndarray]]) -> Values:
+    """Blocks of the frame in each recording: R_world_frame, p_world_frame."""
+    out: Values = {}
+    levelled = _is_levelled(inputs, sensor)
+    for k, (R, p) in enumerate(found):
+        name, value = (
+            (FRAME_YAW.name, np.array([np.arctan2(R[1, 0], R[0, 0])])) if levelled else (FRAME_ROTATION.name, R)
+        )
+        out |= {(frame_of(sensor.name, k), name): value, (frame_of(sensor.name, k), FRAME_TRANSLATION.name): p}
+    return out

@@ -1,0 +1,154 @@
+"""A position sensor on a known motion of the IMU: time offset by speeds, then frame and lever arm linearly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.geometry import so3
+from icalib.initialize.steps.by_recording import Held
+from icalib.initialize.steps.correlation import best_shifts
+from icalib.motion.known_motion import imu_poses, is_known
+from icalib.motion.sweep import Motion
+from icalib.sensors.position.initialize.attitude import Fix
+
+GRID_HZ = 20.0
+STEP_S = 1.0  # over which speeds are means: fixes of 2 cm make 3 cm/s
+SHORTEST_OVERLAP_S = 5.0
+MOST_PEAKS = 4
+PEAKS_APART_S = 0.3
+FEWEST = 8  # fixes
+ROUNDS = 10
+CONVERGED = 1e-6
+OUTLIER = 4.0  # median sizes of residuals
+LEAST_ROW_SIGMA = 0.01  # m
+ARM_SIGMA, OFFSET_SIGMA = 2.0, 0.3  # m, s: of the prior
+OFFSET_STEP_S = 0.005
+LARGEST_LEFT = 0.3  # of the spread of the fixes
+
+
+class PlacedSensor(NamedTuple):
+    """arm: p_imu_sensor (3,) m; R_world_frame (3, 3), p_world_frame (3,) m; offset: as in `Held`; left: median size of
+    the residuals over that of the fixes about their median."""
+
+    arm: np.ndarray
+    R_wf: np.ndarray
+    p_wf: np.ndarray
+    offset: float
+    left: float
+
+
+def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: Held) -> PlacedSensor:
+    """From the fixes of one recording, whose nodes `motion` has. levelled: the frame turns against the world about z
+    alone. Raises EstimationError where they do not show it."""
+    found = [x for offset in _offsets(motion, fix, known) if (x := _placed(motion, fix, offset, levelled, known))]
+    if not found:
+        raise EstimationError(
+            f"{name}: too few of its fixes fall within the motion that the other sensors show; check that the clocks "
+            "overlap, or the time_offset in the rig file."
+        )
+    best = min(found, key=lambda x: x.left)
+    if best.left > LARGEST_LEFT:
+        raise EstimationError(
+            f"{name}: its fixes do not follow the motion that the other sensors show, {best.left:.0%} "
+            "of their spread is left at every time offset; check that both are on the same vehicle."
+        )
+    return best
+
+
+def _offsets(motion: Motion, fix: Fix, known: Held) -> list[float]:
+    """Likely ones, by the correlation of mean speeds."""
+    if known.offset is not None:
+        return [known.offset]
+    state = motion.state
+    moved = _speeds(state.seconds, state.position)
+    seen = _speeds(fix.t, fix.position)
+    if not (moved[1].any() and seen[1].any()):
+        return []
+    peaks = best_shifts(*moved, *seen, SHORTEST_OVERLAP_S * GRID_HZ, MOST_PEAKS, round(PEAKS_APART_S * GRID_HZ))
+    return [peak.samples / GRID_HZ for peak in peaks]
+
+
+def _speeds(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean speed over STEP_S [m/s] of positions p (n, 3) at t (n,) s, on a grid from 0 on, and where it is known."""
+    grid = np.arange(int(t[-1] * GRID_HZ) + 1) / GRID_HZ
+    ends = [grid - 0.5 * STEP_S, grid + 0.5 * STEP_S]
+    apart = max(2.5 * float(np.median(np.diff(t))), 1.5 / GRID_HZ)
+    after = [np.clip(np.searchsorted(t, x), 1, len(t) - 1) for x in ends]
+    known = (ends[0] >= t[0]) & (ends[1] <= t[-1])
+    for k in after:
+        known &= t[k] - t[k - 1] <= apart
+    at = [np.stack([np.interp(x, t, p[:, k]) for k in range(3)], axis=1) for x in ends]
+    return np.linalg.norm(at[1] - at[0], axis=1) / STEP_S, known
+
+
+@dataclass(frozen=True)
+class _Unknowns:
+    arm: np.ndarray
+    R_wf: np.ndarray
+    p_wf: np.ndarray
+    offset: float
+
+    def moved(self, d: np.ndarray, levelled: bool) -> _Unknowns:
+        turn = np.array([0.0, 0.0, d[3]]) if levelled else d[3:6]
+        o = 4 if levelled else 6
+        return _Unknowns(
+            self.arm + d[:3], so3.exp(turn) @ self.R_wf, self.p_wf + d[o : o + 3], self.offset + float(d[-1])
+        )
+
+
+def _placed(motion: Motion, fix: Fix, offset: float, levelled: bool, known: Held) -> PlacedSensor | None:
+    """By Gauss-Newton from Procrustes' turn of the positions, at an offset that is refined."""
+    t = fix.t + offset
+    ok = is_known(motion.state.seconds, t - OFFSET_SIGMA) & is_known(motion.state.seconds, t + OFFSET_SIGMA)
+    if ok.sum() < FEWEST:
+        return None
+    t, p = fix.t[ok], fix.position[ok]
+    arm = np.zeros(3) if known.position is None else known.position
+    x = start = _procrustes(imu_poses(motion, t + offset).position, p, levelled, arm, offset)
+    arm_sigma = ARM_SIGMA if known.position is None else 1e-3
+    sigma = np.r_[np.full(3, arm_sigma), np.full(1 if levelled else 3, 10.0), np.full(3, 1e4)]
+    sigma = np.append(sigma, OFFSET_SIGMA if known.offset is None else 1e-4)
+    r = np.zeros((0, 3))
+    for _ in range(ROUNDS):
+        r, J = _rows(motion, t, p, x, levelled)
+        size = np.linalg.norm(r, axis=1)
+        kept = size <= OUTLIER * np.median(size) + 1e-9
+        row = max(LEAST_ROW_SIGMA, float(np.median(size)))
+        A, b = J[kept].reshape(-1, J.shape[2]) / row, -r[kept].ravel() / row
+        away = np.zeros(len(sigma))
+        away[:3], away[-1] = x.arm - start.arm, x.offset - start.offset
+        step = np.linalg.solve(A.T @ A + np.diag(sigma**-2), A.T @ b - away / sigma**2)
+        x = x.moved(step, levelled)
+        if abs(x.offset - offset) > OFFSET_SIGMA:
+            return None
+        if np.abs(step).max() < CONVERGED:
+            break
+    spread = float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
+    left = float(np.median(np.linalg.norm(r, axis=1))) / max(spread, 1e-9)
+    return PlacedSensor(x.arm, x.R_wf, x.p_wf, x.offset, left)
+
+
+def _procrustes(at: np.ndarray, p: np.ndarray, levelled: bool, arm: np.ndarray, offset: float) -> _Unknowns:
+    """The frame that brings the fixes p (n, 3) to the IMU's positions `at` (n, 3)."""
+    a, b = at - at.mean(axis=0), p - p.mean(axis=0)
+    C = a.T @ b
+    if levelled:
+        R = so3.exp(np.array([0.0, 0.0, np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1])]))
+    else:
+        U, _, Vt = np.linalg.svd(C)
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return _Unknowns(arm, R, np.median(at - p @ R.T, axis=0), offset)
+
+
+def _rows(motion: Motion, t: np.ndarray, p: np.ndarray, x: _Unknowns, levelled: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n, 3) m in the world, and their derivatives (n, 3, 8 or 10): arm, turn, origin, offset."""
+    at, turned = imu_poses(motion, t + x.offset), p @ x.R_wf.T
+    r = at.position + at.rotation @ x.arm - turned - x.p_wf
+    J_turn = so3.hat_many(np.ascontiguousarray(turned))
+    spin = at.rotation @ np.cross(at.rate, x.arm)[:, :, None]
+    J = [at.rotation, J_turn[:, :, 2:] if levelled else J_turn, np.tile(-np.eye(3), (len(t), 1, 1))]
+    return r, np.concatenate([*J, at.velocity[:, :, None] + spin], axis=2)

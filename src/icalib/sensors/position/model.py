@@ -1,0 +1,84 @@
+"""How a position sensor enters the problem: by its fixes, and by the frame in which it reports them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.model.frames import frame_of
+from icalib.model.sensor_model import Pass, SensorModel
+from icalib.model.statistics import ResidualStatistics
+from icalib.motion.clocks import instants
+from icalib.optim.state import Entry, Key
+from icalib.rig import Rig, Settings
+from icalib.rig.scene import FRAME, LEVEL_FRAME
+from icalib.sensors.position.residual import PositionFactor, PositionNoise
+from icalib.sensors.position.spec import PositionSensor
+from icalib.sensors.position.stream import PositionStream
+
+FIRST_NOISE_M = 0.05  # of each axis where nothing is stated: between differential and carrier-phase fixes
+LEAST_NOISE = 1e-6  # m, or times the stated covariance: keeps the weights of fixes without any noise finite
+
+
+class PositionModel(SensorModel[PositionSensor, PositionNoise]):
+    """Noise that is not stated is estimated by degrees of freedom, horizontal and vertical apart. The trajectory
+    absorbs some of it, so that the first estimate is a rough one, and there are two."""
+
+    keyframes = "positions"
+
+    def scene_entries(self, sensor: PositionSensor, rig: Rig, n_recordings: int) -> list[Entry]:
+        """The frame of its fixes in the world of each recording: its yaw and origin where both are levelled."""
+        levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == "levelled"
+        frames = [frame_of(sensor.name, k) for k in range(n_recordings)]
+        return [spec.entry(frame) for frame in frames for spec in (LEVEL_FRAME if levelled else FRAME)]
+
+    def keyframe_times(
+        self, sensor: PositionSensor, stream: PositionStream, values: dict[Key, np.ndarray], rig: Rig
+    ) -> np.ndarray:
+        """See `SensorModel`."""
+        del sensor, rig
+        return instants(stream, values)
+
+    def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
+        """See `SensorModel`."""
+        size = sensor.position_noise
+        first = 1.0 if size == "messages" or size is None else size
+        return PositionNoise(first, first, settings.loss, settings.loss_scale)
+
+    def next_noise(self, sensor: PositionSensor, noise: PositionNoise, found: ResidualStatistics) -> PositionNoise:
+        """See `SensorModel`."""
+        if not self.noise_is_estimated(sensor):
+            return noise
+        factors = found.variance_factors()
+        horizontal, vertical = (
+            max(size * float(np.sqrt(factors.get(kind, 1.0))), LEAST_NOISE)
+            for kind, size in (("horizontal", noise.horizontal), ("vertical", noise.vertical))
+        )
+        return replace(noise, horizontal=horizontal, vertical=vertical)
+
+    def noise_passes(self, sensor: PositionSensor) -> int:
+        """See `SensorModel`."""
+        return 2 if sensor.position_noise is None else 0
+
+    def factors(
+        self, sensor: PositionSensor, stream: PositionStream, noise: PositionNoise, at: Pass
+    ) -> Iterator[PositionFactor]:
+        """One, of all fixes."""
+        assert at.motion is not None
+        yield PositionFactor.build(weighted(sensor, stream), at.motion, noise, at.layout)
+
+
+def weighted(sensor: PositionSensor, stream: PositionStream) -> PositionStream:
+    """The stream with covariances as the noise is counted in: those of the recording, unless the rig file states the
+    noise. Without either FIRST_NOISE_M of each axis."""
+    n = len(stream.stamps_ns)
+    if isinstance(sensor.position_noise, float):
+        return replace(stream, covariance=np.zeros((0, 3, 3)))
+    if len(stream.covariance):
+        return stream
+    return replace(stream, covariance=np.tile(FIRST_NOISE_M**2 * np.eye(3), (n, 1, 1)))
+
+
+MODEL = PositionModel()

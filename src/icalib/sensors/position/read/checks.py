@@ -1,0 +1,133 @@
+"""Whether fixes can be those of one antenna that moves, in metres, in one frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.data.stamps.ordered import kept_readings
+from icalib.errors import RecordingError
+from icalib.sensors.position.read.outliers import single_wrong, steps
+from icalib.sensors.position.read.readings import PositionReadings
+from icalib.sensors.position.read.tables import RATE_HZ
+from icalib.sensors.position.stream import PositionStream
+
+FEWEST = 3
+_FASTEST_M_S = 350.0  # of an aircraft
+_STILL_M = 0.05  # farthest from the middle: fixes of a centimetre at rest
+_FROZEN = 4  # equal fixes, at least: receivers round, and stand still
+_FROZEN_M_S2 = 5.0  # as it was frozen, or was so no more, the antenna would have felt half of gravity, and
+_FROZEN_M = 0.3  # have moved as far when it went on
+
+
+def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream, tuple[str, ...]]:
+    """The fixes with strictly increasing stamps, without single wrong ones, and notes on what was left out.
+
+    Raises RecordingError naming `what` and the instant: too few, not finite, out of order, motionless, in other units.
+    """
+    if len(read.stamps_ns) < FEWEST:
+        raise RecordingError(
+            f"{what}: only {len(read.stamps_ns)} fixes are usable; a calibration needs the whole recording."
+        )
+    finite = np.asarray(np.isfinite(read.position).all(axis=1))
+    notes: tuple[str, ...] = ()
+    if not finite.all():
+        if finite.sum() < FEWEST or finite.mean() < 0.5:
+            raise RecordingError(
+                f"{what}: {int((~finite).sum())} of {len(finite)} positions are not finite, the first at "
+                f"{read.stamps_ns[np.argmin(finite)]} ns; correct the program that writes them."
+            )
+        notes += (f"{what}: {int((~finite).sum())} of {len(finite)} positions are not finite and were removed.",)
+        read = read.some(finite)
+    kept, found = kept_readings(read.stamps_ns, read.position, what, RATE_HZ, "fix", "write the receiver's own stamps")
+    read = read.some(kept)
+    if len(read.stamps_ns) < FEWEST:
+        raise RecordingError(
+            f"{what}: only {len(read.stamps_ns)} fixes are usable; a calibration needs the whole recording."
+        )
+    _refuse_stillness(read, what)
+    _refuse_units(read, what)
+    read, frozen = _without_frozen(read, what)
+    read, single = _without_singles(read, what)
+    notes += found + frozen + single + _jumps(read, what)
+    return PositionStream(read.name, read.stamps_ns, np.ascontiguousarray(read.position), read.covariance), notes
+
+
+def _seconds(read: PositionReadings) -> np.ndarray:
+    return (read.stamps_ns - read.stamps_ns[0]) * 1e-9
+
+
+def _refuse_stillness(read: PositionReadings, what: str) -> None:
+    far = float(np.linalg.norm(read.position - np.median(read.position, axis=0), axis=1).max())
+    if far < _STILL_M:
+        raise RecordingError(
+            f"{what}: all fixes are the same within {far:.2g} m; check that the receiver was running, or record again "
+            "while moving."
+        )
+
+
+def _refuse_units(read: PositionReadings, what: str) -> None:
+    speed = float(np.median(np.linalg.norm(np.diff(read.position, axis=0), axis=1) / np.diff(_seconds(read))))
+    if speed > _FASTEST_M_S:
+        raise RecordingError(
+            f"{what}: it moves at {speed:.4g} m/s, which is implausible. Positions must be in metres (divide "
+            "millimetres by 1000) or degrees, and stamps in nanoseconds."
+        )
+
+
+def _without_frozen(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:
+    """Without runs of equal fixes of a receiver that repeats its last one while the antenna moves: it stops, or starts,
+    faster than a vehicle can. The first fix of a run stays."""
+    t, p = _seconds(read), read.position
+    same = np.concatenate([[False], (np.diff(p, axis=0) == 0.0).all(axis=1)])
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+    frozen = np.zeros(len(t), dtype=bool)
+    for begin, end in edges.reshape(-1, 2).tolist():
+        if end - begin + 1 >= _FROZEN and (_stops_hard(t, p, begin - 1) or _leaps(t, p, end - 1)):
+            frozen[begin:end] = True
+    if not frozen.any():
+        return read, ()
+    seconds = float(np.diff(t, prepend=t[0])[frozen].sum())
+    note = (
+        f"{what}: {int(frozen.sum())} fixes repeat the one before exactly while the antenna moves, as if the receiver "
+        f"was frozen, {seconds:.1f} s in all, the first at {read.stamps_ns[np.argmax(frozen)]} ns; they were removed."
+    )
+    return read.some(~frozen), (note,)
+
+
+def _stops_hard(t: np.ndarray, p: np.ndarray, k: int) -> bool:
+    """Whether the speed before fix k, with no speed after it, is an acceleration beyond _FROZEN_M_S2."""
+    if k < 1 or k + 1 >= len(t):
+        return False
+    speed = np.linalg.norm(p[k] - p[k - 1]) / (t[k] - t[k - 1])
+    return bool(speed > _FROZEN_M_S2 * (t[k + 1] - t[k]))
+
+
+def _leaps(t: np.ndarray, p: np.ndarray, k: int) -> bool:
+    """Whether from standing still at fix k to the next one takes an acceleration beyond _FROZEN_M_S2."""
+    if k + 1 >= len(t):
+        return False
+    step, way = t[k + 1] - t[k], float(np.linalg.norm(p[k + 1] - p[k]))
+    return way > max(_FROZEN_M, 0.5 * _FROZEN_M_S2 * step**2)
+
+
+def _without_singles(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:
+    wrong = single_wrong(_seconds(read), read.position)
+    if not wrong.any():
+        return read, ()
+    return read.some(~wrong), (
+        f"{what}: {int(wrong.sum())} of {len(wrong)} fixes are outliers of the trajectory and were removed, the first "
+        f"at {read.stamps_ns[np.argmax(wrong)]} ns.",
+    )
+
+
+def _jumps(read: PositionReadings, what: str) -> tuple[str, ...]:
+    """A note on steps of the solution."""
+    first, size = steps(_seconds(read), read.position)
+    if not len(first):
+        return ()
+    times = "once" if len(first) == 1 else f"{len(first)} times"
+    return (
+        f"{what}: its fixes jump {times}, by up to {size.max():.2g} m, the first at {read.stamps_ns[first[0]]} ns, as "
+        "when a receiver gains or loses its carrier-phase solution. The robust "
+        "loss reduces their weight; leave such fixes out with least_status, or cut the recording with --from and --to.",
+    )

@@ -1,0 +1,110 @@
+"""Fixes as they were written, and as positions in metres about the first good one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.geometry.geodesy import earth_centred, local_metres
+from icalib.sensors.position.spec import STATUSES, Status
+
+NO_COVARIANCE = np.zeros((0, 3, 3))
+FAR_M = 20_000.0  # from the first fix: over more, "up" turns by 3 mrad, 0.03 m/s^2 of gravity
+
+
+@dataclass(frozen=True)
+class PositionReadings:
+    """stamps_ns (N,) int64, which may still repeat or run backwards; position (N, 3) m; covariance (N, 3, 3) m^2 in the
+    same axes, or (0, 3, 3); status (N,) index into `STATUSES`, -1: no fix, or (0,) where none is stated."""
+
+    name: str
+    stamps_ns: np.ndarray
+    position: np.ndarray
+    covariance: np.ndarray
+    status: np.ndarray
+
+    def some(self, kept: np.ndarray) -> PositionReadings:
+        """Those `kept` (N,), a mask."""
+        if kept.all():
+            return self
+        n = len(self.stamps_ns)
+        own = {k: getattr(self, k) for k in ("position", "covariance", "status")}
+        return replace(
+            self, stamps_ns=self.stamps_ns[kept], **{k: x[kept] if len(x) == n else x for k, x in own.items()}
+        )
+
+
+def good_fixes(status: np.ndarray, least: Status, n: int) -> np.ndarray:
+    """(n,) whether fixes have a status (n,) of at least `least`; all where none is stated."""
+    return status >= STATUSES.index(least) if len(status) else np.ones(n, dtype=bool)
+
+
+def left_out(what: str, status: np.ndarray, good: np.ndarray, least: Status) -> tuple[str, ...]:
+    """A note on fixes that are not good."""
+    if good.all():
+        return ()
+    none, worse = int((status < 0).sum()), int((~good & (status >= 0)).sum())
+    parts = [f"{none} without a fix"] * (none > 0) + [f"{worse} worse than {least} (least_status)"] * (worse > 0)
+    return (f"{what}: {none + worse} of {len(good)} positions were left out, {' and '.join(parts)}.",)
+
+
+def from_geodetic(
+    what: str, readings: PositionReadings, degrees: np.ndarray, good: np.ndarray
+) -> tuple[PositionReadings, tuple[str, ...]]:
+    """The `readings`, whose covariances are in east, north and up, with positions in metres about the first of the
+    `good` (N,) ones. degrees (N, 3): latitude and longitude [deg], height over the ellipsoid [m].
+
+    Raises RecordingError where these can be none.
+    """
+    own = good & np.isfinite(degrees).all(axis=1) & (np.abs(degrees[:, :2]) > 1e-9).any(axis=1)
+    _refuse_heights(what, degrees, good)
+    if not own.any():
+        raise RecordingError(f"{what}: no position has latitude, longitude and height; record again with a fix.")
+    latitude, longitude, height = degrees.T
+    if (np.abs(latitude[own]) > 90.0).any():
+        swapped = (np.abs(longitude[own]) <= 90.0).all()
+        cause = "latitude and longitude are swapped" if swapped else "it is not in degrees"
+        raise RecordingError(
+            f"{what}: the first latitude is {latitude[own][0]:.6g} degrees, as if {cause}; say which "
+            "column is which by `columns: [...]` in the rig file."
+        )
+    xyz = earth_centred(np.deg2rad(latitude), np.deg2rad(longitude), height)
+    first = int(np.argmax(own))
+    position, _ = local_metres(xyz, xyz[first])
+    away = float(np.linalg.norm(position[own], axis=1).max())
+    if away > FAR_M:
+        raise RecordingError(
+            f"{what}: its fixes are up to {away / 1e3:.0f} km from the first one; the plane of east and north does not "
+            "follow the Earth so far. Cut the recording with --from and --to, or leave out fixes without a solution."
+        )
+    note = (
+        f"{what}: metres are east, north and up of the first fix, latitude {latitude[first]:.8f}, longitude "
+        f"{longitude[first]:.8f}, height {height[first]:.3f} m."
+    )
+    return replace(readings, position=position).some(own), (note,)
+
+
+def _refuse_heights(what: str, degrees: np.ndarray, good: np.ndarray) -> None:
+    height = degrees[good, 2]
+    if len(height) and (~np.isfinite(height)).mean() > 0.5:
+        raise RecordingError(f"{what}: heights are missing (NaN); write the height over the WGS84 ellipsoid in metres.")
+    if len(height) > 2 and (height == 0.0).all():
+        raise RecordingError(
+            f"{what}: all heights are 0, as if they were missing; write the height over the WGS84 ellipsoid in metres."
+        )
+
+
+def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings, tuple[str, ...]]:
+    """Metric positions about whole metres at the first one, where the origin of their frame is far away."""
+    p = readings.position
+    finite = np.isfinite(p).all(axis=1)
+    if not finite.any():
+        raise RecordingError(f"{what}: no position is finite; correct the program that writes them.")
+    origin = np.round(p[int(np.argmax(finite))])
+    if np.linalg.norm(origin) <= 100.0:
+        return readings, ()
+    x, y, z = origin
+    note = f"{what}: positions are relative to ({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away."
+    return replace(readings, position=p - origin), (note,)

@@ -1,0 +1,142 @@
+"""Solutions of RTKLIB: text files `.pos`.
+
+Source: RTKLIB 2.4.3 manual, appendix B.1 "Positioning solution file", and `outsolhead` and `outpos` of its solution.c.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from icalib.base.file_hashes import hash_of
+from icalib.errors import RecordingError
+from icalib.sensors.position.spec import STATUSES
+
+SUFFIX = ".pos"
+_GPS_START = datetime(1980, 1, 6, tzinfo=UTC)
+# Q of the file: 1 fixed, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; 0: none.
+_STATUS = {1: "fixed", 2: "float", 3: "differential", 4: "differential", 5: "single", 6: "float"}
+_SIGMAS = {
+    "geodetic": ("sdn", "sde", "sdu", "sdne", "sdeu", "sdun"),
+    "earth": ("sdx", "sdy", "sdz", "sdxy", "sdyz", "sdzx"),
+    "local": ("sde", "sdn", "sdu", "sden", "sdnu", "sdue"),
+}
+_EPOCH_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class PosFile:
+    """stamps_ns (N,) int64, nanoseconds since 1970 of the file's own `scale` of time (GPST or UTC), leap seconds not
+    counted; kind: geodetic, earth or local; values (N, 3): latitude, longitude [deg], height [m], or Earth-centred or
+    local metres; covariance (N, 3, 3) m^2, of geodetic and local ones in east, north and up, or (0, 3, 3); status (N,)
+    index into `STATUSES`, -1: no fix."""
+
+    stamps_ns: np.ndarray
+    scale: str
+    kind: str
+    values: np.ndarray
+    covariance: np.ndarray
+    status: np.ndarray
+
+
+def read_pos(path: Path) -> PosFile:
+    """Raises RecordingError naming file and line."""
+    try:
+        content = path.read_bytes()
+        hash_of(path).saw(0, content)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror or error}); check the file.") from error
+    if path.suffix == ".gz" or content.startswith(b"\x1f\x8b"):
+        content = _unpacked(path, content)
+    lines = content.decode("utf-8", "replace").splitlines()
+    header = next((line for line in reversed(lines) if line.startswith("%") and "Q" in line.split()), "")
+    names = [name.split("(")[0] for name in header.lstrip("% ").replace(",", " ").split()]
+    kind = _kind(path, header, names)
+    rows = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.startswith("%")]
+    if not rows:
+        raise RecordingError(f"{path} holds no solutions; run the positioning again.")
+    fields = [(k, line.replace(",", " ").split()) for k, line in rows]
+    sexagesimal = "(d'\")" in header
+    stamps_ns, numbers = [], []
+    for k, row in fields:
+        try:
+            stamps_ns.append(_stamp_ns(row[0], row[1]))
+            values = [float(x) for x in row[2:]]
+            numbers.append(_in_degrees(values) if sexagesimal else values)
+        except (ValueError, IndexError) as error:
+            raise RecordingError(f"{path}:{k}: the line is not a solution of RTKLIB; correct or remove it.") from error
+    width = min(len(row) for row in numbers)
+    table, columns = np.array([row[:width] for row in numbers]), names[1:]
+    quality = table[:, columns.index("Q")].astype(int)
+    index = {q: STATUSES.index(status) for q, status in _STATUS.items()}
+    status = np.array([index.get(int(q), -1) for q in quality])
+    return PosFile(
+        np.array(stamps_ns, np.int64), names[0], kind, table[:, :3], _covariance(table, columns, kind), status
+    )
+
+
+def _unpacked(path: Path, content: bytes) -> bytes:
+    from icalib.base.unpacking import gunzipped  # noqa: PLC0415
+
+    try:
+        return gunzipped(content)
+    except (OSError, EOFError) as error:
+        raise RecordingError(f"{path} is a damaged gzip file ({error}); copy it again.") from error
+
+
+def _kind(path: Path, header: str, names: list[str]) -> str:
+    for kind, first in (("geodetic", "latitude"), ("earth", "x-ecef"), ("local", "e-baseline")):
+        if len(names) > 4 and names[1] == first:
+            return kind
+    shown = header.strip() or "there is no line that starts with % and names the columns"
+    raise RecordingError(
+        f"{path}: the columns of an RTKLIB solution are not told ({shown:.80}); write the file with its header, with "
+        "latitude, longitude and height, or x, y and z."
+    )
+
+
+def _stamp_ns(first: str, second: str) -> int:
+    """Of a date and a time, or of a week and seconds of GPS."""
+    if "/" in first:
+        year, month, day = (int(x) for x in first.split("/"))
+        hours, minutes, seconds = second.split(":")
+        whole, _, fraction = seconds.partition(".")
+        at = datetime(year, month, day, tzinfo=UTC) + timedelta(
+            hours=int(hours), minutes=int(minutes), seconds=int(whole)
+        )
+    else:
+        whole, _, fraction = second.partition(".")
+        at = _GPS_START + timedelta(weeks=int(first), seconds=int(whole))
+    return round(at.timestamp()) * _EPOCH_NS + int(f"{fraction:0<9.9}")
+
+
+def _in_degrees(values: list[float]) -> list[float]:
+    """The row with latitude and longitude in degrees, of degrees, minutes and seconds in three columns each."""
+    angles = []
+    for k in (0, 3):
+        degrees, minutes, seconds = values[k : k + 3]
+        sign = -1.0 if np.copysign(1.0, degrees) < 0.0 else 1.0
+        angles.append(sign * (abs(degrees) + minutes / 60.0 + seconds / 3600.0))
+    return [*angles, *values[6:]]
+
+
+def _covariance(table: np.ndarray, columns: list[str], kind: str) -> np.ndarray:
+    """(N, 3, 3) in east, north and up, or x, y and z; off the diagonal the file has roots with the sign of what they
+    are roots of."""
+    names = _SIGMAS[kind]
+    if any(name not in columns or columns.index(name) >= table.shape[1] for name in names[:3]):
+        return np.zeros((0, 3, 3))
+    found = [
+        table[:, columns.index(n)] if n in columns and columns.index(n) < table.shape[1] else np.zeros(len(table))
+        for n in names
+    ]
+    a, b, c = (x**2 for x in found[:3])
+    ab, bc, ca = (np.copysign(x**2, x) for x in found[3:])
+    if kind == "geodetic":  # north, east, up
+        a, b, ab, bc, ca = b, a, ab, ca, bc
+    rows = np.stack([a, ab, ca, ab, b, bc, ca, bc, c], axis=1).reshape(-1, 3, 3)
+    usable = (np.linalg.eigvalsh(rows)[:, 0] > 0.0) & np.isfinite(rows).all(axis=(1, 2))
+    return rows if usable.all() else np.zeros((0, 3, 3))

@@ -1,0 +1,164 @@
+"""The factor of a position sensor: each fix at its own instant against the trajectory of the IMU.
+
+    e = R_world_frame^T (p_world_imu + R_world_imu p_imu_sensor - p_world_frame) - p_frame_sensor
+
+at the instant of the fix on the IMU's clock. The trajectory is carried to that instant by the IMU's readings; fixes are
+never interpolated. Parameters: the sensor's blocks translation (p_imu_sensor) and time_offset; of its frame in each
+recording frame_yaw or frame_rotation, and frame_translation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.geometry import so3
+from icalib.model.frames import frame_of
+from icalib.motion.clocks import instants, offset_at
+from icalib.motion.factor import FactorKey, RowFactor, Whitened
+from icalib.motion.imu_data import ImuData
+from icalib.motion.nodes import usable
+from icalib.motion.poses import assign_nodes
+from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
+from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
+from icalib.motion.sweep import Motion
+from icalib.optim.arrowhead import Piece
+from icalib.optim.rows import Rows
+from icalib.optim.state import Layout, State
+from icalib.rig.scene import FRAME_ROTATION, FRAME_TRANSLATION, FRAME_YAW
+from icalib.sensors.position.stream import PositionStream
+
+# Fixes further from all nodes are left out. The noise of an accelerometer of 0.01 m/s^2/sqrt(Hz), a poor one, moves a
+# position by 1 mm over this time; the row does not count it.
+NEAR_NODE_S = 0.3
+
+
+KINDS = {"horizontal": slice(0, 2), "vertical": slice(2, 3)}
+
+
+@dataclass(frozen=True)
+class PositionNoise:
+    """horizontal, vertical: standard deviations of x and y and of z of the frame [m], or where the recording states
+    covariances factors on theirs. The robust loss of each whitened row, and where it bends, in standard deviations."""
+
+    horizontal: float
+    vertical: float
+    loss: str = "none"
+    loss_scale: float = 2.5
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """(3,) of each row."""
+        return np.array([self.horizontal, self.horizontal, self.vertical])
+
+
+def yaw_rotation(yaw: float) -> np.ndarray:
+    """(3, 3) rotation about z by `yaw` rad."""
+    return so3.exp(np.array([0.0, 0.0, yaw]))
+
+
+@dataclass(frozen=True)
+class PositionFactor(RowFactor):
+    """n fixes of one sensor. node (n,): of each, in order; root (n, 3, 3): see `PositionStream`."""
+
+    units: ClassVar[Mapping[str, str]] = {"horizontal": "m", "vertical": "m"}
+
+    name: str
+    seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
+    position: np.ndarray  # (n, 3) m
+    root: np.ndarray
+    node: np.ndarray
+    starts: tuple[int, ...]  # the first node of each recording
+    n_nodes: int
+    imu: ImuData
+    gravity: float
+    noise: PositionNoise
+    layout: Layout
+
+    @classmethod
+    def build(cls, stream: PositionStream, motion: Motion, noise: PositionNoise, layout: Layout) -> PositionFactor:
+        """The fixes near nodes of the motion and outside its gaps, whose nodes stay while the solver runs. Stated
+        covariances are weights where the layout of the noise says so."""
+        state = motion.state
+        times = instants(stream, state.values)
+        node = assign_nodes("inertial", state.seconds, times, motion.imu.forwards)
+        near = np.abs(times - state.seconds[node]) <= NEAR_NODE_S
+        k = np.flatnonzero(near & usable(motion.imu, times, motion.max_gap_s))
+        k = k[np.argsort(node[k], kind="stable")]
+        return cls(
+            stream.name, stream.seconds[k], stream.position[k], stream.root[k], node[k], state.starts,
+            len(state.seconds), motion.imu, motion.gravity, noise, layout,
+        )  # fmt: skip
+
+    @property
+    def key(self) -> FactorKey:
+        return self.name, "positions"
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `Factor`."""
+        return KINDS
+
+    @property
+    def instants(self) -> np.ndarray:
+        """(n,) that the rows are at, on the sensor's clock."""
+        return self.seconds
+
+    def output(self) -> Whitened:
+        """Empty arrays for `accumulate` to fill."""
+        return Whitened.empty(len(self.seconds), 3)
+
+    def times(self, state: State) -> np.ndarray:
+        """See `RowFactor`."""
+        return self.seconds + offset_at(state, self.name, self.node)
+
+    def raw(self, out: Whitened) -> np.ndarray:
+        """(n, 3) residuals in the frame's axes [m]."""
+        return np.linalg.solve(self.root, (self.noise.sizes * out.residual)[:, :, None])[:, :, 0]
+
+    def raw_sigma(self) -> np.ndarray:
+        """(n, 3) m in the frame's axes."""
+        return np.sqrt(((np.linalg.inv(self.root) * self.noise.sizes) ** 2).sum(axis=2))
+
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See `Factor`."""
+        cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last node is an end
+        edges = np.searchsorted(self.node, (*self.starts, self.n_nodes))
+        low, high = np.searchsorted(at, [piece.first, piece.last])
+        for k in range(len(self.starts)):
+            own = slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))
+            for some in in_chunks(own):
+                cost += self._of_recording(k, some, state, Into(piece, out, sums, curved))
+        return cost
+
+    def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
+        """Adds the fixes `own`, of one recording."""
+        frame, v, node = frame_of(self.name, recording), state.values, self.node[own]
+        levelled = (frame, FRAME_YAW.name) in v
+        R_wf = yaw_rotation(v[frame, FRAME_YAW.name][0]) if levelled else v[frame, FRAME_ROTATION.name]
+        kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity)
+        at = SensorPose.at(kinematics, self.seconds[own], node, state, into.sums)
+        in_frame = (at.position - v[frame, FRAME_TRANSLATION.name]) @ R_wf
+        rows = _rows(in_frame - self.position[own], in_frame, R_wf, at, levelled, into.sums)
+        turn = (FRAME_YAW if levelled else FRAME_ROTATION).name
+        columns = [kinematics.columns(recording), self.layout.columns(frame, turn, FRAME_TRANSLATION.name)]
+        noise = RobustNoise(self.root[own] / self.noise.sizes[:, None], self.noise.loss, self.noise.loss_scale)
+        interval = rows.on_intervals(node, self.n_nodes)
+        return add_rows(rows, own, interval, np.concatenate(columns), noise, into)
+
+
+def _rows(
+    residual: np.ndarray, in_frame: np.ndarray, R_wf: np.ndarray, at: SensorPose, levelled: bool, jacobians: bool
+) -> Rows:
+    """Rows of residuals (n, 3) m, by calibration parameters of the sensor's pose, then yaw 1 or rotation 3 (on the
+    right) and translation 3 of the frame. in_frame (n, 3): predicted positions; R_wf (3, 3) R_world_frame."""
+    n = len(residual)
+    if not jacobians:
+        return rows_at(residual, (), (at,), np.zeros((0, 3, 0)))
+    J_pose = np.concatenate([np.zeros((n, 3, 3)), R_wf.T @ at.rotation], axis=2)
+    J_turn = so3.hat_many(np.ascontiguousarray(in_frame))
+    J_frame = [J_turn[:, :, 2:] if levelled else J_turn, np.tile(-R_wf.T, (n, 1, 1))]
+    return rows_at(residual, (J_pose,), (at,), np.concatenate(J_frame, axis=2))

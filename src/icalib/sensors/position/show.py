@@ -1,0 +1,57 @@
+"""What the report shows of position sensors: residuals over time, and a map of where fixes are off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icalib.report.plot import COLORS, Figure, axis, dots, figure, line, thin
+from icalib.report.sections import Section, plot_place, row_sections
+from icalib.report.tables import Html, element
+from icalib.result import Calibration, RowResiduals
+
+OFF = 3.0  # standard deviations: 1 of 34 fixes with white noise are further off (chi, three degrees of freedom)
+MOST_POINTS = 4000  # of a path
+_WORDS = (
+    "Along east, north and up of the sensor's frame. They should look like noise; waves are errors that last, as of "
+    "multipath, and steps are changes of the solution."
+)
+_MAP = (
+    "The path of each antenna from above, and where its fixes are more than three standard deviations off. If they are "
+    "in one place, look for walls and trees there. Axes are those of the estimated world, which need not be east and "
+    "north."
+)
+
+
+def sections(c: Calibration) -> Iterator[Section]:
+    """Residuals of each position sensor, and the map."""
+    yield from row_sections(c, "position", "positions", "Residuals of position sensors", _WORDS)
+    figures = {f"map-{i}": _map(c, r) for i, r in enumerate(_own(c))}
+    if figures:
+        parts = [element("h3", r.sensor) + plot_place(name) for name, r in zip(figures, _own(c), strict=True)]
+        yield Section("maps", "Map of fixes", _MAP, Html("".join(parts)), figures)
+
+
+def amounts(c: Calibration) -> Iterator[str]:
+    """How much was used."""
+    if own := _own(c):
+        yield f"{sum(len(r.seconds) for r in own)} fixes"
+
+
+def _own(c: Calibration) -> list[RowResiduals]:
+    return [r for r in c.residuals.values() if isinstance(r, RowResiduals) and r.sensor in c.of_type("position")]
+
+
+def _map(c: Calibration, r: RowResiduals) -> Figure:
+    """The antenna's path in the world, and the places of fixes that are off."""
+    at = c.trajectory
+    path = at.position + at.rotation @ c.value(r.sensor, "translation")
+    keep = thin(len(path), MOST_POINTS)
+    off = r.seconds[np.linalg.norm(r.whitened, axis=1) > OFF]
+    x, y = (np.interp(off, at.seconds, path[:, k]) for k in range(2))
+    traces = [
+        line(path[keep, 0], path[keep, 1], "path", COLORS[0]),
+        dots(x, y, f"{len(off)} of {len(r.seconds)} fixes, off by more than {OFF:g} sigma", COLORS[1], 7),
+    ]
+    return figure(traces, 480, xaxis=axis("x [m]"), yaxis=axis("y [m]", scaleanchor="x"))

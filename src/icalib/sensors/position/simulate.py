@@ -1,0 +1,125 @@
+"""A simulated position sensor reports where its antenna or prism is in a frame of its own, and not how it is turned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.sensors.position.spec import PositionSensor
+from icalib.sensors.position.stream import PositionStream
+from icalib.tools.simulation.output.bag_writer import BagWriter
+from icalib.tools.simulation.output.csv_table import write_table
+from icalib.tools.simulation.scenario.fields import at_least, mounted_fields, pose
+from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
+from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
+
+_POINT = "geometry_msgs/msg/PointStamped"
+
+
+@dataclass(frozen=True, eq=False)
+class PositionTruth:
+    """seconds (N,) on the IMU's clock of each stamp; position (N, 3) m: what is reported, without noise."""
+
+    seconds: np.ndarray
+    position: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SimPositions(SimSensor):
+    """One true sensor that reports its position in a frame that stands at T_world_frame.
+
+    Errors of a fix: white ones of position_noise [m] on x and y and vertical_noise on z, by default the same; and a
+    slow one of drift_noise [m], a Gauss-Markov process of correlation time drift_time_s, as multipath makes it. A share
+    outliers of the fixes is off by up to outlier_m on each axis.
+    """
+
+    sensor_type: ClassVar[str] = "position"
+    random_stream: ClassVar[int] = 5000
+
+    rate_hz: float = 5.0
+    T_world_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
+    position_noise: float = 0.02
+    vertical_noise: float | None = None
+    drift_noise: float = 0.0
+    drift_time_s: float = 10.0
+    outliers: float = 0.0
+    outlier_m: float = 3.0
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimPositions:
+        sizes = ("position_noise", "vertical_noise", "drift_noise", "drift_time_s", "outliers", "outlier_m")
+        found, common = mounted_fields(value, start_ns, options=("T_world_frame", *sizes))
+        chosen: dict[str, Any] = {key: at_least(found[key], 0.0) for key in sizes if key in found}
+        if "T_world_frame" in found:
+            chosen["T_world_frame"] = pose(found["T_world_frame"])
+        return cls(name, **common, **chosen)
+
+    def plain(self) -> dict[str, Any]:
+        return {"T_world_frame": self.T_world_frame.tolist()}
+
+    def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
+        """Its positions within the readings of the IMU."""
+        stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
+        R, p, _ = scene.trajectory.pose_at(seconds)
+        seen = p + R @ self.T_imu_sensor[:3, 3]
+        seen = (seen - self.T_world_frame[:3, 3]) @ self.T_world_frame[:3, :3]
+        truth = PositionTruth(seconds, seen.copy())
+        if scene.noisy:
+            seen = seen + self._errors(seconds, np.random.default_rng(seed))
+        return Report(PositionStream(self.name, stamps, seen, np.zeros((0, 3, 3))), truth)
+
+    def _errors(self, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(N, 3) m at the instants (N,)."""
+        vertical = self.position_noise if self.vertical_noise is None else self.vertical_noise
+        error = rng.standard_normal((len(seconds), 3)) * [self.position_noise, self.position_noise, vertical]
+        if self.drift_noise:
+            slow = rng.standard_normal((len(seconds), 3))
+            for k in range(1, len(seconds)):
+                kept = np.exp(-(seconds[k] - seconds[k - 1]) / self.drift_time_s)
+                slow[k] = kept * slow[k - 1] + np.sqrt(1.0 - kept**2) * slow[k]
+            error += self.drift_noise * slow
+        if self.outliers:
+            wrong = rng.random(len(seconds)) < self.outliers
+            error[wrong] += self.outlier_m * rng.uniform(-1.0, 1.0, (int(wrong.sum()), 3))
+        return error
+
+    def rig_entry(self) -> PositionSensor:
+        vertical = self.position_noise if self.vertical_noise is None else self.vertical_noise
+        plain = vertical == self.position_noise and not (self.drift_noise or self.outliers)
+        tilted = abs(self.T_world_frame[2, 2] - 1.0) > 1e-12
+        return PositionSensor(
+            self.name,
+            f"{self.name}/positions.csv",
+            frame="tilted" if tilted else "levelled",
+            position_noise=self.position_noise if plain and self.position_noise > 0.0 else None,
+        )
+
+    def write_table(self, folder: Path, stream: PositionStream) -> None:
+        write_table(folder / "positions.csv", "t [ns],x [m],y [m],z [m]", stream.stamps_ns, stream.position)
+
+    def bag_topic(self, stream: PositionStream, offset_ns: int) -> BagTopic:
+        """PointStamped."""
+        return BagTopic(f"/{self.name}/position", _POINT, _messages(stream, offset_ns))
+
+
+SIMULATED = SimPositions
+
+
+def _messages(stream: PositionStream, offset_ns: int) -> Iterator[BagEvent]:
+    frame = f"{stream.name}_frame"
+    for stamp_ns, position in zip(stream.stamps_ns.tolist(), stream.position, strict=True):
+        yield (
+            stamp_ns + offset_ns,
+            lambda bag, stamp_ns=stamp_ns, position=position: _message(bag, stamp_ns, frame, position),
+        )
+
+
+def _message(bag: BagWriter, stamp_ns: int, frame: str, position: np.ndarray) -> Any:
+    """position (3,) [m] in `frame`."""
+    point = bag.make("geometry_msgs/msg/Point", *position.tolist())
+    return bag.make(_POINT, bag.header(stamp_ns, frame), point)

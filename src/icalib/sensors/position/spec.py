@@ -1,0 +1,87 @@
+"""A position sensor (GNSS antenna, total station, UWB, tracked prism), and its fields in the rig file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+from icalib.base.yaml_nodes import YamlValue
+from icalib.sensors.fields import (
+    TABLE,
+    choice_or,
+    groups_to_plain,
+    layout_to_plain,
+    parameter_fields,
+    parameters,
+    path_or,
+    table_layout,
+    topic_or_none,
+)
+from icalib.sensors.parameter import Parameter
+from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.sensor import PLAIN_TABLE, TIME_OFFSET, TRANSLATION, Sensor, TableLayout
+
+FrameKind = Literal["levelled", "tilted"]
+Coordinates = Literal["metric", "geodetic"]
+Status = Literal["single", "differential", "float", "fixed"]  # quality of a GNSS fix, worst first
+STATUSES: tuple[Status, ...] = ("single", "differential", "float", "fixed")
+MESSAGES: Literal["messages"] = "messages"
+_FIELDS = ("path", "topic", "coordinates", "frame", "position_noise", "least_status")
+
+
+@dataclass(frozen=True)
+class PositionSensor(Sensor):
+    """Something that gives its own position in a fixed frame, and no orientation. Its axes are those of the body.
+
+    coordinates: of a table, metric or geodetic (latitude, longitude, height); None: told by its header. frame:
+    levelled, z points up, its yaw and origin in the world are estimated (GNSS, total station); tilted, its whole
+    rotation is (UWB anchors). position_noise [m]: standard deviation of each axis; "messages": the covariances of the
+    recording as they are; None: estimated from the residuals, the covariances of the recording as weights.
+    least_status: worse fixes are left out.
+    """
+
+    sensor_type: ClassVar[str] = "position"
+    noun: ClassVar[str] = "position sensor"
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (TRANSLATION, TIME_OFFSET)
+    gives_motion: ClassVar[bool] = True
+    needs_imu: ClassVar[bool] = True
+
+    path: str
+    coordinates: Coordinates | None = None
+    frame: FrameKind = "levelled"
+    position_noise: float | Literal["messages"] | None = None
+    least_status: Status = "single"
+    translation: Parameter = Parameter()  # (3,) lever arm: the antenna in the body's frame [m]
+    time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
+    topic: str | None = None  # of its messages; None: the one with the sensor's name, or the only one
+    layout: TableLayout = PLAIN_TABLE
+
+    @classmethod
+    def parse(cls, name: str, value: YamlValue) -> PositionSensor:
+        found = value.record(("type",), (*_FIELDS, *TABLE, *parameter_fields(cls)))
+        return cls(
+            name=name,
+            path=path_or(found, f"{name}/positions.csv"),
+            coordinates=choice_or(found, "coordinates", Coordinates, None),
+            frame=choice_or(found, "frame", FrameKind, cls.frame),
+            position_noise=_noise(found["position_noise"]) if "position_noise" in found else None,
+            least_status=choice_or(found, "least_status", Status, cls.least_status),
+            topic=topic_or_none(found),
+            layout=table_layout(found),
+            **parameters(found, cls.stated()),
+        )
+
+    def plain(self) -> dict[str, Any]:
+        plain: dict[str, Any] = {"type": "position", "path": self.path, "frame": self.frame}
+        plain |= layout_to_plain(self.layout) | {"least_status": self.least_status}
+        given = {name: getattr(self, name) for name in ("coordinates", "position_noise", "topic")}
+        return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
+
+
+def _noise(value: YamlValue) -> float | Literal["messages"]:
+    is_text = not (value.is_list or value.is_mapping) and value.text() == MESSAGES
+    return MESSAGES if is_text else value.positive()
+
+
+SENSOR = PositionSensor

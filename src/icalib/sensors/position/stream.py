@@ -1,0 +1,37 @@
+"""What a position sensor measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.sensors.stream import Stream, check
+
+
+@dataclass(frozen=True)
+class PositionStream(Stream):
+    """Positions of one sensor in its own fixed frame.
+
+    stamps_ns (N,) int64, strictly increasing; position (N, 3) p_frame_sensor [m]; covariance (N, 3, 3) m^2 in the
+    frame's axes, as the recording states it, (0, 3, 3) where it states none.
+    """
+
+    sensor_type: ClassVar[str] = "position"
+    position: np.ndarray
+    covariance: np.ndarray
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        n = len(self.stamps_ns)
+        check(self.position.shape == (n, 3), f"{self.name}: position must have shape ({n}, 3).")
+        stated = self.covariance.shape in ((n, 3, 3), (0, 3, 3))
+        check(stated, f"{self.name}: covariance must have shape ({n}, 3, 3), or (0, 3, 3) without any.")
+
+    @property
+    def root(self) -> np.ndarray:
+        """(N, 3, 3) W with W^T W the inverse of the stated covariance [1/m]; the identity where none is stated."""
+        if not len(self.covariance):
+            return np.tile(np.eye(3), (len(self.stamps_ns), 1, 1))
+        return np.linalg.inv(np.linalg.cholesky(self.covariance))

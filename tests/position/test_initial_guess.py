@@ -1,0 +1,116 @@
+"""A position sensor from nothing: time offset, attitude, biases and lever arm by the fixes and the IMU alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from tests.typed import not_none
+
+from icalib.errors import EstimationError
+from icalib.initialize.steps.by_recording import Held
+from icalib.motion.imu_data import ImuData
+from icalib.motion.sweep import Motion
+from icalib.optim.state import State
+from icalib.sensors.position.initialize.attitude import Fix
+from icalib.sensors.position.initialize.placed import place
+from icalib.sensors.position.initialize.with_imu import motion_from_fixes
+from icalib.sensors.position.simulate import SimPositions
+from icalib.sensors.position.stream import PositionStream
+from icalib.tools.simulation import Drive, Room, Scenario, simulate
+from icalib.tools.simulation.scenario.room import hills_of_slope
+
+ARM = np.array([0.4, -0.25, 0.6])
+FRAME_YAW, ORIGIN = 2.1, np.array([3.0, -1.0, 0.5])
+GRAVITY = 9.81
+
+
+def yaw(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def recording(motion, seed):
+    room = Room((30.0, 20.0, 6.0), hills=hills_of_slope(12.0) if motion == "ramps" else None)
+    T_imu_sensor, T_world_frame = np.eye(4), np.eye(4)
+    T_imu_sensor[:3, 3] = ARM
+    T_world_frame[:3, :3], T_world_frame[:3, 3] = yaw(FRAME_YAW), ORIGIN
+    gnss = SimPositions("gnss0", T_imu_sensor, 7.3, 5.0, 0.5, T_world_frame=T_world_frame)
+    return simulate(Scenario((), duration_s=40.0, motion=Drive(motion), board=False, room=room, sensors=(gnss,)), seed)
+
+
+@pytest.fixture(scope="module", params=["free", "ramps"])
+def world(request):
+    """40 s at 5 Hz with 2 cm of noise: the simulated recording, the IMU's readings, fixes, their instants, and the true
+    offset to the IMU's clock since the first stamps."""
+    sim = recording(request.param, 3)
+    scenario = sim.scenario
+    imu = ImuData.build(not_none(sim.measurements.imu), scenario.imu_noise)
+    (stream,) = sim.measurements.of(PositionStream)
+    t = sim.truth.reported["gnss0"].seconds
+    return sim, imu, Fix(stream.seconds, stream.position), t, float(t[0] - sim.truth.seconds[0])
+
+
+def test_everything_from_fixes_and_readings(world):
+    sim, imu, fix, t, offset = world
+    found = motion_from_fixes(imu, "gnss0", fix, GRAVITY, Held())
+    assert found.best.at.offset == pytest.approx(offset, abs=0.02)
+    planar = 0.3 if sim.scenario.motion.kind == "ramps" else 0.08
+    np.testing.assert_allclose(found.best.at.arm, ARM, atol=planar)
+    R, p, v, bias = found.at(t - sim.truth.seconds[0])
+    R_true, p_true, v_true = sim.truth.pose_at(t)
+    off = yaw(FRAME_YAW) @ R @ R_true.transpose(0, 2, 1)
+    assert np.degrees(np.arccos((np.trace(off, axis1=1, axis2=2) - 1.0) / 2.0)).max() < 4.0
+    np.testing.assert_allclose(p @ yaw(FRAME_YAW).T + ORIGIN, p_true, atol=0.5)
+    assert np.median(np.abs(v @ yaw(FRAME_YAW).T - v_true)) < 0.15
+    assert bias.shape == (len(t), 6)
+
+
+def test_what_is_known_stays(world):
+    _, imu, fix, _, offset = world
+    found = motion_from_fixes(imu, "gnss0", fix, GRAVITY, Held(position=ARM, offset=offset))
+    np.testing.assert_allclose(found.best.at.arm, ARM, atol=5e-3)
+    assert found.best.at.offset == pytest.approx(offset, abs=5e-3)
+
+
+@pytest.mark.parametrize("levelled", [True, False])
+def test_placed_on_a_known_motion(world, levelled):
+    sim, imu, fix, _, offset = world
+    nodes = np.arange(0.2, imu.seconds[-1] - 0.2, 0.1)
+    bias = np.tile(np.concatenate([sim.truth.gyro_bias[0], sim.truth.accel_bias[0]]), (len(nodes), 1))
+    values = {("imu0", "intrinsics"): sim.truth.imu_intrinsics}
+    R, p, v = sim.truth.pose_at(nodes + sim.truth.seconds[0])
+    state = State(nodes, R, p, v, bias, values)
+    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, levelled, Held())
+    assert found.offset == pytest.approx(offset, abs=0.01)
+    planar = 0.1 if sim.scenario.motion.kind == "ramps" else 0.04
+    np.testing.assert_allclose(found.arm, ARM, atol=planar)
+    np.testing.assert_allclose(found.R_wf, yaw(FRAME_YAW), atol=0.02)
+    np.testing.assert_allclose(found.p_wf, ORIGIN, atol=planar + 0.1)
+
+
+def other_path(n):
+    """(n, 3) of a smooth random path at 5 Hz."""
+    rng = np.random.default_rng(4)
+    knots = rng.normal(size=(n // 8 + 4, 3)) * [4.0, 4.0, 0.4]
+    return CubicSpline(8.0 * np.arange(len(knots)), knots)(np.arange(n))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda p: other_path(len(p)), "at any time offset"),
+        (lambda p: p[:, [1, 0, 2]].copy(), "where east and north are swapped"),
+        (lambda p: np.zeros_like(p) + 0.001 * np.arange(len(p))[:, None], "motionless or move evenly"),
+        (lambda p: 0.02 * np.random.default_rng(2).normal(size=p.shape), "motionless or move evenly"),
+        (lambda p: p[:5], "groups of three fixes"),
+    ],
+)
+def test_fixes_that_do_not_fit(world, change, sentence):
+    """Of another vehicle, with east and north swapped, at rest, and too few."""
+    _, imu, fix, _, _ = world
+    position = change(fix.position)
+    with pytest.raises(EstimationError, match=sentence):
+        motion_from_fixes(imu, "gnss0", replace(fix, t=fix.t[: len(position)], position=position), GRAVITY, Held())
