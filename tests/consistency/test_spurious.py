@@ -27,7 +27,7 @@ def first_judged(monkeypatch):
     end: where it is left half-way, a tenth more noise is found than there is."""
     seen = []
 
-    def to_its_end(*args, doubtful, guess, **kwargs):
+    def to_its_end(*args, maybe_rank_deficient, guess, **kwargs):
         return estimate(*args, **kwargs)
 
     def spy(problem, outcome, *_):

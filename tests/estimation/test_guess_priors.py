@@ -97,7 +97,7 @@ def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them
         asked.append(len(problem.priors))
         return doubtful
 
-    found = estimate(inputs, state, doubtful=seems_open, guess=state)
+    found = estimate(inputs, state, maybe_rank_deficient=seems_open, guess=state)
     given = {p.block.key for p in given_priors(inputs)}
     guessed = {p.block.key for p in guess_priors(inputs, state)}
     left = {p.block.key for p in found.problem.priors}

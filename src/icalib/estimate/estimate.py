@@ -1,4 +1,4 @@
-"""The estimate in passes: solve, look at what is left, freeze anew, solve again."""
+"""The reweighting loop: solve, estimate noise and inliers from the residuals, freeze them, solve again."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ AGAIN = 4  # further passes, at most, where the last one began too far from its 
 FAR = 1.1  # times the chi^2 at its end: what a pass froze where it began is not what it would freeze at the end
 NEARER = 0.5  # of the way from the end that the pass before had: else two states take turns, and no pass ends it
 ENOUGH = 0.8  # of the observations of tracks take part: no need to see whether more would
-MORE = 1.1  # times as many that would are worth another pass
-FIRST_SHARE = 1e-3  # of half the chi^2: what is made anew after the first pass is worth more
+MORE = 1.1  # times as many that would: another pass follows
+FIRST_SHARE = 1e-3  # of half the chi^2: what the first pass freezes is farther off
 
 
 OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its problem, and where the solver stood
@@ -113,21 +113,23 @@ def estimate(
     held: np.ndarray = NOTHING,
     on_visit: OnVisit = lambda *_: None,
     judged: Judged | None = None,
-    doubtful: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
+    maybe_rank_deficient: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
     guess: State | None = None,
 ) -> Estimate:
     """All passes from an initial `state`; the final one alone if noise and outliers are `judged` already.
 
     Directions of the calibration parameters in `held` (see Problem) are fixed. A pass stops early if the information of
-    the calibration parameters (B, B) may be rank deficient (`doubtful`), because it would converge slowly along an
-    unobservable direction. Until the null space is known, and while directions are fixed, `guess` is a prior, so that
-    unobservable directions do not drift. A pass that ended with that prior counts as stopped early, too.
+    the calibration parameters (B, B) may be rank deficient, as `maybe_rank_deficient` tells, because it would converge
+    slowly along an unobservable direction. Until the null space is known, and while directions are fixed, `guess` is a
+    prior, so that unobservable directions do not drift. A pass that ended with that prior counts as stopped early, too.
 
     Raises EstimationError where the data do not carry an estimate.
     """
     *early, final = pass_names(inputs)
     about = () if guess is None else guess_priors(inputs, guess)
-    passes = _Passes(inputs, held, on_step, on_visit, doubtful, state, judged or Judged.first(inputs), about)
+    passes = _Passes(
+        inputs, held, on_step, on_visit, maybe_rank_deficient, state, judged or Judged.first(inputs), about
+    )
     if judged is None:
         for name in early:
             passes.early(name)
@@ -155,14 +157,14 @@ class _Passes:
     held: np.ndarray
     on_step: Callable[[str, Step], None]
     on_visit: OnVisit
-    doubtful: Callable[[Problem, np.ndarray], bool]
+    maybe_rank_deficient: Callable[[Problem, np.ndarray], bool]
     state: State
     judged: Judged
     about: tuple[Prior, ...]
     history: list[tuple[str, Step]] = field(default_factory=list)
 
     def begin_at(self, state: State) -> None:
-        """The next pass: of the same motion, at the nodes that its clocks want."""
+        """The next pass: of the same motion, at the keyframes that its clocks want."""
         self.state = _on_own_nodes(self.inputs, state)
 
     def early(self, name: str) -> None:
@@ -172,10 +174,10 @@ class _Passes:
         share = FIRST_SHARE if first else EARLY_SHARE
 
         def leaves(_: float, information: np.ndarray) -> bool:
-            return self.doubtful(problem, information)
+            return self.maybe_rank_deficient(problem, information)
 
         outcome = minimise(problem, self.state, told.step, EARLY_DECREASE, told.visit, share, leaves=leaves)
-        self._let_go(self.doubtful(problem, told.information))
+        self._let_go(self.maybe_rank_deficient(problem, told.information))
         self.judged = self.judged.next(self.inputs, outcome, first)
         self.begin_at(outcome.state)
 
@@ -185,13 +187,13 @@ class _Passes:
         problem, told = self._next(name)
 
         def leaves(way: float, information: np.ndarray) -> bool:
-            return bool(self.about) or self.doubtful(problem, information) or _is_far(way, way_before)
+            return bool(self.about) or self.maybe_rank_deficient(problem, information) or _is_far(way, way_before)
 
         def lets_go(way: float, information: np.ndarray) -> tuple[Prior, ...]:
-            return () if _is_far(way, way_before) else self._let_go(self.doubtful(problem, information))
+            return () if _is_far(way, way_before) else self._let_go(self.maybe_rank_deficient(problem, information))
 
         outcome = minimise(problem, self.state, told.step, on_visit=told.visit, leaves=leaves, lets_go=lets_go)
-        is_open = self.doubtful(problem, told.information)
+        is_open = self.maybe_rank_deficient(problem, told.information)
         way, gone = way_come(outcome.steps, outcome.cost), self._let_go(is_open)
         if gone and not _is_far(way, way_before):
             without, room = outcome.problem.without(gone), outcome.room
@@ -272,7 +274,7 @@ def _follows_more(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
 
 
 def _on_own_nodes(inputs: Inputs, state: State) -> State:
-    """The same motion, at the nodes that its clocks want."""
+    """The same motion, at the keyframes that its clocks want."""
     return resample(state, nodes_for(inputs, host_times(inputs, state.values)), inputs)
 
 
@@ -353,8 +355,8 @@ def _noise_is_estimated(inputs: Inputs) -> bool:
 
 
 def pass_names(inputs: Inputs) -> tuple[str, ...]:
-    """The passes: nodes and assignment are made anew once; noise that is estimated takes more, and outliers of tracks,
-    which show when the lens is found."""
+    """The passes: keyframes and assignment are made anew once; noise that is estimated takes more, and outliers of
+    tracks, which show when the lens is found."""
     judged = bool(inputs.measurements.tracks) and inputs.rig.settings.outlier_std > 0.0
     if not (judged or _noise_is_estimated(inputs)):
         return ("first", "final")

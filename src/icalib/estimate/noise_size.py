@@ -105,7 +105,7 @@ def _scaled(inputs: Inputs, scales: dict[str, float]) -> ImuNoise:
 
 
 def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcome:
-    """The same estimate with noise so many times as large."""
+    """The same estimate with noise scaled by `scales`."""
     assert inputs.rig.imu is not None
     rig = inputs.rig.with_sensors(replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
     other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
@@ -118,7 +118,7 @@ def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcom
 
 
 def _corner_sizes(outcome: Outcome) -> dict[str, float]:
-    """By camera, how many times as large as their noise corners are off; nearly all degrees of freedom are left."""
+    """By camera, the root of chi^2 over the number of residuals of corners; the fit takes few of them."""
     sizes = {}
     for camera, out in pairs_of(outcome.problem.factors, outcome.residuals, CornerFactor):
         if len(camera.stream.uv):
@@ -153,7 +153,7 @@ class _ImuDraws:
         return r.size, r.size - float(spent), float((r**2).sum())
 
     def size(self, kind: str) -> float:
-        """How many times as large as its noise, or at least; 1 where that is not known to be more."""
+        """The root of chi^2 over the degrees of freedom, or a lower bound; 1 where these are too few to show more."""
         count, dof, chi2 = self._left(kind)
         least = LEAST_DOF * np.sqrt(count)
         size = float(np.sqrt(chi2 / max(dof, least)))

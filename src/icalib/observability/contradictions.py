@@ -82,7 +82,7 @@ def _is_far(shown: Contradiction) -> bool:
 def _linear(
     inputs: Inputs, stated: Relaxed, standing_out: Sequence[Contradiction], factor: float
 ) -> Sequence[Contradiction]:
-    """One Newton step with all that stand out free, without directions that the data leave open."""
+    """One Newton step with all that stand out free, without directions that are unobservable from the data."""
     keys, n = [c.key for c in standing_out], stated.layout.size
     columns = np.setdiff1d(np.arange(n), stated.fixed_columns(keys))
     outcome, gradient = stated.without(keys)

@@ -1,15 +1,14 @@
-"""What the data determine: estimates in which undetermined directions of the calibration parameters are held where the
-guess has them.
+"""The null space of the data, and estimates in which it is fixed at the initial guess.
 
-Broad priors do not make an undetermined direction harmless: the solver wanders along it, and what couples with it at
-second order comes out wrong with a small standard deviation. So the information of the data alone, without what noise
-makes of it, says which directions are open; these are moved to the guess and held there while all else is estimated
-again, until their number stays. How much the rest depends on where they are is tried out, and is part of the
-covariance.
+Broad priors do not make an unobservable direction harmless. The solver wanders along it, and parameters that couple
+with it at second order come out wrong with a small standard deviation. So the null space is that of the information of
+the data alone, without the part that noise in the Jacobian makes. Its directions are reset to the guess and fixed there
+while all else is estimated again, until their number stays. The sensitivity of the other parameters to the guess along
+these directions is computed, and is part of the covariance (consider covariance).
 
-Noise in the Jacobians may pull along an open direction as hard as data would, and data may be hidden in it. There the
-solver does not wander, and measurements pay dearly for the guess: such a direction is held where they have it, unless
-that is farther from the guess than the guess may be from the truth.
+Noise in the Jacobian can pull along an unobservable direction as hard as data would, and data can be hidden in it.
+The solver does not wander there, and a reset to the guess would cost chi^2. Such a direction is fixed where the
+measurements put it, unless that is farther from the guess than the prior uncertainty of the guess allows.
 """
 
 from __future__ import annotations
@@ -36,11 +35,12 @@ from icalib.optim.calib_block import HELD_BELOW, essential_information, restrict
 from icalib.optim.prior_factor import without_priors
 from icalib.optim.state import Key, State
 
-SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is in doubt: by chance all of it may be
+# A direction with a larger share of noise in its information counts as unobservable: all of it may be noise.
+SPURIOUS_SHARE = 0.5
 MOST_ROUNDS, LATE = 6, 4
-DOUBTFUL = 0.25  # information in tolerance units
+RANK_DEFICIENT_BELOW = 0.25  # information in tolerance units
 UNCHANGED = 0.1  # of the information: less than what a few draws of noise scatter by
-ALIKE = 0.7  # cosine of the largest angle between what is held and what is to be: the rest finds its place about it
+ALIKE = 0.7  # cosine of the largest angle between the fixed subspace and the one to be fixed
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Determined:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(B, B), priors included: of what is determined, and how it moves with what is held."""
+        """(B, B), priors included: of the observable directions, and their sensitivity to the fixed ones."""
         t = self.estimate.problem.tolerance
         known = t[:, None] * self.estimate.outcome.information * t - self.noise
         return t[:, None] * scatter(known, self.noise, self.held) * t + self.shifts.T @ self.shifts
@@ -106,7 +106,7 @@ def determine(
     held, shifts = np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size))
     if found.problem.held.size:
         held = found.problem.held
-        # Of one that failed answers would be looked for, each to no end, that nobody is to use.
+        # After a failed solve the sensitivity is of no use, and each of its solves might fail as well.
         worth = _is_worth_keeping(found.outcome)
         shifts = (owed_to_guess if worth else in_proportion)(inputs, found.outcome, seen.data)
     found = replace(found, outcome=replace(found.outcome, room=None))  # nothing is solved in it any more
@@ -130,20 +130,21 @@ class _Search:
     def begin(
         cls, inputs: Inputs, start: State, guess: State, on_step: Callable[[str, Step], None], on_visit: OnVisit
     ) -> _Search:
-        """Nothing is held yet."""
-        found = estimate(inputs, start, on_step, on_visit=on_visit, doubtful=_is_doubtful, guess=guess)
+        """The first estimate, no direction fixed."""
+        found = estimate(
+            inputs, start, on_step, on_visit=on_visit, maybe_rank_deficient=_maybe_rank_deficient, guess=guess
+        )
         return cls(inputs, start, guess, on_step, on_visit, found, judge(inputs, found.outcome))
 
     def settle(self) -> None:
-        """Holds what is undetermined, until that stays; the guess counts for what it is worth till then, but not in the
-        last estimate."""
+        """Fixes the null space until it stays. Until then the guess has a prior, but not in the last estimate."""
         for k in range(MOST_ROUNDS):
             found, seen = self.found, self.seen
             settled = _is_settled(seen.undetermined, found.problem.held, k >= LATE)
             if settled and not found.outcome.half_way:
                 return
             held = found.problem.held if settled and found.problem.held.size else seen.undetermined
-            # One that failed is worth nothing: from the start, then.
+            # A failed estimate is no start for the next one.
             state = found.outcome.state if _is_worth_keeping(found.outcome) else self.start
             moving = astray(self.inputs, found.problem, state, self.guess, held, seen.asked)
             if moving.size:
@@ -152,7 +153,8 @@ class _Search:
             self._estimate(state, held, led=not settled and k + 1 < MOST_ROUNDS)
 
     def weigh(self) -> None:
-        """Moves what is held to where the guesses have it, each by what it is worth, and all else with it."""
+        """Moves the fixed directions to the guess, weighted by its prior uncertainty, and all other parameters with
+        them."""
         for _ in range(MOST_ROUNDS):
             problem, state = self.found.problem, self.found.outcome.state
             moving = astray(self.inputs, problem, state, self.guess, problem.held, self.seen.asked)
@@ -201,14 +203,14 @@ def _is_worth_keeping(outcome: Outcome) -> bool:
     return outcome.converged or outcome.half_way
 
 
-def _is_doubtful(problem: Problem, information: np.ndarray) -> bool:
-    """Whether something may be open: with what noise adds, all is better known where nothing is."""
-    return essential_information(information, problem.tolerance, problem.layout) < DOUBTFUL
+def _maybe_rank_deficient(problem: Problem, information: np.ndarray) -> bool:
+    """Whether the information, noise in the Jacobian included, may be rank deficient."""
+    return essential_information(information, problem.tolerance, problem.layout) < RANK_DEFICIENT_BELOW
 
 
 def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
-    """Whether `held` (B, m) is what is `undetermined` (B, n), both orthonormal; in `late` rounds it may be more: what
-    was found open twice would be, once more."""
+    """Whether the fixed subspace `held` (B, m) equals the null space `undetermined` (B, n), both orthonormal. In `late`
+    rounds a superset is accepted, to avoid cycling."""
     n, m = (d.shape[1] if d.size else 0 for d in (undetermined, held))
     if n == 0 or n > m:
         return n == m or (n == 0 and late)
@@ -233,11 +235,10 @@ def judge(
 ) -> Judgement:
     """Of `columns` (B,) of the calibration parameters, the others fixed; of all by default.
 
-    Parameters whose priors belong to the model (a target's shape, bloom) are open only where these are, too. Nuisance
-    parameters never are: whether the motion determines all else is asked with these known, and how far all else depends
-    on them is in the covariance. What noise adds is not looked for again where there is about as much information as in
-    the judgement `before`.
-    """
+    Parameters whose priors belong to the model (a target's shape, bloom) are unobservable only together with others.
+    Nuisance parameters never are: whether the motion determines all else is asked with these known, and how far all
+    else depends on them is in the covariance. What noise adds is not looked for again where there is about as much
+    information as in the judgement `before`."""
     problem, information, state = outcome.problem, outcome.information, outcome.state
     columns = np.arange(len(information)) if columns is None else columns
     among, t = np.ix_(columns, columns), problem.tolerance[columns]

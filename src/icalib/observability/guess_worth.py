@@ -79,7 +79,7 @@ def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State,
 
 def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     """(m + TOGETHER or fewer, B) how the calibration parameters move with each of m independent errors of the guess
-    along the held directions, one standard deviation each, and by how much more or less where all of them come
+    along the fixed directions, one standard deviation each, and by how much more or less all of them move it
     together.
 
     data (B, B): information of the data alone, in tolerance units. The room of `outcome` is used.
@@ -102,12 +102,11 @@ def in_proportion(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndar
 
 
 def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(B, m) in tolerance units: errors of the guess along held directions, independent, one standard deviation each.
+    """(B, m) in tolerance units: errors of the guess along fixed directions, independent, one standard deviation each.
 
-    One that is mostly of what nobody guessed is no larger than `data` (B, B) leave open: a board turned against
-    gravity by as much as it likes would be turned round and round, with a bias of the accelerometer that nobody
-    believes.
-    """
+    An error mostly of parameters that nobody guessed is no larger than the information `data` (B, B) allows: a board
+    turned against gravity by as much as it likes would be turned round and round, with a bias of the accelerometer that
+    nobody believes."""
     problem = outcome.problem
     # Of so many like variances divide and conquer, NumPy's way, has failed to find the eigenvectors.
     values, turn = eigh(_guess_covariance(inputs, problem, outcome.state, problem.held), driver="evr")
@@ -161,7 +160,7 @@ def _is_weighed(inputs: Inputs, held: np.ndarray) -> bool:
 
 
 def _weights(inputs: Inputs, state: State) -> np.ndarray:
-    """(B,) what guesses are worth against one another; what nobody guessed does not count, but where it turns."""
+    """(B,) prior uncertainties of the guess; parameters that nobody guessed do not count, except rotations."""
     sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
         if block.kind not in ("vector", "nuisance"):

@@ -34,8 +34,8 @@ COMMON_ERRORS = 1
 SMALLEST_BASE_PX = 0.005  # no detector does better; keeps weights finite where corners are exact
 BINS = 12  # of image speed
 LARGE_MISFIT = 0.5  # times the noise: a fifth of the variance
-# Times the `loss_scale`. On stereo stills whose lenses leave 8 px near the border it takes the held-out error from 0.29
-# px to 0.27 px. No robust loss at all leaves 0.25 px, but moves the baseline by 0.15 mm more.
+# Times the `loss_scale`. On stereo stills whose lenses leave 8 px near the border it takes the error of images that
+# were left out from 0.29 px to 0.27 px. No robust loss at all leaves 0.25 px, but moves the baseline by 0.15 mm more.
 LATER = 2.5
 
 

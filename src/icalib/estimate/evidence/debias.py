@@ -1,13 +1,13 @@
-"""How much of the information on lasting parameters is only noise in the Jacobians.
+"""How much of the information on calibration parameters is only noise in the Jacobians.
 
 A Jacobian that is taken at a noisy trajectory and noisy readings shows motion that was not there: where the truth is no
 information at all, J^T J shows some, which grows with the square of the noise. What noise adds is measured by adding
 it once more: S(x + d) - S(x), its mean over draws +-d of the trajectory's own posterior and of the IMU's noise.
 
-The posterior takes the readings between a node and an image, a sweep or a stamp for true; yet their noise turns the
+The posterior takes the readings between a keyframe and an image, a sweep or a stamp for true; yet their noise turns the
 trajectory, too. With a noisy IMU it may do so as much as all that the posterior knows of. So where a first draw shows
 that noise counts, the trajectory follows noisier readings as the solver would have it, and what the posterior has of
-their noise already is taken off: with u and v where all measurements, or the factors between nodes alone, send it,
+their noise already is taken off: with u and v where all measurements, or the factors between keyframes alone, send it,
 S(x + d + u) - S(x + v), for draws are independent and what they add is quadratic.
 """
 

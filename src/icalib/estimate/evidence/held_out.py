@@ -1,6 +1,6 @@
 """Whether half a recording predicts the other half as well as its formal covariance says.
 
-Near the optimum chi^2 of half h, its own nodes at their best, is a quadratic form of the step d of the calibration
+Near the optimum chi^2 of half h, its own keyframes at their best, is a quadratic form of the step d of the calibration
 parameters:
 
     chi^2_h(d) = c_h + 2 b_h . d + d^T S_h d
@@ -159,7 +159,7 @@ def excess(first: Half, second: Half, prior: tuple[np.ndarray, np.ndarray]) -> E
 
 def _evaluate(parts: Parts, steps: list[np.ndarray]) -> tuple[np.ndarray, Residuals, Residuals]:
     """Half the chi^2 (2,) and the residuals at two steps of the calibration parameters of either half, steps (B, 2) of
-    both and of the other: the nodes of each part follow, and nothing is linear but their step."""
+    both and of the other: the keyframes of each part follow, and nothing is linear but their step."""
     problem, state = parts.problem, parts.state
     found, scratch = (problem.residuals(), problem.residuals()), problem.residuals()
 

@@ -1,4 +1,4 @@
-"""Parts of a recording that stand alone: what each says of the calibration parameters, its own nodes eliminated."""
+"""Parts of a recording that stand alone: what each says of the calibration parameters, its own keyframes eliminated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LOOSE_FRAME = 1e-3
 
 @dataclass(frozen=True)
 class Parts:
-    """Of `problem`, in which tracks end where parts do, at `state`; ends (G + 1,): nodes between which parts lie.
+    """Of `problem`, in which tracks end where parts do, at `state`; ends (G + 1,): keyframes between which parts lie.
 
     sums (G, B + 1, B + 1): each part's information of the calibration parameters, its gradient in the last column.
     """
@@ -58,7 +58,7 @@ class Parts:
         return len(self.ends) - 1
 
     def piece(self, g: int, scratch: Residuals) -> Piece:
-        """All sums of part `g`, its nodes not yet eliminated; fills `scratch` for its measurements."""
+        """All sums of part `g`, its keyframes not yet eliminated; fills `scratch` for its measurements."""
         problem, state = self.problem, self.state
         first, last = (int(k) for k in self.ends[g : g + 2])
         piece = problem.attach(Piece.zeros(first, last, problem.layout.size))
@@ -67,7 +67,7 @@ class Parts:
         if not problem.framed:
             shared = any(b.name in IN_THE_WORLD for b in problem.layout.blocks)
             hold_frame(state, piece, first, problem.levelled, LOOSE_FRAME if shared else FRAME)
-        # A seam says nothing of the node behind it, and that node's own images are in the next part.
+        # A seam says nothing of the keyframe behind it, and that keyframe's own images are in the next part.
         return piece.without_last() if last in problem.chain.starts else piece
 
     def cost(self, g: int, state: State, out: Residuals) -> float:
@@ -79,7 +79,7 @@ class Parts:
 
 
 def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
-    """How many of `count` parts there may be, and how many nodes each needs.
+    """How many of `count` parts there may be, and how many keyframes each needs.
 
     Images that nothing ties to each other stand alone: where there are few, each but the last is a part.
     """
@@ -94,8 +94,8 @@ def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
 
 
 def segment_ends(starts: tuple[int, ...], n_nodes: int, segments: int) -> np.ndarray:
-    """(segments + 1,) nodes between which segments lie; each start of a recording is one. More segments where there are
-    more recordings."""
+    """(segments + 1,) keyframes between which segments lie; each start of a recording is one. More segments where there
+    are more recordings."""
     edges = np.array([*starts, n_nodes - 1])
     counts = np.maximum(np.round(segments * np.diff(edges) / edges[-1]).astype(int), 1)
     pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]

@@ -123,7 +123,8 @@ def _keyframe_sources(rig: Rig) -> list[tuple[SensorModel, list[Sensor]]]:
 
 
 def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
-    """The same motion at other nodes, by integrating the IMU from the nearest old one; without an IMU nodes stay."""
+    """The same motion at other keyframes, by integrating the IMU from the nearest old one; without an IMU keyframes
+    stay."""
     if inputs.imu is None:
         return state
     near = assign_nodes("inertial", state.seconds, nodes, inputs.imu.forwards)
@@ -133,7 +134,7 @@ def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
 
 
 def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
-    """Node times for images or scans at `times`. Raises EstimationError where clocks do not overlap."""
+    """Keyframe times for images or scans at `times`. Raises EstimationError where clocks do not overlap."""
     settings = inputs.rig.settings
     if inputs.imu is None:
         return distinct(np.sort(np.concatenate(times)))
@@ -249,7 +250,7 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
 
 
 def on_the_chain(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...]) -> tuple[np.ndarray, ...]:
-    """By camera, (N,) bool: observations of tracks in images that have a node."""
+    """By camera, (N,) bool: observations of tracks in images that have a keyframe."""
     times, streams = image_times(inputs, state.values), inputs.measurements.tracks
     return tuple(
         np.repeat(is_seen(inputs, t, state.seconds[camera.node]), np.diff(stream.start))
@@ -269,7 +270,7 @@ def _surfaces(inputs: Inputs, state: State, coarse: bool) -> Surfaces | None:
 
 
 def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice], forwards: bool) -> np.ndarray:
-    """(n,) node of each image at `times`, one of its own recording; `images` of each recording."""
+    """(n,) keyframe of each image at `times`, one of its own recording; `images` of each recording."""
     pairs = zip(images, state.recordings, strict=True)
     return np.concatenate([assign_nodes(scheme, state.seconds[k], times[i], forwards) + k.start for i, k in pairs])
 
@@ -282,8 +283,8 @@ def _chain(inputs: Inputs, state: State) -> ChainFactor:
 
 
 def is_seen(inputs: Inputs, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """(n,) whether images at `times` can be used, each at its node's instant: the IMU was running, or without one they
-    were taken there."""
+    """(n,) whether images at `times` can be used, each at its keyframe's instant: the IMU was running, or without one
+    they were taken there."""
     if inputs.imu is None:
         return np.abs(times - nodes) <= MERGED_WITHIN_S
     return usable(inputs.imu, times, inputs.rig.settings.max_gap_s)

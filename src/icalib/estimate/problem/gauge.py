@@ -1,4 +1,4 @@
-"""Where the world's origin is and which way x points, in a rig without a target: the first node stays where it is.
+"""Where the world's origin is and which way x points, in a rig without a target: the first keyframe stays where it is.
 
 A target's frame is the world's; planes and points have none of their own, and turning all about gravity or moving
 it changes no measurement.
@@ -23,9 +23,9 @@ FRAME = 1e10
 
 
 def hold_frame(state: State, piece: Piece, node: int, levelled: bool, information: float = FRAME) -> None:
-    """Holds the position of `node`, and its turn about gravity, or where this is not known (`levelled`) its rotation,
-    where they are: without a target nothing in the world says where its origin is. Adds to the sums of `piece`; there
-    is no gradient, and what is seen does not depend on it."""
+    """Fixes the position of a keyframe, and its turn about gravity, or where this is not known (`levelled`) its
+    rotation, where they are: without a target nothing in the world says where its origin is. Adds to the sums of
+    `piece`; there is no gradient, and what is seen does not depend on it."""
     k, up = node - piece.first, state.rotation[node][2]
     piece.diagonal[k, 0:3, 0:3] += information * (np.outer(up, up) if levelled else np.eye(3))
     piece.diagonal[k, range(3, 6), range(3, 6)] += information

@@ -1,4 +1,7 @@
-"""What guesses are worth, and priors of that width: so that what the motion leaves open does not wander from them."""
+"""Prior uncertainty of the initial guess, and priors of that width.
+
+They keep unobservable directions near the guess while the solver runs.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ RATIO_STEP = 1e-4  # of a coefficient, for a difference quotient
 
 
 def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
-    """(B,) standard deviations of the guess: given ones, or the default ones. `state` has the lenses."""
+    """(B,) standard deviations of the guess: stated ones, or the default ones. `state` has the lenses."""
     sigma = np.zeros(inputs.layout.size)
     for b in inputs.layout.free:
         stated = inputs.stated(b)
@@ -33,8 +36,8 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
 
 
 def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prior, ...]:
-    """Priors about `guess` on everything of the sensors that the rig file gives none for, this many `times` as wide as
-    a guess is off."""
+    """Priors about `guess` on all parameters of sensors for which the rig file gives none. Their standard deviation is
+    `times` that of `guess_sigma`."""
     sigma = times * guess_sigma(inputs, guess)
     given = {p.block.key for p in stated_priors(inputs)}
     own = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.key not in given)
@@ -44,8 +47,8 @@ def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prio
 def _focal_sigma(camera: Camera, state: State, sigma: np.ndarray) -> float:
     """px: how far fx may be off because the coefficients, of standard deviations `sigma`, are.
 
-    A guess knows the scale in the image's centre. In some models it depends on a coefficient, too: it is fx / (1 + xi)
-    where a sphere is seen from xi behind its centre. fx then follows the error of xi.
+    A guess knows the scale in the centre of the image. In some models this scale depends on a coefficient, too: it is
+    fx / (1 + xi) in the unified model. fx then follows the error of xi.
     """
     model, fx = camera_model(camera.model), state.values[camera.name, "intrinsics"][0]
     lens = np.concatenate([state.values[camera.name, name] for name in ("intrinsics", "distortion")])

@@ -1,4 +1,4 @@
-"""Where the solver ended, what it went through, and draws from the posterior there."""
+"""The outcome of a solve: state, residuals, steps, and draws from the posterior."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from icalib.optim.state import State
 
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
-# Of few nodes more free ones: the degrees of freedom that they show are off by sqrt(2 spent / draws), of few residuals
-# too much. So many nodes times draws at most; doubled, they cost twice as much, and are off by 0.7 times as much.
+# Of few keyframes more free ones: the degrees of freedom that they show are off by sqrt(2 spent / draws), of few
+# residuals too much. So many keyframes times draws at most; doubled, they cost twice as much, and are off by 0.7 times
+# as much.
 NODES_DRAWN, MOST_FREE = 640, 64
 MORE_STILL = 5  # for where these leave doubt; drawn later, so that the first stay what they are
 
@@ -45,8 +46,8 @@ class Outcome:
     """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
     looked for where they were; information (B, B): of the calibration parameters at `state`, the chain marginalised, no
     damping; empty, and no draws, where another pass follows. half_way: left before its end, because more seemed of no
-    use. room: the pieces that it was solved in, to be filled anew; None without features, whose fronts alone are worth
-    keeping."""
+    use. room: the pieces that it was solved in, to be filled anew; None without features, of which alone the fronts
+    are kept."""
 
     problem: Problem
     state: State

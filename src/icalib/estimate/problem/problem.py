@@ -19,8 +19,8 @@ from icalib.optim.state import Layout, State
 
 @runtime_checkable
 class ChainFactor(Factor, Protocol):
-    """What ties the nodes together: an `ImuFactor`, or `FreeNodes`. kinds: columns of its residuals by name; starts:
-    the first node of each recording, which nothing ties to the one before."""
+    """What ties the keyframes together: an `ImuFactor`, or `FreeNodes`. kinds: columns of its residuals by name;
+    starts: the first keyframe of each recording, which nothing ties to the one before."""
 
     @property
     def n_nodes(self) -> int: ...
@@ -32,12 +32,12 @@ class ChainFactor(Factor, Protocol):
     def kinds(self) -> dict[str, slice]: ...
 
     def output(self) -> Whitened:
-        """Rows (K - 1, 15), one an interval between nodes."""
+        """Rows (K - 1, 15), one an interval between keyframes."""
         ...
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Adds what keeps the biases of those `starts` defined that lie in `piece`, its last node aside; returns half
-        its chi^2."""
+        """Adds what keeps the biases of those `starts` defined that lie in `piece`, its last keyframe aside; returns
+        half its chi^2."""
         ...
 
 
@@ -79,7 +79,7 @@ class Problem:
         return tuple(self.attach(p, len(pieces) > 1) for p in pieces) if sums else pieces
 
     def attach(self, piece: Piece, keep: bool = False) -> Piece:
-        """The piece with room for what factors eliminate; `keep`: another piece shares a node with it."""
+        """The piece with room for what factors eliminate; `keep`: another piece shares a keyframe with it."""
         for factor in self.factors.values():
             piece = factor.attach(piece, keep)
         return piece
@@ -89,21 +89,21 @@ class Problem:
         gone = {id(p) for p in priors}
         return replace(self, priors=tuple(p for p in self.priors if id(p) not in gone))
 
-    def cut(self, state: State, nodes: np.ndarray) -> Problem:
-        """The same problem, in which nothing ties nodes on both sides of one of `nodes` but the chain, so that pieces
-        between these can stand alone."""
-        ends = tuple(int(k) for k in nodes)
+    def cut(self, state: State, keyframes: np.ndarray) -> Problem:
+        """The same problem with independent pieces between `keyframes` (n,): across one of these nothing but the chain
+        ties others."""
+        ends = tuple(int(k) for k in keyframes)
         return self.replacing([f.cut(state, ends) for f in self.factors.values()])
 
     def marginal(self, sums_of: Callable[[int, int], Piece]) -> np.ndarray:
-        """Border (B + 1, B + 1) of `sums_of` from one node to another, all nodes eliminated: a segment at a time, but
-        where factors tie distant nodes."""
+        """Border (B + 1, B + 1) of `sums_of` from one keyframe to another, all keyframes eliminated: a segment at a
+        time, but where factors tie distant keyframes."""
         if self.ties_distant_nodes:
             return marginalise(sums_of(0, self.n_nodes - 1))
         return marginalise_in_segments(sums_of, self.n_nodes)
 
     def sums_of(self, state: State, first: int, last: int) -> Piece:
-        """The sums between two nodes alone, with the true curvature of robust losses; residuals are not kept."""
+        """The sums between two keyframes alone, with the true curvature of robust losses; residuals are not kept."""
         piece = self.attach(Piece.zeros(first, last, self.layout.size))
         for factor in self.factors.values():
             factor.accumulate(state, piece, factor.throwaway(), curved=True)
@@ -154,7 +154,7 @@ class Problem:
         return sum(f.accumulate(state, piece, out[key], sums, curved) for key, f in self.factors.items())
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Adds the broad prior on the biases of recordings' first nodes, about those that the pass started from."""
+        """Adds the broad prior on the biases of recordings' first keyframes, about those that the pass started from."""
         return self.chain.accumulate_bias_prior(state, piece, sums)
 
     @staticmethod

@@ -23,7 +23,7 @@ MAX_ITERATIONS = 50
 CONVERGED_DECREASE = 5e-4
 ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
 CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
-HALF_WAY = 0.5  # of half the chi^2: where little more is gained, it can be seen what is open
+HALF_WAY = 0.5  # of half the chi^2: where little more is gained, unobservable directions show
 MOST_STALLED = 4  # steps this small that fail before the solver rests
 COMES_BACK = 0.25  # of what a step costs too much, where its error is of second order: this much at most is left next
 STRAIGHT, AS_SAID = 1e3, 0.1  # of half the chi^2; of an early pass's tolerance: how well a larger step may be foretold
@@ -33,7 +33,7 @@ CREEPING = 2  # steps, of the least of which the next one must promise less than
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
 FIRST_DAMPING = 1e-8
 SMALL_DECREASE = 0.5  # of half the chi^2: a step of one standard deviation, all parameters together
-LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations, not worth a relinearisation
+LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations: too small to linearise again
 
 
 class _Pace(NamedTuple):
@@ -55,7 +55,7 @@ GOOD_GAIN = 0.25  # of what a step promises: with less, damping does not shrink
 
 @dataclass
 class _Care:
-    """How steps are held back: by damping, at its `pace`, and by weights alone in place of the true curvature of the
+    """How steps are shortened: by damping, at its `pace`, and by weights alone in place of the true curvature of the
     loss, which the sums have (`curved`) where a step promises less than `curved_below` of the cost."""
 
     pace: _Pace
@@ -127,7 +127,7 @@ class _Descent:
 
     @property
     def enough(self) -> float:
-        """A decrease that is not worth a further step."""
+        """A decrease too small for a further step."""
         return max(self.tolerance, self.share * self.cost)
 
     @property

@@ -82,10 +82,9 @@ class CornerOutput:
 class CornerFactor(FactorDefaults):
     """All images of one camera.
 
-    times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; node (M,), increasing: the node each
-    image hangs on; keep (N,): corners in use; direction (N, 2) image direction of the bloom, (0, 2) without it;
-    seams: the images that begin further recordings, in which the scene stands elsewhere.
-    """
+    times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; `node` (M,), increasing: the keyframe
+    each image hangs on; keep (N,): corners in use; direction (N, 2) image direction of the bloom, (0, 2) without it;
+    seams: the images that begin further recordings, in which the scene stands elsewhere."""
 
     stream: CornerStream
     model: CameraModel
@@ -251,7 +250,7 @@ class CornerFactor(FactorDefaults):
     def accumulate(
         self, state: State, piece: Piece, out: CornerOutput | None, sums: bool = True, curved: bool = False
     ) -> float:
-        """See `Factor`: of the images whose node lies in `piece`. Without `out` residuals are not kept."""
+        """See `Factor`: of the images whose keyframe lies in `piece`. Without `out` residuals are not kept."""
         into, total = piece.sums(sums), 0.0
         for v0, v1, recording in self._blocks_of(piece):
             images, noise, direct, motion = self._arguments(state, v0, v1, recording, curved)
@@ -328,8 +327,8 @@ class CornerFactor(FactorDefaults):
                 yield a, b, Predicted(int(start[a]), X, uv, valid, np.zeros((0, 2, 3)), np.zeros((0, 2, 0)))
 
     def _blocks_of(self, piece: Piece) -> Iterator[tuple[int, int, int]]:
-        """The views that belong to `piece`, nodes from first to before last, the chain's very last node included; some
-        at a time, as `parts` has them."""
+        """The views that belong to `piece`, keyframes from first to before last, the chain's very last keyframe
+        included; some at a time, as `parts` has them."""
         stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
         images = np.searchsorted(self.node, [piece.first, stop])
         v0, v1 = (int(v) for v in np.searchsorted(self.views.image, images))

@@ -81,7 +81,7 @@ def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.
     difference = np.linalg.norm(residual[near] - residual[own, None], axis=2)
     similar = difference < SIMILAR * np.linalg.norm(residual[own], axis=1)[:, None]
     similar &= tag[near] != tag[own, None]
-    # A graph with a node for each suspect corner; node 0 stands for all corners that are not suspect.
+    # A graph with a vertex for each suspect corner; vertex 0 stands for all corners that are not suspect.
     node = np.zeros(len(uv), dtype=np.int64)
     node[own] = 1 + np.arange(len(own))
     row, column = np.nonzero(similar)

@@ -1,6 +1,6 @@
 """Rejects sets of images that count as simultaneous but are not: the rig moved in between, or one was exposed later.
 
-Without an IMU, simultaneous images of several cameras share a keyframe (node), and so a pose of the rig. If the rig
+Without an IMU, simultaneous images of several cameras share a keyframe, and so a pose of the rig. If the rig
 moved in between, no pose fits all of them, however well each image alone fits the target. The median residual of an
 image then is far above that of the camera's other images.
 """

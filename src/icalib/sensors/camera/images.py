@@ -1,4 +1,4 @@
-"""Corners and tracks of one camera on the same images, so that both share its instants, nodes and poses."""
+"""Corners and tracks of one camera on the same images, so that both share its instants, keyframes and poses."""
 
 from __future__ import annotations
 

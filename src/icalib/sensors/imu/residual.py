@@ -1,4 +1,4 @@
-"""The IMU factor: readings between neighbouring nodes, preintegrated once (paper (16)-(19))."""
+"""The IMU factor: readings between neighbouring keyframes, preintegrated once (paper (16)-(19))."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _preintegrate(k0, k1, nodes, first, readings, bias, intrinsics, dR, dv, dp, 
 
 
 class Chain(NamedTuple):
-    """The nodes: R_world_imu (K, 3, 3), p, v (K, 3), biases (K, 6), seconds (K,); gravity m/s^2."""
+    """The keyframes: R_world_imu (K, 3, 3), p, v (K, 3), biases (K, 6), seconds (K,); gravity m/s^2."""
 
     R: np.ndarray
     p: np.ndarray
@@ -70,7 +70,7 @@ def _correction(k, chain, made, dx, change):
 
 @njit(cache=True, nogil=True, inline="always")
 def _motion(k, chain):
-    """R_k^T R_k+1, and velocity and position gained without gravity, in the axes of node k."""
+    """R_k^T R_k+1, and velocity and position gained without gravity, in the axes of keyframe k."""
     R0, dt, g = chain.R[k], chain.seconds[k + 1] - chain.seconds[k], chain.gravity
     mv, mp, hv, hp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
@@ -154,7 +154,7 @@ class ImuFactor(RowFactor):
 
     residual (15,) of interval k: Log((dR Exp(J_R db))^T R_k^T R_k+1); R_k^T (v_k+1 - v_k - g dt) - dv - J_v db;
     R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db; b_k+1 - b_k, whitened jointly. The interval before each of
-    `starts`, recordings' first nodes, carries no information.
+    `starts`, recordings' first keyframes, carries no information.
     """
 
     imu: ImuData
@@ -195,7 +195,7 @@ class ImuFactor(RowFactor):
         return state.seconds[:-1]
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """The broad prior on the biases of the recordings' first nodes in `piece`, about those of the pass's start.
+        """The broad prior on the biases of the recordings' first keyframes in `piece`, about those of the pass's start.
         Returns half its chi^2."""
         own = [k for k in self.starts if piece.first <= k < piece.last]
         return sum(accumulate_bias_prior(state, piece, sums, self.made.bias0[k], k) for k in own)

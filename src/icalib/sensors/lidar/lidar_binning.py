@@ -139,7 +139,7 @@ def _moments_of(
     each = steps_of(bin_s)
     scans, seconds, _ = _laid_out(cloud.stream, cloud.plane, bin_s / each, each, own)
     times = instants(cloud.stream, drive.state.values, seconds)
-    # All steps of a bin hang on one node: between two nodes a state that has not settled yet may jump.
+    # All steps of a bin hang on one keyframe: between two keyframes a state that has not settled yet may jump.
     motion, n = sweep(drive, cloud.stream.name, times, np.repeat(times[each // 2 :: each], each)), len(times)
     cells = Cells(
         np.empty(n, np.bool_), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n // each, 3, 3)),

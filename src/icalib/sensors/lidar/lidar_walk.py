@@ -1,8 +1,8 @@
-"""What the gyroscope's noise between a node and the bins that hang on it takes from what a LiDAR tells.
+"""What the gyroscope's noise between a keyframe and the bins that hang on it takes from what a LiDAR tells.
 
-A bin is where the readings carry the node, and these have noise: on the way it turns the IMU by an angle that walks
-away from nothing. On one side of a node that walk is taken for one unknown turn x, N(0, I), by which a bin is turned as
-far as the walk gets there: `walked` x. |x|^2 is added to the chi^2, and the best x taken: with H = J^T J and
+A bin is where the readings carry the keyframe, and these have noise: on the way it turns the IMU by an angle that walks
+away from nothing. On one side of a keyframe that walk is taken for one unknown turn x, N(0, I), by which a bin is
+turned as far as the walk gets there: `walked` x. |x|^2 is added to the chi^2, and the best x taken: with H = J^T J and
 u = J^T (J_all, r) of x, summed over the bins, u^T (I + H)^-1 u is taken off the normal equations. J is that of the
 state that a pass starts from: were it taken anew, the cost would draw to where noise explains more.
 
@@ -23,8 +23,8 @@ POSE, PLANE = 6, 3
 
 
 class Walk(NamedTuple):
-    """Sums over bins on one side of a node, by the unknown turn: information (3, 3); by_pose (3, w + 1), with the w
-    nodes and columns that act through the pose, and with the residual; by_plane (P, 3, 3), with the columns of each
+    """Sums over bins on one side of a keyframe, by the unknown turn: information (3, 3); by_pose (3, w + 1), with the w
+    keyframes and columns that act through the pose, and with the residual; by_plane (P, 3, 3), with the columns of each
     plane, of which those in `met` (P,) are not empty, `n_met` (1,) of them."""
 
     information: np.ndarray
@@ -61,7 +61,7 @@ def add_entry(turned, slope, row, B, by_pose, walk):
 
 @njit(cache=True, nogil=True, inline="always")
 def add_pose(by_pose, T, walk):
-    """What a bin's entries gathered, T (6, w) its pose by nodes and columns."""
+    """What a bin's entries gathered, T (6, w) its pose by keyframes and columns."""
     for a in range(3):
         for j in range(POSE):
             for i in range(T.shape[1]):
@@ -99,8 +99,8 @@ def columns_of(walk, columns, of_plane):
 
 @njit(cache=True, nogil=True, inline="always")
 def taken_off(walk):
-    """V (3, w + m + 1), V^T V what is taken off the sums of nodes, calibration parameters and residual, the calibration
-    parameters in the order of `columns_of`. The walk is empty again."""
+    """V (3, w + m + 1), V^T V what is taken off the sums of keyframes, calibration parameters and residual, the
+    calibration parameters in the order of `columns_of`. The walk is empty again."""
     n, width, L = walk.n_met[0], walk.by_pose.shape[1] - 1, walk.information
     last = width + PLANE * n
     V = np.empty((3, last + 1))

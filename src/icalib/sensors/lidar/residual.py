@@ -35,9 +35,9 @@ CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 
 @dataclass(frozen=True)
 class LidarFactor(RowFactor):
-    """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on; walked (n,), turned
-    (E, 3, 4), slope (E, 3): see `Bins`, at the state that the pass starts from; planes: keys of the values that the
-    rows of the moments' planes have in a state."""
+    """All scans of one LiDAR. `node` (n,), increasing: the keyframe that each bin of `moments` hangs on; walked (n,),
+    turned (E, 3, 4), slope (E, 3): see `Bins`, at the state that the pass starts from; planes: keys of the values that
+    the rows of the moments' planes have in a state."""
 
     name: str
     moments: Moments
@@ -147,7 +147,7 @@ class LidarFactor(RowFactor):
         """Bins b0..b1 by the chunk, each with the number of its time offset."""
         for clock, own in by_clock(state, self.name, self.node[b0:b1]):
             first, last = b0 + own.start, b0 + own.stop
-            # Bins on one side of a node stay together.
+            # Bins on one side of a keyframe stay together.
             sides = np.flatnonzero(np.diff(2 * self.node[first:last] + (self.walked[first:last] >= 0.0))) + 1
             sides = np.append(sides, last - first)
             ends = sides[np.searchsorted(sides, np.arange(CHUNK, last - first, CHUNK))]
@@ -155,7 +155,8 @@ class LidarFactor(RowFactor):
                 yield clock, first + int(a), first + int(b)
 
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
-        """The bins that belong to `piece`: nodes from first to before last, the chain's very last node included."""
+        """The bins that belong to `piece`: keyframes from first to before last, the chain's very last keyframe
+        included."""
         stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
         b0, b1 = np.searchsorted(self.node, [piece.first, stop])
         return int(b0), int(b1)

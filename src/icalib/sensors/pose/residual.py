@@ -1,7 +1,7 @@
 """Poses that a sensor reports, motion capture or another program's odometry, against the motion of the IMU.
 
 `AbsolutePoseFactor`: each pose at its own instant, in a frame that stands still in the world of each recording.
-`RelativePosesFactor`: the way from one pose to another, about from node to node; their frame may drift.
+`RelativePosesFactor`: the way from one pose to another, about from keyframe to keyframe; their frame may drift.
 
 The sensor's parameters are the blocks rotation, translation (R_imu_sensor, p_imu_sensor), time_offset, and scale (1,),
 true lengths over reported ones. A position is predicted / scale - reported: the noise is that of what is reported, and
@@ -33,7 +33,7 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 
-NEAR_NODE_S = 0.05  # a pose further from all nodes is left out: the IMU alone would carry it there
+NEAR_NODE_S = 0.05  # a pose further from all keyframes is left out: the IMU alone would carry it there
 KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
 UNITS = {"rotation": "rad", "position": "m"}
 
@@ -100,15 +100,15 @@ class _PoseFactor(RowFactor):
 
 @dataclass(frozen=True)
 class AbsolutePoseFactor(_PoseFactor):
-    """n poses of one sensor in its frame, see `absolute_residuals`. node (n,), in order: of each; sigma: of its
-    rotation [rad] and position [m]. imu: None where poses were taken at nodes, which nothing ties to each other."""
+    """n poses of one sensor in its frame, see `absolute_residuals`. `node` (n,), in order: of each; sigma: of its
+    rotation [rad] and position [m]. imu: None where poses were taken at keyframes, which nothing ties to each other."""
 
     name: str
     seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
     rotation: np.ndarray  # (n, 3, 3)
     position: np.ndarray  # (n, 3)
     node: np.ndarray
-    starts: tuple[int, ...]  # the first node of each recording
+    starts: tuple[int, ...]  # the first keyframe of each recording
     n_nodes: int
     imu: ImuData | None
     gravity: float
@@ -117,7 +117,7 @@ class AbsolutePoseFactor(_PoseFactor):
 
     @classmethod
     def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
-        """Of the poses that lie near nodes; those in gaps of the IMU that are not bridged are left out."""
+        """Of the poses that lie near keyframes; those in gaps of the IMU that are not bridged are left out."""
         state = motion.state
         times = instants(stream, state.values)
         node = assign_nodes("inertial", state.seconds, times, motion.imu.forwards)
@@ -133,7 +133,7 @@ class AbsolutePoseFactor(_PoseFactor):
     def at_nodes(
         cls, stream: PoseStream, state: State, starts: tuple[int, ...], noise: PoseNoise, layout: Layout
     ) -> AbsolutePoseFactor:
-        """Of the poses that were taken at a node, without an IMU; starts: the first node of each recording."""
+        """Of the poses that were taken at a keyframe, without an IMU; starts: the first keyframe of each recording."""
         times = instants(stream, state.values)
         node = np.searchsorted(0.5 * (state.seconds[1:] + state.seconds[:-1]), times)
         k = np.flatnonzero(np.abs(times - state.seconds[node]) <= MERGED_WITHIN_S)
@@ -159,7 +159,7 @@ class AbsolutePoseFactor(_PoseFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last node is an end
+        cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last keyframe is an end
         edges = np.searchsorted(self.node, (*self.starts, self.n_nodes))
         low, high = np.searchsorted(at, [piece.first, piece.last])
         for k in range(len(self.starts)):
@@ -190,7 +190,7 @@ class AbsolutePoseFactor(_PoseFactor):
 
 @dataclass(frozen=True)
 class RelativePosesFactor(_PoseFactor):
-    """n ways of one sensor, see `relative_residuals`, each between two of its stamps about from node to node;
+    """n ways of one sensor, see `relative_residuals`, each between two of its stamps about from keyframe to keyframe;
     duration (n,) s. Their noise is that of a random walk, and independent."""
 
     name: str
@@ -205,7 +205,7 @@ class RelativePosesFactor(_PoseFactor):
 
     @classmethod
     def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> RelativePosesFactor:
-        """Chooses the stretches at the time offset and the nodes of the motion."""
+        """Chooses the stretches at the time offset and the keyframes of the motion."""
         state, seconds = motion.state, stream.seconds
         times = instants(stream, state.values)
         found = choose_intervals(motion.imu, state.seconds, state.starts, times)

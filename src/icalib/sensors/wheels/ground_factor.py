@@ -1,14 +1,14 @@
-"""The wheels stand on a plane: their frame is upright on it, and its origin at a height over it, at every node.
+"""The wheels stand on a plane: their frame is upright on it, and its origin at a height over it, at every keyframe.
 
-With n the plane's normal (3,) upwards, q a point on it, R_k, p_k the IMU's pose at node k and R, p that of the wheels
-in the IMU's frame, the rows of a node are
+With n the plane's normal (3,) upwards, q a point on it, R_k, p_k the IMU's pose at keyframe k and R, p that of the
+wheels in the IMU's frame, the rows of a keyframe are
 
     e_1, e_2 of (R_k R)^T n                  over tilt_noise         how the frame is tilted on the plane [rad]
     n . (p_k + R_k p - q) - h                over bump_noise         its height [m]
-    (h - height) / sqrt(nodes)               over height_sigma       what was measured of the height [m]
+    (h - height) / sqrt(keyframes)           over height_sigma       what was measured of the height [m]
 
-The first three are noise of each node: springs and an uneven floor. The last are together one measurement of h: a tape
-has the same error all the time. It is a measurement and no prior, so that verdicts are those of the data with it.
+The first three are noise of each keyframe: springs and an uneven floor. The last are together one measurement of h: a
+tape has the same error all the time. It is a measurement and no prior, so that verdicts are those of the data with it.
 
 `level`: n is upwards, q the origin of the world. `floor`: the plane that the LiDARs see most of, of those that are
 nearly level and below the IMU, in each recording its own.
@@ -58,9 +58,9 @@ def _is_floor(plane: np.ndarray, above: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class GroundFactor(RowFactor):
-    """Rows of the wheels `name` at n nodes: tilt about both level axes, height, and what was measured of it; those that
-    `ground` does not ask for weigh nothing. floor: the key of the plane in each recording; None: the horizon's, or none
-    where `ground` asks for a floor that is not seen."""
+    """Rows of the wheels `name` at n keyframes: tilt about both level axes, height, and what was measured of it; those
+    that `ground` does not ask for weigh nothing. floor: the key of the plane in each recording; None: the horizon's, or
+    none where `ground` asks for a floor that is not seen."""
 
     units: ClassVar[Mapping[str, str]] = {TILT: "rad", HEIGHT: "m"}
 
@@ -76,7 +76,7 @@ class GroundFactor(RowFactor):
     def build(
         cls, name: str, ground: Ground, floor: tuple[Key | None, ...], state: State, imu: ImuData, layout: Layout
     ) -> GroundFactor:
-        """At all nodes of recordings that have the plane, but the last of each."""
+        """At all keyframes of recordings that have the plane, but the last of each."""
         used = [
             np.arange(r.start, r.stop - 1)
             for r, key in zip(state.recordings, floor, strict=True)

@@ -14,7 +14,7 @@ PANEL_S = 0.025
 
 class Instants(NamedTuple):
     """Where motion is looked at. Those of interval i are start[i]:start[i+1]: its first end, points of a quadrature,
-    its last end. times (m,) s on the wheels' clock; node (m,); weight (m,) s of the quadrature, zero at the ends."""
+    its last end. times (m,) s on the wheels' clock; `node` (m,); weight (m,) s of the quadrature, zero at the ends."""
 
     start: np.ndarray
     times: np.ndarray
@@ -24,7 +24,7 @@ class Instants(NamedTuple):
 
 def quadrature(seconds: np.ndarray, intervals: StampIntervals, change: np.ndarray | None = None) -> Instants:
     """Gauss's two points in panels of at most PANEL_S, those before `change` (n,) s of each interval, by default its
-    middle, seen from its first node, the others from the other; seconds (N,): the stamps."""
+    middle, seen from its first keyframe, the others from the other; seconds (N,): the stamps."""
     begin = seconds[intervals.first]
     length = seconds[intervals.last] - begin
     panels = np.maximum(np.ceil(0.5 * length / PANEL_S - 1e-6), 1.0).astype(np.int64)  # of a half

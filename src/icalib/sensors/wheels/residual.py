@@ -1,4 +1,4 @@
-"""Wheels against the motion between neighbouring nodes: two factors.
+"""Wheels against the motion between neighbouring keyframes: two factors.
 
 `IncrementFactor`, the default: what the wheels have turned, or what is reported of speed and yaw rate, and that the
 vehicle moves neither sideways nor off the ground beyond a slip density. `RelativePoseFactor`: paper (27)-(28), a planar
@@ -108,8 +108,8 @@ class IncrementFactor(RowFactor):
         times: np.ndarray | None = None,
     ) -> IncrementFactor:
         """From `integrals_of` (N, m), of a pair the angles in rad that the left and the right wheel have turned, at
-        stamps seconds (N,) since the first on the wheels' clock. Chooses the intervals at the nodes of `state`, with
-        stamps at `times` (N,) on the IMU's clock, by default those of the only time offset."""
+        stamps seconds (N,) since the first on the wheels' clock. Chooses the intervals at the keyframes of `state`,
+        with stamps at `times` (N,) on the IMU's clock, by default those of the only time offset."""
         found = wheel_intervals(name, seconds, imu, state, times)
         dt = seconds[found.last] - seconds[found.first]
         whole = integrals[found.last] - integrals[found.first]
@@ -194,7 +194,7 @@ class RelativePoseFactor(RowFactor):
         cls, stream: WheelPoses, imu: ImuData, gravity: float, noise: WheelNoise, layout: Layout, state: State
     ) -> RelativePoseFactor:
         """Of relative poses that were measured as such: they say nothing of radii and baseline. What the IMU loses from
-        the nodes to their ends is part of their noise."""
+        the keyframes to their ends is part of their noise."""
         times = instants(stream, state.values)
         found = pose_intervals(imu, state.seconds, state.starts, times)
         k, ends = found.first, [(found.node, times[found.first]), (found.node + 1, times[found.last])]
@@ -281,7 +281,7 @@ class RelativePoseFactor(RowFactor):
 def wheel_intervals(
     name: str, seconds: np.ndarray, imu: ImuData, state: State, times: np.ndarray | None = None
 ) -> StampIntervals:
-    """The intervals of the wheels `name`, stamped at `seconds` (N,), at the nodes in `state`; `times` as in
+    """The intervals of the wheels `name`, stamped at `seconds` (N,), at the keyframes in `state`; `times` as in
     `IncrementFactor.build`."""
     if times is not None:
         return choose_intervals(imu, state.seconds, state.starts, times)
@@ -340,7 +340,7 @@ def _raw_sigma(whitening: np.ndarray) -> np.ndarray:
 
 
 def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
-    """The intervals of which both nodes lie in `piece`."""
+    """The intervals of which both keyframes lie in `piece`."""
     i0, i1 = np.searchsorted(intervals.node, [piece.first, piece.last])
     return slice(int(i0), int(i1))
 

@@ -1,8 +1,7 @@
-"""What the IMU's noise adds to a relative pose of wheels whose ends lie beside the nodes that they hang on.
+"""What the IMU's noise adds to a relative pose of wheels whose ends lie beside the keyframes that they hang on.
 
-Sideways such a pose may be good to 0.01 mm, as no wheel slips in (27). In 20 ms from a node to an end the IMU loses as
-much, and where that is not allowed for, the pose is believed more than it can be.
-"""
+Sideways such a pose may be good to 0.01 mm, as no wheel slips in (27). In 20 ms from a keyframe to an end the IMU loses
+as much, and where that is not allowed for, the pose is believed more than it can be."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ def carried_noise(
     first: Poses, last: Poses, away: np.ndarray, rotation: np.ndarray, lever: np.ndarray, imu: ImuData
 ) -> np.ndarray:
     """(n, 3, 3) covariance of yaw, x and y of the wheels over n stretches, where the IMU was carried over `away` (n, 2)
-    s from the nodes to the ends, `first` and `last`.
+    s from the keyframes to the ends, `first` and `last`.
 
     Its orientation walks by the gyroscope's density g, turning the lever arm too, and its position by the
     accelerometer's a: g^2 t of each angle, a^2 t^3 / 3 of each axis. R_imu_wheel: `rotation`, p_imu_wheel: `lever`.

@@ -3,9 +3,8 @@
 residual = K(R_cam_world (P - p_world_cam)) - uv
 
 Points are no part of the state: at every linearisation each is moved to where the poses and the calibration want it
-(variable projection), so that the cost is the least over all points. Their columns are eliminated with the nodes that
-saw them (`front.py`). Those that lie on planes of the LiDARs have a row for that, too (`surfaces.py`).
-"""
+(variable projection), so that the cost is the least over all points. Their columns are eliminated with the keyframes
+that saw them (`front.py`). Those that lie on planes of the LiDARs have a row for that, too (`surfaces.py`)."""
 
 from __future__ import annotations
 
@@ -66,7 +65,7 @@ MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits wors
 @dataclass(frozen=True)
 class FeatureFactor(FactorDefaults):
     """All features of all cameras. cameras: their poses and models; streams: one per camera, on its images; noise: of
-    each camera's observations; keep: (N,) by camera, observations in use; seams: nodes at which further recordings
+    each camera's observations; keep: (N,) by camera, observations in use; seams: keyframes at which further recordings
     begin; surfaces: planes that points may lie on, and which tracks are on them."""
 
     cameras: tuple[CornerFactor, ...]
@@ -95,7 +94,8 @@ class FeatureFactor(FactorDefaults):
         seams: tuple[int, ...] = (),
         surfaces: Surfaces | None = None,
     ) -> FeatureFactor:
-        """Tracks chosen, and points first looked for, with the poses of `state`; the chain is cut at nodes `cuts`."""
+        """Tracks chosen, and points first looked for, with the poses of `state`; the chain is cut at keyframes
+        `cuts`."""
         factor = cls(cameras, streams, noise, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
         return factor.cut(state, cuts)
 
@@ -225,7 +225,7 @@ class FeatureFactor(FactorDefaults):
         return spent_by_features(self, out, along)
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
-        """The piece with room for the features that its nodes saw; `keep`: its end is shared with another piece."""
+        """The piece with room for the features that its keyframes saw; `keep`: its end is shared with another piece."""
         tracks, pairs = self._within(piece)
         images = self._images(piece.first, self._stop(piece))
         begins = np.cumsum([0] + [len(i) for i in images])[:-1] - np.array([i.start for i in images])
@@ -243,7 +243,7 @@ class FeatureFactor(FactorDefaults):
     def accumulate(
         self, state: State, piece: Piece, out: FeatureOutput, sums: bool = True, curved: bool = False
     ) -> float:
-        """See `Factor`: of the features that the nodes of `piece` saw, the cost is the least over the points."""
+        """See `Factor`: of the features that the keyframes of `piece` saw, the cost is the least over the points."""
         tracks, pairs = self._within(piece)
         views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
         planes = self._planes(state)
@@ -312,11 +312,11 @@ class FeatureFactor(FactorDefaults):
         return self.tracks.within(piece.first, self._stop(piece))
 
     def _stop(self, piece: Piece) -> int:
-        """The node before which the images of `piece` hang: the last, or behind the chain's very last."""
+        """The keyframe before which the images of `piece` hang: the last, or behind the chain's very last."""
         return piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
 
     def _images(self, first: int, stop: int) -> list[range]:
-        """By camera, the images that hang on nodes first..stop."""
+        """By camera, the images that hang on keyframes first..stop."""
         return [range(*(int(i) for i in np.searchsorted(c.node, [first, stop]))) for c in self.cameras]
 
     def _sightings(self) -> Sightings:
@@ -330,7 +330,7 @@ class FeatureFactor(FactorDefaults):
         )
 
     def _views(self, state: State, first: int, stop: int) -> list[View]:
-        """What hangs on nodes first..stop."""
+        """What hangs on keyframes first..stop."""
         return [self._view(state, i, images, first) for i, images in enumerate(self._images(first, stop))]
 
     def _view(self, state: State, index: int, images: range, first: int) -> View:

@@ -1,4 +1,4 @@
-"""What a camera that follows points saw from a stretch of nodes, and how it moved there."""
+"""What a camera that follows points saw from a stretch of keyframes, and how it moved there."""
 
 from __future__ import annotations
 

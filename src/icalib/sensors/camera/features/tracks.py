@@ -37,11 +37,10 @@ class Tracks:
     """Tracks in the order of their first nodes. By camera, of each observation: track (N,), -1 where it has none; pair
     (N,), of its track with its image.
 
-    pair_track, pair_camera and pair_image (E,): what each pair joins, in the order of nodes; edges (S + 1,): nodes
-    between which tracks are cut; tracks_from and pairs_from (S + 1,): the first of each stretch; start (T, 3): where
-    each point is first looked for, in the frame of the camera that saw it in the middle of its life; camera and image
-    (T,): which that was.
-    """
+    pair_track, pair_camera and pair_image (E,): what each pair joins, in the order of keyframes; edges (S + 1,):
+    keyframes between which tracks are cut; tracks_from and pairs_from (S + 1,): the first of each stretch; start (T,
+    3): where each point is first looked for, in the frame of the camera that saw it in the middle of its life; camera
+    and image (T,): which that was."""
 
     track: tuple[np.ndarray, ...]
     pair: tuple[np.ndarray, ...]
@@ -64,14 +63,14 @@ class Tracks:
         return self.edges[np.searchsorted(self.tracks_from, np.arange(self.count), side="right") - 1]
 
     def within(self, first: int, stop: int) -> tuple[slice, slice]:
-        """Tracks and pairs of nodes first..stop, both of them edges."""
+        """Tracks and pairs of keyframes first..stop, both of them edges."""
         a, b = np.searchsorted(self.edges, [first, stop])
         return slice(*self.tracks_from[[a, b]].tolist()), slice(*self.pairs_from[[a, b]].tolist())
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """All observations, camera after camera: feature, image of the camera, and node (N,); used (N,): whether they
+    """All observations, camera after camera: feature, image of the camera, and `node` (N,); used (N,): whether they
     count; counts: how many of them each camera has."""
 
     feature: np.ndarray
