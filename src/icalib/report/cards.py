@@ -16,7 +16,7 @@ from icalib.rig import LENS
 
 
 def sensor_cards(c: Calibration) -> Html:
-    """Of all sensors that have parameters or residuals, in the order of the rig file, but the IMU last."""
+    """Cards of all sensors with parameters or residuals, in the order of the rig file, but the IMU last."""
     known = {g.sensor for g in shown_groups(in_body_frame(c))} | {f.sensor for f in c.fits}
     names = sorted((n for n in c.rig["sensors"] if n in known), key=lambda n: n == c.imu)
     return Html("".join(_card(c, name) for name in names))
@@ -40,14 +40,14 @@ def camera_pairs(c: Calibration) -> Html:
 
 
 def _pair_verdict(c: Calibration, r: RelativePose) -> Verdict:
-    """By the largest standard deviation against the tolerances of the rig file's settings."""
+    """Verdict by the largest standard deviation over the tolerance in the settings of the rig file."""
     turn, move = np.deg2rad(tolerance(c, "rotation_tolerance_deg")), tolerance(c, "translation_tolerance_m")
     return by_size(float(max(r.std[:3].max() / turn, r.std[3:].max() / move)))
 
 
 def _card(c: Calibration, sensor: str) -> Html:
-    """Red where a component is undetermined, residuals are far beyond the noise, or a reason says that the sensor is
-    wrong; amber where something is weak, or residuals are large."""
+    """One card. Red: a component is undetermined, residuals are far beyond the noise, or a reason names the sensor.
+    Amber: a component is weak, or residuals are large."""
     is_camera, own = sensor in c.cameras, [f for f in c.fits if f.sensor == sensor]
     groups = [g for g in shown_groups(in_body_frame(c)) if g.sensor == sensor and g.name not in AUXILIARY]
     judged: list[Verdict] = [v for g in groups if not (is_camera and g.name in LENS) for v in g.verdict]

@@ -38,7 +38,7 @@ def table(calibration: Calibration) -> Table:
 
 
 def bodies_words(calibration: Calibration) -> str:
-    """How well the target's bodies are placed, in a line; empty where there is one only."""
+    """One line on the uncertainty of the poses of the target's bodies; empty for a single body."""
     placed = calibration.bodies[1:]
     if not placed:
         return ""
@@ -51,7 +51,7 @@ def bodies_words(calibration: Calibration) -> str:
 
 
 def relative_words(calibration: Calibration) -> list[str]:
-    """Every pair of sensors, a line each: pose of the second as seen from the first; the baseline of two cameras."""
+    """One line for each pair of sensors: pose of the second relative to the first, and the baseline of two cameras."""
     lines = []
     for r in relative_poses(calibration):
         turn, move = np.rad2deg(r.std[:3]), 1e3 * r.std[3:]

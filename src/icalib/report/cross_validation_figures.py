@@ -17,8 +17,8 @@ _PRINTED = "#fde2b3"
 
 
 def moved_without_parts(c: Calibration, held: CrossValidation) -> Figure:
-    """Of each parameter a row: a dot for each part, how far the answer moves without it in units of what noise allows;
-    grey what noise allows, orange the same times the factor that the printed standard deviation includes."""
+    """A row for each parameter, with a dot for each segment: the shift of the estimate without it, in formal standard
+    deviations. Grey: one standard deviation; orange: the same times the empirical factor."""
     groups = [g for g in shown_groups(c) if g.columns is not None]
     columns = np.array([k for g in groups for k in g.columns or ()], dtype=np.int64)
     names = [f"{g.sensor} {_name(g, label)}" for g in groups for label in g.labels]
@@ -51,7 +51,7 @@ def _which(held: CrossValidation, names: list[str]) -> list[str]:
 
 
 def predicted_fits(held: CrossValidation) -> Html:
-    """Each kind of residual where it took part, and where the other half predicts it."""
+    """RMS of each kind of residual in the half that was fitted, and predicted by the other half."""
     if not held.fits:
         return element("p", "Each half alone leaves parameters so loose that its residuals in the other mean nothing.")
     whitened, raw = "whitened RMS, took part", "RMS, took part"
@@ -80,7 +80,7 @@ def _raw(rms: float | None, unit: str) -> str:
 
 
 def words(c: Calibration, held: CrossValidation) -> list[str]:
-    """What was found, and by which factor the formal standard deviations are too small."""
+    """Sentences on the result, and on the factor by which formal standard deviations are too small."""
     expected, spread = f"{held.expected:.0f}", f"{held.spread:.0f}"
     rise = (
         f"Predicted by the other half, chi^2 is {held.excess:.0f} higher than where both halves took part; noise of "
@@ -107,7 +107,7 @@ def _columns(c: Calibration) -> np.ndarray:
 
 
 def _own(c: Calibration) -> list[ParameterGroup]:
-    """Groups of sensors, but for bloom: what users take away."""
+    """Estimated groups of sensors, without edge bloom."""
     return [g for g in c.groups if g.columns is not None and g.sensor in c.rig["sensors"] and g.name != "bloom"]
 
 

@@ -1,4 +1,4 @@
-"""How well the place of each sensor is known, as ellipsoids: what the report and the 3D view draw alike."""
+"""Ellipsoids of the position uncertainty of each sensor, for the report and the 3D view."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _LARGEST = 0.4  # of the spread of the rig, up to which the best known ellipsoid
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """Where a sensor may be: axes (3, 3) of unit length in columns, imu frame; half_sizes (3,) [m], of SIGMAS standard
-    deviations, empirical factors included."""
+    """Position uncertainty of a sensor: axes (3, 3) of unit length in columns, imu frame; half_sizes (3,) [m], of
+    SIGMAS standard deviations, empirical factors included."""
 
     sensor: str
     verdict: str
@@ -27,7 +27,7 @@ class Ellipsoid:
 
 
 def ellipsoids(c: Calibration) -> list[Ellipsoid]:
-    """Of the translation of each mounted sensor that was estimated."""
+    """Ellipsoids of all estimated translations."""
     found = []
     for name in c.mounted:
         group = c.group(name, "translation")
@@ -40,8 +40,8 @@ def ellipsoids(c: Calibration) -> list[Ellipsoid]:
 
 
 def magnification(c: Calibration) -> float:
-    """The power of ten by which ellipsoids are drawn larger: as large as they can be while those that are determined,
-    or where none is the smallest one, stay smaller than the rig."""
+    """The largest power of ten by which all determined ellipsoids can be magnified and stay smaller than the rig. If
+    none is determined, the smallest one counts."""
     sizes = [(e.verdict, float(e.half_sizes.max())) for e in ellipsoids(c)]
     shown = [size for verdict, size in sizes if verdict == "determined"] or [min((x for _, x in sizes), default=0.0)]
     if not 0.0 < max(shown) < np.inf:

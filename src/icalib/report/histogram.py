@@ -1,4 +1,4 @@
-"""Residuals of all sensors against what their noise says."""
+"""Normalised residuals of all sensors."""
 
 from __future__ import annotations
 
@@ -34,6 +34,6 @@ def normalised_histogram(c: Calibration) -> Figure:
 
 
 def _normalised(c: Calibration) -> dict[str, np.ndarray]:
-    """Residuals over their standard deviation, by what they are of."""
+    """Residuals over their standard deviation, by sensor and name."""
     out = {f"{r.sensor} {name}": z for r in c.residuals.values() for name, z in r.normalised().items()}
     return {name: z for name, z in out.items() if len(z)}

@@ -1,4 +1,4 @@
-"""The IMU's residuals, the motion, and how the solver got there."""
+"""Residuals of the IMU, the trajectory, and the convergence of the solver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`report.html`: one file without network that says first whether to trust the calibration, then shows why."""
+"""`report.html`: one file that needs no network. The verdict comes first, the evidence after it."""
 
 from __future__ import annotations
 

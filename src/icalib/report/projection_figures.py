@@ -1,4 +1,4 @@
-"""Where in the image a camera's calibration can be trusted, and to how many pixels."""
+"""Maps of the projection uncertainty of a camera [px]."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOT_SEEN = 3.0  # times the median: a region where hardly anything was seen
 
 
 def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
-    """At infinity, and at the distance of what it saw; none where the rig file fixes the lens."""
+    """Maps at infinity and at the working distance; none if the rig file fixes the lens."""
     if all(c.group(camera, name).columns is None for name in ("intrinsics", "distortion")):
         return []
     ranges = [np.inf, *(x for x in [working_distance(c, camera)] if x is not None)]
@@ -27,7 +27,7 @@ def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
 
 
 def projection_figure(m: ProjectionMap, seen: Sequence[ImageResiduals], resolution: tuple[int, int]) -> Figure:
-    """Standard deviation over the image with its contours, and where what the camera saw was."""
+    """Standard deviation over the image with its contours, and the points that the camera saw."""
     width, height = resolution
     top = float(min(np.nanmax(m.sigma), WIDEST * m.median_seen))
     step = _round(top / LEVELS)

@@ -1,4 +1,4 @@
-"""What was calibrated: the rig in space, and how its parameters correlate."""
+"""The rig in space, and the correlation of its parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icalib.result import Calibration
 
 
 def rig_picture(c: Calibration) -> Figure:
-    """Frames and shapes of all sensors in the imu frame, and how well their places are known."""
+    """Frames and shapes of all sensors in the imu frame, with ellipsoids of their position uncertainty."""
     frames, spread = rig_shapes.frames(c), rig_shapes.spread(c)
     origins = np.array([T[:3, 3] for T in frames.values()])
     traces = [

@@ -1,4 +1,4 @@
-"""How the parts of a rig and of its target look, as polylines: what the report and the 3D view draw alike."""
+"""Shapes of sensors and targets as polylines, for the report and the 3D view."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def frames(c: Calibration) -> dict[str, np.ndarray]:
 
 
 def spread(c: Calibration) -> float:
-    """How far apart the sensors are along an axis of the imu frame [m], which says how large they are drawn."""
+    """Largest distance of sensors along an axis of the imu frame [m], the scale of their shapes."""
     origins = np.array([T[:3, 3] for T in frames(c).values()])
     return max(float(np.ptp(np.vstack([origins, np.zeros(3)]), axis=0).max()), _LEAST_SPREAD_M)
 
@@ -31,7 +31,7 @@ def shape(c: Calibration, name: str) -> np.ndarray | None:
 
 
 def legends(c: Calibration) -> list[str]:
-    """What the shapes of the kinds in the rig are."""
+    """Explanations of the shapes of the kinds in the rig."""
     own = (getattr(facet(kind, "show"), "LEGEND", "") for kind in SENSOR_KINDS if c.of_type(kind))
     return [legend for legend in own if legend]
 

@@ -30,8 +30,8 @@ class Section:
 
 
 def sections(c: Calibration) -> list[Section]:
-    """By kind of sensor in the order of `SENSOR_KINDS`, but the IMU last. A kind that has none of its own gets the
-    panels of its rows."""
+    """Sections by kind of sensor in the order of `SENSOR_KINDS`, but the IMU last. A kind without sections of its own
+    gets the panels of its rows."""
     found = []
     for kind in (*SENSOR_KINDS[1:], SENSOR_KINDS[0]):
         own = facet(kind, "show")
@@ -40,7 +40,7 @@ def sections(c: Calibration) -> list[Section]:
 
 
 def row_sections(c: Calibration, kind: str, name: str, title: str, words: str) -> Iterator[Section]:
-    """One with the panels of each sensor of a type of the rig file that has rows; none without any."""
+    """One section with the panels of all sensors of a type of the rig file; none if they have no rows."""
     own = [r for r in c.residuals.values() if isinstance(r, RowResiduals) and r.sensor in c.of_type(kind)]
     if own:
         figures = {f"{name}-{i}": panels(r) for i, r in enumerate(own)}

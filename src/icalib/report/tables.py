@@ -80,7 +80,7 @@ def parameters(c: Calibration) -> Html:
 
 
 def bodies(c: Calibration) -> Html:
-    """Where the target's bodies stand; empty where there is one only."""
+    """Poses of the target's bodies; empty for a single body."""
     if not c.bodies:
         return Html("")
     sizes = ("x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]", "std [mm]", "std [deg]")
@@ -110,7 +110,7 @@ def _matrix(name: str, T: np.ndarray) -> Html:
 
 
 def relative(c: Calibration) -> Html:
-    """Every pair of sensors, and the baselines of cameras; empty where there is one sensor only."""
+    """Relative poses of all pairs of sensors; empty for a single sensor."""
     found = relative_poses(c)
     if not found:
         return Html("")
@@ -153,7 +153,7 @@ def facts(c: Calibration) -> Html:
 
 
 def size_words(c: Calibration) -> str:
-    """How much was used, in a line."""
+    """One line on the amount of data in use."""
     whole = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
     several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
     span = sum(r.end - r.start for r in c.recordings) if several else whole
