@@ -41,7 +41,7 @@ def found(shown, read, tmp_path_factory):
 def test_every_part_of_result_and_recording_is_there(found):
     still = {"world/imu0/lidar0/shape", "world/target/board0/outline", "world/target/board0/points", "summary"}
     still |= {f"world/imu0/uncertainty/{name}" for name in ("cam0", "lidar0")}
-    over = {"world/imu0", "world/way", "world/target", "world/planes/lidar0", "world/scans/lidar0"}
+    over = {"world/imu0", "world/trajectory", "world/target", "world/planes/lidar0", "world/scans/lidar0"}
     over |= {IMAGE, f"{IMAGE}/corners", "readings/imu0/gyro", "readings/imu0/accel", "motion/velocity"}
     over |= {"residuals/cam0/corners", "residuals/lidar0", "residuals/imu0/rotation", "residuals/imu0/accel_walk"}
     assert all(np.isnan(found[name].seconds).all() for name in still)
@@ -226,9 +226,9 @@ def test_each_of_several_recordings_has_its_own_world(shown, read, tmp_path):
     result = _saved(c, tmp_path / "out", recordings=spans, groups=(*c.groups, second))
     view(result, save=tmp_path / "a.rrd")
     found = read(tmp_path / "a.rrd")
-    ways = found["world/way"]
-    np.testing.assert_allclose(ways.seconds, [spans[0].start, spans[1].start], atol=1e-9)
-    lengths = [len(row[0]) for row in ways.values["LineStrips3D:strips"]]
+    lines = found["world/trajectory"]
+    np.testing.assert_allclose(lines.seconds, [spans[0].start, spans[1].start], atol=1e-9)
+    lengths = [len(row[0]) for row in lines.values["LineStrips3D:strips"]]
     assert lengths == [(c.trajectory.seconds < middle).sum(), (c.trajectory.seconds > middle).sum()]
     np.testing.assert_allclose(_matrix(found["world/target"].values["Transform3D:mat3x3"], 1), second.value, atol=1e-6)
     assert len(found["world/planes/lidar0"].seconds) == 2

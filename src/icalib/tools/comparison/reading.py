@@ -1,4 +1,4 @@
-"""A path -> a side: which kind of file lies there is told by what is in it."""
+"""A path -> a side; the kind of file follows from its content."""
 
 from __future__ import annotations
 

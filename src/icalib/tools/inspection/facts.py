@@ -146,7 +146,7 @@ class SensorSource:
 class Sources:
     """The sensors of a recording by name; left_out: topics of images that are no camera's to calibrate, and why.
     others: of all other kinds, sorted by kind; some topics may be of something that is not on the robot. halves: both
-    topics of an IMU whose gyroscope and accelerometer report apart; in `imus` stands the gyroscope's."""
+    topics of an IMU whose gyroscope and accelerometer report apart; `imus` has the gyroscope's."""
 
     cameras: tuple[CameraSource, ...]
     imus: Mapping[str, TopicInfo]

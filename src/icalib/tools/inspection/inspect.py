@@ -62,8 +62,8 @@ def inspect_recording(
     start_s to end_s after its start.
 
     The `target`, or one of Kalibr's beside the recording, is looked for in all images; the corners are kept for
-    `calibrate`. Raises RecordingError, one sentence, where there is no recording, or nothing in it; what is wrong with
-    a single topic stands in the findings.
+    `calibrate`. Raises RecordingError, one sentence, where there is no recording, or nothing in it; faults of a single
+    topic are in the findings.
     """
     recording = open_recording(path, start_s, end_s)
     topics = recording.topics()

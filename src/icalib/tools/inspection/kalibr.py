@@ -1,4 +1,4 @@
-"""Kalibr's own files beside a recording: camchain, imu and target, told by what is in them."""
+"""Kalibr's own files beside a recording: camchain, imu and target, recognised by their fields."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class KalibrFiles:
 
 
 def find_kalibr_files(recording: Path) -> KalibrFiles:
-    """Kalibr's files in the folder of the recording and in the one above; what is wrong with one stands in the notes.
+    """Kalibr's files in the folder of the recording and in the one above; notes name faults of single files.
 
     Targets that differ are not used: nobody knows which it was.
     """

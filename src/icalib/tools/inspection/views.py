@@ -28,7 +28,7 @@ def target_view(
     resolution: tuple[int, int] | None,
     progress: Callable[[float], None],
 ) -> TargetView:
-    """Finds the target in all images of the camera, or reads the corners that were recorded. What goes wrong stands in
+    """Finds the target in all images of the camera, or reads the corners that were recorded. A failure is in
     `problem`."""
     images = source.images.name if source.images else None
     path = source.corners.name if source.corners else f"{source.name}/corners.csv"

@@ -23,7 +23,7 @@ def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
     # All points of all planes at once hide what moves among them.
     space = [b.Spatial3DView(origin="world", contents=["$origin/**", "- $origin/planes/**"], name="world")]
     if c.planes:
-        parts = [f"$origin/{part}/**" for part in ("planes", "target", "way")]
+        parts = [f"$origin/{part}/**" for part in ("planes", "target", "trajectory")]
         space.append(b.Spatial3DView(origin="world", contents=parts, name="planes"))
     left = b.Vertical(b.Tabs(*space), b.Tabs(*shown), row_shares=[3, 1])
     more = [b.Tabs(*images[2:])] if images[2:] else []

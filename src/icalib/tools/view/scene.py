@@ -1,4 +1,4 @@
-"""The solution in space: the rig, how well it is known, its way, the target, and points on planes."""
+"""The solution in space: the rig, how well it is known, the trajectory, the target, and points on planes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icalib.tools.view.colors import by_value, rgb
 from icalib.tools.view.stream import RerunStream
 
 POINT = 1.5  # radius of a point of a scan, in points of the screen
-_TARGET, _WAY = "#be185d", "#64748b"
+_TARGET, _TRAJECTORY = "#be185d", "#64748b"
 _WORST_OF_SCALE = 4.0  # of a scale of colours, in RMS of the result
 
 
@@ -84,15 +84,15 @@ def log_motion(s: RerunStream, c: Calibration) -> None:
     )
     of = c.recording_of(path.seconds)
     for k, span in enumerate(spans(c)):
-        s.at("world/way", span.start, s.rr.LineStrips3D([path.position[of == k]], colors=rgb(_WAY)))
+        s.at("world/trajectory", span.start, s.rr.LineStrips3D([path.position[of == k]], colors=rgb(_TRAJECTORY)))
 
 
 def log_target(s: RerunStream, c: Calibration) -> None:
-    """Outline and points of each body of the target, as the scene stands in the world of each recording."""
-    target, stands = target_from_plain(c.rig), rig_shapes.scene_in_worlds(c)
-    if target is None or not stands:
+    """Outline and points of each body of the target; its scene has an orientation in the world of each recording."""
+    target, orientations = target_from_plain(c.rig), rig_shapes.scene_in_worlds(c)
+    if target is None or not orientations:
         return
-    for span, (_, R) in zip(spans(c), stands, strict=False):
+    for span, (_, R) in zip(spans(c), orientations, strict=False):
         s.at("world/target", span.start, s.rr.Transform3D(mat3x3=R))
     for body in c.bodies or target.bodies:
         k, T = target.bodies.index(body), c.T_scene_body(body) if c.bodies else np.eye(4)

@@ -21,7 +21,7 @@ _PATIENCE_S = 30.0  # until the viewer has taken what it was sent
 @dataclass(frozen=True)
 class RerunStream:
     """One recording of Rerun, which may be watched while it grows. rr: the package, rec: its stream. All that is not
-    still stands on one timeline, in seconds of the result's clock."""
+    still is on one timeline, in seconds of the result's clock."""
 
     rr: Any
     rec: Any

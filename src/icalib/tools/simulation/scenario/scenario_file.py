@@ -70,7 +70,7 @@ def load_scenario(path: str | Path) -> Scenario:
 
 
 def _made(value: YamlValue, kind: Callable[..., Made], /, **fields: Any) -> Made:
-    """A `kind` of these fields; a RigError is told as one of `value`."""
+    """A `kind` of these fields; a RigError names the place of `value`."""
     try:
         return kind(**fields)
     except RigError as error:
@@ -194,7 +194,7 @@ def _motion(value: YamlValue, folder: Path) -> Drive:
 
 
 def _board(value: YamlValue) -> dict[str, Any]:
-    """The fields of `Scenario` that say which target stands where."""
+    """The fields of `Scenario` that say which target there is, and its pose."""
     fields = value.entries()
     if "type" not in fields:
         value.fail(f"type is missing; add type: {', type: '.join(TARGETS)}.")

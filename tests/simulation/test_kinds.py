@@ -1,0 +1,47 @@
+"""What each kind of sensor declares to the simulator and to `inspect`."""
+
+from __future__ import annotations
+
+import re
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from icalib.rig.kinds import MOUNTED_TYPES
+from icalib.sensors.camera.spec import Camera
+from icalib.tools.inspection.kinds import inspectors
+from icalib.tools.simulation.scenario.sensor import SimSensor, simulated_kinds
+
+OTHERS = [kind.sensor_type for kind in MOUNTED_TYPES if kind is not Camera]
+
+
+def test_every_kind_is_simulated_and_inspected():
+    assert list(simulated_kinds()) == list(inspectors()) == OTHERS
+
+
+def test_streams_of_random_numbers_are_apart():
+    first = [kind.random_stream for kind in simulated_kinds().values()]
+    assert all(abs(a - b) >= 1000 for a, b in combinations(first, 2)) and min(first) >= 1000
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_a_kind_declares_what_its_sensors_have(kind: str):
+    simulated, inspector = simulated_kinds()[kind], inspectors()[kind]
+    assert issubclass(simulated, SimSensor) and simulated.sensor_type == kind
+    assert inspector.sensor.sensor_type == kind and inspector.topic_kinds
+    sensor = simulated("sensor0", np.eye(4))
+    entry = sensor.rig_entry()
+    assert type(entry) is inspector.sensor and entry.name == "sensor0"
+    known = {spec.name: spec for spec in entry.parameters}
+    assert {name: value.shape for name, value in sensor.values().items()} == {
+        name: (known[name].size,) for name in sensor.values()
+    }
+    assert sensor.drawn_values(np.random.default_rng(0), 0.0).keys() <= sensor.values().keys()
+    assert all(hasattr(sensor, field) for field in simulated.effects.values())
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_names_of_topics_are_no_names_of_sensors(kind: str):
+    inspector = inspectors()[kind]
+    assert not re.fullmatch(inspector.plain_names, f"{inspector.prefix}0")
