@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.data.measurements import Stream, WheelPoses
+from icalib.data.measurements import Stream
 from icalib.optim.state import Key, Layout, State
 
 EARLY_S = 5.0  # by which what a stamp stands for may come before it; recordings are further apart
@@ -21,7 +21,6 @@ def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray 
     own, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
     if len(offset) == 1:
         return own + offset[0]
-    assert not isinstance(stream, WheelPoses)  # which are of one recording
     joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in stream.joins_ns]) - EARLY_S
     assert len(joins) == len(offset) - 1
     return own + offset[np.searchsorted(joins, own, side="right")]

@@ -14,7 +14,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.optim.state import Key
-from icalib.rig import Parameter, ParameterSpec, Sensor, Wheels
+from icalib.rig import Parameter, ParameterSpec, Sensor
 from icalib.sensors.sensor import TRANSLATION
 
 SIGMAS = 4.0  # times what a guess is worth
@@ -62,14 +62,14 @@ def refusing_far_off() -> Iterator[None]:
         _REFUSING.reset(token)
 
 
-def refuse_far_off(wheels: Wheels, found: dict[Key, np.ndarray]) -> None:
+def refuse_far_off(sensor: Sensor, found: dict[Key, np.ndarray]) -> None:
     """Raises FarOffError where a length or a lever arm that is fixed is farther from what was `found` than first
     guesses are off."""
-    for (sensor, name), value in found.items() if _REFUSING.get() else ():
-        stated, spec = getattr(wheels, name), wheels.spec(name)
+    for (owner, name), value in found.items() if _REFUSING.get() else ():
+        stated, spec = getattr(sensor, name), sensor.spec(name)
         checked = spec.is_positive or spec == TRANSLATION
         if checked and stated.mode == "fixed" and is_contradicted(spec, stated.value, value):
-            raise FarOffError(f"{sensor}: {name} in the rig file contradicts the data.")
+            raise FarOffError(f"{owner}: {name} in the rig file contradicts the data.")
 
 
 def settled(sensor: Sensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
