@@ -12,12 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console
-from tests.typed import StandIn
 
 from icalib.cli import main
-from icalib.data.measurements import CornerStream
-from icalib.data.recordings import TopicInfo
-from icalib.geometry.targets import AprilGrid, Markers
+from icalib.data.recordings import FolderRecording, TopicInfo
+from icalib.geometry.targets import AprilGrid, Markers, Target
 from icalib.tools.inspection import Inspection, inspect_recording, read_target
 from icalib.tools.inspection.console import print_inspection
 from icalib.tools.inspection.facts import CameraSource
@@ -150,7 +148,17 @@ def test_borders_that_are_empty():
     assert empty_borders(tuple(map(tuple, corner))) == ("bottom right corner",)
 
 
-def test_tilts_and_distances():
+def with_corners(root: Path, target: Target, stamps: np.ndarray, uv: np.ndarray) -> FolderRecording:
+    """A recording with a table of all points of the target at uv (N, 2) px, in one image for each stamp."""
+    tag, corner = target.point_identity(np.tile(np.arange(len(target.points)), len(stamps)))
+    rows = np.column_stack([np.repeat(stamps, len(target.points)), tag, corner])
+    (root / "cam0").mkdir()
+    lines = [f"{t},{a},{b},{u},{v}\n" for (t, a, b), (u, v) in zip(rows.tolist(), uv.tolist(), strict=True)]
+    (root / "cam0" / "corners.csv").write_text("".join(lines))
+    return FolderRecording(root)
+
+
+def test_tilts_and_distances(tmp_path):
     """Against a pinhole far away, where they are exact."""
     rng = np.random.default_rng(1)
     tilts, distances = np.radians(np.linspace(0, 40, 41)), np.linspace(5.0, 10.0, 41)
@@ -159,37 +167,23 @@ def test_tilts_and_distances():
         xyz = TARGET.points - TARGET.points.mean(axis=0)
         z = distance + xyz[:, 1] * np.sin(tilt)
         uv.append(1000.0 * np.column_stack([xyz[:, 0] / z, xyz[:, 1] * np.cos(tilt) / z]))
-    n = len(TARGET.points)
-    stamps = np.arange(41, dtype=np.int64) * STEP
-    stream = CornerStream("cam0", stamps, n * np.arange(42), np.tile(np.arange(n), 41), np.concatenate(uv))
-
-    class Tables(StandIn):
-        def corners(self, camera, target):
-            return stream
-
+    recording = with_corners(tmp_path, TARGET, np.arange(41, dtype=np.int64) * STEP, np.concatenate(uv))
     topic = TopicInfo("cam0/corners.csv", "table", "corners", 41, 0, 1)
-    view = target_view(Tables(), CameraSource("cam0", topic, None, topic, None), TARGET, None, lambda _: None)
+    view = target_view(recording, CameraSource("cam0", topic, None, topic, None), TARGET, None, lambda _: None)
     assert view.tilt_deg == pytest.approx((4.0, 20.0, 36.0), abs=2.0)
     assert view.distance_ratio == pytest.approx(9.5 / 5.5, rel=0.05)
     assert view.images is None and view.cells is None
 
 
-def test_tilts_are_those_of_each_free_tag():
+def test_tilts_are_those_of_each_free_tag(tmp_path):
     """Two tags in every image, one from the front, one tilted by 40 degrees about another axis."""
     target, stamps = Markers("tag36h11", 0.2, (5, 8)), np.arange(20, dtype=np.int64) * STEP
     xy = target.points[:4, :2] - 0.1
     front = 1000.0 / 8.0 * xy
     tilted = 1000.0 * xy * [np.cos(np.radians(40.0)), 1.0] / (8.0 + xy[:, :1] * np.sin(np.radians(40.0)))
-    stream = CornerStream(
-        "cam0", stamps, 8 * np.arange(21), np.tile(np.arange(8), 20), np.tile([*front, *tilted], (20, 1))
-    )
-
-    class Tables(StandIn):
-        def corners(self, camera, target):
-            return stream
-
+    recording = with_corners(tmp_path, target, stamps, np.tile([*front, *tilted], (20, 1)))
     topic = TopicInfo("cam0/corners.csv", "table", "corners", 20, 0, 1)
-    view = target_view(Tables(), CameraSource("cam0", topic, None, topic, None), target, None, lambda _: None)
+    view = target_view(recording, CameraSource("cam0", topic, None, topic, None), target, None, lambda _: None)
     assert view.tilt_deg == pytest.approx((0.0, 20.0, 40.0), abs=0.5)
 
 
