@@ -145,6 +145,7 @@ REVISED = (
     "report",
     "result",
     "rig",
+    "sensors/*/model",
     "sensors/*/spec",
     "sensors/camera/read",
     "sensors/fields",

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.estimate.estimate import ENOUGH, estimate
+from icalib.estimate.estimate import ENOUGH_TRACKED, estimate
 from icalib.geometry import so3
 from icalib.initialize.start import start
 from icalib.motion.factor import of_type
@@ -66,4 +66,6 @@ def test_where_enough_take_part_there_is_one_pass(settled):
     inputs, found = settled
     again, begun = passes(inputs, found, 0.5)
     assert len(begun) == 1
-    assert features_of(again.problem).followed > ENOUGH * sum(int(k.sum()) for k in features_of(again.problem).keep)
+    assert features_of(again.problem).followed > ENOUGH_TRACKED * sum(
+        int(k.sum()) for k in features_of(again.problem).keep
+    )

@@ -580,7 +580,7 @@ def position_sample(
     def accumulate(at, piece, sums):
         return made.accumulate(at, piece, made.output(), sums, curved)
 
-    return Sample("PositionFactor", setup, state, accumulate, lambda at: run(at)[0], weights)
+    return Sample("PositionFactor", setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
 
 
 SAMPLES = {

@@ -39,14 +39,15 @@ from icalib.sensors.camera.corner_outliers import inliers
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.image_pairs import not_simultaneous
 
-LOOSE = 3.0  # times the prior uncertainty of a guess
-EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
-AGAIN = 4  # further passes, at most, where the last one began too far from its end, or without tracks that it found
-FAR = 1.1  # times the chi^2 at its end: what a pass froze where it began is not what it would freeze at the end
-NEARER = 0.5  # of the way from the end that the pass before had: else two states take turns, and no pass ends it
-ENOUGH = 0.8  # of the observations of tracks take part: no need to see whether more would
-MORE = 1.1  # times as many that would: another pass follows
-FIRST_SHARE = 1e-3  # of half the chi^2: what the first pass freezes is farther off
+FIRST_PASS_PRIOR_WIDTH = 3.0  # times the prior uncertainty of the initial guess
+# An early pass stops where the next step would lower half the chi^2 by less, or by less than that share of it.
+EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6
+FIRST_SHARE = 1e-3  # the same of the first pass: noise and inliers that it freezes are farther off
+MOST_REPEATS = 4  # of the final pass
+FAR = 1.1  # ratio of the chi^2 at the start of a pass to that at its end, above which frozen weights are out of date
+NEARER = 0.5  # relative cost decrease over that of the pass before: above it passes alternate between two states
+ENOUGH_TRACKED = 0.8  # share of the observations of tracks that take part, above which no further pass is tried
+MORE_TRACKED = 1.1  # ratio of observations that would take part to those that do, above which the pass is repeated
 
 
 OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its problem, and where the solver stood
@@ -137,7 +138,7 @@ def estimate(
     else:
         passes.begin_at(state)
     way = np.inf
-    for left in reversed(range(1 + AGAIN)):
+    for left in reversed(range(1 + MOST_REPEATS)):
         way_before = way if left else 0.0  # nearer than that is not to be had any more
         outcome, way = passes.final(final, way_before)
         if not left or not _again(inputs, outcome, passes.judged, way, way_before):
@@ -267,10 +268,10 @@ def _follows_more(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
     """Whether many tracks were left out because the poses that the pass began with did not find their points, and those
     that it ended with do."""
     (now,) = of_type(outcome.problem.factors, FeatureFactor) or (None,)
-    if now is None or now.followed > ENOUGH * sum(int(k.sum()) for k in now.keep):
+    if now is None or now.followed > ENOUGH_TRACKED * sum(int(k.sum()) for k in now.keep):
         return False
     anew = of_type(judged.problem(inputs, _on_own_nodes(inputs, outcome.state)).factors, FeatureFactor)
-    return any(f.followed > MORE * now.followed for f in anew)
+    return any(f.followed > MORE_TRACKED * now.followed for f in anew)
 
 
 def _on_own_nodes(inputs: Inputs, state: State) -> State:
@@ -285,7 +286,7 @@ def first_pass(inputs: Inputs, state: State) -> State:
     Raises EstimationError where the data do not carry an estimate.
     """
     problem = Judged.first(inputs).problem(inputs, state)
-    problem = _with_priors(problem, guess_priors(inputs, state, LOOSE))
+    problem = _with_priors(problem, guess_priors(inputs, state, FIRST_PASS_PRIOR_WIDTH))
     return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_SHARE, comes_back=False).state
 
 

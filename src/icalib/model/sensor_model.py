@@ -114,6 +114,14 @@ class SensorModel(Generic[S, N]):
         del sensor, stream, noise, at
         return ()
 
+    def points_on_planes(self, sensor: S, stream: Any, at: Pass) -> tuple[np.ndarray, np.ndarray] | None:
+        """Some points (n, 3) m of the sensor in the world, and the plane (n,) of `at.clouds` that each lies on.
+
+        None for sensors without points.
+        """
+        del sensor, stream, at
+        return None
+
 
 def model_of(sensor: Sensor) -> SensorModel[Any, Any]:
     """The model of a sensor's kind."""

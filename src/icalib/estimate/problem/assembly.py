@@ -38,7 +38,6 @@ from icalib.sensors.camera.features.patch_curvature import with_curved_patches
 from icalib.sensors.camera.features.surfaces import Surfaces
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
-from icalib.sensors.lidar.lidar_binning import points_on_planes
 from icalib.sensors.sensor import TIME_OFFSET
 
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
@@ -263,9 +262,9 @@ def _surfaces(inputs: Inputs, state: State, coarse: bool) -> Surfaces | None:
     clouds, noise = inputs.clouds, inputs.rig.settings.points_on_planes_m
     if not clouds.count or noise == 0.0:
         return None
-    motion, planes = motion_of(inputs, state), np.array([state.values[key] for key in clouds.keys])
-    pairs = zip(inputs.measurements.lidars, clouds.plane, strict=True)
-    seen = (points_on_planes(motion, stream, plane) for stream, plane in pairs)
+    at, planes = _pass(inputs, state, coarse), np.array([state.values[key] for key in clouds.keys])
+    found = (model_of(s).points_on_planes(s, inputs.stream(s.name), at) for s in inputs.sensors)
+    seen = (points for points in found if points is not None)
     return Surfaces.seen(clouds.keys, clouds.recording, planes, seen, noise, coarse)
 
 

@@ -1,4 +1,4 @@
-"""What an estimate is of: the rig, what was measured, and the calibration parameters that both make."""
+"""The inputs of an estimate: rig, measurements, and the layout of the calibration parameters."""
 
 from __future__ import annotations
 
@@ -25,10 +25,12 @@ from icalib.sensors.camera.images import on_common_images
 
 @dataclass(frozen=True)
 class Inputs:
-    """What does not change from pass to pass. bodies: what of the target is used; parts: the recordings that
-    `measurements` were joined from; clouds: points of LiDARs on planes, without which these have no part in it; guess:
-    where everything was before points were looked at by the plane; asked: the rig as it was given, where `rig` has
-    more."""
+    """All that stays the same from pass to pass.
+
+    bodies: bodies of the target in use. parts: the recordings that were joined to `measurements`. clouds: points on
+    planes; sensors that show planes take part only with these. guess: the state before points were associated with
+    planes. asked: the rig as the user gave it, if `rig` has more.
+    """
 
     rig: Rig
     measurements: Measurements
@@ -42,12 +44,12 @@ class Inputs:
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:
-        """All that take part, but for the IMU."""
+        """The mounted sensors that take part."""
         return _taking_part(self.rig, self.clouds)
 
     @cached_property
     def owners(self) -> dict[str, Sensor]:
-        """All that take part, the IMU first, by name."""
+        """All sensors that take part, by name, the IMU first."""
         return {s.name: s for s in self.rig.sensors.values() if model_of(s).takes_part(s, self.clouds)}
 
     @cached_property
@@ -56,7 +58,7 @@ class Inputs:
         return specs_of(self.layout, self.owners.values())
 
     def stated(self, block: Block) -> Parameter | None:
-        """What the rig says of a block of a sensor's; None of blocks of the scene."""
+        """The field of the rig file for a block of a sensor; None for blocks of the scene."""
         owner = self.owners.get(block.sensor)
         return None if owner is None else getattr(owner, block.name)
 
@@ -100,7 +102,7 @@ def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | Non
 
 
 def with_clouds(inputs: Inputs, clouds: Clouds) -> Inputs:
-    """The same with points of the LiDARs on planes."""
+    """The same with points on planes."""
     layout = layout_for(inputs.rig, inputs.bodies, len(inputs.parts), clouds)
     return replace(inputs, layout=layout, clouds=clouds)
 

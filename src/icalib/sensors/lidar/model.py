@@ -12,7 +12,7 @@ from icalib.model.statistics import ResidualStatistics
 from icalib.motion.clouds import Clouds
 from icalib.motion.point_planes import thinned
 from icalib.rig import Lidar, Settings
-from icalib.sensors.lidar.lidar_binning import BIN_S, COARSE_BIN_S, LidarNoise
+from icalib.sensors.lidar.lidar_binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.residual import LidarFactor
 
 NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the model lacks where beams graze a plane
@@ -52,10 +52,20 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
     def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[LidarFactor]:
         """One; early passes take fewer points, in longer bins."""
         assert at.motion is not None
-        plane = at.clouds.plane[[x.name for x in at.rig.lidars].index(sensor.name)]
+        plane = _plane(sensor, at)
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)
         scheme = at.rig.settings.scheme
         yield LidarFactor.build(stream, used, at.clouds.keys, at.motion, noise, at.layout, scheme, bin_s)
+
+    def points_on_planes(self, sensor: Lidar, stream: LidarStream, at: Pass) -> tuple[np.ndarray, np.ndarray]:
+        """See `lidar_binning.points_on_planes`."""
+        assert at.motion is not None
+        return points_on_planes(at.motion, stream, _plane(sensor, at))
+
+
+def _plane(sensor: Lidar, at: Pass) -> np.ndarray:
+    """(N,) index of the plane that each point lies on, -1: none."""
+    return at.clouds.plane[[x.name for x in at.rig.lidars].index(sensor.name)]
 
 
 MODEL = LidarModel()
