@@ -79,7 +79,9 @@ def test_at_the_truth_nothing_is_left_between_nodes_and_at_them(setup, factor_of
 def test_the_lever_arm_turns_with_the_imu(setup, factor_of, scheme):
     factor = factor_of(setup, 1, scheme)
     values = setup.state.values | {("cam1", "time_offset"): setup.state.values["cam1", "time_offset"] + 7e-3}
-    poses, R_cw, p_wc = factor.camera_poses(replace(setup.state, values=values))
+    state = replace(setup.state, values=values)
+    poses, camera = factor.imu_poses(state, 0, len(factor.node)), factor.poses(state)
+    R_cw, p_wc = camera.R_sensor_world, camera.p_world_sensor
     for i in range(len(p_wc)):
         np.testing.assert_allclose(
             p_wc[i], poses.position[i] + poses.rotation[i] @ values["cam1", "translation"], atol=1e-14

@@ -220,9 +220,9 @@ def feature_sample(
     def errors(at, points):
         found = []
         for i, (camera, stream, u) in enumerate(zip(factor.cameras, factor.streams, used, strict=True)):
-            _, R_cw, p_wc = camera.camera_poses(at)
-            image = stream.image[u]
-            X = np.einsum("nij,nj->ni", R_cw[image], points[factor.tracks.track[i][u]] - p_wc[image])
+            poses, image = camera.poses(at), stream.image[u]
+            from_camera = points[factor.tracks.track[i][u]] - poses.position[image]
+            X = np.einsum("nij,nj->ni", poses.R_sensor_world[image], from_camera)
             params = np.concatenate([at.values[camera.name, "intrinsics"], at.values[camera.name, "distortion"]])
             found.append(camera.model.project(params, X)[0] - stream.uv[u])
         return np.concatenate(found)

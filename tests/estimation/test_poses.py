@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from icalib.geometry import so3
 from icalib.motion.poses import assign_nodes, motion_at, poses_at
+from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
 from icalib.optim.state import NODE
 
 SCHEMES = ("inertial", "kinematic", "pose")
@@ -69,6 +70,37 @@ def test_jacobians_of_the_imu_intrinsics_by_central_differences(setup, scheme):
         plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, calib))
         minus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, -calib))
         np.testing.assert_allclose(at.J_imu[:, :, n], difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=str(n))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_chain_rule_of_a_sensor_pose_by_central_differences(setup, scheme):
+    """Through random rows of a camera's pose, along its own axes: by all keyframes, extrinsics and IMU intrinsics, and
+    by the time offset as far as the rate says."""
+    rng, h = np.random.default_rng(4), 1e-6
+    state, n, o = setup.perturbed(rng), len(TIMES), NODE * len(setup.state.seconds)
+    kinematics = Kinematics("cam1", setup.layout, setup.imu, 9.81, scheme)
+    seconds = TIMES - state.values["cam1", "time_offset"][0]
+    node = assign_nodes(scheme, state.seconds, TIMES)
+
+    def poses(d):
+        return SensorPose.at(kinematics, seconds, node, state.retract(setup.layout, d[:o].reshape(-1, NODE), d[o:]))
+
+    at, J_pose = poses(np.zeros(o + setup.layout.size)), rng.normal(size=(n, 2, 6))
+    rows = rows_at(np.zeros((n, 2)), (J_pose,), (at,), np.zeros((n, 2, 0)))
+    J, columns = np.zeros((n, 2, o + setup.layout.size)), kinematics.columns()
+    for i, k in enumerate(node):
+        last = min(NODE * (k + 2), o)
+        J[i, :, NODE * k : last] = rows.J[i, :, : last - NODE * k]
+    J[:, :, o + columns] = rows.J_calib
+    offset = o + columns[6]
+    assert len(columns) == 31
+    for column in [*range(o), *(o + columns)]:
+        d = h * np.eye(o + setup.layout.size)[column]
+        found = difference(poses(d), poses(-d), at, h)
+        found[:, 3:] = np.einsum("nij,nj->ni", at.R_sensor_world, found[:, 3:])
+        expected = np.einsum("nqk,nk->nq", J_pose, found)
+        atol = 2e-3 if column == offset else 5e-8
+        np.testing.assert_allclose(J[:, :, column], expected, rtol=0, atol=atol, err_msg=str(column))
 
 
 def motion(setup, state=None, times=TIMES, imu_free=True):

@@ -23,7 +23,7 @@ from icalib.base.compiled import njit
 from icalib.motion.clocks import mounted_columns, offset_at
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import Poses, poses_alone, poses_at, poses_of_nodes
-from icalib.optim.rows import KEYFRAMES, Rows
+from icalib.optim.rows import KEYFRAMES, Rows, U
 from icalib.optim.state import NODE, Layout, State
 from icalib.rig import Scheme
 
@@ -142,26 +142,29 @@ def fill_imu_pose(i, at, A):
 @njit(cache=True, nogil=True)
 def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
     """Adds to T (m, w) the derivatives of m rows through pose i of the sensor, J_pose (m, 6), or through that of the
-    IMU, J_imu_pose (m, 6): by its keyframe from column `first` on, by calibration parameters from column `calib` on."""
+    IMU, J_imu_pose (m, 6): by its keyframe from column `first` on, by calibration parameters from column `calib` on.
+    Numbers are unsigned, see `add_product`."""
     R, rate, velocity, J_node, J_next, J_imu = at.R_imu_sensor, at.rate, at.velocity, at.J_node, at.J_next, at.J_imu
-    n_imu, has_next = J_imu.shape[2], len(J_next) > 0
-    for r in range(T.shape[0]):
-        for k in range(6):
+    n_imu, has_next, own, mounted, x = U(J_imu.shape[2]), len(J_next) > 0, U(first), U(calib), U(i)
+    imu, offset = mounted + U(N_MOUNTED), mounted + U(OFFSET)
+    for r in range(U(T.shape[0])):
+        for k in range(U(6)):
             f = J_imu_pose[r, k]
-            if f != 0.0:
-                for j in range(NODE):
-                    T[r, first + j] += f * J_node[i, k, j]
-                if has_next:
-                    for j in range(NODE):
-                        T[r, first + NODE + j] += f * J_next[i, k, j]
-                for j in range(n_imu):
-                    T[r, calib + N_MOUNTED + j] += f * J_imu[i, k, j]
-        for k in range(3):
-            T[r, calib + OFFSET] += J_imu_pose[r, k] * rate[i, k] + J_imu_pose[r, 3 + k] * velocity[i, k]
-        for j in range(3):
-            T[r, calib + j] += J_pose[r, j]
-            for k in range(3):
-                T[r, calib + 3 + j] += J_pose[r, 3 + k] * R[j, k]
+            if f == 0.0:
+                continue
+            for j in range(U(NODE)):
+                T[r, own + j] += f * J_node[x, k, j]
+            if has_next:
+                for j in range(U(NODE)):
+                    T[r, own + U(NODE) + j] += f * J_next[x, k, j]
+            for j in range(n_imu):
+                T[r, imu + j] += f * J_imu[x, k, j]
+        for k in range(U(3)):
+            T[r, offset] += J_imu_pose[r, k] * rate[x, k] + J_imu_pose[r, U(3) + k] * velocity[x, k]
+        for j in range(U(3)):
+            T[r, mounted + j] += J_pose[r, j]
+            for k in range(U(3)):
+                T[r, mounted + U(3) + j] += J_pose[r, U(3) + k] * R[j, k]
 
 
 @njit(cache=True, nogil=True)

@@ -11,6 +11,7 @@ from icalib.optim.robust_weights import weight
 from icalib.optim.state import NODE
 
 KEYFRAMES = 2 * NODE  # columns of a row by its keyframe and the next one
+U = np.uint64
 
 
 class Rows(NamedTuple):
@@ -57,64 +58,66 @@ def add_product(k, n_chain, width, A, B, columns, sums):
 
     The first `width` columns of A are by keyframe k and, where n_chain is 30 and not 15, the next one, then by
     calibration parameters. B (m, n_chain + c + 1): the same columns, perhaps those of more calibration parameters, and
-    the residual. columns (c,): calibration columns of B, -1 where fixed; no two are the same."""
-    diagonal, upper, side, calib = sums.diagonal, sums.upper, sums.side, sums.calib
-    n_c, n_b, last = len(columns), calib.shape[0] - 1, n_chain + len(columns)
-    row = np.empty(last + 1)
-    for i in range(n_chain):
-        h, r = i // NODE, i % NODE
-        own, node, has_next = h * NODE, k + h, i < n_chain - NODE
-        for j in range(NODE):
-            row[own + j] = diagonal[node, r, j]
-        if has_next:
-            for j in range(NODE):
-                row[NODE + j] = upper[k, r, j]
-        for j in range(n_c):
-            row[n_chain + j] = side[node, r, columns[j]] if columns[j] >= 0 else 0.0
-        row[last] = side[node, r, n_b]
-        for q in range(len(A)):
+    the residual. columns (c,): calibration columns of B, -1 where fixed; no two are the same.
+
+    Numbers are unsigned: an index that may be negative is wrapped, and the compiler then takes one column at a time.
+    """
+    diagonal, upper, side = sums.diagonal, sums.upper, sums.side
+    n, end, n_b, block = U(n_chain), U(len(columns)), U(sums.calib.shape[0] - 1), U(NODE)
+    row, rest = np.empty(KEYFRAMES), np.empty(len(columns) + 1)
+    for i in range(n):
+        is_next = i >= block
+        node, r, own = (U(k + 1), i - block, block) if is_next else (U(k), i, U(0))
+        has_next = n > block and not is_next
+        for j in range(block):
+            row[j] = diagonal[node, r, j]
+            if has_next:
+                row[block + j] = upper[node, r, j]
+        for j in range(end):
+            rest[j] = side[node, r, U(columns[j])] if columns[j] >= 0 else 0.0
+        rest[end] = side[node, r, n_b]
+        for q in range(U(len(A))):
             f = A[q, i]
             if f == 0.0:
                 continue
-            for j in range(NODE):
-                row[own + j] += f * B[q, own + j]
+            for j in range(block):
+                row[j] += f * B[q, own + j]
             if has_next:
-                for j in range(NODE, KEYFRAMES):
-                    row[j] += f * B[q, j]
-            for j in range(n_chain, last + 1):
-                row[j] += f * B[q, j]
-        for j in range(NODE):
-            diagonal[node, r, j] = row[own + j]
-        if has_next:
-            for j in range(NODE):
-                upper[k, r, j] = row[NODE + j]
-        for j in range(n_c):
+                for j in range(block):
+                    row[block + j] += f * B[q, block + j]
+            for j in range(end + U(1)):
+                rest[j] += f * B[q, n + j]
+        for j in range(block):
+            diagonal[node, r, j] = row[j]
+            if has_next:
+                upper[node, r, j] = row[block + j]
+        for j in range(end):
             if columns[j] >= 0:
-                side[node, r, columns[j]] = row[n_chain + j]
-        side[node, r, n_b] = row[last]
-    for i in range(n_chain, width):
-        if columns[i - n_chain] >= 0:
-            _add_calib(i, n_chain, width, A, B, columns, calib, row)
+                side[node, r, U(columns[j])] = rest[j]
+        side[node, r, n_b] = rest[end]
+    for i in range(n, U(width)):
+        if columns[i - n] >= 0:
+            _add_calib(i, n, U(width), A, B, columns, sums.calib, rest)
 
 
 @njit(cache=True, nogil=True)
-def _add_calib(i, n_chain, width, A, B, columns, calib, row):
-    """Adds row i of A^T B, by a calibration parameter; what A has no column of also across the diagonal."""
-    a, n_c, n_b, last = columns[i - n_chain], len(columns), calib.shape[0] - 1, n_chain + len(columns)
-    for j in range(n_c):
-        row[n_chain + j] = calib[a, columns[j]] if columns[j] >= 0 else 0.0
-    row[last] = calib[a, n_b]
-    for q in range(len(A)):
+def _add_calib(i, n, width, A, B, columns, calib, rest):
+    """Adds row i of A^T B, by a calibration parameter; columns that A lacks also across the diagonal."""
+    a, end, n_b = U(columns[i - n]), U(len(columns)), U(calib.shape[0] - 1)
+    for j in range(end):
+        rest[j] = calib[a, U(columns[j])] if columns[j] >= 0 else 0.0
+    rest[end] = calib[a, n_b]
+    for q in range(U(len(A))):
         f = A[q, i]
         if f != 0.0:
-            for j in range(n_chain, last + 1):
-                row[j] += f * B[q, j]
-    for j in range(n_c):
+            for j in range(end + U(1)):
+                rest[j] += f * B[q, n + j]
+    for j in range(end):
         if columns[j] >= 0:
-            calib[a, columns[j]] = row[n_chain + j]
-            if n_chain + j >= width:
-                calib[columns[j], a] = row[n_chain + j]
-    calib[a, n_b] = calib[n_b, a] = row[last]
+            calib[a, U(columns[j])] = rest[j]
+            if n + j >= width:
+                calib[U(columns[j]), a] = rest[j]
+    calib[a, n_b] = calib[n_b, a] = rest[end]
 
 
 @njit(cache=True, nogil=True)

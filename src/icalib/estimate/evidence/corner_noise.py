@@ -82,7 +82,7 @@ def _squared_flow(factor: CornerFactor, state: State, v0: int, v1: int) -> np.nd
     """(n,) squared speed in the image of the corners of views v0..v1."""
     X, _ = factor.points_in_camera(state, v0, v1)
     image = factor.views.image[v0:v1]
-    poses, _, _ = factor.camera_poses(state, int(image[0]), int(image[-1]) + 1)
+    poses = factor.imu_poses(state, int(image[0]), int(image[-1]) + 1)
     R_ic, p_ic = state.values[factor.name, "rotation"], state.values[factor.name, "translation"]
     rate = poses.rate @ R_ic
     velocity = (np.einsum("nji,nj->ni", poses.rotation, poses.velocity) + np.cross(poses.rate, p_ic)) @ R_ic

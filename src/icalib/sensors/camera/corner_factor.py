@@ -21,10 +21,11 @@ import numpy as np
 from icalib.data.measurements import CornerStream
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import BOARD
-from icalib.motion.clocks import mounted_columns, offset_at
+from icalib.motion.clocks import offset_at
 from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import Poses, poses_at, poses_of_nodes
+from icalib.motion.poses import Poses
+from icalib.motion.sensor_pose import Kinematics, SensorPose
 from icalib.optim import pages
 from icalib.optim.arrowhead import Piece
 from icalib.optim.robust_weights import LOSSES
@@ -125,17 +126,17 @@ class CornerFactor(FactorDefaults):
         """(n_points, 3) the target's points, shapes and size included, in the world frame of a recording."""
         return self.bodies.points(state.values) @ _scene(state, recording).T
 
-    def camera_poses(self, state: State, i0: int = 0, i1: int | None = None) -> tuple[Poses, np.ndarray, np.ndarray]:
-        """IMU poses, and R_cam_world (n, 3, 3), p_world_cam (n, 3) at the instants of images i0..i1."""
-        if self.imu is None:
-            poses = poses_of_nodes(self.node[i0:i1], state)
-        else:
-            times = self.times[i0:i1] + offset_at(state, self.name, self.node[i0:i1])
-            imu_free = self.layout.is_free(self.imu.name, "intrinsics")
-            poses = poses_at(self.scheme, times, self.node[i0:i1], state, self.imu, self.gravity, imu_free)
-        R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
-        R_cw = np.ascontiguousarray((poses.rotation @ R_ic).transpose(0, 2, 1))
-        return poses, R_cw, poses.position + poses.rotation @ p_ic
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        return Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
+
+    def imu_poses(self, state: State, i0: int, i1: int) -> Poses:
+        """Poses of the IMU at the instants of images i0..i1."""
+        return self.kinematics.imu_poses(self.times[i0:i1], self.node[i0:i1], state)
+
+    def poses(self, state: State, i0: int = 0, i1: int | None = None) -> SensorPose:
+        """Poses of the camera at the instants of images i0..i1."""
+        return SensorPose.at(self.kinematics, self.times[i0:i1], self.node[i0:i1], state)
 
     def blocks(self) -> Iterator[tuple[int, int]]:
         """Views v0..v1, whole images, a few at a time: what all corners need at once fills the memory."""
@@ -153,8 +154,8 @@ class CornerFactor(FactorDefaults):
         """Of views v0..v1: X (n, 3), each corner's point in its camera's frame, and R_cam_body (v1 - v0, 3, 3)."""
         image, body, start = self.views.image[v0:v1], self.views.body[v0:v1], self.views.start[v0 : v1 + 1]
         i0 = int(image[0])
-        _, R_cw, p_wc = self.camera_poses(state, i0, int(image[-1]) + 1)
-        R_cw, p_wc, R_sb = R_cw[image - i0], p_wc[image - i0], self.bodies.poses(state.values)[0]
+        camera, R_sb = self.poses(state, i0, int(image[-1]) + 1), self.bodies.poses(state.values)[0]
+        R_cw, p_wc = camera.R_sensor_world[image - i0], camera.p_world_sensor[image - i0]
         X, R_cb = np.empty((start[-1] - start[0], 3)), np.empty_like(R_cw)
         for first, end, recording in self.parts(v0, v1):
             a, b = first - v0, end - v0
@@ -228,24 +229,17 @@ class CornerFactor(FactorDefaults):
         """The same factor with bloom along `direction` (N, 2)."""
         return replace(self, direction=direction)
 
-    def _columns(self, recording: int, body: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Border columns of the chained (n, c) and of the direct parameters (n, d) of views of `body` (n,), and which
-        model parameters the latter hold."""
-        nothing = np.zeros(0, dtype=np.int64)
-        imu = nothing if self.imu is None else self.layout.columns(self.imu.name, "intrinsics")
+    def _columns(self, recording: int, body: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Calibration columns (n, c + d) of views of `body` (n,), see `Motion`, and which model parameters are free."""
         pose, shape = (columns[body] for columns in self.bodies.columns(self.layout))
-        chained = [
-            mounted_columns(self.layout, self.name, recording),
-            self.layout.columns(in_recording(BOARD, recording), "tilt"),
-            imu[imu >= 0],
-        ]
+        tilt = self.layout.columns(in_recording(BOARD, recording), "tilt")
+        chained = np.concatenate([self.kinematics.columns(recording), tilt])
         model = self.layout.columns(self.name, "intrinsics", "distortion")
         pars = np.flatnonzero(model >= 0)
-        direct = [model[pars]]
-        if len(self.direction):
-            direct.append(self.layout.columns(self.name, "bloom"))
-        chained_of_all, direct_of_all = (np.tile(np.concatenate(own), (len(body), 1)) for own in (chained, direct))
-        return np.concatenate([chained_of_all, pose], axis=1), np.concatenate([direct_of_all, shape], axis=1), pars
+        bloom = self.layout.columns(self.name, "bloom") if len(self.direction) else model[:0]
+        direct = np.concatenate([model[pars], bloom])
+        chained_of_all, direct_of_all = (np.tile(own, (len(body), 1)) for own in (chained, direct))
+        return np.concatenate([chained_of_all, pose, direct_of_all, shape], axis=1), pars
 
     def accumulate(
         self, state: State, piece: Piece, out: CornerOutput | None, sums: bool = True, curved: bool = False
@@ -283,7 +277,7 @@ class CornerFactor(FactorDefaults):
     ) -> tuple[Images, Noise, Direct, Motion]:
         """What the kernels need to know of views v0..v1, of one recording."""
         image, body = self.views.image[v0:v1], self.views.body[v0:v1]
-        chained, direct, pars = self._columns(recording, body)
+        columns, pars = self._columns(recording, body)
         s, n = self.stream, self.noise
         images = Images(self.views.start[v0 : v1 + 1], s.uv, s.point, self.keep, self.node[image])
         noise = Noise(n.sigma, LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
@@ -292,34 +286,30 @@ class CornerFactor(FactorDefaults):
         basis = np.ascontiguousarray(
             self.bodies.deformation @ (R_ws @ R_sb)[self.bodies.target.body].transpose(0, 2, 1)
         )
-        motion = self._motion(state, image, body, R_ws, chained)
-        return images, noise, Direct(pars, bloom, self.direction, basis, direct), motion
+        motion = self._motion(state, image, body, R_ws, columns)
+        return images, noise, Direct(pars, bloom, self.direction, basis), motion
 
     def _motion(
-        self, state: State, image: np.ndarray, body: np.ndarray, R_ws: np.ndarray, chained: np.ndarray
+        self, state: State, image: np.ndarray, body: np.ndarray, R_ws: np.ndarray, columns: np.ndarray
     ) -> Motion:
         """What moves views of `body` (n,) in images (n,), one behind the other."""
         i0 = int(image[0])
-        poses, R_cw, p_wc = self.camera_poses(state, i0, int(image[-1]) + 1)
-        own = slice(None) if np.array_equal(image, np.arange(i0, i0 + len(R_cw))) else image - i0
+        camera = self.poses(state, i0, int(image[-1]) + 1)
+        if not np.array_equal(image, np.arange(i0, i0 + len(camera.R_sensor_world))):
+            camera = camera.part(image - i0)
         R_sb, p_sb = (x[body if self.bodies.several else body[:0]] for x in self.bodies.poses(state.values))
-        R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
-        return Motion(
-            np.ascontiguousarray(R_ic), p_ic, R_cw[own], p_wc[own], poses.rate[own], poses.velocity[own],
-            poses.J_node[own], poses.J_next[own] if len(poses.J_next) else poses.J_next, poses.J_imu[own],
-            np.ascontiguousarray(R_ws), R_ws @ R_sb, p_sb @ R_ws.T, chained,
-        )  # fmt: skip
+        return Motion(camera, np.ascontiguousarray(R_ws), R_ws @ R_sb, p_sb @ R_ws.T, columns)
 
     def _chunks(
         self, state: State, images: Images, motion: Motion, recording: int, jacobians: bool
     ) -> Iterator[tuple[int, int, Predicted]]:
         """Views a..b by the chunk, and what the model makes of them."""
         params = self.lens(state)
-        world, start = self.world_points(state, recording), images.start
+        world, start, camera = self.world_points(state, recording), images.start, motion.camera
         for a in range(0, len(images.node), CHUNK):
             b = min(a + CHUNK, len(images.node))
             X = np.empty((start[b] - start[a], 3))
-            camera_points(a, b, start, images.point, motion.R_cam_world, motion.p_world_cam, world, X)
+            camera_points(a, b, start, images.point, camera.R_sensor_world, camera.p_world_sensor, world, X)
             if jacobians:
                 yield a, b, Predicted(int(start[a]), X, *self.model.project_with_jacobians(params, X))
             else:

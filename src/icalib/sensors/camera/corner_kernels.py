@@ -10,8 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.motion.pose_chain import add_clusters, add_image, pose_chain
+from icalib.geometry import so3
+from icalib.motion.sensor_pose import SensorPose, chain_width, fill_chain
 from icalib.optim.robust_weights import bend, marginalise_shared, robust_weights, weight, whole_error
+from icalib.optim.rows import add_gradients, add_gram
 
 
 class Images(NamedTuple):
@@ -39,30 +41,20 @@ class Noise(NamedTuple):
 
 class Direct(NamedTuple):
     """What shows in the image beyond the pose: model parameters `pars` that are free, bloom along direction (N, 2) or
-    (0, 2), the shape's basis (n_points, s, 3) in the world; columns (n, d): those in the calibration parameters, -1
-    where fixed."""
+    (0, 2), the shape's basis (n_points, s, 3) in the world."""
 
     pars: np.ndarray
     bloom: float
     direction: np.ndarray
     basis: np.ndarray
-    columns: np.ndarray
 
 
 class Motion(NamedTuple):
-    """Camera in the IMU, camera poses (n, ...) in the world, of the IMU what `Poses` holds, and where there are several
-    bodies the scene's rotation and each image's body (n, ...) in the world; columns (n, c): those of the calibration
-    parameters that act through the pose."""
+    """Poses of the camera at n images; where there are several bodies, the scene's rotation and each image's body (n,
+    ...) in the world. columns (n, c + d): calibration columns, -1 where fixed: of the camera's pose, tilt of the scene
+    2, pose of the body 6 or 0; then those of `Direct`."""
 
-    R_imu_cam: np.ndarray
-    p_imu_cam: np.ndarray
-    R_cam_world: np.ndarray
-    p_world_cam: np.ndarray
-    rate: np.ndarray
-    velocity: np.ndarray
-    J_node: np.ndarray
-    J_next: np.ndarray
-    J_imu: np.ndarray
+    camera: SensorPose
     R_world_scene: np.ndarray
     R_world_body: np.ndarray
     p_world_body: np.ndarray
@@ -166,7 +158,7 @@ def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
     n, ns, n_pars = n1 - n0, direct.basis.shape[1], len(direct.pars)
     has_bloom = len(direct.direction) > 0
     D = 6 + n_pars + has_bloom + ns
-    R = motion.R_cam_world[i]
+    R = motion.camera.R_sensor_world[i]
     for k in range(n):
         c, root = n0 + k - predicted.first, roots[k]
         x, y, z = predicted.X[c, 0], predicted.X[c, 1], predicted.X[c, 2]
@@ -199,19 +191,60 @@ def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
                 bend(A, D, k, n, error[k], np.sqrt(curvature))
 
 
+class _Work(NamedTuple):
+    """For one image: rows A and their Gram matrix G; residual and error (n, 2), root (n,); its pose by that of the IMU,
+    A_imu, and by keyframes and calibration parameters, T; F: see `add_gram`."""
+
+    A: np.ndarray
+    G: np.ndarray
+    residual: np.ndarray
+    error: np.ndarray
+    root: np.ndarray
+    A_imu: np.ndarray
+    T: np.ndarray
+    F: np.ndarray
+
+
 @njit(cache=True, nogil=True)
-def _work(images, direct, motion):
-    """Arrays for one image: rows A, their Gram matrix, residuals and errors (n, 2), roots (n,), and the chain matrices
-    Tn, Tm, Tc."""
+def _work_space(images, direct, motion):
     most = 0
     for i in range(len(images.start) - 1):
         most = max(most, images.start[i + 1] - images.start[i])
-    D = 6 + len(direct.pars) + (len(direct.direction) > 0) + direct.basis.shape[1]
-    Tm = np.empty((6, 15 if len(motion.J_next) else 0))
-    return (
+    n_d = len(direct.pars) + (len(direct.direction) > 0) + direct.basis.shape[1]
+    width, D = chain_width(motion.camera) + motion.columns.shape[1], 6 + n_d
+    return _Work(
         np.empty((D + 1, 2 * most)), np.empty((D + 1, D + 1)), np.empty((most, 2)), np.empty((most, 2)), np.empty(most),
-        np.empty((6, 15)), Tm, np.empty((6, motion.columns.shape[1])),
+        np.empty((6, 6)), np.empty((6, width - n_d)), np.empty((6, width + 1)),
     )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _fill_chain(i, motion, A_imu, T):
+    """T (6, w): the camera's pose by keyframes and calibration parameters, in the order of `Motion.columns`."""
+    fill_chain(i, motion.camera, A_imu, T)
+    R_cw, p_wc = motion.camera.R_sensor_world[i], motion.camera.p_world_sensor[i]
+    o = T.shape[1] - (8 if len(motion.R_world_body) else 2)
+    for r in range(3):
+        # Turning the board about world x (y) is turning the camera the other way about the board's origin.
+        T[r, o], T[r, o + 1] = -R_cw[r, 0], -R_cw[r, 1]
+        T[3 + r, o] = R_cw[r, 1] * p_wc[2] - R_cw[r, 2] * p_wc[1]
+        T[3 + r, o + 1] = R_cw[r, 2] * p_wc[0] - R_cw[r, 0] * p_wc[2]
+    if len(motion.R_world_body):
+        _fill_body(i, motion, T)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _fill_body(i, motion, T):
+    """The last 6 columns of T: moving the body is moving the camera the other way, turning about the body's origin."""
+    R_cw, R_wb, o = motion.camera.R_sensor_world[i], motion.R_world_body[i], T.shape[1] - 6
+    away = so3.hat(motion.camera.p_world_sensor[i] - motion.p_world_body[i])
+    for r in range(3):
+        for j in range(3):
+            for k in range(3):
+                T[r, o + j] -= R_cw[r, k] * R_wb[k, j]
+                T[3 + r, o + 3 + j] -= R_cw[r, k] * motion.R_world_scene[k, j]
+                for m in range(3):
+                    T[3 + r, o + j] += R_cw[r, k] * away[k, m] * R_wb[m, j]
 
 
 @njit(cache=True, nogil=True)
@@ -220,45 +253,43 @@ def accumulate(i0, i1, images, noise, direct, motion, predicted, sums, found):
 
     Returns half the robust chi^2.
     """
-    A, G, all_residuals, error, all_roots, Tn, Tm, Tc = _work(images, direct, motion)
-    D = len(G) - 1
-    total = 0.0
+    work, total = _work_space(images, direct, motion), 0.0
+    A, G, T, D, n_chain = work.A, work.G, work.T, len(work.G) - 1, chain_width(motion.camera)
     for i in range(i0, i1):
         n0, n1 = images.start[i], images.start[i + 1]
         n = n1 - n0
-        res, root = all_residuals[:n], all_roots[:n]
+        res, root = work.residual[:n], work.root[:n]
         total += _predict_image(i, images, noise, direct, predicted, res, root, found)
         if len(sums.diagonal) == 0:
             continue
-        whole_error(res, noise.field[n0:n1], found.shared[i], error)
-        _fill_rows(i, images, noise, direct, motion, predicted, root, error, A)
+        whole_error(res, noise.field[n0:n1], found.shared[i], work.error)
+        _fill_rows(i, images, noise, direct, motion, predicted, root, work.error, A)
         _gram(A, D + 1, 2 * n, G)
         if len(noise.precision):
             marginalise_shared(A, D, n, root, noise.field[n0:n1], noise.precision, G)
-        pose_chain(i, motion, Tn, Tm, Tc)
-        add_image(images.node[i] - sums.first, G, Tn, Tm, Tc, motion.columns[i], direct.columns[i], sums)
+        _fill_chain(i, motion, work.A_imu, T)
+        add_gram(images.node[i] - sums.first, n_chain, G, T, motion.columns[i], work.F, sums)
     return total
 
 
 @njit(cache=True, nogil=True)
 def accumulate_clusters(i0, i1, cluster, n_clusters, column, images, noise, direct, motion, predicted, sums, found):
-    """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and calib."""
-    A, gram, all_residuals, error, all_roots, Tn, Tm, Tc = _work(images, direct, motion)
-    D = len(gram) - 1
+    """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and calibration
+    parameters."""
+    work = _work_space(images, direct, motion)
+    A, T, D, n_chain = work.A, work.T, len(work.G) - 1, chain_width(motion.camera)
     G = np.empty((D, n_clusters))
     for i in range(i0, i1):
         n0, n1 = images.start[i], images.start[i + 1]
         n = n1 - n0
-        res, root = all_residuals[:n], all_roots[:n]
+        res, root = work.residual[:n], work.root[:n]
         _recall_image(i, images, found, res, root)
-        whole_error(res, noise.field[n0:n1], found.shared[i], error)
-        _fill_rows(i, images, noise, direct, motion, predicted, root, error, A)
+        whole_error(res, noise.field[n0:n1], found.shared[i], work.error)
+        _fill_rows(i, images, noise, direct, motion, predicted, root, work.error, A)
         for d in range(D):
             for g in range(n_clusters):
                 G[d, g] = 0.0
             for k in range(n):
                 G[d, cluster[n0 + k]] += A[d, k] * A[D, k] + A[d, n + k] * A[D, n + k]
-        pose_chain(i, motion, Tn, Tm, Tc)
-        add_clusters(
-            images.node[i] - sums.first, G, column, Tn, Tm, Tc, motion.columns[i], direct.columns[i], sums
-        )  # fmt: skip
+        _fill_chain(i, motion, work.A_imu, T)
+        add_gradients(images.node[i] - sums.first, n_chain, G, T, motion.columns[i], column, sums)

@@ -138,21 +138,24 @@ class LidarFactor(RowFactor):
         """Bins b0..b1 by the chunk, with the LiDAR's poses, their calibration columns (c,), and the planes."""
         planes, m = Planes.of(self.planes, state, self._of_planes), self.moments
         kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
-        for clock, a, b in self._stretches(state, b0, b1):
+        for columns, a, b in self._stretches(state, kinematics, b0, b1):
             node = self.node[a:b]
             bins = Bins(node, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant, self.turned, self.slope)
-            yield bins, SensorPose.at(kinematics, m.seconds[a:b], node, state), kinematics.columns(clock), planes
+            yield bins, SensorPose.at(kinematics, m.seconds[a:b], node, state), columns, planes
 
-    def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[int, int, int]]:
-        """Bins b0..b1 by the chunk, each with the number of its time offset."""
+    def _stretches(
+        self, state: State, kinematics: Kinematics, b0: int, b1: int
+    ) -> Iterator[tuple[np.ndarray, int, int]]:
+        """Bins b0..b1 by the chunk, each with the calibration columns (c,) of its pose."""
         for clock, own in by_clock(state, self.name, self.node[b0:b1]):
+            columns = kinematics.columns(clock)
             first, last = b0 + own.start, b0 + own.stop
             # Bins on one side of a keyframe stay together.
             sides = np.flatnonzero(np.diff(2 * self.node[first:last] + (self.walked[first:last] >= 0.0))) + 1
             sides = np.append(sides, last - first)
             ends = sides[np.searchsorted(sides, np.arange(CHUNK, last - first, CHUNK))]
             for a, b in pairwise(np.unique([0, *ends, last - first])):
-                yield clock, first + int(a), first + int(b)
+                yield columns, first + int(a), first + int(b)
 
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
         """The bins that belong to `piece`: keyframes from first to before last, the chain's very last keyframe

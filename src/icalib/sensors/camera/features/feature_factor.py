@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.data.measurements import TrackStream
-from icalib.motion.clocks import clock_of, mounted_columns
+from icalib.motion.clocks import clock_of
 from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece
@@ -26,7 +26,6 @@ from icalib.optim.planes import Planes
 from icalib.optim.robust_weights import LOSSES, Loss
 from icalib.optim.state import Layout, State
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.corner_kernels import Motion
 from icalib.sensors.camera.features.feature_clusters import accumulate_clusters
 from icalib.sensors.camera.features.feature_kernels import (
     Points,
@@ -146,8 +145,8 @@ class FeatureFactor(FactorDefaults):
         A, b = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for view in views:
             rays, valid = view.camera.model.unproject(view.params, view.seen.uv)
-            motion = view.motion
-            add_rays(view.seen, 0, motion.R_cam_world, motion.p_world_cam, rays, valid, A, b)
+            at = view.poses
+            add_rays(view.seen, 0, at.R_sensor_world, at.p_world_sensor, rays, valid, A, b)
         found = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n), None)
         points = self._in_anchors(views, found.xyz, slice(0, n))
         distance = np.linalg.norm(points, axis=1)
@@ -257,13 +256,12 @@ class FeatureFactor(FactorDefaults):
         total, begin = 0.0, 0
         for view in views:
             i, loss = view.index, self._loss(curved)
-            lens = self.layout.columns(view.camera.name, "intrinsics", "distortion")
             for part, images in view.chunks():
                 own = slice(begin + images.start, begin + images.stop)
                 mine = features._replace(pose=features.pose[own], next_pose=features.next_pose[own])
                 X = part.in_camera(points.xyz, tracks.start)
                 total += accumulate(
-                    X, part.seen, base, part.motion, part.seeing(X, lens), loss, into, mine, out.residual[i],
+                    X, part.seen, base, part.poses, part.columns, part.seeing(X), loss, into, mine, out.residual[i],
                     out.root[i],
                 )  # fmt: skip
             begin += len(view.seen.node)
@@ -285,11 +283,10 @@ class FeatureFactor(FactorDefaults):
         points, side = self._from_anchors(views, tracks, at.points[tracks]), piece.features.sums.side
         for view in views:
             loss, own = self._loss(False), cluster[view.index]
-            lens = self.layout.columns(view.camera.name, "intrinsics", "distortion")
             for part, _ in view.chunks():
                 X = part.in_camera(points, tracks.start)
                 accumulate_clusters(
-                    X, part.seen, base, part.motion, part.seeing(X, lens), loss, own, n_clusters, column,
+                    X, part.seen, base, part.poses, part.columns, part.seeing(X), loss, own, n_clusters, column,
                     piece.sums(True), side,
                 )  # fmt: skip
 
@@ -336,30 +333,16 @@ class FeatureFactor(FactorDefaults):
     def _view(self, state: State, index: int, images: range, first: int) -> View:
         camera, stream, tracks = self.cameras[index], self.streams[index], self.tracks
         i0, i1 = images.start, images.stop
-        poses, R_cw, p_wc = camera.camera_poses(state, i0, i1)
         seen = Seen(
             stream.start[i0 : i1 + 1], stream.uv, self.keep[index], tracks.track[index], tracks.pair[index],
             camera.node[i0:i1] - first, self.sigmas[index],
         )  # fmt: skip
-        motion = Motion(
-            np.ascontiguousarray(state.values[camera.name, "rotation"]), state.values[camera.name, "translation"],
-            R_cw, p_wc, poses.rate, poses.velocity, poses.J_node, poses.J_next, poses.J_imu,
-            np.eye(3), np.zeros((0, 3, 3)), np.zeros((0, 3)), self._chained(camera, state, i0, i1),
-        )  # fmt: skip
-        params = camera.lens(state)
-        return View(camera, index, i0, params, seen, motion)
-
-    def _chained(self, camera: CornerFactor, state: State, i0: int, i1: int) -> np.ndarray:
-        """(i1 - i0, c) calibration columns that act through the camera's pose in its images i0..i1, in the order of
-        `pose_chain`; points know no tilt."""
-        imu = np.zeros(0, dtype=np.int64)
-        if camera.imu is not None:
-            imu = self.layout.columns(camera.imu.name, "intrinsics")
+        lens = self.layout.columns(camera.name, "intrinsics", "distortion")
+        pars = np.flatnonzero(lens >= 0)
         clocks = range(len(state.values[camera.name, "time_offset"]))
-        own = np.array([mounted_columns(self.layout, camera.name, k) for k in clocks])
-        of_image = own[clock_of(state, camera.name, camera.node[i0:i1])]
-        rest = np.concatenate([np.full(2, -1), imu[imu >= 0]])
-        return np.concatenate([of_image, np.tile(rest, (i1 - i0, 1))], axis=1).astype(np.int64)
+        own = np.array([np.concatenate([camera.kinematics.columns(k), lens[pars]]) for k in clocks])
+        columns = own[clock_of(state, camera.name, camera.node[i0:i1])]
+        return View(camera, index, i0, camera.lens(state), seen, camera.poses(state, i0, i1), columns, pars)
 
     def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> Points:
         """The points of `tracks` where their cost is least, that of their `planes` with it, from `xyz` (n, 3) on."""
@@ -384,8 +367,8 @@ class FeatureFactor(FactorDefaults):
         for view in views:
             own = np.flatnonzero(camera == view.index)
             i = image[tracks][own] - view.first
-            turned = np.einsum("nji,nj->ni", view.motion.R_cam_world[i], points[own])
-            out[own] = turned + view.motion.p_world_cam[i]
+            turned = np.einsum("nji,nj->ni", view.poses.R_sensor_world[i], points[own])
+            out[own] = turned + view.poses.position[i]
         return out
 
     def _in_anchors(self, views: list[View], points: np.ndarray, tracks: slice) -> np.ndarray:
@@ -394,7 +377,7 @@ class FeatureFactor(FactorDefaults):
         for view in views:
             own = np.flatnonzero(camera == view.index)
             i = image[tracks][own] - view.first
-            out[own] = np.einsum("nij,nj->ni", view.motion.R_cam_world[i], points[own] - view.motion.p_world_cam[i])
+            out[own] = np.einsum("nij,nj->ni", view.poses.R_sensor_world[i], points[own] - view.poses.position[i])
         return out
 
 

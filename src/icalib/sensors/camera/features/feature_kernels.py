@@ -14,8 +14,10 @@ from icalib.base.compiled import njit
 from icalib.geometry.blas import subtract_gram
 from icalib.geometry.planes import tangents
 from icalib.geometry.small import eigen3, solve_definite
-from icalib.motion.pose_chain import add_image, pose_chain
+from icalib.motion.sensor_pose import chain_width, fill_chain
 from icalib.optim.robust_weights import bend, weight
+from icalib.optim.rows import add_gram
+from icalib.optim.state import NODE
 
 # Of half the chi^2: a point's step that takes off less is its last. What that leaves is the square of it, but where a
 # robust loss bends a part of it; from 1e-8 on gradients show that.
@@ -47,7 +49,7 @@ class Range(NamedTuple):
 
 class Seeing(NamedTuple):
     """What the model makes of observations `first` and on: uv, valid, Jacobians by the point in the camera and by the
-    parameters, those in `pars` free, their columns (d,) in the calibration parameters."""
+    parameters, of which `pars` (d,) are free."""
 
     first: int
     uv: np.ndarray
@@ -55,7 +57,6 @@ class Seeing(NamedTuple):
     J_point: np.ndarray
     J_params: np.ndarray
     pars: np.ndarray
-    columns: np.ndarray
 
 
 class Points(NamedTuple):
@@ -319,55 +320,62 @@ def _gram(rows, G):
 
 
 @njit(cache=True, nogil=True)
-def _add_feature(A, pair, t, own_side, chained, direct, features, by_pose):
-    """One observation's rows A into the sums of its feature; own_side (6, c): camera pose by the calibration
-    parameters, its columns `chained` (c,); by_pose (6,): work space."""
+def _add_feature(i, A, pair, t, T, n_chain, columns, features, by_pose):
+    """One observation's rows A, of image i, into the sums of its feature; T (6, w): camera pose by keyframes and
+    calibration parameters, columns (n, c + d) those of all images; by_pose (6,): work space."""
     D, n_b, side, block = len(A) - 1, features.side.shape[2] - 1, features.side[t], features.block[pair]
+    n_c = T.shape[1] - n_chain
     for a in range(3):
         f0, f1 = A[D - 3 + a, 0], A[D - 3 + a, 1]
         for k in range(3):
             features.own[t, a, k] += f0 * A[D - 3 + k, 0] + f1 * A[D - 3 + k, 1]
         side[a, n_b] += f0 * A[D, 0] + f1 * A[D, 1]
-        for q in range(len(direct)):
-            if direct[q] >= 0:
-                side[a, direct[q]] += f0 * A[6 + q, 0] + f1 * A[6 + q, 1]
+        for q in range(n_c, columns.shape[1]):
+            side[a, columns[i, q]] += f0 * A[6 + q - n_c, 0] + f1 * A[6 + q - n_c, 1]
         for d in range(6):
             by_pose[d] = f0 * A[d, 0] + f1 * A[d, 1]
             block[a, d] += by_pose[d]
-        for j in range(len(chained)):
-            if chained[j] >= 0:
+        for j in range(n_c):
+            if columns[i, j] >= 0:
                 s = 0.0
                 for d in range(6):
-                    s += by_pose[d] * own_side[d, j]
-                side[a, chained[j]] += s
+                    s += by_pose[d] * T[d, n_chain + j]
+                side[a, columns[i, j]] += s
 
 
 @njit(cache=True, nogil=True)
-def accumulate(X, seen, base, motion, seeing, loss, sums, features, residual, root):
-    """Residual (N, 2) and root (N,) of one camera's observations, and the normal equations where they are wanted.
-    Returns half the robust chi^2."""
-    n_d = len(seeing.pars)
+def _fill_pose(i, at, A_imu, T, features):
+    """T (6, w): pose i of the camera by keyframes and calibration parameters; by keyframes also in `features`."""
+    fill_chain(i, at, A_imu, T)
+    for d in range(6):
+        for j in range(NODE):
+            features.pose[i, d, j] = T[d, j]
+        for j in range(NODE if len(features.next_pose) else 0):
+            features.next_pose[i, d, j] = T[d, NODE + j]
+
+
+@njit(cache=True, nogil=True)
+def accumulate(X, seen, base, at, columns, seeing, loss, sums, features, residual, root):
+    """Residual (N, 2) and root (N,) of one camera's observations, and the normal equations where they are wanted. at:
+    its poses in n images; columns (n, c + d): see `View`. Returns half the robust chi^2."""
+    n_d, n_chain, width = len(seeing.pars), chain_width(at), chain_width(at) + columns.shape[1]
     A, G, error = np.zeros((10 + n_d, 2)), np.empty((7 + n_d, 7 + n_d)), np.empty(2)
     by_pose, most = np.empty(6), 0
     for i in range(len(seen.start) - 1):
         most = max(most, seen.start[i + 1] - seen.start[i])
     rows = np.empty((2 * most, 7 + n_d))
-    Tn, Tm = np.empty((6, 15)), np.empty((6, 15 if len(motion.J_next) else 0))
-    Tc, total, D = np.empty((6, motion.columns.shape[1])), 0.0, 9 + n_d
-    wanted = len(sums.diagonal) > 0
+    A_imu, T, F = np.empty((6, 6)), np.empty((6, width - n_d)), np.empty((6, width + 1))
+    total, D, wanted = 0.0, 9 + n_d, len(sums.diagonal) > 0
     for i in range(len(seen.start) - 1):
         if wanted:
-            pose_chain(i, motion, Tn, Tm, Tc)
-            features.pose[i] = Tn
-            if len(features.next_pose):
-                features.next_pose[i] = Tm
+            _fill_pose(i, at, A_imu, T, features)
         m = 0
         for n in range(seen.start[i], seen.start[i + 1]):
             t = seen.track[n] - base.track
             if seen.track[n] < 0:
                 root[n], residual[n, 0], residual[n, 1] = 0.0, 0.0, 0.0
                 continue
-            root[n], cost = weighted_rows(i, n, X, seen, seeing, loss, motion.R_cam_world, error, A)
+            root[n], cost = weighted_rows(i, n, X, seen, seeing, loss, at.R_sensor_world, error, A)
             residual[n, 0], residual[n, 1] = error[0], error[1]
             total += cost
             if not wanted or root[n] == 0.0:
@@ -377,8 +385,8 @@ def accumulate(X, seen, base, motion, seeing, loss, sums, features, residual, ro
                     rows[m + r, a] = A[a, r]
                 rows[m + r, 6 + n_d] = A[D, r]
             m += 2
-            _add_feature(A, seen.pair[n] - base.pair, t, Tc, motion.columns[i], seeing.columns, features, by_pose)
+            _add_feature(i, A, seen.pair[n] - base.pair, t, T, n_chain, columns, features, by_pose)
         if wanted:
             _gram(rows[:m], G)
-            add_image(seen.node[i], G, Tn, Tm, Tc, motion.columns[i], seeing.columns, sums)
+            add_gram(seen.node[i], n_chain, G, T, columns[i], F, sums)
     return total

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.motion.sensor_pose import SensorPose
 from icalib.optim.robust_weights import Loss
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.corner_kernels import Motion
 from icalib.sensors.camera.features.feature_kernels import (
     Points,
     Seeing,
@@ -24,14 +24,17 @@ CHUNK = 4096  # observations at a time: what a chunk needs stays in the cache, i
 
 @dataclass(frozen=True)
 class View:
-    """Images of one camera, `first` and on, number `index` of all cameras: what it saw in them, and how it moved."""
+    """Images of one camera, `first` and on, number `index` of all cameras: what it saw in them, and its poses. columns
+    (n, c + d): calibration columns of its pose in each image, then of its free parameters `pars` (d,)."""
 
     camera: CornerFactor
     index: int
     first: int
     params: np.ndarray
     seen: Seen
-    motion: Motion
+    poses: SensorPose
+    columns: np.ndarray
+    pars: np.ndarray
 
     def chunks(self) -> Iterator[tuple[View, slice]]:
         """Parts of the view, and which of its images are theirs."""
@@ -43,35 +46,30 @@ class View:
 
     def _part(self, a: int, b: int) -> View:
         """Its images a..b."""
-        seen, m, own = self.seen, self.motion, slice(a, b)
+        seen, own = self.seen, slice(a, b)
         seen = seen._replace(start=seen.start[a : b + 1], node=seen.node[own])
-        m = m._replace(
-            R_cam_world=m.R_cam_world[own], p_world_cam=m.p_world_cam[own], rate=m.rate[own], velocity=m.velocity[own],
-            J_node=m.J_node[own], J_next=m.J_next[own], J_imu=m.J_imu[own], columns=m.columns[own],
-        )  # fmt: skip
-        return replace(self, first=self.first + a, seen=seen, motion=m)
+        return replace(self, first=self.first + a, seen=seen, poses=self.poses.part(own), columns=self.columns[own])
 
     def in_camera(self, points: np.ndarray, track: int) -> np.ndarray:
         """(n, 3) the points of tracks `track` and on, in the camera, for each observation."""
-        seen, motion = self.seen, self.motion
+        seen, at = self.seen, self.poses
         X = np.empty((int(seen.start[-1] - seen.start[0]), 3))
-        camera_points(seen, track, motion.R_cam_world, motion.p_world_cam, points, X)
+        camera_points(seen, track, at.R_sensor_world, at.p_world_sensor, points, X)
         return X
 
-    def seeing(self, X: np.ndarray, columns: np.ndarray) -> Seeing:
-        """The observations of points at X (n, 3) in the camera; columns (P,) of its parameters, -1 where fixed."""
-        pars = np.flatnonzero(columns >= 0)
+    def seeing(self, X: np.ndarray) -> Seeing:
+        """The observations of points at X (n, 3) in the camera."""
         found = self.camera.model.project_with_jacobians(self.params, X)
-        return Seeing(int(self.seen.start[0]), *found, pars, columns[pars])
+        return Seeing(int(self.seen.start[0]), *found, self.pars)
 
     def add_to_points(self, track: int, loss: Loss, points: Points) -> None:
         """Adds what the observations say of those points, of tracks `track` and on, that still move."""
         for part, _ in self.chunks():
-            seen, motion = part.seen, part.motion
+            seen, at = part.seen, part.poses
             most = int(seen.start[-1] - seen.start[0])
             image, which, X = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty((most, 3))
-            m = moving_points(seen, track, motion.R_cam_world, motion.p_world_cam, points, image, which, X)
+            m = moving_points(seen, track, at.R_sensor_world, at.p_world_sensor, points, image, which, X)
             if m:
                 uv, valid, J_point, _ = self.camera.model.project_with_jacobians(self.params, X[:m])
-                R = motion.R_cam_world
+                R = at.R_sensor_world
                 add_to_points(seen, track, R, image[:m], which[:m], uv, valid, J_point, loss, points)
