@@ -73,6 +73,7 @@ HEAD = "t,id,u,v\n1,2,3,4\n"
         ("t,id,u,v\n", "holds no rows"),
         (HEAD + "1,2,3\n", ":3: the line has 3 columns instead of 4"),
         (HEAD + "1,2,3,4,5\n", ":3: the line has 5 columns instead of 4"),
+        ("1,2,3,4,5\n", "; name those to be read by `columns` in the rig file"),
         (HEAD + "1,2,3,4,\n", ":3: the line has 5 columns"),
         (HEAD + "# c\n\n1,2,3,abc\n", ":5: v is 'abc', which is not a number"),
         (HEAD + "t,id,u,v\n", ":3: t [ns] is 't', which is not a number"),

@@ -282,7 +282,9 @@ def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column
     spot = f"{text.path}:{line}"
     if len(fields) != len(place):
         wanted = f"{len(place)} ({', '.join(text.header if len(text.header) == len(place) else kind.names)})"
-        return f"{spot}: the line has {len(fields)} columns instead of {wanted}; correct or remove it."
+        others = len(fields) > len(place) and line == text.line and not text.header
+        advice = "name those to be read by `columns` in the rig file" if others else "correct or remove it"
+        return f"{spot}: the line has {len(fields)} columns instead of {wanted}; {advice}."
     name, written = kind.names[place[column]], fields[column]
     shown = written if len(written) <= 40 else written[:40] + "..."
     try:
