@@ -11,6 +11,7 @@ from icalib.result.summary import calibration_yaml, parameter_keys
 from icalib.result.verdict import by_size, worst
 from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
 from icalib.sensors.pose.simulate import SimPoses
+from icalib.sensors.position.simulate import SimPositions
 from icalib.sensors.sensor import MOUNTED
 from icalib.tools.comparison.compare import compare_sides
 from icalib.tools.comparison.results import side_of_result
@@ -22,7 +23,8 @@ pytestmark = pytest.mark.slow
 
 def test_every_parameter_of_a_robot_is_in_its_result(robot):
     scenario = robot("ramp", 20.0, "clw")
-    scenario = scenario.with_sensors(SimPoses("mocap0", scenario.cameras[0].T_imu_sensor))
+    T = scenario.cameras[0].T_imu_sensor
+    scenario = scenario.with_sensors(SimPoses("mocap0", T), SimPositions("gnss0", T))
     rig, simulation = rig_for(scenario, intrinsics="free", distortion="free"), simulate(scenario, 0)
     assert rig.imu is not None
     result = calibrate_measurements(rig, simulation.measurements)
