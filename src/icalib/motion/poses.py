@@ -82,8 +82,8 @@ def _velocity(i, R, run, force, g, at, moving):
     """Fills entry i of `moving`: increments `run` (see `integration_step`) from a node at R, and `force` at the
     instant."""
     first = 0 * i
-    _by_start(i, first, R, run, J + 3 * STRIDE, moving.J_node, moving.J_imu)
-    _by_turn(i, first, R, run, V, moving.J_node)
+    _fill_start(i, first, R, run, J + 3 * STRIDE, moving.J_node, moving.J_imu)
+    _fill_turn(i, first, R, run, V, moving.J_node)
     for a in range(3):
         row = at.rotation[i, a, 0], at.rotation[i, a, 1], at.rotation[i, a, 2]
         moving.acceleration[i, a] = row[0] * force[0] + row[1] * force[1] + row[2] * force[2]
@@ -92,11 +92,11 @@ def _velocity(i, R, run, force, g, at, moving):
 
 
 @njit(cache=True, nogil=True)
-def _by_node(i, dt, R, run, Jn, Jx):
+def _fill_pose(i, dt, R, run, Jn, Jx):
     """Fills entry i of the Jacobians of a pose: dt and increments `run` (see `integration_step`) from a node at R."""
     first = 0 * i  # an integer and no literal, for which all is compiled once more
-    _by_start(i, first + 3, R, run, J + 6 * STRIDE, Jn, Jx)
-    _by_turn(i, first + 3, R, run, P, Jn)
+    _fill_start(i, first + 3, R, run, J + 6 * STRIDE, Jn, Jx)
+    _fill_turn(i, first + 3, R, run, P, Jn)
     for a in range(3):
         Jn[i, 3 + a, 3 + a] = 1.0
         Jn[i, 3 + a, 6 + a] = dt
@@ -109,7 +109,7 @@ def _by_node(i, dt, R, run, Jn, Jx):
 
 
 @njit(cache=True, nogil=True)
-def _by_turn(i, r, R, run, o, Jn):
+def _fill_turn(i, r, R, run, o, Jn):
     """Rows r.. of Jn[i] by the rotation R of the node, of an increment d (3,), run[o:], in its axes: -R hat(d)."""
     d = run[o], run[o + 1], run[o + 2]
     for a in range(3):
@@ -120,7 +120,7 @@ def _by_turn(i, r, R, run, o, Jn):
 
 
 @njit(cache=True, nogil=True)
-def _by_start(i, r, R, x, o, Jn, Jx):
+def _fill_start(i, r, R, x, o, Jn, Jx):
     """Rows r.. of Jn[i] and Jx[i] by biases and intrinsics: R times three rows of J in x, from number o on."""
     for a in range(3):
         R0, R1, R2 = R[3 * a], R[3 * a + 1], R[3 * a + 2]
@@ -141,7 +141,7 @@ def _inertial(ways, nodes, readings, intrinsics, at, Jn, Jx, moving):
         rate, force = integrate_from_node(k, t0, t, ways.first[i], bias, readings, by, carried, run, width)
         place(i, t - t0, k, nodes, run, rate, at)
         if len(Jn):
-            _by_node(i, t - t0, rotation_of(nodes, k), run, Jn, Jx)
+            _fill_pose(i, t - t0, rotation_of(nodes, k), run, Jn, Jx)
         if len(moving.acceleration):
             _velocity(i, rotation_of(nodes, k), run, force, nodes.gravity, at, moving)
 
