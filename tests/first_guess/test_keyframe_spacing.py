@@ -9,9 +9,11 @@ import pytest
 
 from icalib.data.measurements import Measurements, PoseStream, WheelStream
 from icalib.geometry import so3
-from icalib.initialize.steps.keyframe_spacing import LEAST_S, keyframe_spacing, pose_noise
+from icalib.initialize.assumed_motion import LEAST_SPACING_S, keyframe_spacing
+from icalib.initialize.steps.keyframe_spacing import SmoothMotion
 from icalib.initialize.steps.smooth_path import smooth_path
 from icalib.rig import PoseSensor, Rig, Settings, Wheels, by_name
+from icalib.sensors.pose.initialize.noise import pose_noise
 
 TURN, WAY = 2e-3, 1e-3
 DENSITIES = (0.05, 0.2)  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz)
@@ -39,7 +41,7 @@ def spacing(noise: float | None, densities=DENSITIES, **settings: Any) -> float:
     rig = Rig(by_name(PoseSensor("mocap0", "")), settings=Settings(**settings))
     if noise is not None:
         rig = rig.with_(wheels=(Wheels("wheel0", "", wheel_noise=noise),))
-    return keyframe_spacing(rig, [m], [path], *densities)
+    return keyframe_spacing(rig, [m], SmoothMotion([path], *densities))
 
 
 def test_the_noise_of_poses_is_their_scatter_about_a_smooth_path():
@@ -64,4 +66,4 @@ def test_good_encoders_ask_for_closer_keyframes():
     noise, densities = 0.1, (0.3, 0.2)
     yaw = noise * np.sqrt(2.0) * RADIUS / BASELINE
     assert spacing(noise, densities, keyframe_spacing_s=2.0) == pytest.approx(np.sqrt(3.0) * 0.25 * yaw / 0.3, rel=0.05)
-    assert spacing(0.1 * noise, densities) == LEAST_S
+    assert spacing(0.1 * noise, densities) == LEAST_SPACING_S

@@ -1,18 +1,19 @@
-"""Without an IMU, but with wheels or a pose sensor: what is assumed of the motion in its place.
+"""Without an IMU, but with wheels or a pose sensor: smooth motion is assumed in its place.
 
-The chain keeps its IMU, one that reads zero and knows no gravity. The biases of a node are then minus its angular rate
-and minus its acceleration, in the axes of the body, and their random walk is white noise on angular acceleration and on
-jerk: a motion prior, by which nodes are tied, and sensors carried from nodes to their own instants. Its densities are
-those of the motion itself, as the poses of the body show it; they are the only thing that is taken from these twice.
+The estimate keeps an IMU that reads zero and knows no gravity. The biases of a keyframe are then minus its angular rate
+and minus its acceleration, in the axes of the body. Their random walk is white noise on angular acceleration and on
+jerk: a motion prior, which ties keyframes and propagates poses from keyframes to the instants of sensors. Its densities
+are those of the motion itself, as the poses of the body show it. Nothing else is taken from these twice.
 
-The body is the first camera, whose target is the world, or the first pose sensor, whose frame is. Cameras that follow
-points are placed on the motion of the pose sensor.
+The body is the first camera, whose target is the world, or the first pose sensor, whose frame is. Cameras with feature
+tracks are placed on the motion of the pose sensor.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,136 +22,152 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.dead_reckoning import (
-    as_given,
-    camera_paths,
-    in_place_of_wheels,
-    pose_stream,
-    seen_from_first,
-    wheel_path,
+from icalib.initialize.dead_reckoning import as_given, camera_paths, in_place_of, pose_streams, seen_from_first
+from icalib.initialize.steps.contradicted import MotionContradictedError
+from icalib.initialize.steps.initializer import (
+    Initializer,
+    Values,
+    initializer_of,
+    kinds_of,
+    motion_kinds,
+    placed,
 )
-from icalib.initialize.steps.initializer import placed
-from icalib.initialize.steps.keyframe_spacing import keyframe_spacing
+from icalib.initialize.steps.keyframe_spacing import SmoothMotion
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import FEWEST, BodyPoses, SmoothPath
+from icalib.model.frames import FRAME, frame_of
 from icalib.motion.nodes import first_nodes
-from icalib.optim.state import Key, State, in_recording
-from icalib.rig import ImuNoise, ImuSensor, Rig
-from icalib.sensors.camera.initialize.recordings import initial_guesses
-from icalib.sensors.camera.initialize.tracks.on_motion import track_camera_values
+from icalib.optim.state import State, in_recording
+from icalib.rig import ImuNoise, ImuSensor, Rig, Sensor
 from icalib.sensors.parameter import Parameter, fixed
-from icalib.sensors.pose.initialize.conventions import TURNED, WAYS
-from icalib.sensors.pose.initialize.extrinsics import check_rate
-from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, start_from_pairs
-from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.sensor import mounted
-from icalib.sensors.wheels.initialize.drive import SidewaysError
 
-ASSUMPTION = "assumed motion"  # no sensor is called so
-STEP_S = 0.01  # between readings
-WHITE_STEP_S = 5e-3  # white noise is what the walks make of so long a step: keeps covariances regular
-LAG_S = 0.1  # over which the change of rate and acceleration tells their densities
+ASSUMPTION = "assumed motion"  # the name of the IMU; no sensor is called so
+STEP_S = 0.01  # between its readings
+WHITE_STEP_S = 5e-3  # its white noise is what the walks make of so long a step: keeps covariances regular
+LAG_S = 0.1  # over which changes of rate and acceleration tell their densities
 LEAST_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): of a body that stood still
+LEAST_SPACING_S = 0.02  # of keyframes: the same as with an IMU
 
 
-Start = tuple[Inputs, State, dict[Key, np.ndarray]]
+Start = tuple[Inputs, State, Values]
 
 
 def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> Start:
-    """As `start.start`; where all was taken at rest, nothing is assumed.
+    """As `start.start`. Where all was measured at rest, no motion is assumed.
 
-    Raises EstimationError where the body's poses do not show its motion, or are written another way than they should
-    be, or where wheels and pose sensors do not show how they stand.
+    Raises EstimationError where the poses of the body do not show its motion, or are in another convention, or where
+    other sensors are not aligned with it.
     """
     try:
         return _start(rig, recordings)
-    except SidewaysError as error:
-        if rig.moves_by_poses:
-            _refuse_other_ways(rig, recordings, error)
+    except MotionContradictedError as error:
+        for words, others in motion_kinds(rig)[0].rewritten(recordings):
+            try:
+                _start(rig, others)
+            except EstimationError:
+                continue
+            raise EstimationError(words) from error
         raise
 
 
-def _refuse_other_ways(rig: Rig, recordings: Sequence[Measurements], error: EstimationError) -> None:
-    """Raises EstimationError where the wheels fit poses of the body that are written another way."""
-    for words, way in (*WAYS, *TURNED):
-        others = [m.with_streams(way(m.poses[0])) for m in recordings]
-        try:
-            _start(rig, others)
-        except EstimationError:
-            continue
-        raise EstimationError(f"the poses of {rig.poses[0].name} {words}.") from error
-
-
 def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
-    """As `start_without_imu`, of poses as they are written."""
-    shown, cameras = _shown(rig, recordings)
-    if is_stop_and_go(rig, recordings, shown):
-        return start_from_pairs(rig, recordings, shown, cameras)
+    """As `start_without_imu`, with poses as they are written."""
+    shown = _Shown.by(motion_kinds(rig)[0], rig, recordings)
+    for kind in kinds_of(rig):
+        if (still := kind.start_at_rest(rig, recordings, shown.body, shown.values)) is not None:
+            return still
     for m in recordings:
-        for stream in m.poses:
-            check_rate(stream)
-    for own, m in zip(shown, recordings, strict=True):
+        for kind in kinds_of(rig):
+            kind.check_moving(m)
+    for own, m in zip(shown.body, recordings, strict=True):
         if len(own.seconds) < FEWEST:
             where = f"{m.name}: " if len(recordings) > 1 else ""
             raise EstimationError(
                 f"{where}{rig.reference} has a pose at only {len(own.seconds)} instants; record more."
             )
-    grids = [np.arange(0.0, own.seconds[-1], STEP_S) for own in shown]  # from the body's first stamp on
-    paths = [own.at(grid) for own, grid in zip(shown, grids, strict=True)]
+    paths = _smooth(shown.body)
     # Densities come out too large rather than too small: a wide window would take motion from them.
-    narrow = [own.at(grid, narrow=True) for own, grid in zip(shown, grids, strict=True)]
-    body = _with_assumption(rig, recordings, narrow)
+    body = _with_assumption(rig, recordings, _smooth(shown.body, narrow=True))
     inputs = replace(inputs_for(body, _readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
     felt = _felt(body, recordings, paths, inputs)
-    if body.cameras and body.moves_by_poses:
-        cameras = _cameras_on_poses(body, recordings, shown, paths)
-    elif not (rig.has_target or rig.moves_by_poses):
-        cameras = as_given(inputs, cameras)
-    moving, turned = _moving(inputs, shown, cameras)
+    found = shown.values if shown.reckoned is None else as_given(inputs, shown.reckoned, shown.values)
+    if _hosts(body) and not found:
+        found = _hosts_on_body(body, recordings, shown.body, paths)
+    moving, turned = _moving(inputs, shown.body, found)
     others = [s for s in body.mounted if (s.name, "rotation") not in moving.values]
     values = placed(felt, moving, others) | moving.values
     return inputs, replace(moving, bias=-turned, values=values), values
 
 
-def _cameras_on_poses(
+@dataclass(frozen=True)
+class _Shown:
+    """Poses of the body in each recording; values found on the way; reckoned: the sensor whose dead reckoning showed
+    them."""
+
+    body: list[BodyPoses]
+    values: Values
+    reckoned: str | None = None
+
+    @classmethod
+    def by(cls, source: Initializer[Any], rig: Rig, recordings: Sequence[Measurements]) -> _Shown:
+        """The poses of the body by the sensors of `source`, which may not be the body."""
+        paths, found = source.body_poses(rig, recordings)
+        if initializer_of(rig.sensors[rig.reference]) is source:
+            return cls(paths, found)
+        (name,) = source.sources(rig)
+        values = _cameras_on_path(rig, recordings, name, paths)
+        return cls(camera_paths(rig, recordings, name, paths, values), seen_from_first(rig, name, values), name)
+
+
+def _smooth(body: Sequence[BodyPoses], narrow: bool = False) -> list[SmoothPath]:
+    """The path of the body in each recording, every STEP_S from its first stamp on."""
+    return [own.at(np.arange(0.0, own.seconds[-1], STEP_S), narrow=narrow) for own in body]
+
+
+def _hosts(rig: Rig) -> list[Sensor]:
+    """The sensors at whose measurements keyframes lie, but for the body."""
+    return [s for s in rig.mounted if initializer_of(s).hosts_keyframes and s.name != rig.first_seeing]
+
+
+def _hosts_on_body(
     body: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], paths: Sequence[SmoothPath]
-) -> dict[Key, np.ndarray]:
-    """Cameras that follow points, placed on the motion that the first pose sensor of `body` shows."""
-    blind = body.with_(cameras=())
+) -> Values:
+    """The sensors that host keyframes, placed on the motion that the first pose sensor of `body` shows."""
+    hosts = _hosts(body)
+    blind = body.without(*(s.name for s in hosts))
     unseen = [m.only(*blind.sensors) for m in recordings]
     alone = _felt(blind, unseen, paths, inputs_for(blind, _readings(unseen, paths)))
     felt = _felt(body, recordings, paths, inputs_for(body, _readings(recordings, paths)))
-    return track_camera_values(felt, _moving(alone, shown, {})[0])
+    return placed(felt, _moving(alone, shown, {})[0], hosts)
 
 
-def _cameras_on_wheels(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], dict[Key, np.ndarray]]:
-    """As `_shown`, where cameras follow points and the first wheels show the motion, on a floor."""
-    wheels, streams = rig.wheels[0], [m.wheels[0] for m in recordings]
-    shown = [wheel_path(wheels, s) for s in streams]
-    blank, posed = in_place_of_wheels(rig, wheels), []
-    for m, stream, path in zip(recordings, streams, shown, strict=True):
-        posed.append(m.only(*blank.sensors).with_streams(pose_stream(stream, path)))
-    paths = [own.at(np.arange(0.0, own.seconds[-1], STEP_S)) for own in shown]
+def _cameras_on_path(rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses]) -> Values:
+    """Cameras with feature tracks, placed on the planar `paths` of `sensor`, on which nothing else is known."""
+    blank = in_place_of(rig, sensor)
+    streams = pose_streams(recordings, sensor, paths)
+    posed = [m.only(*(c.name for c in rig.cameras)).with_streams(s) for m, s in zip(recordings, streams, strict=True)]
+    smooth = _smooth(paths)
     try:
-        values = _cameras_on_poses(_with_assumption(blank, posed, paths), posed, shown, paths)
+        return _hosts_on_body(_with_assumption(blank, posed, smooth), posed, paths, smooth)
     except EstimationError as error:
         said = str(error).rstrip(".")
         raise EstimationError(
-            f"{said}. Without IMU, target and pose sensor, {wheels.name} determines the motion on a flat floor only."
+            f"{said}. Without IMU, target and pose sensor, {sensor} determines the motion on a flat floor only."
         ) from error
-    return camera_paths(rig, recordings, shown, values), seen_from_first(rig, values)
 
 
 def _felt(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothPath], like: Inputs) -> Inputs:
-    """Of the readings that an IMU in the body would have."""
+    """The inputs with the readings that an IMU in the body would have."""
     felt = inputs_for(rig, _readings(recordings, paths), like)
     assert felt.imu is not None
     return replace(felt, imu=replace(felt.imu, forwards=False))
 
 
-def _moving(inputs: Inputs, shown: Sequence[BodyPoses], cameras: dict[Key, np.ndarray]) -> tuple[State, np.ndarray]:
-    """The body's motion without biases, and its angular rate and acceleration (K, 6) at the nodes."""
-    values = start_values(inputs, cameras | _identity(inputs))
+def _moving(inputs: Inputs, shown: Sequence[BodyPoses], found: Values) -> tuple[State, np.ndarray]:
+    """The motion of the body without biases, and its angular rate and acceleration (K, 6) at keyframes; `found`: what
+    is known of sensors."""
+    values = start_values(inputs, found | _identity(inputs))
     nodes = nodes_for(inputs, host_times(inputs, values))
     starts = first_nodes(inputs.imu, nodes)
     parts = np.split(nodes, starts[1:])
@@ -163,22 +180,6 @@ def _moving(inputs: Inputs, shown: Sequence[BodyPoses], cameras: dict[Key, np.nd
     return State(nodes, R, p, v, still, values, starts), np.concatenate([rate, force], axis=1)
 
 
-def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], dict[Key, np.ndarray]]:
-    """The body's poses in each recording, and what was found of the cameras on the way."""
-    if rig.moves_by_poses:
-        return [BodyPoses(s.seconds, s.rotation, s.position) for s in (m.poses[0] for m in recordings)], {}
-    if not rig.has_target:
-        return _cameras_on_wheels(rig, recordings)
-    seeing = rig.with_(wheels=(), poses=())
-    alone = inputs_for(seeing, [m.only(*seeing.sensors) for m in recordings])
-    (guess,) = initial_guesses(alone.rig, alone.bodies, [m.measurements for m in alone.motions])
-    t, R, p = guess.body_poses(alone.measurements)
-    begins = [part.begin for part in alone.parts]
-    own = np.searchsorted(begins, t, side="right") - 1
-    found = [BodyPoses(t[own == k] - begin, R[own == k], p[own == k]) for k, begin in enumerate(begins)]
-    return found, guess.values()
-
-
 def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothPath]) -> Rig:
     """The rig with the assumption as its IMU, which is where the body is."""
     turning, jerking = (
@@ -188,10 +189,16 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
     noise = ImuNoise(WHITE_STEP_S * turning, turning, WHITE_STEP_S * jerking, jerking, ASSUMPTION)
     here = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
     imu = ImuSensor(ASSUMPTION, "", noise, Parameter("fixed"), assumed=True)
-    if rig.moves_by_poses:
-        spacing = keyframe_spacing(rig, recordings, paths, float(turning), float(jerking))
-        imu = replace(imu, pose_keyframes_s=spacing)
+    if not motion_kinds(rig)[0].hosts_keyframes:
+        motion = SmoothMotion(paths, float(turning), float(jerking))
+        imu = replace(imu, pose_keyframes_s=keyframe_spacing(rig, recordings, motion))
     return rig.with_sensors(imu, replace(rig.sensors[rig.reference], **here), gravity=0.0)
+
+
+def keyframe_spacing(rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
+    """Seconds, from LEAST_SPACING_S to the rig's `keyframe_spacing_s`: the largest that all kinds of sensors allow."""
+    longest = min(kind.longest_spacing(rig, recordings, motion) for kind in kinds_of(rig))
+    return float(np.clip(longest, LEAST_SPACING_S, max(rig.settings.keyframe_spacing_s, LEAST_SPACING_S)))
 
 
 def _changes(path: SmoothPath, what: str) -> np.ndarray:
@@ -227,14 +234,16 @@ def _bridged(path: SmoothPath, max_gap_s: float) -> np.ndarray:
     return path.near | (behind - before <= max_gap_s)
 
 
-def _identity(inputs: Inputs) -> dict[Key, np.ndarray]:
+def _identity(inputs: Inputs) -> Values:
     """The body is where the assumed IMU is, and its target or its frame is the world."""
-    rig, n = inputs.rig, len(inputs.parts)
-    sensor = (rig.poses if rig.moves_by_poses else rig.cameras)[0]
-    out = given(inputs, sensor)
-    if not rig.moves_by_poses:
-        return out | {(in_recording(BOARD, k), "tilt"): np.eye(3) for k in range(n) if rig.has_target}
-    for k in range(n):
+    sensor = inputs.rig.sensors[inputs.rig.first_seeing]
+    out, own = given(inputs, sensor), {block.key for block in inputs.layout.blocks}
+    for k in range(len(inputs.parts)):
         frame = frame_of(sensor.name, k)
-        out |= {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}
+        world = {
+            (in_recording(BOARD, k), "tilt"): np.eye(3),
+            (frame, FRAME[0]): np.eye(3),
+            (frame, FRAME[1]): np.zeros(3),
+        }
+        out |= {key: value for key, value in world.items() if key in own}
     return out

@@ -1,4 +1,7 @@
-"""Dead reckoning by wheels on a floor, in place of a pose sensor: what cameras without IMU and target are placed on."""
+"""Cameras with feature tracks placed on the path of a sensor by dead reckoning, which stands in for a pose sensor.
+
+The first camera is the body: its poses and the extrinsics of all others follow from those on the path.
+"""
 
 from __future__ import annotations
 
@@ -7,114 +10,70 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.data.measurements import Measurements, PoseStream, WheelPoses, WheelStream
-from icalib.errors import EstimationError
+from icalib.data.measurements import Measurements, PoseStream
 from icalib.estimate.problem.inputs import Inputs
-from icalib.geometry import so3
 from icalib.initialize.steps.contradicted import settled
+from icalib.initialize.steps.initializer import Values
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import BodyPoses
-from icalib.optim.state import Key
-from icalib.rig import Parameter, PoseSensor, Rig, Wheels
+from icalib.rig import Parameter, PoseSensor, Rig
 from icalib.sensors.sensor import MOUNTED_NAMES
-from icalib.sensors.wheels.wheel_angles import integrals_of
 
 
-def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:
-    """Poses of the wheels' frame at their stamps, in the plane that they start in, z up.
-
-    Raises EstimationError where the rig file does not say how large the wheels are.
-    """
-    if isinstance(stream, WheelPoses):
-        turn, along = stream.pose[:, 0], stream.pose[:, 1:]
-    else:
-        turn, along = _increments(wheels, stream)
-    yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
-    steps = np.stack([c * along[:, 0] - s * along[:, 1], s * along[:, 0] + c * along[:, 1]], axis=1)
-    position = np.zeros((len(yaw), 3))
-    position[1:, :2] = np.cumsum(steps, axis=0)
-    return BodyPoses(stream.seconds, so3.exp_many(yaw[:, None] * [0.0, 0.0, 1.0]), position)
-
-
-def _increments(wheels: Wheels, stream: WheelStream) -> tuple[np.ndarray, np.ndarray]:
-    """Yaw (n,) rad and way (n, 2) m in the frame at the beginning, from each reading to the next."""
-    turned = np.diff(integrals_of(stream), axis=0)
-    if stream.kind == "pair":
-        path = turned * _size(wheels, "radii")
-        ahead, yaw = path.mean(axis=1), (path[:, 1] - path[:, 0]) / _size(wheels, "baseline")[0]
-    elif stream.kind == "twist":
-        scales = np.ones(2) if wheels.scales.value is None else wheels.scales.value
-        ahead, yaw = (turned * scales).T
-    else:
-        offset = 0.0 if wheels.steering_offset.value is None else float(wheels.steering_offset.value[0])
-        ahead = turned[:, 0] * _size(wheels, "radius")[0]
-        steer = np.arctan2(turned[:, 2], turned[:, 1]) + offset
-        yaw = ahead * np.tan(steer) / _size(wheels, "wheelbase")[0]
-    half = 0.5 * yaw  # the chord of an arc
-    return yaw, (ahead * np.sinc(half / np.pi))[:, None] * np.stack([np.cos(half), np.sin(half)], axis=1)
-
-
-def _size(wheels: Wheels, name: str) -> np.ndarray:
-    value = getattr(wheels, name).value
-    if value is None:
-        raise EstimationError(
-            f"without IMU, target and pose sensor only {wheels.name} determines the scale; give its "
-            f"{' and '.join(spec.name for spec in wheels.drive_specs)} in the rig file, or add one of these sensors."
-        )
-    return np.asarray(value, dtype=np.float64)
-
-
-def in_place_of_wheels(rig: Rig, wheels: Wheels) -> Rig:
-    """The rig with a pose sensor in place of its wheels; nothing is known of where its cameras stand."""
+def in_place_of(rig: Rig, sensor: str) -> Rig:
+    """The cameras of `rig` and a pose sensor in place of `sensor`; the extrinsics of the cameras are unknown."""
     free = dict.fromkeys(MOUNTED_NAMES, Parameter())
     cameras = tuple(replace(c, clock_restarts=False, **free) for c in rig.cameras)
-    return rig.with_(cameras=cameras, wheels=(), poses=(PoseSensor(wheels.name, "", "absolute"),))
+    return rig.only().with_sensors(*cameras, PoseSensor(sensor, "", "absolute"))
 
 
-def pose_stream(stream: WheelStream | WheelPoses, path: BodyPoses) -> PoseStream:
-    return PoseStream(stream.name, stream.stamps_ns, path.rotation, path.position)
+def pose_streams(recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses]) -> list[PoseStream]:
+    """`paths` of `sensor`, one for each recording, as measurements of a pose sensor."""
+    stamps = [m.streams[sensor].stamps_ns for m in recordings]
+    return [PoseStream(sensor, t, p.rotation, p.position) for t, p in zip(stamps, paths, strict=True)]
 
 
 def camera_paths(
-    rig: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], values: dict[Key, np.ndarray]
+    rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses], values: Values
 ) -> list[BodyPoses]:
-    """The first camera's poses, on its own clock, where wheels were `shown`; `values`: where cameras stand on these."""
+    """Poses of the first camera, on its own clock, from `paths` of `sensor`; values: extrinsics of cameras on these."""
     first = rig.cameras[0].name
     R, p, offset = (values[first, name] for name in MOUNTED_NAMES)
-    between = [(m.tracks[0].origin_ns - m.wheels[0].origin_ns) * 1e-9 for m in recordings]
+    between = [(m.tracks[0].origin_ns - m.streams[sensor].origin_ns) * 1e-9 for m in recordings]
     return [
-        BodyPoses(w.seconds - offset[0] + between[0] - b, w.rotation @ R, w.position + w.rotation @ p)
-        for w, b in zip(shown, between, strict=True)
+        BodyPoses(path.seconds - offset[0] + between[0] - b, path.rotation @ R, path.position + path.rotation @ p)
+        for path, b in zip(paths, between, strict=True)
     ]
 
 
-def seen_from_first(rig: Rig, values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
-    """Where cameras and the first wheels stand seen from the first camera, from `values` on the wheels; and lenses."""
-    wheels, (first, *others) = rig.wheels[0], rig.cameras
+def seen_from_first(rig: Rig, sensor: str, values: Values) -> Values:
+    """Extrinsics of cameras and `sensor` relative to the first camera, from `values` relative to `sensor`; lenses; and
+    the other parameters of `sensor` as the rig file gives them."""
+    first, *others = rig.cameras
     R, p, offset = (values[first.name, name] for name in MOUNTED_NAMES)
     out = {key: value for key, value in values.items() if key[1] in ("intrinsics", "distortion")}
-    mounts = {wheels.name: (np.eye(3), np.zeros(3), np.zeros(1))}
+    mounts = {sensor: (np.eye(3), np.zeros(3), np.zeros(1))}
     mounts |= {c.name: tuple(values[c.name, name] for name in MOUNTED_NAMES) for c in others}
     for name, (Q, q, dt) in mounts.items():
         out |= {(name, "rotation"): R.T @ Q, (name, "translation"): R.T @ (q - p), (name, "time_offset"): dt - offset}
-    for spec in wheels.drive_specs:
-        value = getattr(wheels, spec.name).value
-        usual = np.full(spec.size, float(spec.is_positive))
-        out[wheels.name, spec.name] = usual if value is None else np.asarray(value)
+    for spec in rig.sensors[sensor].specs():
+        if spec.name not in MOUNTED_NAMES:
+            value = getattr(rig.sensors[sensor], spec.name).value
+            usual = np.full(spec.size, float(spec.is_positive))
+            out[sensor, spec.name] = usual if value is None else np.asarray(value)
     return out
 
 
-def as_given(inputs: Inputs, found: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
-    """`found`, but what the rig file gives of cameras and the first wheels where that does not contradict it. Nothing
-    shows how high wheels are on a floor: that is as given."""
-    wheels, (_, *others) = inputs.rig.wheels[0], inputs.rig.cameras
-    out, drive = dict(found), [spec.name for spec in wheels.drive_specs]
-    for sensor, names in (*((c, MOUNTED_NAMES) for c in others), (wheels, (*MOUNTED_NAMES, *drive))):
-        known, own = given(inputs, sensor, names), {k: v for k, v in found.items() if k[0] == sensor.name}
-        arm = wheels.name, "translation"
+def as_given(inputs: Inputs, sensor: str, found: Values) -> Values:
+    """`found`, but what the rig file gives of cameras and `sensor` unless that contradicts it. The height of `sensor`
+    is as given: on a floor nothing shows it."""
+    out, rig = dict(found), inputs.rig
+    for other in (*rig.cameras[1:], rig.sensors[sensor]):
+        names = MOUNTED_NAMES if other.name != sensor else [spec.name for spec in other.specs()]
+        known, own = given(inputs, other, names), {k: v for k, v in found.items() if k[0] == other.name}
+        arm = sensor, "translation"
         if arm in known and arm in own:
-            up = own[wheels.name, "rotation"][:, 2]
+            up = own[sensor, "rotation"][:, 2]
             own[arm] = own[arm] + up * (up @ (known[arm] - own[arm]))
-        out |= settled(sensor, known, own)
+        out |= settled(other, known, own)
     return out

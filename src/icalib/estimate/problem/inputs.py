@@ -72,6 +72,7 @@ class Inputs:
         return self.rig.sensors[name]
 
     def stream(self, name: str) -> Stream:
+        """The stream of the sensor `name`; of a camera that of corners."""
         return self.measurements.streams[name]
 
     def clocks_of(self, sensor: Sensor) -> int:

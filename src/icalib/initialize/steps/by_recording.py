@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.data.measurements import LidarStream
 from icalib.data.recordings.several import naming
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.motion.imu_data import imu_data
@@ -71,8 +70,8 @@ def other_clocks(offset: float, sensor: str, before: Inputs, now: Inputs) -> flo
 
 
 def from_the_best(inputs: Inputs, sensor: Sensor, best: int, state_of: Callable[[Inputs, Held | None], State]) -> State:
-    """All recordings' states, each by itself: of the `best` from nothing, and of the others as it has shown how the
-    `sensor` stands, and how its clock goes, if that runs on."""
+    """All recordings' states, each by itself: of the `best` from nothing, and of the others with the extrinsics of the
+    `sensor` that it has shown, and with the time offset unless the clock restarts."""
     recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
     restarts = getattr(sensor, "clock_restarts", False)
     with naming_recording(inputs, best):
@@ -105,21 +104,3 @@ def each_clock(
             with naming_recording(inputs, k):
                 found[k] = find(k)
     return np.array([other_clocks(found[k], sensor, alone(inputs, k), inputs) for k in range(len(inputs.parts))])
-
-
-def most_points(inputs: Inputs, lidar: int) -> int:
-    """The recording that has most points of a LiDAR, given by its number."""
-    return int(np.argmax([len(part.measurements.lidars[lidar].xyz) for part in inputs.parts]))
-
-
-def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
-    """All LiDARs' points of each recording, on the joined clock; scans of the others stay, without points."""
-    streams = inputs.measurements.lidars
-    if len(inputs.parts) == 1:
-        return [streams]
-    scans = [[len(part.measurements.lidars[i].stamps_ns) for part in inputs.parts] for i in range(len(streams))]
-    own = [np.repeat(np.arange(len(n)), n) for n in scans]
-    return [
-        tuple(s.some(np.repeat(o == r, np.diff(s.start))) for s, o in zip(streams, own, strict=True))
-        for r in range(len(inputs.parts))
-    ]

@@ -48,6 +48,10 @@ def chosen(spec: ParameterSpec, parameter: Parameter, given: np.ndarray | None, 
 _REFUSING = ContextVar("_REFUSING", default=False)
 
 
+class MotionContradictedError(EstimationError):
+    """A sensor contradicts the motion that another one showed."""
+
+
 class FarOffError(EstimationError):
     """A length or a lever arm that the rig file fixes is far from what the first guess finds."""
 
@@ -65,11 +69,11 @@ def refusing_far_off() -> Iterator[None]:
 def refuse_far_off(sensor: Sensor, found: dict[Key, np.ndarray]) -> None:
     """Raises FarOffError where a length or a lever arm that is fixed is farther from what was `found` than first
     guesses are off."""
-    for (owner, name), value in found.items() if _REFUSING.get() else ():
+    for (_, name), value in found.items() if _REFUSING.get() else ():
         stated, spec = getattr(sensor, name), sensor.spec(name)
         checked = spec.is_positive or spec == TRANSLATION
         if checked and stated.mode == "fixed" and is_contradicted(spec, stated.value, value):
-            raise FarOffError(f"{owner}: {name} in the rig file contradicts the data.")
+            raise FarOffError(f"{sensor.name}: {name} in the rig file contradicts the data.")
 
 
 def settled(sensor: Sensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:

@@ -6,7 +6,7 @@ are those of a sensor that gives no motion and needs no guess.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
@@ -17,6 +17,8 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets import NoTarget
+from icalib.initialize.steps.keyframe_spacing import SmoothMotion
+from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.optim.state import Key, State
 from icalib.rig import Rig, Sensor
 from icalib.sensors import SENSOR_KINDS, facet
@@ -26,7 +28,7 @@ Values = dict[Key, np.ndarray]
 Moving = tuple[Inputs, State]  # inputs, and a state that has the motion
 
 # Preference among the kinds that give the motion, the best first: see `Initializer.motion_rank`.
-BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS = range(5)
+BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = range(6)
 
 
 class Initializer(Generic[S]):
@@ -83,6 +85,38 @@ class Initializer(Generic[S]):
         """Upwards (3,) in the world, if the sensor's own frame tells it."""
         del state, sensor
         return None
+
+    # Without an IMU
+
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
+        """Poses in each recording of the sensor that is the body, if it is of this kind, or else of the first of its
+        `sources`; and what is found of its sensors. Raises EstimationError where these do not show them."""
+        raise NotImplementedError
+
+    def check_moving(self, recording: Measurements) -> None:
+        """Raises EstimationError where its sensors measure too seldom to show a motion."""
+        del recording
+
+    def start_at_rest(
+        self, rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], found: Values
+    ) -> tuple[Inputs, State, Values] | None:
+        """All of `start.start` if everything was measured at rest, so that no motion is to be assumed; else None. body,
+        found: see `body_poses`."""
+        del rig, recordings, body, found
+        return None
+
+    def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
+        """The largest spacing of keyframes [s] at which the assumed motion adds little to the noise of its sensors."""
+        del rig, recordings, motion
+        return np.inf
+
+    def rewritten(self, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
+        """The recordings with measurements of its `sources` in other conventions, and the words for each: tried where
+        others contradict the motion."""
+        del recordings
+        return iter(())
+
+    # Errors
 
     def explaining(self, inputs: Inputs) -> AbstractContextManager[None]:
         """Errors raised within name what the sensors do not show, if they gave the motion."""

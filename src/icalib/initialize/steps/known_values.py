@@ -18,11 +18,11 @@ def trusted(parameter: Parameter) -> np.ndarray | None:
     return None if parameter.mode == "free" else parameter.value
 
 
-def given(inputs: Inputs, sensor: Sensor, names: Sequence[str] = MOUNTED_NAMES) -> dict[Key, np.ndarray]:
-    """The values of the parameters `names` that the rig file gives; time offsets between first stamps, one for each
-    recording where the clock restarts."""
+def given(inputs: Inputs, sensor: Sensor, names: Sequence[str] | None = None) -> dict[Key, np.ndarray]:
+    """The values of the parameters `names`, or else of its extrinsics and time offset, that the rig file gives; time
+    offsets between first stamps, one for each recording where the clock restarts."""
     out: dict[Key, np.ndarray] = {}
-    for name in names:
+    for name in mounted_names(sensor) if names is None else names:
         value = getattr(sensor, name).value
         if value is not None:
             shift = origin_difference(inputs.measurements, inputs.stream(sensor.name)) if name == "time_offset" else 0.0
@@ -32,14 +32,19 @@ def given(inputs: Inputs, sensor: Sensor, names: Sequence[str] = MOUNTED_NAMES) 
     return out
 
 
+def mounted_names(sensor: Sensor) -> list[str]:
+    """The extrinsics and time offset that sensors of its kind have."""
+    return [spec.name for spec in sensor.specs() if spec.name in MOUNTED_NAMES]
+
+
 def trusted_names(sensor: Sensor) -> list[str]:
     """The extrinsics and time offset that are fixed or have a prior: other guesses may rest on them."""
-    return [name for name in MOUNTED_NAMES if trusted(getattr(sensor, name)) is not None]
+    return [name for name in mounted_names(sensor) if trusted(getattr(sensor, name)) is not None]
 
 
 def held_of(inputs: Inputs, sensor: Sensor, guesses: bool = False) -> Held:
     """What the rig file fixes of a sensor's extrinsics or gives as a prior; with `guesses` its guesses too."""
-    known = given(inputs, sensor, MOUNTED_NAMES if guesses else trusted_names(sensor))
+    known = given(inputs, sensor, mounted_names(sensor) if guesses else trusted_names(sensor))
     offset = known.get((sensor.name, "time_offset"))
     return Held(
         known.get((sensor.name, "rotation")),

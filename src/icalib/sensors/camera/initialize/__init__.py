@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
-from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.initialize.steps.clocks import OneAxisError
 from icalib.initialize.steps.initializer import BY_TARGET, BY_TRACKS, Initializer, Moving, Values
+from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.initialize.boards.on_motion import with_mounts_guessed
@@ -30,7 +33,9 @@ class CameraInitializer(Initializer[Camera]):
     def motion_rank(self, rig: Rig) -> int | None:
         if not rig.cameras:
             return None
-        return BY_TARGET if rig.has_target else BY_TRACKS
+        if rig.has_target:
+            return BY_TARGET
+        return None if rig.imu is None else BY_TRACKS
 
     def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
         return first_state(inputs, *_guesses(inputs, other))
@@ -42,6 +47,16 @@ class CameraInitializer(Initializer[Camera]):
         """Cameras with feature tracks."""
         del sensors
         return track_camera_values(inputs, state)
+
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
+        seeing = rig.only(*(c.name for c in rig.cameras))
+        alone = inputs_for(seeing, [m.only(*seeing.sensors) for m in recordings])
+        (guess,) = initial_guesses(seeing, alone.bodies, [m.measurements for m in alone.motions])
+        t, R, p = guess.body_poses(alone.measurements)
+        begins = [part.begin for part in alone.parts]
+        own = np.searchsorted(begins, t, side="right") - 1
+        found = [BodyPoses(t[own == k] - begin, R[own == k], p[own == k]) for k, begin in enumerate(begins)]
+        return found, guess.values()
 
     def explained(
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]

@@ -23,11 +23,9 @@ from icalib.initialize.steps.by_recording import (
     alone,
     each_clock,
     from_the_best,
-    most_points,
     motion_alone,
     naming_recording,
     other_clocks,
-    points_by_recording,
 )
 from icalib.initialize.steps.contradicted import settled
 from icalib.initialize.steps.known_values import given, held_of, trusted_names
@@ -260,3 +258,21 @@ def _add_in_world(moments: Moments, motion: Motion, stream: LidarStream, sums: n
     A[:, 0, 0], A[:, 1:, 0], A[:, 1:, 1:] = 1.0, at.position[bin_of], at.rotation[bin_of]
     X = A @ L
     np.add.at(sums, moments.plane, X @ X.transpose(0, 2, 1))
+
+
+def most_points(inputs: Inputs, lidar: int) -> int:
+    """The recording that has most points of a LiDAR, given by its number."""
+    return int(np.argmax([len(part.measurements.lidars[lidar].xyz) for part in inputs.parts]))
+
+
+def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
+    """All LiDARs' points of each recording, on the joined clock; scans of the others stay, without points."""
+    streams = inputs.measurements.lidars
+    if len(inputs.parts) == 1:
+        return [streams]
+    scans = [[len(part.measurements.lidars[i].stamps_ns) for part in inputs.parts] for i in range(len(streams))]
+    own = [np.repeat(np.arange(len(n)), n) for n in scans]
+    return [
+        tuple(s.some(np.repeat(o == r, np.diff(s.start))) for s, o in zip(streams, own, strict=True))
+        for r in range(len(inputs.parts))
+    ]

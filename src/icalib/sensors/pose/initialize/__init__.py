@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +12,15 @@ from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.initializer import BY_POSES, Initializer, Moving, Values
+from icalib.initialize.steps.keyframe_spacing import SmoothMotion
+from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.model.frames import FRAME, frame_of
 from icalib.optim.state import State
 from icalib.rig import PoseSensor, Rig
-from icalib.sensors.pose.initialize.extrinsics import pose_values, state_from_poses
-from icalib.sensors.pose.residual import FRAME, frame_of
+from icalib.sensors.pose.initialize.conventions import TURNED, WAYS
+from icalib.sensors.pose.initialize.extrinsics import check_rate, pose_values, state_from_poses
+from icalib.sensors.pose.initialize.noise import pose_noise
+from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, start_from_pairs
 
 
 class PoseInitializer(Initializer[PoseSensor]):
@@ -44,6 +49,32 @@ class PoseInitializer(Initializer[PoseSensor]):
     def vertical(self, state: State, sensor: PoseSensor) -> np.ndarray | None:
         frame = state.values.get((frame_of(sensor.name, 0), FRAME[0]))
         return frame[:, 2] if sensor.level and sensor.kind == "absolute" and frame is not None else None
+
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
+        streams = [m.poses[0] for m in recordings]
+        return [BodyPoses(s.seconds, s.rotation, s.position) for s in streams], {}
+
+    def check_moving(self, recording: Measurements) -> None:
+        for stream in recording.poses:
+            check_rate(stream)
+
+    def start_at_rest(
+        self, rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], found: Values
+    ) -> tuple[Inputs, State, Values] | None:
+        """Hand-eye calibration of pairs of poses."""
+        if not is_stop_and_go(rig, recordings, body):
+            return None
+        return start_from_pairs(rig, recordings, body, found)
+
+    def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
+        return motion.spacing_for_poses(*pose_noise([m.poses[0] for m in recordings]))
+
+    def rewritten(self, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
+        for words, way in (*WAYS, *TURNED):
+            yield (
+                f"the poses of {recordings[0].poses[0].name} {words}.",
+                [m.with_streams(way(m.poses[0])) for m in recordings],
+            )
 
     def explained(
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]

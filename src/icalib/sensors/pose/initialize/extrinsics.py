@@ -36,13 +36,13 @@ from icalib.initialize.steps.contradicted import has_guesses, settled
 from icalib.initialize.steps.gyro import GyroRotation
 from icalib.initialize.steps.known_values import given, held_of
 from icalib.initialize.steps.lever_arm import SIZE_TOLERANCE, size_of
+from icalib.model.frames import FRAME, frame_of
 from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import Key, State
 from icalib.rig import PoseSensor
 from icalib.sensors.pose.initialize.conventions import placed
 from icalib.sensors.pose.initialize.position_frame import turn_of_positions
-from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 LEAST_RATE_HZ = 2.0  # of poses of something that moves

@@ -21,13 +21,13 @@ from icalib.geometry.targets.base import BOARD
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.model.frames import FRAME, frame_of
 from icalib.motion.pose_rows import Mount
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.parameter import fixed
 from icalib.sensors.pose.initialize.conventions import placed
 from icalib.sensors.pose.initialize.pairs import partners
-from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 FEWEST_PAIRS = 3  # of one recording
@@ -41,7 +41,8 @@ HOW = (
 def is_stop_and_go(rig: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses]) -> bool:
     """Whether the body, or one of the pose sensors, moved only while it was not seen, and only pose sensors are beside
     the body."""
-    if rig.wheels or rig.lidars or (rig.cameras and rig.moves_by_poses):
+    others = {s.sensor_type for s in rig.mounted} - {"camera", "pose"}
+    if others or (rig.cameras and rig.moves_by_poses):
         return False
     each = [list(shown), *(list(own) for own in zip(*(m.poses for m in recordings), strict=True))]
     return any(all(stands_still_between(s.seconds, s.rotation, s.position) for s in own) for own in each)

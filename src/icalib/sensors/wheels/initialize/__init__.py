@@ -4,20 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from icalib.data.measurements import Measurements
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.steps.initializer import Initializer, Values
+from icalib.initialize.steps.initializer import BY_DEAD_RECKONING, Initializer, Values
+from icalib.initialize.steps.keyframe_spacing import SmoothMotion
+from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.optim.state import State
-from icalib.rig import Wheels
+from icalib.rig import Rig, Wheels
+from icalib.sensors.wheels.initialize.dead_reckoning import wheel_path
 from icalib.sensors.wheels.initialize.extrinsics import wheel_values
+from icalib.sensors.wheels.initialize.noise import wheel_noise
 
 
 class WheelInitializer(Initializer[Wheels]):
-    """Wheels are placed on the motion of others."""
+    """Wheels are placed on the motion of others. Without any and without an IMU, they give it on a flat floor."""
 
     asks_for_vertical = True
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Wheels]) -> Values:
         return wheel_values(inputs, state, sensors)
+
+    def motion_rank(self, rig: Rig) -> int | None:
+        return BY_DEAD_RECKONING if rig.imu is None else None
+
+    def sources(self, rig: Rig) -> tuple[str, ...]:
+        return (rig.wheels[0].name,)
+
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
+        return [wheel_path(rig.wheels[0], m.wheels[0]) for m in recordings], {}
+
+    def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
+        noise = [
+            wheel_noise(wheels, [m.wheels[k] for m in recordings], motion.paths) for k, wheels in enumerate(rig.wheels)
+        ]
+        return min(motion.spacing_for_increments(turn, way) for way, turn in noise)
 
 
 INITIALIZER = WheelInitializer()

@@ -17,6 +17,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.initialize.steps.clock_shifts import LONGEST_STEP_S, how_alike, longest_step
+from icalib.initialize.steps.contradicted import MotionContradictedError
 from icalib.initialize.steps.correlation import best_shift
 from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.stamp_intervals import LONGEST_S
@@ -282,15 +283,12 @@ def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
         )
 
 
-class SidewaysError(EstimationError):
-    """The vehicle moves as none on wheels does."""
-
-
 def _check_sideways(name: str, slip: np.ndarray, velocity: np.ndarray) -> None:
-    """Raises SidewaysError where no point of the vehicle moves along one axis: slip (n,) m/s across the best one."""
+    """Raises MotionContradictedError where no point of the vehicle moves along one axis: slip (n,) m/s across the best
+    one."""
     share = float(np.sqrt(np.mean(slip**2) / np.mean((velocity**2).sum(axis=1))))
     if share > SIDEWAYS:
-        raise SidewaysError(
+        raise MotionContradictedError(
             f"{name}: the vehicle drives along none of its axes, its lateral slip would be {100 * share:.0f} % "
             "of its speed; check that the sensor that shows its motion is on this vehicle, and how its poses "
             "are written."

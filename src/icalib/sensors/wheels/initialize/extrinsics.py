@@ -12,7 +12,13 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.by_recording import alone, each_clock
-from icalib.initialize.steps.contradicted import has_guesses, is_contradicted, refuse_far_off, settled
+from icalib.initialize.steps.contradicted import (
+    MotionContradictedError,
+    has_guesses,
+    is_contradicted,
+    refuse_far_off,
+    settled,
+)
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.vertical import verticals
 from icalib.motion.clocks import instants
@@ -23,7 +29,6 @@ from icalib.rig import Wheels
 from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION, mounted
 from icalib.sensors.wheels.initialize.drive import (
     OPPOSITE,
-    SidewaysError,
     WheelRates,
     drive_guess,
     wheel_offset,
@@ -110,7 +115,7 @@ def _found(
             f"false for {up.level} instead."
         )
     # Of a motion that is no vehicle's one way up shows the slip, the other but that it turns the wrong way.
-    raise next((error for error in (*failed, other) if isinstance(error, SidewaysError)), failed[0])
+    raise next((error for error in (*failed, other) if isinstance(error, MotionContradictedError)), failed[0])
 
 
 def _try(

@@ -1,0 +1,33 @@
+"""The noise of wheels as densities of path and yaw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from icalib.data.measurements import WheelStream
+from icalib.initialize.steps.smooth_path import SmoothPath
+from icalib.rig import Wheels
+
+
+def wheel_noise(wheels: Wheels, streams: Sequence[object], paths: Sequence[SmoothPath]) -> tuple[float, float]:
+    """Densities of path [m/sqrt(s)] and yaw [rad/sqrt(s)]; zeros if they are unknown. Radius and baseline of a pair are
+    the ratios of RMS speeds and RMS rates of `paths` to those of the wheels, which no time offset changes."""
+    if wheels.kind == "twist":
+        return wheels.speed_noise, wheels.yaw_noise
+    rates = [s.rate for s in streams if isinstance(s, WheelStream) and s.kind == "pair"]
+    if not rates:
+        return 0.0, 0.0
+    rate = np.concatenate(rates)
+    speed, turn = (np.concatenate([getattr(p, name)[p.near] for p in paths]) for name in ("velocity", "rate"))
+    rolled, apart = _rms(rate.mean(axis=1)), _rms(rate[:, 1] - rate[:, 0])
+    if not (rolled > 0.0 and apart > 0.0):
+        return 0.0, 0.0
+    radius, per_baseline = _rms(speed) / rolled, _rms(turn) / apart
+    return wheels.wheel_noise * radius / np.sqrt(2.0), wheels.wheel_noise * np.sqrt(2.0) * per_baseline
+
+
+def _rms(x: np.ndarray) -> float:
+    """Of numbers (n,), or of the lengths of vectors (n, 3)."""
+    return float(np.sqrt((x.reshape(len(x), -1) ** 2).sum(axis=1).mean()))
