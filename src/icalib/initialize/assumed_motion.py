@@ -127,7 +127,7 @@ def _smooth(body: Sequence[BodyPoses], narrow: bool = False) -> list[SmoothPath]
 
 def _hosts(rig: Rig) -> list[Sensor]:
     """The sensors at whose measurements keyframes lie, but for the body."""
-    return [s for s in rig.mounted if initializer_of(s).hosts_keyframes and s.name != rig.first_seeing]
+    return [s for s in rig.mounted if initializer_of(s).hosts_keyframes and s.name != rig.reference_without_imu]
 
 
 def _hosts_on_body(
@@ -236,7 +236,7 @@ def _bridged(path: SmoothPath, max_gap_s: float) -> np.ndarray:
 
 def _identity(inputs: Inputs) -> Values:
     """The body is where the assumed IMU is, and its target or its frame is the world."""
-    sensor = inputs.rig.sensors[inputs.rig.first_seeing]
+    sensor = inputs.rig.sensors[inputs.rig.reference_without_imu]
     out, own = given(inputs, sensor), {block.key for block in inputs.layout.blocks}
     for k in range(len(inputs.parts)):
         frame = frame_of(sensor.name, k)

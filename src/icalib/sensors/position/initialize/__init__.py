@@ -38,7 +38,8 @@ class PositionInitializer(Initializer[PositionSensor]):
     """The first position sensor gives the motion where no other kind does; all others are placed on it."""
 
     def motion_rank(self, rig: Rig) -> int | None:
-        return BY_POSITIONS if rig.of(PositionSensor) else None
+        """Without an IMU positions do not show the attitude."""
+        return BY_POSITIONS if rig.imu is not None and rig.of(PositionSensor) else None
 
     def sources(self, rig: Rig) -> tuple[str, ...]:
         return (rig.of(PositionSensor)[0].name,)
