@@ -21,11 +21,7 @@ FREE = ("sensors/", "export/")  # exporters write the files of programs for cert
 NAMING = {
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
-    "estimate/problem/assembly.py",
-    "initialize/assumed_motion.py",
     "initialize/dead_reckoning.py",
-    "initialize/steps/by_recording.py",
-    "initialize/steps/keyframe_spacing.py",
     "motion/clouds.py",
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
