@@ -106,6 +106,12 @@ def odometry_logs() -> Path:
 
 
 @pytest.fixture(scope="session")
+def gnss_imu() -> Path:
+    """Two recordings of a GNSS antenna beside an IMU, in the hand and on a car."""
+    return _recording("gnss_imu")
+
+
+@pytest.fixture(scope="session")
 def wheel_mocap() -> Path:
     """A differential drive: encoder ticks and planar poses by motion capture."""
     return _recording("wheel_mocap")

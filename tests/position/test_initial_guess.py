@@ -7,13 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 from tests.typed import not_none
 
+from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
 from icalib.initialize.steps.by_recording import Held
 from icalib.motion.imu_data import ImuData
 from icalib.motion.sweep import Motion
 from icalib.optim.state import State
+from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.position.initialize.attitude import Fix
 from icalib.sensors.position.initialize.placed import place
 from icalib.sensors.position.initialize.with_imu import motion_from_fixes
@@ -96,6 +99,28 @@ def other_path(n):
     rng = np.random.default_rng(4)
     knots = rng.normal(size=(n // 8 + 4, 3)) * [4.0, 4.0, 0.4]
     return CubicSpline(8.0 * np.arange(len(knots)), knots)(np.arange(n))
+
+
+def test_placed_on_a_rig_that_turns_in_place():
+    """A camera before a target: the antenna moves by its lever arm more than the rig does."""
+    seconds = np.arange(0.0, 30.0, 0.005)
+    angle = np.stack([0.5 * np.sin(1.1 * seconds), 0.4 * np.sin(1.7 * seconds), 0.9 * np.sin(0.6 * seconds)], axis=1)
+    R = Rotation.from_rotvec(angle).as_matrix()
+    turn = R[:-1].transpose(0, 2, 1) @ R[1:]
+    rate = Rotation.from_matrix(turn).as_rotvec() / 0.005
+    gyro = np.vstack([rate[:1], 0.5 * (rate[1:] + rate[:-1]), rate[-1:]])
+    accel = np.ascontiguousarray(R.transpose(0, 2, 1) @ [0.0, 0.0, GRAVITY])
+    stream = ImuStream("imu0", np.round(1e9 * seconds).astype(np.int64), gyro, accel)
+    imu = ImuData.build(stream, class_noise("consumer"))
+    nodes, still = seconds[100:-100:20], np.zeros((len(seconds[100:-100:20]), 3))
+    values = {("imu0", "intrinsics"): np.zeros(24)}
+    state = State(nodes, R[100:-100:20], still, still, np.zeros((len(nodes), 6)), values)
+    k = np.arange(200, 5800, 40)
+    position = (R[k] @ ARM - ORIGIN) @ yaw(FRAME_YAW) + 0.005 * np.random.default_rng(1).normal(size=(len(k), 3))
+    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), True, Held())
+    assert found.offset == pytest.approx(seconds[k[0]], abs=5e-3)
+    np.testing.assert_allclose(found.arm, ARM, atol=0.01)
+    np.testing.assert_allclose(found.R_wf, yaw(FRAME_YAW), atol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from icalib.motion.clocks import instants
 from icalib.optim.state import Entry, Key
 from icalib.rig import Rig, Settings
 from icalib.rig.scene import FRAME, LEVEL_FRAME
+from icalib.sensors.position.read.outliers import single_wrong
 from icalib.sensors.position.residual import PositionFactor, PositionNoise
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
@@ -72,7 +73,10 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
 
 def weighted(sensor: PositionSensor, stream: PositionStream) -> PositionStream:
     """The stream with covariances as the noise is counted in: those of the recording, unless the rig file states the
-    noise. Without either FIRST_NOISE_M of each axis."""
+    noise. Without either FIRST_NOISE_M of each axis. Single wrong fixes, which streams in memory may have, are left
+    out: by them the estimated noise would be too large."""
+    if (wrong := single_wrong(stream.seconds, stream.position)).any():
+        stream = stream.some(~wrong)
     n = len(stream.stamps_ns)
     if isinstance(sensor.position_noise, float):
         return replace(stream, covariance=np.zeros((0, 3, 3)))

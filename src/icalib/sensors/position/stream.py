@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -28,6 +28,13 @@ class PositionStream(Stream):
         check(self.position.shape == (n, 3), f"{self.name}: position must have shape ({n}, 3).")
         stated = self.covariance.shape in ((n, 3, 3), (0, 3, 3))
         check(stated, f"{self.name}: covariance must have shape ({n}, 3, 3), or (0, 3, 3) without any.")
+
+    def some(self, kept: np.ndarray) -> PositionStream:
+        """The fixes in `kept` (N,) bool, on the same clock: seconds still count from the first of all."""
+        kept = kept.copy()
+        kept[0] = True
+        covariance = self.covariance[kept] if len(self.covariance) else self.covariance
+        return replace(self, stamps_ns=self.stamps_ns[kept], position=self.position[kept], covariance=covariance)
 
     @property
     def root(self) -> np.ndarray:

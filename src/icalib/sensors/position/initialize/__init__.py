@@ -28,6 +28,7 @@ from icalib.rig.scene import FRAME_ROTATION, FRAME_TRANSLATION, FRAME_YAW
 from icalib.sensors.position.initialize.attitude import Fix
 from icalib.sensors.position.initialize.placed import PlacedSensor, place
 from icalib.sensors.position.initialize.with_imu import motion_from_fixes
+from icalib.sensors.position.read.outliers import single_wrong
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
 
@@ -112,9 +113,11 @@ def _held(inputs: Inputs, sensor: PositionSensor) -> Held:
 
 
 def _fix(inputs: Inputs, sensor: PositionSensor) -> Fix:
+    """Without single wrong ones, which measurements in memory may have."""
     stream = inputs.stream(sensor.name)
     assert isinstance(stream, PositionStream)
-    return Fix(stream.seconds, stream.position)
+    good = ~single_wrong(stream.seconds, stream.position)
+    return Fix(stream.seconds[good], stream.position[good])
 
 
 def _is_levelled(inputs: Inputs, sensor: PositionSensor) -> bool:

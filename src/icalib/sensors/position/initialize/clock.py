@@ -19,16 +19,24 @@ SHORTEST_OVERLAP_S = 10.0
 MOST_PEAKS = 6
 PEAKS_APART_S = 0.3
 LEAST_CORRELATION = 0.3
+LEAST_CHANGE = 1e-4  # m/s^2 or m/s
+MOST_FELT, LEVERED = 1.5, 5.0  # times, and at least m/s^2: a long lever arm adds its own where the rig turns
 
 
 def likely_offsets(imu: ImuData, fix: Fix) -> list[Shift]:
     """Offsets in steps of 1 / GRID_HZ s from the sensor's clock to the IMU's, most likely first."""
     seen, is_seen = _of_fixes(fix)
     felt, is_felt = _of_imu(imu)
-    if not (is_seen.any() and is_felt.any()):
+    is_seen &= seen <= max(MOST_FELT * felt.max(initial=0.0), LEVERED)  # more than the IMU ever felt is no motion
+    if not (varies(seen, is_seen) and varies(felt, is_felt)):
         return []
     least, apart = SHORTEST_OVERLAP_S * GRID_HZ, round(PEAKS_APART_S * GRID_HZ)
     return best_shifts(felt, is_felt, seen, is_seen, least, MOST_PEAKS, apart)
+
+
+def varies(signal: np.ndarray, known: np.ndarray) -> bool:
+    """Whether a signal (n,), where it is `known` (n,), changes by more than rounding, so that it can be correlated."""
+    return bool(known.any()) and float(np.ptp(signal[known])) > LEAST_CHANGE
 
 
 def _of_fixes(fix: Fix) -> tuple[np.ndarray, np.ndarray]:

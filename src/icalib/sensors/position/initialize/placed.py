@@ -1,8 +1,8 @@
-"""A position sensor on a known motion of the IMU: time offset by speeds, then frame and lever arm linearly."""
+"""A position sensor on a known motion of the IMU: time offset by correlation, then frame and lever arm linearly."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +12,10 @@ from icalib.geometry import so3
 from icalib.initialize.steps.by_recording import Held
 from icalib.initialize.steps.correlation import best_shifts
 from icalib.motion.known_motion import imu_poses, is_known
+from icalib.motion.poses import Poses
 from icalib.motion.sweep import Motion
 from icalib.sensors.position.initialize.attitude import Fix
+from icalib.sensors.position.initialize.clock import likely_offsets, varies
 
 GRID_HZ = 20.0
 STEP_S = 1.0  # over which speeds are means: fixes of 2 cm make 3 cm/s
@@ -21,6 +23,7 @@ SHORTEST_OVERLAP_S = 5.0
 MOST_PEAKS = 4
 PEAKS_APART_S = 0.3
 FEWEST = 8  # fixes
+SCAN_STEP_S, SCANNED_FIXES = 0.2, 100  # of a grid of offsets: rigs move little in its step
 ROUNDS = 10
 CONVERGED = 1e-6
 OUTLIER = 4.0  # median sizes of residuals
@@ -45,6 +48,9 @@ def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: Held) -> P
     """From the fixes of one recording, whose nodes `motion` has. levelled: the frame turns against the world about z
     alone. Raises EstimationError where they do not show it."""
     found = [x for offset in _offsets(motion, fix, known) if (x := _placed(motion, fix, offset, levelled, known))]
+    if min((x.left for x in found), default=np.inf) > LARGEST_LEFT and known.offset is None:
+        scanned = _scanned(motion, fix, levelled, known)
+        found += [x for offset in scanned if (x := _placed(motion, fix, offset, levelled, known))]
     if not found:
         raise EstimationError(
             f"{name}: too few of its fixes fall within the motion that the other sensors show; check that the clocks "
@@ -60,16 +66,35 @@ def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: Held) -> P
 
 
 def _offsets(motion: Motion, fix: Fix, known: Held) -> list[float]:
-    """Likely ones, by the correlation of mean speeds."""
+    """Likely ones, by the correlation of mean speeds, and of third differences with the IMU's readings: where the rig
+    turns and hardly moves, a long lever arm makes speeds unlike."""
     if known.offset is not None:
         return [known.offset]
+    felt = [shift.samples / GRID_HZ for shift in likely_offsets(motion.imu, fix)]
     state = motion.state
     moved = _speeds(state.seconds, state.position)
     seen = _speeds(fix.t, fix.position)
-    if not (moved[1].any() and seen[1].any()):
-        return []
+    if not (varies(*moved) and varies(*seen)):
+        return felt
     peaks = best_shifts(*moved, *seen, SHORTEST_OVERLAP_S * GRID_HZ, MOST_PEAKS, round(PEAKS_APART_S * GRID_HZ))
-    return [peak.samples / GRID_HZ for peak in peaks]
+    return [*(peak.samples / GRID_HZ for peak in peaks), *felt]
+
+
+def _scanned(motion: Motion, fix: Fix, levelled: bool, known: Held) -> list[float]:
+    """The offsets of a grid at which frame and lever arm fit best, however the rig moves: where it turns in place,
+    neither its speed nor its acceleration is like those of the antenna. Half of the fixes must be used."""
+    some = np.linspace(0, len(fix.t) - 1, min(len(fix.t), SCANNED_FIXES)).astype(int)
+    t, p, nodes = fix.t[some], fix.position[some], motion.state.seconds
+    tried: list[tuple[float, float]] = []
+    for offset in np.arange(nodes[0] - t[-1], nodes[-1] - t[0], SCAN_STEP_S).tolist():
+        ok = is_known(nodes, t + offset)
+        if ok.sum() < max(FEWEST, 0.5 * len(t)):
+            continue
+        at = imu_poses(motion, t[ok] + offset)
+        x = _linear(at, p[ok], levelled, known.position, offset)
+        r = at.position + at.rotation @ x.arm - p[ok] @ x.R_wf.T - x.p_wf
+        tried.append((float(np.median(np.linalg.norm(r, axis=1))), offset))
+    return [offset for _, offset in sorted(tried)[:MOST_PEAKS]]
 
 
 def _speeds(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -101,14 +126,14 @@ class _Unknowns:
 
 
 def _placed(motion: Motion, fix: Fix, offset: float, levelled: bool, known: Held) -> PlacedSensor | None:
-    """By Gauss-Newton from Procrustes' turn of the positions, at an offset that is refined."""
+    """By Gauss-Newton from a linear solution, at an offset that is refined."""
     t = fix.t + offset
     ok = is_known(motion.state.seconds, t - OFFSET_SIGMA) & is_known(motion.state.seconds, t + OFFSET_SIGMA)
     if ok.sum() < FEWEST:
         return None
     t, p = fix.t[ok], fix.position[ok]
-    arm = np.zeros(3) if known.position is None else known.position
-    x = start = _procrustes(imu_poses(motion, t + offset).position, p, levelled, arm, offset)
+    x = _linear(imu_poses(motion, t + offset), p, levelled, known.position, offset)
+    start = x if known.position is not None else replace(x, arm=np.zeros(3))
     arm_sigma = ARM_SIGMA if known.position is None else 1e-3
     sigma = np.r_[np.full(3, arm_sigma), np.full(1 if levelled else 3, 10.0), np.full(3, 1e4)]
     sigma = np.append(sigma, OFFSET_SIGMA if known.offset is None else 1e-4)
@@ -132,16 +157,32 @@ def _placed(motion: Motion, fix: Fix, offset: float, levelled: bool, known: Held
     return PlacedSensor(x.arm, x.R_wf, x.p_wf, x.offset, left)
 
 
-def _procrustes(at: np.ndarray, p: np.ndarray, levelled: bool, arm: np.ndarray, offset: float) -> _Unknowns:
-    """The frame that brings the fixes p (n, 3) to the IMU's positions `at` (n, 3)."""
-    a, b = at - at.mean(axis=0), p - p.mean(axis=0)
-    C = a.T @ b
-    if levelled:
-        R = so3.exp(np.array([0.0, 0.0, np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1])]))
+def _linear(at: Poses, p: np.ndarray, levelled: bool, arm: np.ndarray | None, offset: float) -> _Unknowns:
+    """Frame and lever arm, linear in p_imu + R_imu p_imu_sensor = M p + origin with the fixes p (n, 3); M is then made
+    a rotation. arm: where it is known."""
+    n = len(p)
+    A, b = np.zeros((n, 3, 15)), -at.position.copy()
+    A[:, :, 12:] = -np.eye(3)
+    if arm is None:
+        A[:, :, :3] = at.rotation
     else:
-        U, _, Vt = np.linalg.svd(C)
+        b -= at.rotation @ arm
+    if levelled:  # M = (c, -s, 0; s, c, 0; 0, 0, 1)
+        A[:, 0, 3], A[:, 0, 4], A[:, 1, 3], A[:, 1, 4] = -p[:, 0], p[:, 1], -p[:, 1], -p[:, 0]
+        b[:, 2] += p[:, 2]
+    else:
+        for k in range(3):
+            A[:, k, 3 + 3 * k : 6 + 3 * k] = -p
+    weak = np.zeros((3, 15))
+    weak[:, :3] = LEAST_ROW_SIGMA / ARM_SIGMA * np.eye(3)
+    x = np.linalg.lstsq(np.vstack([A.reshape(-1, 15), weak]), np.append(b.ravel(), np.zeros(3)), rcond=None)[0]
+    if levelled:
+        R = so3.exp(np.array([0.0, 0.0, np.arctan2(x[4], x[3])]))
+    else:
+        U, _, Vt = np.linalg.svd(x[3:12].reshape(3, 3))
         R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return _Unknowns(arm, R, np.median(at - p @ R.T, axis=0), offset)
+    found = x[:3] if arm is None else arm
+    return _Unknowns(found, R, np.median(at.position + at.rotation @ found - p @ R.T, axis=0), offset)
 
 
 def _rows(motion: Motion, t: np.ndarray, p: np.ndarray, x: _Unknowns, levelled: bool) -> tuple[np.ndarray, np.ndarray]:
