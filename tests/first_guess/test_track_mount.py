@@ -83,7 +83,7 @@ def test_a_rough_lens_is_found_with_the_camera(example):
     guessed = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 3)
     nothing = Parameter("free")
     cameras = tuple(replace(c, rotation=nothing, translation=nothing, time_offset=nothing) for c in guessed.cameras)
-    values = placed(simulation, state, replace(guessed, cameras=cameras))
+    values = placed(simulation, state, guessed.with_sensors(*cameras))
     for camera in cameras:
         turn, arm, offset = errors(simulation, values, camera.name)
         assert np.abs(turn).max() < 2.5
