@@ -117,7 +117,8 @@ def rig_and_measurements(
     rig = with_drawn_guess(rig, scenario, SEED, only=only)
     if not sees:
         rig = rig.with_(cameras=(), target=NoTarget())
-    unused = [s.name for s in rig.sensors.values() if s.sensor_type in {"lidar", "wheels", "pose"} - set(others.split("+"))]
+    unwanted = {"lidar", "wheels", "pose"} - set(others.split("+"))
+    unused = [s.name for s in rig.sensors.values() if s.sensor_type in unwanted]
     rig = rig.without(*unused)
     if not imu:
         rig = in_body(rig.with_(imu=None), simulation)
