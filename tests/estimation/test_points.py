@@ -48,7 +48,7 @@ def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
     star."""
     views = factor._views(setup.state, 0, factor.n_nodes)
     track = next(t for t in range(factor.tracks.count) if factor.tracks.camera[t] == 0)
-    star = views[0].motion.R_cam_world[factor.tracks.image[track]].T @ [0.05, 0.02, 1.0]
+    star = views[0].poses.rotation[factor.tracks.image[track]] @ [0.05, 0.02, 1.0]
     streams = list(factor.streams)
     for view in views:
         stream, own = streams[view.index], np.flatnonzero(factor.tracks.track[view.index] == track)

@@ -25,7 +25,7 @@ CLIP = 4.0  # standard deviations
 # behind TAI by 19 s. Source: IERS Bulletin C.
 SCALES = {18.0: "GPS time and UTC", 19.0: "TAI and GPS time", 37.0: "TAI and UTC"}
 SAME_SCALE_S = 0.5  # about one of them: receivers and drivers are not later than that
-LABELS = ("east", "north", "up")
+LABELS = ("east", "north", "up")  # of a levelled frame of GNSS; in others x, y and z
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:

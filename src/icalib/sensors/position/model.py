@@ -20,7 +20,8 @@ from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
 
 FIRST_NOISE_M = 0.05  # of each axis where nothing is stated: between differential and carrier-phase fixes
-LEAST_NOISE = 1e-6  # m, or times the stated covariance: keeps the weights of fixes without any noise finite
+# m, or times the standard deviation of the weights: keeps the weights of fixes without any noise finite.
+LEAST_NOISE = 1e-6
 
 
 class PositionModel(SensorModel[PositionSensor, PositionNoise]):
@@ -43,7 +44,7 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
         return instants(stream, values)
 
     def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
-        """See `SensorModel`."""
+        """In metres if the rig file states a number, else 1: times the standard deviations of `weighted`."""
         size = sensor.position_noise
         first = 1.0 if size == "messages" or size is None else size
         return PositionNoise(first, first, settings.loss, settings.loss_scale)

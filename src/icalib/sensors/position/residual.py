@@ -41,8 +41,9 @@ KINDS = {"horizontal": slice(0, 2), "vertical": slice(2, 3)}
 
 @dataclass(frozen=True)
 class PositionNoise:
-    """horizontal, vertical: standard deviations of x and y and of z of the frame [m], or where the recording states
-    covariances factors on theirs. The robust loss of each whitened row, and where it bends, in standard deviations."""
+    """Standard deviations of x and y (`horizontal`) and of z (`vertical`) of the frame: times those of the stream's
+    covariances, or in metres where it has none. loss: robust loss of each whitened row, and where it bends, in
+    standard deviations."""
 
     horizontal: float
     vertical: float
@@ -80,8 +81,8 @@ class PositionFactor(RowFactor):
 
     @classmethod
     def build(cls, stream: PositionStream, motion: Motion, noise: PositionNoise, layout: Layout) -> PositionFactor:
-        """The fixes near nodes of the motion and outside its gaps, whose nodes stay while the solver runs. Stated
-        covariances are weights where the layout of the noise says so."""
+        """The fixes near keyframes and outside gaps of the IMU; their keyframes stay while the solver runs. The
+        covariances of `stream` are the weights: see `model.weighted`."""
         state = motion.state
         times = instants(stream, state.values)
         node = assign_nodes("inertial", state.seconds, times, motion.imu.forwards)
@@ -125,7 +126,8 @@ class PositionFactor(RowFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last node is an end
+        # Rows belong to intervals: those at the last keyframe go to the last interval.
+        cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)
         edges = np.searchsorted(self.node, (*self.starts, self.n_nodes))
         low, high = np.searchsorted(at, [piece.first, piece.last])
         for k in range(len(self.starts)):

@@ -14,8 +14,8 @@ from icalib.result import Calibration, RowResiduals
 OFF = 3.0  # standard deviations: 1 of 34 fixes with white noise are further off (chi, three degrees of freedom)
 MOST_POINTS = 4000  # of a path
 _WORDS = (
-    "Along east, north and up of the sensor's frame. They should look like noise; waves are errors that last, as of "
-    "multipath, and steps are changes of the solution."
+    "Along x, y and z of the sensor's frame: east, north and up of GNSS. They should look like noise; waves are errors "
+    "that last, as of multipath, and steps are changes of the solution."
 )
 _MAP = (
     "The path of each antenna from above, and where its fixes are more than three standard deviations off. If they are "

@@ -59,15 +59,15 @@ def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: Held) -> P
     best = min(found, key=lambda x: x.left)
     if best.left > LARGEST_LEFT:
         raise EstimationError(
-            f"{name}: its fixes do not follow the motion that the other sensors show, {best.left:.0%} "
-            "of their spread is left at every time offset; check that both are on the same vehicle."
+            f"{name}: its fixes do not follow the motion that the other sensors show: at the best time offset the "
+            f"median residual is {best.left:.0%} of their spread; check that both are on the same vehicle."
         )
     return best
 
 
 def _offsets(motion: Motion, fix: Fix, known: Held) -> list[float]:
-    """Likely ones, by the correlation of mean speeds, and of third differences with the IMU's readings: where the rig
-    turns and hardly moves, a long lever arm makes speeds unlike."""
+    """Candidate time offsets [s]: peaks of the correlation of mean speeds, then of third differences with the IMU's
+    readings. The latter are needed where the rig turns and hardly moves: a long lever arm makes speeds differ."""
     if known.offset is not None:
         return [known.offset]
     felt = [shift.samples / GRID_HZ for shift in likely_offsets(motion.imu, fix)]

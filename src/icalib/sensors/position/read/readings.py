@@ -16,8 +16,9 @@ FAR_M = 20_000.0  # from the first fix: over more, "up" turns by 3 mrad, 0.03 m/
 
 @dataclass(frozen=True)
 class PositionReadings:
-    """stamps_ns (N,) int64, which may still repeat or run backwards; position (N, 3) m; covariance (N, 3, 3) m^2 in the
-    same axes, or (0, 3, 3); status (N,) index into `STATUSES`, -1: no fix, or (0,) where none is stated."""
+    """stamps_ns (N,) int64, which may still repeat or run backwards; position (N, 3) m, or latitude, longitude [deg]
+    and height [m] until they are converted; covariance (N, 3, 3) m^2, or (0, 3, 3); status (N,) index into `STATUSES`,
+    -1: no fix, or (0,) where none is stated."""
 
     name: str
     stamps_ns: np.ndarray
