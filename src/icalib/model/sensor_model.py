@@ -25,8 +25,10 @@ N = TypeVar("N")
 
 @dataclass(frozen=True)
 class Pass:
-    """What the factors of one pass are frozen at. motion: of the IMU; None without one. starts: the first keyframe of
-    each recording. coarse: an early pass, which shall cost little and lead near."""
+    """The state, motion and layout at which factors are built for one outer iteration.
+
+    motion: of the IMU; None without one. starts: the first keyframe of each recording. coarse: an early pass, which
+    needs less accuracy and shall cost little."""
 
     rig: Rig
     clouds: Clouds
@@ -42,7 +44,7 @@ class SensorModel(Generic[S, N]):
     with a pose and a clock, and with no factor.
 
     keyframes: what keyframes are placed at, as in "images of cam0"; empty where the kind places none.
-    only_first_places_keyframes: and not each of several sensors.
+    only_first_places_keyframes: if the kind has several sensors, only the first places keyframes.
     """
 
     keyframes: ClassVar[str] = ""
@@ -70,7 +72,8 @@ class SensorModel(Generic[S, N]):
         return []
 
     def start_value(self, sensor: S, spec: ParameterSpec, rig: Rig) -> np.ndarray | None:
-        """(spec.size,) of a group that needs no guess: how imperfect the sensor is. None for all others."""
+        """Start (spec.size,) of a nuisance or auxiliary group (bias, scale, shape): the stated value, or zero. None for
+        groups that the initial guess finds."""
         del rig
         if not (spec.manifold == "nuisance" or spec.is_auxiliary):
             return None
@@ -105,12 +108,13 @@ class SensorModel(Generic[S, N]):
     # Factors
 
     def factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
-        """With an IMU: `at.motion` is its motion."""
+        """The sensor's factors for a rig with an IMU, whose motion is `at.motion`."""
         del sensor, stream, noise, at
         return ()
 
     def still_factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
-        """Without an IMU: of what was measured at keyframes, which nothing ties to one another."""
+        """The sensor's factors for a rig without an IMU. Measurements are taken at keyframes; nothing links
+        keyframes."""
         del sensor, stream, noise, at
         return ()
 

@@ -60,7 +60,8 @@ class ResidualRows:
 
 
 class Along(NamedTuple):
-    """`share` of a step, from the state `start` to `end`: small enough for residuals to be linear."""
+    """A step from `start`, scaled by `share`, that ends at `end`; for difference quotients of residuals. The share is
+    small enough for residuals to be linear."""
 
     start: State
     end: State
@@ -261,7 +262,7 @@ class RowFactor(FactorDefaults):
         return float(np.sqrt(np.mean(own**2))) if own.size else 0.0, self.units[kind]
 
     def count(self: _HasRows, out: Whitened, kind: str) -> int:
-        """How many rows of a kind are in use, times their columns."""
+        """Number of scalar residuals of a kind in use."""
         return out.residual[:, self.kinds[kind]].size
 
     def squares(self: _HasRows, out: Whitened) -> dict[FitKey, Squares]:

@@ -145,5 +145,5 @@ def integration_room(n):
 
 
 def readings_of(imu: ImuData, linear: bool) -> Readings:
-    """Those of `imu`, with its noise."""
+    """The kernels' view of `imu`: its readings and noise. linear: see `Readings`."""
     return Readings(imu.seconds, imu.gyro, imu.accel, imu.variance, imu.walk, linear)

@@ -151,7 +151,10 @@ def _series_slope(phi, f, products, c1, c2, d1, d2):
 
 @njit(cache=True, nogil=True)
 def step(rate, force, dt, by, run, width):
-    """Advances `run` by dt (either sign) of constant body `rate` and specific `force`; returns what `carry` needs."""
+    """Advances `run` by dt (either sign) of constant body `rate` and specific `force`; returns what `carry` needs.
+
+    run: the increments and their derivatives, laid out as at V, P, ... above. by: see `correction`; read only if
+    derivatives are wanted. width, columns of J that are advanced: 0 none, 6 biases, more: IMU intrinsics too."""
     phi = rate[0] * dt, rate[1] * dt, rate[2] * dt
     x = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s0, s1, s2, s3 = so3.jacobian_coefficients(x)

@@ -208,7 +208,8 @@ def _between(times, node, nodes, R, p, out_R, out_p, rate, vel, Jn, Jm):
 
 
 def poses_of_nodes(node: np.ndarray, state: State) -> Poses:
-    """IMU poses at the nodes themselves, which stand still: where there is no IMU, images are taken at nodes."""
+    """IMU poses at the nodes, with zero rate and velocity: without an IMU, measurements lie at nodes and time
+    derivatives play no role."""
     n = len(node)
     J_node, still = np.zeros((n, 6, NODE)), np.zeros((n, 3))
     J_node[:, range(6), range(6)] = 1.0

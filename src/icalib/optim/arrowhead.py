@@ -138,9 +138,11 @@ class Draw:
 
 @dataclass(frozen=True)
 class Factors:
-    """What an elimination leaves behind, in `pieces` too: of each piece what is `done`, of the node that they share its
-    factor and side (15, B + 1), and the `information` (B, B) of the calibration parameters. tolerance, held: see
-    calib_step."""
+    """Result of block elimination (Cholesky factors) that back substitution and sampling need.
+
+    pieces: overwritten by their factors. done: per piece, see `_reduce`. shared (15, 15), shared_side (15, B + 1): of
+    the node that all pieces share; empty without one. information (B, B): marginal information of the calibration
+    parameters. tolerance, held: see calib_step."""
 
     pieces: tuple[Piece, ...]
     done: list[Eliminated | bool]
@@ -152,8 +154,10 @@ class Factors:
     held: np.ndarray
 
     def back(self, calib: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
-        """(K, 15, m) the chain's part of m solutions: from calib (B + 1, m), its last row what the gradient counts,
-        and what stands on the right beside the gradient, of each piece and of the shared node."""
+        """Back substitution: (K, 15, m) node parts of m solutions.
+
+        calib (B + 1, m): calibration parts; last row: factor on the gradient (1 solves, 0 samples). white: additional
+        right-hand sides after forward substitution, per piece, then of the shared node."""
         m = calib.shape[1]
         chain = np.zeros((self.n_nodes, NODE, m))
         if len(self.shared):
@@ -234,7 +238,9 @@ def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
 
 def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
     """Eliminates a piece in place, but for a kept end node: that node's sums and the calibration parameters' are left.
-    False: not definite."""
+
+    Returns `Eliminated` for a piece with features. Without features, returns True, and the factors are in the piece's
+    own arrays. False: not positive definite."""
     forwards = piece.first == 0 or not keep
     if piece.features is None:
         done = eliminate_chain(piece.diagonal, piece.upper, piece.side, forwards, keep)
@@ -263,7 +269,7 @@ def _reduce_all(piece: Piece) -> Eliminated | bool:
 
 
 def _unknowns(piece: Piece, done: Eliminated | bool) -> int:
-    """How many of a piece's were eliminated, or stand in it."""
+    """Number of eliminated unknowns of a piece; without features, a kept end node counts too."""
     return done.rows if isinstance(done, Eliminated) else len(piece.diagonal) * NODE
 
 

@@ -49,7 +49,7 @@ class Eliminated:
 
     @property
     def rows(self) -> int:
-        """How many unknowns were eliminated, those of features that one step alone sees aside."""
+        """Number of eliminated unknowns, not counting features seen in a single step."""
         return int(self.sizes.rest.sum() + self.sizes.coupled.sum() + self.sizes.dying.sum())
 
     def substitute(self, calib: np.ndarray, white: np.ndarray, chain: np.ndarray) -> None:

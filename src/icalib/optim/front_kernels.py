@@ -155,7 +155,11 @@ def _places(g, plan, rest, row):
 
 @njit(cache=True, nogil=True)
 def _fill_nodes(g, plan, chain, row, U, Wr, Wc):
-    """The step's nodes with one another, with the one after, and with the calibration parameters."""
+    """Adds the sums of the step's nodes, each turned by its Q, to U, Wr and Wc.
+
+    U (a + c, a + c), upper triangle: the nodes with one another. Wr (a, .), Wc (c + d, .): the a rest rows and the c
+    coupled ones (then the d of dying features) by columns: 15 of the node after, calib, gradient, and features in Wc.
+    row (K, 15): see `_places`. q counts the step's nodes, k those of the piece."""
     a, n_b, last = len(Wr), chain.side.shape[2], plan.nodes.start[g + 1] - 1
     for q in range(plan.nodes.start[g], last + 1):
         k = plan.nodes.values[q]

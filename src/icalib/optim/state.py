@@ -151,9 +151,9 @@ class State:
         return [self._common_turn(layout, chain, calib)] if len(self.starts) == 1 else [np.zeros(3)] * len(self.starts)
 
     def _common_turn(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> np.ndarray:
-        """(3,) by which the planes turn, in world axes; without these, by which the positions do, but about a line of
-        them; and what neither shows is that of the first node. On a flat floor all sensors may turn against the IMU:
-        map and path turn then, and no node does."""
+        """Rotation (3,) [world axes] common to all planes in this step, by least squares; without planes, that of the
+        positions about their mean. Directions that neither determines, such as about a straight path, follow the first
+        node. On a flat floor all sensors may turn against the IMU: map and path turn then, and no node does."""
         free = [b for b in layout.free if b.kind == "plane"]
         if free:
             x = np.array([self.values[b.key][:3] for b in free])

@@ -1,7 +1,11 @@
 """The kinds of sensors: one folder each. A new kind is a new folder and one entry in `SENSOR_KINDS`.
 
-A facet is a module of a fixed name in the folder of a kind, for one stage of the program: `spec`, `record`, `read`,
-`model`, `initialize`, `assess`, `show`, `simulate`, `inspect`. Each stage asks the kinds for its own facet.
+Three things of a kind are registered elsewhere. A kind that gives the motion needs a rank, one of the BY_... in
+`initialize/steps/initializer.py`. Parameters of the scene belong to `SCENE` in `rig/scene.py`. A simulated kind needs
+a free `random_stream`; `CONTRIBUTING.md` lists those taken.
+
+A facet is a module or package of a fixed name in the folder of a kind, for one stage of the program: see `FACETS`.
+Each stage asks the kinds for its own facet.
 """
 
 from __future__ import annotations

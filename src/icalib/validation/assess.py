@@ -243,8 +243,8 @@ def _final_verdict(formal: Verdict, size: float) -> Verdict:
 
 
 def _empirical_variance(found: Estimate, parts: Parts | None, white: np.ndarray) -> np.ndarray:
-    """(B,) variances by the scatter of segments of the recording, or of feature tracks if that is larger, plus the
-    excess over `white` noise (B,) of regions of the image and of the target. Without segments and tracks: `white`."""
+    """Variance (B,): the larger of the scatter over segments and over feature tracks, plus the excess of clustered over
+    `white` variance (B,) for image and target regions. Without segments and tracks: `white`."""
     if parts is None and not of_type(found.problem.factors, FeatureFactor):
         return white
     clusters = cluster_covariances(found.problem, found.outcome)

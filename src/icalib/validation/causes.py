@@ -189,7 +189,7 @@ def _apart(c: Change, timeline: Timeline, words: str) -> str:
     """How to use the recording before or after a step, which lies within a segment of its `second`."""
     if c.pattern == "drift" or len(timeline.parts) > 1:
         return ""
-    return f"{words} (--to or --from, well off {c.second:.1f})"
+    return f"{words} (--to or --from; stay clear of the change near {c.second:.1f} s)"
 
 
 def _sizes(parts: Parts, c: Change, over: float) -> tuple[float, float]:

@@ -72,8 +72,8 @@ class Excess(NamedTuple):
 
 
 def predict(parts: Parts) -> Prediction | None:
-    """Each half from the other. None where the two have nothing of the calibration parameters in common that both
-    know."""
+    """Predicts each half of the recording from the other. None if no direction of the calibration parameters is
+    determined by both."""
     t, B = parts.problem.tolerance, parts.problem.layout.size
     free = t[:, None] * complement(parts.problem.held, B)
     halves, shared, own = halves_of(parts.sums, free)

@@ -58,7 +58,7 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
 
 
 def stated_priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """Those on nuisance parameters, and others that the rig file gives."""
+    """All priors except the default ones on auxiliary parameters."""
     return (*_nuisance_priors(inputs), *given_priors(inputs))
 
 

@@ -299,13 +299,12 @@ class _Descent:
         return state, self._linearise(state, True, curved)
 
     def _corrected(self, state: State, cost: float, curved: bool) -> tuple[State, float]:
-        """Further steps from a candidate, linearised at `state`, that costs too much, as long as each leaves but a part
-        of the excess; and what that costs.
+        """Second-order correction: if a candidate step, linearised at `state`, raises the cost, takes further steps
+        from it while each removes most of the excess (share < COMES_BACK). Returns state and cost.
 
-        What the data hardly tell, gravity's direction on a straight drive for one, moves far in a step, along a valley
-        that is curved: a step along its tangent leaves it by the square of the way, the next ones come back. More
-        damping would make the way so short that the solver creeps. An excess within rounding is none: it would never
-        be less.
+        A weakly observable direction, such as gravity's on a straight drive, moves far in one step. A step along the
+        tangent of a curved valley leaves it by the square of its length; the next ones return. More damping would make
+        the solver creep. An excess within rounding counts as none: it would never be less.
         """
         share, least = 0.0, self.cost
         while cost - least >= ROUNDING * least and share < COMES_BACK:

@@ -113,8 +113,9 @@ def _shifts(imu: ImuData, rates: CameraRates) -> list[list[Shift]]:
 
 
 def _peaks(imu: ImuData, rates: CameraRates, count: int) -> list[Shift]:
-    """Of the camera's grid against the IMU's; means over `count` points of them. The IMU's rates as they are or about
-    their median, whichever is more alike: the one has a bias in it, the other lacks what is steady in a turn."""
+    """Peaks of the correlation of camera rates with gyroscope rates, both averaged over `count` grid points.
+
+    The gyroscope's median is subtracted or not, whichever correlates better: it holds the bias, and any steady turn."""
     known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < rates.longest_step_s

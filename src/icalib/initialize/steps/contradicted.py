@@ -77,8 +77,8 @@ def refuse_far_off(sensor: Sensor, found: dict[Key, np.ndarray]) -> None:
 
 
 def settled(sensor: Sensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
-    """Where the solver starts with a sensor: at what the rig file gives of it, `known`, and else at what was `found`;
-    there, too, where this contradicts a guess, or a prior of a length, from which the solver may not come back."""
+    """Start values of a sensor: the rig file's, `known`, else those `found`. A found value replaces a guess (or a prior
+    on a length or factor) that it contradicts, as the solver may not recover from that."""
     leaves = {
         key
         for key, value in known.items()

@@ -91,9 +91,11 @@ def telling_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: n
 def _scored(
     imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray, step: float
 ) -> list[tuple[float, CameraRates]]:
-    """Rates, and how well they go with the gyroscope's. Where a camera moves far sideways, the turn that fits best
-    without any motion often leads to a local minimum, and that of the interval before does not; with a guessed lens it
-    may be the other way round: the gyroscope tells."""
+    """Tries two choices of starts for each relative pose: no translation, or this and the previous interval's pose.
+    Returns score and rates of the second if they match the gyroscope clearly better, else of the first.
+
+    If a camera moves far sideways, a start without translation often leads to a local minimum, and the previous
+    interval's does not. With a guessed lens it may be the other way round."""
     found = []
     for chained in (False, True):
         rates = track_rates(stream, model, lens, step, chained=chained)

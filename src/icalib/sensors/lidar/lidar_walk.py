@@ -99,8 +99,9 @@ def columns_of(walk, columns, of_plane):
 
 @njit(cache=True, nogil=True, inline="always")
 def taken_off(walk):
-    """V (3, w + m + 1), V^T V what is taken off the sums of keyframes, calibration parameters and residual, the
-    calibration parameters in the order of `columns_of`. The walk is empty again."""
+    """V (3, w + 3 n + 1): V^T V is the Schur term of the walk's three unknowns, to be subtracted from the normal
+    equations. Columns: keyframes, calibration parameters in the order of `columns_of` (n planes met), residual. Resets
+    the walk."""
     n, width, L = walk.n_met[0], walk.by_pose.shape[1] - 1, walk.information
     last = width + PLANE * n
     V = np.empty((3, last + 1))

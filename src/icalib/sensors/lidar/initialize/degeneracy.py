@@ -47,7 +47,7 @@ def directions(stream: LidarStream) -> int:
 
 
 def count_of(shares: np.ndarray) -> int:
-    """Of `facing`: how many directions there are."""
+    """Number of independent normal directions, from the shares of `facing`."""
     return int((shares > LEAST_SHARE).sum())
 
 

@@ -71,11 +71,12 @@ def scans_of(stream: LidarStream) -> list[Scan]:
 def lidar_path(
     name: str, scans: list[Scan], turning: Turning | None = None, moving: Moving | None = None, whole: bool = True
 ) -> SensorPath:
-    """Of LiDAR `name`. `turning`: how it turned, where that is known, and `moving`: how it moved. Unless it is to be
-    `whole`, a path that lost its way goes on in another map: LONGEST_STEP_S lie between what is ok in one and in the
-    next. A whole one is of one map, which begins later where hardly any scan fits that of the first.
+    """Scan-to-map odometry of LiDAR `name`. turning, moving: known rotation, translation.
 
-    Raises EstimationError where scans do not fit one another."""
+    whole: one map for the whole recording, which begins later if hardly any scan fits the first. Else a lost path
+    restarts in a new map, and scans within LONGEST_STEP_S after the last good one are not ok.
+
+    Raises EstimationError if scans do not fit one another."""
     seconds = np.array([s.middle for s in scans])
     known = _Known.of(seconds, turning, moving)
     if turning is not None:
@@ -218,7 +219,7 @@ def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tup
         return pose
 
     def begin(k: int) -> ScanPose:
-        """A map of one scan, moving as the next one shows."""
+        """Starts a new map from scan k, with rate and velocity estimated by registering scan k + 1."""
         pose = still
         for _ in range(FIRST_ROUNDS):
             voxels.clear()

@@ -30,8 +30,12 @@ REACH = 1 << 20  # voxels from the origin to either side
 
 
 class VoxelMap(NamedTuple):
-    """Voxels of an edge [m], found by an open hash table: key (H,), -1: empty, and place (H,) of each among the voxels;
-    size (1,) of them. weight (V,), moments (V, 9), touched (V,): last scan; centre, normal (V, 3); flat (V,)."""
+    """An open hash table of cubic voxels with edge `edge_m`. key (H,): -1 where empty; place (H,): row of the voxel.
+    size (1,): number of voxels in use.
+
+    Per voxel: middle (V, 3) of the cube [m]; weight (V,): decayed number of points; moments (V, 9) about middle, see
+    MOMENTS; touched (V,): last scan that added a point; centre, normal (V, 3) of the points; flat (V,): they are a
+    plane."""
 
     edge_m: float
     key: np.ndarray
@@ -111,7 +115,7 @@ def place_point(pose, x, y, z, tau, out):
 
 @njit(cache=True, nogil=True)
 def insert(voxels, pose, xyz, tau, scan, keep):
-    """Adds points xyz (n, 3) of scan number `scan`; what voxels held counts by `keep` per scan since."""
+    """Adds points xyz (n, 3) of scan number `scan`; older content decays by the factor `keep` per scan."""
     y, touched, n_touched = np.empty(6), np.empty(len(xyz), np.int64), 0
     for n in range(len(xyz)):
         place_point(pose, xyz[n, 0], xyz[n, 1], xyz[n, 2], tau[n], y)

@@ -71,8 +71,8 @@ def pose_values(inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> 
 
 
 def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream) -> dict[Key, np.ndarray]:
-    """Where a sensor stands, as `state` has the motion. Where its clock restarts between recordings, the one with most
-    poses says so."""
+    """Extrinsics and time offsets of a sensor, given the motion in `state`. If its clock restarts between recordings,
+    the extrinsics are those of the recording with most poses."""
     assert inputs.imu is not None
     held = held_of(inputs, sensor)
     if not sensor.clock_restarts:

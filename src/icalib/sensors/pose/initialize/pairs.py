@@ -44,7 +44,8 @@ def _nearest(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, np.ndarray
 
 
 def _is_at_rest(own: BodyPoses, seconds: np.ndarray) -> np.ndarray:
-    """(n,) whether its poses before and behind AROUND_S about each of `seconds` (n,) are close in time and alike."""
+    """(n,) whether the poses just outside +- AROUND_S of each of `seconds` (n,) are at most SEEN_S apart and nearly
+    equal."""
     last = len(own.seconds) - 1
     before = np.clip(np.searchsorted(own.seconds, seconds - AROUND_S, side="right") - 1, 0, last)
     behind = np.clip(np.searchsorted(own.seconds, seconds + AROUND_S), 0, last)

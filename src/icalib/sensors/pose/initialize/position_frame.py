@@ -23,8 +23,8 @@ UNTURNED = np.eye(3)
 
 
 def turn_of_positions(rows: LeverArmRows, R_world_frame: np.ndarray = UNTURNED) -> np.ndarray | None:
-    """C (3, 3) that may turn positions into the frame of rotations; None where it is none, or the rows are few.
-    R_world_frame (3, 3): how the frame of rotations stands in the world whose axes the rows have."""
+    """Estimated rotation C (3, 3) from the frame of positions to that of rotations; None if it is the identity, not a
+    rotation, or rows are few. R_world_frame (3, 3): rotation from the frame of rotations to the axes of the rows."""
     felt, n = rows.seen - rows.b, len(rows.b)
     X = np.concatenate([felt, rows.A[:, :, 3:6].reshape(n, 9), rows.A[:, 0, 6:7]], axis=1)
     if n < FEWEST:

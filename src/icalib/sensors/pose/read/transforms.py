@@ -216,7 +216,7 @@ def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[
 
 
 def _along(steps: Sequence[_TransformEdge], sensor: PoseSensor, where: str, note: Note) -> PoseReadings:
-    """The product of the transforms of all steps at the stamps of one that moves."""
+    """Composes the chain of transforms, at the common stamps of those that move."""
     assert sensor.frames is not None
     what, shown = f"{where} ({sensor.name})", " -> ".join(sensor.frames)
     sent = [s.edge for s in steps if len(s.edge.stamps_ns) > 1]

@@ -36,7 +36,7 @@ class Interior:
     atlas: Atlas | None = None
 
     def view(self, people: tuple[Obstacle, ...] = ()) -> VisibleFaces:
-        """people: where those of this room, in their order, stand now."""
+        """Faces visible with the obstacles at their current places. people: those of this room, in their order."""
         others, atlas = self.room.faces_of(people), self._atlas
         faces = np.concatenate([self.room.faces, others])
         origin, u, v, mark = np.moveaxis(faces, 1, 0)

@@ -72,7 +72,7 @@ class BagWriter:
 
 
 def package(name: str, extra: str) -> Any:
-    """A module that only writing needs. Raises CalibrationError where it is not installed."""
+    """Imports an optional module needed for writing. Raises CalibrationError if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:
