@@ -83,7 +83,7 @@ def _rig(scenario: Scenario) -> Rig:
         time_offset="start",
         intrinsics="start",
         distortion="start",
-        drive="start",
+        others="start",
     )
     return rig.with_(
         cameras=tuple(replace(c, corner_noise_px=None, track_noise_px=None) for c in rig.cameras),

@@ -158,7 +158,7 @@ def followed_by_wheels(example: str, seed: int, drive: str) -> tuple[Rig, Measur
     cameras = tuple(replace(c, corner_noise_px=0.5) for c in scenario.cameras[:1])
     scenario = replace(scenario, duration_s=15.0, cameras=cameras, sensors=scenario.of(SimWheels))
     simulation = simulate(scenario, seed)
-    rig = rig_for(scenario, intrinsics="free", distortion="free", others=drive)  # pyright: ignore
+    rig = rig_for(scenario, intrinsics="free", distortion="free", radii=drive, baseline=drive)  # pyright: ignore
     return rig.with_(imu=None), simulation.measurements.without("imu0"), simulation
 
 

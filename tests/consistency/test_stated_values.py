@@ -94,7 +94,7 @@ def test_a_wrong_rotation_is_named_and_nothing_else(simulation, sigma):
 
 
 def test_true_wheels_are_no_news(driven):
-    rig = rig_for(driven.scenario, others="fixed")
+    rig = rig_for(driven.scenario, radii="fixed", baseline="fixed")
     result = calibrate_measurements(rig, driven.measurements)
     assert result.converged and said(result) == []
 

@@ -52,7 +52,9 @@ def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
     streams = list(factor.streams)
     for view in views:
         stream, own = streams[view.index], np.flatnonzero(factor.tracks.track[view.index] == track)
-        seen, _ = view.camera.model.project(view.params, np.einsum("nij,j->ni", view.motion.R_cam_world, star))
+        seen, _ = view.camera.model.project(
+            view.params, np.einsum("nij,j->ni", view.poses.rotation.transpose(0, 2, 1), star)
+        )
         uv = stream.uv.copy()
         uv[own] = seen[stream.image[own]]
         streams[view.index] = replace(stream, uv=uv)

@@ -269,7 +269,7 @@ def _are_alike(a: np.ndarray, b: np.ndarray) -> bool:
     return bool(np.abs(ratios - 1.0).max(initial=0.0) < UNCHANGED)
 
 
-class _Shown(NamedTuple):
+class _ShownDirections(NamedTuple):
     """Directions vectors (B, n) in tolerance units, of which the data show `nothing` (n,), or what may be `in_doubt`
     (n,) noise in all of it."""
 
@@ -278,7 +278,7 @@ class _Shown(NamedTuple):
     in_doubt: np.ndarray
 
 
-def _shown(asked: np.ndarray, tolerance: np.ndarray, is_essential: np.ndarray, spurious: Spurious) -> _Shown:
+def _shown(asked: np.ndarray, tolerance: np.ndarray, is_essential: np.ndarray, spurious: Spurious) -> _ShownDirections:
     """Of the information asked (B, B), in tolerance units, noise and all, on what `is_essential` (B,)."""
     own = np.flatnonzero(is_essential)
     known = asked - tolerance[:, None] * spurious.mean * tolerance
@@ -287,4 +287,4 @@ def _shown(asked: np.ndarray, tolerance: np.ndarray, is_essential: np.ndarray, s
     all_of_it = np.einsum("ik,ij,jk->k", vectors, asked, vectors)
     nothing = values < HELD_BELOW
     maybe = values < spurious.chance(tolerance[:, None] * vectors)
-    return _Shown(vectors, nothing, ~nothing & maybe & (values < SPURIOUS_SHARE * all_of_it))
+    return _ShownDirections(vectors, nothing, ~nothing & maybe & (values < SPURIOUS_SHARE * all_of_it))

@@ -148,7 +148,7 @@ def _ends_here(i, bins):
     return (bins.walked[i + 1] < 0.0) != (bins.walked[i] < 0.0)
 
 
-class _Work(NamedTuple):
+class _BinWork(NamedTuple):
     """Work space of `accumulate`. T, A_imu: see `fill_chain`; m: see `_distances`; A, B (10, 4): derivatives of an
     entry, and these times its root; G (6, 7), W (3, 6): products of a bin's derivatives by its pose with themselves and
     the residual, and with those by the turn that noise makes; F, V: room for sums."""
@@ -167,7 +167,7 @@ class _Work(NamedTuple):
 @njit(cache=True, nogil=True)
 def _work_space(at, n_columns):
     width = chain_width(at) + n_columns
-    return _Work(
+    return _BinWork(
         np.empty((POSE, width)), np.empty((POSE, POSE)), np.empty(ROWS), np.empty((RESIDUAL + 1, ROWS)),
         np.empty((RESIDUAL + 1, ROWS)), np.empty((POSE, POSE + 1)), np.empty((3, POSE)), np.empty((POSE, width + 1)),
         np.empty((PLANE, width)),
