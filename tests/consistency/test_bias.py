@@ -26,13 +26,12 @@ def mirrored(exact, noisy):
     def turned(a, b, fields):
         return replace(a, **{f: 2.0 * getattr(a, f) - getattr(b, f) for f in fields})
 
-    changed = {}
+    changed = []
     for name, fields in NOISY.items():
         a, b = getattr(exact, name), getattr(noisy, name)
-        changed[name] = (
-            tuple(turned(x, y, fields) for x, y in zip(a, b, strict=True)) if name != "imu" else turned(a, b, fields)
-        )
-    return replace(exact, **changed)
+        pairs = [(a, b)] if name == "imu" else zip(a, b, strict=True)
+        changed += [turned(x, y, fields) for x, y in pairs]
+    return exact.with_streams(*changed)
 
 
 @pytest.fixture(scope="module")
