@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,14 +34,14 @@ def mocap() -> SimPoses:
 
 def reset(scenario: Scenario, parts: str) -> Scenario:
     """The same scenario, the clocks of some of its sensors set back or forward, each by another time."""
-    moved = {
-        KINDS[p]: tuple(
-            replace(s, clock_origin_ns=s.clock_origin_ns - round(1e9 * SET_BACK_S[p]))
-            for s in getattr(scenario, KINDS[p])
-        )
-        for p in parts
-    }
-    return replace(scenario, **moved)
+
+    def moved(sensor: Any, part: str) -> Any:
+        back = round(1e9 * SET_BACK_S[part]) if part in parts else 0
+        return replace(sensor, clock_origin_ns=sensor.clock_origin_ns - back)
+
+    cameras = tuple(moved(c, "c") for c in scenario.cameras)
+    sensors = tuple(moved(s, s.sensor_type[0]) for s in scenario.sensors)
+    return replace(scenario, cameras=cameras, sensors=sensors)
 
 
 def open_rig(scenario: Scenario, restarting: str) -> Rig:
