@@ -20,7 +20,7 @@ from icalib.tools.simulation import Simulation, rig_for, simulate
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 ON_TOP = np.array([[1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, 0.2], [0.0, 1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
-STARTS: dict[str, Any] = dict.fromkeys(("rotation", "translation", "time_offset", "drive"), "start")
+STARTS: dict[str, Any] = dict.fromkeys(("rotation", "translation", "time_offset", "radii", "baseline"), "start")
 Sensor = Camera | Lidar | Wheels | PoseSensor
 KINDS = ("cameras", "lidars", "wheels", "poses")
 
