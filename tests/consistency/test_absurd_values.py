@@ -36,7 +36,7 @@ def solved(monkeypatch) -> list[Rig]:
 
 def measured(scenario: Scenario, imu: bool) -> tuple[Rig, Measurements, Rig]:
     """The rig from nothing, what it measured, and the rig at its true values."""
-    truth = rig_for(scenario, rotation="fixed", translation="fixed", radii="fixed", baseline="fixed")
+    truth = rig_for(scenario, time_offset="free", others="fixed")
     if not imu:
         rig, measurements, _ = without_imu(scenario, SEED)
         return rig, measurements, truth
