@@ -164,3 +164,14 @@ def test_coefficients_keep_their_digits(x: float) -> None:
             expected = expected + term
         # In closed form each is a difference of the one two before and its limit: x * coefficient of order 1 is lost.
         assert found == pytest.approx(float(expected), rel=1e-15 * (3 if k < 2 else 3 / min(max(x, 0.01), 1.0)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_closest_rotation_is_that_of_the_wahba_problem(seed: int):
+    rng = np.random.default_rng(seed)
+    b = rng.normal(size=(6, 3))
+    a = b @ Rotation.random(random_state=seed).as_matrix().T + 0.1 * rng.normal(size=(6, 3))
+    found = so3.closest_rotation(a.T @ b)
+    np.testing.assert_allclose(found, Rotation.align_vectors(a, b)[0].as_matrix(), atol=1e-12)
+    mirrored = so3.closest_rotation(-np.eye(3) - np.diag([0.1, 0.2, 0.3]))  # no reflection
+    assert np.linalg.det(mirrored) == pytest.approx(1.0)

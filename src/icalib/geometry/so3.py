@@ -186,6 +186,13 @@ def chain(steps, out):
                 out[n + 1, i, j] = s
 
 
+def closest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation R that is closest to `matrix` (3, 3) in the Frobenius norm: the R with a = R b in least squares,
+    where it is the sum of a b^T (Kabsch 1976)."""
+    U, _, Vt = np.linalg.svd(matrix)
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+
+
 def value_change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """(n,) what takes the value of a parameter to another, as standard deviations are stated: of rotations (3, 3) the
     vector in the sensor's axes [rad], of vectors (n,) their difference."""

@@ -40,6 +40,17 @@ def in_chunks(own: slice) -> Iterator[slice]:
         yield slice(start, min(start + CHUNK, own.stop))
 
 
+def of_recordings(node: np.ndarray, starts: tuple[int, ...], n_nodes: int, piece: Piece) -> Iterator[tuple[int, slice]]:
+    """The rows in `piece` of measurements at keyframes `node` (n,), in order, CHUNK at a time: number of the recording,
+    and its rows. Rows belong to intervals: those at the last keyframe, number n_nodes - 1, go to the last interval.
+    starts: the first keyframe of each recording."""
+    edges = np.searchsorted(node, (*starts, n_nodes))
+    low, high = np.searchsorted(np.minimum(node, n_nodes - 2), [piece.first, piece.last])
+    for k in range(len(starts)):
+        for some in in_chunks(slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))):
+            yield k, some
+
+
 def add_rows(rows: Rows, own: slice, node: np.ndarray, columns: np.ndarray, noise: RobustNoise, into: Into) -> float:
     """Adds the rows `own` of a factor, each to the interval that begins at its keyframe `node` (n,), and fills
     `into.out`; returns half the robust chi^2. columns (c,): calibration columns of rows.J, -1 where fixed."""

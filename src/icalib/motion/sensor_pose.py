@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -32,6 +32,22 @@ N_MOUNTED = 7  # extrinsics and time offset; the IMU intrinsics follow
 ITSELF = np.eye(6)  # a pose by itself
 
 
+class _Moving(Protocol):
+    """A factor of measurements by a sensor on the body."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def layout(self) -> Layout: ...
+
+    @property
+    def imu(self) -> ImuData | None: ...
+
+    @property
+    def gravity(self) -> float: ...
+
+
 @dataclass(frozen=True)
 class Kinematics:
     """What the pose of a sensor depends on beside a state. imu: None where measurements are taken at keyframes; gravity
@@ -42,6 +58,11 @@ class Kinematics:
     imu: ImuData | None
     gravity: float
     scheme: Scheme = "inertial"
+
+    @classmethod
+    def of(cls, factor: _Moving) -> Kinematics:
+        """That of the sensor of a factor, by the readings of the IMU."""
+        return cls(factor.name, factor.layout, factor.imu, factor.gravity)
 
     def columns(self, clock: int = 0) -> np.ndarray:
         """(7 + 24 or 0,) calibration columns of the sensor's pose, -1 where fixed; `clock`: number of its time

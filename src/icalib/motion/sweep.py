@@ -1,4 +1,4 @@
-"""Where a LiDAR is at any instant, and how it moves there, by the IMU's readings from the nodes of a state."""
+"""The motion of the IMU as a state has it: keyframes of measurements, and the poses and twists of a LiDAR."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.base.compiled import njit
+from icalib.data.measurements import Stream
 from icalib.geometry.small import mul3
+from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
+from icalib.motion.nodes import usable
 from icalib.motion.poses import assign_nodes, poses_alone
 from icalib.optim.state import State
 
@@ -22,6 +25,16 @@ class Motion:
     imu: ImuData
     gravity: float
     max_gap_s: float
+
+    def near_keyframes(self, stream: Stream, within_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (n,) of the stream's measurements that lie within `within_s` of a keyframe and in no gap of the IMU
+        that is not bridged, in the order of their keyframes; and these keyframes (n,)."""
+        times = instants(stream, self.state.values)
+        node = assign_nodes("inertial", self.state.seconds, times, self.imu.forwards)
+        near = np.abs(times - self.state.seconds[node]) <= within_s
+        own = np.flatnonzero(near & usable(self.imu, times, self.max_gap_s))
+        own = own[np.argsort(node[own], kind="stable")]
+        return own, node[own]
 
 
 class Sweep(NamedTuple):

@@ -122,8 +122,7 @@ def _aligned(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """R with a = R b of vectors (m, 3), by Kabsch's method, in which those that are not equally long weigh less."""
     unlike = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1))
     weight = 1.0 / (1.0 + (unlike / max(BEND * np.median(unlike), LEAST_SCALE)) ** 2)
-    U, _, Vt = np.linalg.svd((a * weight[:, None]).T @ b)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return so3.closest_rotation((a * weight[:, None]).T @ b)
 
 
 def _refined(pairs: PosePairs, start: Mount, held: tuple[bool, bool]) -> HandEye:
@@ -156,8 +155,7 @@ def _refined(pairs: PosePairs, start: Mount, held: tuple[bool, bool]) -> HandEye
 
 def _frame_for(pairs: PosePairs, mount: Mount) -> Frame:
     """The mean over the pairs."""
-    U, _, Vt = np.linalg.svd((pairs.R_body @ mount.R @ pairs.R_sensor.transpose(0, 2, 1)).sum(axis=0))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = so3.closest_rotation((pairs.R_body @ mount.R @ pairs.R_sensor.transpose(0, 2, 1)).sum(axis=0))
     return Frame(R, np.median(pairs.p_body + pairs.R_body @ mount.p - pairs.p_sensor @ R.T, axis=0))
 
 

@@ -22,10 +22,9 @@ from icalib.model.frames import FRAME, frame_of
 from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.nodes import MERGED_WITHIN_S, usable
+from icalib.motion.nodes import MERGED_WITHIN_S
 from icalib.motion.pose_rows import Frame, PoseResiduals, absolute_residuals, relative_residuals
-from icalib.motion.poses import assign_nodes
-from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
+from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks, of_recordings
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
 from icalib.motion.stamp_intervals import StampIntervals, choose_intervals
 from icalib.motion.sweep import Motion
@@ -118,14 +117,9 @@ class AbsolutePoseFactor(_PoseFactor):
     @classmethod
     def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
         """Of the poses that lie near keyframes; those in gaps of the IMU that are not bridged are left out."""
-        state = motion.state
-        times = instants(stream, state.values)
-        node = assign_nodes("inertial", state.seconds, times, motion.imu.forwards)
-        near = np.abs(times - state.seconds[node]) <= NEAR_NODE_S
-        k = np.flatnonzero(near & usable(motion.imu, times, motion.max_gap_s))
-        k = k[np.argsort(node[k], kind="stable")]
+        state, (k, node) = motion.state, motion.near_keyframes(stream, NEAR_NODE_S)
         return cls(
-            stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], node[k], state.starts,
+            stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], node, state.starts,
             len(state.seconds), motion.imu, motion.gravity, noise, layout,
         )  # fmt: skip
 
@@ -159,19 +153,13 @@ class AbsolutePoseFactor(_PoseFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last keyframe is an end
-        edges = np.searchsorted(self.node, (*self.starts, self.n_nodes))
-        low, high = np.searchsorted(at, [piece.first, piece.last])
-        for k in range(len(self.starts)):
-            own = slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))
-            for some in in_chunks(own):
-                cost += self._of_recording(k, some, state, Into(piece, out, sums, curved))
-        return cost
+        into, parts = Into(piece, out, sums, curved), of_recordings(self.node, self.starts, self.n_nodes, piece)
+        return sum(self._of_recording(k, own, state, into) for k, own in parts)
 
     def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
         """Adds the poses `own`, of one recording."""
         frame = frame_of(self.name, recording)
-        v, node, kinematics = state.values, self.node[own], _kinematics(self)
+        v, node, kinematics = state.values, self.node[own], Kinematics.of(self)
         at = SensorPose.at(kinematics, self.seconds[own], node, state, into.sums)
         found = absolute_residuals(
             at.rotation,
@@ -243,7 +231,7 @@ class RelativePosesFactor(_PoseFactor):
     def _of_clock(self, clock: int, own: slice, state: State, into: Into) -> float:
         """Adds the ways `own`, which go by one time offset."""
         first, last, node = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.node))
-        kinematics = _kinematics(self)
+        kinematics = Kinematics.of(self)
         a = SensorPose.at(kinematics, self.seconds[first], node, state, into.sums)
         b = SensorPose.at(kinematics, self.seconds[last], node + 1, state, into.sums)
         found = relative_residuals(
@@ -258,10 +246,6 @@ class RelativePosesFactor(_PoseFactor):
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor
-
-
-def _kinematics(factor: PoseFactor) -> Kinematics:
-    return Kinematics(factor.name, factor.layout, factor.imu, factor.gravity)
 
 
 def _rows(found: PoseResiduals, ends: tuple[SensorPose, ...], factor: PoseFactor, state: State, own: slice) -> Rows:

@@ -17,12 +17,10 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.model.frames import frame_of
-from icalib.motion.clocks import instants, offset_at
+from icalib.motion.clocks import offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.nodes import usable
-from icalib.motion.poses import assign_nodes
-from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
+from icalib.motion.row_sums import Into, RobustNoise, add_rows, of_recordings
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece
@@ -83,14 +81,9 @@ class PositionFactor(RowFactor):
     def build(cls, stream: PositionStream, motion: Motion, noise: PositionNoise, layout: Layout) -> PositionFactor:
         """The fixes near keyframes and outside gaps of the IMU; their keyframes stay while the solver runs. The
         covariances of `stream` are the weights: see `model.weighted`."""
-        state = motion.state
-        times = instants(stream, state.values)
-        node = assign_nodes("inertial", state.seconds, times, motion.imu.forwards)
-        near = np.abs(times - state.seconds[node]) <= NEAR_NODE_S
-        k = np.flatnonzero(near & usable(motion.imu, times, motion.max_gap_s))
-        k = k[np.argsort(node[k], kind="stable")]
+        state, (k, node) = motion.state, motion.near_keyframes(stream, NEAR_NODE_S)
         return cls(
-            stream.name, stream.seconds[k], stream.position[k], stream.root[k], node[k], state.starts,
+            stream.name, stream.seconds[k], stream.position[k], stream.root[k], node, state.starts,
             len(state.seconds), motion.imu, motion.gravity, noise, layout,
         )  # fmt: skip
 
@@ -126,22 +119,15 @@ class PositionFactor(RowFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        # Rows belong to intervals: those at the last keyframe go to the last interval.
-        cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)
-        edges = np.searchsorted(self.node, (*self.starts, self.n_nodes))
-        low, high = np.searchsorted(at, [piece.first, piece.last])
-        for k in range(len(self.starts)):
-            own = slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))
-            for some in in_chunks(own):
-                cost += self._of_recording(k, some, state, Into(piece, out, sums, curved))
-        return cost
+        into, parts = Into(piece, out, sums, curved), of_recordings(self.node, self.starts, self.n_nodes, piece)
+        return sum(self._of_recording(k, own, state, into) for k, own in parts)
 
     def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
         """Adds the fixes `own`, of one recording."""
         frame, v, node = frame_of(self.name, recording), state.values, self.node[own]
         levelled = (frame, FRAME_YAW.name) in v
         R_wf = yaw_rotation(v[frame, FRAME_YAW.name][0]) if levelled else v[frame, FRAME_ROTATION.name]
-        kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity)
+        kinematics = Kinematics.of(self)
         at = SensorPose.at(kinematics, self.seconds[own], node, state, into.sums)
         in_frame = (at.position - v[frame, FRAME_TRANSLATION.name]) @ R_wf
         rows = _rows(in_frame - self.position[own], in_frame, R_wf, at, levelled, into.sums)

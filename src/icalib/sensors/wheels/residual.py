@@ -261,7 +261,7 @@ class RelativePoseFactor(RowFactor):
 
     def _added(self, own: slice, state: State, into: Into) -> float:
         """Adds the intervals `own`; returns half their robust chi^2."""
-        i, z, kinematics = self.intervals, self.poses, _kinematics(self)
+        i, z, kinematics = self.intervals, self.poses, Kinematics.of(self)
         first = SensorPose.at(kinematics, self.seconds[i.first[own]], i.node[own], state, into.sums)
         last = SensorPose.at(kinematics, self.seconds[i.last[own]], i.node[own] + 1, state, into.sums)
         n, drive = len(z.z[own]), drive_of(self.name, state, self.kind)
@@ -345,17 +345,14 @@ def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
     return slice(int(i0), int(i1))
 
 
-def _kinematics(factor: IncrementFactor | RelativePoseFactor) -> Kinematics:
-    return Kinematics(factor.name, factor.layout, factor.imu, factor.gravity)
-
-
 def _add(factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, state: State, into: Into) -> float:
     """Adds the rows of intervals `own`, by calibration parameters of the pose, then those of the drive."""
     cost, node, layout = 0.0, factor.intervals.node[own], factor.layout
     drive = layout.columns(factor.name, *drive_names(factor.kind))
     drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])
+    kinematics = Kinematics.of(factor)
     for clock, part in by_clock(state, factor.name, node):
-        columns = np.concatenate([_kinematics(factor).columns(clock), drive])
+        columns = np.concatenate([kinematics.columns(clock), drive])
         mine = slice(own.start + part.start, own.start + part.stop)
         noise = RobustNoise(factor.whitening[mine], factor.noise.loss, factor.noise.loss_scale)
         cost += add_rows(Rows(rows.residual[part], rows.J[part]), mine, node[part], columns, noise, into)

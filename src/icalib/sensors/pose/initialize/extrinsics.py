@@ -17,6 +17,7 @@ from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs
+from icalib.geometry import so3
 from icalib.initialize.paths.alignment import align_path
 from icalib.initialize.paths.lever_arm_rows import LeverArmRows, against_motion, against_readings
 from icalib.initialize.paths.on_motion import path_on_motion, path_rates, poses_in, too_short
@@ -233,8 +234,7 @@ def _frames(
         if not len(own):
             raise too_short(stream.name)
         R, p = poses_in(part, GyroRotation.integrate(imu, part.bias[:, :3].mean(axis=0)), t[own])
-        U, _, Vt = np.linalg.svd((R @ R_is @ stream.rotation[own].transpose(0, 2, 1)).sum(axis=0))
-        R_wf = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R_wf = so3.closest_rotation((R @ R_is @ stream.rotation[own].transpose(0, 2, 1)).sum(axis=0))
         origin = np.median(p + R @ p_is - stream.position[own] @ R_wf.T, axis=0)
         frame = frame_of(sensor.name, k)
         out |= {(frame, FRAME[0]): R_wf, (frame, FRAME[1]): origin}

@@ -91,8 +91,7 @@ def first_attitude(imu: ImuData, fix: Fix, own: Triples, reference: float, offse
     seen = own.second(fix.position)
     seen[:, 2] += gravity * own.half
     felt = own.second(carried.doubles_at(t)[:, :3])
-    U, _, Vt = np.linalg.svd(seen.T @ felt)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return so3.closest_rotation(seen.T @ felt)
 
 
 def fit(

@@ -179,8 +179,7 @@ def _linear(at: Poses, p: np.ndarray, levelled: bool, arm: np.ndarray | None, of
     if levelled:
         R = so3.exp(np.array([0.0, 0.0, np.arctan2(x[4], x[3])]))
     else:
-        U, _, Vt = np.linalg.svd(x[3:12].reshape(3, 3))
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R = so3.closest_rotation(x[3:12].reshape(3, 3))
     found = x[:3] if arm is None else arm
     return _Unknowns(found, R, np.median(at.position + at.rotation @ found - p @ R.T, axis=0), offset)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from icalib.data.measurements import WheelPoses
 from icalib.errors import EstimationError
+from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 
 GRID_HZ = 100.0
@@ -81,8 +82,7 @@ def mount_guess(stream: WheelPoses, inside: np.ndarray, rate: np.ndarray, veloci
     up = _least_squares(np.column_stack([rate, np.ones(len(rate))]), pose[:, 0] / dt)[:3]
     moving = np.column_stack([velocity, rate])
     ahead, left = (_least_squares(moving, way / dt) for way in (x, y))
-    U, _, Vt = np.linalg.svd(np.stack([ahead[:3], left[:3], up]))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = so3.closest_rotation(np.stack([ahead[:3], left[:3], up]))
     rows = np.concatenate([-_cross(R[0]), -_cross(R[1])])  # p x r = -r x p
     return MountGuess(R.T, _least_squares(rows, np.concatenate([ahead[3:], left[3:]])))
 
