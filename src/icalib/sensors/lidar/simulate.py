@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.base.compiled import njit
 from icalib.base.yaml_nodes import YamlValue
 from icalib.data.measurements import LidarStream
 from icalib.errors import RigError

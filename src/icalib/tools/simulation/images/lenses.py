@@ -7,8 +7,8 @@ centre of the unit sphere, D meets the sphere at t D - shift e_z, t = shift D_z 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from icalib.base.compiled import njit
 from icalib.tools.simulation.scenario.projection import in_range
 from icalib.tools.simulation.scenario.scenario import MODELS, SimCamera
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 from math import erf
 
 import numpy as np
-from numba import njit
+
+from icalib.base.compiled import njit
 
 _SLACK = 1.3  # of a pixel's linear footprint, for what the lens bends it
 

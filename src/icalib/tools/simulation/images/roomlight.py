@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.base.compiled import njit
 from icalib.tools.simulation.scenario.room import RoomSurfaces, ground
 from icalib.tools.simulation.scenario.texture import Atlas
 

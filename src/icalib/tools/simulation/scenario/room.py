@@ -12,8 +12,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.base.compiled import njit
 from icalib.errors import RigError
 from icalib.tools.simulation.scenario.texture import Texture
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from icalib.base.compiled import njit
 
 _TEXEL_M = 0.004  # 1.8 px from 1 m at a focal length of 460 px
 _MOST_TEXELS = 40_000_000  # of all surfaces together, 110 MB with their pyramids; texels of larger rooms are larger
