@@ -11,6 +11,8 @@ from icalib.result.timeline import Timeline
 from icalib.sensors.parameter_spec import AXES
 from icalib.sensors.records import RowResiduals
 
+CLIP = 4.0  # standard deviations: outliers must not make the correlation
+
 
 def row_record(
     kind: str, rows: Sequence[ResidualRows], timeline: Timeline, labels: Mapping[str, tuple[str, ...]] | None = None
@@ -37,3 +39,9 @@ def _labels(r: ResidualRows) -> tuple[str, ...]:
     if n == 1:
         return (r.kind,)
     return tuple(f"{r.kind} {mark}" for mark in (AXES if n == len(AXES) else range(1, n + 1)))
+
+
+def lag_one_correlation(whitened: np.ndarray) -> float:
+    """Correlation of rows (n, m) of standard normal numbers with the ones before, large ones clipped; 0 without any."""
+    clipped = np.clip(whitened, -CLIP, CLIP)
+    return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))

@@ -20,8 +20,40 @@ _IMAGES: Shapes = {
 }
 
 
+class _PointsInImages:
+    """What both records share: rows of points, image by image."""
+
+    kind: str
+    start: np.ndarray
+    point: np.ndarray
+    residual: np.ndarray
+    sigma: np.ndarray
+
+    @property
+    def used(self) -> np.ndarray:
+        """(N,) bool"""
+        raise NotImplementedError
+
+    @property
+    def whitened(self) -> np.ndarray:
+        """(N, 2) residuals over their standard deviation, NaN where there are none."""
+        return self.residual / self.sigma[:, None]
+
+    def normalised(self) -> dict[str, np.ndarray]:
+        """Of both coordinates together."""
+        return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
+
+    def successive(self) -> dict[str, Successive]:
+        """Of the same corner or tracked point, from one image to the next."""
+        image, point = image_of(self), self.point
+        order = np.lexsort((image, point))
+        order = order[self.used[order]]
+        follows = (np.diff(point[order]) == 0) & (np.diff(image[order]) == 1)
+        return {self.kind: Successive(self.whitened[order].astype(np.float64), follows)}
+
+
 @dataclass(frozen=True)
-class CornerResiduals:
+class CornerResiduals(_PointsInImages):
     """Residuals (predicted - measured) of one camera's corners, in the recording's order; rejected ones stay."""
 
     kind: str = field(default="corners", init=False)
@@ -41,22 +73,9 @@ class CornerResiduals:
         """(N,) bool"""
         return ~self.rejected
 
-    @property
-    def whitened(self) -> np.ndarray:
-        """(N, 2) residuals over their standard deviation."""
-        return self.residual / self.sigma[:, None]
-
-    def normalised(self) -> dict[str, np.ndarray]:
-        """Of both coordinates together."""
-        return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
-
-    def successive(self) -> dict[str, Successive]:
-        """Of the same point, from one image to the next."""
-        return _of_points(self)
-
 
 @dataclass(frozen=True)
-class TrackResiduals:
+class TrackResiduals(_PointsInImages):
     """Residuals (predicted - measured) of tracked points in the images of one camera, in the recording's order, with
     each point at its least-squares position.
 
@@ -83,36 +102,14 @@ class TrackResiduals:
         """(N,) bool"""
         return np.isfinite(self.residual[:, 0])
 
-    @property
-    def whitened(self) -> np.ndarray:
-        """(N, 2) residuals over their standard deviation, NaN where there are none."""
-        return self.residual / self.sigma[:, None]
-
-    def normalised(self) -> dict[str, np.ndarray]:
-        """Of both coordinates together."""
-        return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
-
-    def successive(self) -> dict[str, Successive]:
-        """Of the same point, from one image to the next."""
-        return _of_points(self)
-
-
-def _of_points(r: CornerResiduals | TrackResiduals) -> dict[str, Successive]:
-    """Of a corner or tracked point, from one image to the next."""
-    image, point = image_of(r), r.point
-    order = np.lexsort((image, point))
-    order = order[r.used[order]]
-    follows = (np.diff(point[order]) == 0) & (np.diff(image[order]) == 1)
-    return {r.kind: Successive(r.whitened[order].astype(np.float64), follows)}
-
 
 RECORDS = (CornerResiduals, TrackResiduals)
 ImageResiduals = CornerResiduals | TrackResiduals
 
 
-def image_of(r: ImageResiduals) -> np.ndarray:
+def image_of(r: _PointsInImages) -> np.ndarray:
     """(N,) the image that each was seen in."""
-    return np.repeat(np.arange(len(r.seconds)), np.diff(r.start))
+    return np.repeat(np.arange(len(r.start) - 1), np.diff(r.start))
 
 
 def rms_of_images(r: ImageResiduals) -> np.ndarray:

@@ -11,13 +11,13 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.factor import Whitened
 from icalib.result import SensorFit
 from icalib.result.excess import excess, times
+from icalib.result.row_records import lag_one_correlation
 from icalib.result.timeline import Timeline
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
 
 # Correlations of residuals of poses with their neighbours. Of white noise between poses, steps have -0.5.
 CORRELATED, ALTERNATING = 0.5, 0.35
-CLIP = 4.0  # standard deviations
 UNKNOWN = "they are no white noise, and the cause is unknown: check its clock and mount, and record again, slower"
 
 
@@ -51,7 +51,7 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
     kinds = {s.name: s.kind for s in inputs.rig.poses}
     for factor, rows in _pose_factors(found):
         for what, own in (("rotation", rows.residual[:, :3]), ("position", rows.residual[:, 3:])):
-            correlation = neighbours(own)
+            correlation = lag_one_correlation(own)
             if kinds[factor.name] == "absolute" and correlation > CORRELATED:
                 yield (
                     f"the {what} residuals of {factor.name} follow one another (correlation {correlation:.2f} from "
@@ -63,12 +63,6 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
                     f"the {what} residuals of {factor.name} alternate (correlation {correlation:.2f} from step to "
                     "step), as those of poses that are noisy but do not drift; try kind: absolute."
                 )
-
-
-def neighbours(rows: np.ndarray) -> float:
-    """Correlation of rows (n, 3) with the ones before, large ones clipped; 0 where there are none."""
-    clipped = np.clip(rows, -CLIP, CLIP)
-    return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))
 
 
 def misfit(sensor: PoseSensor, f: SensorFit, is_noise: bool) -> str | None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs, origin_difference
-from icalib.motion.clocks import instants
 from icalib.motion.factor import pairs_of
 from icalib.result import RowResiduals, SensorFit
 from icalib.result.excess import excess, times
+from icalib.result.row_records import lag_one_correlation, row_record
 from icalib.result.timeline import Timeline
 from icalib.rig import Rig
 from icalib.sensors.position.model import FIRST_NOISE_M
@@ -20,21 +18,18 @@ from icalib.sensors.position.spec import MESSAGES, PositionSensor
 from icalib.sensors.position.stream import PositionStream
 
 CORRELATED = 0.5  # of a residual with the one before: white noise has 0, an error that lasts for two fixes 0.6
-CLIP = 4.0  # standard deviations
 # Seconds by which clocks of satellite systems and of computers differ: GPS time is ahead of UTC by 18 s since 2017, and
 # behind TAI by 19 s. Source: IERS Bulletin C.
 SCALES = {18.0: "GPS time and UTC", 19.0: "TAI and GPS time", 37.0: "TAI and UTC"}
 SAME_SCALE_S = 0.5  # about one of them: receivers and drivers are not later than that
-LABELS = ("east", "north", "up")  # of a levelled frame of GNSS; in others x, y and z
+# Axes of a levelled frame of GNSS; in others they are x, y and z.
+LABELS = {"horizontal": ("east", "north"), "vertical": ("up",)}
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
     """Of each position sensor, along the axes of its frame."""
     for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
-        seconds = instants(inputs.stream(factor.name), found.outcome.state.values, factor.instants)
-        shown = timeline.shown(seconds, timeline.recording_of(seconds))
-        whitened = rows.residual.copy()
-        yield RowResiduals(factor.name, "positions", LABELS, ("m",) * 3, shown, factor.raw(rows), whitened)
+        yield row_record("positions", factor.rows(rows, found.outcome.state), timeline, LABELS)
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
@@ -78,19 +73,13 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """Where errors of fixes last, so that they count for less than their number."""
     del inputs
     for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
-        correlation = neighbours(rows.residual)
+        correlation = lag_one_correlation(rows.residual)
         if correlation > CORRELATED:
             yield (
                 f"the residuals of {factor.name} follow one another (correlation {correlation:.2f} from fix to fix), "
                 "as those of multipath, or of a receiver that filters; the empirical factor counts it in the standard "
                 "deviations. Record for longer, or leave out worse fixes with least_status."
             )
-
-
-def neighbours(rows: np.ndarray) -> float:
-    """Correlation of rows (n, 3) with the ones before, large ones clipped; 0 where there are none."""
-    clipped = np.clip(rows, -CLIP, CLIP)
-    return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))
 
 
 def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> str | None:
