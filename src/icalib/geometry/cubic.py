@@ -1,4 +1,4 @@
-"""Cubics between two instants."""
+"""Cubics between two instants, and polynomials through several."""
 
 from __future__ import annotations
 
@@ -8,3 +8,13 @@ import numpy as np
 def hermite(s: np.ndarray, end: np.ndarray, before: np.ndarray, behind: np.ndarray) -> np.ndarray:
     """The cubic from 0 at s = 0 to `end` at s = 1, with derivatives by s `before` and `behind` there."""
     return s * (before + s * (3.0 * end - 2.0 * before - behind + s * (before + behind - 2.0 * end)))
+
+
+def lagrange_weights(t: np.ndarray) -> np.ndarray:
+    """(k, n) weights of values at times t (k, n) in the polynomial's value at 0."""
+    weight = np.ones_like(t)
+    for a in range(len(t)):
+        for b in range(len(t)):
+            if a != b:
+                weight[a] *= t[b] / (t[b] - t[a])
+    return weight

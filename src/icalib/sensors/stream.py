@@ -50,6 +50,29 @@ def far_origin(positions: np.ndarray) -> np.ndarray | None:
 
 
 @dataclass(frozen=True)
+class RawReadings:
+    """What one sensor measured, as it was written. stamps_ns (N,) int64, which may still repeat or run backwards.
+
+    Subclasses add arrays of N rows; an array of 0 rows is one that is not stated.
+    """
+
+    name: str
+    stamps_ns: np.ndarray
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(N,) seconds since the first stamp."""
+        return seconds_since(self.stamps_ns, int(self.stamps_ns[0]))
+
+    def some(self, kept: np.ndarray) -> Self:
+        """Those `kept` (N,), a mask."""
+        if kept.all():
+            return self
+        arrays = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray) and len(v) == len(kept)}
+        return dataclasses.replace(self, **{name: values[kept] for name, values in arrays.items()})
+
+
+@dataclass(frozen=True)
 class Stream:
     """What one sensor measured. name: of the sensor; stamps_ns (N,) int64, in nanoseconds of the sensor's own clock;
     joins_ns: where several recordings were joined, the first stamp of each but the first.

@@ -16,7 +16,20 @@ NO_VIEWS = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
-class CornerStream(Stream):
+class _ImageStream(Stream):
+    """Rows of image i are start[i]:start[i + 1]."""
+
+    sensor_type: ClassVar[str] = "camera"
+    start: np.ndarray
+
+    @property
+    def image(self) -> np.ndarray:
+        """(N,) the image that each row belongs to."""
+        return np.repeat(np.arange(len(self.stamps_ns)), np.diff(self.start))
+
+
+@dataclass(frozen=True)
+class CornerStream(_ImageStream):
     """Target corners that one camera saw, image by image.
 
     stamps_ns (M,) int64, one per image, strictly increasing; start (M + 1,) int64, corners of image i are
@@ -32,8 +45,6 @@ class CornerStream(Stream):
     files: names of the files that images come from, by stamp, "" for those of no file; also of images without corners.
     """
 
-    sensor_type: ClassVar[str] = "camera"
-    start: np.ndarray
     point: np.ndarray
     uv: np.ndarray
     sigma: np.ndarray = field(default_factory=lambda: np.zeros(0), kw_only=True)
@@ -74,14 +85,9 @@ class CornerStream(Stream):
         """(N,) each corner's standard deviation over that of the median corner; ones where the detector states none."""
         return self.sigma / np.median(self.sigma) if len(self.sigma) else np.ones(len(self.uv))
 
-    @property
-    def image(self) -> np.ndarray:
-        """(N,) the image that each corner belongs to."""
-        return np.repeat(np.arange(len(self.stamps_ns)), np.diff(self.start))
-
 
 @dataclass(frozen=True)
-class TrackStream(Stream):
+class TrackStream(_ImageStream):
     """Points of the scene that one camera followed, image by image, as a front end reports them.
 
     stamps_ns (M,) int64, one per image, strictly increasing; start (M + 1,) int64, observations of image i are
@@ -91,8 +97,6 @@ class TrackStream(Stream):
     each axis, as the alignment weighs its points, (0,) where it does not say.
     """
 
-    sensor_type: ClassVar[str] = "camera"
-    start: np.ndarray
     feature: np.ndarray
     uv: np.ndarray
     views: np.ndarray = field(default_factory=lambda: NO_VIEWS, kw_only=True)
@@ -125,11 +129,6 @@ class TrackStream(Stream):
     def which(self, stamp_ns: int) -> str:
         """Tells the image with this stamp from others, in sentences."""
         return which_image("", stamp_ns)
-
-    @property
-    def image(self) -> np.ndarray:
-        """(N,) the image that each observation belongs to."""
-        return np.repeat(np.arange(len(self.stamps_ns)), np.diff(self.start))
 
 
 def shared_rows(start: np.ndarray, feature: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:

@@ -45,6 +45,19 @@ def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tu
     return corners.of_rows(inside, corners.stamps_ns, count), (note,)
 
 
+def image_starts(what: str, stamps_ns: np.ndarray) -> np.ndarray:
+    """(M + 1,) where the rows of each image begin, and the last end; stamps_ns (N,) of the rows, image by image. Raises
+    RecordingError naming `what` and the instant where images are out of order."""
+    step = np.diff(stamps_ns)
+    if (step < 0).any():
+        i = int(np.argmax(step < 0))
+        raise RecordingError(
+            f"{what}: the image at {stamps_ns[i + 1]} ns comes after the one at {stamps_ns[i]} ns; "
+            "sort the rows by stamp."
+        )
+    return np.append(np.flatnonzero(np.concatenate([[True], step > 0])), len(stamps_ns)).astype(np.int64)
+
+
 def in_image(uv: np.ndarray, resolution: tuple[int, int], margin_px: float) -> np.ndarray:
     """(N,) bool: which points (N, 2) lie in the image, or so near outside."""
     return np.logical_and.reduce((uv >= -0.5 - margin_px) & (uv <= np.array(resolution) - 0.5 + margin_px), axis=1)

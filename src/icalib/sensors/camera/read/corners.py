@@ -8,6 +8,7 @@ from icalib.data.measurements import CornerStream
 from icalib.data.tables.columns import STAMP, TableKind
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
+from icalib.sensors.camera.read.checks import image_starts
 
 CORNERS = TableKind(
     ("t [ns]", "tag id", "corner"),
@@ -37,18 +38,10 @@ def group_corners(
     Raises RecordingError naming `source` and the instant: images out of order, a corner that the target does not have,
     or one that appears twice in an image.
     """
-    step = np.diff(stamps_ns)
-    if (step < 0).any():
-        i = int(np.argmax(step < 0))
-        raise RecordingError(
-            f"{source}: the image at {stamps_ns[i + 1]} ns comes after the one at {stamps_ns[i]} ns; "
-            "sort the rows by stamp."
-        )
+    start = image_starts(source, stamps_ns)
     point = _point_index(source, stamps_ns, tag, corner, target)
-    first = np.flatnonzero(np.concatenate([[True], step > 0]))
-    start = np.append(first, len(stamps_ns)).astype(np.int64)
     _refuse_repeated(source, stamps_ns, tag, corner, point, start, len(target.points))
-    return CornerStream(name, stamps_ns[first], start, point, np.ascontiguousarray(uv))
+    return CornerStream(name, stamps_ns[start[:-1]], start, point, np.ascontiguousarray(uv))
 
 
 def _point_index(source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np.ndarray, target: Target) -> np.ndarray:

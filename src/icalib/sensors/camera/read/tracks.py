@@ -13,7 +13,7 @@ from icalib.data.tables.columns import STAMP, TableKind
 from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, TableLayout
-from icalib.sensors.camera.read.checks import in_image, outside_note
+from icalib.sensors.camera.read.checks import image_starts, in_image, outside_note
 
 _RATE_HZ = (1e-3, 1000.0)
 _KIND = TableKind(
@@ -44,17 +44,8 @@ def read_tracks(
         note(sentence)
     stamps_ns, feature, uv = table.integers[:, 0].copy(), table.integers[:, 1].copy(), table.decimals
     what = f"{path} ({name})"
-    step = np.diff(stamps_ns)
-    if (step < 0).any():
-        i = int(np.argmax(step < 0))
-        raise RecordingError(
-            f"{what}: the image at {stamps_ns[i + 1]} ns comes after the one at {stamps_ns[i]} ns; "
-            "sort the rows by stamp."
-        )
-    first = np.flatnonzero(np.concatenate([[True], step > 0]))
-    stream = TrackStream(
-        name, stamps_ns[first], np.append(first, len(stamps_ns)).astype(np.int64), feature, np.ascontiguousarray(uv)
-    )
+    start = image_starts(what, stamps_ns)
+    stream = TrackStream(name, stamps_ns[start[:-1]], start, feature, np.ascontiguousarray(uv))
     inside = in_image(stream.uv, resolution, _MARGIN_PX)
     if not inside.all():
         first = stream.feature[np.argmin(inside)]

@@ -13,7 +13,6 @@ from icalib.rig import PoseSensor
 from icalib.sensors.pose.read.bad_poses import are_poses, path_of, stale_copies
 from icalib.sensors.pose.read.pose_tables import RATE_HZ, PoseReadings
 from icalib.sensors.pose.read.single_poses import single_wrong
-from icalib.sensors.stream import seconds_since
 
 _FASTEST_M_S = 100.0
 _BROKEN_SHARE = 0.5  # of all poses: more are no single bad readings
@@ -34,12 +33,12 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     values = np.hstack([read.position, read.rotation.reshape(-1, 9)])
     own = "write the sensor's own stamps"
     kept, notes = kept_readings(read.stamps_ns, values, what, RATE_HZ, "pose", own)
-    read = _some(read, kept)
+    read = read.some(kept)
     copied, single, jumped = (), (), ()
-    if not stands_still_between(_seconds(read), read.rotation, read.position):
+    if not stands_still_between(read.seconds, read.rotation, read.position):
         # Of a robot that stands still the controller repeats its pose in every digit.
         read, copied = _without_copies(read, what)
-    if not stands_still_between(_seconds(read), read.rotation, read.position):
+    if not stands_still_between(read.seconds, read.rotation, read.position):
         # Where it stands still what moved while it was not seen did not jump.
         read, single = _without_singles(read, what)
         read, jumped = _on_path(read, sensor, what)
@@ -47,12 +46,6 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     _refuse_units(read, what)
     stream = PoseStream(read.name, read.stamps_ns, np.ascontiguousarray(read.rotation), read.position)
     return stream, broken + notes + copied + single + jumped
-
-
-def _some(read: PoseReadings, kept: np.ndarray) -> PoseReadings:
-    if kept.all():
-        return read
-    return PoseReadings(read.name, read.stamps_ns[kept], read.rotation[kept], read.position[kept])
 
 
 def _without_broken(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
@@ -66,17 +59,17 @@ def _without_broken(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
             f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion, the first at "
             f"{first} ns; correct the program that writes them."
         )
-    return _some(read, good), (
+    return read.some(good), (
         f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion and were removed, the "
         f"first at {first} ns.",
     )
 
 
 def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    stale = stale_copies(_seconds(read), read.rotation, read.position)
+    stale = stale_copies(read.seconds, read.rotation, read.position)
     if not stale.any():
         return read, ()
-    return _some(read, ~stale), (
+    return read.some(~stale), (
         f"{what}: {int(stale.sum())} of {len(stale)} poses repeat an earlier one exactly during motion, as if "
         "the tracker was lost or the driver sent its last pose again. They were removed, the first at "
         f"{read.stamps_ns[np.argmax(stale)]} ns.",
@@ -84,10 +77,10 @@ def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
 
 
 def _without_singles(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    wrong = single_wrong(_seconds(read), read.rotation, read.position)
+    wrong = single_wrong(read.seconds, read.rotation, read.position)
     if not wrong.any():
         return read, ()
-    return _some(read, ~wrong), (
+    return read.some(~wrong), (
         f"{what}: {int(wrong.sum())} of {len(wrong)} poses are outliers of the trajectory and were removed, "
         f"the first at {read.stamps_ns[np.argmax(wrong)]} ns.",
     )
@@ -96,7 +89,7 @@ def _without_singles(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple
 def _on_path(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
     """Without poses off the path of the others, and a note where poses jump; raises RecordingError where jumps of a
     frame that stands still do not come back."""
-    path = path_of(_seconds(read), read.rotation, read.position)
+    path = path_of(read.seconds, read.rotation, read.position)
     if not len(path.jumps):
         return read, ()
     first, count = read.stamps_ns[path.jumps[0]], int((~path.on).sum())
@@ -109,14 +102,10 @@ def _on_path(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseRea
         )
     if not count:
         return read, (f"{words}; the robust loss reduces their weight.",)
-    return _some(read, path.on), (
+    return read.some(path.on), (
         f"{words}. {count} of {len(path.on)} poses are off the trajectory of the others, as if the tracker was "
         f"lost, and were removed; the longest gap is {path.longest_s:.2g} s.",
     )
-
-
-def _seconds(read: PoseReadings) -> np.ndarray:
-    return seconds_since(read.stamps_ns, int(read.stamps_ns[0]))
 
 
 def _refuse_stillness(read: PoseReadings, what: str) -> None:

@@ -14,6 +14,7 @@ from icalib.data.tables.columns import STAMP, TableKind, split_kind, vector_name
 from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, PoseSensor, TableLayout
+from icalib.sensors.stream import RawReadings
 
 RATE_HZ = (1e-3, 5000.0)
 POSES = TableKind(
@@ -33,12 +34,9 @@ _UNIT = 1e-2  # of the length of a quaternion: of few digits
 
 
 @dataclass(frozen=True)
-class PoseReadings:
-    """stamps_ns (N,) int64, which may still repeat or run backwards; R_frame_sensor (N, 3, 3), NaN where there is
-    none; p_frame_sensor (N, 3) m."""
+class PoseReadings(RawReadings):
+    """R_frame_sensor (N, 3, 3), NaN where there is none; p_frame_sensor (N, 3) m."""
 
-    name: str
-    stamps_ns: np.ndarray
     rotation: np.ndarray
     position: np.ndarray
 

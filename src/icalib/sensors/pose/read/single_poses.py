@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from icalib.geometry import so3
+from icalib.geometry.cubic import lagrange_weights
 
 _TIMES = 6.0  # the median distance: about 9 of its standard deviations, which noise does not reach
 _NEAR = 51  # poses about it, of which the median is taken: motion and noise change
@@ -56,19 +57,9 @@ def _distances(
     left, right = np.clip(left, 2, len(knots)), np.clip(right, 0, len(knots) - 2)
     beside = knots[np.stack([left - 2, left - 1, right, right + 1])]
     found &= t[beside[3]] - t[beside[0]] < _LONGEST_STEPS * np.median(np.diff(t))
-    weight = np.where(found, _lagrange(np.where(found, t[beside] - t[asked], np.arange(1.0, 5.0)[:, None])), 0.0)
+    weight = np.where(found, lagrange_weights(np.where(found, t[beside] - t[asked], np.arange(1.0, 5.0)[:, None])), 0.0)
     off = p[asked] - np.einsum("kn,kni->ni", weight, p[beside])
     turns = [so3.log_many(np.ascontiguousarray(R[asked].transpose(0, 2, 1) @ R[k])) for k in beside]
     turned = np.einsum("kn,kni->ni", weight, np.stack(turns))
     far = np.stack([np.linalg.norm(off, axis=1), np.linalg.norm(turned, axis=1)], axis=1)
     return far * found[:, None], np.sqrt((1.0 + (weight**2).sum(axis=0)) / _EVEN)
-
-
-def _lagrange(t: np.ndarray) -> np.ndarray:
-    """(k, n) weights of values at times t (k, n) in the polynomial's value at 0."""
-    weight = np.ones_like(t)
-    for a in range(len(t)):
-        for b in range(len(t)):
-            if a != b:
-                weight[a] *= t[b] / (t[b] - t[a])
-    return weight

@@ -52,10 +52,6 @@ def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream
     return PositionStream(read.name, read.stamps_ns, np.ascontiguousarray(read.position), read.covariance), notes
 
 
-def _seconds(read: PositionReadings) -> np.ndarray:
-    return (read.stamps_ns - read.stamps_ns[0]) * 1e-9
-
-
 def _refuse_stillness(read: PositionReadings, what: str) -> None:
     far = float(np.linalg.norm(read.position - np.median(read.position, axis=0), axis=1).max())
     if far < _STILL_M:
@@ -66,7 +62,7 @@ def _refuse_stillness(read: PositionReadings, what: str) -> None:
 
 
 def _refuse_units(read: PositionReadings, what: str) -> None:
-    speed = float(np.median(np.linalg.norm(np.diff(read.position, axis=0), axis=1) / np.diff(_seconds(read))))
+    speed = float(np.median(np.linalg.norm(np.diff(read.position, axis=0), axis=1) / np.diff(read.seconds)))
     if speed > _FASTEST_M_S:
         raise RecordingError(
             f"{what}: it moves at {speed:.4g} m/s, which is implausible. Positions must be in metres (divide "
@@ -77,7 +73,7 @@ def _refuse_units(read: PositionReadings, what: str) -> None:
 def _without_frozen(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:
     """Without runs of equal fixes of a receiver that repeats its last one while the antenna moves: it stops, or starts,
     faster than a vehicle can. The first fix of a run stays."""
-    t, p = _seconds(read), read.position
+    t, p = read.seconds, read.position
     same = np.concatenate([[False], (np.diff(p, axis=0) == 0.0).all(axis=1)])
     edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
     frozen = np.zeros(len(t), dtype=bool)
@@ -111,7 +107,7 @@ def _leaps(t: np.ndarray, p: np.ndarray, k: int) -> bool:
 
 
 def _without_singles(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:
-    wrong = single_wrong(_seconds(read), read.position)
+    wrong = single_wrong(read.seconds, read.position)
     if not wrong.any():
         return read, ()
     return read.some(~wrong), (
@@ -122,7 +118,7 @@ def _without_singles(read: PositionReadings, what: str) -> tuple[PositionReading
 
 def _jumps(read: PositionReadings, what: str) -> tuple[str, ...]:
     """A note on steps of the solution."""
-    first, size = steps(_seconds(read), read.position)
+    first, size = steps(read.seconds, read.position)
     if not len(first):
         return ()
     times = "once" if len(first) == 1 else f"{len(first)} times"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 
+from icalib.geometry.cubic import lagrange_weights
+
 NEAR = 51  # fixes about one, whose median distance is the usual one: motion and noise change
 TIMES = 8.0  # the usual distance, some 10 standard deviations
 LEAST_M = 0.05  # of fixes that are exact anything else would stand out
@@ -36,14 +38,7 @@ def _from_cubic(t: np.ndarray, p: np.ndarray) -> np.ndarray:
     n = len(t)
     i = np.arange(2, n - 2)
     knots = np.stack([i - 2, i - 1, i + 1, i + 2])
-    x = t[knots] - t[i]
-    predicted = np.zeros((len(i), 3))
-    for a in range(4):
-        weight = np.ones(len(i))
-        for b in range(4):
-            if a != b:
-                weight *= x[b] / (x[b] - x[a])
-        predicted += weight[:, None] * p[knots[a]]
+    predicted = np.einsum("kn,kni->ni", lagrange_weights(t[knots] - t[i]), p[knots])
     out = np.zeros(n)
     even = t[i + 2] - t[i - 2] < 4.0 * GAP_STEPS * np.median(np.diff(t))
     out[i] = np.where(even, np.linalg.norm(p[i] - predicted, axis=1), 0.0)

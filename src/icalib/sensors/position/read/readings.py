@@ -9,32 +9,20 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.geometry.geodesy import earth_centred, local_metres
 from icalib.sensors.position.spec import STATUSES, Status
+from icalib.sensors.stream import RawReadings
 
 NO_COVARIANCE = np.zeros((0, 3, 3))
 FAR_M = 20_000.0  # from the first fix: over more, "up" turns by 3 mrad, 0.03 m/s^2 of gravity
 
 
 @dataclass(frozen=True)
-class PositionReadings:
-    """stamps_ns (N,) int64, which may still repeat or run backwards; position (N, 3) m, or latitude, longitude [deg]
-    and height [m] until they are converted; covariance (N, 3, 3) m^2, or (0, 3, 3); status (N,) index into `STATUSES`,
-    -1: no fix, or (0,) where none is stated."""
+class PositionReadings(RawReadings):
+    """position (N, 3) m, or latitude, longitude [deg] and height [m] until they are converted; covariance (N, 3, 3)
+    m^2, or (0, 3, 3); status (N,) index into `STATUSES`, -1: no fix, or (0,) where none is stated."""
 
-    name: str
-    stamps_ns: np.ndarray
     position: np.ndarray
     covariance: np.ndarray
     status: np.ndarray
-
-    def some(self, kept: np.ndarray) -> PositionReadings:
-        """Those `kept` (N,), a mask."""
-        if kept.all():
-            return self
-        n = len(self.stamps_ns)
-        own = {k: getattr(self, k) for k in ("position", "covariance", "status")}
-        return replace(
-            self, stamps_ns=self.stamps_ns[kept], **{k: x[kept] if len(x) == n else x for k, x in own.items()}
-        )
 
 
 def good_fixes(status: np.ndarray, least: Status, n: int) -> np.ndarray:

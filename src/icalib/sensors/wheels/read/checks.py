@@ -11,7 +11,6 @@ from icalib.data.stamps.clocks import usual_step
 from icalib.data.stamps.ordered import kept_readings, longest_run
 from icalib.errors import RecordingError
 from icalib.rig import RATE_UNITS, Wheels
-from icalib.sensors.stream import seconds_since
 from icalib.sensors.wheels.read.bad_wheels import apart, comes_back, counter_of, range_of, set_back, without_wraps
 from icalib.sensors.wheels.read.wheel_readings import RATE_HZ, WheelReadings
 
@@ -97,7 +96,7 @@ def _turning(read: WheelReadings, wheels: Wheels) -> int:
 
 def _even_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
     """Rates or velocities without single ones that stand apart."""
-    off, own = apart(read.value, _seconds(read))
+    off, own = apart(read.value, read.seconds)
     return _some(read, ~np.logical_or.reduce(own, axis=1)), _apart_note(read, off, own, what)
 
 
@@ -105,17 +104,17 @@ def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelRe
     """Rates (N, m) rad/s between the stamps of angles or ticks, steering angles as they are. Single wrong readings are
     left out first; steps to another count after which it goes on, as of a counter that was set back, then."""
     size, notes = _range(read, wheels, what)
-    off, own = apart(_steps(read, wheels, size), _seconds(read)[1:])
-    dt = np.diff(_seconds(read))[:, None]
+    off, own = apart(_steps(read, wheels, size), read.seconds[1:])
+    dt = np.diff(read.seconds)[:, None]
     wrong = comes_back(off * dt, own)
     if wrong.any():
         at = read.stamps_ns[np.argmax(wrong)]
         notes += (f"{what}: {int(wrong.sum())} single readings are outliers and were removed, the first at {at} ns.",)
         read = _some(read, ~wrong)
-        off, own = apart(_steps(read, wheels, size), _seconds(read)[1:])
+        off, own = apart(_steps(read, wheels, size), read.seconds[1:])
     own = set_back(_steps(read, wheels, size), off, own)
     if wheels.measures == "ticks" and wheels.counter_size is None and own.any():
-        _refuse_counter(read, wheels, off * np.diff(_seconds(read))[:, None] * own, what)
+        _refuse_counter(read, wheels, off * np.diff(read.seconds)[:, None] * own, what)
     rate, stamps = _steps(read, wheels, size), read.stamps_ns
     n_turning = _turning(read, wheels)
     turned = WheelReadings(read.name, stamps[1:], np.concatenate([rate, read.value[1:, n_turning:]], axis=1))
@@ -171,10 +170,6 @@ def _apart_note(read: WheelReadings, off: np.ndarray, own: np.ndarray, what: str
         f"{what}: {count} of {len(own)} readings are outliers, off by up to {most:.3g}, and were removed, the "
         f"first at {at} ns.",
     )
-
-
-def _seconds(read: WheelReadings) -> np.ndarray:
-    return seconds_since(read.stamps_ns, int(read.stamps_ns[0]))
 
 
 def _combined(value: np.ndarray, wheels: Wheels) -> np.ndarray:

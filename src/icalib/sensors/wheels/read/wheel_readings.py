@@ -14,6 +14,7 @@ from icalib.data.tables.columns import STAMP, TableKind
 from icalib.data.tables.table import Table, read_table
 from icalib.errors import RecordingError
 from icalib.rig import WheelDrive, WheelMeasure, Wheels
+from icalib.sensors.stream import RawReadings
 from icalib.sensors.wheels.read.joints import JointStream
 
 RATE_HZ = (1e-2, 10_000.0)
@@ -47,13 +48,11 @@ _NAMES: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class WheelReadings:
-    """stamps_ns (N,) int64, which may still repeat or run backwards; value (N, m) in the unit of what the wheels
-    measure: left and right; of skid-steer front and rear left, front and rear right; of ackermann the driven wheel
-    and the steering angle [rad], or two of each, left and right; of twist forward speed and yaw rate."""
+class WheelReadings(RawReadings):
+    """value (N, m) in the unit of what the wheels measure: left and right; of skid-steer front and rear left, front and
+    rear right; of ackermann the driven wheel and the steering angle [rad], or two of each, left and right; of twist
+    forward speed and yaw rate."""
 
-    name: str
-    stamps_ns: np.ndarray
     value: np.ndarray
 
 
