@@ -8,12 +8,12 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from icalib.rig.kinds import MOUNTED_TYPES
+from icalib.rig.kinds import SENSOR_TYPES
 from icalib.sensors.camera.spec import Camera
 from icalib.tools.inspection.kinds import inspectors
 from icalib.tools.simulation.scenario.sensor import SimSensor, simulated_kinds
 
-OTHERS = [kind.sensor_type for kind in MOUNTED_TYPES if kind is not Camera]
+OTHERS = [name for name, kind in SENSOR_TYPES.items() if not kind.is_inertial and kind is not Camera]
 
 
 def test_every_kind_is_simulated_and_inspected():

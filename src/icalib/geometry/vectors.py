@@ -1,4 +1,4 @@
-"""Products of many vectors at a time."""
+"""Products of many vectors at a time, and comparisons of vectors."""
 
 from __future__ import annotations
 
@@ -14,3 +14,8 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         np.multiply(a[..., j], b[..., k], out=out[..., i])
         out[..., i] -= a[..., k] * b[..., j]
     return out
+
+
+def is_near(a: np.ndarray, b: np.ndarray, share: float) -> bool:
+    """Whether the difference of the arrays is smaller than a share of b, by their norms."""
+    return float(np.linalg.norm(a - b)) < share * float(np.linalg.norm(b))

@@ -117,6 +117,11 @@ class State:
     starts: tuple[int, ...] = (0,)
 
     @property
+    def recording(self) -> np.ndarray:
+        """(K,) number of the recording of each node."""
+        return np.repeat(np.arange(len(self.starts)), np.diff((*self.starts, len(self.seconds))))
+
+    @property
     def recordings(self) -> list[slice]:
         """The nodes of each recording."""
         return [slice(a, b) for a, b in pairwise((*self.starts, len(self.seconds)))]

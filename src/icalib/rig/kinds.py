@@ -7,7 +7,6 @@ from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.sensor import Sensor
 
 SENSOR_TYPES: dict[str, type[Sensor]] = {kind: facet(kind, "spec").SENSOR for kind in SENSOR_KINDS}
-MOUNTED_TYPES = tuple(t for t in SENSOR_TYPES.values() if not t.is_inertial)  # those with a pose relative to the IMU
 _OWN = (spec for kind in SENSOR_TYPES.values() for spec in kind.parameters)
 ALL_SPECS = tuple(dict.fromkeys((*_OWN, *SCENE)))  # each once
 

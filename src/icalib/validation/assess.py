@@ -287,7 +287,7 @@ def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:
 def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.ndarray:
     """(K,) the recording of each keyframe; without an IMU, that of the image or the pose at it."""
     if inputs.imu is not None:
-        return np.repeat(np.arange(len(state.starts)), np.diff((*state.starts, len(state.seconds))))
+        return state.recording
     if not inputs.rig.cameras:
         return timeline.recording_of(state.seconds)
     times = np.concatenate(image_times(inputs, state.values))

@@ -7,6 +7,7 @@ from itertools import permutations, product
 import numpy as np
 
 from icalib.geometry import so3
+from icalib.geometry.vectors import is_near
 from icalib.rig import Rig
 from icalib.sensors import answer
 
@@ -31,17 +32,17 @@ def looks_like(
         return _frames(value, found)
     if name == "translation" and rotation is not None:
         inverse = -rotation.T @ found
-        if _is_near(value, inverse) and not _is_near(value, found):
+        if is_near(value, inverse, NEARLY) and not is_near(value, found, NEARLY):
             return " It looks like that of the inverse: icalib wants p_imu_sensor."
     sensor = rig.sensors.get(key[0])
     for size, unit in (LENGTHS if sensor is not None and sensor.spec(name).unit == "m" else {}).items():
-        if _is_near(found, size * value):
+        if is_near(found, size * value, NEARLY):
             return f" It looks like {unit}: write metres."
-    if name == "time_offset" and _is_near(found, 1e-3 * value):
+    if name == "time_offset" and is_near(found, 1e-3 * value, NEARLY):
         return " It looks like milliseconds: write seconds."
     if name == "intrinsics":
         for size in IMAGE_SIZES:
-            if _is_near(found[:2], size * value[:2]):
+            if is_near(found[:2], size * value[:2], NEARLY):
                 return f" The focal length is {size:g} times that: was it of images of another size?"
     own = None if sensor is None else answer(sensor.sensor_type, "assess", "looks_like", sensor, name, value, found)
     return own or ""
@@ -53,10 +54,6 @@ def _frames(value: np.ndarray, found: np.ndarray) -> str:
     if min(_angle(value @ turn, found) for turn in TURNS if np.linalg.det(turn) > 0.0) < NEAR_RAD:
         return " It looks like that of a frame whose axes are named otherwise, as a link's and a camera's are."
     return ""
-
-
-def _is_near(a: np.ndarray, b: np.ndarray) -> bool:
-    return float(np.linalg.norm(a - b)) < NEARLY * float(np.linalg.norm(b))
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:

@@ -24,6 +24,7 @@ import numpy as np
 from icalib.geometry import so3
 from icalib.initialize.paths.imu_motion import Integrals
 from icalib.initialize.steps.clocks import only_axis
+from icalib.initialize.steps.lever_arm import Triples
 from icalib.motion.imu_data import ImuData, clear_of
 
 ARM_SIGMA = 0.5  # m: what the motion leaves open stays small
@@ -102,13 +103,8 @@ def against_readings(
 ) -> System:
     """Of a LiDAR at seconds (n,) on the imu clock; carry: R_map_imu (N, 3, 3) at the IMU's stamps from that (n, 3, 3)
     at the scans. The unknowns after p are gravity in the map and the accelerometer's bias."""
-    i, j, k = _triples(seconds, imu.gaps)
-    h1, h2 = (seconds[j] - seconds[i])[:, None], (seconds[k] - seconds[j])[:, None]
-
-    def second(x: np.ndarray) -> np.ndarray:
-        flat = x.reshape(len(x), -1)
-        return ((flat[k] - flat[j]) / h2 - (flat[j] - flat[i]) / h1).reshape(len(i), *x.shape[1:])
-
+    triples = _triples(seconds, imu.gaps)
+    n, second = len(triples.i), triples.second
     bend = second(position)
 
     def rows(R_il: np.ndarray, p_il: np.ndarray) -> LeverArmRows:
@@ -119,10 +115,10 @@ def against_readings(
         by_turn = so3.hat_many(felt) @ R @ R_il
         x = np.concatenate([felt, R.reshape(-1, 9), by_turn.reshape(-1, 9)], axis=1)
         D = Integrals.of(imu, x).at(seconds)[1]
-        A = np.zeros((len(i), 3, 12))
+        A = np.zeros((n, 3, 12))
         A[:, :, :3] = second(rotation @ so3.hat_many((R_il.T @ p_il)[None])[0] + D[:, 12:].reshape(-1, 3, 3))
         A[:, :, 3:6] = second(at_scans)
-        A[:, :, 6:9] = 0.5 * (h1 + h2)[:, :, None] * np.eye(3)
+        A[:, :, 6:9] = triples.half[:, None, None] * np.eye(3)
         A[:, :, 9:] = -second(D[:, 3:12].reshape(-1, 3, 3))
         return LeverArmRows(A, bend - second(D[:, :3]), bend)
 
@@ -193,7 +189,7 @@ def _pairs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return i[good], j[good]
 
 
-def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Triples:
     """Scans (i, j, k) about STEP_S apart, or next to each other, and no part of them in a gap of the IMU."""
     i = np.arange(len(t))
     step = max(STEP_S, float(np.median(np.diff(t))))
@@ -203,4 +199,4 @@ def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.n
     i, j, k = i[good], j[good], k[good]
     close = (t[j] - t[i] < 2.0 * step) & (t[k] - t[j] < 2.0 * step)
     close &= clear_of(gaps, t[i], t[k])
-    return i[close], j[close], k[close]
+    return Triples.at(t, i[close], j[close], k[close])

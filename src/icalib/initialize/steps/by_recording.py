@@ -37,6 +37,11 @@ def alone(inputs: Inputs, k: int) -> Inputs:
     return replace(inputs, measurements=part.measurements, imu=imu_data(inputs.rig, part.measurements), parts=(own,))
 
 
+def fullest(inputs: Inputs, key: str) -> int:
+    """Number of the recording in which the stream `key` has most rows."""
+    return int(np.argmax([part.measurements.streams[key].rows for part in inputs.parts]))
+
+
 def naming_recording(inputs: Inputs, k: int) -> AbstractContextManager[None]:
     """Errors raised within begin with the name of recording `k`, where there are several."""
     return naming(inputs.parts[k].name if len(inputs.parts) > 1 else "")

@@ -10,6 +10,7 @@ where D_R is the double integral of R_board_imu itself; velocities have dropped 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,36 @@ G_TOLERANCE = 0.1
 GIVEN_TOLERANCE = 0.5  # of both, where a guess that may be degrees off goes into them
 UNLIKE = 1.2  # times the acceleration that was seen, which is left of it
 SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
+
+
+class Triples(NamedTuple):
+    """Numbers (n,) of the instants i < j < k of each triple, and h_1, h_2 (n,) s between them."""
+
+    i: np.ndarray
+    j: np.ndarray
+    k: np.ndarray
+    h1: np.ndarray
+    h2: np.ndarray
+
+    @classmethod
+    def at(cls, t: np.ndarray, i: np.ndarray, j: np.ndarray, k: np.ndarray) -> Triples:
+        """Of the instants i, j, k (n,) of t (N,) s."""
+        return cls(i, j, k, t[j] - t[i], t[k] - t[j])
+
+    def some(self, kept: np.ndarray) -> Triples:
+        """Those `kept` (n,), a mask or indices."""
+        return Triples(*(x[kept] for x in self))
+
+    def second(self, x: np.ndarray) -> np.ndarray:
+        """A[x] (n, ...) of x (N, ...) at the instants."""
+        flat, h1, h2 = x.reshape(len(x), -1), self.h1[:, None], self.h2[:, None]
+        found = (flat[self.k] - flat[self.j]) / h2 - (flat[self.j] - flat[self.i]) / h1
+        return found.reshape(-1, *x.shape[1:])
+
+    @property
+    def half(self) -> np.ndarray:
+        """(n,) (h_1 + h_2) / 2 [s], A of t^2 / 2."""
+        return 0.5 * (self.h1 + self.h2)
 
 
 @dataclass(frozen=True)
@@ -67,18 +98,13 @@ def lever_arm(
     # The error of one image's rotation goes with that of its position, as if the lever arm reached to the target.
     R_bi = gyro.smoothed(t, poses.rotation[ok] @ R_imu_cam.T)
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
-    i, j, k = _triples(t, imu.gaps)
-    if len(i) < 10:
+    triples = _triples(t, imu.gaps)
+    n, second = len(triples.i), triples.second
+    if n < 10:
         raise EstimationError("too few images are close enough in time to estimate gravity; record for longer.")
-    h1, h2 = (t[j] - t[i])[:, None], (t[k] - t[j])[:, None]
-
-    def second(x: np.ndarray) -> np.ndarray:
-        flat = x.reshape(len(x), -1)
-        return ((flat[k] - flat[j]) / h2 - (flat[j] - flat[i]) / h1).reshape(len(i), *x.shape[1:])
-
-    rows = np.zeros((len(i), 3, 9))
+    rows = np.zeros((n, 3, 9))
     rows[:, :, 0:3] = second(R_bi)
-    rows[:, :, 3:6] = 0.5 * (h1 + h2)[:, :, None] * np.eye(3)
+    rows[:, :, 3:6] = triples.half[:, None, None] * np.eye(3)
     rows[:, :, 6:9] = -second(D_R)
     rhs = second(p) - second(D_f)
     if given is not None:
@@ -123,7 +149,7 @@ def size_of(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float,
     return 1.0 / factor, float(np.sqrt(variance * np.linalg.inv(information)[-1, -1])) / factor**2
 
 
-def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Triples:
     """Images (i, j, k) about STEP_S apart, within a factor of two, or neighbours where most are further apart, and no
     part of them in a gap of the IMU."""
     i = np.arange(len(t))
@@ -136,7 +162,7 @@ def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.n
     i, j, k = i[good], j[good], k[good]
     close = (t[j] - t[i] < longest) & (t[k] - t[j] < longest)
     close &= clear_of(gaps, t[i], t[k])
-    return i[close], j[close], k[close]
+    return Triples.at(t, i[close], j[close], k[close])
 
 
 def _double_integrals(

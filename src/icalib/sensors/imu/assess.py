@@ -19,8 +19,7 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[I
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
     chain, state = found.problem.chain, found.outcome.state
-    recording = np.repeat(np.arange(len(state.starts)), np.diff((*state.starts, len(state.seconds))))
-    seconds, seams = timeline.shown(state.seconds, recording)[:-1], np.array(chain.starts[1:], dtype=np.int64) - 1
+    seconds, seams = timeline.shown(state.seconds, state.recording)[:-1], np.array(chain.starts[1:], dtype=np.int64) - 1
     whitened = found.outcome.residuals[chain.key].residual
     yield ImuResiduals(chain.name, np.delete(seconds, seams), np.delete(whitened, seams, axis=0))
 

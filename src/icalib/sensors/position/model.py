@@ -10,11 +10,9 @@ import numpy as np
 from icalib.model.frames import frame_of
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.model.statistics import ResidualStatistics
-from icalib.motion.clocks import instants
-from icalib.optim.state import Entry, Key
+from icalib.optim.state import Entry
 from icalib.rig import Rig, Settings
 from icalib.rig.scene import FRAME, LEVEL_FRAME
-from icalib.sensors.position.read.outliers import single_wrong
 from icalib.sensors.position.residual import PositionFactor, PositionNoise
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
@@ -35,13 +33,6 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
         levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == "levelled"
         frames = [frame_of(sensor.name, k) for k in range(n_recordings)]
         return [spec.entry(frame) for frame in frames for spec in (LEVEL_FRAME if levelled else FRAME)]
-
-    def keyframe_times(
-        self, sensor: PositionSensor, stream: PositionStream, values: dict[Key, np.ndarray], rig: Rig
-    ) -> np.ndarray:
-        """See `SensorModel`."""
-        del sensor, rig
-        return instants(stream, values)
 
     def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
         """In metres if the rig file states a number, else 1: times the standard deviations of `weighted`."""
@@ -74,10 +65,7 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
 
 def weighted(sensor: PositionSensor, stream: PositionStream) -> PositionStream:
     """The stream with covariances as the noise is counted in: those of the recording, unless the rig file states the
-    noise. Without either FIRST_NOISE_M of each axis. Single wrong fixes, which streams in memory may have, are left
-    out: by them the estimated noise would be too large."""
-    if (wrong := single_wrong(stream.seconds, stream.position)).any():
-        stream = stream.some(~wrong)
+    noise. Without either FIRST_NOISE_M of each axis."""
     n = len(stream.stamps_ns)
     if isinstance(sensor.position_noise, float):
         return replace(stream, covariance=np.zeros((0, 3, 3)))

@@ -96,11 +96,6 @@ class PositionFactor(RowFactor):
         """See `Factor`."""
         return KINDS
 
-    @property
-    def instants(self) -> np.ndarray:
-        """(n,) that the rows are at, on the sensor's clock."""
-        return self.seconds
-
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
         return Whitened.empty(len(self.seconds), 3)

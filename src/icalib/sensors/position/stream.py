@@ -30,9 +30,7 @@ class PositionStream(Stream):
         check(stated, f"{self.name}: covariance must have shape ({n}, 3, 3), or (0, 3, 3) without any.")
 
     def some(self, kept: np.ndarray) -> PositionStream:
-        """The fixes in `kept` (N,) bool, on the same clock: seconds still count from the first of all."""
-        kept = kept.copy()
-        kept[0] = True
+        """The fixes in `kept` (N,) bool."""
         covariance = self.covariance[kept] if len(self.covariance) else self.covariance
         return replace(self, stamps_ns=self.stamps_ns[kept], position=self.position[kept], covariance=covariance)
 

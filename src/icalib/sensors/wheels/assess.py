@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
+from icalib.geometry.vectors import is_near
 from icalib.initialize.steps.vertical import level_sensor
 from icalib.motion.factor import of_type
 from icalib.result import ParameterGroup, RowResiduals, SensorFit
@@ -179,15 +180,11 @@ def looks_like(wheels: Wheels, name: str, value: np.ndarray, found: np.ndarray) 
     """What the stated size of wheels looks like, as a sentence that begins with a space; or nothing."""
     if name not in ("radii", "radius"):
         return ""
-    if _is_near(found, 0.5 * value):
+    if is_near(found, 0.5 * value, NEARLY):
         return " It looks like a diameter: write the radius."
     if wheels.measures == "ticks" and wheels.counts_per_turn is not None:
         return f" With it counts_per_turn would be {wheels.counts_per_turn * float(np.median(value / found)):.0f}."
     for size, unit in RATES.items() if wheels.measures == "rates" else ():
-        if _is_near(found, size * value):
+        if is_near(found, size * value, NEARLY):
             return f" Its readings look like {unit}: write rate_unit: {unit}."
     return ""
-
-
-def _is_near(a: np.ndarray, b: np.ndarray) -> bool:
-    return float(np.linalg.norm(a - b)) < NEARLY * float(np.linalg.norm(b))

@@ -23,6 +23,7 @@ from icalib.initialize.steps.by_recording import (
     alone,
     each_clock,
     from_the_best,
+    fullest,
     motion_alone,
     naming_recording,
     other_clocks,
@@ -56,7 +57,8 @@ def state_from_lidar(inputs: Inputs) -> State:
         with naming_sight(own.measurements.lidars[:1]):
             return _state_of_one(own, held)
 
-    return from_the_best(inputs, inputs.rig.lidars[0], most_points(inputs, 0), state_of)
+    first = inputs.rig.lidars[0]
+    return from_the_best(inputs, first, fullest(inputs, first.name), state_of)
 
 
 def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
@@ -208,7 +210,7 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             continue
         known = given(inputs, lidar)
         if len(known) < len(MOUNTED_NAMES):
-            k = most_points(inputs, i)
+            k = fullest(inputs, inputs.rig.lidars[i].name)
             own, motion = alone(inputs, k), motion_alone(inputs, k, state)
             assert own.imu is not None
             stream = own.measurements.lidars[i]
@@ -258,11 +260,6 @@ def _add_in_world(moments: Moments, motion: Motion, stream: LidarStream, sums: n
     A[:, 0, 0], A[:, 1:, 0], A[:, 1:, 1:] = 1.0, at.position[bin_of], at.rotation[bin_of]
     X = A @ L
     np.add.at(sums, moments.plane, X @ X.transpose(0, 2, 1))
-
-
-def most_points(inputs: Inputs, lidar: int) -> int:
-    """The recording that has most points of a LiDAR, given by its number."""
-    return int(np.argmax([len(part.measurements.lidars[lidar].xyz) for part in inputs.parts]))
 
 
 def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:

@@ -28,6 +28,7 @@ from icalib.initialize.steps.by_recording import (
     alone,
     each_clock,
     from_the_best,
+    fullest,
     motion_alone,
     naming_recording,
 )
@@ -81,7 +82,7 @@ def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream
         turn = partial(_turn_on_motion, inputs.imu, **known)
         return placed(stream, partial(_on_motion, inputs.imu, **known), turn).values(sensor.name)
     streams = [_alone(inputs, k, sensor.name) for k in range(len(inputs.parts))]
-    k = int(np.argmax([len(own.stamps_ns) for _, own in streams]))
+    k = fullest(inputs, sensor.name)
     imu, own = streams[k]
     with naming_recording(inputs, k):
         known = {"known": motion_alone(inputs, k, state), "held": held}
@@ -107,8 +108,8 @@ def state_from_poses(inputs: Inputs) -> State:
 
     Raises EstimationError where they do not.
     """
-    best = int(np.argmax([len(part.measurements.poses[0].stamps_ns) for part in inputs.parts]))
-    return from_the_best(inputs, inputs.rig.poses[0], best, _state_of_one)
+    sensor = inputs.rig.poses[0]
+    return from_the_best(inputs, sensor, fullest(inputs, sensor.name), _state_of_one)
 
 
 def _state_of_one(inputs: Inputs, held: Held | None) -> State:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.assembly import host_times, motion_of, nodes_for, start_values
 from icalib.estimate.problem.inputs import Inputs
@@ -14,6 +15,7 @@ from icalib.initialize.steps.by_recording import (
     Held,
     alone,
     from_the_best,
+    fullest,
     motion_alone,
     naming_recording,
     other_clocks,
@@ -48,14 +50,20 @@ class PositionInitializer(Initializer[PositionSensor]):
     def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
         del other
         sensor = inputs.rig.of(PositionSensor)[0]
-        counts = [len(alone(inputs, k).stream(sensor.name).stamps_ns) for k in range(len(inputs.parts))]
-        state = from_the_best(inputs, sensor, int(np.argmax(counts)), _state_of_one)
+        state = from_the_best(inputs, sensor, fullest(inputs, sensor.name), _state_of_one)
         frames = _frames(inputs, sensor, [(np.eye(3), np.zeros(3))] * len(inputs.parts))
         return replace(state, values=state.values | frames)
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
         state = first_pass(inputs, state)
         return inputs, state, state.values
+
+    def cleaned(self, recording: Measurements) -> Measurements:
+        """Without single wrong fixes, which measurements in memory may have: by them the estimated noise would be too
+        large."""
+        return recording.with_streams(
+            *(s.some(~single_wrong(s.seconds, s.position)) for s in recording.of(PositionStream))
+        )
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[PositionSensor]) -> Values:
         out: Values = {}
@@ -87,7 +95,7 @@ def _on_motion(inputs: Inputs, state: State, sensor: PositionSensor) -> Values:
     """What one sensor shows on the motion of `state`. Of several recordings the one with most fixes gives the lever
     arm, and the time offset if the clock runs on."""
     recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
-    best = int(np.argmax([len(own.stream(sensor.name).stamps_ns) for own in recordings]))
+    best = fullest(inputs, sensor.name)
     found: dict[int, PlacedSensor] = {}
     for k in sorted(range(len(recordings)), key=lambda k: k != best):
         known = _held(recordings[k], sensor)
@@ -113,11 +121,9 @@ def _held(inputs: Inputs, sensor: PositionSensor) -> Held:
 
 
 def _fix(inputs: Inputs, sensor: PositionSensor) -> Fix:
-    """Without single wrong ones, which measurements in memory may have."""
     stream = inputs.stream(sensor.name)
     assert isinstance(stream, PositionStream)
-    good = ~single_wrong(stream.seconds, stream.position)
-    return Fix(stream.seconds[good], stream.position[good])
+    return Fix(stream.seconds, stream.position)
 
 
 def _is_levelled(inputs: Inputs, sensor: PositionSensor) -> bool:

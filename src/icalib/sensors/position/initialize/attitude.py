@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.geometry import so3
+from icalib.initialize.steps.lever_arm import Triples
 from icalib.motion.imu_data import ImuData
-from icalib.sensors.position.initialize.triples import MARGIN_S, Carried, Triples
+from icalib.sensors.position.initialize.triples import MARGIN_S, Carried
 
 ROUNDS = 12
 CONVERGED = 1e-5  # rad, rad/s, m/s^2, m, s: a change below which nothing that the estimator starts from matters

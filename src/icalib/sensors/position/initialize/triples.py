@@ -12,11 +12,11 @@ the world.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from icalib.geometry import so3
+from icalib.initialize.steps.lever_arm import Triples
 from icalib.motion.imu_data import ImuData, clear_of
 
 # Between the fixes of a triple. Noise of 2 cm makes 5 cm/s in a row, a walk's or a car's motion some 1 m/s; gyroscopes
@@ -26,49 +26,24 @@ LONGEST_STEPS = 1.6  # STEP_S, or steps between slow fixes; longer ones hold a g
 MARGIN_S = 0.2  # of readings beside the fixes of a window, for the derivative by the time offset
 
 
-class Triples(NamedTuple):
-    """Indices (n,) of the fixes i < j < k of each triple, and h_1, h_2 (n,) s."""
+def triples_of(t: np.ndarray) -> Triples:
+    """All of fixes at increasing t (N,) s that are about STEP_S apart, or neighbours of slower fixes."""
+    usual = float(np.median(np.diff(t))) if len(t) > 1 else STEP_S
+    step = max(STEP_S, usual)
+    i = np.arange(len(t))
+    j = np.searchsorted(t, t + step - 0.1 * usual)
+    k = np.searchsorted(t, t[np.minimum(j, len(t) - 1)] + step - 0.1 * usual)
+    good = k < len(t)
+    i, j, k = i[good], j[good], k[good]
+    near = np.maximum(t[j] - t[i], t[k] - t[j]) < LONGEST_STEPS * step
+    return Triples.at(t, i[near], j[near], k[near])
 
-    i: np.ndarray
-    j: np.ndarray
-    k: np.ndarray
-    h1: np.ndarray
-    h2: np.ndarray
 
-    @classmethod
-    def of(cls, t: np.ndarray) -> Triples:
-        """All of fixes at increasing t (N,) s that are about STEP_S apart, or neighbours of slower fixes."""
-        usual = float(np.median(np.diff(t))) if len(t) > 1 else STEP_S
-        step = max(STEP_S, usual)
-        i = np.arange(len(t))
-        j = np.searchsorted(t, t + step - 0.1 * usual)
-        k = np.searchsorted(t, t[np.minimum(j, len(t) - 1)] + step - 0.1 * usual)
-        good = k < len(t)
-        i, j, k = i[good], j[good], k[good]
-        near = np.maximum(t[j] - t[i], t[k] - t[j]) < LONGEST_STEPS * step
-        i, j, k = i[near], j[near], k[near]
-        return cls(i, j, k, t[j] - t[i], t[k] - t[j])
-
-    def some(self, kept: np.ndarray) -> Triples:
-        """Those `kept` (n,), a mask or indices."""
-        return Triples(*(x[kept] for x in self))
-
-    def inside(self, imu: ImuData, t: np.ndarray) -> np.ndarray:
-        """(n,) whether the IMU ran without a gap over each, of fixes at t (N,) s on its clock."""
-        begin, end = t[self.i] - MARGIN_S, t[self.k] + MARGIN_S
-        seams = (*imu.gaps, *imu.seams)
-        return (begin >= imu.seconds[0]) & (end <= imu.seconds[-1]) & clear_of(seams, begin, end)
-
-    def second(self, x: np.ndarray) -> np.ndarray:
-        """A[x] (n, ...) of x (N, ...) at the fixes."""
-        shape = (-1, *(1,) * (x.ndim - 1))
-        later = (x[self.k] - x[self.j]) / self.h2.reshape(shape)
-        return later - (x[self.j] - x[self.i]) / self.h1.reshape(shape)
-
-    @property
-    def half(self) -> np.ndarray:
-        """(n,) (h_1 + h_2) / 2 [s], A of t^2 / 2."""
-        return 0.5 * (self.h1 + self.h2)
+def recorded(imu: ImuData, triples: Triples, t: np.ndarray) -> Triples:
+    """The triples, of fixes at t (N,) s on the IMU's clock, over which the IMU ran without a gap."""
+    begin, end = t[triples.i] - MARGIN_S, t[triples.k] + MARGIN_S
+    inside = (begin >= imu.seconds[0]) & (end <= imu.seconds[-1])
+    return triples.some(inside & clear_of((*imu.gaps, *imu.seams), begin, end))
 
 
 @dataclass(frozen=True)

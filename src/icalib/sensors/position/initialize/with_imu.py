@@ -13,10 +13,11 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.initialize.steps.by_recording import Held
+from icalib.initialize.steps.lever_arm import Triples
 from icalib.motion.imu_data import ImuData
 from icalib.sensors.position.initialize.attitude import FEWEST, Fitted, Fix, Unknowns, first_attitude, fit, sigmas
 from icalib.sensors.position.initialize.clock import GRID_HZ, LEAST_CORRELATION, likely_offsets
-from icalib.sensors.position.initialize.triples import Carried, Triples
+from icalib.sensors.position.initialize.triples import Carried, recorded, triples_of
 
 HALF_S = 10.0  # half of the first window: a gyroscope's bias turns by some degrees in it, Kabsch bears that
 MOST_HALF_S = 60.0  # and of the last: biases are taken as constant in it
@@ -77,7 +78,7 @@ class PositionMotion:
 
 def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: Held) -> PositionMotion:
     """Raises EstimationError, one sentence, where fixes and readings do not belong together or do not move."""
-    triples = Triples.of(fix.t)
+    triples = triples_of(fix.t)
     if len(triples.i) < FEWEST:
         raise EstimationError(
             f"{name}: only {len(triples.i)} groups of three fixes about a second apart are usable, and {FEWEST} are "
@@ -101,7 +102,7 @@ def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: 
         mirrored = min((one[0].left for one in tried), default=np.inf) < MIRRORED * best.left
         if mirrored or best.left > LARGEST_LEFT:
             raise _unlike(imu, name, best.left, mirrored)
-    usable = triples.some(triples.inside(imu, fix.t + best.at.offset))
+    usable = recorded(imu, triples, fix.t + best.at.offset)
     return PositionMotion(imu, fix, best, _all_windows(imu, fix, usable, (best, window), gravity))
 
 
@@ -147,7 +148,7 @@ def _tried(
 ) -> tuple[Fitted, tuple[float, float]] | None:
     """What the largest window about the one with most motion shows, and the window on the sensor's clock; None where
     there are too few triples."""
-    usable = triples.some(triples.inside(imu, fix.t + offset))
+    usable = recorded(imu, triples, fix.t + offset)
     if len(usable.i) < FEWEST:
         return None
     middle = fix.t[usable.j]

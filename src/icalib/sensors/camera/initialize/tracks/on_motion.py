@@ -10,7 +10,14 @@ import numpy as np
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.by_recording import alone, each_clock, motion_alone, naming_recording, other_clocks
+from icalib.initialize.steps.by_recording import (
+    alone,
+    each_clock,
+    fullest,
+    motion_alone,
+    naming_recording,
+    other_clocks,
+)
 from icalib.initialize.steps.clocks import main_axis, rough_alignments
 from icalib.initialize.steps.known_values import given, trusted
 from icalib.initialize.steps.rate_shifts import telling_rates
@@ -30,7 +37,7 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     """
 
     def values(number: int) -> dict[Key, np.ndarray]:
-        camera, best = inputs.rig.cameras[number], _most_seen(inputs, number)
+        camera, best = inputs.rig.cameras[number], fullest(inputs, inputs.measurements.tracks[number].key)
         with naming_recording(inputs, best):
             lens = _lens(inputs, number, best)
         known = given(inputs, camera)
@@ -39,11 +46,6 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
 
     with ThreadPoolExecutor(THREADS) as pool:  # its own: what it does may use the solver's
         return {k: v for own in pool.map(values, range(len(inputs.rig.cameras))) for k, v in own.items()}
-
-
-def _most_seen(inputs: Inputs, number: int) -> int:
-    """The recording in which a camera saw most."""
-    return int(np.argmax([len(part.measurements.tracks[number].feature) for part in inputs.parts]))
 
 
 def _lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
@@ -56,7 +58,7 @@ def _lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
 def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
     """Where a camera stands, and its lens, sought from `lens` (P,). Of several recordings the one in which it saw most
     says so."""
-    camera, best = inputs.rig.cameras[number], _most_seen(inputs, number)
+    camera, best = inputs.rig.cameras[number], fullest(inputs, inputs.measurements.tracks[number].key)
     mount_in = partial(_mount_in, inputs, state, number, lens)
     with naming_recording(inputs, best):
         found, lens = mount_in(best)
