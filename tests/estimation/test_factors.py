@@ -98,6 +98,25 @@ def slope_along(loss, t):
     return np.maximum((psi(t + 1e-6) - psi(t - 1e-6)) / 2e-6 / (psi(t) / t), LEAST_CURVATURE)
 
 
+def row_sample(setup, state, made, bend, curved):
+    """A sample of a factor of whitened rows; bend: the loss whose curvature along each row counts, or "none"."""
+
+    def run(at):
+        out = made.output()
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            made.accumulate(at, piece, out, sums=False)
+        return out.residual.ravel(), out.root.ravel()
+
+    def weights(at):
+        r, root = run(at)
+        return root**2 * r, np.diag(root**2 * slope_along(bend, np.abs(r)))
+
+    def accumulate(at, piece, sums):
+        return made.accumulate(at, piece, made.output(), sums, curved)
+
+    return Sample(type(made).__name__, setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
+
+
 def with_two_clocks(setup, node=5):
     """The setup as two recordings, the second from `node` on; each clock has a time offset of its own in it."""
     entries = [
@@ -438,21 +457,7 @@ def wheel_sample(
     made = factor.build(*own, **times) if kind == "pair" else factor.build(*own, kind, **times)
     state = setup.perturbed(rng, 0.3)
 
-    def run(at):
-        out = made.output()
-        for piece in make_pieces(len(at.seconds), setup.layout.size):
-            made.accumulate(at, piece, out, sums=False)
-        return out.residual.ravel(), out.root.ravel()
-
-    def weights(at):
-        r, root = run(at)
-        slope = slope_along(loss if curved else "none", np.abs(r))
-        return root**2 * r, np.diag(root**2 * slope)
-
-    def accumulate(at, piece, sums):
-        return made.accumulate(at, piece, made.output(), sums, curved)
-
-    return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
+    return row_sample(setup, state, made, loss if curved else "none", curved)
 
 
 def ground_sample(unlike, setup_of, plane, seen=True):
@@ -522,20 +527,7 @@ def pose_sample(
     made = factor.build(stream, motion, PoseNoise(0.5, 0.3, loss, LOSS_SCALE), setup.layout)
     state = setup.perturbed(rng, 0.3)
 
-    def run(at):
-        out = made.output()
-        for piece in make_pieces(len(at.seconds), setup.layout.size):
-            made.accumulate(at, piece, out, sums=False)
-        return out.residual.ravel(), out.root.ravel()
-
-    def weights(at):
-        r, root = run(at)
-        return root**2 * r, np.diag(root**2 * slope_along(loss if curved else "none", np.abs(r)))
-
-    def accumulate(at, piece, sums):
-        return made.accumulate(at, piece, made.output(), sums, curved)
-
-    return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
+    return row_sample(setup, state, made, loss if curved else "none", curved)
 
 
 def position_sample(
@@ -567,20 +559,7 @@ def position_sample(
     )
     state = setup.perturbed(rng, 0.3)
 
-    def run(at):
-        out = made.output()
-        for piece in make_pieces(len(at.seconds), setup.layout.size):
-            made.accumulate(at, piece, out, sums=False)
-        return out.residual.ravel(), out.root.ravel()
-
-    def weights(at):
-        r, root = run(at)
-        return root**2 * r, np.diag(root**2 * slope_along(loss if curved else "none", np.abs(r)))
-
-    def accumulate(at, piece, sums):
-        return made.accumulate(at, piece, made.output(), sums, curved)
-
-    return Sample("PositionFactor", setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
+    return row_sample(setup, state, made, loss if curved else "none", curved)
 
 
 SAMPLES = {

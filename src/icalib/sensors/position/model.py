@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.model.frames import frame_of
+from icalib.model.frames import frame_entries
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.model.statistics import ResidualStatistics
 from icalib.optim.state import Entry
@@ -31,8 +31,7 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
     def scene_entries(self, sensor: PositionSensor, rig: Rig, n_recordings: int) -> list[Entry]:
         """The frame of its fixes in the world of each recording: its yaw and origin where both are levelled."""
         levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == "levelled"
-        frames = [frame_of(sensor.name, k) for k in range(n_recordings)]
-        return [spec.entry(frame) for frame in frames for spec in (LEVEL_FRAME if levelled else FRAME)]
+        return frame_entries(sensor.name, n_recordings, specs=LEVEL_FRAME if levelled else FRAME)
 
     def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
         """In metres if the rig file states a number, else 1: times the standard deviations of `weighted`."""
