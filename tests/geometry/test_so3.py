@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from tests.typed import random_rotations
 
 from icalib.geometry import so3
 
@@ -170,7 +171,7 @@ def test_coefficients_keep_their_digits(x: float) -> None:
 def test_closest_rotation_is_that_of_the_wahba_problem(seed: int):
     rng = np.random.default_rng(seed)
     b = rng.normal(size=(6, 3))
-    a = b @ Rotation.random(random_state=seed).as_matrix().T + 0.1 * rng.normal(size=(6, 3))
+    a = b @ random_rotations(None, seed).as_matrix().T + 0.1 * rng.normal(size=(6, 3))
     found = so3.closest_rotation(a.T @ b)
     np.testing.assert_allclose(found, Rotation.align_vectors(a, b)[0].as_matrix(), atol=1e-12)
     mirrored = so3.closest_rotation(-np.eye(3) - np.diag([0.1, 0.2, 0.3]))  # no reflection

@@ -150,4 +150,4 @@ def own_entries(
 
 def clocks_of(sensor: Sensor, n_recordings: int) -> int:
     """How many time offsets a sensor has: one in each recording where its clock restarts."""
-    return n_recordings if getattr(sensor, "clock_restarts", False) else 1
+    return n_recordings if sensor.clock_restarts else 1

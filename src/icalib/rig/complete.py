@@ -62,7 +62,7 @@ def _no_motion(rig: Rig) -> str:
 def _clocks_without_reference(rig: Rig) -> Iterator[Lack]:
     """Sensors whose clocks are said to restart, in a rig without an IMU, and that have no time offset."""
     for sensor in rig.mounted:
-        if not getattr(sensor, "clock_restarts", False):
+        if not sensor.clock_restarts:
             continue
         where = ("sensors", sensor.name, "clock_restarts")
         if rig.cameras_alone:

@@ -80,4 +80,4 @@ def groups_to_plain(sensor: Sensor) -> dict[str, Any]:
     """The parameters of the sensor, and whether its clock restarts."""
     groups = {f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)}
     plain = {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}
-    return plain | ({"clock_restarts": True} if getattr(sensor, "clock_restarts", False) else {})
+    return plain | ({"clock_restarts": True} if sensor.clock_restarts else {})

@@ -97,6 +97,7 @@ class Sensor:
     is_inertial: ClassVar[bool] = False
     shows_planes: ClassVar[bool] = False
     drives: ClassVar[bool] = False
+    clock_restarts = False  # a field of sensors that may have a time offset in each recording
     name: str
 
     def __post_init__(self) -> None:

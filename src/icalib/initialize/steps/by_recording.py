@@ -78,7 +78,7 @@ def from_the_best(inputs: Inputs, sensor: Sensor, best: int, state_of: Callable[
     """All recordings' states, each by itself: of the `best` from nothing, and of the others with the extrinsics of the
     `sensor` that it has shown, and with the time offset unless the clock restarts."""
     recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
-    restarts = getattr(sensor, "clock_restarts", False)
+    restarts = sensor.clock_restarts
     with naming_recording(inputs, best):
         states = {best: state_of(recordings[best], None)}
     values, name = dict(states[best].values), sensor.name
