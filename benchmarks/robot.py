@@ -26,7 +26,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.start import start
 from icalib.observability.determination import Determined, determine
 from icalib.rig import Rig
-from icalib.sensors.lidar.lidar_binning import Associated, take_moments
+from icalib.sensors.lidar.binning import Associated, take_moments
 from icalib.sensors.lidar.residual import LidarFactor
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 from icalib.validation import assess

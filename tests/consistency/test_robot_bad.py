@@ -17,7 +17,7 @@ from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Rig
-from icalib.sensors.lidar.initialize import rounds
+from icalib.sensors.lidar.initialize import association_rounds
 from icalib.tools.montecarlo.truth import true_value
 from icalib.tools.simulation import Simulation, rig_for, simulate, with_drawn_guess
 
@@ -181,7 +181,7 @@ def test_a_corridor_is_told_where_no_plane_is_found_any_more(drive, monkeypatch)
     def nothing(*_):
         raise EstimationError("lidar0 saw no flat surface of 0.7 m^2 or more.")
 
-    monkeypatch.setattr(rounds, "associate", nothing)
+    monkeypatch.setattr(association_rounds, "associate", nothing)
     assert "surfaces that lidar0 sees face two directions only" in refusal(guessed(simulation), corridor)
     assert "lidar0 saw no flat surface" in refusal(guessed(simulation), simulation.measurements.unassociated())
 

@@ -35,7 +35,7 @@ from icalib.sensors.camera.features.surfaces import OnPlanes, Surfaces
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
-from icalib.sensors.lidar.lidar_binning import LidarNoise
+from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.lidar.residual import LidarFactor
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, simulate

@@ -36,7 +36,7 @@ from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import CornerNoise
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.sensors.imu.residual import ImuFactor
-from icalib.sensors.lidar.lidar_binning import LidarNoise
+from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.position.residual import PositionFactor, PositionNoise
 from icalib.sensors.position.stream import PositionStream

@@ -15,7 +15,7 @@ from icalib.motion.factor import chi2 as weighted_squares
 from icalib.motion.poses import Poses, assign_nodes, poses_at
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import NODE
-from icalib.sensors.lidar.lidar_binning import Associated, LidarNoise, in_world, take_moments
+from icalib.sensors.lidar.binning import Associated, LidarNoise, in_world, take_moments
 from icalib.tools.simulation import simulate
 
 

@@ -13,7 +13,7 @@ from icalib.detection.planes.planes import PlaneSearch, find_planes
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry import so3
 from icalib.optim.state import make_layout
-from icalib.sensors.lidar.lidar_binning import BIN_S, LidarNoise, in_world
+from icalib.sensors.lidar.binning import BIN_S, LidarNoise, in_world
 from icalib.tools.simulation import simulate
 
 pytestmark = pytest.mark.slow

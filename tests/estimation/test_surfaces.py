@@ -10,7 +10,7 @@ import pytest
 from icalib.motion.clouds import Clouds
 from icalib.optim.arrowhead import make_pieces
 from icalib.sensors.camera.features.surfaces import CELL_M, PATCH_M, REACH_M, Surfaces, most_alike
-from icalib.sensors.lidar.lidar_binning import points_on_planes
+from icalib.sensors.lidar.binning import points_on_planes
 from icalib.tools.simulation import handheld, simulate
 
 NOISE = 0.01

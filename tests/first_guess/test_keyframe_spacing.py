@@ -13,7 +13,7 @@ from icalib.initialize.assumed_motion import LEAST_SPACING_S, keyframe_spacing
 from icalib.initialize.steps.keyframe_spacing import SmoothMotion
 from icalib.initialize.steps.smooth_path import smooth_path
 from icalib.rig import PoseSensor, Rig, Settings, Wheels, by_name
-from icalib.sensors.pose.initialize.noise import pose_noise
+from icalib.sensors.pose.initialize.initial_noise import pose_noise
 
 TURN, WAY = 2e-3, 1e-3
 DENSITIES = (0.05, 0.2)  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz)

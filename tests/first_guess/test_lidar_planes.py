@@ -20,10 +20,10 @@ from icalib.optim.state import State, make_layout
 from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
+from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.lidar.initialize.association import ROUNDS, associate, round_search
+from icalib.sensors.lidar.initialize.association_rounds import check_shares
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
-from icalib.sensors.lidar.initialize.rounds import check_shares
-from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.lidar.residual import LidarFactor
 
 pytestmark = pytest.mark.slow

@@ -10,9 +10,9 @@ import pytest
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.motion.clouds import Clouds
 from icalib.pipeline import calibrate_measurements
-from icalib.sensors.lidar.initialize import association, rounds
+from icalib.sensors.lidar.initialize import association, association_rounds
 from icalib.sensors.lidar.initialize.association import Association, odd_step
-from icalib.sensors.lidar.initialize.rounds import _firsts, _of_all
+from icalib.sensors.lidar.initialize.association_rounds import _firsts, _of_all
 from icalib.tools.simulation import rig_for
 
 pytestmark = pytest.mark.slow
@@ -61,7 +61,7 @@ def test_the_result_is_that_of_all_points(robot, monkeypatch):
 
     recordings, rig = [raw(s.measurements) for s in sims], rig_for(sims[0].scenario)
     whole = calibrate_measurements(rig, recordings)
-    monkeypatch.setattr(rounds, "odd_step", lambda points: 7)
+    monkeypatch.setattr(association_rounds, "odd_step", lambda points: 7)
     thinned = calibrate_measurements(rig, recordings)
     assert whole.converged and thinned.converged
     counts = [c.lidar_residuals[0].points_used for c in (whole, thinned)]

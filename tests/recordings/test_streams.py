@@ -13,7 +13,7 @@ from icalib.data.messages.streams import read_odometry, read_poses, read_twists
 from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
 from icalib.sensors.camera.read.camera_info import read_camera_info
-from icalib.sensors.lidar.read.clouds import point_clouds
+from icalib.sensors.lidar.read.point_clouds import point_clouds
 from icalib.sensors.wheels.read.joints import read_joints
 
 RNG = np.random.default_rng(11)

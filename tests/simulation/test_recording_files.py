@@ -18,7 +18,7 @@ from icalib.geometry.targets import AprilGrid
 from icalib.rig import ImuSensor
 from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.sensors.imu.read import readings as imu_readings
-from icalib.sensors.lidar.read.clouds import point_clouds
+from icalib.sensors.lidar.read.point_clouds import point_clouds
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.wheels.read.joints import read_joints
 from icalib.sensors.wheels.simulate import SimWheels

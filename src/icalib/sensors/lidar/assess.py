@@ -20,8 +20,8 @@ from icalib.result import Plane, SensorFit
 from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import Lidar, Rig
+from icalib.sensors.lidar.binning import LidarNoise, in_world
 from icalib.sensors.lidar.initialize.degeneracy import count_of, facing
-from icalib.sensors.lidar.lidar_binning import LidarNoise, in_world
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from icalib.data.recordings import BagRecording, Recording, TopicInfo
 from icalib.errors import RecordingError
-from icalib.sensors.lidar.read.clouds import point_clouds, timing_fields
+from icalib.sensors.lidar.read.point_clouds import point_clouds, timing_fields
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.sensor import Sensor, TimeUnit
 from icalib.tools.inspection.facts import Finding, Inspection

@@ -12,7 +12,7 @@ from icalib.model.statistics import ResidualStatistics
 from icalib.motion.clouds import Clouds
 from icalib.motion.point_planes import thinned
 from icalib.rig import Lidar, Settings
-from icalib.sensors.lidar.lidar_binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
+from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.residual import LidarFactor
 
 NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the model lacks where beams graze a plane
@@ -58,7 +58,7 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         yield LidarFactor.build(stream, used, at.clouds.keys, at.motion, noise, at.layout, scheme, bin_s)
 
     def points_on_planes(self, sensor: Lidar, stream: LidarStream, at: Pass) -> tuple[np.ndarray, np.ndarray]:
-        """See `lidar_binning.points_on_planes`."""
+        """See `binning.points_on_planes`."""
         assert at.motion is not None
         return points_on_planes(at.motion, stream, _plane(sensor, at))
 

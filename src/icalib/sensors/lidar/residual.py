@@ -3,7 +3,7 @@
 residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d of each point x at its own instant t. Of (24) and (25) this
 is the form that keeps its sign on both sides of the plane. What a factor holds are moments of the points
 (`take_moments`), taken once a pass: robust weights, like the association with planes, stay as they are while the solver
-runs. Its residuals are the four of each plane in a bin that stand for all points there (`lidar_kernels`).
+runs. Its residuals are the four of each plane in a bin that stand for all points there (`kernels`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.planes import Planes
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Scheme
-from icalib.sensors.lidar import lidar_kernels
-from icalib.sensors.lidar.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
-from icalib.sensors.lidar.lidar_kernels import ROWS, Bins
+from icalib.sensors.lidar import kernels
+from icalib.sensors.lidar.binning import BIN_S, Associated, LidarNoise, Moments, take_moments
+from icalib.sensors.lidar.kernels import ROWS, Bins
 
 CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 
@@ -87,7 +87,7 @@ class LidarFactor(RowFactor):
 
         def turn(ends: tuple[int, int]) -> None:
             for bins, at, columns, planes in self._chunks(state, *ends):
-                lidar_kernels.turn_by_noise(bins, at, columns, planes)
+                kernels.turn_by_noise(bins, at, columns, planes)
 
         middle = len(self.node) // 2
         in_parallel(turn, [(0, middle), (middle, len(self.node))])
@@ -115,7 +115,7 @@ class LidarFactor(RowFactor):
         del curved
         into, total = piece.sums(sums), 0.0
         for bins, at, columns, planes in self._chunks(state, *self._bins_of(piece)):
-            total += lidar_kernels.accumulate(bins, at, columns, planes, into, out.residual)
+            total += kernels.accumulate(bins, at, columns, planes, into, out.residual)
         return total
 
     def count(self, out: Whitened, kind: str) -> int:

@@ -12,8 +12,8 @@ from icalib.initialize.steps.initializer import BY_SCANS, Initializer, Moving, V
 from icalib.initialize.steps.known_values import given
 from icalib.optim.state import State
 from icalib.rig import Lidar, Rig
+from icalib.sensors.lidar.initialize.association_rounds import lidar_values, state_from_lidar, with_lidars
 from icalib.sensors.lidar.initialize.degeneracy import naming_sight
-from icalib.sensors.lidar.initialize.rounds import lidar_values, state_from_lidar, with_lidars
 from icalib.sensors.lidar.initialize.self_returns import without_own_robot
 
 

@@ -18,7 +18,7 @@ from icalib.motion.clouds import Clouds
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import in_parallel
 from icalib.optim.state import Key
-from icalib.sensors.lidar.lidar_binning import in_world
+from icalib.sensors.lidar.binning import in_world
 
 POINTS_AT_A_TIME = 200_000  # by one thread: what association needs beside the clouds stays small
 ROUNDS = 4

@@ -12,7 +12,7 @@ from icalib.data.tables.files import TableFile
 from icalib.data.topics import MessageType, UnreadType
 from icalib.sensors.lidar.read import livox
 from icalib.sensors.lidar.read.checks import Sieve, checked_lidar, sifted
-from icalib.sensors.lidar.read.clouds import point_clouds, read_clouds
+from icalib.sensors.lidar.read.point_clouds import point_clouds, read_clouds
 from icalib.sensors.lidar.read.scans import in_seconds, read_scan_stamps, read_scans
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.lidar.stream import LidarStream

@@ -19,7 +19,7 @@ from icalib.optim.state import State
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.pose.initialize.conventions import TURNED, WAYS
 from icalib.sensors.pose.initialize.extrinsics import check_rate, pose_values, state_from_poses
-from icalib.sensors.pose.initialize.noise import pose_noise
+from icalib.sensors.pose.initialize.initial_noise import pose_noise
 from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, start_from_pairs
 
 

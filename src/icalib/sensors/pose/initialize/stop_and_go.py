@@ -27,7 +27,7 @@ from icalib.optim.state import Key, State, in_recording
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.parameter import fixed
 from icalib.sensors.pose.initialize.conventions import placed
-from icalib.sensors.pose.initialize.pairs import partners
+from icalib.sensors.pose.initialize.pose_pairs import partners
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 FEWEST_PAIRS = 3  # of one recording

@@ -11,8 +11,8 @@ from icalib.errors import RecordingError
 from icalib.geometry import so3
 from icalib.rig import PoseSensor
 from icalib.sensors.pose.read.bad_poses import are_poses, path_of, stale_copies
+from icalib.sensors.pose.read.outliers import single_wrong
 from icalib.sensors.pose.read.pose_tables import RATE_HZ, PoseReadings
-from icalib.sensors.pose.read.single_poses import single_wrong
 
 _FASTEST_M_S = 100.0
 _BROKEN_SHARE = 0.5  # of all poses: more are no single bad readings

@@ -36,10 +36,10 @@ from icalib.motion.known_motion import near_nodes
 from icalib.motion.point_planes import are_somewhere, thinned
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.state import Key, State
+from icalib.sensors.lidar.binning import COARSE_BIN_S, Associated, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.initialize.association import ROUNDS, Association, associate, odd_step, round_search
 from icalib.sensors.lidar.initialize.degeneracy import naming_sight
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
-from icalib.sensors.lidar.lidar_binning import COARSE_BIN_S, Associated, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.model import FIRST_RANGE_M
 from icalib.sensors.sensor import MOUNTED_NAMES
 

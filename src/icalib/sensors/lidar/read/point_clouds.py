@@ -15,10 +15,10 @@ from icalib.data.measurements import LidarStream
 from icalib.data.messages.streams import HasMessages
 from icalib.errors import RecordingError
 from icalib.rig import Lidar, TimeUnit
+from icalib.sensors.lidar.read.azimuth_times import SweepOrder, find_sweep, sweep_share
 from icalib.sensors.lidar.read.checks import Sieve
 from icalib.sensors.lidar.read.livox import LivoxCloud
 from icalib.sensors.lidar.read.point_times import PointTimes, clock_note, find_point_times, likely_fields
-from icalib.sensors.lidar.read.sweeps import SweepOrder, find_sweep, sweep_share
 
 _AHEAD = 8  # clouds with points that tell how points are timed
 

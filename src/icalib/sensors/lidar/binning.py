@@ -27,7 +27,7 @@ from icalib.motion.sweep import Motion, sweep
 from icalib.optim.arrowhead import in_parallel
 from icalib.optim.robust_weights import LOSSES
 from icalib.rig import Loss
-from icalib.sensors.lidar.lidar_moments import (
+from icalib.sensors.lidar.moments import (
     MOMENTS,
     Cells,
     Scans,

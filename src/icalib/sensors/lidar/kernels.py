@@ -14,7 +14,16 @@ from icalib.base.compiled import njit
 from icalib.motion.sensor_pose import chain_width, fill_chain, fill_imu_pose
 from icalib.optim.rows import add_gram, add_product
 from icalib.optim.state import NODE
-from icalib.sensors.lidar.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, columns_of, no_walk, taken_off
+from icalib.sensors.lidar.propagation_noise import (
+    PLANE,
+    POSE,
+    add_entry,
+    add_plane,
+    add_pose,
+    columns_of,
+    no_walk,
+    taken_off,
+)
 
 ROWS = 4  # whitened residuals of a plane in a bin
 RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian

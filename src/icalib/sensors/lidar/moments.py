@@ -1,4 +1,4 @@
-"""Compiled sums over the points of LiDAR scans: see `lidar_binning`.
+"""Compiled sums over the points of LiDAR scans: see `binning`.
 
 Points of a scan are first sorted by step of time and plane. Of those that stand together then all is alike but their
 coordinates, and several are added at a time.
