@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 from typing import Any, get_args
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.sensors.parameter import Parameter
 from icalib.sensors.parameter_fields import parameter, parameter_to_plain
 from icalib.sensors.parameter_spec import ParameterSpec
 from icalib.sensors.sensor import PLAIN_TABLE, Axes, Sensor, TableLayout, TimeUnit
@@ -78,6 +76,5 @@ def topic_or_none(found: dict[str, YamlValue]) -> str | None:
 
 def groups_to_plain(sensor: Sensor) -> dict[str, Any]:
     """The parameters of the sensor, and whether its clock restarts."""
-    groups = {f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)}
-    plain = {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}
+    plain = {spec.name: parameter_to_plain(getattr(sensor, spec.name)) for spec in sensor.stated()}
     return plain | ({"clock_restarts": True} if sensor.clock_restarts else {})

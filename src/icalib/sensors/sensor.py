@@ -1,4 +1,4 @@
-"""The base class of all sensors of a rig, and the parameters of those that are mounted beside the IMU."""
+"""The base classes of the sensors of a rig: all, those with a clock of their own, and those with extrinsics."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, TypeVar
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.sensors.parameter import check_sizes
+from icalib.sensors.parameter import Parameter, check_sizes
 from icalib.sensors.parameter_spec import AXES, ParameterSpec
 
 T = TypeVar("T")
@@ -91,13 +91,13 @@ class Sensor:
 
     sensor_type: ClassVar[str]
     noun: ClassVar[str]
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = MOUNTED
+    parameters: ClassVar[tuple[ParameterSpec, ...]]
     gives_motion: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False
     is_inertial: ClassVar[bool] = False
     shows_planes: ClassVar[bool] = False
     drives: ClassVar[bool] = False
-    clock_restarts = False  # a field of sensors that may have a time offset in each recording
+    clock_restarts = False  # a field of `ClockedSensor`
     name: str
 
     def __post_init__(self) -> None:
@@ -143,6 +143,31 @@ class Sensor:
         """Those of `parameters` that are fields of the rig file."""
         names = {f.name for f in fields(cls)}
         return tuple(spec for spec in cls.parameters if spec.name in names)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockedSensor(Sensor):
+    """A sensor whose stamps are of another clock than those of the reference: t_reference = t + time_offset [s].
+
+    clock_restarts: each recording has its own time offset.
+    """
+
+    time_offset: Parameter = Parameter()
+    clock_restarts: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedSensor(ClockedSensor):
+    """A sensor with extrinsics T_imu_sensor, constant: x_imu = R_imu_sensor x_sensor + p_imu_sensor.
+
+    rotation (3, 3) is R_imu_sensor, translation (3,) is p_imu_sensor [m]. Without an IMU they are relative to
+    `Rig.reference`.
+    """
+
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = MOUNTED
+
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
 
 
 def has_imu(sensors: Mapping[str, Sensor]) -> bool:

@@ -20,7 +20,7 @@ from icalib.sensors.fields import (
 )
 from icalib.sensors.parameter import Parameter, check_sizes
 from icalib.sensors.parameter_spec import ParameterSpec
-from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, Sensor, TableLayout
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sensor, TableLayout
 
 INTRINSICS = ParameterSpec(
     name="intrinsics",
@@ -65,7 +65,7 @@ TRACK_IMAGES = "images"  # value of `tracks`: feature tracks are found in the im
 
 
 @dataclass(frozen=True)
-class Camera(Sensor):
+class Camera(MountedSensor):
     """One camera. Intrinsics are (fx, fy, cx, cy) in pixels, distortion the model's coefficients."""
 
     sensor_type: ClassVar[str] = "camera"
@@ -77,10 +77,6 @@ class Camera(Sensor):
     model: str
     resolution: tuple[int, int]
     corner_noise_px: float | None = None  # None: estimated from the residuals
-    rotation: Parameter = Parameter()
-    translation: Parameter = Parameter()
-    time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # each recording has its own time offset
     intrinsics: Parameter = Parameter()
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()

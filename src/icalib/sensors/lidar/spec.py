@@ -15,8 +15,7 @@ from icalib.sensors.fields import (
     positive_or,
     topic_or_none,
 )
-from icalib.sensors.parameter import Parameter
-from icalib.sensors.sensor import Sensor, TimeUnit
+from icalib.sensors.sensor import MountedSensor, TimeUnit
 
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
 _FIELDS = (
@@ -25,7 +24,7 @@ _FIELDS = (
 
 
 @dataclass(frozen=True)
-class Lidar(Sensor):
+class Lidar(MountedSensor):
     """One LiDAR. Points closer than min_range_m or farther than max_range_m are not used.
 
     point_time: the instant from which the times of points count; see `read.point_times`. point_time_field,
@@ -40,10 +39,6 @@ class Lidar(Sensor):
 
     path: str
     range_noise_m: float | None = None  # along the beam; None: estimated from the residuals
-    rotation: Parameter = Parameter()
-    translation: Parameter = Parameter()
-    time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # each recording has its own time offset
     min_range_m: float = 0.5
     max_range_m: float = 100.0
     point_time: PointTime = "auto"

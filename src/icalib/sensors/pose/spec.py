@@ -23,7 +23,7 @@ from icalib.sensors.fields import (
 )
 from icalib.sensors.parameter import Parameter
 from icalib.sensors.parameter_spec import ParameterSpec
-from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, Lack, Sensor, TableLayout, has_imu
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, Lack, MountedSensor, Sensor, TableLayout, has_imu
 
 PoseKind = Literal["absolute", "relative"]
 SCALE = ParameterSpec("scale", 1, "nuisance", "", ("scale",), 1e-2, 0.1)  # true lengths over reported ones
@@ -32,7 +32,7 @@ _NOISE = ("rotation_noise", "position_noise")
 
 
 @dataclass(frozen=True)
-class PoseSensor(Sensor):
+class PoseSensor(MountedSensor):
     """A sensor of poses: motion capture, or the odometry of another program.
 
     absolute: poses in a static frame, whose pose in the world is estimated; the noise is white, rad and m. relative:
@@ -51,10 +51,6 @@ class PoseSensor(Sensor):
     position_noise: float | None = None
     level: bool = True
     position_axes: Axes | None = None  # recorded columns that are x, y, z in the axes of the rotations
-    rotation: Parameter = Parameter()
-    translation: Parameter = Parameter()
-    time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # each recording has its own time offset
     topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
     inverted: bool = False  # T_sensor_frame is recorded

@@ -19,7 +19,7 @@ from icalib.sensors.fields import (
 )
 from icalib.sensors.parameter import Parameter
 from icalib.sensors.parameter_spec import ParameterSpec
-from icalib.sensors.sensor import PLAIN_TABLE, TIME_OFFSET, TRANSLATION, Sensor, TableLayout
+from icalib.sensors.sensor import PLAIN_TABLE, TIME_OFFSET, TRANSLATION, ClockedSensor, TableLayout
 
 FrameKind = Literal["levelled", "tilted"]
 Coordinates = Literal["metric", "geodetic"]
@@ -30,7 +30,7 @@ _FIELDS = ("path", "topic", "coordinates", "frame", "position_noise", "least_sta
 
 
 @dataclass(frozen=True)
-class PositionSensor(Sensor):
+class PositionSensor(ClockedSensor):
     """Something that gives its own position in a fixed frame, and no orientation. Its axes are those of the body.
 
     coordinates: of a table, metric or geodetic (latitude, longitude, height); None: told by its header. frame:
@@ -52,8 +52,6 @@ class PositionSensor(Sensor):
     position_noise: float | Literal["messages"] | None = None
     least_status: Status = "single"
     translation: Parameter = Parameter()  # (3,) lever arm: the antenna in the body's frame [m]
-    time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
     topic: str | None = None  # of its messages; None: the one with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
 

@@ -24,7 +24,7 @@ from icalib.sensors.fields import (
 )
 from icalib.sensors.parameter import Parameter, check_sizes
 from icalib.sensors.parameter_spec import ParameterSpec
-from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, Sensor, TableLayout
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sensor, TableLayout
 
 WheelFactor = Literal["increments", "relative-poses"]
 WheelMeasure = Literal["rates", "angles", "ticks", "poses", "twist"]
@@ -119,7 +119,7 @@ _JOINTS = {
 
 
 @dataclass(frozen=True)
-class Wheels(Sensor):
+class Wheels(MountedSensor):
     """The odometry of one set of wheels. Frame: x forward, y to the left, z up; the origin is midway between the wheels
     of the axle that is not steered.
 
@@ -140,10 +140,6 @@ class Wheels(Sensor):
 
     path: str
     drive: WheelDrive = "differential"
-    rotation: Parameter = Parameter()
-    translation: Parameter = Parameter()
-    time_offset: Parameter = Parameter()
-    clock_restarts: bool = False  # each recording has its own time offset
     radii: Parameter = Parameter()  # (2,) left, right [m]
     baseline: Parameter = Parameter()  # (1,) between the wheels [m]; of skid-steer the effective one
     radius: Parameter = Parameter()  # (1,) of the driven wheel of ackermann [m]
