@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.targets import Scene
+from icalib.model.bodies import Bodies
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
+from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.initialize.boards.scene_changes import check_scene, scene_changes
 from icalib.sensors.camera.initialize.boards.scene_lens import find_scene
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, tag_map

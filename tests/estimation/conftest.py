@@ -19,6 +19,7 @@ from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
+from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import keyed
 from icalib.motion.imu_data import ImuData
 from icalib.motion.nodes import place_nodes
@@ -28,7 +29,7 @@ from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.state import NODE, Entry, Kind, Layout, State, make_layout
 from icalib.rig import ImuSensor, Lidar, Scheme, Settings
 from icalib.rig.scene import SHAPE_LABELS
-from icalib.sensors.camera.bodies import SIZE, Bodies, restrict
+from icalib.sensors.camera.connected_bodies import restrict
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.surfaces import OnPlanes, Surfaces

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
+from icalib.model.bodies import Bodies
 from icalib.rig import Settings
-from icalib.sensors.camera.bodies import Bodies
 from icalib.sensors.camera.corner_outliers import inliers, isolated
 
 SIZE = np.array([900.0, 600.0])

@@ -26,11 +26,11 @@ from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.start import start
+from icalib.model.bodies import Bodies
 from icalib.motion.factor import look, of_type
 from icalib.optim.calib_block import restricted_inverse
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.sensors.camera.bodies import Bodies
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess

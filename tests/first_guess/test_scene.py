@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.geometry.cameras import camera_model
-from icalib.sensors.camera.bodies import choose_bodies, restrict
+from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.corner_factor import Views
 from icalib.sensors.camera.initialize.boards.scene import body_poses, scene_poses
 from icalib.sensors.camera.initialize.boards.scene_growth import place_bodies

@@ -16,7 +16,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Markers
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
-from icalib.sensors.camera.bodies import choose_bodies
+from icalib.sensors.camera.connected_bodies import choose_bodies
 from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, is_possible, scene_params
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate, tag_map

@@ -22,7 +22,7 @@ from icalib.initialize.steps.initializer import (
 )
 from icalib.optim.state import State
 from icalib.rig import Rig
-from icalib.sensors.camera.bodies import without_bodies
+from icalib.sensors.camera.connected_bodies import without_bodies
 from icalib.sensors.camera.initialize.boards.numbering import number_alike
 from icalib.sensors.camera.initialize.boards.scene_growth import UntiedBodiesError
 

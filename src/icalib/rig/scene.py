@@ -9,7 +9,7 @@ from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 # Ratio of true lengths of the target to those in the rig file.
 SIZE = ParameterSpec("size", 1, "nuisance", "", ("size",), 1e-2, 0.1)
-# Deviation of a body from its design: see `sensors.camera.board.shape_basis`.
+# Deviation of a body from its design: see `model.bodies.shape_basis`.
 BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
 # Deviations in the plane by printing and mounting, to second order. A rotation, a shift and the scale are left out: the
 # first two belong to the pose of the board, and the scale to its size.

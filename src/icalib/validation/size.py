@@ -10,9 +10,9 @@ from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.evidence.target_size import TargetSize, target_size
 from icalib.estimate.problem.inputs import Inputs
+from icalib.model.bodies import SIZE
 from icalib.result import ParameterGroup
 from icalib.sensors import answer
-from icalib.sensors.camera.bodies import SIZE
 from icalib.validation.causes import Cause
 
 WRONG = 0.02  # of the size: more than a ruler or a good accelerometer is off by

@@ -13,6 +13,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.problem import ChainFactor, Problem
 from icalib.geometry.cameras import camera_model
+from icalib.model.bodies import SHAPE_SIGMA_M, SIZE
 from icalib.model.sensor_model import Pass, SensorModel, kind_model, model_of
 from icalib.motion.clocks import EARLY_S, instants
 from icalib.motion.factor import Factor, keyed
@@ -28,8 +29,7 @@ from icalib.optim.state import Block, Key, State
 from icalib.rig import Camera, Parameter, Rig, Scheme, Sensor
 from icalib.rig.scene import SHAPE_LABELS
 from icalib.sensors import SENSOR_KINDS
-from icalib.sensors.camera.board import SHAPE_SIGMA_M, bloom_direction
-from icalib.sensors.camera.bodies import SIZE
+from icalib.sensors.camera.bloom import bloom_direction
 from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.edge_curvature import with_bent_edges

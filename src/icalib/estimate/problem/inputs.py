@@ -13,13 +13,14 @@ from icalib.data.joining import Part, join
 from icalib.data.measurements import Measurements, Stream
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets.base import BOARD
+from icalib.model.bodies import Bodies
 from icalib.model.sensor_model import clocks_of, model_of
 from icalib.motion.clouds import NO_CLOUDS, Clouds
 from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, make_layout
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
 from icalib.rig.scene import TILT
-from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
+from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.images import on_common_images
 
 

@@ -16,8 +16,8 @@ from icalib.result import CornerResiduals, SensorFit, TrackResiduals
 from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.bodies import words_on_left_out
 from icalib.sensors.camera.circle_centres import centre_shifts
+from icalib.sensors.camera.connected_bodies import words_on_left_out
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.surfaces import ON_PLANES

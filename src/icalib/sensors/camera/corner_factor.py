@@ -21,6 +21,7 @@ import numpy as np
 from icalib.data.measurements import CornerStream
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import BOARD
+from icalib.model.bodies import Bodies
 from icalib.motion.clocks import offset_at
 from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares
 from icalib.motion.imu_data import ImuData
@@ -31,7 +32,6 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.robust_weights import LOSSES
 from icalib.optim.state import Layout, State, in_recording
 from icalib.rig import Scheme
-from icalib.sensors.camera.bodies import Bodies
 from icalib.sensors.camera.corner_kernels import (
     Direct,
     Found,

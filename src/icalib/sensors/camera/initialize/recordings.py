@@ -11,9 +11,9 @@ from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.clocks import OneAxisError, better_offset, camera_rates
+from icalib.model.bodies import Bodies
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.bodies import Bodies
 from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
 from icalib.sensors.camera.initialize.boards.scene_changes import check_scene
 from icalib.sensors.camera.initialize.boards.scene_lens import find_scene

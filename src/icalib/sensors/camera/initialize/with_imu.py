@@ -19,7 +19,7 @@ from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.bodies import choose_bodies, restrict
+from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, trusted
 from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
 from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, lens_of

@@ -10,7 +10,7 @@ from icalib.geometry import so3
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.optim.state import Key
 from icalib.rig import Rig
-from icalib.sensors.camera.bodies import taken_at_once
+from icalib.sensors.camera.connected_bodies import taken_at_once
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 
 MOST_PAIRS = 200  # of images taken together; more do not make a first guess better

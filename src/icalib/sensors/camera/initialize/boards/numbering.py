@@ -25,7 +25,7 @@ from icalib.initialize.steps.gyro import GyroRotation
 from icalib.initialize.steps.target_poses import Flat, TargetPoses, target_poses
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.bodies import taken_at_once
+from icalib.sensors.camera.connected_bodies import taken_at_once
 from icalib.sensors.camera.initialize.align_camera import align_camera
 from icalib.sensors.camera.initialize.boards.intrinsics import camera_params
 from icalib.sensors.camera.initialize.guess import relative_offset

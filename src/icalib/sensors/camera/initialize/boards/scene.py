@@ -28,8 +28,8 @@ from icalib.initialize.steps.target_poses import (
     target_poses,
     usable_rays,
 )
+from icalib.model.bodies import Bodies
 from icalib.optim.state import Key
-from icalib.sensors.camera.bodies import Bodies
 from icalib.sensors.camera.corner_factor import Views
 
 MIRRORS = 2

@@ -16,7 +16,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.evidence.corner_noise import SMALLEST_BASE_PX
 from icalib.geometry.cameras import camera_model
 from icalib.rig import Rig
-from icalib.sensors.camera.bodies import restrict
+from icalib.sensors.camera.connected_bodies import restrict
 from icalib.sensors.camera.initialize.boards.scene import Placed, poses_by_bodies
 from icalib.sensors.camera.initialize.boards.scene_growth import fixed_lens, grow
 

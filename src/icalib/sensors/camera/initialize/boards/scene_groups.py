@@ -20,10 +20,17 @@ from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, PosePairs, hand_eye, left_over
 from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.model.bodies import Bodies
 from icalib.motion.pose_rows import Frame, Mount
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.bodies import FEWEST_TOGETHER, Bodies, camera_times, restrict, taken_at_once, tied_by_images
+from icalib.sensors.camera.connected_bodies import (
+    FEWEST_TOGETHER,
+    camera_times,
+    restrict,
+    taken_at_once,
+    tied_by_images,
+)
 from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
 from icalib.sensors.camera.initialize.boards.scene_growth import UntiedBodiesError, place_bodies
 

@@ -17,8 +17,8 @@ from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras.base import CameraModel
 from icalib.initialize.steps.target_poses import LARGEST_RMS_PX, MOST_CORNERS, TargetPoses
+from icalib.model.bodies import Bodies
 from icalib.optim.state import Key
-from icalib.sensors.camera.bodies import Bodies
 from icalib.sensors.camera.corner_factor import Views
 from icalib.sensors.camera.initialize.boards.scene import Placed, body_poses, poses_by_bodies
 from icalib.sensors.camera.initialize.boards.scene_bundle import (

@@ -13,8 +13,9 @@ from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import Target
+from icalib.model.bodies import Bodies
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict, tied_by_images
+from icalib.sensors.camera.connected_bodies import choose_bodies, restrict, tied_by_images
 from icalib.sensors.camera.initialize.boards.intrinsics import camera_params
 from icalib.sensors.camera.initialize.boards.scene import Placed
 from icalib.sensors.camera.initialize.boards.scene_bundle import CameraIntrinsics

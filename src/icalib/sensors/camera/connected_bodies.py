@@ -1,13 +1,9 @@
-"""The rigid bodies that a target consists of: which of them are estimated, and where their points are.
-
-The first body in use is the reference: its frame is the scene's, in which the others have poses that are estimated.
-"""
+"""Which bodies of the target are estimated: those that images tie to each other."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -15,106 +11,12 @@ import numpy as np
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.targets import Target
-from icalib.geometry.targets.base import BOARD
+from icalib.model.bodies import Bodies
 from icalib.motion.nodes import MERGED_WITHIN_S
-from icalib.optim.state import Entry, Key, Layout
-from icalib.rig import Rig, scene
-from icalib.sensors.camera.board import shape_basis
+from icalib.rig import Rig
 
 FEWEST_TOGETHER = 3  # images with both of two bodies that tie them to each other
 MOST_NAMED = 8  # bodies in a sentence
-SIZE: Key = (BOARD, scene.SIZE.name)  # (1,) true lengths over those of the target as stated
-
-
-@dataclass(frozen=True)
-class Bodies:
-    """used: indices of the target's bodies that are estimated, the reference first; left_out: those that were seen, but
-    too seldom with others; bent: whether bodies may bend; size: of each body, in what the target says. sized: whether
-    the size is a parameter of its own, on which `size` is a factor."""
-
-    target: Target
-    used: tuple[int, ...]
-    left_out: tuple[int, ...] = ()
-    bent: bool = False
-    size: float = 1.0
-    sized: bool = False
-
-    @property
-    def several(self) -> bool:
-        return len(self.used) > 1
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of those in use."""
-        return tuple(self.target.bodies[k] for k in self.used)
-
-    @property
-    def bending(self) -> tuple[str, ...]:
-        """Names of those whose shape is estimated."""
-        return tuple(self.target.bodies[k] for k in self.used if self.bent and self.target.bends[k])
-
-    @cached_property
-    def basis(self) -> np.ndarray:
-        """(n_points, s, 3) displacement of each point by unit of its body's shape parameters, in the body's frame."""
-        return shape_basis(self.target, self.bent)
-
-    @cached_property
-    def deformation(self) -> np.ndarray:
-        """(n_points, s or s + 1, 3) `basis`, and after it by unit of the size where it is a parameter."""
-        grown = self.size * self.target.points[:, None, :]
-        return np.concatenate([self.basis, grown], axis=1) if self.sized else self.basis
-
-    def size_entries(self) -> list[Entry]:
-        """The block of a layout for the size of all bodies together."""
-        return [scene.SIZE.entry(BOARD)] if self.sized and self.used else []
-
-    def shape_entries(self) -> list[Entry]:
-        """Blocks of a layout for how bodies bend."""
-        return [scene.SHAPE.entry(name) for name in self.bending]
-
-    def pose_entries(self) -> list[Entry]:
-        """Blocks of a layout for poses in the scene, the reference's fixed; none where there is one body only."""
-        names = self.names if self.several else ()
-        return [spec.entry(name, name != self.names[0]) for name in names for spec in scene.BODY]
-
-    def columns(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Border columns of each of the target's bodies: pose (n, 6, or 0 where only one is in use), and shape and size
-        as in `deformation` (n, s or s + 1), -1 where there are none."""
-        names, n = self.target.bodies, len(self.target.bodies)
-        pose, shape = np.full((n, 6 if self.several else 0), -1), np.full((n, self.deformation.shape[1]), -1)
-        for k in self.used if self.several else ():
-            pose[k] = layout.columns(names[k], "rotation", "translation")
-        for k in self.used:
-            if names[k] in self.bending:
-                shape[k, : self.basis.shape[1]] = layout.columns(names[k], "shape")
-        if self.sized:
-            shape[list(self.used), -1] = layout.columns(*SIZE)
-        return pose, shape
-
-    def poses(self, values: dict[Key, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """R_scene_body (n, 3, 3) and p_scene_body (n, 3) of all the target's bodies; the identity where one has
-        none."""
-        n = len(self.target.bodies)
-        R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
-        for k in self.used[1:]:
-            name = self.target.bodies[k]
-            R[k], p[k] = values[name, "rotation"], values[name, "translation"]
-        return R, p
-
-    def points(self, values: dict[Key, np.ndarray]) -> np.ndarray:
-        """(n_points, 3) the target's points in the scene, shapes included; of the stated size if `values` has none."""
-        size = self.size * values[SIZE][0] if self.sized and SIZE in values else self.size
-        points, body = size * self.target.points, self.target.body
-        if self.bending:
-            sizes = np.zeros((len(self.target.bodies), self.basis.shape[1]))
-            for k in self.used:
-                if self.target.bodies[k] in self.bending:
-                    sizes[k] = values[self.target.bodies[k], "shape"]
-            points = points + np.einsum("nsk,ns->nk", self.basis, sizes[body])
-        if not self.several:
-            return points
-        R, p = self.poses(values)
-        return np.einsum("nij,nj->ni", R[body], points) + p[body]
 
 
 def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool, rig: Rig | None = None) -> Bodies:

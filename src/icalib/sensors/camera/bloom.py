@@ -1,0 +1,16 @@
+"""Bloom: where dark edges seem to move in the image, by the blur of the lens and the response of the camera."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.geometry.cameras.base import CameraModel
+
+
+def bloom_direction(model: CameraModel, params: np.ndarray, X: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """(N, 2) unit image direction of `towards` (N, 3, camera axes) at points X (N, 3) in the camera frame."""
+    _, valid, J, _ = model.project_with_jacobians(params, X)
+    d = np.einsum("nij,nj->ni", J, towards)
+    norm = np.linalg.norm(d, axis=1)
+    ok = valid & (norm > 0.0)
+    return np.where(ok[:, None], d / np.where(ok, norm, 1.0)[:, None], 0.0)
