@@ -157,8 +157,8 @@ def _add_camera(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, inputs:
     assert camera.corner_noise_px is not None
     noise = gtsam.noiseModel.Isotropic.Sigma(2, camera.corner_noise_px)
     times = stream.seconds + state.values[camera.name, "time_offset"][0]
-    node = np.searchsorted(state.seconds, times - 1e-3)[stream.image].tolist()
-    for k, j, uv in zip(node, stream.point.tolist(), stream.uv, strict=True):
+    keyframe = np.searchsorted(state.seconds, times - 1e-3)[stream.image].tolist()
+    for k, j, uv in zip(keyframe, stream.point.tolist(), stream.uv, strict=True):
         graph.add(gtsam_unstable.ProjectionFactorPPPCal3DS2(uv, noise, X(k), T(c), L(j), calibration))
 
 

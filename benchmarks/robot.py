@@ -81,7 +81,8 @@ def _parts(inputs: Inputs, found: Estimate) -> None:
         print(f"{rate:.0f} M points/s and core, {2.0 * rate:.0f} on two")
     pieces, residuals = problem.pieces(), problem.residuals()
     whole = min(_spent(lambda: problem.linearise(state, pieces, residuals))[1] for _ in range(REPEATS))
-    print(f"{problem.n_nodes} nodes, {problem.layout.size} calibration parameters; linearising {whole:.3f} s, of which")
+    print(f"{problem.n_keyframes} keyframes, {problem.layout.size} calibration parameters")
+    print(f"linearising {whole:.3f} s, of which")
     for factor in problem.factors.values():
         out = factor.output()
         own = min(

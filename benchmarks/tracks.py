@@ -68,12 +68,13 @@ def _step(found: Estimate) -> None:
     linearising, solving = [], []
     for _ in range(REPEATS):
         linearising.append(_spent(lambda: problem.linearise(state, pieces, residuals))[0])
-        solving.append(_spent(lambda: solve(pieces, problem.n_nodes, problem.tolerance))[0])
+        solving.append(_spent(lambda: solve(pieces, problem.n_keyframes, problem.tolerance))[0])
     products = sum(min(_spent(_products(p))[0] for _ in range(REPEATS)) for p in pieces)
     features = [p.features for p in pieces if p.features is not None]
     alive = max(int(f.plan.alive.max(initial=0)) for f in features)
     n = sum(len(f.sums.track) for f in features)
-    print(f"{problem.n_nodes} nodes, {sum(len(f.sums.own) for f in features)} tracks, {alive} alive, {n} observations")
+    print(f"{problem.n_keyframes} keyframes, {sum(len(f.sums.own) for f in features)} tracks")
+    print(f"{alive} alive, {n} observations")
     print(f"linearising               {min(linearising):>8.2f} s, {1e6 * min(linearising) / n:.2f} us an observation")
     print(f"solving                   {min(solving):>8.2f} s, {min(solving) / products:.1f} times its products alone")
 
@@ -85,7 +86,7 @@ def _products(piece: Piece) -> Callable[[], None]:
     plan, n_calib = features.plan, features.sums.side.shape[2]
     ranks = []
     for g in range(len(plan.after)):
-        own = plan.nodes.values[plan.nodes.start[g] : plan.nodes.start[g + 1]]
+        own = plan.keyframes.values[plan.keyframes.start[g] : plan.keyframes.start[g + 1]]
         ranks.append(int(plan.coupled[own].sum() + 3 * (plan.dying.start[g + 1] - plan.dying.start[g])))
     wide = n_calib + 3 * plan.alive
     rows, front = np.random.default_rng(0).standard_normal((max(ranks), wide.max())), np.zeros((wide.max(),) * 2)

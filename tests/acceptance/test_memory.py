@@ -1,4 +1,4 @@
-"""Peak memory grows with a recording by what its corners and nodes need, not by copies of them."""
+"""Peak memory grows with a recording by what its corners and keyframes need, not by copies of them."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ print(next(line.split()[1] for line in open("/proc/self/status") if line.startsw
 SHORT_S, LONG_S = 60.0, 240.0
 # Of a corner: where it is, its point, standard deviation, residual, weight, bloom, and whether it is kept.
 CORNER_BYTES = 16 + 8 + 8 + 8 + 4 + 8 + 1
-# Of a node: two blocks of 15 x 15, 15 x 25 with the calibration, preintegration, ten readings, states and steps.
-NODE_BYTES = 8 * (2 * 225 + 15 * 25 + 225 + 54 + 150 + 200)
+# Of a keyframe: two blocks of 15 x 15, 15 x 25 with the calibration, preintegration, ten readings, states and steps.
+KEYFRAME_BYTES = 8 * (2 * 225 + 15 * 25 + 225 + 54 + 150 + 200)
 LEAST, MOST = 0.75, 1.2  # of what is needed: work space and what the allocator holds are much the same in both
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory in kilobytes, and an allocator that gives back")
-def test_memory_grows_with_what_corners_and_nodes_need(tmp_path: Path) -> None:
+def test_memory_grows_with_what_corners_and_keyframes_need(tmp_path: Path) -> None:
     _peak(tmp_path, 10.0)  # compiles what is not yet compiled
     (short, corners0, nodes0), (long, corners1, nodes1) = (_peak(tmp_path, s) for s in (SHORT_S, LONG_S))
-    needed = CORNER_BYTES * (corners1 - corners0) + NODE_BYTES * (nodes1 - nodes0)
+    needed = CORNER_BYTES * (corners1 - corners0) + KEYFRAME_BYTES * (nodes1 - nodes0)
     assert LEAST * needed < long - short < MOST * needed
 
 

@@ -217,8 +217,8 @@ def test_nees_of_a_camera_and_wheels(robot):
 
 
 def test_the_clock_of_wheels_that_say_more_than_the_poses(robot):
-    """The rate of a node is the mean until the next. Carried backwards as well, it goes with the noise of one neighbour
-    more than with the other's, and the time offset is off by 0.6 ms, three standard deviations."""
+    """The rate of a keyframe is the mean until the next. Carried backwards as well, it goes with the noise of one
+    neighbour more than with the other's, and the time offset is off by 0.6 ms, three standard deviations."""
     scenario = robot("ramp", 20.0, "w").with_sensors(mocap())
     normal = []
     for seed in (15, 16, 17, 19):

@@ -16,7 +16,7 @@ from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
 
 MOUNTS = ("rotation", "translation", "time_offset")
-TILT, HEIGHT = 5e-3, 2e-3  # of each node [rad]; of what was measured [m]
+TILT, HEIGHT = 5e-3, 2e-3  # of each keyframe [rad]; of what was measured [m]
 FLOOR, LEVEL = Ground("floor", TILT, 0.0, HEIGHT, 2e-3), Ground("level", TILT, 0.0, HEIGHT, 2e-3)
 TAPE_M = 3e-3
 

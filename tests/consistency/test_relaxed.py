@@ -39,7 +39,7 @@ def test_some_groups_alone_are_free_as_in_a_problem_of_their_own(estimated):
     problem = found.judged.problem(freed, stated.state)
     pieces = problem.pieces()
     problem.linearise(stated.state, pieces, problem.residuals(), curved=True)
-    own = solve(pieces, problem.n_nodes, problem.tolerance)
+    own = solve(pieces, problem.n_keyframes, problem.tolerance)
     assert 0 < problem.layout.size == len(columns) < stated.layout.size
     t = problem.tolerance
     one, other = (t[:, None] * x * t for x in (outcome.information[np.ix_(columns, columns)], own.information))

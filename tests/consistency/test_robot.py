@@ -63,7 +63,7 @@ def test_a_few_recordings_of_a_lidar(consistency, robot):
 
 
 def test_a_lidar_beside_a_noisy_imu(consistency, robot):
-    """Between nodes the gyroscope loses as much as the LiDAR sees: taken for exact there, NEES is 3.8."""
+    """Between keyframes the gyroscope loses as much as the LiDAR sees: taken for exact there, NEES is 3.8."""
     scenario = robot("3d", 12.0, "l", 600)
     scenario = replace(scenario, imu_noise=scenario.imu_noise.scaled(10.0))
     rig = rig_for(scenario, time_offset="fixed")

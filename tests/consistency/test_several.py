@@ -203,7 +203,7 @@ def test_a_recording_without_a_guess_is_named(noisy):
 
 
 def test_gaps_and_other_schemes(noisy):
-    """A gap is told with its recording, and images between two nodes never reach into another recording."""
+    """A gap is told with its recording, and images between two keyframes never reach into another recording."""
     first, other = (s.measurements for s in noisy)
     t = other.imu.seconds
     kept = (t < 4.0) | (t > 4.1)

@@ -50,7 +50,7 @@ def first_judged(monkeypatch):
 def test_all_information_that_is_noise_is_found(first_judged):
     """A robot that turns about one axis shows nothing of the wheels' lever arm along it. Relative poses of wheels that
     never slip are as good as constraints, so that what the IMU's noise makes of the turn between them shows it well:
-    half of that noise is what turns the trajectory between its nodes and the images."""
+    half of that noise is what turns the trajectory between its keyframes and the images."""
     shown, noise = [], []
     for seed in range(RECORDINGS):
         problem, outcome = first_judged(seed)

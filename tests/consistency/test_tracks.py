@@ -13,7 +13,7 @@ from tests.typed import not_none
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.evidence.corner_noise import first_noise
 from icalib.estimate.evidence.feature_noise import first_following
-from icalib.estimate.problem.assembly import assemble, image_times, nodes_for, resample
+from icalib.estimate.problem.assembly import assemble, image_times, keyframes_for, resample
 from icalib.estimate.problem.inputs import inputs_for, origin_difference
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import NoTarget
@@ -45,7 +45,7 @@ def rig_of(scenario: Scenario, scale: float = 1.0) -> Rig:
 
 
 def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
-    """In passes, each with nodes and preintegration made anew from what the last one found."""
+    """In passes, each with keyframes and preintegration made anew from what the last one found."""
     scenario = table2(8.0)
     exact = {"imu_noise_enabled": False, "robot_noise_enabled": False}
     # At 1000 Hz all images stand at stamps of the IMU: in between, readings are taken to run linearly.
@@ -67,7 +67,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
         assert outcome.converged, outcome.status
         last = problem, state, outcome
         state = outcome.state
-        state = resample(state, nodes_for(inputs, image_times(inputs, state.values)), inputs)
+        state = resample(state, keyframes_for(inputs, image_times(inputs, state.values)), inputs)
     _is_the_same_in_its_own_room(*not_none(last))
     for camera, stream in zip(scenario.cameras, streams, strict=True):
         value, T = {name: state.values[camera.name, name] for name in CALIBRATED}, camera.T_imu_sensor

@@ -22,11 +22,11 @@ from icalib.geometry.targets import AprilGrid
 from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import keyed
 from icalib.motion.imu_data import ImuData
-from icalib.motion.nodes import place_nodes
-from icalib.motion.poses import assign_nodes
+from icalib.motion.keyframe_placement import place_keyframes
+from icalib.motion.poses import assign_keyframes
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece, make_pieces
-from icalib.optim.state import NODE, Entry, Kind, Layout, State, make_layout
+from icalib.optim.state import KEYFRAME_DIM, Entry, Kind, Layout, State, make_layout
 from icalib.rig import ImuSensor, Lidar, Scheme, Settings
 from icalib.rig.scene import SHAPE_LABELS
 from icalib.sensors.camera.connected_bodies import restrict
@@ -132,7 +132,7 @@ class Setup:
         return scale
 
     def perturbed(self, rng: np.random.Generator, size: float = 1.0) -> State:
-        chain = rng.normal(size=(len(self.state.seconds), NODE)) * np.repeat([2e-3, 2e-3, 5e-3, 5e-4, 5e-3], 3)
+        chain = rng.normal(size=(len(self.state.seconds), KEYFRAME_DIM)) * np.repeat([2e-3, 2e-3, 5e-3, 5e-4, 5e-3], 3)
         return self.state.retract(
             self.layout, size * chain, size * rng.normal(size=self.layout.size) * self.columns_scale()
         )
@@ -183,7 +183,7 @@ def make_setup(
             entries.append((c.name, name, kind, columns, bloom or name != "bloom"))
             values[c.name, name] = value
         times.append(c.seconds + offset)
-    seconds = place_nodes(imu, times, spacing, 0.5)
+    seconds = place_keyframes(imu, times, spacing, 0.5)
     bias = np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]])
     streams = restrict(bodies, measurements).cameras
     empty = np.empty(0)
@@ -204,7 +204,7 @@ def make_factor(setup: Setup, camera: int, scheme: Scheme = "inertial", **change
     """The factor of one camera, everything kept, sigma 0.2 px, no loss and no common error unless `changes` say so."""
     stream = setup.streams[camera]
     n, state = len(stream.uv), setup.state
-    node = assign_nodes(scheme, state.seconds, stream.seconds + state.values[stream.name, "time_offset"][0])
+    keyframe = assign_keyframes(scheme, state.seconds, stream.seconds + state.values[stream.name, "time_offset"][0])
     factor = CornerFactor(
         stream=stream,
         model=camera_model(setup.sim.scenario.cameras[camera].model),
@@ -212,13 +212,13 @@ def make_factor(setup: Setup, camera: int, scheme: Scheme = "inertial", **change
         gravity=9.81,
         scheme=scheme,
         times=stream.seconds,
-        node=node,
+        keyframe=keyframe,
         keep=np.ones(n, dtype=bool),
         noise=CornerNoise(np.full(n, 0.2), np.zeros(0), np.zeros((n, 0))),
         direction=np.zeros((0, 2)),
         bodies=setup.bodies,
         layout=setup.layout,
-        n_nodes=len(state.seconds),
+        n_keyframes=len(state.seconds),
     )
     return replace(factor, **changes)
 
@@ -246,7 +246,7 @@ def make_features_on_planes(setup: Setup, *arguments, **options) -> tuple[Setup,
     """The setup with two planes, about where the features are and 2 deg from there, and its features, of which two of
     three are on one of them, known to lie there to 3 to 8 mm."""
     factor = make_features(setup, *arguments, **options)
-    views, n = factor._views(setup.state, 0, factor.n_nodes), factor.tracks.count
+    views, n = factor._views(setup.state, 0, factor.n_keyframes), factor.tracks.count
     points = factor._from_anchors(views, slice(0, n), factor.tracks.start)
     centre = points.mean(axis=0)
     across, _, normal = np.linalg.svd(points - centre, full_matrices=False)[2]
@@ -294,7 +294,7 @@ class RoomSetup:
         return scale
 
     def perturbed(self, rng: np.random.Generator, size: float = 1.0) -> State:
-        chain = rng.normal(size=(len(self.state.seconds), NODE)) * np.repeat([2e-3, 2e-3, 5e-3, 5e-4, 5e-3], 3)
+        chain = rng.normal(size=(len(self.state.seconds), KEYFRAME_DIM)) * np.repeat([2e-3, 2e-3, 5e-3, 5e-4, 5e-3], 3)
         calib = rng.normal(size=self.layout.size) * self.columns_scale()
         return self.state.retract(self.layout, size * chain, size * calib)
 
@@ -308,7 +308,7 @@ class RoomSetup:
         return LidarFactor.build(self.stream, self.plane, self.planes, motion, noise, self.layout, **options)
 
     def problem(self, start: State, noise: LidarNoise | None = None, **options) -> Problem:
-        """IMU and LiDAR, the first node held where it is."""
+        """IMU and LiDAR, the first keyframe held where it is."""
         columns = self.layout.columns("imu0", "intrinsics")
         imu = ImuFactor.build(self.imu, start, 9.81, columns[columns >= 0])
         lidar = self.factor(start, noise, **options)
@@ -341,7 +341,7 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
     for key, k in zip(planes, used, strict=True):
         values[key] = plane_of(truth.planes[k, :3], faces[k, 0] + 0.5 * (faces[k, 1] + faces[k, 2]))
     ends = stream.seconds[[0, -1]] + offset + np.array([0.0, stream.offset_s.max()])
-    seconds = place_nodes(imu, [np.clip(ends, 0.0, imu.seconds[-1])], spacing, 0.5)
+    seconds = place_keyframes(imu, [np.clip(ends, 0.0, imu.seconds[-1])], spacing, 0.5)
     R, p, v = truth.pose_at(seconds + truth.seconds[0])
     bias = np.tile(np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]]), (len(seconds), 1))
     state = State(seconds, R, p, v, bias, values)
@@ -366,39 +366,39 @@ def room_scenario(
     )
 
 
-def make_dense(pieces: tuple[Piece, ...], n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def make_dense(pieces: tuple[Piece, ...], n_keyframes: int) -> tuple[np.ndarray, np.ndarray]:
     """The normal matrix (chain, then calib) and its gradient."""
     n_calib = pieces[0].calib.shape[0] - 1
-    o = NODE * n_nodes
+    o = KEYFRAME_DIM * n_keyframes
     H, g = np.zeros((o + n_calib, o + n_calib)), np.zeros(o + n_calib)
     for piece in pieces:
         for k in range(piece.first, piece.last + 1):
-            i, a = k - piece.first, slice(NODE * k, NODE * k + NODE)
+            i, a = k - piece.first, slice(KEYFRAME_DIM * k, KEYFRAME_DIM * k + KEYFRAME_DIM)
             H[a, a] += piece.diagonal[i]
             H[a, o:] += piece.side[i, :, :-1]
             g[a] += piece.side[i, :, -1]
             if k < piece.last:
-                H[a, NODE * k + NODE : NODE * k + 2 * NODE] += piece.upper[i]
+                H[a, KEYFRAME_DIM * k + KEYFRAME_DIM : KEYFRAME_DIM * k + 2 * KEYFRAME_DIM] += piece.upper[i]
         H[o:, o:] += piece.calib[:-1, :-1]
         g[o:] += piece.calib[:-1, -1]
-        for H_part, g_part in schur_of_features(piece, n_nodes) if piece.features else ():
+        for H_part, g_part in schur_of_features(piece, n_keyframes) if piece.features else ():
             H -= H_part
             g -= g_part
     return np.triu(H) + np.triu(H, 1).T, g
 
 
-def schur_of_features(piece: Piece, n_nodes: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def schur_of_features(piece: Piece, n_keyframes: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """What eliminating each feature of a piece takes from the dense normal matrix and its gradient."""
-    sums, o = not_none(piece.features).sums, NODE * n_nodes
+    sums, o = not_none(piece.features).sums, KEYFRAME_DIM * n_keyframes
     for f in range(len(sums.own)):
         K = np.zeros((3, o + sums.side.shape[2]))
         K[:, o:] = sums.side[f]
         for e in np.flatnonzero(sums.track == f):
             i = sums.image[e]
-            a = NODE * (piece.first + sums.node[i])
-            K[:, a : a + NODE] += sums.block[e] @ sums.pose[i]
+            a = KEYFRAME_DIM * (piece.first + sums.keyframe[i])
+            K[:, a : a + KEYFRAME_DIM] += sums.block[e] @ sums.pose[i]
             if len(sums.next_pose):
-                K[:, a + NODE : a + 2 * NODE] += sums.block[e] @ sums.next_pose[i]
+                K[:, a + KEYFRAME_DIM : a + 2 * KEYFRAME_DIM] += sums.block[e] @ sums.next_pose[i]
         M = K[:, :-1].T @ np.linalg.solve(sums.own[f], K)
         yield M[:, :-1], M[:, -1]
 

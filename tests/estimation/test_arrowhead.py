@@ -6,25 +6,27 @@ import pytest
 from icalib.optim import arrowhead
 from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, marginalise_in_segments, solve
 from icalib.optim.calib_block import HELD_BELOW, calib_step
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 
 
-def random_pieces(n_nodes, n_calib, seed=0, calib_rank=None):
-    """Pieces filled with the sums of random factors: each on two neighbouring nodes and the calibration parameters, or
-    on one node."""
+def random_pieces(n_keyframes, n_calib, seed=0, calib_rank=None):
+    """Pieces filled with the sums of random factors: each on two neighbouring keyframes and the calibration parameters,
+    or on one keyframe."""
     rng = np.random.default_rng(seed)
-    pieces = make_pieces(n_nodes, n_calib)
+    pieces = make_pieces(n_keyframes, n_calib)
     mix = np.eye(n_calib)
     if calib_rank is not None:
         mix = rng.normal(size=(calib_rank, n_calib))
     for piece in pieces:
         for k in range(piece.last - piece.first + 1):
             pair = k < piece.last - piece.first
-            own = piece.first + k != piece.first or piece.first == 0  # a shared node's own factor belongs to one piece
+            own = (
+                piece.first + k != piece.first or piece.first == 0
+            )  # a shared keyframe's own factor belongs to one piece
             for rows, both in ((22, True), (30, False)):
                 if (both and not pair) or (not both and not own):
                     continue
-                A, B = rng.normal(size=(2, rows, NODE))
+                A, B = rng.normal(size=(2, rows, KEYFRAME_DIM))
                 C, r = rng.normal(size=(rows, len(mix))) @ mix, rng.normal(size=rows)
                 add_factor(piece, k, A, B if both else None, C, r)
     return pieces
@@ -42,9 +44,9 @@ def add_factor(piece, k, A, B, C, r):
     piece.calib[-1, -1] = 0.0
 
 
-def schur(H, g, n_nodes):
+def schur(H, g, n_keyframes):
     """Border with the chain eliminated: information and gradient."""
-    o = NODE * n_nodes
+    o = KEYFRAME_DIM * n_keyframes
     X = np.linalg.solve(H[:o, :o], np.concatenate([H[:o, o:], g[:o, None]], axis=1))
     return H[o:, o:] - H[o:, :o] @ X[:, :-1], g[o:] - H[o:, :o] @ X[:, -1]
 
@@ -54,28 +56,28 @@ def flat(solution):
 
 
 @pytest.mark.parametrize("n_calib", [0, 1, 3, 8])
-@pytest.mark.parametrize("n_nodes", range(1, 13))
-def test_solution_is_the_dense_one(dense, n_nodes, n_calib):
-    pieces = random_pieces(n_nodes, n_calib)
-    H, g = dense(pieces, n_nodes)
-    information, _ = schur(H, g, n_nodes)
-    solution = solve(pieces, n_nodes, np.ones(n_calib))
+@pytest.mark.parametrize("n_keyframes", range(1, 13))
+def test_solution_is_the_dense_one(dense, n_keyframes, n_calib):
+    pieces = random_pieces(n_keyframes, n_calib)
+    H, g = dense(pieces, n_keyframes)
+    information, _ = schur(H, g, n_keyframes)
+    solution = solve(pieces, n_keyframes, np.ones(n_calib))
     step = np.linalg.solve(H, -g)
     np.testing.assert_allclose(flat(solution), step, rtol=0, atol=1e-10 * np.abs(step).max())
     np.testing.assert_allclose(solution.information, information, rtol=0, atol=1e-9)
     assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-10)
 
 
-@pytest.mark.parametrize("n_nodes", [1, 3, 4, 7])
+@pytest.mark.parametrize("n_keyframes", [1, 3, 4, 7])
 @pytest.mark.parametrize("damping", [1e-9, 1e-2, 10.0])
-def test_damping_scales_the_whole_diagonal(dense, n_nodes, damping):
-    pieces = random_pieces(n_nodes, 4, seed=1)
-    H, g = dense(pieces, n_nodes)
+def test_damping_scales_the_whole_diagonal(dense, n_keyframes, damping):
+    pieces = random_pieces(n_keyframes, 4, seed=1)
+    H, g = dense(pieces, n_keyframes)
     H = H + damping * np.diag(np.diag(H))
     step = np.linalg.solve(H, -g)
-    solution = solve(pieces, n_nodes, np.ones(4), damping)
+    solution = solve(pieces, n_keyframes, np.ones(4), damping)
     np.testing.assert_allclose(flat(solution), step, rtol=0, atol=1e-10 * np.abs(step).max())
-    np.testing.assert_allclose(solution.information, schur(H, g, n_nodes)[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(solution.information, schur(H, g, n_keyframes)[0], rtol=1e-9, atol=1e-9)
     assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-10)
 
 
@@ -85,85 +87,86 @@ def test_the_scale_of_the_tolerances_does_not_matter_where_all_is_determined():
     np.testing.assert_allclose(flat(one), flat(other), rtol=0, atol=1e-12)
 
 
-def test_long_chain_is_cut_into_two_pieces_that_share_a_node():
+def test_long_chain_is_cut_into_two_pieces_that_share_a_keyframe():
     assert [(p.first, p.last) for p in make_pieces(9, 2)] == [(0, 4), (4, 8)]
     assert [(p.first, p.last) for p in make_pieces(4, 2)] == [(0, 2), (2, 3)]
     assert [(p.first, p.last) for p in make_pieces(3, 2)] == [(0, 2)]
 
 
-@pytest.mark.parametrize("n_nodes", [1, 2, 3])
-def test_marginalise_is_the_schur_complement(dense, n_nodes):
-    (piece,) = random_pieces(n_nodes, 5, seed=2)
-    H, g = dense((piece,), n_nodes)
-    information, gradient = schur(H, g, n_nodes)
+@pytest.mark.parametrize("n_keyframes", [1, 2, 3])
+def test_marginalise_is_the_schur_complement(dense, n_keyframes):
+    (piece,) = random_pieces(n_keyframes, 5, seed=2)
+    H, g = dense((piece,), n_keyframes)
+    information, gradient = schur(H, g, n_keyframes)
     calib = marginalise(piece)
     np.testing.assert_allclose(calib[:-1, :-1], information, rtol=0, atol=1e-10)
     np.testing.assert_allclose(calib[:-1, -1], gradient, rtol=0, atol=1e-10)
     np.testing.assert_allclose(calib[-1, :-1], gradient, rtol=0, atol=1e-10)
 
 
-def whole_and_segments(n_nodes, n_calib, seed):
-    """A random chain whole, and a function that makes its part between two nodes: factors on a node and the next one
-    belong to the part that holds both, those on a node alone to the part that it begins (the last one: ends)."""
+def whole_and_segments(n_keyframes, n_calib, seed):
+    """A random chain whole, and a function that makes its part between two keyframes: factors on a keyframe and the
+    next one belong to the part that holds both, those on a keyframe alone to the part that it begins (the last one:
+    ends)."""
     rng = np.random.default_rng(seed)
     factors = []
-    for k in range(n_nodes):
-        for both in (True, False) if k < n_nodes - 1 else (False,):
-            A, B = rng.normal(size=(2, 30, NODE))
+    for k in range(n_keyframes):
+        for both in (True, False) if k < n_keyframes - 1 else (False,):
+            A, B = rng.normal(size=(2, 30, KEYFRAME_DIM))
             factors.append((k, A, B if both else None, rng.normal(size=(30, n_calib)), rng.normal(size=30)))
 
     def part(first, last):
         piece = Piece.zeros(first, last, n_calib)
         for k, A, B, C, r in factors:
-            if first <= k < last or (k == last == n_nodes - 1 and B is None):
+            if first <= k < last or (k == last == n_keyframes - 1 and B is None):
                 add_factor(piece, k - first, A, B, C, r)
         return piece
 
-    return part(0, n_nodes - 1), part
+    return part(0, n_keyframes - 1), part
 
 
 @pytest.mark.parametrize("segment", [1, 2, 3, 100])
-@pytest.mark.parametrize("n_nodes", [1, 2, 3, 4, 6, 7, 8])
-def test_marginalising_in_segments_is_the_schur_complement(monkeypatch, dense, n_nodes, segment):
+@pytest.mark.parametrize("n_keyframes", [1, 2, 3, 4, 6, 7, 8])
+def test_marginalising_in_segments_is_the_schur_complement(monkeypatch, dense, n_keyframes, segment):
     monkeypatch.setattr(arrowhead, "SEGMENT", segment)
-    whole, part = whole_and_segments(n_nodes, 5, seed=4)
-    H, g = dense((whole,), n_nodes)
-    information, gradient = schur(H, g, n_nodes)
-    calib = marginalise_in_segments(part, n_nodes)
+    whole, part = whole_and_segments(n_keyframes, 5, seed=4)
+    H, g = dense((whole,), n_keyframes)
+    information, gradient = schur(H, g, n_keyframes)
+    calib = marginalise_in_segments(part, n_keyframes)
     np.testing.assert_allclose(calib[:-1, :-1], information, rtol=0, atol=1e-10)
     np.testing.assert_allclose(calib[:-1, -1], gradient, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("node", [0, 2, 3, 6])
-def test_marginalising_in_segments_raises_where_a_node_is_not_determined(monkeypatch, node):
+@pytest.mark.parametrize("keyframe", [0, 2, 3, 6])
+def test_marginalising_in_segments_raises_where_a_keyframe_is_not_determined(monkeypatch, keyframe):
     monkeypatch.setattr(arrowhead, "SEGMENT", 3)
     _, part = whole_and_segments(7, 2, seed=4)
 
     def spoilt(first, last):
         piece = part(first, last)
-        if first <= node <= last:
-            piece.diagonal[node - first] -= 1e3 * np.eye(NODE)
+        if first <= keyframe <= last:
+            piece.diagonal[keyframe - first] -= 1e3 * np.eye(KEYFRAME_DIM)
         return piece
 
     with pytest.raises(NotDefiniteError):
         marginalise_in_segments(spoilt, 7)
 
 
-@pytest.mark.parametrize("n_nodes", [3, 8])
-def test_undetermined_directions_stay_and_the_rest_is_solved(dense, n_nodes):
+@pytest.mark.parametrize("n_keyframes", [3, 8])
+def test_undetermined_directions_stay_and_the_rest_is_solved(dense, n_keyframes):
     """Factors see three combinations of five calibration parameters: the two others are held."""
-    pieces = random_pieces(n_nodes, 5, seed=3, calib_rank=3)
+    pieces = random_pieces(n_keyframes, 5, seed=3, calib_rank=3)
     tolerance = np.array([1.0, 0.5, 2.0, 1.0, 0.3])
-    H, g = dense(pieces, n_nodes)
-    information, gradient = schur(H, g, n_nodes)
+    H, g = dense(pieces, n_keyframes)
+    information, gradient = schur(H, g, n_keyframes)
     values, vectors = np.linalg.eigh(information * np.outer(tolerance, tolerance))
     assert values[1] < 1e-8 < HELD_BELOW < values[2]
-    solution = solve(pieces, n_nodes, tolerance)
+    solution = solve(pieces, n_keyframes, tolerance)
     np.testing.assert_allclose(vectors[:, :2].T @ (solution.calib / tolerance), 0.0, atol=1e-12)
     free = tolerance[:, None] * vectors[:, 2:]
     expected = free @ np.linalg.solve(free.T @ information @ free, -free.T @ gradient)
     np.testing.assert_allclose(solution.calib, expected, rtol=0, atol=1e-10)
-    o, step = NODE * n_nodes, flat(solution)
+    o, step = KEYFRAME_DIM * n_keyframes, flat(solution)
     np.testing.assert_allclose((H @ step + g)[:o], 0.0, atol=1e-9)  # the chain follows the held parameters
     assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-8)
 
@@ -178,12 +181,12 @@ def test_calibration_parameters_between_held_and_moved(factor):
     assert decrease == pytest.approx(-0.5 * 3.0 * expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("node", [0, 4, 8])
-def test_a_node_that_nothing_determines_is_an_error(node):
+@pytest.mark.parametrize("keyframe", [0, 4, 8])
+def test_a_keyframe_that_nothing_determines_is_an_error(keyframe):
     pieces = random_pieces(9, 2)
     for piece in pieces:
-        if piece.first <= node <= piece.last:
-            k = node - piece.first
+        if piece.first <= keyframe <= piece.last:
+            k = keyframe - piece.first
             piece.diagonal[k], piece.upper[k], piece.side[k] = 0.0, 0.0, 0.0
             if k > 0:
                 piece.upper[k - 1] = 0.0
@@ -200,7 +203,7 @@ def test_not_a_number_is_an_error():
 
 def test_marginalise_raises_too():
     (piece,) = random_pieces(2, 2)
-    piece.diagonal[1] = -np.eye(NODE)
+    piece.diagonal[1] = -np.eye(KEYFRAME_DIM)
     with pytest.raises(NotDefiniteError):
         marginalise(piece)
 

@@ -25,7 +25,7 @@ def near(setup):
 def run(factor, state, sums=False):
     """Cost, output in double precision, and pieces."""
     out = factor.output(np.float64)
-    pieces = make_pieces(factor.n_nodes, factor.layout.size)
+    pieces = make_pieces(factor.n_keyframes, factor.layout.size)
     return sum(factor.accumulate(state, p, out, sums) for p in pieces), out, pieces
 
 
@@ -68,7 +68,7 @@ def test_residual_is_the_obvious_formula_at_the_true_motion(unlike, setup_of, fa
     np.testing.assert_allclose(out.residual, predicted - factor.stream.uv, rtol=0, atol=1e-8)
 
 
-def test_at_the_truth_nothing_is_left_between_nodes_and_at_them(setup, factor_of):
+def test_at_the_truth_nothing_is_left_between_keyframes_and_at_them(setup, factor_of):
     for camera in (0, 1):
         cost, out, _ = run(factor_of(setup, camera), setup.state)
         assert np.abs(out.residual).max() < 1e-8
@@ -80,7 +80,7 @@ def test_the_lever_arm_turns_with_the_imu(setup, factor_of, scheme):
     factor = factor_of(setup, 1, scheme)
     values = setup.state.values | {("cam1", "time_offset"): setup.state.values["cam1", "time_offset"] + 7e-3}
     state = replace(setup.state, values=values)
-    poses, camera = factor.imu_poses(state, 0, len(factor.node)), factor.poses(state)
+    poses, camera = factor.imu_poses(state, 0, len(factor.keyframe)), factor.poses(state)
     R_cw, p_wc = camera.R_sensor_world, camera.p_world_sensor
     for i in range(len(p_wc)):
         np.testing.assert_allclose(
@@ -157,7 +157,7 @@ def test_estimating_the_common_error_explicitly_gives_the_same_normal_equations(
     field = np.column_stack([np.ones(n), (uv - [376.0, 240.0]) / 400.0])
     tau = np.array([0.4, 0.3, 0.2])
     with_field = replace(factor, noise=replace(factor.noise, tau=tau, field=field))
-    H, g = dense(run(with_field, near, sums=True)[2], factor.n_nodes)
+    H, g = dense(run(with_field, near, sums=True)[2], factor.n_keyframes)
     J, r, F = whitened(factor, setup, near, field)
     M = F.T @ F + np.diag(np.tile(tau**-2.0, F.shape[1] // 3))
     taken = np.linalg.solve(M, F.T @ np.column_stack([J, r]))
@@ -169,7 +169,7 @@ def test_estimating_the_common_error_explicitly_gives_the_same_normal_equations(
 
 def whitened(factor, setup, state, field):
     """J by central differences, r, and the common errors' columns F, all over sigma = 0.2; rows: u, then v."""
-    o, h = 15 * factor.n_nodes, 1e-6
+    o, h = 15 * factor.n_keyframes, 1e-6
 
     def residual(d):
         _, out, _ = run(factor, state.retract(setup.layout, d[:o].reshape(-1, 15), d[o:]))
@@ -190,9 +190,9 @@ def test_single_precision_rounds_what_is_kept_and_not_the_sums(setup, near, fact
     factor = noisy(factor_of(setup, 0))
     factor = replace(factor, noise=replace(factor.noise, loss=loss))
     cost, exact, pieces = run(factor, near, sums=True)
-    out, others = factor.output(), make_pieces(factor.n_nodes, factor.layout.size)
+    out, others = factor.output(), make_pieces(factor.n_keyframes, factor.layout.size)
     assert sum(factor.accumulate(near, p, out, True) for p in others) == cost
-    for a, b in zip(dense(others, factor.n_nodes), dense(pieces, factor.n_nodes), strict=True):
+    for a, b in zip(dense(others, factor.n_keyframes), dense(pieces, factor.n_keyframes), strict=True):
         np.testing.assert_array_equal(a, b)
     for a, b in ((out.residual, exact.residual), (out.root, exact.root)):
         np.testing.assert_array_equal(a, b.astype(np.float32))
@@ -218,7 +218,7 @@ def test_corners_left_out_are_as_if_they_were_not_there(setup, factor_of, dense)
     )
     cost_small, _, pieces_small = run(small, setup.state, sums=True)
     assert cost == pytest.approx(cost_small, rel=1e-12)
-    for a, b in zip(dense(pieces, factor.n_nodes), dense(pieces_small, factor.n_nodes), strict=True):
+    for a, b in zip(dense(pieces, factor.n_keyframes), dense(pieces_small, factor.n_keyframes), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.abs(b).max())
 
 
@@ -244,7 +244,7 @@ def test_two_pieces_hold_what_one_holds(setup, near, factor_of, dense, scheme):
     factor = noisy(factor_of(setup, 1, scheme))
     cost, _, pieces = run(factor, near, sums=True)
     assert len(pieces) == 2
-    whole = Piece.zeros(0, factor.n_nodes - 1, factor.layout.size)
+    whole = Piece.zeros(0, factor.n_keyframes - 1, factor.layout.size)
     assert factor.accumulate(near, whole, factor.output()) == pytest.approx(cost, rel=1e-12)
-    for a, b in zip(dense(pieces, factor.n_nodes), dense((whole,), factor.n_nodes), strict=True):
+    for a, b in zip(dense(pieces, factor.n_keyframes), dense((whole,), factor.n_keyframes), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.abs(b).max())

@@ -37,18 +37,18 @@ def columns_of(solution):
     return np.concatenate([chain.reshape(-1, ends[-1]), calib[:-1]])
 
 
-@pytest.mark.parametrize("n_nodes", [1, 3, 4, 9])
-def test_draws_have_the_covariance_of_the_posterior(dense, n_nodes):
-    pieces = random_pieces(n_nodes, 3)
-    H, _ = dense(pieces, n_nodes)
-    X = columns_of(solve(pieces, n_nodes, np.ones(3)))
+@pytest.mark.parametrize("n_keyframes", [1, 3, 4, 9])
+def test_draws_have_the_covariance_of_the_posterior(dense, n_keyframes):
+    pieces = random_pieces(n_keyframes, 3)
+    H, _ = dense(pieces, n_keyframes)
+    X = columns_of(solve(pieces, n_keyframes, np.ones(3)))
     inverse = np.linalg.inv(H)
     np.testing.assert_allclose(X @ X.T, inverse, rtol=0, atol=1e-10 * np.abs(inverse).max())
 
 
-@pytest.mark.parametrize(("per_node", "by_next"), [(1, False), (2, False), (2, True)])
-def test_draws_have_the_covariance_of_the_posterior_where_features_tie_nodes(per_node, by_next):
-    pieces, H, _ = build(9, 12, 3, per_node=per_node, by_next=by_next)
+@pytest.mark.parametrize(("per_keyframe", "by_next"), [(1, False), (2, False), (2, True)])
+def test_draws_have_the_covariance_of_the_posterior_where_features_tie_keyframes(per_keyframe, by_next):
+    pieces, H, _ = build(9, 12, 3, per_keyframe=per_keyframe, by_next=by_next)
     X = columns_of(solve(pieces, 9, np.ones(3)))
     inverse = np.linalg.inv(H)
     np.testing.assert_allclose(X @ X.T, inverse, rtol=0, atol=1e-9 * np.abs(inverse).max())
@@ -95,7 +95,7 @@ def outcome_of(problem, state):
     """As if the solver had ended here."""
     pieces, residuals = problem.pieces(), problem.residuals()
     problem.linearise(state, pieces, residuals, curved=True)
-    solution = solve(pieces, problem.n_nodes, problem.tolerance)
+    solution = solve(pieces, problem.n_keyframes, problem.tolerance)
     draws = solution.factors.draws(np.random.default_rng(3), DRAWS, 1)
     return Outcome(problem, state, 0.0, residuals, solution.information, (), True, "", Draws(draws[:-1], draws[-1:]))
 
@@ -104,11 +104,11 @@ def paid(problem, state, dense, what):
     """What some factors pay for of chain and calib: tr(H_s H^-1), H_s their own sums."""
     pieces = problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
-    H, _ = dense(pieces, problem.n_nodes)
+    H, _ = dense(pieces, problem.n_keyframes)
     for piece in pieces:
         piece.clear()
         what(piece)
-    own, _ = dense(pieces, problem.n_nodes)
+    own, _ = dense(pieces, problem.n_keyframes)
     return float(np.trace(np.linalg.solve(H, own)))
 
 
@@ -186,7 +186,7 @@ def test_an_early_outcome_has_no_draws_and_they_are_made_where_they_are_asked_fo
     np.testing.assert_allclose(
         spurious_information(followed, without).mean, spurious_information(followed, late).mean, rtol=1e-3, atol=1e-3
     )
-    bare = Piece.bare(0, followed.n_nodes - 1)
+    bare = Piece.bare(0, followed.n_keyframes - 1)
     features = followed.factors[FEATURES]
     out = features.output()
     features.accumulate(early.state, bare, out, sums=False)

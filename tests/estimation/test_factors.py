@@ -31,7 +31,7 @@ from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.optim.robust_weights import LEAST_CURVATURE
-from icalib.optim.state import NODE, State, in_recording, make_layout
+from icalib.optim.state import KEYFRAME_DIM, State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import CornerNoise
 from icalib.sensors.camera.features.surfaces import ON_PLANES
@@ -117,8 +117,8 @@ def row_sample(setup, state, made, bend, curved):
     return Sample(type(made).__name__, setup, state, accumulate, lambda at: run(at)[0], weights, made=made)
 
 
-def with_two_clocks(setup, node=5):
-    """The setup as two recordings, the second from `node` on; each clock has a time offset of its own in it."""
+def with_two_clocks(setup, keyframe=5):
+    """The setup as two recordings, the second from `keyframe` on; each clock has a time offset of its own in it."""
     entries = [
         (b.sensor, b.name, b.kind, 2 if b.name == "time_offset" else b.size, b.start is not None)
         for b in setup.layout.blocks
@@ -127,7 +127,7 @@ def with_two_clocks(setup, node=5):
     if ("board0", "tilt") in values and (in_recording("board0", 1), "tilt") not in values:
         entries.append((in_recording("board0", 1), "tilt", "tilt", 2, True))
         values[in_recording("board0", 1), "tilt"] = values["board0", "tilt"]
-    return replace(setup, layout=make_layout(entries), state=replace(setup.state, values=values, starts=(0, node)))
+    return replace(setup, layout=make_layout(entries), state=replace(setup.state, values=values, starts=(0, keyframe)))
 
 
 def corner_sample(
@@ -161,7 +161,7 @@ def corner_sample(
         keep=rng.random(n) < 0.15,
         noise=noise,
         direction=rng.normal(size=(n, 2)),
-        seams=(int(np.searchsorted(factor.node, setup.state.starts[1])),) if restarts else (),
+        seams=(int(np.searchsorted(factor.keyframe, setup.state.starts[1])),) if restarts else (),
     )
     state = setup.perturbed(rng, 0.02)
 
@@ -222,7 +222,7 @@ def feature_sample(
     at_optimum = factor.output()
     for piece in make_pieces(len(state.seconds), setup.layout.size):
         factor.accumulate(state, piece, at_optimum, sums=False)
-    views = factor._views(state, 0, factor.n_nodes)
+    views = factor._views(state, 0, factor.n_keyframes)
     world = factor._from_anchors(views, slice(0, factor.tracks.count), at_optimum.points)
     used = [root > 0 for root in at_optimum.root]
     track = np.concatenate([t[u] for t, u in zip(factor.tracks.track, used, strict=True)])
@@ -314,8 +314,8 @@ def lidar_sample(
     walks = lidar_walks(factor, start)
 
     def weights(at):
-        """Of rows that the gyroscope's noise moves together, on each side of a node; what it explains by slanted beams
-        is part of their slope."""
+        """Of rows that the gyroscope's noise moves together, on each side of a keyframe; what it explains by slanted
+        beams is part of their slope."""
         y, W = residual(at), np.eye(residual(at).size)
         for rows, J, slope in walks:
             W[np.ix_(rows, rows)] -= J @ np.linalg.solve(np.eye(3) + J.T @ J, J.T)
@@ -324,7 +324,8 @@ def lidar_sample(
 
     def turned(at):
         return (
-            factor.moments.slant[:, 0].sum() + lidar_rows_turned(factor, at, np.zeros((len(factor.node), 3)))[1].sum()
+            factor.moments.slant[:, 0].sum()
+            + lidar_rows_turned(factor, at, np.zeros((len(factor.keyframe), 3)))[1].sum()
         )
 
     r, explained = residual(state), 0.0
@@ -338,11 +339,11 @@ def lidar_sample(
 
 
 def lidar_walks(factor, at):
-    """Of the bins on each side of each node: rows, derivatives (n, 3) by the turn that the gyroscope's noise makes, one
-    standard deviation along the way, and what half the chi^2 changes with it as beams turn (3,)."""
+    """Of the bins on each side of each keyframe: rows, derivatives (n, 3) by the turn that the gyroscope's noise makes,
+    one standard deviation along the way, and what half the chi^2 changes with it as beams turn (3,)."""
     m, h = factor.moments, 1e-4
     bin_of = np.repeat(np.arange(len(m.seconds)), np.diff(m.start))
-    side = 2 * factor.node[bin_of] + (factor.walked[bin_of] > 0.0)
+    side = 2 * factor.keyframe[bin_of] + (factor.walked[bin_of] > 0.0)
     slopes = []
     for axis in h * np.eye(3):
         there, back = (lidar_rows_turned(factor, at, sign * factor.walked[:, None] * axis) for sign in (1.0, -1.0))
@@ -361,8 +362,8 @@ def lidar_rows_turned(factor, at, turn):
     bin."""
     m, name = factor.moments, factor.name
     bin_of = np.repeat(np.arange(len(m.seconds)), np.diff(m.start))
-    times = m.seconds + offset_at(at, name, factor.node)
-    poses = poses_at(factor.scheme, times, factor.node, at, factor.imu, factor.gravity, False)
+    times = m.seconds + offset_at(at, name, factor.keyframe)
+    poses = poses_at(factor.scheme, times, factor.keyframe, at, factor.imu, factor.gravity, False)
     R = poses.rotation @ so3.exp_many(turn)
     R_lidar, p_lidar = R @ at.values[name, "rotation"], poses.position + R @ at.values[name, "translation"]
     plane = np.array([at.values[key] for key in factor.planes])[m.plane]
@@ -487,8 +488,8 @@ def ground_sample(unlike, setup_of, plane, seen=True):
 
 
 def with_poses(setup, starts):
-    """The setup with mocap0 in its state and layout, and the nodes of recordings that begin at `starts`; readings are
-    constant, as in `with_wheels`."""
+    """The setup with mocap0 in its state and layout, and the keyframes of recordings that begin at `starts`; readings
+    are constant, as in `with_wheels`."""
     rng = np.random.default_rng(6)
     mount = {"rotation": so3.exp(rng.normal(size=3)), "translation": rng.normal(size=3), "time_offset": np.zeros(1)}
     mount["scale"] = np.array([1.03])
@@ -635,7 +636,7 @@ SAMPLES = {
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
     "wheels": ("IncrementFactor", lambda u, s, f: wheel_sample(u, s, IncrementFactor)),
     "wheels, intrinsics": ("IncrementFactor", lambda u, s, f: wheel_sample(u, s, IncrementFactor, True)),
-    "wheels with fewer stamps than nodes": (
+    "wheels with fewer stamps than keyframes": (
         "IncrementFactor",
         lambda u, s, f: wheel_sample(u, s, IncrementFactor, rate_hz=9.0),
     ),
@@ -734,8 +735,8 @@ def sums_of(sample, dense):
 
 
 def moved(sample, d):
-    o = NODE * len(sample.state.seconds)
-    return sample.state.retract(sample.setup.layout, d[:o].reshape(-1, NODE), d[o:])
+    o = KEYFRAME_DIM * len(sample.state.seconds)
+    return sample.state.retract(sample.setup.layout, d[:o].reshape(-1, KEYFRAME_DIM), d[o:])
 
 
 def cost_at(sample, d):

@@ -1,4 +1,4 @@
-"""Chains whose nodes are tied by features: the elimination against dense linear algebra on random sums."""
+"""Chains whose keyframes are tied by features: the elimination against dense linear algebra on random sums."""
 
 from __future__ import annotations
 
@@ -8,36 +8,36 @@ import pytest
 from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, solve
 from icalib.optim.front import Features
 from icalib.optim.front_plan import SIZES, FeatureSums, plan
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 
 
-def random_images(n, per_node, by_next, rng):
-    """Node (I,) of each image, and poses by node and by the next one."""
-    node = np.repeat(np.arange(n - by_next), per_node)
-    pose = rng.normal(size=(len(node), 6, NODE))
-    return node, pose, rng.normal(size=pose.shape) if by_next else pose[:0]
+def random_images(n, per_keyframe, by_next, rng):
+    """Node (I,) of each image, and poses by keyframe and by the next one."""
+    keyframe = np.repeat(np.arange(n - by_next), per_keyframe)
+    pose = rng.normal(size=(len(keyframe), 6, KEYFRAME_DIM))
+    return keyframe, pose, rng.normal(size=pose.shape) if by_next else pose[:0]
 
 
 def random_sums(piece, n_tracks, images, rng, whole):
     """Random IMU-like factors and features, each seen in images of the piece; returns pairs of feature and image.
 
-    whole: rows (node columns, their Jacobian, feature, image, Jacobians by feature and camera pose, by the calibration
-    parameters, residual) are appended."""
+    whole: rows (keyframe columns, their Jacobian, feature, image, Jacobians by feature and camera pose, by the
+    calibration parameters, residual) are appended."""
     n, B = piece.last - piece.first + 1, piece.calib.shape[0] - 1
     for k in range(n - 1):
-        A, C, r = rng.normal(size=(40, 2 * NODE)), rng.normal(size=(40, B)), rng.normal(size=40)
-        whole.append((NODE * (piece.first + k), A, None, None, None, None, C, r))
-    pairs, (node, pose, next_pose) = [], images
+        A, C, r = rng.normal(size=(40, 2 * KEYFRAME_DIM)), rng.normal(size=(40, B)), rng.normal(size=40)
+        whole.append((KEYFRAME_DIM * (piece.first + k), A, None, None, None, None, C, r))
+    pairs, (keyframe, pose, next_pose) = [], images
     for f in range(n_tracks):
-        begin, length = rng.integers(len(node)), rng.integers(1, 1 + len(node))
-        life = np.arange(begin, min(begin + length, len(node)))
+        begin, length = rng.integers(len(keyframe)), rng.integers(1, 1 + len(keyframe))
+        life = np.arange(begin, min(begin + length, len(keyframe)))
         seen = rng.choice(life, size=min(len(life), rng.integers(1, 6)), replace=False)
         for i in np.sort(seen):
             pairs.append((f, int(i)))
             G, F = rng.normal(size=(3, 6)), rng.normal(size=(3, 3))
             C, r = rng.normal(size=(3, B)), rng.normal(size=3)
             A = np.concatenate([G @ pose[i], *([G @ next_pose[i]] if len(next_pose) else [])], axis=1)
-            whole.append((NODE * (piece.first + node[i]), A, f, i, F, G, C, r))
+            whole.append((KEYFRAME_DIM * (piece.first + keyframe[i]), A, f, i, F, G, C, r))
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
@@ -45,15 +45,15 @@ def add(piece, sums, rows):
     """The same factors in the sums of the piece."""
     index = {pair: e for e, pair in enumerate(zip(sums.track.tolist(), sums.image.tolist(), strict=True))}
     for column, A, f, i, F, G, C, r in rows:
-        k = column // NODE - piece.first
+        k = column // KEYFRAME_DIM - piece.first
         Cr = np.concatenate([C, r[:, None]], axis=1)
-        piece.diagonal[k] += A[:, :NODE].T @ A[:, :NODE]
-        piece.side[k] += A[:, :NODE].T @ Cr
+        piece.diagonal[k] += A[:, :KEYFRAME_DIM].T @ A[:, :KEYFRAME_DIM]
+        piece.side[k] += A[:, :KEYFRAME_DIM].T @ Cr
         piece.calib += Cr.T @ Cr
-        if A.shape[1] > NODE:
-            piece.upper[k] += A[:, :NODE].T @ A[:, NODE:]
-            piece.diagonal[k + 1] += A[:, NODE:].T @ A[:, NODE:]
-            piece.side[k + 1] += A[:, NODE:].T @ Cr
+        if A.shape[1] > KEYFRAME_DIM:
+            piece.upper[k] += A[:, :KEYFRAME_DIM].T @ A[:, KEYFRAME_DIM:]
+            piece.diagonal[k + 1] += A[:, KEYFRAME_DIM:].T @ A[:, KEYFRAME_DIM:]
+            piece.side[k + 1] += A[:, KEYFRAME_DIM:].T @ Cr
         if f is not None:
             sums.own[f] += F.T @ F
             sums.side[f] += F.T @ Cr
@@ -61,14 +61,14 @@ def add(piece, sums, rows):
     piece.calib[-1, -1] = 0.0
 
 
-def build(n_nodes, n_tracks, n_calib, seed=0, pieces=None, per_node=1, by_next=False, sizes=(2,)):
+def build(n_keyframes, n_tracks, n_calib, seed=0, pieces=None, per_keyframe=1, by_next=False, sizes=(2,)):
     """Pieces with features, and the dense normal equations of chain and calibration parameters, features eliminated."""
     rng, J = np.random.default_rng(seed), []
-    pieces = make_pieces(n_nodes, n_calib) if pieces is None else pieces
-    o, width = NODE * n_nodes, NODE * n_nodes + n_calib + 1 + 3 * n_tracks * len(pieces)
+    pieces = make_pieces(n_keyframes, n_calib) if pieces is None else pieces
+    o, width = KEYFRAME_DIM * n_keyframes, KEYFRAME_DIM * n_keyframes + n_calib + 1 + 3 * n_tracks * len(pieces)
     for i, piece in enumerate(pieces):
         rows, n, keep = [], piece.last - piece.first + 1, len(pieces) > 1
-        images = random_images(n, per_node, by_next, rng)
+        images = random_images(n, per_keyframe, by_next, rng)
         pairs = random_sums(piece, n_tracks, images, rng, rows)
         sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], n_calib, by_next)
         sums.pose[:], sums.next_pose[:] = images[1:]
@@ -87,30 +87,30 @@ def build(n_nodes, n_tracks, n_calib, seed=0, pieces=None, per_node=1, by_next=F
     return pieces, H[:-1, :-1], H[:-1, -1]
 
 
-def check(pieces, H, g, n_nodes):
-    step, o = np.linalg.solve(H, -g), NODE * n_nodes
+def check(pieces, H, g, n_keyframes):
+    step, o = np.linalg.solve(H, -g), KEYFRAME_DIM * n_keyframes
     information = H[o:, o:] - H[o:, :o] @ np.linalg.solve(H[:o, :o], H[:o, o:])
-    solution = solve(pieces, n_nodes, np.ones(len(H) - o))
+    solution = solve(pieces, n_keyframes, np.ones(len(H) - o))
     found = np.concatenate([solution.chain.ravel(), solution.calib])
     np.testing.assert_allclose(found, step, rtol=0, atol=1e-9 * np.abs(step).max())
     np.testing.assert_allclose(solution.information, information, rtol=0, atol=1e-8 * np.abs(information).max())
 
 
 @pytest.mark.parametrize("n_tracks", [0, 1, 7, 40])
-@pytest.mark.parametrize("n_nodes", [3, 4, 5, 8, 11])
-def test_solution_is_the_dense_one(n_nodes, n_tracks):
-    check(*build(n_nodes, n_tracks, 3), n_nodes)
+@pytest.mark.parametrize("n_keyframes", [3, 4, 5, 8, 11])
+def test_solution_is_the_dense_one(n_keyframes, n_tracks):
+    check(*build(n_keyframes, n_tracks, 3), n_keyframes)
 
 
 @pytest.mark.parametrize("sizes", [(1,), (3,), SIZES])
-@pytest.mark.parametrize(("per_node", "by_next"), [(1, False), (2, False), (3, False), (1, True), (2, True)])
-def test_solution_is_the_dense_one_however_images_hang_on_nodes(per_node, by_next, sizes):
-    check(*build(13, 30, 2, per_node=per_node, by_next=by_next, sizes=sizes), 13)
+@pytest.mark.parametrize(("per_keyframe", "by_next"), [(1, False), (2, False), (3, False), (1, True), (2, True)])
+def test_solution_is_the_dense_one_however_images_hang_on_keyframes(per_keyframe, by_next, sizes):
+    check(*build(13, 30, 2, per_keyframe=per_keyframe, by_next=by_next, sizes=sizes), 13)
 
 
 def test_marginalise_takes_features_out():
     (piece,), H, g = build(6, 5, 4, pieces=(Piece.zeros(0, 5, 4),))
-    o = NODE * 6
+    o = KEYFRAME_DIM * 6
     X = np.linalg.solve(H[:o, :o], np.concatenate([H[:o, o:], g[:o, None]], axis=1))
     calib = marginalise(piece)
     expected = np.concatenate([H[o:, o:], g[o:, None]], axis=1) - H[o:, :o] @ X
@@ -123,17 +123,17 @@ def by_step(lists, n):
 
 
 def test_features_are_in_the_front_from_the_first_group_that_sees_them_to_the_last():
-    track, node = np.array([0, 0, 1, 1, 2, 3, 3]), np.array([1, 6, 2, 4, 7, 0, 2])
+    track, keyframe = np.array([0, 0, 1, 1, 2, 3, 3]), np.array([1, 6, 2, 4, 7, 0, 2])
     for forwards in (True, False):
-        order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, forwards, False, sizes=(2,))
-        assert by_step(order.nodes, 4) == (
+        order = plan(FeatureSums.zeros(4, track, keyframe, np.arange(8), 2), 8, forwards, False, sizes=(2,))
+        assert by_step(order.keyframes, 4) == (
             [[0, 1], [2, 3], [4, 5], [6, 7]] if forwards else [[7, 6], [5, 4], [3, 2], [1, 0]]
         )
         assert by_step(order.local, 4) == ([[], [], [], [2]] if forwards else [[2], [], [], []])
         assert by_step(order.born, 4) == ([[0, 3], [1], [], []] if forwards else [[0], [1], [3], []])
         assert order.alive.tolist() == ([2, 3, 2, 1] if forwards else [1, 2, 3, 2])
     # Forwards, feature 3 leaves slot 1 in the second step, and 1 moves there from slot 2 in the third.
-    order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, True, False, sizes=(2,))
+    order = plan(FeatureSums.zeros(4, track, keyframe, np.arange(8), 2), 8, True, False, sizes=(2,))
     assert by_step(order.dying, 4) == [[], [1], [1], [0]]
     assert by_step(order.leave, 4) == [[], [], [2], []]
     assert order.enter.tolist() == [1]
@@ -141,17 +141,17 @@ def test_features_are_in_the_front_from_the_first_group_that_sees_them_to_the_la
 
 def test_the_size_of_groups_is_chosen_by_cost():
     """A group that holds all of its features' lives spares them the front; long lives make small groups best."""
-    n, per_node = 192, 200
-    image = np.repeat(np.arange(n), per_node)
+    n, per_keyframe = 192, 200
+    image = np.repeat(np.arange(n), per_keyframe)
     ends = np.arange(0, n, 24)
     sums = FeatureSums.zeros(
-        len(image) // 24, image // 24 * per_node + np.arange(len(image)) % per_node, image, np.arange(n), 40
+        len(image) // 24, image // 24 * per_keyframe + np.arange(len(image)) % per_keyframe, image, np.arange(n), 40
     )
     short = plan(sums, n, True, False, ends)
-    assert np.diff(short.nodes.start).tolist() == [24] * 8
+    assert np.diff(short.keyframes.start).tolist() == [24] * 8
     assert short.alive.max() == 0 and len(short.local.values) == len(sums.own)
     lasting = FeatureSums.zeros(200, np.tile(np.arange(200), 2), np.repeat([0, n - 1], 200), np.arange(n), 40)
-    assert np.diff(plan(lasting, n, True, False).nodes.start).max() < 24
+    assert np.diff(plan(lasting, n, True, False).keyframes.start).max() < 24
 
 
 def test_a_feature_that_nothing_determines_is_an_error():

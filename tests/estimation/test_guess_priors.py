@@ -75,7 +75,7 @@ def information_of(found: Estimate) -> np.ndarray:
     problem = found.problem
     pieces = problem.pieces()
     problem.linearise(found.outcome.state, pieces, problem.residuals(), curved=True)
-    return solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held).information
+    return solve(pieces, problem.n_keyframes, problem.tolerance, held=problem.held).information
 
 
 def same_information(found: Estimate) -> None:

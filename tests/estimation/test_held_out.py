@@ -1,4 +1,4 @@
-"""Half a recording predicted by the other: the algebra against dense least squares and draws, nodes against dense
+"""Half a recording predicted by the other: the algebra against dense least squares and draws, keyframes against dense
 elimination."""
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from tests.estimation.test_arrowhead import random_pieces
 
 from icalib.estimate.evidence.evidence import chi2_by_kind
 from icalib.estimate.evidence.held_out import Half, excess, halves_of, predict, shifts
-from icalib.estimate.evidence.parts import FEWEST_NODES, Parts
+from icalib.estimate.evidence.parts import MIN_PART_KEYFRAMES, Parts
 from icalib.estimate.problem.solver import minimise
-from icalib.optim.arrowhead import NODE, given_calib
+from icalib.optim.arrowhead import KEYFRAME_DIM, given_calib
 from icalib.optim.prior_factor import Prior
 from icalib.tools.simulation import handheld, simulate
 
@@ -22,14 +22,14 @@ NO_PRIOR = np.zeros((3, 3)), np.zeros(3)
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_nodes_follow_the_calibration_from_the_first_node_and_from_another(dense, which):
+def test_keyframes_follow_the_calibration_from_the_first_keyframe_and_from_another(dense, which):
     piece = random_pieces(9, 3)[which]
     first, n = piece.first, piece.last - piece.first + 1
     piece.first, piece.last = 0, n - 1
     H, g = dense((piece,), n)
     piece.first, piece.last = first, first + n - 1
     calib = np.random.default_rng(1).normal(size=(3, 2))
-    o = NODE * n
+    o = KEYFRAME_DIM * n
     expected = -np.linalg.solve(H[:o, :o], g[:o, None] + H[:o, o:] @ calib)
     np.testing.assert_allclose(given_calib(piece, calib).reshape(o, 2), expected, rtol=1e-8, atol=1e-10)
 
@@ -133,7 +133,7 @@ def solved(setup_of, problem_of):
 
 
 def test_residuals_rise_as_the_sums_say(solved):
-    """The nodes of all parts follow; what is evaluated is not linear, and hardly differs."""
+    """The keyframes of all parts follow; what is evaluated is not linear, and hardly differs."""
     problem, outcome, parts = solved
     found = predict(parts)
     assert found is not None and found.directions == problem.layout.size
@@ -151,7 +151,7 @@ def test_residuals_rise_as_the_sums_say(solved):
     inside, outside = (chi2_by_kind(parts.problem, x) for x in (found.inside, found.outside))
     rise = sum(outside[key][1] - inside[key][1] for key in inside)
     assert rise == pytest.approx(found.excess, rel=1e-2)  # of residuals in single precision
-    assert sum(x for _, x in inside.values()) <= 2.0 * outcome.cost  # each part has its own nodes at its ends
+    assert sum(x for _, x in inside.values()) <= 2.0 * outcome.cost  # each part has its own keyframes at its ends
 
 
 def test_shifts_are_those_of_solutions_without_a_part(solved):
@@ -178,17 +178,17 @@ def test_parts_are_as_many_as_asked_for_and_long_enough(solved):
     problem, outcome, _ = solved
     assert Parts.of(problem, outcome, 0) is None
     assert Parts.of(problem, outcome, 1) is None
-    two, many = Parts.of(problem, outcome, 2), Parts.of(problem, outcome, problem.n_nodes // 2)
+    two, many = Parts.of(problem, outcome, 2), Parts.of(problem, outcome, problem.n_keyframes // 2)
     assert two is not None and two.count == 2
-    assert many is not None and many.count == (problem.n_nodes - 1) // FEWEST_NODES
-    assert np.diff(many.ends).min() >= FEWEST_NODES
+    assert many is not None and many.count == (problem.n_keyframes - 1) // MIN_PART_KEYFRAMES
+    assert np.diff(many.ends).min() >= MIN_PART_KEYFRAMES
 
 
-@pytest.mark.parametrize(("duration", "nodes", "parts"), [(0.35, 5, None), (0.45, 8, 2)])
-def test_a_recording_too_short_for_two_parts_has_none(duration, nodes, parts, setup_of, problem_of):
+@pytest.mark.parametrize(("duration", "keyframes", "parts"), [(0.35, 5, None), (0.45, 8, 2)])
+def test_a_recording_too_short_for_two_parts_has_none(duration, keyframes, parts, setup_of, problem_of):
     """Three keyframes a part and one at the end: two parts need seven."""
     setup = setup_of(simulate(handheld(duration), seed=5))
     problem = problem_of(setup)
     found = Parts.of(problem, minimise(problem, setup.state), 8)
-    assert problem.n_nodes == nodes
+    assert problem.n_keyframes == keyframes
     assert (None if found is None else found.count) == parts

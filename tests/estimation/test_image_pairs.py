@@ -19,9 +19,9 @@ NOISE_PX = 0.1
 def cameras(unlike, setup_of, factor_of) -> list[CornerFactor]:
     """Three cameras with an image each at every keyframe, and different stamps."""
     first = factor_of(setup_of(unlike), 0)
-    node = np.arange(len(first.node))
+    keyframe = np.arange(len(first.keyframe))
     streams = [replace(first.stream, name=f"cam{k}", stamps_ns=first.stream.stamps_ns + k) for k in range(3)]
-    return [replace(first, stream=stream, node=node) for stream in streams]
+    return [replace(first, stream=stream, keyframe=keyframe) for stream in streams]
 
 
 def output(camera: CornerFactor, late: tuple[int, ...], common: bool) -> tuple[CornerFactor, CornerOutput]:
@@ -48,13 +48,13 @@ def test_late_images_are_found_whether_or_not_a_common_error_takes_them_up(camer
 
 def test_the_sentence_names_the_cameras_and_stamps_of_the_rejected_sets(cameras):
     """Also of sets without an image of the first camera."""
-    node = cameras[0].node
-    cameras[0] = replace(cameras[0], node=node + (node >= 2))  # none at keyframe 2
-    late = [np.isin(camera.node, [2]) for camera in cameras]
+    keyframe = cameras[0].keyframe
+    cameras[0] = replace(cameras[0], keyframe=keyframe + (keyframe >= 2))  # none at keyframe 2
+    late = [np.isin(camera.keyframe, [2]) for camera in cameras]
     first, stamps = cameras[0].stream.stamps_ns, cameras[1].stream.stamps_ns
     words = late_words(cameras, late)
     assert words.startswith("1 sets of images of cam1 and cam2 ") and words.endswith(f": at {stamps[2]} ns.")
-    words = late_words(cameras, [np.isin(camera.node, [2, 4]) for camera in cameras])
+    words = late_words(cameras, [np.isin(camera.keyframe, [2, 4]) for camera in cameras])
     assert words.startswith("2 sets of images of cam0 and cam1 and cam2 ")
     assert words.endswith(f": at {stamps[2]} ns, at {first[3]} ns.")
-    assert late_words(cameras, [np.zeros(len(camera.node), dtype=bool) for camera in cameras]) == ""
+    assert late_words(cameras, [np.zeros(len(camera.keyframe), dtype=bool) for camera in cameras]) == ""

@@ -1,4 +1,4 @@
-"""The IMU factor against its formula, written out with numpy, at nodes of uneven spacing."""
+"""The IMU factor against its formula, written out with numpy, at keyframes of uneven spacing."""
 
 from dataclasses import replace
 

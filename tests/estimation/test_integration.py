@@ -6,9 +6,9 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from icalib.geometry import so3
-from icalib.motion.from_nodes import in_order_of_nodes, integrate_from_node, nothing_carried
 from icalib.motion.integration import Increment, Readings, finish, integrate, integration_room
 from icalib.motion.integration_step import COVARIANCE, SIZE, correction
+from icalib.motion.propagation import in_order_of_keyframes, integrate_from_keyframe, nothing_carried
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
 INTRINSICS = np.random.default_rng(5).normal(size=24) * np.repeat([0.01, 0.01, 0.02, 2e-3], [6, 6, 3, 9])
@@ -168,31 +168,35 @@ def test_starting_in_either_interval_at_a_stamp_is_the_same(backwards):
         np.testing.assert_allclose(a, b, atol=1e-15)
 
 
-@pytest.mark.parametrize("order", ["of nodes", "of time", "any"])
+@pytest.mark.parametrize("order", ["of keyframes", "of time", "any"])
 @pytest.mark.parametrize("width", [0, 6, 30])
 def test_what_is_carried_on_is_what_starts_anew(order, width):
-    """Bit by bit, whatever the order; instants lie on stamps and nodes, between, and beyond both ends."""
+    """Bit by bit, whatever the order; instants lie on stamps and keyframes, between, and beyond both ends."""
     rng = np.random.default_rng(3)
     seconds = np.array([R0.t[2], 0.5 * (R0.t[5] + R0.t[6]), R0.t[9]])
     times = np.sort(np.concatenate([rng.uniform(R0.t[0] - 0.01, R0.t[-1] + 0.01, 60), R0.t[3:8], seconds]))
-    node = np.clip(np.searchsorted(0.5 * (seconds[1:] + seconds[:-1]), times), 0, 2)
-    ways = {"of nodes": in_order_of_nodes(times, node, seconds), "of time": np.arange(68), "any": rng.permutation(68)}
+    keyframe = np.clip(np.searchsorted(0.5 * (seconds[1:] + seconds[:-1]), times), 0, 2)
+    ways = {
+        "of keyframes": in_order_of_keyframes(times, keyframe, seconds),
+        "of time": np.arange(68),
+        "any": rng.permutation(68),
+    }
     readings = Readings(R0.t, R0.gyro, R0.accel, R0.variance, R0.walk, True)
     by, carried, x, none = correction(INTRINSICS), nothing_carried(), np.empty(SIZE), np.empty(0)
     for i in ways[order]:
-        k = node[i]
+        k = keyframe[i]
         out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
         first, bias = R0.interval(seconds[k]), tuple(BIAS)
-        end = integrate_from_node(k, seconds[k], times[i], first, bias, readings, by, carried, x, width)
+        end = integrate_from_keyframe(k, seconds[k], times[i], first, bias, readings, by, carried, x, width)
         finish(x, none, out)
         anew = run(R0, seconds[k], times[i], intrinsics=INTRINSICS, width=width, linear=True)
         for a, b in zip((*out[:4], *end), (*anew[:4], *anew[5]), strict=True):
             np.testing.assert_array_equal(a, b)
 
 
-def test_instants_lead_away_from_their_nodes():
-    times, node = np.array([0.1, 0.4, 0.5, 0.7, 0.9, 1.2]), np.array([0, 0, 0, 1, 1, 1])
-    assert in_order_of_nodes(times, node, np.array([0.5, 1.0])).tolist() == [2, 5, 4, 3, 1, 0]
+def test_instants_lead_away_from_their_keyframes():
+    times, keyframe = np.array([0.1, 0.4, 0.5, 0.7, 0.9, 1.2]), np.array([0, 0, 0, 1, 1, 1])
+    assert in_order_of_keyframes(times, keyframe, np.array([0.5, 1.0])).tolist() == [2, 5, 4, 3, 1, 0]
 
 
 @pytest.mark.parametrize("backwards", [False, True])

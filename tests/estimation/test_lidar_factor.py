@@ -12,9 +12,9 @@ from tests.typed import not_none
 from icalib.errors import EstimationError
 from icalib.geometry.planes import moved
 from icalib.motion.factor import chi2 as weighted_squares
-from icalib.motion.poses import Poses, assign_nodes, poses_at
+from icalib.motion.poses import Poses, assign_keyframes, poses_at
 from icalib.optim.arrowhead import make_pieces
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.lidar.binning import Associated, LidarNoise, in_world, take_moments
 from icalib.tools.simulation import simulate
 
@@ -31,11 +31,11 @@ def point_times(setup):
     return np.repeat(stream.seconds, np.diff(stream.start)) + stream.offset_s
 
 
-def poses_of_points(setup, state, times, nodes_at=None) -> tuple[Poses, np.ndarray]:
-    """IMU poses at times on the LiDAR's clock, each from the node next to `nodes_at`, or to itself."""
+def poses_of_points(setup, state, times, keyframes_at=None) -> tuple[Poses, np.ndarray]:
+    """IMU poses at times on the LiDAR's clock, each from the keyframe next to `keyframes_at`, or to itself."""
     offset = state.values["lidar0", "time_offset"][0]
-    node = assign_nodes("inertial", state.seconds, (times if nodes_at is None else nodes_at) + offset)
-    return poses_at("inertial", times + offset, node, state, setup.imu, 9.81, False), node
+    keyframe = assign_keyframes("inertial", state.seconds, (times if keyframes_at is None else keyframes_at) + offset)
+    return poses_at("inertial", times + offset, keyframe, state, setup.imu, 9.81, False), keyframe
 
 
 def world_points(setup, state, poses, xyz):
@@ -56,12 +56,12 @@ class Point:
 
 
 def pointwise(setup, state, bin_s=1e-3) -> Point:
-    """The points of a bin hang on one node, though each has a pose of its own."""
+    """The points of a bin hang on one keyframe, though each has a pose of its own."""
     used = np.flatnonzero(setup.plane >= 0)
     xyz = setup.stream.xyz[used].astype(np.float64)
     scan = np.repeat(setup.stream.seconds, np.diff(setup.stream.start))
     centre = scan + (np.floor(setup.stream.offset_s.astype(np.float64) / bin_s) + 0.5) * bin_s
-    poses, node = poses_of_points(setup, state, point_times(setup)[used], centre[used])
+    poses, keyframe = poses_of_points(setup, state, point_times(setup)[used], centre[used])
     world, in_imu = world_points(setup, state, poses, xyz)
     value = np.array([state.values[p] for p in setup.planes])[setup.plane[used]]
     n, c = value[:, :3], value[:, 3:]
@@ -71,11 +71,11 @@ def pointwise(setup, state, bin_s=1e-3) -> Point:
     beam = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
     J_pose = np.concatenate([np.cross(in_imu, in_body), n], axis=1)
     turned = np.concatenate([np.cross(beam @ R_il.T, in_body), np.zeros_like(n)], axis=1)
-    o = NODE * len(state.seconds)
+    o = KEYFRAME_DIM * len(state.seconds)
     J, J_c = np.zeros((2, len(used), o + setup.layout.size))
-    for i, k in enumerate(node):
-        J[i, NODE * k : NODE * (k + 1)] = J_pose[i] @ poses.J_node[i]
-        J_c[i, NODE * k : NODE * (k + 1)] = turned[i] @ poses.J_node[i]
+    for i, k in enumerate(keyframe):
+        J[i, KEYFRAME_DIM * k : KEYFRAME_DIM * (k + 1)] = J_pose[i] @ poses.J_keyframe[i]
+        J_c[i, KEYFRAME_DIM * k : KEYFRAME_DIM * (k + 1)] = turned[i] @ poses.J_keyframe[i]
     columns = [o + setup.layout.columns("lidar0", name) for name in ("rotation", "translation", "time_offset")]
     J[:, columns[0]] = np.cross(xyz, in_body @ R_il)
     J[:, columns[1]] = in_body
@@ -96,17 +96,17 @@ def pointwise(setup, state, bin_s=1e-3) -> Point:
 
 
 def sums(setup, factor, state, dense):
-    pieces, out = make_pieces(factor.n_nodes, setup.layout.size), factor.output()
+    pieces, out = make_pieces(factor.n_keyframes, setup.layout.size), factor.output()
     cost = sum(factor.accumulate(state, p, out) for p in pieces)
-    return cost, *dense(pieces, factor.n_nodes), out.residual
+    return cost, *dense(pieces, factor.n_keyframes), out.residual
 
 
 @pytest.mark.parametrize("bin_s", [1e-3, 1e-4, 2e-6])
 @pytest.mark.parametrize("loss", ["none", "huber", "cauchy"])
 @pytest.mark.parametrize("beam", [0.0, 0.03])
 def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, beam):
-    """But for the instants at which states act on them, wrong by half a bin at most: of 25 ms from the node. Without
-    the gyroscope's noise, of which test_factors.py knows."""
+    """But for the instants at which states act on them, wrong by half a bin at most: of 25 ms from the keyframe.
+    Without the gyroscope's noise, of which test_factors.py knows."""
     setup = room_of(sparse_room, spacing=0.05)
     state = setup.perturbed(np.random.default_rng(0), 0.3)
     noise = LidarNoise(0.02, beam, loss, 1.2)
@@ -125,7 +125,7 @@ def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, 
     J, r = point.J * (root / sigma)[:, None], point.r * root / sigma
     size = np.sqrt(np.maximum((J**2).sum(axis=0), 1e-6 * (J**2).sum(axis=0).max()))
     found, expected = (M / np.outer(size, size) for M in (H, J.T @ J))
-    bound, o = 10.0 * bin_s, NODE * len(state.seconds)
+    bound, o = 10.0 * bin_s, KEYFRAME_DIM * len(state.seconds)
     np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
     np.testing.assert_allclose(found[o:, o:], expected[o:, o:], rtol=0, atol=0.1 * bound)
     # Half of r^2 / sigma^2 by the pose: sigma turns with the incidence.
@@ -202,7 +202,7 @@ def test_a_point_beyond_its_plane_has_a_positive_residual(sparse_room, room_of, 
         after[key] = moved(after[key], np.array([0.0, 0.0, -0.1]))
     factor = setup.factor(before)
     _, _, g, _ = sums(setup, factor, replace(before, values=after), dense)
-    distance = [NODE * factor.n_nodes + setup.layout.columns(*key)[2] for key in setup.planes]
+    distance = [KEYFRAME_DIM * factor.n_keyframes + setup.layout.columns(*key)[2] for key in setup.planes]
     # Predicted - measured is then +0.1 m, and moving the plane along its normal lowers it.
     count = np.bincount(factor.moments.plane, factor.moments.count)
     np.testing.assert_allclose(g[distance] / count * 0.03**2, -0.1, atol=0.01)
@@ -242,8 +242,11 @@ def test_stamps_at_the_end_of_scans_and_points_in_any_order_change_nothing(spars
     state = replace(setup.state, values=later)
     found: Any = sums(ended, ended.factor(state), state, dense)
     expected: Any = sums(setup, setup.factor(), setup.state, dense)
-    # Points at the edge of bins of 3 ms change theirs, and perhaps the node; the calibration parameters are the same.
-    H, H_expected = (h[NODE * len(state.seconds) :, NODE * len(state.seconds) :] for h in (found[1], expected[1]))
+    # Points at the edge of bins of 3 ms change theirs, and perhaps the keyframe; the calibration parameters are the
+    # same.
+    H, H_expected = (
+        h[KEYFRAME_DIM * len(state.seconds) :, KEYFRAME_DIM * len(state.seconds) :] for h in (found[1], expected[1])
+    )
     size = np.sqrt(np.diag(H_expected))
     np.testing.assert_allclose(H / np.outer(size, size), H_expected / np.outer(size, size), atol=3e-4)
     assert found[0] == pytest.approx(expected[0], rel=1e-4)
@@ -255,7 +258,7 @@ def test_scans_that_overlap_in_time_are_sorted(sparse_room, room_of, dense):
     early = replace(stream, stamps_ns=stream.stamps_ns - np.arange(len(stream.stamps_ns)) * 60_000_000)
     factor = with_stream(setup, early).factor()
     assert (np.diff(factor.moments.seconds) >= 0.0).all()
-    assert (np.diff(factor.node) >= 0).all()
+    assert (np.diff(factor.keyframe) >= 0).all()
     assert factor.moments.count.sum() == (setup.plane >= 0).sum()
     _, H, _, _ = sums(setup, factor, setup.state, dense)
     assert np.isfinite(H).all()
@@ -265,7 +268,7 @@ def test_rows_count_and_weigh_as_their_points(sparse_room, room_of):
     setup = room_of(sparse_room, spacing=0.05)
     factor = setup.factor(noise=LidarNoise(0.03))
     out = factor.output()
-    for piece in make_pieces(factor.n_nodes, setup.layout.size):
+    for piece in make_pieces(factor.n_keyframes, setup.layout.size):
         factor.accumulate(setup.state, piece, out, sums=False)
     r = pointwise(setup, setup.state).r
     assert factor.count(out, "points") == len(r) == (setup.plane >= 0).sum()

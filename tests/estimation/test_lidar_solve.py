@@ -82,7 +82,7 @@ def test_longer_bins_change_the_answer_little(robot, room_of):
 
 
 def test_gauge_changes_no_calibration(robot, room_of):
-    """Another world, a first node held elsewhere: the same errors, the same covariance."""
+    """Another world, a first keyframe held elsewhere: the same errors, the same covariance."""
     setup = room_of(simulate(robot(3.0, azimuth_steps=600), seed=4))
     found = []
     for turn, move in ((0.0, 0.0), (2.0, 30.0)):

@@ -26,7 +26,7 @@ def factor(setup, features_of) -> FeatureFactor:
 
 def outcome(factor: FeatureFactor, state) -> tuple[float, FeatureOutput]:
     out = factor.output()
-    cost = sum(factor.accumulate(state, p, out, sums=False) for p in make_pieces(factor.n_nodes, None))
+    cost = sum(factor.accumulate(state, p, out, sums=False) for p in make_pieces(factor.n_keyframes, None))
     return cost, out
 
 
@@ -46,7 +46,7 @@ def test_points_come_back_from_near_and_far(factor, setup, times: float):
 def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
     """Seen from everywhere in one direction, as a star is, it goes as far as points may, and its cost is that of the
     star."""
-    views = factor._views(setup.state, 0, factor.n_nodes)
+    views = factor._views(setup.state, 0, factor.n_keyframes)
     track = next(t for t in range(factor.tracks.count) if factor.tracks.camera[t] == 0)
     star = views[0].poses.rotation[factor.tracks.image[track]] @ [0.05, 0.02, 1.0]
     streams = list(factor.streams)

@@ -31,7 +31,7 @@ def pose(vector, position):
 
 @pytest.fixture(scope="module", params=["absolute", "relative"])
 def world(request):
-    """Four seconds without noise, nodes every 20 ms at the truth: inputs, state, stream."""
+    """Four seconds without noise, keyframes every 20 ms at the truth: inputs, state, stream."""
     mocap = SimPoses(
         "mocap0",
         pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]),
@@ -65,9 +65,9 @@ def world(request):
         (frame_of("mocap0", 0), FRAME[0]): mocap.T_world_frame[:3, :3].copy(),
         (frame_of("mocap0", 0), FRAME[1]): mocap.T_world_frame[:3, 3].copy(),
     }
-    nodes = np.arange(0.0, not_none(sim.measurements.imu).seconds[-1], 0.02)
+    keyframes = np.arange(0.0, not_none(sim.measurements.imu).seconds[-1], 0.02)
     bias = np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]])
-    state = State(nodes, *truth.pose_at(nodes + truth.seconds[0]), np.tile(bias, (len(nodes), 1)), values)
+    state = State(keyframes, *truth.pose_at(keyframes + truth.seconds[0]), np.tile(bias, (len(keyframes), 1)), values)
     return inputs, state, stream
 
 

@@ -7,16 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from icalib.geometry import so3
-from icalib.motion.poses import assign_nodes, motion_at, poses_at
+from icalib.motion.poses import assign_keyframes, motion_at, poses_at
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 
 SCHEMES = ("inertial", "kinematic", "pose")
 
 
 @pytest.fixture(scope="module")
 def setup(unlike, setup_of):
-    """Nodes off the stamps of the IMU as well as on them."""
+    """Keyframes off the stamps of the IMU as well as on them."""
     setup = setup_of(unlike, imu_free=True)
     seconds = np.array([0.05, 0.1013, 0.1487, 0.2, 0.2471])
     R, p, v = setup.truth_at(seconds)
@@ -24,13 +24,13 @@ def setup(unlike, setup_of):
     return replace(setup, state=state)
 
 
-# Between nodes, on stamps of the IMU, at nodes, before the first node and after the last.
+# Between keyframes, on stamps of the IMU, at keyframes, before the first keyframe and after the last.
 TIMES = np.array([0.0312, 0.05, 0.0521, 0.0913, 0.105, 0.1251, 0.1488, 0.17, 0.2, 0.2219, 0.26])
 
 
 def evaluate(setup, scheme, state=None, times=TIMES, imu_free=True):
-    node = assign_nodes(scheme, setup.state.seconds, TIMES)
-    return poses_at(scheme, times, node, state or setup.state, setup.imu, 9.81, imu_free), node
+    keyframe = assign_keyframes(scheme, setup.state.seconds, TIMES)
+    return poses_at(scheme, times, keyframe, state or setup.state, setup.imu, 9.81, imu_free), keyframe
 
 
 def difference(plus, minus, at, h):
@@ -43,19 +43,19 @@ def difference(plus, minus, at, h):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_jacobians_of_every_node_by_central_differences(setup, scheme):
+def test_jacobians_of_every_keyframe_by_central_differences(setup, scheme):
     state = setup.perturbed(np.random.default_rng(1))
-    at, node = evaluate(setup, scheme, state)
+    at, keyframe = evaluate(setup, scheme, state)
     h, calib = 1e-6, np.zeros(setup.layout.size)
     for k in range(len(state.seconds)):
-        for j in range(NODE):
-            chain = np.zeros((len(state.seconds), NODE))
+        for j in range(KEYFRAME_DIM):
+            chain = np.zeros((len(state.seconds), KEYFRAME_DIM))
             chain[k, j] = h
             plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, calib))
             minus, _ = evaluate(setup, scheme, state.retract(setup.layout, -chain, calib))
-            analytic = at.J_node[:, :, j] * (node == k)[:, None]
+            analytic = at.J_keyframe[:, :, j] * (keyframe == k)[:, None]
             if scheme == "pose":
-                analytic = analytic + at.J_next[:, :, j] * (node + 1 == k)[:, None]
+                analytic = analytic + at.J_next[:, :, j] * (keyframe + 1 == k)[:, None]
             np.testing.assert_allclose(analytic, difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=f"{k} {j}")
 
 
@@ -63,7 +63,7 @@ def test_jacobians_of_every_node_by_central_differences(setup, scheme):
 def test_jacobians_of_the_imu_intrinsics_by_central_differences(setup, scheme):
     state = setup.perturbed(np.random.default_rng(2))
     at, _ = evaluate(setup, scheme, state)
-    h, chain = 1e-5, np.zeros((len(state.seconds), NODE))
+    h, chain = 1e-5, np.zeros((len(state.seconds), KEYFRAME_DIM))
     assert at.J_imu.shape == (len(TIMES), 6, 24)
     for n, column in enumerate(setup.layout.columns("imu0", "intrinsics")):
         calib = h * np.eye(setup.layout.size)[column]
@@ -77,20 +77,22 @@ def test_the_chain_rule_of_a_sensor_pose_by_central_differences(setup, scheme):
     """Through random rows of a camera's pose, along its own axes: by all keyframes, extrinsics and IMU intrinsics, and
     by the time offset as far as the rate says."""
     rng, h = np.random.default_rng(4), 1e-6
-    state, n, o = setup.perturbed(rng), len(TIMES), NODE * len(setup.state.seconds)
+    state, n, o = setup.perturbed(rng), len(TIMES), KEYFRAME_DIM * len(setup.state.seconds)
     kinematics = Kinematics("cam1", setup.layout, setup.imu, 9.81, scheme)
     seconds = TIMES - state.values["cam1", "time_offset"][0]
-    node = assign_nodes(scheme, state.seconds, TIMES)
+    keyframe = assign_keyframes(scheme, state.seconds, TIMES)
 
     def poses(d):
-        return SensorPose.at(kinematics, seconds, node, state.retract(setup.layout, d[:o].reshape(-1, NODE), d[o:]))
+        return SensorPose.at(
+            kinematics, seconds, keyframe, state.retract(setup.layout, d[:o].reshape(-1, KEYFRAME_DIM), d[o:])
+        )
 
     at, J_pose = poses(np.zeros(o + setup.layout.size)), rng.normal(size=(n, 2, 6))
     rows = rows_at(np.zeros((n, 2)), (J_pose,), (at,), np.zeros((n, 2, 0)))
     J, columns = np.zeros((n, 2, o + setup.layout.size)), kinematics.columns()
-    for i, k in enumerate(node):
-        last = min(NODE * (k + 2), o)
-        J[i, :, NODE * k : last] = rows.J[i, :, : last - NODE * k]
+    for i, k in enumerate(keyframe):
+        last = min(KEYFRAME_DIM * (k + 2), o)
+        J[i, :, KEYFRAME_DIM * k : last] = rows.J[i, :, : last - KEYFRAME_DIM * k]
     J[:, :, o + columns] = rows.J_calib
     offset = o + columns[6]
     assert len(columns) == 31
@@ -104,29 +106,29 @@ def test_the_chain_rule_of_a_sensor_pose_by_central_differences(setup, scheme):
 
 
 def motion(setup, state=None, times=TIMES, imu_free=True):
-    node = assign_nodes("inertial", setup.state.seconds, TIMES)
-    return *motion_at(times, node, state or setup.state, setup.imu, 9.81, imu_free), node
+    keyframe = assign_keyframes("inertial", setup.state.seconds, TIMES)
+    return *motion_at(times, keyframe, state or setup.state, setup.imu, 9.81, imu_free), keyframe
 
 
 def test_motion_has_the_inertial_poses(setup):
     at, _ = evaluate(setup, "inertial")
     poses, _, _ = motion(setup)
-    for name in ("rotation", "position", "rate", "velocity", "J_node", "J_next", "J_imu"):
+    for name in ("rotation", "position", "rate", "velocity", "J_keyframe", "J_next", "J_imu"):
         np.testing.assert_array_equal(getattr(poses, name), getattr(at, name))
 
 
 def test_jacobians_of_the_velocity_by_central_differences(setup):
     state = setup.perturbed(np.random.default_rng(5))
-    _, moving, node = motion(setup, state)
+    _, moving, keyframe = motion(setup, state)
     n, h = len(state.seconds), 1e-6
-    for column in range(n * NODE + setup.layout.size):
-        d = h * np.eye(1, n * NODE + setup.layout.size, column)[0]
-        chain, calib = d[: n * NODE].reshape(n, NODE), d[n * NODE :]
+    for column in range(n * KEYFRAME_DIM + setup.layout.size):
+        d = h * np.eye(1, n * KEYFRAME_DIM + setup.layout.size, column)[0]
+        chain, calib = d[: n * KEYFRAME_DIM].reshape(n, KEYFRAME_DIM), d[n * KEYFRAME_DIM :]
         plus, minus = (motion(setup, state.retract(setup.layout, s * chain, s * calib))[0] for s in (1.0, -1.0))
         numeric = (plus.velocity - minus.velocity) / (2.0 * h)
-        if column < n * NODE:
-            analytic = moving.J_node[:, :, column % NODE] * (node == column // NODE)[:, None]
-        elif (k := column - n * NODE) in (own := list(setup.layout.columns("imu0", "intrinsics"))):
+        if column < n * KEYFRAME_DIM:
+            analytic = moving.J_keyframe[:, :, column % KEYFRAME_DIM] * (keyframe == column // KEYFRAME_DIM)[:, None]
+        elif (k := column - n * KEYFRAME_DIM) in (own := list(setup.layout.columns("imu0", "intrinsics"))):
             analytic = moving.J_imu[:, :, own.index(k)]
         elif k in setup.layout.columns("board0", "tilt"):
             continue  # turns the whole state with it
@@ -159,8 +161,10 @@ def test_rate_and_velocity_are_the_time_derivative(setup, scheme, rate, velocity
 
 def test_inertial_has_no_jumps_at_the_stamps_of_the_imu(setup):
     stamps = setup.imu.seconds[(setup.imu.seconds > 0.06) & (setup.imu.seconds < 0.24)]
-    node = assign_nodes("inertial", setup.state.seconds, stamps)
-    before, after = (poses_at("inertial", stamps + d, node, setup.state, setup.imu, 9.81, False) for d in (-1e-9, 1e-9))
+    keyframe = assign_keyframes("inertial", setup.state.seconds, stamps)
+    before, after = (
+        poses_at("inertial", stamps + d, keyframe, setup.state, setup.imu, 9.81, False) for d in (-1e-9, 1e-9)
+    )
     np.testing.assert_allclose(after.rotation, before.rotation, rtol=0, atol=1e-7)
     np.testing.assert_allclose(after.rate, before.rate, rtol=0, atol=1e-6)
 
@@ -168,15 +172,15 @@ def test_inertial_has_no_jumps_at_the_stamps_of_the_imu(setup):
 def test_shapes_without_what_is_not_wanted(setup):
     inertial, _ = evaluate(setup, "inertial", imu_free=False)
     assert inertial.J_imu.shape == (len(TIMES), 6, 0)
-    assert inertial.J_next.shape == (0, 6, NODE)
+    assert inertial.J_next.shape == (0, 6, KEYFRAME_DIM)
 
 
 def test_inertial_is_exact_from_stamp_to_stamp_on_an_exact_trajectory(setup):
-    nodes = np.array([0.05, 0.2])
-    R, p, v = setup.truth_at(nodes)
-    state = replace(setup.state, seconds=nodes, rotation=R, position=p, velocity=v, bias=setup.state.bias[:2])
+    keyframes = np.array([0.05, 0.2])
+    R, p, v = setup.truth_at(keyframes)
+    state = replace(setup.state, seconds=keyframes, rotation=R, position=p, velocity=v, bias=setup.state.bias[:2])
     times = setup.imu.seconds[setup.imu.seconds < 0.3]
-    at = poses_at("inertial", times, assign_nodes("inertial", nodes, times), state, setup.imu, 9.81, False)
+    at = poses_at("inertial", times, assign_keyframes("inertial", keyframes, times), state, setup.imu, 9.81, False)
     R, p, v = setup.truth_at(times)
     np.testing.assert_allclose(at.rotation, R, rtol=0, atol=1e-13)
     np.testing.assert_allclose(at.position, p, rtol=0, atol=1e-13)
@@ -212,19 +216,24 @@ def test_pose_interpolates_rotation_on_the_geodesic_and_position_linearly(setup)
     np.testing.assert_allclose(at.position[inside], position, rtol=0, atol=1e-15)
 
 
-def test_kinematic_keeps_the_rate_and_velocity_of_the_node(setup):
-    at, node = evaluate(setup, "kinematic")
+def test_kinematic_keeps_the_rate_and_velocity_of_the_keyframe(setup):
+    at, keyframe = evaluate(setup, "kinematic")
     state = setup.state
-    dt = TIMES - state.seconds[node]
+    dt = TIMES - state.seconds[keyframe]
     raw = np.array(
-        [np.interp(state.seconds[node], setup.imu.seconds, x) for x in np.hstack([setup.imu.gyro, setup.imu.accel]).T]
+        [
+            np.interp(state.seconds[keyframe], setup.imu.seconds, x)
+            for x in np.hstack([setup.imu.gyro, setup.imu.accel]).T
+        ]
     ).T
-    rate = corrected_rate(state.values["imu0", "intrinsics"], raw - state.bias[node])
+    rate = corrected_rate(state.values["imu0", "intrinsics"], raw - state.bias[keyframe])
     np.testing.assert_allclose(at.rate, rate, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(at.velocity, state.velocity[node], rtol=0, atol=0)
-    expected = state.rotation[node] @ Rotation.from_rotvec(rate * dt[:, None]).as_matrix()
+    np.testing.assert_allclose(at.velocity, state.velocity[keyframe], rtol=0, atol=0)
+    expected = state.rotation[keyframe] @ Rotation.from_rotvec(rate * dt[:, None]).as_matrix()
     np.testing.assert_allclose(at.rotation, expected, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(at.position, state.position[node] + state.velocity[node] * dt[:, None], atol=1e-15)
+    np.testing.assert_allclose(
+        at.position, state.position[keyframe] + state.velocity[keyframe] * dt[:, None], atol=1e-15
+    )
 
 
 LOWER = ([0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2])
@@ -244,32 +253,32 @@ def corrected_rate(intrinsics, readings):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_at_a_node_every_scheme_gives_the_node(setup, scheme):
+def test_at_a_keyframe_every_scheme_gives_the_keyframe(setup, scheme):
     state = setup.perturbed(np.random.default_rng(4))
-    node = assign_nodes(scheme, state.seconds, state.seconds)
-    at = poses_at(scheme, state.seconds, node, state, setup.imu, 9.81, False)
+    keyframe = assign_keyframes(scheme, state.seconds, state.seconds)
+    at = poses_at(scheme, state.seconds, keyframe, state, setup.imu, 9.81, False)
     np.testing.assert_allclose(at.rotation, state.rotation, rtol=0, atol=1e-14)
     np.testing.assert_allclose(at.position, state.position, rtol=0, atol=1e-15)
 
 
-NODES = np.array([0.0, 1.0, 3.0])
+N_KEYFRAMES = np.array([0.0, 1.0, 3.0])
 
 
 @pytest.mark.parametrize("scheme", ["inertial", "kinematic"])
 @pytest.mark.parametrize(
-    ("time", "node"),
+    ("time", "keyframe"),
     [(-5.0, 0), (0.0, 0), (0.4, 0), (0.6, 1), (1.0, 1), (1.9, 1), (2.1, 2), (3.0, 2), (9.0, 2)],
 )
-def test_nearest_node(scheme, time, node):
-    assert assign_nodes(scheme, NODES, np.array([time]))[0] == node
+def test_nearest_keyframe(scheme, time, keyframe):
+    assert assign_keyframes(scheme, N_KEYFRAMES, np.array([time]))[0] == keyframe
 
 
 @pytest.mark.parametrize("time", [0.5, 2.0])
-def test_in_the_middle_the_later_node_is_taken(time):
-    nearest = assign_nodes("inertial", NODES, np.array([time]))[0]
-    assert NODES[nearest] > time
+def test_in_the_middle_the_later_keyframe_is_taken(time):
+    nearest = assign_keyframes("inertial", N_KEYFRAMES, np.array([time]))[0]
+    assert N_KEYFRAMES[nearest] > time
 
 
-@pytest.mark.parametrize(("time", "node"), [(-1.0, 0), (0.0, 0), (0.9, 0), (1.0, 1), (2.9, 1), (3.0, 1), (4.0, 1)])
-def test_pose_takes_the_node_before_that_has_one_after(time, node):
-    assert assign_nodes("pose", NODES, np.array([time]))[0] == node
+@pytest.mark.parametrize(("time", "keyframe"), [(-1.0, 0), (0.0, 0), (0.9, 0), (1.0, 1), (2.9, 1), (3.0, 1), (4.0, 1)])
+def test_pose_takes_the_keyframe_before_that_has_one_after(time, keyframe):
+    assert assign_keyframes("pose", N_KEYFRAMES, np.array([time]))[0] == keyframe

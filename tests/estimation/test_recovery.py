@@ -48,7 +48,7 @@ def errors(setup, state):
 
 
 def without_bias(scenario):
-    """The broad prior on the biases of the first node, about zero, then pulls nothing."""
+    """The broad prior on the biases of the first keyframe, about zero, then pulls nothing."""
     return replace(scenario, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3)
 
 
@@ -110,7 +110,7 @@ def test_information_is_that_of_the_end_and_without_damping(noisy_problem):
     outcome = minimise(problem, start)
     pieces = problem.pieces()
     problem.linearise(outcome.state, pieces, problem.residuals())
-    expected = solve(pieces, problem.n_nodes, problem.tolerance).information
+    expected = solve(pieces, problem.n_keyframes, problem.tolerance).information
     np.testing.assert_allclose(outcome.information, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
@@ -168,7 +168,7 @@ def test_the_information_has_the_true_curvature_of_the_loss(unlike, setup_of, pr
     def information(curved):
         pieces = problem.pieces()
         problem.linearise(outcome.state, pieces, problem.residuals(), curved=curved)
-        return solve(pieces, problem.n_nodes, problem.tolerance).information
+        return solve(pieces, problem.n_keyframes, problem.tolerance).information
 
     np.testing.assert_allclose(outcome.information, information(True), rtol=1e-9, atol=1e-3)
     assert np.diag(information(True)).sum() < 0.95 * np.diag(information(False)).sum()

@@ -1,4 +1,4 @@
-"""Recordings joined: stamps, nodes, the chain's seams, tilts of each board."""
+"""Recordings joined: stamps, keyframes, the chain's seams, tilts of each board."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.geometry import so3
 from icalib.motion.factor import of_type
-from icalib.motion.nodes import first_nodes, place_nodes, usable
-from icalib.optim.state import NODE, State
+from icalib.motion.keyframe_placement import first_keyframes, place_keyframes, usable
+from icalib.optim.state import KEYFRAME_DIM, State
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.initialize.recordings import initial_guesses
@@ -89,16 +89,16 @@ def test_without_an_imu_given_offsets_keep_recordings_apart(rig, recordings):
     assert before.max() < joined.cameras[0].stamps_ns[parts[1].own["cam0"]].min()
 
 
-def test_nodes_and_images_stay_off_the_seam(rig, recordings):
+def test_keyframes_and_images_stay_off_the_seam(rig, recordings):
     inputs = inputs_for(rig, recordings)
     imu = inputs.imu
     ((end, begin),) = not_none(imu).seams
     assert not_none(imu).gaps == ()
     times = np.array([end - 0.5, end - 0.4, end + 1.0, begin - 1.0, begin + 0.4, begin + 0.5])
     np.testing.assert_array_equal(usable(not_none(imu), times, 1e9), [True, True, False, False, True, True])
-    nodes = place_nodes(not_none(imu), [times], 0.05, 1e9)
-    k = first_nodes(imu, nodes)[1]
-    np.testing.assert_allclose(nodes, [end - 0.5, end - 0.45, end - 0.4, begin + 0.4, begin + 0.45, begin + 0.5])
+    keyframes = place_keyframes(not_none(imu), [times], 0.05, 1e9)
+    k = first_keyframes(imu, keyframes)[1]
+    np.testing.assert_allclose(keyframes, [end - 0.5, end - 0.45, end - 0.4, begin + 0.4, begin + 0.45, begin + 0.5])
     assert k == 3
 
 
@@ -132,7 +132,7 @@ def test_nothing_is_known_across_the_seam(problem):
     for camera in of_type(built.factors, CornerFactor):
         assert len(camera.seams) == 1
         m = camera.seams[0]
-        assert camera.node[m - 1] < k <= camera.node[m]
+        assert camera.keyframe[m - 1] < k <= camera.keyframe[m]
 
 
 def test_the_gradient_is_that_of_the_cost(problem):
@@ -141,12 +141,16 @@ def test_the_gradient_is_that_of_the_cost(problem):
     rng = np.random.default_rng(0)
     pieces, out = built.pieces(), built.residuals()
     built.linearise(state, pieces, out)
-    chain_gradient = np.zeros((built.n_nodes, NODE))
+    chain_gradient = np.zeros((built.n_keyframes, KEYFRAME_DIM))
     for p in pieces:
         chain_gradient[p.first : p.last + 1] += p.side[:, :, -1]
     calib_gradient = sum(p.calib[:-1, -1] for p in pieces)
     for tilted in (False, True):
-        chain = rng.normal(size=(built.n_nodes, NODE)) * np.repeat([1e-3, 1e-3, 1e-3, 1e-4, 1e-3], 3) * (not tilted)
+        chain = (
+            rng.normal(size=(built.n_keyframes, KEYFRAME_DIM))
+            * np.repeat([1e-3, 1e-3, 1e-3, 1e-4, 1e-3], 3)
+            * (not tilted)
+        )
         calib = np.zeros(built.layout.size)
         for b in built.layout.free:
             if (b.name == "tilt") == tilted:
@@ -164,8 +168,8 @@ def test_a_tilt_turns_its_own_recording(problem):
     calib = np.zeros(built.layout.size)
     calib[built.layout.block("board0 in recording 2", "tilt").columns] = [0.1, -0.2]
     Q, k = so3.exp(np.array([0.1, -0.2, 0.0])), state.starts[1]
-    # A turn as a whole is what the nodes' own steps are counted from.
-    chain = np.zeros((len(state.seconds), NODE))
+    # A turn as a whole is what the keyframes' own steps are counted from.
+    chain = np.zeros((len(state.seconds), KEYFRAME_DIM))
     turn = np.array([0.1, -0.2, 0.0])
     chain[k:, 0:3], chain[k:, 3:6] = turn @ state.rotation[k:], np.cross(turn, state.position[k:])
     moved = state.retract(built.layout, chain, calib)

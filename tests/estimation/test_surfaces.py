@@ -135,7 +135,7 @@ def test_a_plane_pulls_its_points_towards_it(setup_of, features_on_planes):
     def distance(sigma: float) -> np.ndarray:
         own = replace(factor, on=factor.on._replace(sigma=np.full(factor.tracks.count, sigma)))
         out = own.output()
-        for piece in make_pieces(factor.n_nodes, None):
+        for piece in make_pieces(factor.n_keyframes, None):
             own.accumulate(setup.state, piece, out, sums=False)
         return np.where(factor.on.plane == 0, np.abs(out.off.residual), 0.0)
 

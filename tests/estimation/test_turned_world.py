@@ -50,11 +50,11 @@ def test_what_a_lidar_sees_does_not_change(setup):
         return sum(factor.accumulate(state, p, factor.output(), sums=False) for p in pieces)
 
     before, after = cost(setup.state), cost(setup.state.retract(setup.layout, *turning(setup, TURN)))
-    # Between nodes the IMU leads, and gravity has not turned.
+    # Between keyframes the IMU leads, and gravity has not turned.
     assert after == pytest.approx(before, rel=1e-5)
 
 
-def test_on_a_flat_floor_map_and_path_turn_while_no_node_does(robot, room_of):
+def test_on_a_flat_floor_map_and_path_turn_while_no_keyframe_does(robot, room_of):
     """All sensors turn against the IMU: on a flat floor the LiDAR sees the same."""
     setup = room_of(simulate(robot(3.0, example="table2-planar"), seed=1))
     turn, state = np.array([0.0, 0.0, 0.14]), setup.state
@@ -69,7 +69,7 @@ def test_on_a_flat_floor_map_and_path_turn_while_no_node_does(robot, room_of):
     np.testing.assert_allclose(turned.position, state.position @ Q.T, atol=1e-12)
     factor, pieces = setup.factor(), setup.problem(state).pieces(sums=False)
     before, after = (sum(factor.accumulate(s, p, factor.output(), sums=False) for p in pieces) for s in (state, turned))
-    # But for the lever arm, which moves along the tangent, and what the IMU says between nodes.
+    # But for the lever arm, which moves along the tangent, and what the IMU says between keyframes.
     assert after == pytest.approx(before, rel=1e-2)
 
 

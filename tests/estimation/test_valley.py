@@ -21,10 +21,10 @@ FAR, WEAK, STEEP, LARGE = 10.0, 1e-3, 1e3, 100.0
 
 
 class OneNumber(StandIn):
-    """A problem in one number y, with one node that is left alone."""
+    """A problem in one number y, with one keyframe that is left alone."""
 
     layout = make_layout([(*KEY, "vector", 1, True)])
-    n_nodes, tolerance, held = 1, np.array([1e3]), NOTHING
+    n_keyframes, tolerance, held = 1, np.array([1e3]), NOTHING
 
     def pieces(self):
         return make_pieces(1, 1)

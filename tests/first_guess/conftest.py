@@ -46,13 +46,13 @@ class Robot:
         """At seconds since the IMU's first stamp."""
         return self.sim.truth.pose_at(t + self.sim.truth.seconds[0])
 
-    def state(self, nodes: np.ndarray) -> State:
+    def state(self, keyframes: np.ndarray) -> State:
         truth = self.sim.truth
         bias = np.concatenate([truth.gyro_bias.mean(axis=0), truth.accel_bias.mean(axis=0)])
         values = {("imu0", "intrinsics"): np.zeros(24)}
         for k, stream in enumerate(self.streams):
             values |= self.truth(k).values(stream.name)
-        return State(nodes, *self.pose_at(nodes), np.tile(bias, (len(nodes), 1)), values)
+        return State(keyframes, *self.pose_at(keyframes), np.tile(bias, (len(keyframes), 1)), values)
 
     def errors(self, found: ExtrinsicsGuess, k: int = 0) -> tuple[np.ndarray, np.ndarray, float]:
         """Of rotation [deg], position [m], time offset [s]."""

@@ -139,10 +139,10 @@ def test_a_shifted_clock_shifts_the_offset_alone(simulation: Simulation, seconds
 def test_the_trajectory_follows_the_truth(simulation: Simulation):
     rig = rig_for(simulation.scenario)
     guess = initial_guess(rig, simulation.measurements)
-    nodes = np.linspace(1.0, 19.0, 100)
-    rotation, position, velocity = initial_trajectory(guess, rig, simulation.measurements, nodes)
+    keyframes = np.linspace(1.0, 19.0, 100)
+    rotation, position, velocity = initial_trajectory(guess, rig, simulation.measurements, keyframes)
     apart = (not_none(simulation.measurements.imu).origin_ns - simulation.scenario.imu_clock_origin_ns) * 1e-9
-    R, p, v = simulation.truth.pose_at(nodes + apart)
+    R, p, v = simulation.truth.pose_at(keyframes + apart)
     # The guess's world differs from the truth's by a turn about gravity and a shift.
     turn = R[0] @ rotation[0].T
     assert max(angle_deg(turn @ a, b) for a, b in zip(rotation, R, strict=True)) < 2.0

@@ -16,7 +16,7 @@ from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_o
 
 pytestmark = pytest.mark.slow
 
-NODE_S = 0.05
+KEYFRAME_S = 0.05
 
 
 def within(robot, found, degrees, metres, seconds, k=0, but=None):
@@ -50,7 +50,7 @@ def test_lidar_and_imu_alone(free_robot):
 
 
 def test_a_lidar_on_a_motion_that_is_known(free_robot):
-    known = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], NODE_S))
+    known = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], KEYFRAME_S))
     found = lidar_on_motion(free_robot.imu, free_robot.streams[0], known)
     assert within(free_robot, found, 0.2, 0.02, 5e-4)
 
@@ -62,7 +62,7 @@ def test_any_orientation_and_clocks_far_apart(robot, seed):
     T[:3, 3] = np.random.default_rng(seed).uniform(-0.3, 0.3, 3)
     r = robot(16.0, 3, {"T_imu_sensor": T, "time_offset_s": 0.7 - seed, "clock_origin_ns": 5 * 10**18})
     assert within(r, lidar_and_motion(r.imu, r.streams[0], 9.81)[0], 2.0, 0.15, 5e-3)
-    known = r.state(np.arange(0.0, r.imu.seconds[-1], NODE_S))
+    known = r.state(np.arange(0.0, r.imu.seconds[-1], KEYFRAME_S))
     assert within(r, lidar_on_motion(r.imu, r.streams[0], known), 2.0, 0.15, 5e-3)
 
 
@@ -96,14 +96,14 @@ def test_a_long_turn_to_one_side_shows_the_clocks(robot, seconds, seed):
 def test_on_a_floor_the_turn_about_its_axis_comes_from_the_known_motion(robot, seed):
     """Which way that motion is for the LiDAR must not be taken from the turn that is looked for."""
     r = robot(20.0, seed, example="table2-planar")
-    known, up = r.state(np.arange(0.0, r.imu.seconds[-1], NODE_S)), r.state(np.zeros(1)).rotation[0, 2]
+    known, up = r.state(np.arange(0.0, r.imu.seconds[-1], KEYFRAME_S)), r.state(np.zeros(1)).rotation[0, 2]
     assert within(r, lidar_on_motion(r.imu, r.streams[0], known), 0.1, 0.005, 1e-3, but=up)
 
 
 def test_what_is_held_stays(free_robot):
     true = free_robot.truth()
     held = Held(true.rotation, true.position + [0.1, 0.0, 0.0], true.offset + 1e-3)
-    known = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], NODE_S))
+    known = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], KEYFRAME_S))
     for found in (
         lidar_and_motion(free_robot.imu, free_robot.streams[0], 9.81, held)[0],
         lidar_on_motion(free_robot.imu, free_robot.streams[0], known, held),
@@ -177,7 +177,7 @@ def test_one_wall_does_not_crash(free_robot):
     stream, true = free_robot.streams[0], free_robot.truth()
     largest = np.bincount(stream.plane[stream.plane >= 0]).argmax()
     wall = changed(stream, stream.xyz, stream.plane == largest)
-    known = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], NODE_S))
+    known = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], KEYFRAME_S))
     held = Held(true.rotation, true.position, true.offset)
     try:
         found = lidar_on_motion(free_robot.imu, wall, known, held)

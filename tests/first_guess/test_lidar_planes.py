@@ -14,7 +14,7 @@ from icalib.estimate.problem.solver import minimise
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.initialize.paths.path import ExtrinsicsGuess
 from icalib.motion.factor import keyed
-from icalib.motion.nodes import place_nodes
+from icalib.motion.keyframe_placement import place_keyframes
 from icalib.motion.sweep import Motion
 from icalib.optim.state import State, make_layout
 from icalib.rig import ImuSensor, Lidar, Settings
@@ -37,10 +37,10 @@ def guessed(r):
     found, motion = lidar_and_motion(r.imu, r.streams[0], 9.81)
     first = r.streams[0]
     ends = first.seconds[[0, -1]] + found.offset + [0.0, first.offset_s.max()]
-    nodes = place_nodes(r.imu, [np.clip(ends, 0.0, r.imu.seconds[-1])], 0.025, 0.5)
+    keyframes = place_keyframes(r.imu, [np.clip(ends, 0.0, r.imu.seconds[-1])], 0.025, 0.5)
     values = {("imu0", "intrinsics"): np.zeros(24)} | found.values(first.name)
-    R, p, v = motion.at(nodes)
-    state = State(nodes, np.ascontiguousarray(R), p, v, np.tile(motion.bias, (len(nodes), 1)), values)
+    R, p, v = motion.at(keyframes)
+    state = State(keyframes, np.ascontiguousarray(R), p, v, np.tile(motion.bias, (len(keyframes), 1)), values)
     for stream in r.streams[1:]:
         values |= lidar_on_motion(r.imu, stream, state).values(stream.name)
     return replace(state, values=values)

@@ -85,10 +85,10 @@ def sim(request):
 
 
 def state_of(sim) -> State:
-    nodes = np.arange(0.05, 11.5, 0.05)
+    keyframes = np.arange(0.05, 11.5, 0.05)
     bias = np.concatenate([sim.truth.gyro_bias.mean(axis=0), sim.truth.accel_bias.mean(axis=0)])
-    R, p, v = sim.truth.pose_at(nodes + sim.truth.seconds[0])
-    return State(nodes, R, p, v, np.tile(bias, (len(nodes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
+    R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
+    return State(keyframes, R, p, v, np.tile(bias, (len(keyframes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
 
 
 @pytest.mark.parametrize(("way", "words"), WRONG)

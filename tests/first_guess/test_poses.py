@@ -57,10 +57,10 @@ def errors(sim, values):
     return np.rad2deg(turn), way, abs(values["mocap0", "time_offset"][0] - offset)
 
 
-def truth_at(sim, nodes):
+def truth_at(sim, keyframes):
     bias = np.concatenate([sim.truth.gyro_bias.mean(axis=0), sim.truth.accel_bias.mean(axis=0)])
-    R, p, v = sim.truth.pose_at(nodes + sim.truth.seconds[0])
-    return State(nodes, R, p, v, np.tile(bias, (len(nodes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
+    R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
+    return State(keyframes, R, p, v, np.tile(bias, (len(keyframes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
 
 
 def test_with_the_imu_alone(sim):

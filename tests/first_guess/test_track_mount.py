@@ -39,10 +39,12 @@ def drive(example="table2-planar", cameras=1, seed=1, noise_px=0.0, duration_s=2
     simulation = simulate(scenario, seed)
     truth = simulation.truth
     imu = ImuData.build(not_none(simulation.measurements.imu), scenario.imu_noise)
-    nodes = np.arange(0.0, imu.seconds[-1], 0.05)
+    keyframes = np.arange(0.0, imu.seconds[-1], 0.05)
     bias = np.concatenate([truth.gyro_bias.mean(axis=0), truth.accel_bias.mean(axis=0)])
-    poses = truth.pose_at(nodes + truth.seconds[0])
-    return simulation, State(nodes, *poses, np.tile(bias, (len(nodes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
+    poses = truth.pose_at(keyframes + truth.seconds[0])
+    return simulation, State(
+        keyframes, *poses, np.tile(bias, (len(keyframes), 1)), {("imu0", "intrinsics"): np.zeros(24)}
+    )
 
 
 def placed(simulation, state, rig):

@@ -81,11 +81,11 @@ def test_what_is_known_stays(world):
 @pytest.mark.parametrize("levelled", [True, False])
 def test_placed_on_a_known_motion(world, levelled):
     sim, imu, fix, _, offset = world
-    nodes = np.arange(0.2, imu.seconds[-1] - 0.2, 0.1)
-    bias = np.tile(np.concatenate([sim.truth.gyro_bias[0], sim.truth.accel_bias[0]]), (len(nodes), 1))
+    keyframes = np.arange(0.2, imu.seconds[-1] - 0.2, 0.1)
+    bias = np.tile(np.concatenate([sim.truth.gyro_bias[0], sim.truth.accel_bias[0]]), (len(keyframes), 1))
     values = {("imu0", "intrinsics"): sim.truth.imu_intrinsics}
-    R, p, v = sim.truth.pose_at(nodes + sim.truth.seconds[0])
-    state = State(nodes, R, p, v, bias, values)
+    R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
+    state = State(keyframes, R, p, v, bias, values)
     found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, levelled, Held())
     assert found.offset == pytest.approx(offset, abs=0.01)
     planar = 0.1 if sim.scenario.motion.kind == "ramps" else 0.04
@@ -112,9 +112,9 @@ def test_placed_on_a_rig_that_turns_in_place():
     accel = np.ascontiguousarray(R.transpose(0, 2, 1) @ [0.0, 0.0, GRAVITY])
     stream = ImuStream("imu0", np.round(1e9 * seconds).astype(np.int64), gyro, accel)
     imu = ImuData.build(stream, class_noise("consumer"))
-    nodes, still = seconds[100:-100:20], np.zeros((len(seconds[100:-100:20]), 3))
+    keyframes, still = seconds[100:-100:20], np.zeros((len(seconds[100:-100:20]), 3))
     values = {("imu0", "intrinsics"): np.zeros(24)}
-    state = State(nodes, R[100:-100:20], still, still, np.zeros((len(nodes), 6)), values)
+    state = State(keyframes, R[100:-100:20], still, still, np.zeros((len(keyframes), 6)), values)
     k = np.arange(200, 5800, 40)
     position = (R[k] @ ARM - ORIGIN) @ yaw(FRAME_YAW) + 0.005 * np.random.default_rng(1).normal(size=(len(k), 3))
     found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), True, Held())

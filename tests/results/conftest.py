@@ -29,7 +29,7 @@ from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Setti
 from icalib.rig.file import rig_to_dict
 from icalib.sensors.lidar.record import LidarResiduals
 
-NODES, CORNERS_PER_IMAGE = 300, 34
+N_KEYFRAMES, CORNERS_PER_IMAGE = 300, 34
 IMU_LABELS = tuple(f"accel_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz"))
 POSES = {
     "cam0": ([0.35, 1.47, 89.15], [-0.02164, -0.06468, 0.00981]),
@@ -68,7 +68,7 @@ def calibration() -> Calibration:
         residuals=by_key(
             [
                 *(_corners(name, trajectory, instance(rig.target, AprilGrid), rng) for name in POSES),
-                ImuResiduals("imu0", trajectory.seconds[:-1], rng.normal(size=(NODES - 1, 15))),
+                ImuResiduals("imu0", trajectory.seconds[:-1], rng.normal(size=(N_KEYFRAMES - 1, 15))),
             ]
         ),
         trajectory=trajectory,
@@ -160,7 +160,7 @@ def _covariance(groups: tuple[ParameterGroup, ...], rng: np.random.Generator) ->
 
 
 def _trajectory() -> Trajectory:
-    t = 0.05 * np.arange(NODES)
+    t = 0.05 * np.arange(N_KEYFRAMES)
     angles = np.stack([0.5 * np.sin(2.1 * t), 0.4 * np.sin(1.7 * t + 1), 0.6 * np.sin(1.3 * t)], axis=1)
     position = np.stack([0.4 + 0.3 * np.sin(1.9 * t), 0.2 * np.cos(1.6 * t) - 1.2, 0.3 + 0.2 * np.sin(2.3 * t)], axis=1)
     facing = Rotation.from_matrix(np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]]).T[[2, 0, 1]])
@@ -177,9 +177,9 @@ def _trajectory() -> Trajectory:
 def _corners(name: str, path: Trajectory, target: AprilGrid, rng: np.random.Generator) -> CornerResiduals:
     fx, fy, cx, cy = INTRINSICS[name]
     point = np.concatenate(
-        [np.sort(rng.choice(len(target.points), CORNERS_PER_IMAGE, replace=False)) for _ in range(NODES)]
+        [np.sort(rng.choice(len(target.points), CORNERS_PER_IMAGE, replace=False)) for _ in range(N_KEYFRAMES)]
     )
-    image = np.repeat(np.arange(NODES), CORNERS_PER_IMAGE)
+    image = np.repeat(np.arange(N_KEYFRAMES), CORNERS_PER_IMAGE)
     shift = path.position[image, :2] - path.position[:, :2].mean(axis=0)
     xy = target.points[point, :2] - 0.35 + shift
     uv = np.stack([cx + fx * xy[:, 0] / 1.2, cy + fy * xy[:, 1] / 1.2], axis=1)
@@ -188,7 +188,7 @@ def _corners(name: str, path: Trajectory, target: AprilGrid, rng: np.random.Gene
     rejected = rng.random(len(uv)) < 0.01
     residual = 0.2 * rng.normal(size=uv.shape) * np.where(rejected, 12.0, 1.0)[:, None]
     residual[:, 0] += 1e-4 * (uv[:, 0] - cx)
-    start = np.concatenate([[0], np.cumsum(np.bincount(image, minlength=NODES))])
+    start = np.concatenate([[0], np.cumsum(np.bincount(image, minlength=N_KEYFRAMES))])
     return CornerResiduals(name, path.seconds - 1e-4, start, point, uv, residual, np.full(len(uv), 0.2), rejected)
 
 
@@ -227,7 +227,7 @@ def robot(calibration: Calibration) -> Calibration:
         for key, value in values.items():
             groups.append(_group(groups, name, key, value, False))
     names = tuple(f"{g.sensor}.{g.name}.{n}" for g in groups if g.columns for n in g.labels)
-    seconds = 0.05 * np.arange(NODES - 1)
+    seconds = 0.05 * np.arange(N_KEYFRAMES - 1)
     whitened = rng.normal(size=(len(seconds), 4))
     labels, units = ("left", "right", "lateral", "vertical"), ("rad", "rad", "m", "m")
     fits = (SensorFit("lidar0", "points", 40000, 39900.0, 40100.0, 0.03, "m"),)

@@ -1,4 +1,4 @@
-"""Poses between nodes, against a motion that is known in closed form."""
+"""Poses between keyframes, against a motion that is known in closed form."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture
-def nodes(shown):
+def keyframes(shown):
     """The trajectory of a result, which is moved as above, at uneven times."""
 
     def make(seconds: np.ndarray, recordings=()):
@@ -36,14 +36,14 @@ def nodes(shown):
 
 
 @pytest.mark.parametrize("step", [0.05, 0.025])
-def test_between_nodes_the_error_falls_with_the_third_power_of_their_distance(nodes, step):
+def test_between_keyframes_the_error_falls_with_the_third_power_of_their_distance(keyframes, step):
     """A parabola's slope is off by f''' h^2 / 6, and what a cubic makes of that is at most 0.0963 h times as large.
 
-    The third derivative of the position is 8 m/s^3, that of the rotation below 15 rad/s^3; nodes are up to 1.2 steps
-    apart."""
+    The third derivative of the position is 8 m/s^3, that of the rotation below 15 rad/s^3; keyframes are up to 1.2
+    steps apart."""
     seconds = np.arange(0.0, 3.0, step)
     seconds[1:-1] += 0.2 * step * np.sin(np.arange(len(seconds) - 2))
-    path = nodes(seconds)
+    path = keyframes(seconds)
     t = np.linspace(seconds[2], seconds[-3], 2001)
     R, p, known = path.at(t)
     R_true, p_true = _pose(t)
@@ -53,21 +53,21 @@ def test_between_nodes_the_error_falls_with_the_third_power_of_their_distance(no
     assert Rotation.from_matrix(R @ R_true.transpose(0, 2, 1)).magnitude().max() < 15.0 * scale
 
 
-def test_at_a_node_the_pose_is_that_of_the_node(nodes):
+def test_at_a_keyframe_the_pose_is_that_of_the_keyframe(keyframes):
     seconds = np.arange(0.0, 1.0, 0.05)
-    R, p, known = nodes(seconds).at(seconds)
+    R, p, known = keyframes(seconds).at(seconds)
     R_true, p_true = _pose(seconds)
     assert known.all()
     np.testing.assert_allclose(R, R_true, atol=1e-12)
     np.testing.assert_allclose(p, p_true, atol=1e-12)
 
 
-def test_beyond_the_ends_and_in_gaps_nothing_is_known(nodes):
+def test_beyond_the_ends_and_in_gaps_nothing_is_known(keyframes):
     """Beside them the slope is that of the one interval: off by h / 2 times the acceleration, 4 m/s^2 and below
     6 rad/s^2, of which a cubic makes 0.149 h times as much."""
     seconds = np.array([0.0, 0.05, 0.1, 1.1, 1.15, 1.2])
     t = np.array([-0.01, 0.02, 0.099, 0.1, 0.3, 1.0999, 1.1, 1.12, 1.21])
-    R, p, known = nodes(seconds).at(t)
+    R, p, known = keyframes(seconds).at(t)
     assert known.tolist() == [False, True, True, True, False, False, True, True, False]
     assert np.isfinite(R).all()
     assert np.isfinite(p).all()
@@ -76,10 +76,10 @@ def test_beyond_the_ends_and_in_gaps_nothing_is_known(nodes):
     np.testing.assert_allclose(R[known], R_true, atol=6.0 * 0.149 * 0.05**2 / 2.0)
 
 
-def test_one_recording_does_not_go_over_into_the_next(nodes, shown):
+def test_one_recording_does_not_go_over_into_the_next(keyframes, shown):
     only = shown.calibration.recordings[0]
     spans = (dataclasses.replace(only, start=0.0, end=0.1), dataclasses.replace(only, start=0.4, end=0.5))
-    _, _, known = nodes(np.array([0.0, 0.05, 0.1, 0.4, 0.45, 0.5]), spans).at(np.array([0.07, 0.2, 0.3, 0.42]))
+    _, _, known = keyframes(np.array([0.0, 0.05, 0.1, 0.4, 0.45, 0.5]), spans).at(np.array([0.07, 0.2, 0.3, 0.42]))
     assert known.tolist() == [True, False, False, True]
 
 

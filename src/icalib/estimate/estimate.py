@@ -20,7 +20,7 @@ from icalib.estimate.evidence.corner_noise import (
 )
 from icalib.estimate.evidence.evidence import chi2_by_kind, fits
 from icalib.estimate.evidence.feature_noise import first_following, next_following
-from icalib.estimate.problem.assembly import Following, assemble, host_times, nodes_for, resample
+from icalib.estimate.problem.assembly import Following, assemble, keyframe_times, keyframes_for, resample
 from icalib.estimate.problem.guess_priors import guess_priors
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome, Step, Visit, way_come
@@ -166,7 +166,7 @@ class _Passes:
 
     def begin_at(self, state: State) -> None:
         """The next pass: of the same motion, at the keyframes that its clocks want."""
-        self.state = _on_own_nodes(self.inputs, state)
+        self.state = _on_own_keyframes(self.inputs, state)
 
     def early(self, name: str) -> None:
         """One that leads near, and shows what is judged before the next."""
@@ -270,13 +270,13 @@ def _follows_more(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
     (now,) = of_type(outcome.problem.factors, FeatureFactor) or (None,)
     if now is None or now.followed > ENOUGH_TRACKED * sum(int(k.sum()) for k in now.keep):
         return False
-    anew = of_type(judged.problem(inputs, _on_own_nodes(inputs, outcome.state)).factors, FeatureFactor)
+    anew = of_type(judged.problem(inputs, _on_own_keyframes(inputs, outcome.state)).factors, FeatureFactor)
     return any(f.followed > MORE_TRACKED * now.followed for f in anew)
 
 
-def _on_own_nodes(inputs: Inputs, state: State) -> State:
+def _on_own_keyframes(inputs: Inputs, state: State) -> State:
     """The same motion, at the keyframes that its clocks want."""
-    return resample(state, nodes_for(inputs, host_times(inputs, state.values)), inputs)
+    return resample(state, keyframes_for(inputs, keyframe_times(inputs, state.values)), inputs)
 
 
 def first_pass(inputs: Inputs, state: State) -> State:

@@ -19,7 +19,7 @@ import numpy as np
 
 from icalib.data.measurements import ImuStream, Measurements
 from icalib.errors import EstimationError
-from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
+from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
 from icalib.initialize.dead_reckoning import as_given, camera_paths, in_place_of, pose_streams, seen_from_first
@@ -36,7 +36,7 @@ from icalib.initialize.steps.keyframe_spacing import SmoothMotion
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import FEWEST, BodyPoses, SmoothPath
 from icalib.model.frames import FRAME, frame_of
-from icalib.motion.nodes import first_nodes
+from icalib.motion.keyframe_placement import first_keyframes
 from icalib.optim.state import State, in_recording
 from icalib.rig import ImuNoise, ImuSensor, Rig, Sensor
 from icalib.sensors.parameter import Parameter, fixed
@@ -168,16 +168,16 @@ def _moving(inputs: Inputs, shown: Sequence[BodyPoses], found: Values) -> tuple[
     """The motion of the body without biases, and its angular rate and acceleration (K, 6) at keyframes; `found`: what
     is known of sensors."""
     values = start_values(inputs, found | _identity(inputs))
-    nodes = nodes_for(inputs, host_times(inputs, values))
-    starts = first_nodes(inputs.imu, nodes)
-    parts = np.split(nodes, starts[1:])
+    keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
+    starts = first_keyframes(inputs.imu, keyframes)
+    parts = np.split(keyframes, starts[1:])
     ways = [own.at(t - part.begin) for own, t, part in zip(shown, parts, inputs.parts, strict=True)]
     R, p, v, rate, force = (
         np.concatenate([getattr(w, name) for w in ways])
         for name in ("rotation", "position", "velocity", "rate", "acceleration")
     )
-    still = np.zeros((len(nodes), 6))
-    return State(nodes, R, p, v, still, values, starts), np.concatenate([rate, force], axis=1)
+    still = np.zeros((len(keyframes), 6))
+    return State(keyframes, R, p, v, still, values, starts), np.concatenate([rate, force], axis=1)
 
 
 def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothPath]) -> Rig:

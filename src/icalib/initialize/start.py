@@ -8,7 +8,7 @@ from typing import Any
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimate.problem.assembly import host_times, nodes_for, resample, start_values
+from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, resample, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.initialize.assumed_motion import start_without_imu
 from icalib.initialize.steps.initializer import (
@@ -93,7 +93,7 @@ def _with_others(whole: Inputs, source: Initializer[Any], own: Inputs, state: St
     found = placed(inputs, state, hosts)
     if hosts or source.moves_keyframes:
         values = start_values(inputs, state.values | found)
-        state = resample(replace(state, values=values), nodes_for(inputs, host_times(inputs, values)), inputs)
+        state = resample(replace(state, values=values), keyframes_for(inputs, keyframe_times(inputs, values)), inputs)
     found |= placed(inputs, state, [s for s in others if s not in hosts])
     state, guess = replace(state, values=state.values | found), guess | found
     for kind in kinds_of(whole.rig):

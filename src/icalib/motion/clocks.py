@@ -26,25 +26,25 @@ def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray 
     return own + offset[np.searchsorted(joins, own, side="right")]
 
 
-def clock_of(state: State, name: str, node: np.ndarray) -> np.ndarray:
-    """(n,) number of the time offset that a sensor's measurements which hang on `node` (n,) go by."""
+def clock_of(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
+    """(n,) number of the time offset that a sensor's measurements which hang on `keyframe` (n,) go by."""
     if len(state.values[name, "time_offset"]) == 1:
-        return np.zeros(len(node), dtype=np.int64)
-    return np.searchsorted(state.starts, node, side="right") - 1
+        return np.zeros(len(keyframe), dtype=np.int64)
+    return np.searchsorted(state.starts, keyframe, side="right") - 1
 
 
-def offset_at(state: State, name: str, node: np.ndarray) -> np.ndarray:
-    """(n,) time offset of a sensor's measurements that hang on `node` (n,)."""
-    return state.values[name, "time_offset"][clock_of(state, name, node)]
+def offset_at(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
+    """(n,) time offset of a sensor's measurements that hang on `keyframe` (n,)."""
+    return state.values[name, "time_offset"][clock_of(state, name, keyframe)]
 
 
-def by_clock(state: State, name: str, node: np.ndarray) -> Iterator[tuple[int, slice]]:
-    """Stretches of measurements that hang on `node` (n,), in order, and go by one time offset: its number, and which
-    they are."""
+def by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[tuple[int, slice]]:
+    """Stretches of measurements that hang on `keyframe` (n,), in order, and go by one time offset: its number, and
+    which they are."""
     if len(state.values[name, "time_offset"]) == 1:
-        yield 0, slice(0, len(node))
+        yield 0, slice(0, len(keyframe))
         return
-    edges = np.searchsorted(node, (*state.starts, len(state.seconds)))
+    edges = np.searchsorted(keyframe, (*state.starts, len(state.seconds)))
     for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
         if a < b:
             yield k, slice(int(a), int(b))

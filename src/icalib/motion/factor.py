@@ -71,12 +71,13 @@ class Along(NamedTuple):
 class Factor(Protocol):
     """All measurements of one kind by one sensor. The output of `accumulate` is the factor's own class of arrays.
 
-    is_sparse: one keyframe alone has too few rows to say anything of the calibration. ties_distant_nodes: rows share
-    what is eliminated with the nodes, such as points of the scene, so that segments of the chain do not stand alone.
+    is_sparse: one keyframe alone has too few rows to say anything of the calibration. ties_distant_keyframes: rows
+    share what is eliminated with the keyframes, such as points of the scene, so that segments of the chain do not stand
+    alone.
     """
 
     is_sparse: ClassVar[bool]
-    ties_distant_nodes: ClassVar[bool]
+    ties_distant_keyframes: ClassVar[bool]
 
     @property
     def key(self) -> FactorKey: ...
@@ -128,11 +129,11 @@ class Factor(Protocol):
         ...
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
-        """The piece with room for what the factor eliminates; `keep`: another piece shares a node with it."""
+        """The piece with room for what the factor eliminates; `keep`: another piece shares a keyframe with it."""
         ...
 
-    def cut(self, state: State, nodes: tuple[int, ...]) -> Self:
-        """The same measurements, of which none ties nodes on both sides of one of `nodes`."""
+    def cut(self, state: State, keyframes: tuple[int, ...]) -> Self:
+        """The same measurements, of which none ties keyframes on both sides of one of `keyframes`."""
         ...
 
     def settled(self, out: Any) -> Self:
@@ -141,10 +142,10 @@ class Factor(Protocol):
 
 
 class FactorDefaults:
-    """A factor that ties a node to the next one at most, and keeps all it needs in the state."""
+    """A factor that ties a keyframe to the next one at most, and keeps all it needs in the state."""
 
     is_sparse: ClassVar[bool] = False
-    ties_distant_nodes: ClassVar[bool] = False
+    ties_distant_keyframes: ClassVar[bool] = False
 
     def with_imu(self, imu: ImuData) -> Self:
         """See `Factor`."""
@@ -165,9 +166,9 @@ class FactorDefaults:
         del keep
         return piece
 
-    def cut(self, state: State, nodes: tuple[int, ...]) -> Self:
+    def cut(self, state: State, keyframes: tuple[int, ...]) -> Self:
         """See `Factor`."""
-        del state, nodes
+        del state, keyframes
         return self
 
     def settled(self, out: Any) -> Self:

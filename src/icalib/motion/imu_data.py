@@ -35,8 +35,8 @@ class ImuData:
     variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and how the force departs
     from its mean within the interval; walk (2,): squared densities of the bias walks. gaps: (start, end) of intervals
     without readings. seams: (end, begin) of recordings that were joined; nothing is known of what lies between.
-    forwards: the biases of a node hold until the next one, and what is between is carried forwards only; they are what
-    is assumed of the motion, and change a lot from node to node.
+    forwards: the biases of a keyframe hold until the next one, and what is between is carried forwards only; they are
+    what is assumed of the motion, and change a lot from keyframe to keyframe.
     """
 
     name: str
@@ -103,7 +103,7 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
 
 
 def _is_dense(measurements: Measurements) -> bool:
-    """Whether the body's poses, where there is no IMU, come so fast that rates may jump at nodes."""
+    """Whether the body's poses, where there is no IMU, come so fast that rates may jump at keyframes."""
     return float(np.median(np.diff(measurements.body.seconds))) <= DENSE_S
 
 

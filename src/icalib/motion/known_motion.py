@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.motion.poses import Poses, assign_nodes, poses_at
+from icalib.motion.poses import Poses, assign_keyframes, poses_at
 from icalib.motion.sweep import Motion
 
-NEAR_NODE_S = 0.15  # a scan of a LiDAR alone goes on so long after its node
+NEAR_KEYFRAME_S = 0.15  # a scan of a LiDAR alone goes on so long after its keyframe
 
 
-def near_nodes(nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """(n,) whether there is a node near each of the times (n,)."""
-    k = np.clip(np.searchsorted(nodes, times), 1, len(nodes) - 1)
-    return np.minimum(np.abs(times - nodes[k - 1]), np.abs(times - nodes[k])) < NEAR_NODE_S
+def are_near_keyframes(keyframes: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(n,) whether there is a keyframe near each of the times (n,)."""
+    k = np.clip(np.searchsorted(keyframes, times), 1, len(keyframes) - 1)
+    return np.minimum(np.abs(times - keyframes[k - 1]), np.abs(times - keyframes[k])) < NEAR_KEYFRAME_S
 
 
-def is_known(nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """(n,) whether the motion is known at times (n,) on the IMU's clock: between nodes, and near one of them."""
-    return near_nodes(nodes, times) & (times >= nodes[0]) & (times <= nodes[-1])
+def is_known(keyframes: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(n,) whether the motion is known at times (n,) on the IMU's clock: between keyframes, and near one of them."""
+    return are_near_keyframes(keyframes, times) & (times >= keyframes[0]) & (times <= keyframes[-1])
 
 
 def imu_poses(motion: Motion, times: np.ndarray) -> Poses:
-    """The IMU's poses at times (n,) on its clock, by its readings from the nodes next to them."""
-    node = assign_nodes("inertial", motion.state.seconds, times)
-    return poses_at("inertial", times, node, motion.state, motion.imu, motion.gravity, False)
+    """The IMU's poses at times (n,) on its clock, by its readings from the keyframes next to them."""
+    keyframe = assign_keyframes("inertial", motion.state.seconds, times)
+    return poses_at("inertial", times, keyframe, motion.state, motion.imu, motion.gravity, False)

@@ -1,10 +1,10 @@
 """Where the IMU was at a sensor's own instant: three schemes behind one function, `poses_at`.
 
-    inertial    the IMU's readings integrated from the nearest node to t, forwards or backwards
-    kinematic   constant angular rate and velocity from the nearest node, paper (8)-(9)
-    pose        between the two bounding nodes, paper (10)-(12); position interpolated linearly
+    inertial    the IMU's readings integrated from the nearest keyframe to t, forwards or backwards
+    kinematic   constant angular rate and velocity from the nearest keyframe, paper (8)-(9)
+    pose        between the two bounding keyframes, paper (10)-(12); position interpolated linearly
 
-A measurement keeps its node (`Assignment`) while the solver runs; only the time itself moves with the offset.
+A measurement keeps its keyframe (`Assignment`) while the solver runs; only the time itself moves with the offset.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry import so3
-from icalib.motion.from_nodes import (
+from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_model import correction_matrices
+from icalib.motion.integration import bias_of, readings_of
+from icalib.motion.integration_step import SIZE, STRIDE, E, J, P, V, correction, fill_intrinsics
+from icalib.motion.propagation import (
     Moving,
-    integrate_from_node,
-    nodes_of,
+    integrate_from_keyframe,
+    keyframes_of,
     nothing_carried,
     place,
     rotation_of,
     ways_from,
 )
-from icalib.motion.imu_data import ImuData
-from icalib.motion.imu_model import correction_matrices
-from icalib.motion.integration import bias_of, readings_of
-from icalib.motion.integration_step import SIZE, STRIDE, E, J, P, V, correction, fill_intrinsics
-from icalib.optim.state import NODE, State
+from icalib.optim.state import KEYFRAME_DIM, State
 from icalib.rig import Scheme
 from icalib.sensors.imu.spec import N_INTRINSICS
 
@@ -39,15 +39,15 @@ class Poses:
     """IMU poses at n instants, and how they move. Rows of the Jacobians: rotation (right), position (world).
 
     rotation (n, 3, 3), position (n, 3); rate (n, 3) body rad/s and velocity (n, 3) world m/s, the time derivative;
-    J_node, J_next (n, 6, 15): with respect to the node and, for `pose` alone, the one after it (else of length 0);
-    J_imu (n, 6, 24 or 0): with respect to the IMU intrinsics.
+    J_keyframe, J_next (n, 6, 15): with respect to the keyframe and, for `pose` alone, the one after it (else of length
+    0); J_imu (n, 6, 24 or 0): with respect to the IMU intrinsics.
     """
 
     rotation: np.ndarray
     position: np.ndarray
     rate: np.ndarray
     velocity: np.ndarray
-    J_node: np.ndarray
+    J_keyframe: np.ndarray
     J_next: np.ndarray
     J_imu: np.ndarray
 
@@ -55,45 +55,46 @@ class Poses:
 class Velocities(NamedTuple):
     """How the velocity in `Poses` (world, m/s) moves in the `inertial` scheme.
 
-    acceleration (n, 3) world m/s^2, its time derivative; J_node (n, 3, 15), J_imu (n, 3, 24 or 0): with respect to
-    the node and the IMU intrinsics. All of length 0 where not wanted.
+    acceleration (n, 3) world m/s^2, its time derivative; J_keyframe (n, 3, 15), J_imu (n, 3, 24 or 0): with respect to
+    the keyframe and the IMU intrinsics. All of length 0 where not wanted.
     """
 
     acceleration: np.ndarray
-    J_node: np.ndarray
+    J_keyframe: np.ndarray
     J_imu: np.ndarray
 
     @classmethod
     def empty(cls, n: int, n_imu: int) -> Velocities:
-        return cls(np.empty((n, 3)), np.zeros((n, 3, NODE)), np.zeros((n, 3, n_imu)))
+        return cls(np.empty((n, 3)), np.zeros((n, 3, KEYFRAME_DIM)), np.zeros((n, 3, n_imu)))
 
 
-def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray, forwards: bool = False) -> np.ndarray:
-    """(n,) node of each time: the nearest one, or for `pose`, and where motion is carried `forwards` only (see
+def assign_keyframes(scheme: Scheme, keyframes: np.ndarray, times: np.ndarray, forwards: bool = False) -> np.ndarray:
+    """(n,) keyframe of each time: the nearest one, or for `pose`, and where motion is carried `forwards` only (see
     `ImuData`), the one before it."""
-    after = np.clip(np.searchsorted(nodes, times, side="right"), 1, len(nodes) - 1)
+    after = np.clip(np.searchsorted(keyframes, times, side="right"), 1, len(keyframes) - 1)
     if scheme == "pose" or forwards:
         return after - 1
-    return after - (times - nodes[after - 1] < nodes[after] - times)
+    return after - (times - keyframes[after - 1] < keyframes[after] - times)
 
 
 @njit(cache=True, nogil=True)
 def _velocity(i, R, run, force, g, at, moving):
-    """Fills entry i of `moving`: increments `run` (see `integration_step`) from a node at R, and `force` at the
+    """Fills entry i of `moving`: increments `run` (see `integration_step`) from a keyframe at R, and `force` at the
     instant."""
     first = 0 * i
-    _fill_start(i, first, R, run, J + 3 * STRIDE, moving.J_node, moving.J_imu)
-    _fill_turn(i, first, R, run, V, moving.J_node)
+    _fill_start(i, first, R, run, J + 3 * STRIDE, moving.J_keyframe, moving.J_imu)
+    _fill_turn(i, first, R, run, V, moving.J_keyframe)
     for a in range(3):
         row = at.rotation[i, a, 0], at.rotation[i, a, 1], at.rotation[i, a, 2]
         moving.acceleration[i, a] = row[0] * force[0] + row[1] * force[1] + row[2] * force[2]
-        moving.J_node[i, a, 6 + a] = 1.0
+        moving.J_keyframe[i, a, 6 + a] = 1.0
     moving.acceleration[i, 2] -= g
 
 
 @njit(cache=True, nogil=True)
 def _fill_pose(i, dt, R, run, Jn, Jx):
-    """Fills entry i of the Jacobians of a pose: dt and increments `run` (see `integration_step`) from a node at R."""
+    """Fills entry i of the Jacobians of a pose: dt and increments `run` (see `integration_step`) from a keyframe at
+    R."""
     first = 0 * i  # an integer and no literal, for which all is compiled once more
     _fill_start(i, first + 3, R, run, J + 6 * STRIDE, Jn, Jx)
     _fill_turn(i, first + 3, R, run, P, Jn)
@@ -110,7 +111,7 @@ def _fill_pose(i, dt, R, run, Jn, Jx):
 
 @njit(cache=True, nogil=True)
 def _fill_turn(i, r, R, run, o, Jn):
-    """Rows r.. of Jn[i] by the rotation R of the node, of an increment d (3,), run[o:], in its axes: -R hat(d)."""
+    """Rows r.. of Jn[i] by the rotation R of the keyframe, of an increment d (3,), run[o:], in its axes: -R hat(d)."""
     d = run[o], run[o + 1], run[o + 2]
     for a in range(3):
         R0, R1, R2 = R[3 * a], R[3 * a + 1], R[3 * a + 2]
@@ -131,31 +132,33 @@ def _fill_start(i, r, R, x, o, Jn, Jx):
 
 
 @njit(cache=True, nogil=True)
-def _inertial(ways, nodes, readings, intrinsics, at, Jn, Jx, moving):
+def _inertial(ways, keyframes, readings, intrinsics, at, Jn, Jx, moving):
     """Fills `at`, a `Moving`, and where they are not empty the Jacobians and `moving`."""
     width = 6 + Jx.shape[2] if len(Jn) else 0
     by, carried, run = correction(intrinsics), nothing_carried(), np.empty(SIZE)
     for i in ways.order:
-        k, t = ways.node[i], ways.times[i]
-        t0, bias = nodes.seconds[k], bias_of(nodes.bias, k)
-        rate, force = integrate_from_node(k, t0, t, ways.first[i], bias, readings, by, carried, run, width)
-        place(i, t - t0, k, nodes, run, rate, at)
+        k, t = ways.keyframe[i], ways.times[i]
+        t0, bias = keyframes.seconds[k], bias_of(keyframes.bias, k)
+        rate, force = integrate_from_keyframe(k, t0, t, ways.first[i], bias, readings, by, carried, run, width)
+        place(i, t - t0, k, keyframes, run, rate, at)
         if len(Jn):
-            _fill_pose(i, t - t0, rotation_of(nodes, k), run, Jn, Jx)
+            _fill_pose(i, t - t0, rotation_of(keyframes, k), run, Jn, Jx)
         if len(moving.acceleration):
-            _velocity(i, rotation_of(nodes, k), run, force, nodes.gravity, at, moving)
+            _velocity(i, rotation_of(keyframes, k), run, force, keyframes.gravity, at, moving)
 
 
 @njit(cache=True, nogil=True)
-def _kinematic(times, node, first, nodes, R, p, v, b, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx):
+def _kinematic(
+    times, keyframe, first, keyframes, R, p, v, b, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx
+):
     F, G, H = correction_matrices(intrinsics)
     n_x = Jx.shape[2]
     by, run = correction(intrinsics), np.zeros(SIZE)
     w, f = np.empty(3), np.empty(3)
     for i in range(len(times)):
-        k, j = node[i], first[i]
-        dt = times[i] - nodes[k]
-        s = (nodes[k] - t[j]) / (t[j + 1] - t[j])
+        k, j = keyframe[i], first[i]
+        dt = times[i] - keyframes[k]
+        s = (keyframes[k] - t[j]) / (t[j + 1] - t[j])
         for a in range(3):
             w[a] = f[a] = 0.0
             for c in range(3):
@@ -185,11 +188,11 @@ def _kinematic(times, node, first, nodes, R, p, v, b, t, gyro, accel, intrinsics
 
 
 @njit(cache=True, nogil=True)
-def _between(times, node, nodes, R, p, out_R, out_p, rate, vel, Jn, Jm):
+def _between(times, keyframe, keyframes, R, p, out_R, out_p, rate, vel, Jn, Jm):
     for i in range(len(times)):
-        k = node[i]
-        span = nodes[k + 1] - nodes[k]
-        s = (times[i] - nodes[k]) / span
+        k = keyframe[i]
+        span = keyframes[k + 1] - keyframes[k]
+        s = (times[i] - keyframes[k]) / span
         R01 = np.ascontiguousarray(R[k].T) @ R[k + 1]
         phi = so3.log(R01)
         turned = so3.exp(s * phi)
@@ -207,62 +210,68 @@ def _between(times, node, nodes, R, p, out_R, out_p, rate, vel, Jn, Jm):
                 Jm[i, a, c] = slide[a, c]
 
 
-def poses_of_nodes(node: np.ndarray, state: State) -> Poses:
-    """IMU poses at the nodes, with zero rate and velocity: without an IMU, measurements lie at nodes and time
+def poses_of_keyframes(keyframe: np.ndarray, state: State) -> Poses:
+    """IMU poses at the keyframes, with zero rate and velocity: without an IMU, measurements lie at keyframes and time
     derivatives play no role."""
-    n = len(node)
-    J_node, still = np.zeros((n, 6, NODE)), np.zeros((n, 3))
-    J_node[:, range(6), range(6)] = 1.0
-    nothing = np.zeros((0, 6, NODE))
-    return Poses(state.rotation[node], state.position[node], still, still, J_node, nothing, np.zeros((n, 6, 0)))
+    n = len(keyframe)
+    J_keyframe, still = np.zeros((n, 6, KEYFRAME_DIM)), np.zeros((n, 3))
+    J_keyframe[:, range(6), range(6)] = 1.0
+    nothing = np.zeros((0, 6, KEYFRAME_DIM))
+    return Poses(
+        state.rotation[keyframe], state.position[keyframe], still, still, J_keyframe, nothing, np.zeros((n, 6, 0))
+    )
 
 
 def poses_at(
-    scheme: Scheme, times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
+    scheme: Scheme, times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> Poses:
-    """IMU poses at `times` (n,) seconds on the imu clock, each from its `node` (see `assign_nodes`)."""
+    """IMU poses at `times` (n,) seconds on the imu clock, each from its `keyframe` (see `assign_keyframes`)."""
     n = len(times)
     if scheme == "inertial":
-        return _carried(_empty(n, n, imu_free), times, node, state, imu, gravity, Velocities.empty(0, 0))
-    out, J_node, J_imu = Moving.empty(n), np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
-    J_next = np.zeros((n if scheme == "pose" else 0, 6, NODE))
+        return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, Velocities.empty(0, 0))
+    out, J_keyframe, J_imu = (
+        Moving.empty(n),
+        np.zeros((n, 6, KEYFRAME_DIM)),
+        np.zeros((n, 6, N_INTRINSICS if imu_free else 0)),
+    )
+    J_next = np.zeros((n if scheme == "pose" else 0, 6, KEYFRAME_DIM))
     if scheme == "pose":
-        _between(times, node, state.seconds, state.rotation, state.position, *out, J_node, J_next)
+        _between(times, keyframe, state.seconds, state.rotation, state.position, *out, J_keyframe, J_next)
     else:
         _kinematic(
-            times, node, imu.interval(state.seconds[node]), state.seconds, state.rotation, state.position,
+            times, keyframe, imu.interval(state.seconds[keyframe]), state.seconds, state.rotation, state.position,
             state.velocity, state.bias, imu.seconds, imu.gyro, imu.accel, state.values[imu.name, "intrinsics"],
-            *out, J_node, J_imu,
+            *out, J_keyframe, J_imu,
         )  # fmt: skip
-    return Poses(*out, J_node, J_next, J_imu)
+    return Poses(*out, J_keyframe, J_next, J_imu)
 
 
-def poses_alone(times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float) -> Poses:
+def poses_alone(times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float) -> Poses:
     """The `inertial` poses of `poses_at` with Jacobians of length 0."""
-    return _carried(_empty(len(times), 0, False), times, node, state, imu, gravity, Velocities.empty(0, 0))
+    return _carried(_empty(len(times), 0, False), times, keyframe, state, imu, gravity, Velocities.empty(0, 0))
 
 
 def motion_at(
-    times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
+    times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> tuple[Poses, Velocities]:
     """The `inertial` poses of `poses_at`, and how their velocities move."""
     n = len(times)
     moving = Velocities.empty(n, N_INTRINSICS if imu_free else 0)
-    return _carried(_empty(n, n, imu_free), times, node, state, imu, gravity, moving), moving
+    return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, moving), moving
 
 
 def _empty(n: int, n_jacobians: int, imu_free: bool) -> Poses:
     """To be filled with n `inertial` poses and the Jacobians of as many, or of none."""
     J_imu = np.zeros((n_jacobians, 6, N_INTRINSICS if imu_free else 0))
-    return Poses(*Moving.empty(n), np.zeros((n_jacobians, 6, NODE)), np.zeros((0, 6, NODE)), J_imu)
+    return Poses(*Moving.empty(n), np.zeros((n_jacobians, 6, KEYFRAME_DIM)), np.zeros((0, 6, KEYFRAME_DIM)), J_imu)
 
 
 def _carried(
-    out: Poses, times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, moving: Velocities
+    out: Poses, times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, moving: Velocities
 ) -> Poses:
     """Fills `out` with the `inertial` poses, and `moving` where it is not empty; returns `out`."""
-    ways, nodes = ways_from(state, times, node, imu), nodes_of(state, gravity)
+    ways, keyframes = ways_from(state, times, keyframe, imu), keyframes_of(state, gravity)
     at = Moving(out.rotation, out.position, out.rate, out.velocity)
     intrinsics = state.values[imu.name, "intrinsics"]
-    _inertial(ways, nodes, readings_of(imu, True), intrinsics, at, out.J_node, out.J_imu, moving)
+    _inertial(ways, keyframes, readings_of(imu, True), intrinsics, at, out.J_keyframe, out.J_imu, moving)
     return out

@@ -1,5 +1,5 @@
-"""Rows of a sensor between nodes, into the normal equations: what factors share whose measurements lie between two
-neighbouring nodes."""
+"""Rows of a sensor between keyframes, into the normal equations: what factors share whose measurements lie between two
+neighbouring keyframes."""
 
 from __future__ import annotations
 
@@ -40,22 +40,26 @@ def in_chunks(own: slice) -> Iterator[slice]:
         yield slice(start, min(start + CHUNK, own.stop))
 
 
-def of_recordings(node: np.ndarray, starts: tuple[int, ...], n_nodes: int, piece: Piece) -> Iterator[tuple[int, slice]]:
-    """The rows in `piece` of measurements at keyframes `node` (n,), in order, CHUNK at a time: number of the recording,
-    and its rows. Rows belong to intervals: those at the last keyframe, number n_nodes - 1, go to the last interval.
-    starts: the first keyframe of each recording."""
-    edges = np.searchsorted(node, (*starts, n_nodes))
-    low, high = np.searchsorted(np.minimum(node, n_nodes - 2), [piece.first, piece.last])
+def of_recordings(
+    keyframe: np.ndarray, starts: tuple[int, ...], n_keyframes: int, piece: Piece
+) -> Iterator[tuple[int, slice]]:
+    """The rows in `piece` of measurements at keyframes `keyframe` (n,), in order, CHUNK at a time: number of the
+    recording, and its rows. Rows belong to intervals: those at the last keyframe, number n_keyframes - 1, go to the
+    last interval. starts: the first keyframe of each recording."""
+    edges = np.searchsorted(keyframe, (*starts, n_keyframes))
+    low, high = np.searchsorted(np.minimum(keyframe, n_keyframes - 2), [piece.first, piece.last])
     for k in range(len(starts)):
         for some in in_chunks(slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))):
             yield k, some
 
 
-def add_rows(rows: Rows, own: slice, node: np.ndarray, columns: np.ndarray, noise: RobustNoise, into: Into) -> float:
-    """Adds the rows `own` of a factor, each to the interval that begins at its keyframe `node` (n,), and fills
+def add_rows(
+    rows: Rows, own: slice, keyframe: np.ndarray, columns: np.ndarray, noise: RobustNoise, into: Into
+) -> float:
+    """Adds the rows `own` of a factor, each to the interval that begins at its keyframe `keyframe` (n,), and fills
     `into.out`; returns half the robust chi^2. columns (c,): calibration columns of rows.J, -1 where fixed."""
     loss = Loss(LOSSES[noise.loss], noise.loss_scale, into.curved)
     return accumulate_rows(
-        rows, node, noise.whitening, loss, columns, into.piece.sums(into.sums), into.out.residual[own],
+        rows, keyframe, noise.whitening, loss, columns, into.piece.sums(into.sums), into.out.residual[own],
         into.out.root[own],
     )  # fmt: skip

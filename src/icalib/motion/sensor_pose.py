@@ -22,9 +22,9 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.motion.clocks import mounted_columns, offset_at
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import Poses, poses_alone, poses_at, poses_of_nodes
-from icalib.optim.rows import KEYFRAMES, Rows, U
-from icalib.optim.state import NODE, Layout, State
+from icalib.motion.poses import Poses, poses_alone, poses_at, poses_of_keyframes
+from icalib.optim.rows import KEYFRAME_PAIR_DIM, Rows, U
+from icalib.optim.state import KEYFRAME_DIM, Layout, State
 from icalib.rig import Scheme
 
 OFFSET = 6  # number of the time offset among the calibration parameters of a pose
@@ -75,14 +75,14 @@ class Kinematics:
         """The IMU whose intrinsics are estimated; empty where there is none."""
         return self.imu.name if self.imu is not None and self.layout.is_free(self.imu.name, "intrinsics") else ""
 
-    def imu_poses(self, seconds: np.ndarray, node: np.ndarray, state: State, jacobians: bool = True) -> Poses:
-        """Poses of the IMU at `seconds` (n,) on the sensor's clock, each from its keyframe `node` (n,)."""
+    def imu_poses(self, seconds: np.ndarray, keyframe: np.ndarray, state: State, jacobians: bool = True) -> Poses:
+        """Poses of the IMU at `seconds` (n,) on the sensor's clock, each from its keyframe `keyframe` (n,)."""
         if self.imu is None:
-            return poses_of_nodes(node, state)
-        times = seconds + offset_at(state, self.sensor, node)
+            return poses_of_keyframes(keyframe, state)
+        times = seconds + offset_at(state, self.sensor, keyframe)
         if self.scheme == "inertial" and not jacobians:
-            return poses_alone(times, node, state, self.imu, self.gravity)
-        return poses_at(self.scheme, times, node, state, self.imu, self.gravity, bool(self._imu))
+            return poses_alone(times, keyframe, state, self.imu, self.gravity)
+        return poses_at(self.scheme, times, keyframe, state, self.imu, self.gravity, bool(self._imu))
 
 
 class SensorPose(NamedTuple):
@@ -95,22 +95,22 @@ class SensorPose(NamedTuple):
     p_world_sensor: np.ndarray
     rate: np.ndarray
     velocity: np.ndarray
-    J_node: np.ndarray
+    J_keyframe: np.ndarray
     J_next: np.ndarray
     J_imu: np.ndarray
 
     @classmethod
     def at(
-        cls, kinematics: Kinematics, seconds: np.ndarray, node: np.ndarray, state: State, jacobians: bool = True
+        cls, kinematics: Kinematics, seconds: np.ndarray, keyframe: np.ndarray, state: State, jacobians: bool = True
     ) -> SensorPose:
-        """At `seconds` (n,) on the sensor's clock, each from its keyframe `node` (n,). Without `jacobians` these may be
-        of length 0. A sensor without a rotation has the axes of the body."""
-        name, imu = kinematics.sensor, kinematics.imu_poses(seconds, node, state, jacobians)
+        """At `seconds` (n,) on the sensor's clock, each from its keyframe `keyframe` (n,). Without `jacobians` these
+        may be of length 0. A sensor without a rotation has the axes of the body."""
+        name, imu = kinematics.sensor, kinematics.imu_poses(seconds, keyframe, state, jacobians)
         R_is = np.ascontiguousarray(state.values.get((name, "rotation"), np.eye(3)))
         p_is = state.values[name, "translation"]
         R_sw = np.ascontiguousarray((imu.rotation @ R_is).transpose(0, 2, 1))
         p_ws = imu.position + imu.rotation @ p_is
-        return cls(R_is, p_is, R_sw, p_ws, imu.rate, imu.velocity, imu.J_node, imu.J_next, imu.J_imu)
+        return cls(R_is, p_is, R_sw, p_ws, imu.rate, imu.velocity, imu.J_keyframe, imu.J_next, imu.J_imu)
 
     @property
     def rotation(self) -> np.ndarray:
@@ -141,11 +141,11 @@ def rows_at(residual: np.ndarray, J_pose: Sequence[np.ndarray], ends: Sequence[S
     """
     n, m, n_pose = *residual.shape, ends[0].n_calib
     if not len(J_own):
-        return Rows(residual, np.zeros((0, m, KEYFRAMES + n_pose)))
-    J = np.zeros((n, m, KEYFRAMES + n_pose + J_own.shape[2]))
-    J[:, :, KEYFRAMES + n_pose :] = J_own
+        return Rows(residual, np.zeros((0, m, KEYFRAME_PAIR_DIM + n_pose)))
+    J = np.zeros((n, m, KEYFRAME_PAIR_DIM + n_pose + J_own.shape[2]))
+    J[:, :, KEYFRAME_PAIR_DIM + n_pose :] = J_own
     for k, (by_pose, at) in enumerate(zip(J_pose, ends, strict=True)):
-        _chain_rows(by_pose, at, NODE * k, J)
+        _chain_rows(by_pose, at, KEYFRAME_DIM * k, J)
     return Rows(residual, J)
 
 
@@ -165,7 +165,14 @@ def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
     """Adds to T (m, w) the derivatives of m rows through pose i of the sensor, J_pose (m, 6), or through that of the
     IMU, J_imu_pose (m, 6): by its keyframe from column `first` on, by calibration parameters from column `calib` on.
     Numbers are unsigned, see `add_product`."""
-    R, rate, velocity, J_node, J_next, J_imu = at.R_imu_sensor, at.rate, at.velocity, at.J_node, at.J_next, at.J_imu
+    R, rate, velocity, J_keyframe, J_next, J_imu = (
+        at.R_imu_sensor,
+        at.rate,
+        at.velocity,
+        at.J_keyframe,
+        at.J_next,
+        at.J_imu,
+    )
     n_imu, has_next, own, mounted, x = U(J_imu.shape[2]), len(J_next) > 0, U(first), U(calib), U(i)
     imu, offset = mounted + U(N_MOUNTED), mounted + U(OFFSET)
     for r in range(U(T.shape[0])):
@@ -173,11 +180,11 @@ def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
             f = J_imu_pose[r, k]
             if f == 0.0:
                 continue
-            for j in range(U(NODE)):
-                T[r, own + j] += f * J_node[x, k, j]
+            for j in range(U(KEYFRAME_DIM)):
+                T[r, own + j] += f * J_keyframe[x, k, j]
             if has_next:
-                for j in range(U(NODE)):
-                    T[r, own + U(NODE) + j] += f * J_next[x, k, j]
+                for j in range(U(KEYFRAME_DIM)):
+                    T[r, own + U(KEYFRAME_DIM) + j] += f * J_next[x, k, j]
             for j in range(n_imu):
                 T[r, imu + j] += f * J_imu[x, k, j]
         for k in range(U(3)):
@@ -202,7 +209,7 @@ def fill_chain(i, at, A, T):
 @njit(cache=True, nogil=True)
 def chain_width(at):
     """How many columns keyframes have: 30 where poses depend on two, else 15."""
-    return KEYFRAMES if len(at.J_next) else NODE
+    return KEYFRAME_PAIR_DIM if len(at.J_next) else KEYFRAME_DIM
 
 
 @njit(cache=True, nogil=True)
@@ -217,4 +224,4 @@ def _chain_rows(J_pose, at, first, J):
                 B[q, c] = 0.0
                 for k in range(6):
                     B[q, c] += J_pose[i, q, k] * A[k, c]
-        add_chain(i, at, J_pose[i], B, first, KEYFRAMES, J[i])
+        add_chain(i, at, J_pose[i], B, first, KEYFRAME_PAIR_DIM, J[i])

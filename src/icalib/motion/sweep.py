@@ -12,8 +12,8 @@ from icalib.data.measurements import Stream
 from icalib.geometry.small import mul3
 from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
-from icalib.motion.nodes import usable
-from icalib.motion.poses import assign_nodes, poses_alone
+from icalib.motion.keyframe_placement import usable
+from icalib.motion.poses import assign_keyframes, poses_alone
 from icalib.optim.state import State
 
 
@@ -30,11 +30,11 @@ class Motion:
         """Numbers (n,) of the stream's measurements that lie within `within_s` of a keyframe and in no gap of the IMU
         that is not bridged, in the order of their keyframes; and these keyframes (n,)."""
         times = instants(stream, self.state.values)
-        node = assign_nodes("inertial", self.state.seconds, times, self.imu.forwards)
-        near = np.abs(times - self.state.seconds[node]) <= within_s
+        keyframe = assign_keyframes("inertial", self.state.seconds, times, self.imu.forwards)
+        near = np.abs(times - self.state.seconds[keyframe]) <= within_s
         own = np.flatnonzero(near & usable(self.imu, times, self.max_gap_s))
-        own = own[np.argsort(node[own], kind="stable")]
-        return own, node[own]
+        own = own[np.argsort(keyframe[own], kind="stable")]
+        return own, keyframe[own]
 
 
 class Sweep(NamedTuple):
@@ -68,11 +68,11 @@ def _to_lidar(R_il, p_il, R, p, rate, velocity):
 
 
 def sweep(drive: Motion, name: str, times: np.ndarray, near: np.ndarray | None = None) -> Sweep:
-    """Where LiDAR `name` is and how it moves at `times` (n,) on the IMU's clock, by the IMU's readings from the nodes
-    next to them, or next to `near` (n,)."""
+    """Where LiDAR `name` is and how it moves at `times` (n,) on the IMU's clock, by the IMU's readings from the
+    keyframes next to them, or next to `near` (n,)."""
     state, imu = drive.state, drive.imu
-    node = assign_nodes("inertial", state.seconds, times if near is None else near)
-    imu_at = poses_alone(times, node, state, imu, drive.gravity)
+    keyframe = assign_keyframes("inertial", state.seconds, times if near is None else near)
+    imu_at = poses_alone(times, keyframe, state, imu, drive.gravity)
     R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
     found = Sweep(imu_at.rotation, imu_at.position, imu_at.rate, imu_at.velocity)
     _to_lidar(np.ascontiguousarray(R_il), p_il, *found)

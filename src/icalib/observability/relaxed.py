@@ -85,7 +85,7 @@ def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
         problem = found.judged.problem(freed, state, held)
         pieces, residuals = problem.pieces(), problem.residuals()
         problem.linearise(state, pieces, residuals, curved=True)
-        solution = solve(pieces, problem.n_nodes, problem.tolerance, held=held)
+        solution = solve(pieces, problem.n_keyframes, problem.tolerance, held=held)
     except EstimationError:
         return None
     return Relaxed(freed, problem, state, solution, residuals, inputs.layout, tuple(stated_keys(inputs, freed.layout)))

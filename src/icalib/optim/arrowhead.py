@@ -1,12 +1,12 @@
-"""Normal equations of a chain of nodes with dense calibration parameters: an arrowhead, solved in time linear in the
-chain.
+"""Normal equations of a chain of keyframes with dense calibration parameters: an arrowhead, solved in time linear in
+the chain.
 
     [ T   E ] [chain ]     [g_chain ]      T: block tridiagonal, 15 x 15 blocks
     [ E^T C ] [calib ] = - [g_calib ]      E: chain x calib, C: calib x calib
 
-The chain is cut into pieces that share their end nodes. Each piece is accumulated and eliminated on its own, by its own
-thread, towards the node that it shares with its neighbour; shared node and calibration parameters are what is left at
-the end. The number of pieces does not depend on the number of cores, so that the answer does not either."""
+The chain is cut into pieces that share their end keyframes. Each piece is accumulated and eliminated on its own, by its
+own thread, towards the keyframe that it shares with its neighbour; shared keyframe and calibration parameters are what
+is left at the end. The number of pieces does not depend on the number of cores, so that the answer does not either."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from icalib.optim.calib_block import NOTHING, calib_draws, calib_step
 from icalib.optim.chain_kernels import damp, eliminate_chain, forward_solve, substitute_chain
 from icalib.optim.front import Eliminated, Features, eliminate
 from icalib.optim.front_plan import plan
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 
 T = TypeVar("T")
 THREADS = 2  # pieces of the chain; more would need separators of their own
-SEGMENT = 512  # nodes at a time, where nothing is asked of the chain itself
+SEGMENT = 512  # keyframes at a time, where nothing is asked of the chain itself
 
 
 @cache
@@ -49,7 +49,7 @@ def in_parallel(function: Callable[..., T], items: Iterable) -> list[T]:
 
 
 class Sums(NamedTuple):
-    """What a kernel adds to: the arrays of the `Piece` that starts at node `first`, empty where only residuals are
+    """What a kernel adds to: the arrays of the `Piece` that starts at keyframe `first`, empty where only residuals are
     wanted."""
 
     first: int
@@ -61,11 +61,11 @@ class Sums(NamedTuple):
 
 @dataclass
 class Piece:
-    """J^T J and J^T r of the factors between nodes `first` and `last`, both included.
+    """J^T J and J^T r of the factors between keyframes `first` and `last`, both included.
 
-    diagonal (n, 15, 15); upper (n, 15, 15), node k with node k + 1; side (n, 15, B + 1), node with calib, the node's
-    gradient in the last column; calib (B + 1, B + 1), the calibration parameters' gradient in its last column;
-    features: those that are seen from its nodes alone, to be eliminated with them."""
+    diagonal (n, 15, 15); upper (n, 15, 15), keyframe k with keyframe k + 1; side (n, 15, B + 1), keyframe with calib,
+    the keyframe's gradient in the last column; calib (B + 1, B + 1), the calibration parameters' gradient in its last
+    column; features: those that are seen from its keyframes alone, to be eliminated with them."""
 
     first: int
     last: int
@@ -81,16 +81,16 @@ class Piece:
         return cls(
             first,
             last,
-            pages.zeros((n, NODE, NODE)),
-            pages.zeros((n, NODE, NODE)),
-            pages.zeros((n, NODE, n_calib + 1)),
+            pages.zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)),
+            pages.zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)),
+            pages.zeros((n, KEYFRAME_DIM, n_calib + 1)),
             np.zeros((n_calib + 1, n_calib + 1)),
         )
 
     @classmethod
     def bare(cls, first: int, last: int) -> Piece:
         """For residuals alone: nothing to add to."""
-        nothing = np.zeros((0, NODE, NODE))
+        nothing = np.zeros((0, KEYFRAME_DIM, KEYFRAME_DIM))
         return cls(first, last, nothing, nothing, nothing, np.zeros((0, 0)))
 
     def clear(self) -> None:
@@ -100,7 +100,7 @@ class Piece:
             self.features.sums.clear()
 
     def without_last(self) -> Piece:
-        """The same sums without node `last`, of which they must say nothing."""
+        """The same sums without keyframe `last`, of which they must say nothing."""
         features = self.features
         if features is not None:
             features = Features.of(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
@@ -113,16 +113,16 @@ class Piece:
         return Sums(piece.first, piece.diagonal, piece.upper, piece.side, piece.calib)
 
 
-def chain_cuts(n_nodes: int) -> tuple[int, ...]:
-    """The nodes that two pieces share: the middle one; none where the chain is too short."""
-    middle = n_nodes // 2
+def chain_cuts(n_keyframes: int) -> tuple[int, ...]:
+    """The keyframes that two pieces share: the middle one; none where the chain is too short."""
+    middle = n_keyframes // 2
     return () if middle < 2 else (middle,)
 
 
-def make_pieces(n_nodes: int, n_calib: int | None) -> tuple[Piece, ...]:
+def make_pieces(n_keyframes: int, n_calib: int | None) -> tuple[Piece, ...]:
     """Two pieces of about the same length; one where the chain is too short to share. Without calibration parameters,
     bare ones."""
-    ends = (0, *chain_cuts(n_nodes), n_nodes - 1)
+    ends = (0, *chain_cuts(n_keyframes), n_keyframes - 1)
     if n_calib is not None:
         pages.give_back()  # there is no moment at which more is needed
     return tuple(Piece.bare(a, b) if n_calib is None else Piece.zeros(a, b, n_calib) for a, b in pairwise(ends))
@@ -141,12 +141,12 @@ class Factors:
     """Result of block elimination (Cholesky factors) that back substitution and sampling need.
 
     pieces: overwritten by their factors. done: per piece, see `_reduce`. shared (15, 15), shared_side (15, B + 1): of
-    the node that all pieces share; empty without one. information (B, B): marginal information of the calibration
+    the keyframe that all pieces share; empty without one. information (B, B): marginal information of the calibration
     parameters. tolerance, held: see calib_step."""
 
     pieces: tuple[Piece, ...]
     done: list[Eliminated | bool]
-    n_nodes: int
+    n_keyframes: int
     shared: np.ndarray
     shared_side: np.ndarray
     information: np.ndarray
@@ -154,12 +154,12 @@ class Factors:
     held: np.ndarray
 
     def back(self, calib: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
-        """Back substitution: (K, 15, m) node parts of m solutions.
+        """Back substitution: (K, 15, m) keyframe parts of m solutions.
 
         calib (B + 1, m): calibration parts; last row: factor on the gradient (1 solves, 0 samples). white: additional
-        right-hand sides after forward substitution, per piece, then of the shared node."""
+        right-hand sides after forward substitution, per piece, then of the shared keyframe."""
         m = calib.shape[1]
-        chain = np.zeros((self.n_nodes, NODE, m))
+        chain = np.zeros((self.n_keyframes, KEYFRAME_DIM, m))
         if len(self.shared):
             chain[self.pieces[0].last] = np.linalg.solve(np.tril(self.shared).T, white[-1] - self.shared_side @ calib)
         keep = len(self.shared) > 0
@@ -168,7 +168,7 @@ class Factors:
         return chain
 
     def rows(self) -> list[int]:
-        """Unknowns of each piece, and of the shared node."""
+        """Unknowns of each piece, and of the shared keyframe."""
         return [*(_unknowns(p, d) for p, d in zip(self.pieces, self.done, strict=True)), len(self.shared)]
 
     def draws(self, rng: np.random.Generator, free: int, still: int) -> tuple[Draw, ...]:
@@ -227,7 +227,7 @@ class NotDefiniteError(EstimationError):
 
 
 def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
-    """(B + 1, B + 1) what the eliminated chain of a piece, but for a kept end node, takes from the calibration
+    """(B + 1, B + 1) what the eliminated chain of a piece, but for a kept end keyframe, takes from the calibration
     parameters."""
     rows = piece.side
     if keep:
@@ -237,7 +237,8 @@ def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
 
 
 def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
-    """Eliminates a piece in place, but for a kept end node: that node's sums and the calibration parameters' are left.
+    """Eliminates a piece in place, but for a kept end keyframe: that keyframe's sums and the calibration parameters'
+    are left.
 
     Returns `Eliminated` for a piece with features. Without features, returns True, and the factors are in the piece's
     own arrays. False: not positive definite."""
@@ -251,12 +252,12 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
     if done is None:
         return False
     left = np.triu(done.left) + np.triu(done.left, 1).T
-    kept = NODE if keep else 0
+    kept = KEYFRAME_DIM if keep else 0
     piece.calib += left[kept:, kept:]
     if keep:
         end = -1 if forwards else 0
-        piece.diagonal[end] += left[:NODE, :NODE]
-        piece.side[end] += left[:NODE, NODE:]
+        piece.diagonal[end] += left[:KEYFRAME_DIM, :KEYFRAME_DIM]
+        piece.side[end] += left[:KEYFRAME_DIM, KEYFRAME_DIM:]
     return done
 
 
@@ -269,29 +270,29 @@ def _reduce_all(piece: Piece) -> Eliminated | bool:
 
 
 def _unknowns(piece: Piece, done: Eliminated | bool) -> int:
-    """Number of eliminated unknowns of a piece; without features, a kept end node counts too."""
-    return done.rows if isinstance(done, Eliminated) else len(piece.diagonal) * NODE
+    """Number of eliminated unknowns of a piece; without features, a kept end keyframe counts too."""
+    return done.rows if isinstance(done, Eliminated) else len(piece.diagonal) * KEYFRAME_DIM
 
 
 def marginalise(piece: Piece) -> np.ndarray:
-    """Border (B + 1, B + 1) with all nodes of `piece` eliminated; overwrites the piece. Raises NotDefiniteError."""
+    """Border (B + 1, B + 1) with all keyframes of `piece` eliminated; overwrites the piece. Raises NotDefiniteError."""
     _reduce_all(piece)
     return piece.calib
 
 
 def given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
-    """(n, 15, m) the best steps of the nodes of `piece` where the calibration parameters make steps (B, m); overwrites
-    the piece. Raises NotDefiniteError."""
+    """(n, 15, m) the best steps of the keyframes of `piece` where the calibration parameters make steps (B, m);
+    overwrites the piece. Raises NotDefiniteError."""
     done, m = _reduce_all(piece), calib.shape[1]
-    chain = np.zeros((piece.last + 1, NODE, m))
+    chain = np.zeros((piece.last + 1, KEYFRAME_DIM, m))
     _back(piece, done, np.zeros((_unknowns(piece, done), m)), False, np.vstack([calib, np.ones((1, m))]), chain)
     return chain[piece.first :]
 
 
-def marginalise_in_segments(piece: Callable[[int, int], Piece], n_nodes: int) -> np.ndarray:
-    """As `marginalise`, of a whole chain whose `piece` from one node to another is made when it is its turn, so that
-    the chain never lies in memory as a whole."""
-    ends = [*range(0, n_nodes - 1, SEGMENT), n_nodes - 1]
+def marginalise_in_segments(piece: Callable[[int, int], Piece], n_keyframes: int) -> np.ndarray:
+    """As `marginalise`, of a whole chain whose `piece` from one keyframe to another is made when it is its turn, so
+    that the chain never lies in memory as a whole."""
+    ends = [*range(0, n_keyframes - 1, SEGMENT), n_keyframes - 1]
     spans, rest = list(pairwise(ends)), None
     for k in range(0, len(spans), THREADS):
         for own in in_parallel(lambda span: piece(*span), spans[k : k + THREADS]):
@@ -304,7 +305,7 @@ def marginalise_in_segments(piece: Callable[[int, int], Piece], n_nodes: int) ->
 
 
 def _onto_last(piece: Piece) -> Piece:
-    """The last node and the calibration parameters, all other nodes eliminated. Raises NotDefiniteError."""
+    """The last keyframe and the calibration parameters, all other keyframes eliminated. Raises NotDefiniteError."""
     if not eliminate_chain(piece.diagonal, piece.upper, piece.side, True, True):
         raise NotDefiniteError(BROKEN_DOWN)
     last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1)
@@ -317,22 +318,23 @@ def _onto_last(piece: Piece) -> Piece:
 def _back(
     piece: Piece, done: Eliminated | bool, white: np.ndarray, keep: bool, calib: np.ndarray, chain: np.ndarray
 ) -> None:
-    """Fills the part of `chain` (K, 15, m) that belongs to a piece, from `calib` and the kept node's; see Factors."""
+    """Fills the part of `chain` (K, 15, m) that belongs to a piece, from `calib` and the kept keyframe's; see
+    Factors."""
     own = chain[piece.first : piece.last + 1]
     if isinstance(done, Eliminated):
         done.substitute(calib, white, own)
         return
     for k in range(calib.shape[1]):
         one, known = np.ascontiguousarray(own[:, :, k]), np.ascontiguousarray(calib[:, k])
-        noise, forwards = np.ascontiguousarray(white[:, k]).reshape(-1, NODE), piece.first == 0 or not keep
+        noise, forwards = np.ascontiguousarray(white[:, k]).reshape(-1, KEYFRAME_DIM), piece.first == 0 or not keep
         substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, known, noise, one)
-        # The shared node is given, and both pieces write their own nodes alone.
+        # The shared keyframe is given, and both pieces write their own keyframes alone.
         inner = slice(None) if not keep else slice(None, -1) if piece.first == 0 else slice(1, None)
         own[inner, :, k] = one[inner]
 
 
 def solve(
-    pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, damping: float = 0.0, held: np.ndarray = NOTHING
+    pieces: tuple[Piece, ...], n_keyframes: int, tolerance: np.ndarray, damping: float = 0.0, held: np.ndarray = NOTHING
 ) -> Solution:
     """Solves (H + damping diag(H)) step = -gradient, directions of the calibration parameters in `held` left alone (see
     calib_step); overwrites the pieces. Raises NotDefiniteError."""
@@ -356,5 +358,5 @@ def solve(
         forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side
     information = rest[:n_calib, :n_calib]
-    factors = Factors(pieces, done, n_nodes, shared, shared_side, information, tolerance, held)
+    factors = Factors(pieces, done, n_keyframes, shared, shared_side, information, tolerance, held)
     return Solution.of(factors, rest[:, n_calib])

@@ -1,4 +1,4 @@
-"""Compiled elimination of a chain of nodes with calibration parameters, and the way back (`arrowhead.py`)."""
+"""Compiled elimination of a chain of keyframes with calibration parameters, and the way back (`arrowhead.py`)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ def _transpose(A):
 
 @njit(cache=True, nogil=True)
 def eliminate_chain(diagonal, upper, side, forwards, keep):
-    """Factorises in place from one end to the other; with `keep`, the last node is only updated. False: not definite.
+    """Factorises in place from one end to the other; with `keep`, the last keyframe is only updated. False: not
+    definite.
 
     Afterwards diagonal holds L_k, link (upper, turned when running backwards) L_k^-1 T[k, next], side L_k^-1 side.
     """
@@ -66,7 +67,7 @@ def eliminate_chain(diagonal, upper, side, forwards, keep):
 @njit(cache=True, nogil=True)
 def substitute_chain(diagonal, upper, side, forwards, keep, calib, white, chain):
     """Back substitution: fills chain (n, 15) from calib (B + 1,), its last number what the gradient counts, and with
-    `keep` the last node's step in it; white (n, 15): what stands on the right beside the gradient."""
+    `keep` the last keyframe's step in it; white (n, 15): what stands on the right beside the gradient."""
     n = diagonal.shape[0]
     for step in range(n - 2 if keep else n - 1, -1, -1):
         k = step if forwards else n - 1 - step

@@ -1,7 +1,8 @@
-"""Elimination of a chain whose nodes are tied together by features, each seen from many nodes (paper (15), Schur).
+"""Elimination of a chain whose keyframes are tied together by features, each seen from many keyframes (paper (15),
+Schur).
 
-The plan (`front_plan.py`) says in which order nodes and features go; the steps (`front_kernels.py`) are compiled. The
-cost of a step grows with the square of the number of features that are alive.
+The plan (`front_plan.py`) says in which order keyframes and features go; the steps (`front_kernels.py`) are compiled.
+The cost of a step grows with the square of the number of features that are alive.
 """
 
 from __future__ import annotations
@@ -10,15 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.optim.front_kernels import Chain, Sizes, eliminate_all, substitute_all, turn_nodes
+from icalib.optim.front_kernels import Chain, Sizes, eliminate_all, rotate_keyframes, substitute_all
 from icalib.optim.front_plan import FeatureSums, Plan
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 
 
 @dataclass(frozen=True)
 class Features:
-    """Those of a `Piece`: their sums, the steps in which nodes and features are eliminated, and room for the factors:
-    each elimination overwrites that of the one before, because memory that is new costs more than what it is for."""
+    """Those of a `Piece`: their sums, the steps in which keyframes and features are eliminated, and room for the
+    factors: each elimination overwrites that of the one before, because memory that is new costs more than what it is
+    for."""
 
     sums: FeatureSums
     plan: Plan
@@ -38,8 +40,8 @@ class Features:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """The factors of all steps in `room`, how nodes were turned, and what is `left` (15 or 0 + B + 1): the kept node
-    and the calibration parameters, upper triangle."""
+    """The factors of all steps in `room`, how keyframes were turned, and what is `left` (15 or 0 + B + 1): the kept
+    keyframe and the calibration parameters, upper triangle."""
 
     plan: Plan
     sizes: Sizes
@@ -53,18 +55,18 @@ class Eliminated:
         return int(self.sizes.rest.sum() + self.sizes.coupled.sum() + self.sizes.dying.sum())
 
     def substitute(self, calib: np.ndarray, white: np.ndarray, chain: np.ndarray) -> None:
-        """Back substitution: fills `chain` (n, 15, m), of which the kept node is given, from calib (B + 1, m), its
+        """Back substitution: fills `chain` (n, 15, m), of which the kept keyframe is given, from calib (B + 1, m), its
         last row what the gradient counts; white (rows, m): what stands on the right beside the gradient."""
         substitute_all(self.plan, self.sizes, self.turn, self.room, calib, white, chain)
 
 
 def _sizes(plan: Plan, n_calib: int) -> Sizes:
-    coupled = np.add.reduceat(np.append(plan.coupled[plan.nodes.values], 0), plan.nodes.start[:-1])
-    counts = np.diff(plan.nodes.start)
+    coupled = np.add.reduceat(np.append(plan.coupled[plan.keyframes.values], 0), plan.keyframes.start[:-1])
+    counts = np.diff(plan.keyframes.start)
     coupled[counts == 0] = 0
-    rest, dying, wide = NODE * counts - coupled, 3 * np.diff(plan.dying.start), n_calib + 3 * plan.alive
-    room = (rest + coupled) ** 2 + dying * (dying + coupled) + rest * (NODE + n_calib)
-    room += (coupled + dying) * (NODE + wide)
+    rest, dying, wide = KEYFRAME_DIM * counts - coupled, 3 * np.diff(plan.dying.start), n_calib + 3 * plan.alive
+    room = (rest + coupled) ** 2 + dying * (dying + coupled) + rest * (KEYFRAME_DIM + n_calib)
+    room += (coupled + dying) * (KEYFRAME_DIM + wide)
     return Sizes(rest, coupled, dying, wide, np.concatenate([[0], np.cumsum(room)]))
 
 
@@ -77,12 +79,15 @@ def eliminate(
     widest = int(sizes.wide.max())
     turn, room = np.empty_like(diagonal), features.room
     chain = Chain(diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose))
-    turn_nodes(plan, sums, turn, chain.pose, chain.next_pose)
-    front, carry = np.zeros((widest, widest)), np.zeros((NODE, NODE + widest))
+    rotate_keyframes(plan, sums, turn, chain.pose, chain.next_pose)
+    front, carry = np.zeros((widest, widest)), np.zeros((KEYFRAME_DIM, KEYFRAME_DIM + widest))
     if not eliminate_all(plan, sizes, sums, chain, room, front, carry):
         return None
     if not keep:
         return Eliminated(plan, sizes, turn, room, front[:n_calib, :n_calib].copy())
-    left = np.zeros((NODE + n_calib, NODE + n_calib))
-    left[:NODE], left[NODE:, NODE:] = carry[:, : NODE + n_calib], front[:n_calib, :n_calib]
+    left = np.zeros((KEYFRAME_DIM + n_calib, KEYFRAME_DIM + n_calib))
+    left[:KEYFRAME_DIM], left[KEYFRAME_DIM:, KEYFRAME_DIM:] = (
+        carry[:, : KEYFRAME_DIM + n_calib],
+        front[:n_calib, :n_calib],
+    )
     return Eliminated(plan, sizes, turn, room, left)

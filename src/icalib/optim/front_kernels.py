@@ -1,8 +1,8 @@
-"""Compiled steps of the elimination of nodes and features (`front.py`), in place in a front that fits the cache.
+"""Compiled steps of the elimination of keyframes and features (`front.py`), in place in a front that fits the cache.
 
 The front is the upper triangle over calibration parameters and features in slots; `carry` (15, 15 + .) what is left of
-the node that comes next: with itself, calibration parameters, features. Matrices are split into rows that meet no
-feature ("rest") and those that do ("coupled"), and the former are eliminated first: of a node that one camera sees
+the keyframe that comes next: with itself, calibration parameters, features. Matrices are split into rows that meet no
+feature ("rest") and those that do ("coupled"), and the former are eliminated first: of a keyframe that one camera sees
 from, six dimensions of 15 meet any."""
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry.blas import factorise, solve_transposed, solve_upper, subtract_gram, subtract_product
 
-NODE, POSE = 15, 6
+KEYFRAME_DIM, POSE = 15, 6
 
 
 class Chain(NamedTuple):
-    """Nodes of the piece: diagonal, upper (n, 15, 15), side (n, 15, B + 1), the direction, and how each is turned:
+    """Keyframes of the piece: diagonal, upper (n, 15, 15), side (n, 15, B + 1), the direction, and how each is turned:
     turn (n, 15, 15), its columns the new dimensions; pose and next_pose by these (I, 6, 15)."""
 
     diagonal: np.ndarray
@@ -43,7 +43,8 @@ class Sizes(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _factors(g, sizes, n_b, room):
-    """Views of step g: U of the nodes, and of dying features; nodes by these; rows of rest, and of all others."""
+    """Views of step g: U of the keyframes, and of dying features; keyframes by these; rows of rest, and of all
+    others."""
     a, c, d, w = sizes.rest[g], sizes.coupled[g], sizes.dying[g], sizes.wide[g]
     o, p = sizes.start[g], a + c
     U = room[o : o + p * p].reshape(p, p)
@@ -52,9 +53,9 @@ def _factors(g, sizes, n_b, room):
     o += d * d
     D = room[o : o + c * d].reshape(c, d)
     o += c * d
-    Wr = room[o : o + a * (NODE + n_b)].reshape(a, NODE + n_b)
-    o += a * (NODE + n_b)
-    return U, Ud, D, Wr, room[o : o + (c + d) * (NODE + w)].reshape(c + d, NODE + w)
+    Wr = room[o : o + a * (KEYFRAME_DIM + n_b)].reshape(a, KEYFRAME_DIM + n_b)
+    o += a * (KEYFRAME_DIM + n_b)
+    return U, Ud, D, Wr, room[o : o + (c + d) * (KEYFRAME_DIM + w)].reshape(c + d, KEYFRAME_DIM + w)
 
 
 @njit(cache=True, nogil=True)
@@ -71,8 +72,8 @@ def _mirror(v, first, M):
 @njit(cache=True, nogil=True)
 def _reflect(T, Q):
     """Q (15, 15), orthogonal: T Q has nothing but zeros behind its first rows' number of columns (Householder)."""
-    A, v = T.T.copy(), np.empty(NODE)
-    Q[:] = np.eye(NODE)
+    A, v = T.T.copy(), np.empty(KEYFRAME_DIM)
+    Q[:] = np.eye(KEYFRAME_DIM)
     for k in range(A.shape[1]):
         norm = np.sqrt((A[k:, k] ** 2).sum())
         if norm == 0.0:
@@ -86,23 +87,23 @@ def _reflect(T, Q):
 
 
 @njit(cache=True, nogil=True)
-def turn_nodes(plan, sums, turn, pose, next_pose):
-    """Turns every node such that what meets features comes first."""
-    n, seeing = len(turn), np.zeros(len(sums.node), dtype=np.bool_)
+def rotate_keyframes(plan, sums, turn, pose, next_pose):
+    """Turns every keyframe such that what meets features comes first."""
+    n, seeing = len(turn), np.zeros(len(sums.keyframe), dtype=np.bool_)
     for e in range(len(sums.image)):
         seeing[sums.image[e]] = True
-    rows, filled = np.zeros((n, NODE, NODE)), np.zeros(n, dtype=np.int64)
-    for i in range(len(sums.node)):
-        k = sums.node[i]
-        if seeing[i] and plan.coupled[k] < NODE:
+    rows, filled = np.zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)), np.zeros(n, dtype=np.int64)
+    for i in range(len(sums.keyframe)):
+        k = sums.keyframe[i]
+        if seeing[i] and plan.coupled[k] < KEYFRAME_DIM:
             rows[k, filled[k] : filled[k] + POSE] = sums.pose[i]
             filled[k] += POSE
     for k in range(n):
-        turn[k] = np.eye(NODE)
+        turn[k] = np.eye(KEYFRAME_DIM)
         if filled[k]:
             _reflect(rows[k, : filled[k]], turn[k])
-    for i in range(len(sums.node)):
-        pose[i] = sums.pose[i] @ turn[sums.node[i]]
+    for i in range(len(sums.keyframe)):
+        pose[i] = sums.pose[i] @ turn[sums.keyframe[i]]
     for i in range(len(next_pose)):
         next_pose[i] = sums.next_pose[i]
 
@@ -121,13 +122,13 @@ def _join(g, plan, sums, n_b, front, carry, old_wide):
         for i in range(3):
             for j in range(i, 3):
                 front[b + i, b + j] = front[a + i, a + j]
-            carry[:, NODE + b + i] = carry[:, NODE + a + i]
+            carry[:, KEYFRAME_DIM + b + i] = carry[:, KEYFRAME_DIM + a + i]
     wide = n_b + 3 * plan.alive[g]
     for q in range(plan.born.start[g], plan.born.start[g + 1]):
         f, a = plan.born.values[q], n_b + 3 * plan.born_at[q]
         front[:a, a : a + 3] = 0.0
         front[a : a + 3, a:wide] = 0.0
-        carry[:, NODE + a : NODE + a + 3] = 0.0
+        carry[:, KEYFRAME_DIM + a : KEYFRAME_DIM + a + 3] = 0.0
     for q in range(plan.born.start[g], plan.born.start[g + 1]):
         f, a = plan.born.values[q], n_b + 3 * plan.born_at[q]
         for i in range(3):
@@ -140,11 +141,11 @@ def _join(g, plan, sums, n_b, front, carry, old_wide):
 
 @njit(cache=True, nogil=True)
 def _places(g, plan, rest, row):
-    """row (K, 15): where each dimension of the step's nodes stands, rest first."""
+    """row (K, 15): where each dimension of the step's keyframes stands, rest first."""
     r, c = 0, rest
-    for q in range(plan.nodes.start[g], plan.nodes.start[g + 1]):
-        k = plan.nodes.values[q]
-        for j in range(NODE):
+    for q in range(plan.keyframes.start[g], plan.keyframes.start[g + 1]):
+        k = plan.keyframes.values[q]
+        for j in range(KEYFRAME_DIM):
             if j < plan.coupled[k]:
                 row[k, j] = c
                 c += 1
@@ -154,29 +155,29 @@ def _places(g, plan, rest, row):
 
 
 @njit(cache=True, nogil=True)
-def _fill_nodes(g, plan, chain, row, U, Wr, Wc):
-    """Adds the sums of the step's nodes, each turned by its Q, to U, Wr and Wc.
+def _fill_keyframes(g, plan, chain, row, U, Wr, Wc):
+    """Adds the sums of the step's keyframes, each turned by its Q, to U, Wr and Wc.
 
-    U (a + c, a + c), upper triangle: the nodes with one another. Wr (a, .), Wc (c + d, .): the a rest rows and the c
-    coupled ones (then the d of dying features) by columns: 15 of the node after, calib, gradient, and features in Wc.
-    row (K, 15): see `_places`. q counts the step's nodes, k those of the piece."""
-    a, n_b, last = len(Wr), chain.side.shape[2], plan.nodes.start[g + 1] - 1
-    for q in range(plan.nodes.start[g], last + 1):
-        k = plan.nodes.values[q]
+    U (a + c, a + c), upper triangle: the keyframes with one another. Wr (a, .), Wc (c + d, .): the a rest rows and the
+    c coupled ones (then the d of dying features) by columns: 15 of the keyframe after, calib, gradient, and features in
+    Wc. row (K, 15): see `_places`. q counts the step's keyframes, k those of the piece."""
+    a, n_b, last = len(Wr), chain.side.shape[2], plan.keyframes.start[g + 1] - 1
+    for q in range(plan.keyframes.start[g], last + 1):
+        k = plan.keyframes.values[q]
         Q = chain.turn[k]
         own, side = Q.T @ chain.diagonal[k] @ Q, Q.T @ chain.side[k]
-        after = plan.nodes.values[q + 1] if q < last else plan.after[g]
-        link = np.zeros((NODE, NODE))
+        after = plan.keyframes.values[q + 1] if q < last else plan.after[g]
+        link = np.zeros((KEYFRAME_DIM, KEYFRAME_DIM))
         if after >= 0:
             link = Q.T @ (chain.upper[k] if chain.forwards else chain.upper[after].T.copy())
         if q < last:
             link = link @ chain.turn[after]
-        for i in range(NODE):
+        for i in range(KEYFRAME_DIM):
             x = row[k, i]
             into = Wr[x] if x < a else Wc[x - a]
             for j in range(n_b):
-                into[NODE + j] += side[i, j]
-            for j in range(NODE):
+                into[KEYFRAME_DIM + j] += side[i, j]
+            for j in range(KEYFRAME_DIM):
                 if row[k, j] >= x:
                     U[x, row[k, j]] += own[i, j]
                 if q == last:
@@ -188,13 +189,13 @@ def _fill_nodes(g, plan, chain, row, U, Wr, Wc):
 
 @njit(cache=True, nogil=True)
 def _fill_carry(g, plan, row, carry, U, Wc, rest):
-    """What the step before left of the first node."""
-    k = plan.nodes.values[plan.nodes.start[g]]
+    """What the step before left of the first keyframe."""
+    k = plan.keyframes.values[plan.keyframes.start[g]]
     x = row[k, 0]
-    for i in range(NODE):
-        for j in range(i, NODE):
+    for i in range(KEYFRAME_DIM):
+        for j in range(i, KEYFRAME_DIM):
             U[x + i, x + j] += carry[i, j]
-        Wc[x - rest + i, NODE:] += carry[i, NODE : Wc.shape[1]]
+        Wc[x - rest + i, KEYFRAME_DIM:] += carry[i, KEYFRAME_DIM : Wc.shape[1]]
 
 
 @njit(cache=True, nogil=True)
@@ -209,21 +210,21 @@ def _add_pose(T, n, block, rows, column, into):
 
 @njit(cache=True, nogil=True)
 def _fill_pairs(g, plan, sums, chain, row, rest, n_b, Wc, carry):
-    """Features in the front with the step's nodes, and with the one after (carry)."""
-    here, after = plan.nodes.start[g + 1] > plan.nodes.start[g], plan.after[g]
+    """Features in the front with the step's keyframes, and with the one after (carry)."""
+    here, after = plan.keyframes.start[g + 1] > plan.keyframes.start[g], plan.after[g]
     for q in range(plan.pair.start[g], plan.pair.start[g + 1]):
-        e, column = plan.pair.values[q], NODE + n_b + 3 * plan.pair_at[q]
+        e, column = plan.pair.values[q], KEYFRAME_DIM + n_b + 3 * plan.pair_at[q]
         i = sums.image[e]
-        k = sums.node[i]
+        k = sums.keyframe[i]
         if k == after or not here:
-            _add_pose(chain.pose[i], NODE, sums.block[e], 0, column, carry)
+            _add_pose(chain.pose[i], KEYFRAME_DIM, sums.block[e], 0, column, carry)
         else:
             _add_pose(chain.pose[i], plan.coupled[k], sums.block[e], row[k, 0] - rest, column, Wc)
         if len(chain.next_pose):
             if k + 1 == after or not here:
-                _add_pose(chain.next_pose[i], NODE, sums.block[e], 0, column, carry)
+                _add_pose(chain.next_pose[i], KEYFRAME_DIM, sums.block[e], 0, column, carry)
             else:
-                _add_pose(chain.next_pose[i], NODE, sums.block[e], row[k + 1, 0] - rest, column, Wc)
+                _add_pose(chain.next_pose[i], KEYFRAME_DIM, sums.block[e], row[k + 1, 0] - rest, column, Wc)
 
 
 @njit(cache=True, nogil=True)
@@ -237,7 +238,7 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
         for p in range(plan.local_start[at], plan.local_start[at + 1]):
             e = plan.local_pair[p]
             i = sums.image[e]
-            k = sums.node[i]
+            k = sums.keyframe[i]
             begin = row[k, 0] - rest
             for a in range(3):
                 for j in range(POSE):
@@ -255,8 +256,8 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
         solve_transposed(own, rows)
     subtract_gram(V[:, :coupled], U[rest:, rest:])
     # Of the calibration parameters features meet the `used` columns at most, and the gradient.
-    here, gradient, last = V[:, coupled : coupled + used], V[:, coupled + n_b - 1 :], NODE + n_b
-    subtract_product(V[:, :coupled], here, Wc[:coupled, NODE : NODE + used])
+    here, gradient, last = V[:, coupled : coupled + used], V[:, coupled + n_b - 1 :], KEYFRAME_DIM + n_b
+    subtract_product(V[:, :coupled], here, Wc[:coupled, KEYFRAME_DIM : KEYFRAME_DIM + used])
     subtract_product(V[:, :coupled], gradient, Wc[:coupled, last - 1 : last])
     subtract_gram(here, front[:used, :used])
     subtract_product(here, gradient, front[:used, n_b - 1 : n_b])
@@ -265,55 +266,60 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
 
 
 @njit(cache=True, nogil=True)
-def _eliminate_nodes(U, Wr, Wc, carry, front):
-    """Takes the step's nodes out of what comes next, but for the front, which is left to `_eliminate_dying`."""
+def _eliminate_keyframes(U, Wr, Wc, carry, front):
+    """Takes the step's keyframes out of what comes next, but for the front, which is left to `_eliminate_dying`."""
     a, c, thin = len(Wr), len(U) - len(Wr), Wr.shape[1]
     if not factorise(U):
         return False
     solve_transposed(U[:a, :a], Wr)
     subtract_product(U[:a, a:], Wr, Wc[:c, :thin])
     solve_transposed(U[a:, a:], Wc[:c])
-    subtract_product(Wr[:, :NODE], Wr, carry[:, :thin])
-    subtract_product(Wc[:c, :NODE], Wc[:c], carry[:, : Wc.shape[1]])
-    subtract_gram(Wr[:, NODE:], front[: thin - NODE, : thin - NODE])
+    subtract_product(Wr[:, :KEYFRAME_DIM], Wr, carry[:, :thin])
+    subtract_product(Wc[:c, :KEYFRAME_DIM], Wc[:c], carry[:, : Wc.shape[1]])
+    subtract_gram(Wr[:, KEYFRAME_DIM:], front[: thin - KEYFRAME_DIM, : thin - KEYFRAME_DIM])
     return True
 
 
 @njit(cache=True, nogil=True)
 def _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
-    """Takes dying features out of what comes next, and these and the nodes out of the front. False: not definite."""
-    dying, W, wide = plan.dying.values[plan.dying.start[g] : plan.dying.start[g + 1]], Wc[c:], Wc.shape[1] - NODE
+    """Takes dying features out of what comes next, and these and the keyframes out of the front. False: not
+    definite."""
+    dying, W, wide = (
+        plan.dying.values[plan.dying.start[g] : plan.dying.start[g + 1]],
+        Wc[c:],
+        Wc.shape[1] - KEYFRAME_DIM,
+    )
     for q in range(len(dying)):
         o = n_b + 3 * dying[q]
         for y in range(o):
             for i in range(3):
-                W[3 * q + i, NODE + y] = front[y, o + i]
+                W[3 * q + i, KEYFRAME_DIM + y] = front[y, o + i]
         for i in range(3):
             f, x = o + i, 3 * q + i
-            W[x, :NODE] = carry[:, NODE + f]
-            W[x, NODE + o : NODE + f] = front[o:f, f]
-            W[x, NODE + f :] = front[f, f:wide]
-            D[:, x] = Wc[:c, NODE + f]
-    subtract_product(D, Wc[:c, NODE:], W[:, NODE:])
+            W[x, :KEYFRAME_DIM] = carry[:, KEYFRAME_DIM + f]
+            W[x, KEYFRAME_DIM + o : KEYFRAME_DIM + f] = front[o:f, f]
+            W[x, KEYFRAME_DIM + f :] = front[f, f:wide]
+            D[:, x] = Wc[:c, KEYFRAME_DIM + f]
+    subtract_product(D, Wc[:c, KEYFRAME_DIM:], W[:, KEYFRAME_DIM:])
     for q in range(len(dying)):
         for i in range(3):
-            f, x = NODE + n_b + 3 * dying[q] + i, 3 * q + i
+            f, x = KEYFRAME_DIM + n_b + 3 * dying[q] + i, 3 * q + i
             Ud[:, x] = W[:, f]
             Wc[:, f] = 0.0
     if not factorise(Ud):
         return False
     solve_transposed(Ud, W)
-    subtract_product(W[:, :NODE], W, carry[:, : Wc.shape[1]])
-    subtract_gram(Wc[:, NODE:], front[:wide, :wide])
+    subtract_product(W[:, :KEYFRAME_DIM], W, carry[:, : Wc.shape[1]])
+    subtract_gram(Wc[:, KEYFRAME_DIM:], front[:wide, :wide])
     return True
 
 
 @njit(cache=True, nogil=True)
 def eliminate_all(plan, sizes, sums, chain, room, front, carry):
-    """All steps; their factors are left in `room`, the kept node's sums in `carry`, the calibration parameters' in
+    """All steps; their factors are left in `room`, the kept keyframe's sums in `carry`, the calibration parameters' in
     `front`. False: not definite."""
     n_b, old_wide = chain.side.shape[2], 0
-    row = np.zeros((len(chain.diagonal), NODE), dtype=np.int64)
+    row = np.zeros((len(chain.diagonal), KEYFRAME_DIM), dtype=np.int64)
     for g in range(len(plan.after)):
         a, c = sizes.rest[g], sizes.coupled[g]
         U, Ud, D, Wr, Wc = _factors(g, sizes, n_b, room)
@@ -322,14 +328,14 @@ def eliminate_all(plan, sizes, sums, chain, room, front, carry):
         if a + c:
             U[:], Wr[:], Wc[:] = 0.0, 0.0, 0.0
             _places(g, plan, a, row)
-            _fill_nodes(g, plan, chain, row, U, Wr, Wc)
+            _fill_keyframes(g, plan, chain, row, U, Wr, Wc)
             _fill_carry(g, plan, row, carry, U, Wc, a)
             carry[:] = 0.0
         _fill_pairs(g, plan, sums, chain, row, a, n_b, Wc, carry)
         if a + c:
             if not _eliminate_local(g, plan, sums, chain, row, a, U, Wc, front, c):
                 return False
-            if not _eliminate_nodes(U, Wr, Wc, carry, front):
+            if not _eliminate_keyframes(U, Wr, Wc, carry, front):
                 return False
         if not _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
             return False
@@ -345,24 +351,24 @@ def _solve_columns(U, X):
 
 @njit(cache=True, nogil=True)
 def substitute_all(plan, sizes, turn, room, calib, white, chain):
-    """Fills `chain` (n, 15, m), of which the kept node is given, from calib (B + 1, m), its last row what the gradient
-    counts; white (rows, m): what stands on the right beside the gradient, by step: rest, coupled, dying."""
+    """Fills `chain` (n, 15, m), of which the kept keyframe is given, from calib (B + 1, m), its last row what the
+    gradient counts; white (rows, m): what stands on the right beside the gradient, by step: rest, coupled, dying."""
     n_b, m, end = len(calib), calib.shape[1], len(white)
-    known = np.zeros((NODE + sizes.wide.max(), m))
-    known[NODE : NODE + n_b] = calib
+    known = np.zeros((KEYFRAME_DIM + sizes.wide.max(), m))
+    known[KEYFRAME_DIM : KEYFRAME_DIM + n_b] = calib
     for g in range(len(plan.after) - 1, -1, -1):
         a, c = sizes.rest[g], sizes.coupled[g]
         U, Ud, D, Wr, Wc = _factors(g, sizes, n_b, room)
         begin = end - a - len(Wc)
-        known[:NODE] = 0.0
+        known[:KEYFRAME_DIM] = 0.0
         if plan.after[g] >= 0:
-            known[:NODE] = chain[plan.after[g]]
+            known[:KEYFRAME_DIM] = chain[plan.after[g]]
         x = white[begin + a : end] - Wc @ known[: Wc.shape[1]]
         _solve_columns(Ud, x[c:])
         z = np.empty((a + c, m))
         z[a:] = x[:c] - D @ x[c:]
         _solve_columns(U[a:, a:], z[a:])
-        z[:a] = white[begin : begin + a] - Wr @ known[: NODE + n_b]
+        z[:a] = white[begin : begin + a] - Wr @ known[: KEYFRAME_DIM + n_b]
         for i in range(a):
             for j in range(a, a + c):
                 for k in range(m):
@@ -376,7 +382,7 @@ def substitute_all(plan, sizes, turn, room, calib, white, chain):
 @njit(cache=True, nogil=True)
 def _take_back(g, plan, n_b, dying, known):
     """Features in the slots that they had at the end of the step before."""
-    o = NODE + n_b
+    o = KEYFRAME_DIM + n_b
     for q in range(plan.dying.start[g], plan.dying.start[g + 1]):
         at, x = o + 3 * plan.dying.values[q], 3 * (q - plan.dying.start[g])
         known[at : at + 3] = dying[x : x + 3]
@@ -387,11 +393,11 @@ def _take_back(g, plan, n_b, dying, known):
 
 @njit(cache=True, nogil=True)
 def _turn_back(g, plan, rest, turn, z, chain):
-    """Steps of the nodes, in their own dimensions."""
-    r, c, x = 0, rest, np.empty((NODE, z.shape[1]))
-    for q in range(plan.nodes.start[g], plan.nodes.start[g + 1]):
-        k = plan.nodes.values[q]
+    """Steps of the keyframes, in their own dimensions."""
+    r, c, x = 0, rest, np.empty((KEYFRAME_DIM, z.shape[1]))
+    for q in range(plan.keyframes.start[g], plan.keyframes.start[g + 1]):
+        k = plan.keyframes.values[q]
         n = plan.coupled[k]
-        x[:n], x[n:] = z[c : c + n], z[r : r + NODE - n]
-        c, r = c + n, r + NODE - n
+        x[:n], x[n:] = z[c : c + n], z[r : r + KEYFRAME_DIM - n]
+        c, r = c + n, r + KEYFRAME_DIM - n
         chain[k] = turn[k] @ x

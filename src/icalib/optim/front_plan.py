@@ -1,10 +1,9 @@
-"""In which order the nodes of a piece and the features seen from them are eliminated, and what that costs.
+"""In which order the keyframes of a piece and the features seen from them are eliminated, and what that costs.
 
-Nodes go in groups, from one end of the piece to the other. A feature that one group alone sees goes before that group,
-whatever else there is. Any other joins the front with the first group that sees it and leaves with the last one, so
-that the answer is exact however long it lives; one that lives as long as the piece is a calibration parameter
-in all but name. A larger group keeps more features out of the front, and fewer are at its end: its size is
-chosen by cost."""
+Keyframes go in groups, from one end of the piece to the other. A feature that one group alone sees goes before that
+group, whatever else there is. Any other joins the front with the first group that sees it and leaves with the last one,
+so that the answer is exact however long it lives; one that lives as long as the piece is a calibration parameter in all
+but name. A larger group keeps more features out of the front, and fewer are at its end: its size is chosen by cost."""
 
 from __future__ import annotations
 
@@ -13,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 
 POSE = 6  # of a camera
-SIZES = (4, 8, 12, 16, 24, 32)  # nodes of a group
+SIZES = (4, 8, 12, 16, 24, 32)  # keyframes of a group
 # What costs beside the products of the front, in their multiplications (measured on one machine; groups of half or
 # twice the size that this finds best cost 10 % more):
 SMALL = 3.0  # one of a small factorisation or triangular solve
@@ -29,8 +28,8 @@ class FeatureSums(NamedTuple):
     """What features add to the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with calib,
     its gradient in the last column; block (E, 3, 6), feature with the camera's pose, of each pair of feature and image.
 
-    pose (I, 6, 15), a camera's pose by the node its image hangs on; next_pose (I or 0, 6, 15), by the node after. track
-    and image (E,) of the pairs, node (I,) of the images, all counted from the first of the piece.
+    pose (I, 6, 15), a camera's pose by the keyframe its image hangs on; next_pose (I or 0, 6, 15), by the keyframe
+    after. track and image (E,) of the pairs, keyframe (I,) of the images, all counted from the first of the piece.
     """
 
     own: np.ndarray
@@ -40,13 +39,19 @@ class FeatureSums(NamedTuple):
     next_pose: np.ndarray
     track: np.ndarray
     image: np.ndarray
-    node: np.ndarray
+    keyframe: np.ndarray
 
     @classmethod
     def zeros(
-        cls, n_tracks: int, track: np.ndarray, image: np.ndarray, node: np.ndarray, n_calib: int, by_next: bool = False
+        cls,
+        n_tracks: int,
+        track: np.ndarray,
+        image: np.ndarray,
+        keyframe: np.ndarray,
+        n_calib: int,
+        by_next: bool = False,
     ) -> FeatureSums:
-        pose = np.zeros((len(node), POSE, NODE))
+        pose = np.zeros((len(keyframe), POSE, KEYFRAME_DIM))
         return cls(
             np.zeros((n_tracks, 3, 3)),
             np.zeros((n_tracks, 3, n_calib + 1)),
@@ -55,7 +60,7 @@ class FeatureSums(NamedTuple):
             pose.copy() if by_next else pose[:0],
             track,
             image,
-            node,
+            keyframe,
         )
 
     def clear(self) -> None:
@@ -84,16 +89,17 @@ class Lists(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Steps of the elimination; each takes its nodes, in order, and `after` them (G,) comes another node (-1: none).
+    """Steps of the elimination; each takes its keyframes, in order, and `after` them (G,) comes another keyframe (-1:
+    none).
 
-    coupled (K,): how many of a node's dimensions meet features; turned such that these come first. Features in the
+    coupled (K,): how many of a keyframe's dimensions meet features; turned such that these come first. Features in the
     front have slots 0..alive (G,): at a step's beginning some move from slots `leave` to `enter`, then `born` ones join
     in slots `born_at`; at its end those in slots `dying` go. pair: pairs of the step's images with features in slots
     `pair_at`. local: features that go before all else, with their pairs: local_pair, of local feature l from
     local_start[l] on.
     """
 
-    nodes: Lists
+    keyframes: Lists
     after: np.ndarray
     coupled: np.ndarray
     alive: np.ndarray
@@ -111,8 +117,8 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True)
 class _Lives:
-    """Groups of nodes, the step (I,) of each image, first and last step (T,) of each feature (none: first > last), and
-    whether that is `local` (T,)."""
+    """Groups of keyframes, the step (I,) of each image, first and last step (T,) of each feature (none: first > last),
+    and whether that is `local` (T,)."""
 
     groups: list[np.ndarray]
     step: np.ndarray
@@ -121,24 +127,24 @@ class _Lives:
     local: np.ndarray
 
     @classmethod
-    def of(cls, sums: FeatureSums, n_nodes: int, forwards: bool, keep: bool, size: int, ends: np.ndarray) -> _Lives:
-        order = np.arange(n_nodes) if forwards else np.arange(n_nodes)[::-1]
+    def of(cls, sums: FeatureSums, n_keyframes: int, forwards: bool, keep: bool, size: int, ends: np.ndarray) -> _Lives:
+        order = np.arange(n_keyframes) if forwards else np.arange(n_keyframes)[::-1]
         pivots = order[:-1] if keep else order
         stretches = np.split(pivots, np.flatnonzero(np.diff(np.searchsorted(ends, pivots, side="right"))) + 1)
         groups = [s[k : k + size] for s in stretches for k in range(0, len(s), size)]
         if keep:
-            groups.append(order[:0])  # what still ties the kept node to features
-        which = np.full(n_nodes + 1, len(groups) - 1)
-        for g, nodes in enumerate(groups):
-            which[nodes] = g
-        step = which[sums.node]
+            groups.append(order[:0])  # what still ties the kept keyframe to features
+        which = np.full(n_keyframes + 1, len(groups) - 1)
+        for g, keyframes in enumerate(groups):
+            which[keyframes] = g
+        step = which[sums.keyframe]
         if len(sums.next_pose):
-            step = np.minimum(step, which[sums.node + 1])
+            step = np.minimum(step, which[sums.keyframe + 1])
         first, last = np.full(len(sums.own), len(groups)), np.full(len(sums.own), -1)
         np.minimum.at(first, sums.track, step[sums.image])
         np.maximum.at(last, sums.track, step[sums.image])
-        nodeless = len(groups) - 1 if keep else -1
-        local = (first == last) & (first != nodeless) & (len(sums.next_pose) == 0)
+        without_keyframes = len(groups) - 1 if keep else -1
+        local = (first == last) & (first != without_keyframes) & (len(sums.next_pose) == 0)
         return cls(groups, step, first, last, local)
 
     def cost(self, coupled: np.ndarray, n_calib: int) -> float:
@@ -147,41 +153,41 @@ class _Lives:
         born = np.bincount(self.first[lasting], minlength=n)[:n]
         died = np.bincount(self.last[lasting], minlength=n)[:n]
         wide = n_calib + 3.0 * (np.cumsum(born) - np.cumsum(died) + died)
-        nodes = NODE * np.array([len(g) for g in self.groups])
-        meets = np.array([coupled[g].sum() + (NODE - coupled[g[:1]]).sum() for g in self.groups])
+        keyframes = KEYFRAME_DIM * np.array([len(g) for g in self.groups])
+        meets = np.array([coupled[g].sum() + (KEYFRAME_DIM - coupled[g[:1]]).sum() for g in self.groups])
         rank = meets + 3.0 * died
-        small = nodes**3 / 6.0 + nodes**2 * n_calib / 2.0 + wide * rank**2 / 2.0
-        moved = CACHED * wide**2 + STORED * (rank * wide + nodes**2)
+        small = keyframes**3 / 6.0 + keyframes**2 * n_calib / 2.0 + wide * rank**2 / 2.0
+        moved = CACHED * wide**2 + STORED * (rank * wide + keyframes**2)
         return float((rank * wide**2 / 2.0 + SMALL * small + moved + STEP).sum())
 
 
 def plan(
     sums: FeatureSums,
-    n_nodes: int,
+    n_keyframes: int,
     forwards: bool,
     keep: bool,
     ends: np.ndarray = NO_ENDS,
     sizes: tuple[int, ...] = SIZES,
 ) -> Plan:
-    """Steps that eliminate `n_nodes` nodes and all features; with `keep`, all but the last node in this direction.
-    ends: nodes before which all features end; sizes: of groups, tried for the cheapest."""
-    met = np.zeros(n_nodes, dtype=np.int64)
-    np.add.at(met, sums.node[np.unique(sums.image)], POSE)
-    coupled = np.minimum(met, NODE) if not len(sums.next_pose) else np.full(n_nodes, NODE)
-    tried = [_Lives.of(sums, n_nodes, forwards, keep, s, ends) for s in sizes]
+    """Steps that eliminate `n_keyframes` keyframes and all features; with `keep`, all but the last keyframe in this
+    direction. ends: keyframes before which all features end; sizes: of groups, tried for the cheapest."""
+    met = np.zeros(n_keyframes, dtype=np.int64)
+    np.add.at(met, sums.keyframe[np.unique(sums.image)], POSE)
+    coupled = np.minimum(met, KEYFRAME_DIM) if not len(sums.next_pose) else np.full(n_keyframes, KEYFRAME_DIM)
+    tried = [_Lives.of(sums, n_keyframes, forwards, keep, s, ends) for s in sizes]
     lives = min(tried, key=lambda x: x.cost(coupled, sums.side.shape[2]))
-    return _steps(sums, lives, coupled, n_nodes, forwards)
+    return _steps(sums, lives, coupled, n_keyframes, forwards)
 
 
-def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_nodes: int, forwards: bool) -> Plan:
+def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_keyframes: int, forwards: bool) -> Plan:
     groups, n = lives.groups, len(lives.groups)
     ends = np.cumsum([len(g) for g in groups])
-    order = np.arange(n_nodes) if forwards else np.arange(n_nodes)[::-1]
-    after = np.append(order, -1)[np.minimum(ends, n_nodes)]
+    order = np.arange(n_keyframes) if forwards else np.arange(n_keyframes)[::-1]
+    after = np.append(order, -1)[np.minimum(ends, n_keyframes)]
     own = coupled.copy()
     for group in groups:
-        own[group[:1]] = NODE  # the step before left something in all of its dimensions
-    own[after[after >= 0]] = NODE
+        own[group[:1]] = KEYFRAME_DIM  # the step before left something in all of its dimensions
+    own[after[after >= 0]] = KEYFRAME_DIM
     tracks, in_front = np.arange(len(sums.own)), ~lives.local
     slots = _slots(lives, n)
     step = np.where(in_front[sums.track], lives.step[sums.image], -1)

@@ -1,4 +1,4 @@
-"""Gaussian priors on lasting parameters, and a very broad one on the biases of each recording's first node."""
+"""Gaussian priors on lasting parameters, and a very broad one on the biases of each recording's first keyframe."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ def variance_of_priors(covariance: np.ndarray, priors: Sequence[Prior], state: S
 
 
 def accumulate_bias_prior(
-    state: State, piece: Piece, sums: bool = True, centre: np.ndarray | None = None, node: int = 0
+    state: State, piece: Piece, sums: bool = True, centre: np.ndarray | None = None, keyframe: int = 0
 ) -> float:
-    """The broad prior on the biases of `node`, a recording's first, about `centre` (6,) or zero. Returns half its
+    """The broad prior on the biases of `keyframe`, a recording's first, about `centre` (6,) or zero. Returns half its
     chi^2."""
-    r = (state.bias[node] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
+    r = (state.bias[keyframe] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
     if sums:
-        index, k = np.arange(9, 15), node - piece.first
+        index, k = np.arange(9, 15), keyframe - piece.first
         piece.diagonal[k, index, index] += 1.0 / FIRST_BIAS_SIGMA**2
         piece.side[k, 9:15, -1] += r / FIRST_BIAS_SIGMA
     return 0.5 * float(r @ r)

@@ -8,9 +8,9 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.optim.robust_weights import weight
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 
-KEYFRAMES = 2 * NODE  # columns of a row by its keyframe and the next one
+KEYFRAME_PAIR_DIM = 2 * KEYFRAME_DIM  # columns of a row by its keyframe and the next one
 U = np.uint64
 
 
@@ -24,31 +24,31 @@ class Rows(NamedTuple):
     @classmethod
     def empty(cls, n: int, m: int, n_columns: int, jacobians: bool) -> Rows:
         """To be filled: residuals, and zeros for Jacobians by `n_columns` calibration parameters."""
-        return cls(np.empty((n, m)), np.zeros((n if jacobians else 0, m, KEYFRAMES + n_columns)))
+        return cls(np.empty((n, m)), np.zeros((n if jacobians else 0, m, KEYFRAME_PAIR_DIM + n_columns)))
 
     @property
-    def J_node(self) -> np.ndarray:
+    def J_keyframe(self) -> np.ndarray:
         """(n, m, 15) by the keyframe."""
-        return self.J[:, :, :NODE]
+        return self.J[:, :, :KEYFRAME_DIM]
 
     @property
     def J_next(self) -> np.ndarray:
         """(n, m, 15) by the next keyframe."""
-        return self.J[:, :, NODE:KEYFRAMES]
+        return self.J[:, :, KEYFRAME_DIM:KEYFRAME_PAIR_DIM]
 
     @property
     def J_calib(self) -> np.ndarray:
         """(n, m, c) by calibration parameters."""
-        return self.J[:, :, KEYFRAMES:]
+        return self.J[:, :, KEYFRAME_PAIR_DIM:]
 
-    def on_intervals(self, node: np.ndarray, n_nodes: int) -> np.ndarray:
-        """(n,) the interval between keyframes that each measurement at keyframe `node` (n,) is added to. The last
+    def on_intervals(self, keyframe: np.ndarray, n_keyframes: int) -> np.ndarray:
+        """(n,) the interval between keyframes that each measurement at keyframe `keyframe` (n,) is added to. The last
         keyframe ends one: Jacobians by it move to where those by the next keyframe are."""
-        interval = np.minimum(node, n_nodes - 2)
+        interval = np.minimum(keyframe, n_keyframes - 2)
         if len(self.J):
-            last = node > interval
-            self.J_next[last] = self.J_node[last]
-            self.J_node[last] = 0.0
+            last = keyframe > interval
+            self.J_next[last] = self.J_keyframe[last]
+            self.J_keyframe[last] = 0.0
         return interval
 
 
@@ -63,19 +63,19 @@ def add_product(k, n_chain, width, A, B, columns, sums):
     Numbers are unsigned: an index that may be negative is wrapped, and the compiler then takes one column at a time.
     """
     diagonal, upper, side = sums.diagonal, sums.upper, sums.side
-    n, end, n_b, block = U(n_chain), U(len(columns)), U(sums.calib.shape[0] - 1), U(NODE)
-    row, rest = np.empty(KEYFRAMES), np.empty(len(columns) + 1)
+    n, end, n_b, block = U(n_chain), U(len(columns)), U(sums.calib.shape[0] - 1), U(KEYFRAME_DIM)
+    row, rest = np.empty(KEYFRAME_PAIR_DIM), np.empty(len(columns) + 1)
     for i in range(n):
         is_next = i >= block
-        node, r, own = (U(k + 1), i - block, block) if is_next else (U(k), i, U(0))
+        keyframe, r, own = (U(k + 1), i - block, block) if is_next else (U(k), i, U(0))
         has_next = n > block and not is_next
         for j in range(block):
-            row[j] = diagonal[node, r, j]
+            row[j] = diagonal[keyframe, r, j]
             if has_next:
-                row[block + j] = upper[node, r, j]
+                row[block + j] = upper[keyframe, r, j]
         for j in range(end):
-            rest[j] = side[node, r, U(columns[j])] if columns[j] >= 0 else 0.0
-        rest[end] = side[node, r, n_b]
+            rest[j] = side[keyframe, r, U(columns[j])] if columns[j] >= 0 else 0.0
+        rest[end] = side[keyframe, r, n_b]
         for q in range(U(len(A))):
             f = A[q, i]
             if f == 0.0:
@@ -88,13 +88,13 @@ def add_product(k, n_chain, width, A, B, columns, sums):
             for j in range(end + U(1)):
                 rest[j] += f * B[q, n + j]
         for j in range(block):
-            diagonal[node, r, j] = row[j]
+            diagonal[keyframe, r, j] = row[j]
             if has_next:
-                upper[node, r, j] = row[block + j]
+                upper[keyframe, r, j] = row[block + j]
         for j in range(end):
             if columns[j] >= 0:
-                side[node, r, U(columns[j])] = rest[j]
-        side[node, r, n_b] = rest[end]
+                side[keyframe, r, U(columns[j])] = rest[j]
+        side[keyframe, r, n_b] = rest[end]
     for i in range(n, U(width)):
         if columns[i - n] >= 0:
             _add_calib(i, n, U(width), A, B, columns, sums.calib, rest)
@@ -160,7 +160,7 @@ def add_gradients(k, n_chain, G, T, columns, first, sums):
         for d in range(6):
             f = G[d, g]
             for i in range(n_chain):
-                side[k + i // NODE, i % NODE, first + g] += T[d, i] * f
+                side[k + i // KEYFRAME_DIM, i % KEYFRAME_DIM, first + g] += T[d, i] * f
             for i in range(n_c):
                 if columns[i] >= 0:
                     calib[columns[i], first + g] += T[d, n_chain + i] * f
@@ -197,9 +197,9 @@ def whiten(W, M, out):
 
 
 @njit(cache=True, nogil=True)
-def accumulate_rows(rows, node, W, loss, columns, sums, residual, root):
-    """Whitens rows by W (n, m, m), weighs them, and adds each to the interval that begins at its keyframe `node` (n,),
-    where sums are wanted.
+def accumulate_rows(rows, keyframe, W, loss, columns, sums, residual, root):
+    """Whitens rows by W (n, m, m), weighs them, and adds each to the interval that begins at its keyframe `keyframe`
+    (n,), where sums are wanted.
 
     columns (c,): of the calibration parameters in rows.J, -1 where fixed. residual, root (n, m): whitened residuals and
     square roots of their weights, out. Returns half the robust chi^2.
@@ -220,5 +220,5 @@ def accumulate_rows(rows, node, W, loss, columns, sums, residual, root):
             for j in range(width):
                 whitened[q, j] *= scaled[0, q]
             whitened[q, width] = scaled[1, q] * residual[i, q]
-        add_product(node[i] - sums.first, KEYFRAMES, width, whitened, whitened, columns, sums)
+        add_product(keyframe[i] - sums.first, KEYFRAME_PAIR_DIM, width, whitened, whitened, columns, sums)
     return cost

@@ -1,6 +1,6 @@
-"""What is estimated: the inertial states at the nodes, and the lasting parameters of the calibration parameters.
+"""What is estimated: the inertial states at the keyframes, and the lasting parameters of the calibration parameters.
 
-A node is (R_world_imu, p, v, b_g, b_a), 15 tangent dimensions in this order (paper (2)).
+A keyframe is (R_world_imu, p, v, b_g, b_a), 15 tangent dimensions in this order (paper (2)).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from icalib.geometry import planes, so3
 
-NODE = 15
+KEYFRAME_DIM = 15
 Key = tuple[str, str]  # sensor, parameter
 Kind = Literal["vector", "nuisance", "rotation", "tilt", "plane"]
 Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it is estimated
@@ -97,15 +97,15 @@ def make_layout(entries: list[Entry]) -> Layout:
     return Layout(tuple(blocks))
 
 
-# Of the weight of planes, or of 1 m^2: where these show nothing, the world turns as the first node does.
-FIRST_NODE = 1e-4
+# Of the weight of planes, or of 1 m^2: where these show nothing, the world turns as the first keyframe does.
+FIRST_KEYFRAME_WEIGHT = 1e-4
 
 
 @dataclass(frozen=True)
 class State:
-    """One estimate. seconds (K,) node times on the imu clock since its first stamp; world frame z up.
+    """One estimate. seconds (K,) keyframe times on the imu clock since its first stamp; world frame z up.
 
-    starts: the first node of each recording; each has a world of its own, whose origin is the board's.
+    starts: the first keyframe of each recording; each has a world of its own, whose origin is the board's.
     """
 
     seconds: np.ndarray
@@ -118,20 +118,20 @@ class State:
 
     @property
     def recording(self) -> np.ndarray:
-        """(K,) number of the recording of each node."""
+        """(K,) number of the recording of each keyframe."""
         return np.repeat(np.arange(len(self.starts)), np.diff((*self.starts, len(self.seconds))))
 
     @property
     def recordings(self) -> list[slice]:
-        """The nodes of each recording."""
+        """The keyframes of each recording."""
         return [slice(a, b) for a, b in pairwise((*self.starts, len(self.seconds)))]
 
     def retract(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> State:
         """The state moved by tangent steps chain (K, 15) and calib (B,).
 
-        A tilt of the board turns the whole trajectory of its recording with it, exactly; the nodes' own steps are what
-        they have beyond that, and turn too. To first order nothing changes. But where gravity is weakly known the tilt
-        is large against the precision of positions relative to the board: moved along the tangent they would leave
+        A tilt of the board turns the whole trajectory of its recording with it, exactly; the keyframes' own steps are
+        what they have beyond that, and turn too. To first order nothing changes. But where gravity is weakly known the
+        tilt is large against the precision of positions relative to the board: moved along the tangent they would leave
         their circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so. Without
         a board planes and trajectory turn by what turns them most alike.
         """
@@ -158,7 +158,7 @@ class State:
     def _common_turn(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> np.ndarray:
         """Rotation (3,) [world axes] common to all planes in this step, by least squares; without planes, that of the
         positions about their mean. Directions that neither determines, such as about a straight path, follow the first
-        node. On a flat floor all sensors may turn against the IMU: map and path turn then, and no node does."""
+        keyframe. On a flat floor all sensors may turn against the IMU: map and path turn then, and no keyframe does."""
         free = [b for b in layout.free if b.kind == "plane"]
         if free:
             x = np.array([self.values[b.key][:3] for b in free])
@@ -166,9 +166,9 @@ class State:
         else:
             x, moved = self.position - self.position.mean(axis=0), chain[:, 3:6] - chain[:, 3:6].mean(axis=0)
         spread = (x.T @ x) / len(x)
-        A = np.trace(spread) * np.eye(3) - spread + FIRST_NODE * np.eye(3)
+        A = np.trace(spread) * np.eye(3) - spread + FIRST_KEYFRAME_WEIGHT * np.eye(3)
         turned = np.cross(x, moved).mean(axis=0)
-        return np.linalg.solve(A, turned + FIRST_NODE * (self.rotation[0] @ chain[0, 0:3]))
+        return np.linalg.solve(A, turned + FIRST_KEYFRAME_WEIGHT * (self.rotation[0] @ chain[0, 0:3]))
 
     def _moved(self, block: Block, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """The value of a block of the calibration parameters, moved by `d` in a world that turns by `turn`."""

@@ -23,14 +23,14 @@ from icalib.report.plot import (
 )
 from icalib.result import Calibration
 
-MOST_NODES = 2000
+MAX_PLOTTED_KEYFRAMES = 2000
 BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")
 
 
 def imu_residuals(c: Calibration) -> Figure:
     """Whitened residuals of the IMU factor; each should scatter like a standard normal number, or less."""
     seconds, whitened = c.imu_residuals.seconds, c.imu_residuals.whitened
-    keep = thin(len(seconds), MOST_NODES)
+    keep = thin(len(seconds), MAX_PLOTTED_KEYFRAMES)
     return _panels(seconds[keep], [whitened[keep, 3 * b : 3 * b + 3] for b in range(5)], BLOCKS, 680)
 
 
@@ -41,7 +41,7 @@ def motion(c: Calibration) -> Figure:
     between = np.einsum("kji,kjl->kil", path.rotation[:-1], path.rotation[1:])
     rate = so3.log_many(np.ascontiguousarray(between)) / steps[:, None]
     rate[_seams(c)] = np.nan
-    keep, inner = thin(len(path.seconds), MOST_NODES), thin(len(steps), MOST_NODES)
+    keep, inner = thin(len(path.seconds), MAX_PLOTTED_KEYFRAMES), thin(len(steps), MAX_PLOTTED_KEYFRAMES)
     t = path.seconds
     panels = [
         (t[:-1][inner] + 0.5 * steps[inner], np.rad2deg(rate[inner])),
@@ -56,7 +56,7 @@ def motion(c: Calibration) -> Figure:
 def trajectory(c: Calibration) -> Figure:
     """Path of the IMU in the world, coloured by time, with the target at the origin."""
     path = c.trajectory
-    keep = thin(len(path.seconds), MOST_NODES)
+    keep = thin(len(path.seconds), MAX_PLOTTED_KEYFRAMES)
     color = {"color": numbers(path.seconds[keep]), "colorscale": "Viridis", "width": 4}
     color |= {"showscale": True, "colorbar": {"title": {"text": "time [s]"}, "thickness": 10}}
     ends = path.position[[0, -1]]

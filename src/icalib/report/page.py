@@ -36,7 +36,7 @@ def report_html(calibration: Calibration) -> str:
         "answer": f"{c.verdict[0].upper()}{c.verdict[1:]}. {NEXT[c.verdict]}",
         "ellipsoids": _ellipsoid_words(c),
         "legend": "".join(f"; {legend}" for legend in rig_shapes.legends(c)),
-        "most_nodes": motion_figures.MOST_NODES,
+        "most_keyframes": motion_figures.MAX_PLOTTED_KEYFRAMES,
     }
     parts = {
         "trust": tables.trust(c),

@@ -160,8 +160,8 @@ NOISE = ImuNoise(gyro=2e-4, accel=2e-3, gyro_walk=1e-5, accel_walk=1e-4)
 
 @dataclass(frozen=True)
 class World:
-    """A drive as the estimator sees it: IMU readings with a bias, nodes, wheel stamps on a clock of their own. state:
-    the truth."""
+    """A drive as the estimator sees it: IMU readings with a bias, keyframes, wheel stamps on a clock of their own.
+    state: the truth."""
 
     drive: Drive
     imu: ImuData
@@ -186,7 +186,7 @@ def make_world(
     drive: Drive,
     imu_hz: float = 200.0,
     wheel_hz: float = 70.0,
-    node_s: float = 0.05,
+    keyframe_s: float = 0.05,
     offset: float = 0.0123,
     noise_seed: int | None = None,
 ) -> World:
@@ -198,8 +198,8 @@ def make_world(
         gyro, accel = gyro + white[0] * NOISE.gyro, accel + white[1] * NOISE.accel
     stream = ImuStream("imu0", np.round(t * 1e9).astype(np.int64), gyro + BIAS[:3], accel + BIAS[3:])
     seconds = np.arange(0.0, drive.duration - 0.05, 1.0 / wheel_hz)
-    nodes = np.arange(0.0317, t[-1], node_s)
-    R, p, v = drive.pose(nodes)
+    keyframes = np.arange(0.0317, t[-1], keyframe_s)
+    R, p, v = drive.pose(keyframes)
     values = {
         ("imu0", "intrinsics"): np.zeros(24),
         ("wheel0", "rotation"): drive.R_imu_wheel,
@@ -214,13 +214,13 @@ def make_world(
             for (s, n), v in values.items()
         ]
     )
-    state = State(nodes, R, p, v, np.tile(BIAS, (len(nodes), 1)), values)
+    state = State(keyframes, R, p, v, np.tile(BIAS, (len(keyframes), 1)), values)
     return World(drive, ImuData.build(stream, NOISE), seconds, drive.angles(seconds + offset), layout, state)
 
 
 @dataclass(frozen=True)
 class PoseFactor:
-    """In place of cameras: poses of the nodes, measured with noise of rotation [rad] and position [m]."""
+    """In place of cameras: poses of the keyframes, measured with noise of rotation [rad] and position [m]."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -251,8 +251,8 @@ class DriveProblem:
     held: np.ndarray = field(default_factory=lambda: NOTHING)
 
     @property
-    def n_nodes(self):
-        return self.imu.n_nodes
+    def n_keyframes(self):
+        return self.imu.n_keyframes
 
     @property
     def tolerance(self):
@@ -262,7 +262,7 @@ class DriveProblem:
         return out
 
     def pieces(self):
-        return make_pieces(self.n_nodes, self.layout.size)
+        return make_pieces(self.n_keyframes, self.layout.size)
 
     def residuals(self):
         return self.imu.output(), self.wheels.output()

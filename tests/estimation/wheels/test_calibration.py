@@ -67,12 +67,12 @@ class Slipping:
         factor = IncrementFactor.build("wheel0", w.seconds, self.angles, w.imu, 9.81, self.noise, w.layout, state)
         dt = w.seconds[factor.intervals.last] - w.seconds[factor.intervals.first]
         measured = factor.measured.copy()
-        measured[:, 2:] += self.slip[factor.intervals.node] * np.sqrt(dt)[:, None]
+        measured[:, 2:] += self.slip[factor.intervals.keyframe] * np.sqrt(dt)[:, None]
         return replace(factor, measured=measured)
 
 
 def noisy(world, rng, noise, pose_sigma):
-    """Angles of the wheels, slip (K, 2), and rotation and position of the nodes, all with noise."""
+    """Angles of the wheels, slip (K, 2), and rotation and position of the keyframes, all with noise."""
     n, k = len(world.seconds), len(world.state.seconds)
     period = world.seconds[1] - world.seconds[0]
     angles = world.angles + np.cumsum(noise.wheel * np.sqrt(period) * rng.normal(size=(n, 2)), axis=0)
@@ -215,10 +215,12 @@ def paper_factor(world, angles, noise):
     return at
 
 
-def both_factors(drive_of_kind, world_of, problem_of, seed, wheel_noise, node_s):
+def both_factors(drive_of_kind, world_of, problem_of, seed, wheel_noise, keyframe_s):
     """Errors and standard deviations of yaw, x, y, time offset, radii, baseline by both factors, on the same planar
     drive. Without the upwards row, which (27) does not have."""
-    world = world_of(level_drive(drive_of_kind, seed, duration=10.0), wheel_hz=100.0, node_s=node_s, noise_seed=seed)
+    world = world_of(
+        level_drive(drive_of_kind, seed, duration=10.0), wheel_hz=100.0, keyframe_s=keyframe_s, noise_seed=seed
+    )
     noise = WheelNoise(wheel_noise, 5e-3, 1e4)
     angles, _, R, p = noisy(world, np.random.default_rng(seed + 100), noise, POSE_SIGMA)
     priors = pinned(world, [PINNED, PINNED, FREE], PINNED)
@@ -240,11 +242,11 @@ def test_paper_27_agrees_with_the_increments_on_short_planar_intervals(drive_of_
 
 def test_paper_27_makes_the_baseline_too_long_by_the_noise_in_its_yaw(drive_of_kind, world_of, problem_of):
     """Errors in variables: b (variance of the measured yaw) / (mean square of the true one)."""
-    node_s = 0.02
+    keyframe_s = 0.02
     for seed in range(3):
-        world, ((e, _), (paper_e, _)) = both_factors(drive_of_kind, world_of, problem_of, seed, 0.01, node_s)
-        yaw = np.diff(world.drive.yaw(np.arange(0.0, 10.0, node_s)))
-        variance = 0.01**2 * node_s * (world.drive.radii**2).sum() / world.drive.baseline**2
+        world, ((e, _), (paper_e, _)) = both_factors(drive_of_kind, world_of, problem_of, seed, 0.01, keyframe_s)
+        yaw = np.diff(world.drive.yaw(np.arange(0.0, 10.0, keyframe_s)))
+        variance = 0.01**2 * keyframe_s * (world.drive.radii**2).sum() / world.drive.baseline**2
         expected = world.drive.baseline * variance / np.mean(yaw**2)
         assert paper_e[-1] - e[-1] == pytest.approx(expected, rel=0.25)
         assert expected > 1e-3

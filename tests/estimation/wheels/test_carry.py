@@ -1,4 +1,4 @@
-"""What the IMU loses from a node to the end of a relative pose, against walks that are drawn."""
+"""What the IMU loses from a keyframe to the end of a relative pose, against walks that are drawn."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -44,10 +44,10 @@ def test_against_walks_of_orientation_and_speed():
         sampled = np.cov(drawn.T)
         scale = np.sqrt(np.diag(found[n]))
         np.testing.assert_allclose(sampled / np.outer(scale, scale), found[n] / np.outer(scale, scale), atol=0.08)
-    assert found[1, 2, 2] > 1e-8  # of the second, whose first end lies on its node, the other end alone counts
+    assert found[1, 2, 2] > 1e-8  # of the second, whose first end lies on its keyframe, the other end alone counts
 
 
-def test_at_the_nodes_nothing_is_lost():
+def test_at_the_keyframes_nothing_is_lost():
     eye: Any = SimpleNamespace(rotation=np.eye(3)[None], position=np.zeros((1, 3)))
     imu: Any = SimpleNamespace(variance=np.ones((3, 3)))
     np.testing.assert_array_equal(carried_noise(eye, eye, np.zeros((1, 2)), np.eye(3), np.ones(3), imu), 0.0)

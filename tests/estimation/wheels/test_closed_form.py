@@ -21,7 +21,7 @@ from .test_calibration import FREE, PINNED, Slipping, away, level_drive, noisy, 
 
 NOISE = WheelNoise(2e-3, 1e-4, 1e-4)
 POSE_SIGMA = 2e-4, 3e-4  # rad, m
-STRIDE = 5  # nodes from one end of a stretch to the other: 0.25 s
+STRIDE = 5  # keyframes from one end of a stretch to the other: 0.25 s
 
 
 def closed_form(turned, ways):

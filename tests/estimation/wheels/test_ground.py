@@ -68,7 +68,7 @@ def test_what_was_measured_of_the_height_counts_once(world_of, drive_of_kind):
     for piece in make_pieces(len(world.state.seconds), factor.layout.size):
         factor.accumulate(world.state, piece, out, sums=False)
     assert (out.residual[:, 3] ** 2).sum() == pytest.approx((0.03 / 0.004) ** 2, rel=1e-9)
-    assert factor.count(out, "ground height") == len(factor.nodes) and list(factor.kinds) == [
+    assert factor.count(out, "ground height") == len(factor.keyframes) and list(factor.kinds) == [
         "ground tilt",
         "ground height",
     ]
@@ -139,7 +139,7 @@ def test_recordings_that_do_not_see_the_floor_have_no_part(world_of, drive_of_ki
     world = standing(world_of, drive_of_kind, plane_of(np.array([0.0, 0.0, 1.0]), np.zeros(3)))
     state = replace(world.state, starts=(0, 30))
     factor = GroundFactor.build("wheel0", FLOOR, (None, KEY), state, world.imu, world.layout)
-    assert factor.nodes.tolist() == list(range(30, len(state.seconds) - 1))
+    assert factor.keyframes.tolist() == list(range(30, len(state.seconds) - 1))
     none = GroundFactor.build("wheel0", FLOOR, (None, None), state, world.imu, world.layout)
     found: Any = SimpleNamespace(
         problem=SimpleNamespace(factors={("seen", "ground"): factor, ("unseen", "ground"): none})
@@ -148,4 +148,4 @@ def test_recordings_that_do_not_see_the_floor_have_no_part(world_of, drive_of_ki
     assert (
         "none of the planes that LiDARs see is a floor" in words and "the ground of wheel0 counts for nothing" in words
     )
-    assert len(none.nodes) == 0 and none.rms(none.output(), "ground tilt") == (0.0, "rad")
+    assert len(none.keyframes) == 0 and none.rms(none.output(), "ground tilt") == (0.0, "rad")

@@ -39,8 +39,8 @@ def test_residuals_vanish_on_a_path_without_slip(drive_of_kind, world_of, kind, 
     assert np.abs(r[:, :2]).max() < wheel and np.abs(r[:, 2:]).max() < slip
 
 
-def test_residuals_vanish_where_stamps_are_rarer_than_nodes(drive_of_kind, world_of):
-    world = world_of(drive_of_kind("planar", 2), wheel_hz=8.0, node_s=0.025)
+def test_residuals_vanish_where_stamps_are_rarer_than_keyframes(drive_of_kind, world_of):
+    world = world_of(drive_of_kind("planar", 2), wheel_hz=8.0, keyframe_s=0.025)
     r = raw_residuals(factor_on(world), world.state)
     assert len(r) > 28
     assert np.abs(r[:, :2]).max() < 2e-6 and np.abs(r[:, 2:]).max() < 1e-7
@@ -52,12 +52,12 @@ def brisk(drive_of_kind, waves):
     return replace(drive_of_kind("planar"), yaw=waves(0.0, (1.05,), (0.159,), (0.2,)), speed=speed)
 
 
-@pytest.mark.parametrize(("node_s", "bound"), [(0.05, 2e-5), (0.5, 2e-4)])
+@pytest.mark.parametrize(("keyframe_s", "bound"), [(0.05, 2e-5), (0.5, 2e-4)])
 def test_the_integral_of_brisk_motion_is_good_to_hundredths_of_a_millimetre(
-    drive_of_kind, world_of, waves, node_s, bound
+    drive_of_kind, world_of, waves, keyframe_s, bound
 ):
     """Against Gauss's four points every 2 ms. Readings at 1 kHz, so that they hold the vibration."""
-    world = world_of(brisk(drive_of_kind, waves), imu_hz=1000.0, wheel_hz=100.0, node_s=node_s)
+    world = world_of(brisk(drive_of_kind, waves), imu_hz=1000.0, wheel_hz=100.0, keyframe_s=keyframe_s)
     t = np.linspace(0.0, 3.9, 4000)
     assert np.abs(world.drive.speed(t, 1)).max() > 5.0 and np.abs(world.drive.rate(t)).max() > np.deg2rad(59.0)
     r = raw_residuals(factor_on(world), world.state)

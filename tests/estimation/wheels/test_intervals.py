@@ -22,22 +22,22 @@ def imu():
 
 
 def pairs(found):
-    return list(zip(found.first.tolist(), found.last.tolist(), found.node.tolist(), strict=True))
+    return list(zip(found.first.tolist(), found.last.tolist(), found.keyframe.tolist(), strict=True))
 
 
-def test_the_stamps_nearest_to_the_nodes_are_taken(imu):
+def test_the_stamps_nearest_to_the_keyframes_are_taken(imu):
     times = np.arange(0.1, 0.5, 0.02)  # 0.1, 0.12, ...
     found = choose_intervals(imu, np.array([0.161, 0.2, 0.269]), (0,), times)
     assert pairs(found) == [(3, 5, 0), (5, 8, 1)]
 
 
-def test_nodes_denser_than_stamps_share_them_and_the_two_about_the_middle_carry_the_interval(imu):
-    nodes = np.arange(0.1, 0.45, 0.025)
+def test_keyframes_denser_than_stamps_share_them_and_the_two_about_the_middle_carry_the_interval(imu):
+    keyframes = np.arange(0.1, 0.45, 0.025)
     times = np.array([0.11, 0.21, 0.31])
-    found = choose_intervals(imu, nodes, (0,), times)
+    found = choose_intervals(imu, keyframes, (0,), times)
     assert [(a, b) for a, b, _ in pairs(found)] == [(0, 1), (1, 2)]
     for a, b, k in pairs(found):
-        assert nodes[k] <= 0.5 * (times[a] + times[b]) <= nodes[k + 1]
+        assert keyframes[k] <= 0.5 * (times[a] + times[b]) <= keyframes[k + 1]
 
 
 def test_outside_the_wheels_recording_there_are_no_intervals(imu):
@@ -47,24 +47,24 @@ def test_outside_the_wheels_recording_there_are_no_intervals(imu):
 
 
 def test_intervals_stay_off_gaps_of_the_imu_and_within_its_recording(imu):
-    times, nodes = np.arange(-0.2, 3.2, 0.01), np.arange(0.02, 2.97, 0.05)
-    nodes[0] = -0.1
-    found = choose_intervals(imu, nodes, (0,), times)
+    times, keyframes = np.arange(-0.2, 3.2, 0.01), np.arange(0.02, 2.97, 0.05)
+    keyframes[0] = -0.1
+    found = choose_intervals(imu, keyframes, (0,), times)
     start, end = imu.gaps[0]
     assert np.all((times[found.last] <= start + 1e-9) | (times[found.first] >= end - 1e-9))
     assert times[found.first].min() >= 0.0
-    assert len(found.node) == len(nodes) - 1 - 1 - 3  # one starts before the IMU, three touch the gap
+    assert len(found.keyframe) == len(keyframes) - 1 - 1 - 3  # one starts before the IMU, three touch the gap
 
 
 def test_no_interval_goes_from_one_recording_to_another(imu):
-    nodes, times = np.arange(0.1, 0.5, 0.05), np.arange(0.0, 1.0, 0.01)
-    assert 2 not in choose_intervals(imu, nodes, (0, 3), times).node
-    assert 2 in choose_intervals(imu, nodes, (0,), times).node
+    keyframes, times = np.arange(0.1, 0.5, 0.05), np.arange(0.0, 1.0, 0.01)
+    assert 2 not in choose_intervals(imu, keyframes, (0, 3), times).keyframe
+    assert 2 in choose_intervals(imu, keyframes, (0,), times).keyframe
 
 
 def test_a_seam_within_the_readings_is_not_crossed(imu):
-    nodes, times = np.arange(0.1, 0.5, 0.05), np.arange(0.0, 1.0, 0.01)
-    assert 2 not in choose_intervals(replace(imu, seams=((0.22, 0.23),)), nodes, (0,), times).node
+    keyframes, times = np.arange(0.1, 0.5, 0.05), np.arange(0.0, 1.0, 0.01)
+    assert 2 not in choose_intervals(replace(imu, seams=((0.22, 0.23),)), keyframes, (0,), times).keyframe
 
 
 def test_a_pause_of_the_wheels_is_no_interval(imu):
@@ -85,7 +85,7 @@ def test_quadrature_is_exact_for_cubics():
             exact = (SECONDS[b] ** (power + 1) - SECONDS[a] ** (power + 1)) / (power + 1)
             assert at.weight[own] @ at.times[own] ** power == pytest.approx(exact, rel=1e-13)
         middle = 0.5 * (SECONDS[a] + SECONDS[b])
-        np.testing.assert_array_equal(at.node[own], k + (at.times[own] > middle))
+        np.testing.assert_array_equal(at.keyframe[own], k + (at.times[own] > middle))
 
 
 def test_instants_begin_and_end_with_the_stamps_and_are_dense_enough():

@@ -133,7 +133,7 @@ def test_given_poses_of_the_wheels_frame_leave_no_residual(drive_of_kind, world_
     t = world.seconds + 0.0123
     chosen = wheel_intervals("wheel0", world.seconds, world.imu, world.state)
     poses = np.column_stack([drive.yaw(t), drive.integral(drive.travel, t)[:, :2]])
-    made = between_given(poses, chosen, np.tile(1e-4 * np.eye(3), (len(chosen.node), 1, 1)))
+    made = between_given(poses, chosen, np.tile(1e-4 * np.eye(3), (len(chosen.keyframe), 1, 1)))
     assert np.abs(residuals(replace(factor_on(world), poses=made), world.state)).max() < 1e-7
 
 

@@ -117,14 +117,14 @@ class _Noise:
         """(B, B), where the trajectory follows noise of the `readings` beside a draw `chain` (K, 15) of its posterior,
         but that noise once."""
         everywhere = _with_noise(self.problem, self.outcome.state, readings)
-        between_nodes = self.problem.replacing([everywhere.chain])
-        return self.added(chain + self._step(everywhere), readings) - self.added(self._step(between_nodes), None)
+        between_keyframes = self.problem.replacing([everywhere.chain])
+        return self.added(chain + self._step(everywhere), readings) - self.added(self._step(between_keyframes), None)
 
     def _step(self, problem: Problem) -> np.ndarray:
         """(K, 15) where the solver would move the chain alone."""
         pieces = self.outcome.room or problem.pieces()
         problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
-        factors = solve(pieces, problem.n_nodes, problem.tolerance).factors
+        factors = solve(pieces, problem.n_keyframes, problem.tolerance).factors
         calib = np.append(np.zeros(problem.layout.size), 1.0)[:, None]
         return factors.back(calib, [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
 
@@ -142,7 +142,7 @@ def _information(problem: Problem, state: State, room: tuple[Piece, ...] | None)
         n = problem.layout.size
         return problem.marginal(partial(problem.sums_of, state))[:n, :n]
     problem.linearise(state, room, problem.residuals(), curved=True)
-    return solve(room, problem.n_nodes, problem.tolerance).information
+    return solve(room, problem.n_keyframes, problem.tolerance).information
 
 
 def _reading_noise(imu: ImuData, rng: np.random.Generator) -> np.ndarray:

@@ -45,7 +45,7 @@ def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool
     # All that was seen, with the poses of the pass's end: those of its beginning left tracks out that these find, and
     # what a lens that was not found yet made an outlier may be none.
     shown = on_the_chain(inputs, outcome.state, factor.cameras)
-    anew = replace(factor, noise=noise, keep=shown).cut(outcome.state, chain_cuts(factor.n_nodes))
+    anew = replace(factor, noise=noise, keep=shown).cut(outcome.state, chain_cuts(factor.n_keyframes))
     left, share = look(anew, outcome.state), GOOD_AT_FIRST if first else GOOD
     # The next pass uses no observation that was not judged, as those of tracks that the poses do not find.
     judged = [_judged(anew, left, i, rig.settings, share) for i in range(len(shown))]

@@ -168,7 +168,7 @@ def _evaluate(parts: Parts, steps: list[np.ndarray]) -> tuple[np.ndarray, Residu
         own = given_calib(parts.piece(g, scratch), step)
         out = []
         for k in range(2):
-            chain = np.zeros((problem.n_nodes, own.shape[1]))
+            chain = np.zeros((problem.n_keyframes, own.shape[1]))
             chain[parts.ends[g] : parts.ends[g] + len(own)] = own[:, :, k]
             out.append(parts.cost(g, state.retract(problem.layout, chain, step[:, k]), found[k]))
         return out

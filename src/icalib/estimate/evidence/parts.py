@@ -11,11 +11,11 @@ from icalib.estimate.problem.gauge import FRAME, IN_THE_WORLD, hold_frame
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
-from icalib.motion.free_nodes import FreeNodes
+from icalib.motion.independent_keyframes import IndependentKeyframes
 from icalib.optim.arrowhead import Piece, in_parallel, marginalise
 from icalib.optim.state import State
 
-FEWEST_NODES = 3  # between the ends of a part
+MIN_PART_KEYFRAMES = 3  # between the ends of a part
 FEWEST_PARTS = 4  # of poses at rest: the spread of fewer says little
 # Information [1/m^2, 1/rad^2] that holds the frame of each part in a world that nobody sees, where parts share planes
 # or the frame of a pose sensor: held firmly, each would seem to say where these are. Where they share nothing of the
@@ -42,7 +42,7 @@ class Parts:
         count, fewest = _as_many_as_stand_alone(problem, count)
         if count < 2:
             return None
-        ends = segment_ends(problem.chain.starts, problem.n_nodes, count)
+        ends = segment_ends(problem.chain.starts, problem.n_keyframes, count)
         if len(ends) < 3 or np.diff(ends).min() < fewest:
             return None
         parts = cls(problem.cut(outcome.state, ends[:-1]), outcome.state, ends, np.zeros(0))
@@ -83,20 +83,20 @@ def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
 
     Images that nothing ties to each other stand alone: where there are few, each but the last is a part.
     """
-    if not isinstance(problem.chain, FreeNodes):
-        return min(count, (problem.n_nodes - 1) // FEWEST_NODES), FEWEST_NODES
+    if not isinstance(problem.chain, IndependentKeyframes):
+        return min(count, (problem.n_keyframes - 1) // MIN_PART_KEYFRAMES), MIN_PART_KEYFRAMES
     others = [f for f in problem.factors.values() if f is not problem.chain]
     if any(f.is_sparse for f in others):  # poses at rest, of which there may be few
-        fewer = min(count, problem.n_nodes // FEWEST_NODES)
-        return fewer if fewer >= FEWEST_PARTS else 0, FEWEST_NODES
-    few = count > 0 and problem.n_nodes <= FEWEST_NODES * count
-    return problem.n_nodes - 1 if few else count, 1
+        fewer = min(count, problem.n_keyframes // MIN_PART_KEYFRAMES)
+        return fewer if fewer >= FEWEST_PARTS else 0, MIN_PART_KEYFRAMES
+    few = count > 0 and problem.n_keyframes <= MIN_PART_KEYFRAMES * count
+    return problem.n_keyframes - 1 if few else count, 1
 
 
-def segment_ends(starts: tuple[int, ...], n_nodes: int, segments: int) -> np.ndarray:
+def segment_ends(starts: tuple[int, ...], n_keyframes: int, segments: int) -> np.ndarray:
     """(segments + 1,) keyframes between which segments lie; each start of a recording is one. More segments where there
     are more recordings."""
-    edges = np.array([*starts, n_nodes - 1])
+    edges = np.array([*starts, n_keyframes - 1])
     counts = np.maximum(np.round(segments * np.diff(edges) / edges[-1]).astype(int), 1)
     pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]
     return np.concatenate([*pieces, edges[-1:]]).astype(int)

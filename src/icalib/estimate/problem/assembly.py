@@ -17,9 +17,9 @@ from icalib.model.bodies import SHAPE_SIGMA_M, SIZE
 from icalib.model.sensor_model import Pass, SensorModel, kind_model, model_of
 from icalib.motion.clocks import EARLY_S, instants
 from icalib.motion.factor import Factor, keyed
-from icalib.motion.free_nodes import FreeNodes
-from icalib.motion.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
-from icalib.motion.poses import assign_nodes, poses_at
+from icalib.motion.independent_keyframes import IndependentKeyframes
+from icalib.motion.keyframe_placement import MERGED_WITHIN_S, distinct, first_keyframes, place_keyframes, usable
+from icalib.motion.poses import assign_keyframes, poses_at
 from icalib.motion.sweep import Motion
 from icalib.optim import pages
 from icalib.optim.arrowhead import chain_cuts
@@ -101,7 +101,7 @@ def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarra
     return [instants(c, values) for c in inputs.measurements.cameras]
 
 
-def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
+def keyframe_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
     """Instants that keyframes are placed at, by sensor, seconds on the body's clock since its first stamp."""
     return [
         model.keyframe_times(sensor, inputs.stream(sensor.name), values, inputs.rig)
@@ -121,32 +121,34 @@ def _keyframe_sources(rig: Rig) -> list[tuple[SensorModel, list[Sensor]]]:
     return found if rig.assumes_motion and rig.moves_by_poses else found[:1]
 
 
-def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
+def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
     """The same motion at other keyframes, by integrating the IMU from the nearest old one; without an IMU keyframes
     stay."""
     if inputs.imu is None:
         return state
-    near = assign_nodes("inertial", state.seconds, nodes, inputs.imu.forwards)
-    poses = poses_at("inertial", nodes, near, state, inputs.imu, inputs.rig.gravity, False)
-    starts = first_nodes(inputs.imu, nodes)
-    return State(nodes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts)
+    near = assign_keyframes("inertial", state.seconds, keyframes, inputs.imu.forwards)
+    poses = poses_at("inertial", keyframes, near, state, inputs.imu, inputs.rig.gravity, False)
+    starts = first_keyframes(inputs.imu, keyframes)
+    return State(
+        keyframes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts
+    )
 
 
-def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
+def keyframes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
     """Keyframe times for images or scans at `times`. Raises EstimationError where clocks do not overlap."""
     settings = inputs.rig.settings
     if inputs.imu is None:
         return distinct(np.sort(np.concatenate(times)))
     hosts = times[:1] if settings.keyframes == "first-camera" else times
-    nodes = place_nodes(inputs.imu, hosts, settings.keyframe_spacing_s, settings.max_gap_s)
-    counts = np.diff((*first_nodes(inputs.imu, nodes), len(nodes)))
+    keyframes = place_keyframes(inputs.imu, hosts, settings.keyframe_spacing_s, settings.max_gap_s)
+    counts = np.diff((*first_keyframes(inputs.imu, keyframes), len(keyframes)))
     if counts.min() < 3:
         where = f"{inputs.parts[int(np.argmin(counts))].name}: " if len(inputs.parts) > 1 else ""
         raise EstimationError(
             f"{where}fewer than 3 {_hosts(inputs.rig)} fall within the recording of {inputs.imu.name}; check that the "
             "clocks overlap, or the time_offset in the rig file."
         )
-    return nodes
+    return keyframes
 
 
 def _hosts(rig: Rig) -> str:
@@ -185,10 +187,10 @@ def assemble(
     times = image_times(inputs, state.values)
     for camera, stream, t, k in zip(rig.cameras, inputs.measurements.cameras, times, keep, strict=True):
         own = [m.own[camera.name] for m in inputs.motions]
-        node = _nodes_of(scheme, state, t, own, inputs.imu is not None and inputs.imu.forwards)
-        seen = is_seen(inputs, t, state.seconds[node])
+        keyframe = _keyframes_of(scheme, state, t, own, inputs.imu is not None and inputs.imu.forwards)
+        seen = is_seen(inputs, t, state.seconds[keyframe])
         factor = CornerFactor(
-            stream, camera_model(camera.model), inputs.imu, rig.gravity, scheme, stream.seconds, node,
+            stream, camera_model(camera.model), inputs.imu, rig.gravity, scheme, stream.seconds, keyframe,
             k & np.repeat(seen, np.diff(stream.start)), noise[camera.name], NO_BLOOM, inputs.bodies, layout,
             len(state.seconds), tuple(images.start for images in own[1:]),
         )  # fmt: skip
@@ -252,7 +254,7 @@ def on_the_chain(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...]
     """By camera, (N,) bool: observations of tracks in images that have a keyframe."""
     times, streams = image_times(inputs, state.values), inputs.measurements.tracks
     return tuple(
-        np.repeat(is_seen(inputs, t, state.seconds[camera.node]), np.diff(stream.start))
+        np.repeat(is_seen(inputs, t, state.seconds[camera.keyframe]), np.diff(stream.start))
         for camera, stream, t in zip(cameras, streams, times, strict=True)
     )
 
@@ -268,24 +270,24 @@ def _surfaces(inputs: Inputs, state: State, coarse: bool) -> Surfaces | None:
     return Surfaces.seen(clouds.keys, clouds.recording, planes, seen, noise, coarse)
 
 
-def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice], forwards: bool) -> np.ndarray:
+def _keyframes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice], forwards: bool) -> np.ndarray:
     """(n,) keyframe of each image at `times`, one of its own recording; `images` of each recording."""
     pairs = zip(images, state.recordings, strict=True)
-    return np.concatenate([assign_nodes(scheme, state.seconds[k], times[i], forwards) + k.start for i, k in pairs])
+    return np.concatenate([assign_keyframes(scheme, state.seconds[k], times[i], forwards) + k.start for i, k in pairs])
 
 
 def _chain(inputs: Inputs, state: State) -> ChainFactor:
     if inputs.imu is None:
-        return FreeNodes(inputs.rig.reference, len(state.seconds))
+        return IndependentKeyframes(inputs.rig.reference, len(state.seconds))
     columns = inputs.layout.columns(inputs.imu.name, "intrinsics")
     return ImuFactor.build(inputs.imu, state, inputs.rig.gravity, columns[columns >= 0])
 
 
-def is_seen(inputs: Inputs, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+def is_seen(inputs: Inputs, times: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
     """(n,) whether images at `times` can be used, each at its keyframe's instant: the IMU was running, or without one
     they were taken there."""
     if inputs.imu is None:
-        return np.abs(times - nodes) <= MERGED_WITHIN_S
+        return np.abs(times - keyframes) <= MERGED_WITHIN_S
     return usable(inputs.imu, times, inputs.rig.settings.max_gap_s)
 
 

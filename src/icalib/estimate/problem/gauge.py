@@ -22,10 +22,10 @@ IN_THE_WORLD = (PLANE.name, *(spec.name for spec in (*SENSOR_FRAME, *LEVEL_FRAME
 FRAME = 1e10
 
 
-def hold_frame(state: State, piece: Piece, node: int, levelled: bool, information: float = FRAME) -> None:
+def hold_frame(state: State, piece: Piece, keyframe: int, levelled: bool, information: float = FRAME) -> None:
     """Fixes the position of a keyframe, and its turn about gravity, or where this is not known (`levelled`) its
     rotation, where they are: without a target nothing in the world says where its origin is. Adds to the sums of
     `piece`; there is no gradient, and what is seen does not depend on it."""
-    k, up = node - piece.first, state.rotation[node][2]
+    k, up = keyframe - piece.first, state.rotation[keyframe][2]
     piece.diagonal[k, 0:3, 0:3] += information * (np.outer(up, up) if levelled else np.eye(3))
     piece.diagonal[k, range(3, 6), range(3, 6)] += information

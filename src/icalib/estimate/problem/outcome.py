@@ -18,7 +18,7 @@ FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the ou
 # Of few keyframes more free ones: the degrees of freedom that they show are off by sqrt(2 spent / draws), of few
 # residuals too much. So many keyframes times draws at most; doubled, they cost twice as much, and are off by 0.7 times
 # as much.
-NODES_DRAWN, MOST_FREE = 640, 64
+DRAWN_KEYFRAMES, MOST_FREE = 640, 64
 MORE_STILL = 5  # for where these leave doubt; drawn later, so that the first stay what they are
 
 
@@ -75,7 +75,7 @@ class Draws:
         """From what was solved last, the pieces as the solve left them."""
         rng, factors = np.random.default_rng(0), solution.factors
         drawn = factors.draws(rng, FREE_DRAWS, STILL_DRAWS) + factors.draws(rng, 0, MORE_STILL)
-        more = min(NODES_DRAWN // len(solution.chain), MOST_FREE) - FREE_DRAWS
+        more = min(DRAWN_KEYFRAMES // len(solution.chain), MOST_FREE) - FREE_DRAWS
         free = drawn[:FREE_DRAWS] + (factors.draws(rng, more, 0) if more > 0 else ())
         return cls(free, drawn[FREE_DRAWS:])
 
@@ -120,4 +120,4 @@ def posterior(problem: Problem, state: State) -> Draws:
     """Draws from the posterior at `state`. Raises NotDefiniteError."""
     pieces = problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
-    return Draws.of(solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held))
+    return Draws.of(solve(pieces, problem.n_keyframes, problem.tolerance, held=problem.held))

@@ -19,11 +19,11 @@ from icalib.optim.state import Layout, State
 
 @runtime_checkable
 class ChainFactor(Factor, Protocol):
-    """What ties the keyframes together: an `ImuFactor`, or `FreeNodes`. kinds: columns of its residuals by name;
-    starts: the first keyframe of each recording, which nothing ties to the one before."""
+    """What ties the keyframes together: an `ImuFactor`, or `IndependentKeyframes`. kinds: columns of its residuals by
+    name; starts: the first keyframe of each recording, which nothing ties to the one before."""
 
     @property
-    def n_nodes(self) -> int: ...
+    def n_keyframes(self) -> int: ...
 
     @property
     def starts(self) -> tuple[int, ...]: ...
@@ -61,13 +61,13 @@ class Problem:
         return next(f for f in self.factors.values() if isinstance(f, ChainFactor))
 
     @property
-    def n_nodes(self) -> int:
-        return self.chain.n_nodes
+    def n_keyframes(self) -> int:
+        return self.chain.n_keyframes
 
     @cached_property
-    def ties_distant_nodes(self) -> bool:
+    def ties_distant_keyframes(self) -> bool:
         """Whether segments of the chain do not stand alone."""
-        return any(f.ties_distant_nodes for f in self.factors.values())
+        return any(f.ties_distant_keyframes for f in self.factors.values())
 
     def replacing(self, factors: Sequence[Factor]) -> Problem:
         """The same problem with other `factors` of the same keys, or more of them."""
@@ -75,7 +75,7 @@ class Problem:
 
     def pieces(self, sums: bool = True) -> tuple[Piece, ...]:
         """The chain in pieces; without `sums`, only residuals can be asked for."""
-        pieces = make_pieces(self.n_nodes, self.layout.size if sums else None)
+        pieces = make_pieces(self.n_keyframes, self.layout.size if sums else None)
         return tuple(self.attach(p, len(pieces) > 1) for p in pieces) if sums else pieces
 
     def attach(self, piece: Piece, keep: bool = False) -> Piece:
@@ -98,9 +98,9 @@ class Problem:
     def marginal(self, sums_of: Callable[[int, int], Piece]) -> np.ndarray:
         """Border (B + 1, B + 1) of `sums_of` from one keyframe to another, all keyframes eliminated: a segment at a
         time, but where factors tie distant keyframes."""
-        if self.ties_distant_nodes:
-            return marginalise(sums_of(0, self.n_nodes - 1))
-        return marginalise_in_segments(sums_of, self.n_nodes)
+        if self.ties_distant_keyframes:
+            return marginalise(sums_of(0, self.n_keyframes - 1))
+        return marginalise_in_segments(sums_of, self.n_keyframes)
 
     def sums_of(self, state: State, first: int, last: int) -> Piece:
         """The sums between two keyframes alone, with the true curvature of robust losses; residuals are not kept."""
@@ -143,9 +143,9 @@ class Problem:
 
     def hold_frames(self, state: State, piece: Piece) -> None:
         """Each recording's world stays where it is, if nothing says where that is."""
-        for node in self.chain.starts if not self.framed else ():
-            if piece.first <= node < piece.last:
-                hold_frame(state, piece, node, self.levelled)
+        for keyframe in self.chain.starts if not self.framed else ():
+            if piece.first <= keyframe < piece.last:
+                hold_frame(state, piece, keyframe, self.levelled)
 
     def add_measurements(
         self, state: State, piece: Piece, out: Residuals, sums: bool = True, curved: bool = False

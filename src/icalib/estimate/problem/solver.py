@@ -321,7 +321,7 @@ class _Descent:
         return self.problem.linearise(state, self.pieces, self.residuals, sums, curved)
 
     def _solve(self, damping: float) -> Solution:
-        return solve(self.pieces, self.problem.n_nodes, self.problem.tolerance, damping, self.problem.held)
+        return solve(self.pieces, self.problem.n_keyframes, self.problem.tolerance, damping, self.problem.held)
 
 
 def minimise(

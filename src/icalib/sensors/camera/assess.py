@@ -11,7 +11,7 @@ from icalib.estimate.evidence.corner_noise import NoiseModel
 from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.clocks import instants
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
-from icalib.motion.nodes import usable
+from icalib.motion.keyframe_placement import usable
 from icalib.result import CornerResiduals, SensorFit, TrackResiduals
 from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
@@ -86,7 +86,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
         yield words
     factors = of_type(found.problem.factors, CornerFactor)
     yield from _outside_imu_notes(inputs, found, factors)
-    apart = found.judged.apart or tuple(np.zeros(len(c.node), dtype=bool) for c in factors)
+    apart = found.judged.apart or tuple(np.zeros(len(c.keyframe), dtype=bool) for c in factors)
     for camera, factor, model, late in zip(inputs.rig.cameras, factors, found.judged.models, apart, strict=True):
         yield from _corner_notes(camera, factor, model, late, found)
     if words := late_words(factors, apart):
@@ -131,11 +131,11 @@ def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> 
     for camera, late in zip(cameras, apart, strict=True):
         if late.any():
             names.append(camera.name)
-        for node, stamp in zip(camera.node[late].tolist(), camera.stream.stamps_ns[late].tolist(), strict=True):
-            first_of.setdefault(node, camera.stream.which(stamp))
+        for keyframe, stamp in zip(camera.keyframe[late].tolist(), camera.stream.stamps_ns[late].tolist(), strict=True):
+            first_of.setdefault(keyframe, camera.stream.which(stamp))
     if not first_of:
         return ""
-    named = ", ".join(first_of[node] for node in sorted(first_of)[:MOST_NAMED])
+    named = ", ".join(first_of[keyframe] for keyframe in sorted(first_of)[:MOST_NAMED])
     which = f", the first {MOST_NAMED}" if len(first_of) > MOST_NAMED else ""
     return (
         f"{len(first_of)} sets of images of {' and '.join(names)} were not exposed together, or the rig moved between, "

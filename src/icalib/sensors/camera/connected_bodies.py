@@ -12,7 +12,7 @@ from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.targets import Target
 from icalib.model.bodies import Bodies
-from icalib.motion.nodes import MERGED_WITHIN_S
+from icalib.motion.keyframe_placement import MERGED_WITHIN_S
 from icalib.rig import Rig
 
 FEWEST_TOGETHER = 3  # images with both of two bodies that tie them to each other

@@ -83,9 +83,9 @@ class CornerOutput:
 class CornerFactor(FactorDefaults):
     """All images of one camera.
 
-    times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; `node` (M,), increasing: the keyframe
-    each image hangs on; keep (N,): corners in use; direction (N, 2) image direction of the bloom, (0, 2) without it;
-    seams: the images that begin further recordings, in which the scene stands elsewhere."""
+    times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; `keyframe` (M,), increasing: the
+    keyframe each image hangs on; keep (N,): corners in use; direction (N, 2) image direction of the bloom, (0, 2)
+    without it; seams: the images that begin further recordings, in which the scene stands elsewhere."""
 
     stream: CornerStream
     model: CameraModel
@@ -93,13 +93,13 @@ class CornerFactor(FactorDefaults):
     gravity: float
     scheme: Scheme
     times: np.ndarray
-    node: np.ndarray
+    keyframe: np.ndarray
     keep: np.ndarray
     noise: CornerNoise
     direction: np.ndarray
     bodies: Bodies
     layout: Layout
-    n_nodes: int
+    n_keyframes: int
     seams: tuple[int, ...] = ()
 
     @property
@@ -116,7 +116,7 @@ class CornerFactor(FactorDefaults):
 
     def parts(self, v0: int, v1: int) -> Iterator[tuple[int, int, int]]:
         """Views v0..v1 recording by recording, each with the number of it."""
-        seams = np.searchsorted(self.views.image, (0, *self.seams, len(self.node)))
+        seams = np.searchsorted(self.views.image, (0, *self.seams, len(self.keyframe)))
         for k, (first, end) in enumerate(pairwise(seams)):
             a, b = max(v0, int(first)), min(v1, int(end))
             if a < b:
@@ -132,15 +132,15 @@ class CornerFactor(FactorDefaults):
 
     def imu_poses(self, state: State, i0: int, i1: int) -> Poses:
         """Poses of the IMU at the instants of images i0..i1."""
-        return self.kinematics.imu_poses(self.times[i0:i1], self.node[i0:i1], state)
+        return self.kinematics.imu_poses(self.times[i0:i1], self.keyframe[i0:i1], state)
 
     def poses(self, state: State, i0: int = 0, i1: int | None = None) -> SensorPose:
         """Poses of the camera at the instants of images i0..i1."""
-        return SensorPose.at(self.kinematics, self.times[i0:i1], self.node[i0:i1], state)
+        return SensorPose.at(self.kinematics, self.times[i0:i1], self.keyframe[i0:i1], state)
 
     def blocks(self) -> Iterator[tuple[int, int]]:
         """Views v0..v1, whole images, a few at a time: what all corners need at once fills the memory."""
-        image, n = self.views.image, len(self.node)
+        image, n = self.views.image, len(self.keyframe)
         for first in range(0, n, BLOCK):
             v0, v1 = np.searchsorted(image, [first, min(first + BLOCK, n)])
             if v0 < v1:
@@ -172,7 +172,7 @@ class CornerFactor(FactorDefaults):
 
     def instants(self, state: State) -> np.ndarray:
         """(M,) of the images, s on the body's clock since its first stamp."""
-        return self.times + offset_at(state, self.name, self.node)
+        return self.times + offset_at(state, self.name, self.keyframe)
 
     def lens(self, state: State) -> np.ndarray:
         """(P,) parameters of the camera model."""
@@ -279,7 +279,7 @@ class CornerFactor(FactorDefaults):
         image, body = self.views.image[v0:v1], self.views.body[v0:v1]
         columns, pars = self._columns(recording, body)
         s, n = self.stream, self.noise
-        images = Images(self.views.start[v0 : v1 + 1], s.uv, s.point, self.keep, self.node[image])
+        images = Images(self.views.start[v0 : v1 + 1], s.uv, s.point, self.keep, self.keyframe[image])
         noise = Noise(n.sigma, LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
         bloom = float(state.values[self.name, "bloom"][0])
         R_ws, R_sb = _scene(state, recording), self.bodies.poses(state.values)[0]
@@ -306,8 +306,8 @@ class CornerFactor(FactorDefaults):
         """Views a..b by the chunk, and what the model makes of them."""
         params = self.lens(state)
         world, start, camera = self.world_points(state, recording), images.start, motion.camera
-        for a in range(0, len(images.node), CHUNK):
-            b = min(a + CHUNK, len(images.node))
+        for a in range(0, len(images.keyframe), CHUNK):
+            b = min(a + CHUNK, len(images.keyframe))
             X = np.empty((start[b] - start[a], 3))
             camera_points(a, b, start, images.point, camera.R_sensor_world, camera.p_world_sensor, world, X)
             if jacobians:
@@ -319,8 +319,8 @@ class CornerFactor(FactorDefaults):
     def _blocks_of(self, piece: Piece) -> Iterator[tuple[int, int, int]]:
         """The views that belong to `piece`, keyframes from first to before last, the chain's very last keyframe
         included; some at a time, as `parts` has them."""
-        stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
-        images = np.searchsorted(self.node, [piece.first, stop])
+        stop = piece.last + 1 if piece.last == self.n_keyframes - 1 else piece.last
+        images = np.searchsorted(self.keyframe, [piece.first, stop])
         v0, v1 = (int(v) for v in np.searchsorted(self.views.image, images))
         for first in range(v0, v1, POSES):
             yield from self.parts(first, min(first + POSES, v1))

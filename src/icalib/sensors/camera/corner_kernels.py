@@ -18,13 +18,13 @@ from icalib.optim.rows import add_gradients, add_gram
 
 class Images(NamedTuple):
     """What was seen, each body of the target in an image taken as an image of its own: corners of image i are
-    start[i]:start[i+1]; uv (N, 2), point (N,), keep (N,); node (n,)."""
+    start[i]:start[i+1]; uv (N, 2), point (N,), keep (N,); keyframe (n,)."""
 
     start: np.ndarray
     uv: np.ndarray
     point: np.ndarray
     keep: np.ndarray
-    node: np.ndarray
+    keyframe: np.ndarray
 
 
 class Noise(NamedTuple):
@@ -268,7 +268,7 @@ def accumulate(i0, i1, images, noise, direct, motion, predicted, sums, found):
         if len(noise.precision):
             marginalise_shared(A, D, n, root, noise.field[n0:n1], noise.precision, G)
         _fill_chain(i, motion, work.A_imu, T)
-        add_gram(images.node[i] - sums.first, n_chain, G, T, motion.columns[i], work.F, sums)
+        add_gram(images.keyframe[i] - sums.first, n_chain, G, T, motion.columns[i], work.F, sums)
     return total
 
 
@@ -292,4 +292,4 @@ def accumulate_clusters(i0, i1, cluster, n_clusters, column, images, noise, dire
             for k in range(n):
                 G[d, cluster[n0 + k]] += A[d, k] * A[D, k] + A[d, n + k] * A[D, n + k]
         _fill_chain(i, motion, work.A_imu, T)
-        add_gradients(images.node[i] - sums.first, n_chain, G, T, motion.columns[i], column, sums)
+        add_gradients(images.keyframe[i] - sums.first, n_chain, G, T, motion.columns[i], column, sums)

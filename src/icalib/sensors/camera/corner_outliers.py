@@ -82,10 +82,10 @@ def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.
     similar = difference < SIMILAR * np.linalg.norm(residual[own], axis=1)[:, None]
     similar &= tag[near] != tag[own, None]
     # A graph with a vertex for each suspect corner; vertex 0 stands for all corners that are not suspect.
-    node = np.zeros(len(uv), dtype=np.int64)
-    node[own] = 1 + np.arange(len(own))
+    keyframe = np.zeros(len(uv), dtype=np.int64)
+    keyframe[own] = 1 + np.arange(len(own))
     row, column = np.nonzero(similar)
-    ends = node[own][row], node[near[row, column]]
+    ends = keyframe[own][row], keyframe[near[row, column]]
     graph = coo_array((np.ones(len(row)), ends), shape=(len(own) + 1, len(own) + 1))
     component = connected_components(graph, directed=False)[1]
     out = np.zeros(len(uv), dtype=bool)

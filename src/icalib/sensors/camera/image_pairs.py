@@ -27,23 +27,23 @@ def not_simultaneous(
     An image does not fit where its median residual is above `outlier_min_px` and `MEDIAN_RATIO` times the usual one.
     All images of its keyframe are rejected: which of them was late is not known.
     """
-    shared = _shared_nodes(cameras)
+    shared = _shared_keyframes(cameras)
     bad = np.zeros(len(shared), dtype=bool)
     for camera, out in zip(cameras, outputs, strict=True):
         size = np.linalg.norm(camera.errors(out), axis=1)  # an image that is late errs in common
-        medians = grouped_quantiles(size, camera.stream.image, len(camera.node), 0.5)
-        own = shared[camera.node] & np.isfinite(medians)
+        medians = grouped_quantiles(size, camera.stream.image, len(camera.keyframe), 0.5)
+        own = shared[camera.keyframe] & np.isfinite(medians)
         if own.any():
             limit = max(MEDIAN_RATIO * float(np.median(medians[own])), settings.outlier_min_px)
-            bad[camera.node[own & (medians > limit)]] = True
+            bad[camera.keyframe[own & (medians > limit)]] = True
     if bad.sum() > MOST_SHARE * shared.sum():
         bad[:] = False
-    return [bad[camera.node] for camera in cameras]
+    return [bad[camera.keyframe] for camera in cameras]
 
 
-def _shared_nodes(cameras: Sequence[CornerFactor]) -> np.ndarray:
+def _shared_keyframes(cameras: Sequence[CornerFactor]) -> np.ndarray:
     """(K,) bool: keyframes with images of two or more cameras; K is one more than the last that has an image."""
-    count = np.zeros(1 + max(int(c.node.max(initial=-1)) for c in cameras), dtype=np.int64)
+    count = np.zeros(1 + max(int(c.keyframe.max(initial=-1)) for c in cameras), dtype=np.int64)
     for camera in cameras:
-        count[np.unique(camera.node)] += 1
+        count[np.unique(camera.keyframe)] += 1
     return count > 1

@@ -17,20 +17,20 @@ from icalib.motion.integration_step import COVARIANCE, correction
 from icalib.optim import pages
 from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.prior_factor import accumulate_bias_prior
-from icalib.optim.rows import KEYFRAMES, add_product, whiten
-from icalib.optim.state import NODE, State
+from icalib.optim.rows import KEYFRAME_PAIR_DIM, add_product, whiten
+from icalib.optim.state import KEYFRAME_DIM, State
 
 ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS)}
 
 
 @njit(cache=True, nogil=True)
-def _preintegrate(k0, k1, nodes, first, readings, bias, intrinsics, dR, dv, dp, J, W):
+def _preintegrate(k0, k1, keyframes, first, readings, bias, intrinsics, dR, dv, dp, J, W):
     """Increments, bias (and intrinsics) Jacobians and inverse Cholesky factor W of the covariance, intervals k0..k1."""
     P, by, room = np.empty((ROWS, ROWS)), correction(intrinsics), integration_room(COVARIANCE)
     for k in range(k0, k1):
         out = Increment(dR[k], dv[k], dp[k], J[k], P)
-        integrate(nodes[k], nodes[k + 1], first[k], bias_of(bias, k), readings, by, room, out)
+        integrate(keyframes[k], keyframes[k + 1], first[k], bias_of(bias, k), readings, by, room, out)
         inverse_cholesky(P, W[k])
 
 
@@ -107,14 +107,18 @@ def _jacobians(k, chain, made, change, R01, hv, hp, r, J):
             J[i, j], J[3 + i, j], J[6 + i, j] = -turned[i, j], J_v[i, j], J_p[i, j]
             J[3 + i, 6 + j], J[6 + i, 3 + j] = -R0[j, i], -R0[j, i]
             J[6 + i, 6 + j] = (chain.seconds[k] - chain.seconds[k + 1]) * R0[j, i]
-            J[i, NODE + j], J[3 + i, NODE + 6 + j], J[6 + i, NODE + 3 + j] = Jr_inv[i, j], R0[j, i], R0[j, i]
+            J[i, KEYFRAME_DIM + j], J[3 + i, KEYFRAME_DIM + 6 + j], J[6 + i, KEYFRAME_DIM + 3 + j] = (
+                Jr_inv[i, j],
+                R0[j, i],
+                R0[j, i],
+            )
     J_turn = mul3(Jr_inv, tmul3(so3.exp(r[:3]), so3.right_jacobian(change[:3])))
     for i in range(3):
-        for j in range(6 + J.shape[1] - KEYFRAMES):
+        for j in range(6 + J.shape[1] - KEYFRAME_PAIR_DIM):
             turn = 0.0
             for m in range(3):
                 turn -= J_turn[i, m] * made.J[k, m, j]
-            c = 9 + j if j < 6 else KEYFRAMES + j - 6
+            c = 9 + j if j < 6 else KEYFRAME_PAIR_DIM + j - 6
             J[i, c] = turn
             J[3 + i, c], J[6 + i, c] = -made.J[k, 3 + i, j], -made.J[k, 6 + i, j]
 
@@ -125,10 +129,10 @@ def _accumulate(k1, chain, made, dx, columns, sums, out):
 
     dx, columns (24 or 0,): change and calibration columns of the intrinsics. Returns half the chi^2.
     """
-    width = KEYFRAMES + len(columns)
+    width = KEYFRAME_PAIR_DIM + len(columns)
     r, change, J, whitened = np.zeros(ROWS), np.zeros(9), np.zeros((ROWS, width)), np.empty((ROWS, width + 1))
     for i in range(9, ROWS):
-        J[i, i], J[i, NODE + i] = -1.0, 1.0
+        J[i, i], J[i, KEYFRAME_DIM + i] = -1.0, 1.0
     wanted = len(sums.diagonal) > 0
     cost = 0.0
     for k in range(sums.first, k1):
@@ -144,13 +148,13 @@ def _accumulate(k1, chain, made, dx, columns, sums, out):
         if wanted:
             _jacobians(k, chain, made, change, R01, hv, hp, r, J)
             whiten(made.W[k], J, whitened)
-            add_product(k - sums.first, KEYFRAMES, width, whitened, whitened, columns, sums)
+            add_product(k - sums.first, KEYFRAME_PAIR_DIM, width, whitened, whitened, columns, sums)
     return cost
 
 
 @dataclass(frozen=True)
 class ImuFactor(RowFactor):
-    """All intervals of one IMU between neighbouring nodes.
+    """All intervals of one IMU between neighbouring keyframes.
 
     residual (15,) of interval k: Log((dR Exp(J_R db))^T R_k^T R_k+1); R_k^T (v_k+1 - v_k - g dt) - dv - J_v db;
     R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db; b_k+1 - b_k, whitened jointly. The interval before each of
@@ -178,12 +182,12 @@ class ImuFactor(RowFactor):
         return KINDS
 
     @property
-    def n_nodes(self) -> int:
+    def n_keyframes(self) -> int:
         return len(self.made.dR) + 1
 
     def output(self) -> Whitened:
         """Empty rows (K - 1, 15) for `accumulate` to fill."""
-        return Whitened.without_loss(self.n_nodes - 1, ROWS)
+        return Whitened.without_loss(self.n_keyframes - 1, ROWS)
 
     def count(self, out: Whitened, kind: str) -> int:
         """Rows of a kind, without those of intervals between recordings."""

@@ -10,7 +10,8 @@ from icalib.report.sections import Section, plot_place
 from icalib.result import Calibration, ImuResiduals
 
 _WORDS = (
-    f"Whitened: between two keyframes, in units of what the IMU's noise allows. At most {motion_figures.MOST_NODES} "
+    f"Whitened: between two keyframes, in units of what the IMU's noise allows. "
+    f"At most {motion_figures.MAX_PLOTTED_KEYFRAMES} "
     "intervals are drawn."
 )
 

@@ -22,7 +22,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.motion.clocks import instants
-from icalib.motion.nodes import usable
+from icalib.motion.keyframe_placement import usable
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.arrowhead import in_parallel
 from icalib.optim.robust_weights import LOSSES

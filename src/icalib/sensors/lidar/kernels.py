@@ -13,7 +13,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.motion.sensor_pose import chain_width, fill_chain, fill_imu_pose
 from icalib.optim.rows import add_gram, add_product
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.lidar.propagation_noise import (
     PLANE,
     POSE,
@@ -30,12 +30,12 @@ RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian
 
 
 class Bins(NamedTuple):
-    """Bins of a piece: node (n,); walked (n,): by what angle the gyroscope's noise turns the IMU about each axis on the
-    way from the node, one standard deviation [rad], negative before it; entries of bin i are start[i]:start[i + 1],
-    with plane, root and slant as in `Moments`; turned (E, 3, 4), slope (E, 3): how their residuals, and what slanted
-    beams add to half the chi^2, change with that turn."""
+    """Bins of a piece: keyframe (n,); walked (n,): by what angle the gyroscope's noise turns the IMU about each axis on
+    the way from the keyframe, one standard deviation [rad], negative before it; entries of bin i are start[i]:start[i +
+    1], with plane, root and slant as in `Moments`; turned (E, 3, 4), slope (E, 3): how their residuals, and what
+    slanted beams add to half the chi^2, change with that turn."""
 
-    node: np.ndarray
+    keyframe: np.ndarray
     walked: np.ndarray
     start: np.ndarray
     plane: np.ndarray
@@ -110,10 +110,10 @@ def _add_plane(k, B, T, columns, own, sums, V):
             v = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
             for j in range(T.shape[1]):
                 V[t, j] += v * T[i, j]
-    for h in range(n_chain // NODE):
-        for r in range(NODE):
+    for h in range(n_chain // KEYFRAME_DIM):
+        for r in range(KEYFRAME_DIM):
             for t in range(PLANE):
-                sums.side[k + h, r, own[t]] += V[t, NODE * h + r]
+                sums.side[k + h, r, own[t]] += V[t, KEYFRAME_DIM * h + r]
     for j in range(len(columns)):
         if columns[j] >= 0:
             for t in range(PLANE):
@@ -151,8 +151,8 @@ def _take_off(k, walk, n_chain, columns, of_plane, sums):
 
 @njit(cache=True, nogil=True, inline="always")
 def _ends_here(i, bins):
-    """Whether bin i is the last on its side of its node."""
-    if i + 1 == len(bins.node) or bins.node[i + 1] != bins.node[i]:
+    """Whether bin i is the last on its side of its keyframe."""
+    if i + 1 == len(bins.keyframe) or bins.keyframe[i + 1] != bins.keyframe[i]:
         return True
     return (bins.walked[i + 1] < 0.0) != (bins.walked[i] < 0.0)
 
@@ -202,7 +202,7 @@ def _see(e, R_lw, p_wl, bins, planes, work, rows):
 def turn_by_noise(bins, at, columns, planes):
     """Fills `turned` and `slope` of the bins, which are empty."""
     work = _work_space(at, len(columns))
-    for i in range(len(bins.node)):
+    for i in range(len(bins.keyframe)):
         R_lw, p_wl = at.R_sensor_world[i], at.p_world_sensor[i]
         fill_imu_pose(i, at, work.A_imu)
         for e in range(bins.start[i], bins.start[i + 1]):
@@ -227,8 +227,8 @@ def accumulate(bins, at, columns, planes, sums, rows):
     wanted, work, cost = len(sums.diagonal) > 0, _work_space(at, len(columns)), 0.0
     T, A, B, G, W = work.T, work.A, work.B, work.G, work.W
     n_chain, walk = chain_width(at), no_walk(T.shape[1], len(planes.normal))
-    for i in range(len(bins.node)):
-        k, walks = bins.node[i] - sums.first, bins.walked[i] != 0.0
+    for i in range(len(bins.keyframe)):
+        k, walks = bins.keyframe[i] - sums.first, bins.walked[i] != 0.0
         R_lw, p_wl = at.R_sensor_world[i], at.p_world_sensor[i]
         if wanted:
             fill_chain(i, at, work.A_imu, T)

@@ -19,7 +19,7 @@ from icalib.data.measurements import LidarStream
 from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import assign_nodes
+from icalib.motion.poses import assign_keyframes
 from icalib.motion.sensor_pose import Kinematics, SensorPose
 from icalib.motion.sweep import Motion as ImuMotion
 from icalib.optim.arrowhead import Piece, in_parallel
@@ -35,13 +35,13 @@ CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 
 @dataclass(frozen=True)
 class LidarFactor(RowFactor):
-    """All scans of one LiDAR. `node` (n,), increasing: the keyframe that each bin of `moments` hangs on; walked (n,),
-    turned (E, 3, 4), slope (E, 3): see `Bins`, at the state that the pass starts from; planes: keys of the values that
-    the rows of the moments' planes have in a state."""
+    """All scans of one LiDAR. `keyframe` (n,), increasing: the keyframe that each bin of `moments` hangs on; walked
+    (n,), turned (E, 3, 4), slope (E, 3): see `Bins`, at the state that the pass starts from; planes: keys of the values
+    that the rows of the moments' planes have in a state."""
 
     name: str
     moments: Moments
-    node: np.ndarray
+    keyframe: np.ndarray
     walked: np.ndarray
     turned: np.ndarray
     slope: np.ndarray
@@ -50,7 +50,7 @@ class LidarFactor(RowFactor):
     gravity: float
     scheme: Scheme
     layout: Layout
-    n_nodes: int
+    n_keyframes: int
 
     @classmethod
     def build(
@@ -69,15 +69,15 @@ class LidarFactor(RowFactor):
         values = np.array([motion.state.values[p] for p in planes])
         moments = take_moments(Associated(stream, plane, values), motion, noise, bin_s)
         times = instants(stream, motion.state.values, moments.seconds)
-        node = assign_nodes(scheme, motion.state.seconds, times)
-        n_nodes = len(motion.state.seconds)
-        walked = motion.imu.turned_by_noise(motion.state.seconds[node], times)
+        keyframe = assign_keyframes(scheme, motion.state.seconds, times)
+        n_keyframes = len(motion.state.seconds)
+        walked = motion.imu.turned_by_noise(motion.state.seconds[keyframe], times)
         if scheme != "inertial":
             walked[:] = 0.0
         entries = len(moments.plane)
         factor = cls(
-            stream.name, moments, node, walked, np.zeros((entries, 3, ROWS), np.float32),
-            np.zeros((entries, 3), np.float32), planes, motion.imu, motion.gravity, scheme, layout, n_nodes,
+            stream.name, moments, keyframe, walked, np.zeros((entries, 3, ROWS), np.float32),
+            np.zeros((entries, 3), np.float32), planes, motion.imu, motion.gravity, scheme, layout, n_keyframes,
         )  # fmt: skip
         factor._turn_by_noise(motion.state)
         return factor
@@ -89,8 +89,8 @@ class LidarFactor(RowFactor):
             for bins, at, columns, planes in self._chunks(state, *ends):
                 kernels.turn_by_noise(bins, at, columns, planes)
 
-        middle = len(self.node) // 2
-        in_parallel(turn, [(0, middle), (middle, len(self.node))])
+        middle = len(self.keyframe) // 2
+        in_parallel(turn, [(0, middle), (middle, len(self.keyframe))])
 
     @cached_property
     def _of_planes(self) -> np.ndarray:
@@ -125,7 +125,7 @@ class LidarFactor(RowFactor):
 
     def times(self, state: State) -> np.ndarray:
         """(E,) the middle of the bin of each plane's rows."""
-        at = self.moments.seconds + offset_at(state, self.name, self.node)
+        at = self.moments.seconds + offset_at(state, self.name, self.keyframe)
         return np.repeat(at, np.diff(self.moments.start))
 
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
@@ -139,19 +139,21 @@ class LidarFactor(RowFactor):
         planes, m = Planes.of(self.planes, state, self._of_planes), self.moments
         kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
         for columns, a, b in self._stretches(state, kinematics, b0, b1):
-            node = self.node[a:b]
-            bins = Bins(node, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant, self.turned, self.slope)
-            yield bins, SensorPose.at(kinematics, m.seconds[a:b], node, state), columns, planes
+            keyframe = self.keyframe[a:b]
+            bins = Bins(
+                keyframe, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant, self.turned, self.slope
+            )
+            yield bins, SensorPose.at(kinematics, m.seconds[a:b], keyframe, state), columns, planes
 
     def _stretches(
         self, state: State, kinematics: Kinematics, b0: int, b1: int
     ) -> Iterator[tuple[np.ndarray, int, int]]:
         """Bins b0..b1 by the chunk, each with the calibration columns (c,) of its pose."""
-        for clock, own in by_clock(state, self.name, self.node[b0:b1]):
+        for clock, own in by_clock(state, self.name, self.keyframe[b0:b1]):
             columns = kinematics.columns(clock)
             first, last = b0 + own.start, b0 + own.stop
             # Bins on one side of a keyframe stay together.
-            sides = np.flatnonzero(np.diff(2 * self.node[first:last] + (self.walked[first:last] >= 0.0))) + 1
+            sides = np.flatnonzero(np.diff(2 * self.keyframe[first:last] + (self.walked[first:last] >= 0.0))) + 1
             sides = np.append(sides, last - first)
             ends = sides[np.searchsorted(sides, np.arange(CHUNK, last - first, CHUNK))]
             for a, b in pairwise(np.unique([0, *ends, last - first])):
@@ -160,6 +162,6 @@ class LidarFactor(RowFactor):
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
         """The bins that belong to `piece`: keyframes from first to before last, the chain's very last keyframe
         included."""
-        stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
-        b0, b1 = np.searchsorted(self.node, [piece.first, stop])
+        stop = piece.last + 1 if piece.last == self.n_keyframes - 1 else piece.last
+        b0, b1 = np.searchsorted(self.keyframe, [piece.first, stop])
         return int(b0), int(b1)

@@ -69,7 +69,7 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
         self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass
     ) -> Iterator[AbsolutePoseFactor]:
         """One, of the poses at keyframes."""
-        yield AbsolutePoseFactor.at_nodes(stream, at.state, at.starts, noise, at.layout)
+        yield AbsolutePoseFactor.at_keyframes(stream, at.state, at.starts, noise, at.layout)
 
 
 def scaled_noise(sensor: PoseSensor, noise: PoseNoise, variance_factors: dict[str, float]) -> PoseNoise:

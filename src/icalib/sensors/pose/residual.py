@@ -22,7 +22,7 @@ from icalib.model.frames import FRAME, frame_of
 from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.nodes import MERGED_WITHIN_S
+from icalib.motion.keyframe_placement import MERGED_WITHIN_S
 from icalib.motion.pose_rows import Frame, PoseResiduals, absolute_residuals, relative_residuals
 from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks, of_recordings
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
@@ -32,7 +32,7 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 
-NEAR_NODE_S = 0.05  # a pose further from all keyframes is left out: the IMU alone would carry it there
+NEAR_KEYFRAME_S = 0.05  # a pose further from all keyframes is left out: the IMU alone would carry it there
 KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
 UNITS = {"rotation": "rad", "position": "m"}
 
@@ -99,16 +99,16 @@ class _PoseFactor(RowFactor):
 
 @dataclass(frozen=True)
 class AbsolutePoseFactor(_PoseFactor):
-    """n poses of one sensor in its frame, see `absolute_residuals`. `node` (n,), in order: of each; sigma: of its
+    """n poses of one sensor in its frame, see `absolute_residuals`. `keyframe` (n,), in order: of each; sigma: of its
     rotation [rad] and position [m]. imu: None where poses were taken at keyframes, which nothing ties to each other."""
 
     name: str
     seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
     rotation: np.ndarray  # (n, 3, 3)
     position: np.ndarray  # (n, 3)
-    node: np.ndarray
+    keyframe: np.ndarray
     starts: tuple[int, ...]  # the first keyframe of each recording
-    n_nodes: int
+    n_keyframes: int
     imu: ImuData | None
     gravity: float
     noise: PoseNoise
@@ -117,22 +117,22 @@ class AbsolutePoseFactor(_PoseFactor):
     @classmethod
     def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
         """Of the poses that lie near keyframes; those in gaps of the IMU that are not bridged are left out."""
-        state, (k, node) = motion.state, motion.near_keyframes(stream, NEAR_NODE_S)
+        state, (k, keyframe) = motion.state, motion.near_keyframes(stream, NEAR_KEYFRAME_S)
         return cls(
-            stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], node, state.starts,
+            stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], keyframe, state.starts,
             len(state.seconds), motion.imu, motion.gravity, noise, layout,
         )  # fmt: skip
 
     @classmethod
-    def at_nodes(
+    def at_keyframes(
         cls, stream: PoseStream, state: State, starts: tuple[int, ...], noise: PoseNoise, layout: Layout
     ) -> AbsolutePoseFactor:
         """Of the poses that were taken at a keyframe, without an IMU; starts: the first keyframe of each recording."""
         times = instants(stream, state.values)
-        node = np.searchsorted(0.5 * (state.seconds[1:] + state.seconds[:-1]), times)
-        k = np.flatnonzero(np.abs(times - state.seconds[node]) <= MERGED_WITHIN_S)
+        keyframe = np.searchsorted(0.5 * (state.seconds[1:] + state.seconds[:-1]), times)
+        k = np.flatnonzero(np.abs(times - state.seconds[keyframe]) <= MERGED_WITHIN_S)
         return cls(
-            stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], node[k], starts,
+            stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], keyframe[k], starts,
             len(state.seconds), None, 0.0, noise, layout,
         )  # fmt: skip
 
@@ -144,7 +144,7 @@ class AbsolutePoseFactor(_PoseFactor):
     @property
     def keyframes(self) -> np.ndarray:
         """See `_PoseFactor`."""
-        return self.node
+        return self.keyframe
 
     @property
     def sigma(self) -> np.ndarray:
@@ -153,14 +153,14 @@ class AbsolutePoseFactor(_PoseFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        into, parts = Into(piece, out, sums, curved), of_recordings(self.node, self.starts, self.n_nodes, piece)
+        into, parts = Into(piece, out, sums, curved), of_recordings(self.keyframe, self.starts, self.n_keyframes, piece)
         return sum(self._of_recording(k, own, state, into) for k, own in parts)
 
     def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
         """Adds the poses `own`, of one recording."""
         frame = frame_of(self.name, recording)
-        v, node, kinematics = state.values, self.node[own], Kinematics.of(self)
-        at = SensorPose.at(kinematics, self.seconds[own], node, state, into.sums)
+        v, keyframe, kinematics = state.values, self.keyframe[own], Kinematics.of(self)
+        at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
         found = absolute_residuals(
             at.rotation,
             at.position,
@@ -172,7 +172,7 @@ class AbsolutePoseFactor(_PoseFactor):
         rows = _rows(found, (at,), self, state, own)
         frame_columns = self.layout.columns(frame, *FRAME)
         columns = [kinematics.columns(recording), frame_columns, self.layout.columns(self.name, "scale")]
-        interval = rows.on_intervals(node, self.n_nodes)
+        interval = rows.on_intervals(keyframe, self.n_keyframes)
         return add_rows(rows, own, interval, np.concatenate(columns), _noise(self, own), into)
 
 
@@ -211,7 +211,7 @@ class RelativePosesFactor(_PoseFactor):
     @property
     def keyframes(self) -> np.ndarray:
         """See `_PoseFactor`."""
-        return self.intervals.node
+        return self.intervals.keyframe
 
     @property
     def sigma(self) -> np.ndarray:
@@ -221,19 +221,19 @@ class RelativePosesFactor(_PoseFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        low, high = (int(k) for k in np.searchsorted(self.intervals.node, [piece.first, piece.last]))
+        low, high = (int(k) for k in np.searchsorted(self.intervals.keyframe, [piece.first, piece.last]))
         into, cost = Into(piece, out, sums, curved), 0.0
-        for clock, part in by_clock(state, self.name, self.intervals.node[low:high]):
+        for clock, part in by_clock(state, self.name, self.intervals.keyframe[low:high]):
             for some in in_chunks(slice(low + part.start, low + part.stop)):
                 cost += self._of_clock(clock, some, state, into)
         return cost
 
     def _of_clock(self, clock: int, own: slice, state: State, into: Into) -> float:
         """Adds the ways `own`, which go by one time offset."""
-        first, last, node = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.node))
+        first, last, keyframe = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.keyframe))
         kinematics = Kinematics.of(self)
-        a = SensorPose.at(kinematics, self.seconds[first], node, state, into.sums)
-        b = SensorPose.at(kinematics, self.seconds[last], node + 1, state, into.sums)
+        a = SensorPose.at(kinematics, self.seconds[first], keyframe, state, into.sums)
+        b = SensorPose.at(kinematics, self.seconds[last], keyframe + 1, state, into.sums)
         found = relative_residuals(
             (a.rotation, b.rotation),
             (a.position, b.position),
@@ -242,7 +242,7 @@ class RelativePosesFactor(_PoseFactor):
             into.sums,
         )
         columns = np.append(kinematics.columns(clock), self.layout.columns(self.name, "scale"))
-        return add_rows(_rows(found, (a, b), self, state, own), own, node, columns, _noise(self, own), into)
+        return add_rows(_rows(found, (a, b), self, state, own), own, keyframe, columns, _noise(self, own), into)
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor

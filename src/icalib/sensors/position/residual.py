@@ -29,9 +29,9 @@ from icalib.optim.state import Layout, State
 from icalib.rig.scene import FRAME_ROTATION, FRAME_TRANSLATION, FRAME_YAW
 from icalib.sensors.position.stream import PositionStream
 
-# Fixes further from all nodes are left out. The noise of an accelerometer of 0.01 m/s^2/sqrt(Hz), a poor one, moves a
-# position by 1 mm over this time; the row does not count it.
-NEAR_NODE_S = 0.3
+# Fixes further from all keyframes are left out. The noise of an accelerometer of 0.01 m/s^2/sqrt(Hz), a poor one, moves
+# a position by 1 mm over this time; the row does not count it.
+NEAR_KEYFRAME_S = 0.3
 
 
 KINDS = {"horizontal": slice(0, 2), "vertical": slice(2, 3)}
@@ -61,7 +61,7 @@ def yaw_rotation(yaw: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PositionFactor(RowFactor):
-    """n fixes of one sensor. node (n,): of each, in order; root (n, 3, 3): see `PositionStream`."""
+    """n fixes of one sensor. keyframe (n,): of each, in order; root (n, 3, 3): see `PositionStream`."""
 
     units: ClassVar[Mapping[str, str]] = {"horizontal": "m", "vertical": "m"}
 
@@ -69,9 +69,9 @@ class PositionFactor(RowFactor):
     seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
     position: np.ndarray  # (n, 3) m
     root: np.ndarray
-    node: np.ndarray
-    starts: tuple[int, ...]  # the first node of each recording
-    n_nodes: int
+    keyframe: np.ndarray
+    starts: tuple[int, ...]  # the first keyframe of each recording
+    n_keyframes: int
     imu: ImuData
     gravity: float
     noise: PositionNoise
@@ -81,9 +81,9 @@ class PositionFactor(RowFactor):
     def build(cls, stream: PositionStream, motion: Motion, noise: PositionNoise, layout: Layout) -> PositionFactor:
         """The fixes near keyframes and outside gaps of the IMU; their keyframes stay while the solver runs. The
         covariances of `stream` are the weights: see `model.weighted`."""
-        state, (k, node) = motion.state, motion.near_keyframes(stream, NEAR_NODE_S)
+        state, (k, keyframe) = motion.state, motion.near_keyframes(stream, NEAR_KEYFRAME_S)
         return cls(
-            stream.name, stream.seconds[k], stream.position[k], stream.root[k], node, state.starts,
+            stream.name, stream.seconds[k], stream.position[k], stream.root[k], keyframe, state.starts,
             len(state.seconds), motion.imu, motion.gravity, noise, layout,
         )  # fmt: skip
 
@@ -102,7 +102,7 @@ class PositionFactor(RowFactor):
 
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
-        return self.seconds + offset_at(state, self.name, self.node)
+        return self.seconds + offset_at(state, self.name, self.keyframe)
 
     def raw(self, out: Whitened) -> np.ndarray:
         """(n, 3) residuals in the frame's axes [m]."""
@@ -114,22 +114,22 @@ class PositionFactor(RowFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        into, parts = Into(piece, out, sums, curved), of_recordings(self.node, self.starts, self.n_nodes, piece)
+        into, parts = Into(piece, out, sums, curved), of_recordings(self.keyframe, self.starts, self.n_keyframes, piece)
         return sum(self._of_recording(k, own, state, into) for k, own in parts)
 
     def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
         """Adds the fixes `own`, of one recording."""
-        frame, v, node = frame_of(self.name, recording), state.values, self.node[own]
+        frame, v, keyframe = frame_of(self.name, recording), state.values, self.keyframe[own]
         levelled = (frame, FRAME_YAW.name) in v
         R_wf = yaw_rotation(v[frame, FRAME_YAW.name][0]) if levelled else v[frame, FRAME_ROTATION.name]
         kinematics = Kinematics.of(self)
-        at = SensorPose.at(kinematics, self.seconds[own], node, state, into.sums)
+        at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
         in_frame = (at.position - v[frame, FRAME_TRANSLATION.name]) @ R_wf
         rows = _rows(in_frame - self.position[own], in_frame, R_wf, at, levelled, into.sums)
         turn = (FRAME_YAW if levelled else FRAME_ROTATION).name
         columns = [kinematics.columns(recording), self.layout.columns(frame, turn, FRAME_TRANSLATION.name)]
         noise = RobustNoise(self.root[own] / self.noise.sizes[:, None], self.noise.loss, self.noise.loss_scale)
-        interval = rows.on_intervals(node, self.n_nodes)
+        interval = rows.on_intervals(keyframe, self.n_keyframes)
         return add_rows(rows, own, interval, np.concatenate(columns), noise, into)
 
 

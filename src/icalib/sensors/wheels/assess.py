@@ -71,7 +71,7 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
 def ground_warnings(found: Estimate) -> Iterator[str]:
     """Warnings on ground constraints whose floor no LiDAR sees."""
     for factor in of_type(found.problem.factors, GroundFactor):
-        if not len(factor.nodes):
+        if not len(factor.keyframes):
             yield (
                 f"none of the planes that LiDARs see is a floor (nearly level and below the IMU), so the ground of "
                 f"{factor.name} counts for nothing; see that a LiDAR sees it, or write plane: level."

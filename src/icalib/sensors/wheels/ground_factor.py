@@ -43,9 +43,9 @@ def floors(state: State, keys: tuple[Key, ...], points: np.ndarray, recording: n
     """The key of the floor in each recording, None where it is not seen; points (P,): how many lie on each of the
     planes `keys`, which belong to `recording` (P,)."""
     found = []
-    for r, nodes in enumerate(state.recordings):
+    for r, keyframes in enumerate(state.recordings):
         own = np.flatnonzero(recording == r)
-        middle = state.position[nodes].mean(axis=0)
+        middle = state.position[keyframes].mean(axis=0)
         seen = [k for k in own if _is_floor(state.values[keys[k]], middle)]
         found.append(keys[max(seen, key=lambda k: points[k])] if seen else None)
     return tuple(found)
@@ -67,7 +67,7 @@ class GroundFactor(RowFactor):
     name: str
     ground: Ground
     floor: tuple[Key | None, ...]
-    nodes: np.ndarray  # (n,)
+    keyframes: np.ndarray  # (n,)
     starts: tuple[int, ...]
     imu: ImuData
     layout: Layout
@@ -82,8 +82,8 @@ class GroundFactor(RowFactor):
             for r, key in zip(state.recordings, floor, strict=True)
             if ground.plane == "level" or key is not None
         ]
-        nodes = np.concatenate([np.empty(0, dtype=np.int64), *used])
-        return cls(name, ground, floor, nodes, state.starts, imu, layout)
+        keyframes = np.concatenate([np.empty(0, dtype=np.int64), *used])
+        return cls(name, ground, floor, keyframes, state.starts, imu, layout)
 
     @property
     def key(self) -> FactorKey:
@@ -100,7 +100,7 @@ class GroundFactor(RowFactor):
         """(4,) of the rows, infinite where they are not asked for."""
         tilt, height = self.ground.tilt_noise, self.ground.height_sigma
         bump = np.inf if height is None else self.ground.bump_noise
-        once = np.inf if height is None else height * np.sqrt(len(self.nodes))
+        once = np.inf if height is None else height * np.sqrt(len(self.keyframes))
         return np.array([*[np.inf if tilt is None else tilt] * 2, bump, once])
 
     def with_imu(self, imu: ImuData) -> GroundFactor:
@@ -110,11 +110,11 @@ class GroundFactor(RowFactor):
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
-        return Whitened.empty(len(self.nodes), 4)
+        return Whitened.empty(len(self.keyframes), 4)
 
     def times(self, state: State) -> np.ndarray:
         """(n,) of the keyframes."""
-        return state.seconds[self.nodes]
+        return state.seconds[self.keyframes]
 
     def raw(self, out: Whitened) -> np.ndarray:
         """(n, 4) rad and m; 0 in rows that are not asked for."""
@@ -122,22 +122,22 @@ class GroundFactor(RowFactor):
 
     def raw_sigma(self) -> np.ndarray:
         """(n, 4) rad and m."""
-        return np.tile(self.sigma, (len(self.nodes), 1))
+        return np.tile(self.sigma, (len(self.keyframes), 1))
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
         cost = 0.0
         ends = (*self.starts[1:], len(state.seconds))
         for begin, end, key in zip(self.starts, ends, self.floor, strict=True):
-            low, high = np.searchsorted(self.nodes, [max(begin, piece.first), min(end, piece.last)])
+            low, high = np.searchsorted(self.keyframes, [max(begin, piece.first), min(end, piece.last)])
             if low >= high:
                 continue
             own = slice(int(low), int(high))
-            rows = self._rows(state, self.nodes[own], None if key is None else state.values[key])
+            rows = self._rows(state, self.keyframes[own], None if key is None else state.values[key])
             whitening = np.tile(np.diag(1.0 / self.sigma), (high - low, 1, 1))
             by = RobustNoise(whitening, "none", 1.0)
             into = Into(piece, out, sums, curved)
-            cost += add_rows(rows, own, self.nodes[own], self._columns(key), by, into)
+            cost += add_rows(rows, own, self.keyframes[own], self._columns(key), by, into)
         return cost
 
     def _columns(self, key: Key | None) -> np.ndarray:
@@ -150,27 +150,27 @@ class GroundFactor(RowFactor):
             columns[7:] = self.layout.columns(*key)
         return columns
 
-    def _rows(self, state: State, nodes: np.ndarray, floor: np.ndarray | None) -> Rows:
+    def _rows(self, state: State, keyframes: np.ndarray, floor: np.ndarray | None) -> Rows:
         plane = LEVEL if floor is None else floor
         sign = 1.0 if plane[2] >= 0.0 else -1.0
         n, across = sign * plane[:3], sign * planes.tangents(np.ascontiguousarray(plane[:3]))
         R, p = state.values[self.name, "rotation"], state.values[self.name, "translation"]
-        R_k = state.rotation[nodes]
+        R_k = state.rotation[keyframes]
         up = np.einsum("kji,j->ki", R_k, n)  # in the axes of the IMU
-        way = state.position[nodes] + R_k @ p - plane[3:]
+        way = state.position[keyframes] + R_k @ p - plane[3:]
         h = state.values.get((self.name, GROUND_HEIGHT.name), np.zeros(1))[0]
-        rows = Rows.empty(len(nodes), 4, N_COLUMNS, True)
-        own, J_node = rows.J_calib, rows.J_node
+        rows = Rows.empty(len(keyframes), 4, N_COLUMNS, True)
+        own, J_keyframe = rows.J_calib, rows.J_keyframe
         tilt = up @ R
         # R_k <- R_k Exp(d) takes up to up + up x d, and R <- R Exp(d) the tilt to tilt + tilt x d.
-        J_node[:, :2, :3] = np.cross(R[:, :2].T, up[:, None])
+        J_keyframe[:, :2, :3] = np.cross(R[:, :2].T, up[:, None])
         own[:, :2, :3] = np.cross(np.eye(3)[:2], tilt[:, None])
         own[:, :2, 7:9] = np.einsum("kji,tj->kit", R_k @ R[:, :2], across)
-        J_node[:, 2, :3] = np.cross(p, up)
-        J_node[:, 2, 3:6] = n
+        J_keyframe[:, 2, :3] = np.cross(p, up)
+        J_keyframe[:, 2, 3:6] = n
         own[:, 2, 3:6] = up
         own[:, 2, 7:9] = way @ across.T
         own[:, 2, 9] = -sign
         own[:, 2:, 6] = [-1.0, 1.0]
-        rows.residual[:] = np.column_stack([tilt[:, :2], way @ n - h, np.full(len(nodes), h - self.ground.height)])
+        rows.residual[:] = np.column_stack([tilt[:, :2], way @ n - h, np.full(len(keyframes), h - self.ground.height)])
         return rows

@@ -14,11 +14,12 @@ PANEL_S = 0.025
 
 class Instants(NamedTuple):
     """Where motion is looked at. Those of interval i are start[i]:start[i+1]: its first end, points of a quadrature,
-    its last end. times (m,) s on the wheels' clock; `node` (m,); weight (m,) s of the quadrature, zero at the ends."""
+    its last end. times (m,) s on the wheels' clock; `keyframe` (m,); weight (m,) s of the quadrature, zero at the
+    ends."""
 
     start: np.ndarray
     times: np.ndarray
-    node: np.ndarray
+    keyframe: np.ndarray
     weight: np.ndarray
 
 
@@ -36,8 +37,8 @@ def quadrature(seconds: np.ndarray, intervals: StampIntervals, change: np.ndarra
     times = begin[interval] + (panel + 0.5 + (second - 0.5) / np.sqrt(3.0)) * width
     weight = 0.5 * width
     change = begin + 0.5 * length if change is None else change
-    node = intervals.node[interval] + (times > change[interval])
+    keyframe = intervals.keyframe[interval] + (times > change[interval])
     times[start[:-1]], times[start[1:] - 1] = begin, seconds[intervals.last]
-    node[start[:-1]], node[start[1:] - 1] = intervals.node, intervals.node + 1
+    keyframe[start[:-1]], keyframe[start[1:] - 1] = intervals.keyframe, intervals.keyframe + 1
     weight[start[:-1]] = weight[start[1:] - 1] = 0.0
-    return Instants(start, times, node, weight)
+    return Instants(start, times, keyframe, weight)

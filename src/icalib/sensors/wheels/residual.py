@@ -119,7 +119,7 @@ class IncrementFactor(RowFactor):
         n_measured = 1 if kind == "steered" else 2
         measured[:, :n_measured] = whole[:, :n_measured]
         mean = whole[:, 1:] / dt[:, None]
-        change = state.seconds[found.node + 1] - offset_at(state, name, found.node) if imu.forwards else None
+        change = state.seconds[found.keyframe + 1] - offset_at(state, name, found.keyframe) if imu.forwards else None
         instants = quadrature(seconds, found, change)
         return cls(name, kind, found, measured, mean, whitening, instants, imu, gravity, noise, layout)
 
@@ -129,7 +129,7 @@ class IncrementFactor(RowFactor):
 
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
-        return self.instants.times[self.instants.start[:-1]] + offset_at(state, self.name, self.intervals.node)
+        return self.instants.times[self.instants.start[:-1]] + offset_at(state, self.name, self.intervals.keyframe)
 
     def raw(self, out: Whitened) -> np.ndarray:
         """See `RowFactor`."""
@@ -151,15 +151,15 @@ class IncrementFactor(RowFactor):
         """Adds the intervals `own`; returns half their robust chi^2."""
         start = self.instants.start[own.start : own.stop + 1]
         seen = slice(int(start[0]), int(start[-1]))
-        node = self.instants.node[seen]
-        times = self.instants.times[seen] + offset_at(state, self.name, node)
-        poses, moving = _motion(self, times, node, state, into.sums)
+        keyframe = self.instants.keyframe[seen]
+        times = self.instants.times[seen] + offset_at(state, self.name, keyframe)
+        poses, moving = _motion(self, times, keyframe, state, into.sums)
         rows = Rows.empty(len(start) - 1, 4, N_MOUNTED + poses.J_imu.shape[2] + N_DRIVE, into.sums)
         wheels = _wheels(self.name, state, self.kind)
         c = coefficients(self.kind, wheels.drive, self.mean[own])
         increment_rows(
-            start - start[0], self.instants.weight[seen], _track(node, poses), moving, wheels, c, self.measured[own],
-            rows,
+            start - start[0], self.instants.weight[seen], _track(keyframe, poses), moving, wheels, c,
+            self.measured[own], rows,
         )  # fmt: skip
         return _add(self, own, rows, state, into)
 
@@ -197,9 +197,9 @@ class RelativePoseFactor(RowFactor):
         the keyframes to their ends is part of their noise."""
         times = instants(stream, state.values)
         found = pose_intervals(imu, state.seconds, state.starts, times)
-        k, ends = found.first, [(found.node, times[found.first]), (found.node + 1, times[found.last])]
-        first, last = (poses_at("inertial", t, node, state, imu, gravity, False) for node, t in ends)
-        away = np.stack([np.abs(t - state.seconds[node]) for node, t in ends], axis=1)
+        k, ends = found.first, [(found.keyframe, times[found.first]), (found.keyframe + 1, times[found.last])]
+        first, last = (poses_at("inertial", t, keyframe, state, imu, gravity, False) for keyframe, t in ends)
+        away = np.stack([np.abs(t - state.seconds[keyframe]) for keyframe, t in ends], axis=1)
         wheels = _wheels(stream.name, state, cls.kind)
         covariance = stream.covariance[k] + carried_noise(first, last, away, wheels.R, wheels.p, imu)
         W = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -244,7 +244,7 @@ class RelativePoseFactor(RowFactor):
 
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
-        return self.seconds[self.intervals.first] + offset_at(state, self.name, self.intervals.node)
+        return self.seconds[self.intervals.first] + offset_at(state, self.name, self.intervals.keyframe)
 
     def raw(self, out: Whitened) -> np.ndarray:
         """See `RowFactor`."""
@@ -262,8 +262,8 @@ class RelativePoseFactor(RowFactor):
     def _added(self, own: slice, state: State, into: Into) -> float:
         """Adds the intervals `own`; returns half their robust chi^2."""
         i, z, kinematics = self.intervals, self.poses, Kinematics.of(self)
-        first = SensorPose.at(kinematics, self.seconds[i.first[own]], i.node[own], state, into.sums)
-        last = SensorPose.at(kinematics, self.seconds[i.last[own]], i.node[own] + 1, state, into.sums)
+        first = SensorPose.at(kinematics, self.seconds[i.first[own]], i.keyframe[own], state, into.sums)
+        last = SensorPose.at(kinematics, self.seconds[i.last[own]], i.keyframe[own] + 1, state, into.sums)
         n, drive = len(z.z[own]), drive_of(self.name, state, self.kind)
         found = relative_residuals(
             (first.rotation, last.rotation),
@@ -317,16 +317,16 @@ def _wheels(name: str, state: State, kind: WheelKind) -> Wheels:
 
 
 def _motion(
-    factor: IncrementFactor, times: np.ndarray, node: np.ndarray, state: State, jacobians: bool
+    factor: IncrementFactor, times: np.ndarray, keyframe: np.ndarray, state: State, jacobians: bool
 ) -> tuple[Poses, Velocities]:
     if not jacobians:
-        return poses_alone(times, node, state, factor.imu, factor.gravity), Velocities.empty(0, 0)
+        return poses_alone(times, keyframe, state, factor.imu, factor.gravity), Velocities.empty(0, 0)
     free = factor.layout.is_free(factor.imu.name, "intrinsics")
-    return motion_at(times, node, state, factor.imu, factor.gravity, free)
+    return motion_at(times, keyframe, state, factor.imu, factor.gravity, free)
 
 
-def _track(node: np.ndarray, poses: Poses) -> Track:
-    return Track(node, poses.rotation, poses.position, poses.rate, poses.velocity, poses.J_node, poses.J_imu)
+def _track(keyframe: np.ndarray, poses: Poses) -> Track:
+    return Track(keyframe, poses.rotation, poses.position, poses.rate, poses.velocity, poses.J_keyframe, poses.J_imu)
 
 
 def _unwhitened(out: Whitened, whitening: np.ndarray) -> np.ndarray:
@@ -341,19 +341,19 @@ def _raw_sigma(whitening: np.ndarray) -> np.ndarray:
 
 def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
     """The intervals of which both keyframes lie in `piece`."""
-    i0, i1 = np.searchsorted(intervals.node, [piece.first, piece.last])
+    i0, i1 = np.searchsorted(intervals.keyframe, [piece.first, piece.last])
     return slice(int(i0), int(i1))
 
 
 def _add(factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, state: State, into: Into) -> float:
     """Adds the rows of intervals `own`, by calibration parameters of the pose, then those of the drive."""
-    cost, node, layout = 0.0, factor.intervals.node[own], factor.layout
+    cost, keyframe, layout = 0.0, factor.intervals.keyframe[own], factor.layout
     drive = layout.columns(factor.name, *drive_names(factor.kind))
     drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])
     kinematics = Kinematics.of(factor)
-    for clock, part in by_clock(state, factor.name, node):
+    for clock, part in by_clock(state, factor.name, keyframe):
         columns = np.concatenate([kinematics.columns(clock), drive])
         mine = slice(own.start + part.start, own.start + part.stop)
         noise = RobustNoise(factor.whitening[mine], factor.noise.loss, factor.noise.loss_scale)
-        cost += add_rows(Rows(rows.residual[part], rows.J[part]), mine, node[part], columns, noise, into)
+        cost += add_rows(Rows(rows.residual[part], rows.J[part]), mine, keyframe[part], columns, noise, into)
     return cost

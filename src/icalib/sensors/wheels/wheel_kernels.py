@@ -17,8 +17,8 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
 from icalib.motion.sensor_pose import N_MOUNTED, OFFSET
-from icalib.optim.rows import KEYFRAMES
-from icalib.optim.state import NODE
+from icalib.optim.rows import KEYFRAME_PAIR_DIM
+from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.wheels.wheel_drives import N_DRIVE
 
 
@@ -32,14 +32,14 @@ class Wheels(NamedTuple):
 
 
 class Track(NamedTuple):
-    """Of `Poses` what the kernels need, at m instants, and the node that each hangs on."""
+    """Of `Poses` what the kernels need, at m instants, and the keyframe that each hangs on."""
 
-    node: np.ndarray
+    keyframe: np.ndarray
     rotation: np.ndarray
     position: np.ndarray
     rate: np.ndarray
     velocity: np.ndarray
-    J_node: np.ndarray
+    J_keyframe: np.ndarray
     J_imu: np.ndarray
 
 
@@ -58,8 +58,8 @@ def _add(R, x, scale, sign, out):
 
 @njit(cache=True, nogil=True)
 def _turn(a, b, track, M0, M1, Mc, wanted):
-    """Theta (3,) between instants a and b; its derivatives, where `wanted`, by their nodes into rows 3: of M0, M1 (6,
-    15), by time and the IMU intrinsics into those of Mc (6, 1 + 24 or 0)."""
+    """Theta (3,) between instants a and b; its derivatives, where `wanted`, by their keyframes into rows 3: of M0, M1
+    (6, 15), by time and the IMU intrinsics into those of Mc (6, 1 + 24 or 0)."""
     theta = so3.log(tmul3(track.rotation[a], track.rotation[b]))
     if not wanted:
         return theta
@@ -67,9 +67,9 @@ def _turn(a, b, track, M0, M1, Mc, wanted):
     for i in range(3):
         for j in range(3):
             Mc[3 + i, 0] += after[i, j] * track.rate[b, j] - before[i, j] * track.rate[a, j]
-            for c in range(NODE):
-                M0[3 + i, c] -= before[i, j] * track.J_node[a, j, c]
-                M1[3 + i, c] += after[i, j] * track.J_node[b, j, c]
+            for c in range(KEYFRAME_DIM):
+                M0[3 + i, c] -= before[i, j] * track.J_keyframe[a, j, c]
+                M1[3 + i, c] += after[i, j] * track.J_keyframe[b, j, c]
             for c in range(track.J_imu.shape[2]):
                 Mc[3 + i, 1 + c] += after[i, j] * track.J_imu[b, j, c] - before[i, j] * track.J_imu[a, j, c]
     return theta
@@ -91,26 +91,27 @@ def _add_travel(j, w, track, moving, D, M, Mc, wanted):
     for i in range(3):
         Mc[i, 0] += w * (spin[i] + pull[i])
         for k in range(3):
-            for c in range(NODE):
-                M[i, c] += w * (U[i, k] * track.J_node[j, k, c] + R[k, i] * moving.J_node[j, k, c])
+            for c in range(KEYFRAME_DIM):
+                M[i, c] += w * (U[i, k] * track.J_keyframe[j, k, c] + R[k, i] * moving.J_keyframe[j, k, c])
             for c in range(track.J_imu.shape[2]):
                 Mc[i, 1 + c] += w * (U[i, k] * track.J_imu[j, k, c] + R[k, i] * moving.J_imu[j, k, c])
 
 
 @njit(cache=True, nogil=True)
 def _fill_row(i, q, gX, gT, aY, aT, X, T, M0, M1, Mc, rows):
-    """Derivatives of row q of interval i, g_X X + g_T T = a_Y Y + a_T Theta: nodes, rotation, time, IMU intrinsics."""
+    """Derivatives of row q of interval i, g_X X + g_T T = a_Y Y + a_T Theta: keyframes, rotation, time, IMU
+    intrinsics."""
     # R <- R Exp(d) turns X and T by -d: d X = X x d.
     x, t = _cross(gX, X), _cross(gT, T)
     for c in range(3):
-        rows.J[i, q, KEYFRAMES + c] = x[c] + t[c]
+        rows.J[i, q, KEYFRAME_PAIR_DIM + c] = x[c] + t[c]
     for k in range(3):
-        for c in range(NODE):
+        for c in range(KEYFRAME_DIM):
             rows.J[i, q, c] += aY[k] * M0[k, c] + aT[k] * M0[3 + k, c]
-            rows.J[i, q, NODE + c] += aY[k] * M1[k, c] + aT[k] * M1[3 + k, c]
-        rows.J[i, q, KEYFRAMES + OFFSET] += aY[k] * Mc[k, 0] + aT[k] * Mc[3 + k, 0]
+            rows.J[i, q, KEYFRAME_DIM + c] += aY[k] * M1[k, c] + aT[k] * M1[3 + k, c]
+        rows.J[i, q, KEYFRAME_PAIR_DIM + OFFSET] += aY[k] * Mc[k, 0] + aT[k] * Mc[3 + k, 0]
         for c in range(Mc.shape[1] - 1):
-            rows.J[i, q, KEYFRAMES + N_MOUNTED + c] += aY[k] * Mc[k, 1 + c] + aT[k] * Mc[3 + k, 1 + c]
+            rows.J[i, q, KEYFRAME_PAIR_DIM + N_MOUNTED + c] += aY[k] * Mc[k, 1 + c] + aT[k] * Mc[3 + k, 1 + c]
 
 
 @njit(cache=True, nogil=True)
@@ -142,14 +143,14 @@ def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
     """
     wanted = len(rows.J) > 0
     n_c = 1 + track.J_imu.shape[2]
-    M0, M1, Mc, D = np.empty((6, NODE)), np.empty((6, NODE)), np.empty((6, n_c)), np.empty(3)
+    M0, M1, Mc, D = np.empty((6, KEYFRAME_DIM)), np.empty((6, KEYFRAME_DIM)), np.empty((6, n_c)), np.empty(3)
     X, T, aY, aT = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(len(start) - 1):
         a, b, g = start[i], start[i + 1] - 1, min(i, len(c.X) - 1)
         M0[:], M1[:], Mc[:], D[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(a + 1, b):
             _add_travel(
-                j, weights[j], track, moving, D, M0 if track.node[j] == track.node[a] else M1, Mc, wanted
+                j, weights[j], track, moving, D, M0 if track.keyframe[j] == track.keyframe[a] else M1, Mc, wanted
             )  # fmt: skip
         theta = _turn(a, b, track, M0, M1, Mc, wanted)
         Y = D + _cross(theta, wheels.p)
@@ -166,5 +167,5 @@ def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
             _fill_row(i, q, c.X[g, q], c.T[g, q], aY, aT, X, T, M0, M1, Mc, rows)
             lever = _cross(aY, theta)
             for k in range(3):
-                rows.J[i, q, KEYFRAMES + 3 + k] = lever[k]
+                rows.J[i, q, KEYFRAME_PAIR_DIM + 3 + k] = lever[k]
             _by_drive(i, q, c.by_X[g, q], c.by_T[g, q], X, T, rows)

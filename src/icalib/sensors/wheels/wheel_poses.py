@@ -110,7 +110,7 @@ def preintegrated(
     wheel_noise: density of each wheel's angle, rad/sqrt(s); slip_noise: of lateral slip, m/sqrt(s). Both above zero:
     without slip the covariance of a short interval is singular, and of a long one it claims what no vehicle does.
     """
-    n = len(intervals.node)
+    n = len(intervals.keyframe)
     z, J, W = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 3))
     drive0 = np.array(drive, dtype=np.float64)
     _integrate_all(intervals.first, intervals.last, seconds, angles, drive0, wheel_noise, slip_noise, z, J, W)

@@ -31,4 +31,4 @@ def accumulate_clusters(X, seen, base, at, columns, seeing, loss, cluster, n_clu
                 by_point = A[D - 3 + a, 0] * A[D, 0] + A[D - 3 + a, 1] * A[D, 1]
                 side[seen.track[n] - base.track, a, column + cluster[n]] += by_point
         fill_chain(i, at, A_imu, T)
-        add_gradients(seen.node[i], chain_width(at), G, T, columns[i], column, sums)
+        add_gradients(seen.keyframe[i], chain_width(at), G, T, columns[i], column, sums)

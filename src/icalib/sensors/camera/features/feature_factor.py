@@ -98,7 +98,7 @@ class FeatureFactor(FactorDefaults):
         factor = cls(cameras, streams, noise, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
         return factor.cut(state, cuts)
 
-    ties_distant_nodes: ClassVar[bool] = True
+    ties_distant_keyframes: ClassVar[bool] = True
 
     @property
     def name(self) -> str:
@@ -115,19 +115,19 @@ class FeatureFactor(FactorDefaults):
         return tuple(noise.of(stream) for noise, stream in zip(self.noise, self.streams, strict=True))
 
     @property
-    def n_nodes(self) -> int:
-        return self.cameras[0].n_nodes
+    def n_keyframes(self) -> int:
+        return self.cameras[0].n_keyframes
 
     @property
     def followed(self) -> int:
         """How many observations take part."""
         return sum(int((t >= 0).sum()) for t in self.tracks.track)
 
-    def cut(self, state: State, nodes: tuple[int, ...]) -> FeatureFactor:
-        """The same features as tracks that end at `nodes`. A track is left out whose point the poses of `state` do
+    def cut(self, state: State, keyframes: tuple[int, ...]) -> FeatureFactor:
+        """The same features as tracks that end at `keyframes`. A track is left out whose point the poses of `state` do
         not find where all its images can show it, whose distance they leave uncertain, or that fits far worse than
         most."""
-        edges = np.unique([0, *nodes, *self.seams, self.n_nodes])
+        edges = np.unique([0, *keyframes, *self.seams, self.n_keyframes])
         sightings = self._sightings()
         label = sightings.in_order(sightings.labels(state.seconds, edges, LONGEST_GAP_S))
         tracks = sightings.tracks(label, edges)
@@ -141,7 +141,7 @@ class FeatureFactor(FactorDefaults):
     def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray, OnPlanes]:
         """Points (T, 3) in the frames of the cameras that they move with, from the rays with the poses of `state`;
         whether each is certain enough; and of those that are, the planes that they lie on."""
-        views, n = self._views(state, 0, self.n_nodes), self.tracks.count
+        views, n = self._views(state, 0, self.n_keyframes), self.tracks.count
         A, b = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for view in views:
             rays, valid = view.camera.model.unproject(view.params, view.seen.uv)
@@ -168,7 +168,7 @@ class FeatureFactor(FactorDefaults):
     def coarse(self, state: State) -> FeatureFactor:
         """The same features, their noise as large as most errors with the poses of `state` and a guessed lens. Taken as
         exact, what fits by chance would draw the lens far from its guess, where other tracks are lost."""
-        views = self._views(state, 0, self.n_nodes)
+        views = self._views(state, 0, self.n_keyframes)
         points = self._from_anchors(views, slice(0, self.tracks.count), self.tracks.start)
         noise = list(self.noise)
         for view in views:
@@ -229,10 +229,10 @@ class FeatureFactor(FactorDefaults):
         images = self._images(piece.first, self._stop(piece))
         begins = np.cumsum([0] + [len(i) for i in images])[:-1] - np.array([i.start for i in images])
         image = self.tracks.pair_image[pairs] + begins[self.tracks.pair_camera[pairs]]
-        node = np.concatenate([c.node[i.start : i.stop] for c, i in zip(self.cameras, images, strict=True)])
+        keyframe = np.concatenate([c.keyframe[i.start : i.stop] for c, i in zip(self.cameras, images, strict=True)])
         by_next = any(c.scheme == "pose" and c.imu is not None for c in self.cameras)
         sums = FeatureSums.zeros(
-            tracks.stop - tracks.start, self.tracks.pair_track[pairs] - tracks.start, image, node - piece.first,
+            tracks.stop - tracks.start, self.tracks.pair_track[pairs] - tracks.start, image, keyframe - piece.first,
             piece.calib.shape[0] - 1, by_next,
         )  # fmt: skip
         ends = self.tracks.edges - piece.first
@@ -264,7 +264,7 @@ class FeatureFactor(FactorDefaults):
                     X, part.seen, base, part.poses, part.columns, part.seeing(X), loss, into, mine, out.residual[i],
                     out.root[i],
                 )  # fmt: skip
-            begin += len(view.seen.node)
+            begin += len(view.seen.keyframe)
         if planes is not None:
             loss, off = self._loss(curved), out.off.of(tracks)
             total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
@@ -310,18 +310,18 @@ class FeatureFactor(FactorDefaults):
 
     def _stop(self, piece: Piece) -> int:
         """The keyframe before which the images of `piece` hang: the last, or behind the chain's very last."""
-        return piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
+        return piece.last + 1 if piece.last == self.n_keyframes - 1 else piece.last
 
     def _images(self, first: int, stop: int) -> list[range]:
         """By camera, the images that hang on keyframes first..stop."""
-        return [range(*(int(i) for i in np.searchsorted(c.node, [first, stop]))) for c in self.cameras]
+        return [range(*(int(i) for i in np.searchsorted(c.keyframe, [first, stop]))) for c in self.cameras]
 
     def _sightings(self) -> Sightings:
         pairs = list(zip(self.streams, self.cameras, strict=True))
         return Sightings(
             np.concatenate([s.feature for s in self.streams]),
             np.concatenate([s.image for s in self.streams]),
-            np.concatenate([c.node[s.image] for s, c in pairs]),
+            np.concatenate([c.keyframe[s.image] for s, c in pairs]),
             np.concatenate(self.keep),
             tuple(len(s.feature) for s in self.streams),
         )
@@ -335,13 +335,13 @@ class FeatureFactor(FactorDefaults):
         i0, i1 = images.start, images.stop
         seen = Seen(
             stream.start[i0 : i1 + 1], stream.uv, self.keep[index], tracks.track[index], tracks.pair[index],
-            camera.node[i0:i1] - first, self.sigmas[index],
+            camera.keyframe[i0:i1] - first, self.sigmas[index],
         )  # fmt: skip
         lens = self.layout.columns(camera.name, "intrinsics", "distortion")
         pars = np.flatnonzero(lens >= 0)
         clocks = range(len(state.values[camera.name, "time_offset"]))
         own = np.array([np.concatenate([camera.kinematics.columns(k), lens[pars]]) for k in clocks])
-        columns = own[clock_of(state, camera.name, camera.node[i0:i1])]
+        columns = own[clock_of(state, camera.name, camera.keyframe[i0:i1])]
         return View(camera, index, i0, camera.lens(state), seen, camera.poses(state, i0, i1), columns, pars)
 
     def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> Points:

@@ -17,7 +17,7 @@ from icalib.geometry.small import eigen3, solve_definite
 from icalib.motion.sensor_pose import chain_width, fill_chain
 from icalib.optim.robust_weights import bend, weight
 from icalib.optim.rows import add_gram
-from icalib.optim.state import NODE
+from icalib.optim.state import KEYFRAME_DIM
 
 # Of half the chi^2: a point's step that takes off less is its last. What that leaves is the square of it, but where a
 # robust loss bends a part of it; from 1e-8 on gradients show that.
@@ -29,14 +29,15 @@ FARTHEST_M, AT_END = 1e5, 1.0 - 1e-6  # of a point from the camera that it moves
 
 class Seen(NamedTuple):
     """What one camera saw: observations of image i are start[i]:start[i + 1]; uv (N, 2), keep (N,), track (N,) -1 where
-    left out; pair (N,) of feature and image (-1: none); node (n,), counted from the piece's first; sigma (N,) px."""
+    left out; pair (N,) of feature and image (-1: none); keyframe (n,), counted from the piece's first; sigma (N,)
+    px."""
 
     start: np.ndarray
     uv: np.ndarray
     keep: np.ndarray
     track: np.ndarray
     pair: np.ndarray
-    node: np.ndarray
+    keyframe: np.ndarray
     sigma: np.ndarray
 
 
@@ -348,10 +349,10 @@ def _fill_pose(i, at, A_imu, T, features):
     """T (6, w): pose i of the camera by keyframes and calibration parameters; by keyframes also in `features`."""
     fill_chain(i, at, A_imu, T)
     for d in range(6):
-        for j in range(NODE):
+        for j in range(KEYFRAME_DIM):
             features.pose[i, d, j] = T[d, j]
-        for j in range(NODE if len(features.next_pose) else 0):
-            features.next_pose[i, d, j] = T[d, NODE + j]
+        for j in range(KEYFRAME_DIM if len(features.next_pose) else 0):
+            features.next_pose[i, d, j] = T[d, KEYFRAME_DIM + j]
 
 
 @njit(cache=True, nogil=True)
@@ -388,5 +389,5 @@ def accumulate(X, seen, base, at, columns, seeing, loss, sums, features, residua
             _add_feature(i, A, seen.pair[n] - base.pair, t, T, n_chain, columns, features, by_pose)
         if wanted:
             _gram(rows[:m], G)
-            add_gram(seen.node[i], n_chain, G, T, columns[i], F, sums)
+            add_gram(seen.keyframe[i], n_chain, G, T, columns[i], F, sums)
     return total

@@ -47,7 +47,7 @@ class View:
     def _part(self, a: int, b: int) -> View:
         """Its images a..b."""
         seen, own = self.seen, slice(a, b)
-        seen = seen._replace(start=seen.start[a : b + 1], node=seen.node[own])
+        seen = seen._replace(start=seen.start[a : b + 1], keyframe=seen.keyframe[own])
         return replace(self, first=self.first + a, seen=seen, poses=self.poses.part(own), columns=self.columns[own])
 
     def in_camera(self, points: np.ndarray, track: int) -> np.ndarray:

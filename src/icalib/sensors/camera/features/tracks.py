@@ -34,8 +34,8 @@ class TrackNoise:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Tracks in the order of their first nodes. By camera, of each observation: track (N,), -1 where it has none; pair
-    (N,), of its track with its image.
+    """Tracks in the order of their first keyframes. By camera, of each observation: track (N,), -1 where it has none;
+    pair (N,), of its track with its image.
 
     pair_track, pair_camera and pair_image (E,): what each pair joins, in the order of keyframes; edges (S + 1,):
     keyframes between which tracks are cut; tracks_from and pairs_from (S + 1,): the first of each stretch; start (T,
@@ -70,34 +70,35 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Sightings:
-    """All observations, camera after camera: feature, image of the camera, and `node` (N,); used (N,): whether they
+    """All observations, camera after camera: feature, image of the camera, and `keyframe` (N,); used (N,): whether they
     count; counts: how many of them each camera has."""
 
     feature: np.ndarray
     image: np.ndarray
-    node: np.ndarray
+    keyframe: np.ndarray
     used: np.ndarray
     counts: tuple[int, ...]
 
     def labels(self, seconds: np.ndarray, edges: np.ndarray, longest_gap: float) -> np.ndarray:
         """(N,) a number for each stretch of a feature's life, -1 for observations that do not count; `seconds` (K,) of
-        the nodes."""
+        the keyframes."""
         at = np.flatnonzero(self.used)
-        order = at[np.lexsort((self.node[at], self.feature[at]))]
-        feature, node = self.feature[order], self.node[order]
-        stretch = np.searchsorted(edges, node, side="right")
+        order = at[np.lexsort((self.keyframe[at], self.feature[at]))]
+        feature, keyframe = self.feature[order], self.keyframe[order]
+        stretch = np.searchsorted(edges, keyframe, side="right")
         new = np.ones(len(order), dtype=bool)
-        new[1:] = (np.diff(feature) != 0) | (np.diff(stretch) != 0) | (np.diff(seconds[node]) > longest_gap)
+        new[1:] = (np.diff(feature) != 0) | (np.diff(stretch) != 0) | (np.diff(seconds[keyframe]) > longest_gap)
         out = np.full(len(self.feature), -1)
         out[order] = np.cumsum(new) - 1
         return out
 
     def in_order(self, label: np.ndarray) -> np.ndarray:
-        """(N,) the same labels, but for those with too few observations, numbered in the order of their first nodes."""
+        """(N,) the same labels, but for those with too few observations, numbered in the order of their first
+        keyframes."""
         seen = label >= 0
         n = int(label.max(initial=-1)) + 1
         first = np.full(n, np.iinfo(np.int64).max)
-        np.minimum.at(first, label[seen], self.node[seen])
+        np.minimum.at(first, label[seen], self.keyframe[seen])
         left = np.bincount(label[seen], minlength=n) >= FEWEST
         order = np.argsort(first, kind="stable")
         number = np.full(n + 1, -1)
@@ -107,18 +108,18 @@ class Sightings:
     def tracks(self, label: np.ndarray, edges: np.ndarray) -> Tracks:
         """Of labels that are in order; where points are looked for is unknown as yet."""
         seen, n = np.flatnonzero(label >= 0), int(label.max(initial=-1)) + 1
-        pairs = seen[np.argsort(self.node[seen], kind="stable")]
+        pairs = seen[np.argsort(self.keyframe[seen], kind="stable")]
         pair = np.full(len(label), -1)
         pair[pairs] = np.arange(len(pairs))
         lives = pairs[np.argsort(label[pairs], kind="stable")]
         begins = np.searchsorted(label[lives], np.arange(n))
         middle = lives[begins + np.bincount(label[lives], minlength=n) // 2]
-        tracks_from = np.searchsorted(self.node[lives[begins]], edges)
+        tracks_from = np.searchsorted(self.keyframe[lives[begins]], edges)
         camera = np.repeat(np.arange(len(self.counts)), self.counts)
         own_track, own_pair = (tuple(np.split(a, np.cumsum(self.counts)[:-1])) for a in (label, pair))
         return Tracks(
             own_track, own_pair, label[pairs], camera[pairs], self.image[pairs], edges, tracks_from,
-            np.searchsorted(self.node[pairs], edges), camera[middle], self.image[middle], np.zeros((n, 3)),
+            np.searchsorted(self.keyframe[pairs], edges), camera[middle], self.image[middle], np.zeros((n, 3)),
         )  # fmt: skip
 
 

@@ -45,7 +45,7 @@ class Guess:
         return out
 
     def biases(self, n: int) -> np.ndarray:
-        """(n, 6) the biases, the same at all nodes."""
+        """(n, 6) the biases, the same at all keyframes."""
         return np.tile(np.concatenate([self.gyro_bias, self.accel_bias]), (n, 1))
 
     def body_poses(self, measurements: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

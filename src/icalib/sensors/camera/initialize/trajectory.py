@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
+from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.targets.base import BOARD
 from icalib.initialize.steps.by_recording import each_clock
-from icalib.motion.nodes import first_nodes
+from icalib.motion.keyframe_placement import first_keyframes
 from icalib.optim.state import State, in_recording
 from icalib.sensors.camera.initialize.guess import Guess
 from icalib.sensors.camera.initialize.with_imu import initial_trajectory
@@ -24,10 +24,12 @@ def first_state(inputs: Inputs, *guesses: Guess) -> State:
             own = [g.cameras[camera.name].offset for g in guesses]
             values[camera.name, "time_offset"] = each_clock(inputs, camera.name, own.__getitem__)
     values = start_values(inputs, values)
-    nodes = nodes_for(inputs, host_times(inputs, values))
-    starts = first_nodes(inputs.imu, nodes)
-    own = [(g, m, t - m.begin) for g, m, t in zip(guesses, inputs.motions, np.split(nodes, starts[1:]), strict=True)]
+    keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
+    starts = first_keyframes(inputs.imu, keyframes)
+    own = [
+        (g, m, t - m.begin) for g, m, t in zip(guesses, inputs.motions, np.split(keyframes, starts[1:]), strict=True)
+    ]
     paths = [initial_trajectory(guess, inputs.rig, motion.measurements, t) for guess, motion, t in own]
     rotation, position, velocity = (np.concatenate(x) for x in zip(*paths, strict=True))
     bias = np.concatenate([guess.biases(len(t)) for guess, _, t in own])
-    return State(nodes, rotation, position, velocity, bias, values, starts)
+    return State(keyframes, rotation, position, velocity, bias, values, starts)

@@ -147,20 +147,20 @@ def _level(gravity_board: np.ndarray) -> np.ndarray:
 
 
 def initial_trajectory(
-    guess: Guess, rig: Rig, measurements: Measurements, nodes: np.ndarray
+    guess: Guess, rig: Rig, measurements: Measurements, keyframes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R_world_imu (K, 3, 3), position and velocity (K, 3) at `nodes` [s on the imu clock since its first stamp].
+    """R_world_imu (K, 3, 3), position and velocity (K, 3) at `keyframes` [s on the imu clock since its first stamp].
 
     From the nearest camera pose, rotation carried by the gyroscope, position interpolated.
     """
     imu = imu_data(rig, measurements)
     if imu is None:
-        return trajectory_without_imu(guess, measurements, nodes)
+        return trajectory_without_imu(guess, measurements, keyframes)
     t, R, p = guess.body_poses(measurements)
 
     def position(s: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(s, t, p[:, k]) for k in range(3)], axis=1)
 
-    rotation = GyroRotation.integrate(imu, guess.gyro_bias).carry(t, R, nodes)
-    velocity = (position(nodes + VELOCITY_STEP_S) - position(nodes - VELOCITY_STEP_S)) / (2.0 * VELOCITY_STEP_S)
-    return np.ascontiguousarray(rotation), position(nodes), velocity
+    rotation = GyroRotation.integrate(imu, guess.gyro_bias).carry(t, R, keyframes)
+    velocity = (position(keyframes + VELOCITY_STEP_S) - position(keyframes - VELOCITY_STEP_S)) / (2.0 * VELOCITY_STEP_S)
+    return np.ascontiguousarray(rotation), position(keyframes), velocity

@@ -41,12 +41,12 @@ def guess_without_imu(
 
 
 def trajectory_without_imu(
-    guess: Guess, measurements: Measurements, nodes: np.ndarray
+    guess: Guess, measurements: Measurements, keyframes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R_world_body (K, 3, 3), position and velocity (K, 3) at `nodes`: the pose of the nearest image, at rest."""
+    """R_world_body (K, 3, 3), position and velocity (K, 3) at `keyframes`: the pose of the nearest image, at rest."""
     t, R, p = guess.body_poses(measurements)
-    nearest = np.searchsorted(0.5 * (t[1:] + t[:-1]), nodes)
-    return np.ascontiguousarray(R[nearest]), p[nearest], np.zeros((len(nodes), 3))
+    nearest = np.searchsorted(0.5 * (t[1:] + t[:-1]), keyframes)
+    return np.ascontiguousarray(R[nearest]), p[nearest], np.zeros((len(keyframes), 3))
 
 
 def _places(rig: Rig, times: list[np.ndarray], poses: list[TargetPoses]) -> list[Pose]:

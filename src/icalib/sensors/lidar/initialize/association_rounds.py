@@ -15,7 +15,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
-from icalib.estimate.problem.assembly import host_times, motion_of, nodes_for, start_values
+from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, motion_of, start_values
 from icalib.estimate.problem.inputs import Inputs, with_clouds
 from icalib.geometry.planes import plane_of
 from icalib.initialize.steps.by_recording import (
@@ -32,7 +32,7 @@ from icalib.initialize.steps.contradicted import settled
 from icalib.initialize.steps.known_values import given, held_of, trusted_names
 from icalib.motion.clocks import instants
 from icalib.motion.clouds import Clouds, joined_clouds, known_planes
-from icalib.motion.known_motion import near_nodes
+from icalib.motion.known_motion import are_near_keyframes
 from icalib.motion.point_planes import are_somewhere, thinned
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.state import Key, State
@@ -78,9 +78,9 @@ def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
     own, known = guess.values(lidar.name), given(inputs, lidar, names)
     values = start_values(inputs, settled(lidar, known, own) if guess.turned else own | known)
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
-    nodes = nodes_for(inputs, host_times(inputs, hosts)[:1])
-    rotation, position, velocity = motion.at(nodes)
-    return State(nodes, rotation, position, velocity, np.tile(motion.bias, (len(nodes), 1)), values)
+    keyframes = keyframes_for(inputs, keyframe_times(inputs, hosts)[:1])
+    rotation, position, velocity = motion.at(keyframes)
+    return State(keyframes, rotation, position, velocity, np.tile(motion.bias, (len(keyframes), 1)), values)
 
 
 def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
@@ -175,14 +175,15 @@ def _without_planes(state: State) -> dict[Key, np.ndarray]:
 
 
 def while_known(inputs: Inputs, state: State) -> Inputs:
-    """`inputs` without points that are nowhere, and without scans beyond the nodes of `state`: carried there by the IMU
-    alone, their points would count as if its readings had no noise. Raises EstimationError where no scan is left."""
+    """`inputs` without points that are nowhere, and without scans beyond the keyframes of `state`: carried there by the
+    IMU alone, their points would count as if its readings had no noise. Raises EstimationError where no scan is
+    left."""
     measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
     for stream in measured.lidars:
         begin = instants(stream, state.values)
         last, some = np.zeros(len(begin)), np.diff(stream.start) > 0
         last[some] = np.maximum.reduceat(stream.offset_s, stream.start[:-1][some]) if some.any() else 0.0
-        known = near_nodes(state.seconds, begin) & near_nodes(state.seconds, begin + last)
+        known = are_near_keyframes(state.seconds, begin) & are_near_keyframes(state.seconds, begin + last)
         if not known.any():
             raise EstimationError(
                 f"{stream.name}: none of its scans falls within the recording of the other sensors; check that the "

@@ -54,7 +54,7 @@ def lidar_and_motion(
 
 
 def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = UNKNOWN) -> ExtrinsicsGuess:
-    """From the motion of the IMU in `known`: nodes no further apart than 50 ms or so. Raises EstimationError, one
+    """From the motion of the IMU in `known`: keyframes no further apart than 50 ms or so. Raises EstimationError, one
     sentence, where the recording does not show it."""
     scans = scans_of(stream)
     aligned, alone, rates = _aligned(imu, stream.name, scans, held)

@@ -15,7 +15,7 @@ import numpy as np
 
 from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
-from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
+from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
 from icalib.initialize.paths.alignment import align_path
@@ -121,9 +121,9 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
     own = settled(sensor, given(inputs, sensor), found.guess.values(sensor.name))
     values = start_values(inputs, own)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
-    nodes = nodes_for(inputs, host_times(inputs, hosts))
-    rotation, position, velocity = found.motion.at(nodes)
-    return State(nodes, rotation, position, velocity, np.tile(found.motion.bias, (len(nodes), 1)), values)
+    keyframes = keyframes_for(inputs, keyframe_times(inputs, hosts))
+    rotation, position, velocity = found.motion.at(keyframes)
+    return State(keyframes, rotation, position, velocity, np.tile(found.motion.bias, (len(keyframes), 1)), values)
 
 
 def pose_rates(stream: PoseStream) -> CameraRates:
@@ -229,8 +229,8 @@ def _frames(
     out: dict[Key, np.ndarray] = {}
     R_is, p_is, _ = (values[sensor.name, name] for name in MOUNTED_NAMES)
     t = instants(stream, values)
-    for k, nodes in enumerate(known.recordings if sensor.kind == "absolute" else ()):
-        part = _nodes(known, nodes)
+    for k, keyframes in enumerate(known.recordings if sensor.kind == "absolute" else ()):
+        part = _keyframes(known, keyframes)
         own = np.flatnonzero((t >= part.seconds[0]) & (t <= part.seconds[-1]))
         if not len(own):
             raise too_short(stream.name)
@@ -242,6 +242,6 @@ def _frames(
     return out
 
 
-def _nodes(state: State, own: slice) -> State:
+def _keyframes(state: State, own: slice) -> State:
     columns = {name: getattr(state, name)[own] for name in ("seconds", "rotation", "position", "velocity", "bias")}
     return replace(state, **columns, starts=(0,))

@@ -6,7 +6,7 @@ import numpy as np
 
 from icalib.data.checks.stops import moved
 from icalib.initialize.steps.smooth_path import BodyPoses
-from icalib.motion.nodes import MERGED_WITHIN_S
+from icalib.motion.keyframe_placement import MERGED_WITHIN_S
 
 AROUND_S = 0.2  # before and behind an instant at which a sensor must be at rest: clocks may be so far apart
 SEEN_S = 2.0  # between poses that show whether it is

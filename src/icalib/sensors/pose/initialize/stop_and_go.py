@@ -15,7 +15,7 @@ from icalib.data.checks.stops import stands_still_between
 from icalib.data.measurements import Measurements, PoseStream
 from icalib.data.recordings.several import naming
 from icalib.errors import EstimationError
-from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
+from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
@@ -86,11 +86,11 @@ def _at_rest(sensor: PoseSensor, is_body: bool) -> PoseSensor:
 def _state(inputs: Inputs, shown: Sequence[BodyPoses], found: dict[Key, np.ndarray]) -> State:
     """At every instant the nearest pose of the body, at rest."""
     values = start_values(inputs, found)
-    nodes = nodes_for(inputs, host_times(inputs, values))
+    keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     t = np.concatenate([own.seconds + part.begin for own, part in zip(shown, inputs.parts, strict=True)])
     R, p = (np.concatenate([getattr(own, name) for own in shown]) for name in ("rotation", "position"))
-    k, n = np.searchsorted(0.5 * (t[1:] + t[:-1]), nodes), len(nodes)
-    return State(nodes, np.ascontiguousarray(R[k]), p[k], np.zeros((n, 3)), np.zeros((n, 6)), values)
+    k, n = np.searchsorted(0.5 * (t[1:] + t[:-1]), keyframes), len(keyframes)
+    return State(keyframes, np.ascontiguousarray(R[k]), p[k], np.zeros((n, 3)), np.zeros((n, 6)), values)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.data.measurements import Measurements
 from icalib.estimate.estimate import first_pass
-from icalib.estimate.problem.assembly import host_times, motion_of, nodes_for, start_values
+from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, motion_of, start_values
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.by_recording import (
     Held,
@@ -86,9 +86,9 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
         for name, value in zip(NAMES, (found.best.at.arm, np.array([found.best.at.offset])), strict=True)
     }
     values = start_values(inputs, settled(sensor, given(inputs, sensor, NAMES), shown))
-    nodes = nodes_for(inputs, host_times(inputs, values))
-    rotation, position, velocity, bias = found.at(nodes)
-    return State(nodes, rotation, position, velocity, bias, values)
+    keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
+    rotation, position, velocity, bias = found.at(keyframes)
+    return State(keyframes, rotation, position, velocity, bias, values)
 
 
 def _on_motion(inputs: Inputs, state: State, sensor: PositionSensor) -> Values:

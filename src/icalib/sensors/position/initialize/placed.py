@@ -45,8 +45,8 @@ class PlacedSensor(NamedTuple):
 
 
 def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: Held) -> PlacedSensor:
-    """From the fixes of one recording, whose nodes `motion` has. levelled: the frame turns against the world about z
-    alone. Raises EstimationError where they do not show it."""
+    """From the fixes of one recording, whose keyframes `motion` has. levelled: the frame turns against the world about
+    z alone. Raises EstimationError where they do not show it."""
     found = [x for offset in _offsets(motion, fix, known) if (x := _placed(motion, fix, offset, levelled, known))]
     if min((x.left for x in found), default=np.inf) > LARGEST_LEFT and known.offset is None:
         scanned = _scanned(motion, fix, levelled, known)
@@ -84,10 +84,10 @@ def _scanned(motion: Motion, fix: Fix, levelled: bool, known: Held) -> list[floa
     """The offsets of a grid at which frame and lever arm fit best, however the rig moves: where it turns in place,
     neither its speed nor its acceleration is like those of the antenna. Half of the fixes must be used."""
     some = np.linspace(0, len(fix.t) - 1, min(len(fix.t), SCANNED_FIXES)).astype(int)
-    t, p, nodes = fix.t[some], fix.position[some], motion.state.seconds
+    t, p, keyframes = fix.t[some], fix.position[some], motion.state.seconds
     tried: list[tuple[float, float]] = []
-    for offset in np.arange(nodes[0] - t[-1], nodes[-1] - t[0], SCAN_STEP_S).tolist():
-        ok = is_known(nodes, t + offset)
+    for offset in np.arange(keyframes[0] - t[-1], keyframes[-1] - t[0], SCAN_STEP_S).tolist():
+        ok = is_known(keyframes, t + offset)
         if ok.sum() < max(FEWEST, 0.5 * len(t)):
             continue
         at = imu_poses(motion, t[ok] + offset)

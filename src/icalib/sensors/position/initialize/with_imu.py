@@ -50,18 +50,21 @@ class PositionMotion:
     best: Fitted
     windows: tuple[MotionWindow, ...]
 
-    def at(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """R_frame_imu (K, 3, 3), p_frame_imu, velocity (K, 3), biases (K, 6) at `nodes` (K,) s on the IMU's clock."""
+    def at(self, keyframes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """R_frame_imu (K, 3, 3), p_frame_imu, velocity (K, 3), biases (K, 6) at `keyframes` (K,) s on the IMU's
+        clock."""
         t = self.fix.t + self.best.at.offset
-        R, bias = self._attitude(nodes)
+        R, bias = self._attitude(keyframes)
         at_fixes, _ = self._attitude(t)
         p = self.fix.position - at_fixes @ self.best.at.arm
 
         def position(s: np.ndarray) -> np.ndarray:
             return np.stack([np.interp(s, t, p[:, k]) for k in range(3)], axis=1)
 
-        velocity = (position(nodes + VELOCITY_STEP_S) - position(nodes - VELOCITY_STEP_S)) / (2.0 * VELOCITY_STEP_S)
-        return R, position(nodes), velocity, bias
+        velocity = (position(keyframes + VELOCITY_STEP_S) - position(keyframes - VELOCITY_STEP_S)) / (
+            2.0 * VELOCITY_STEP_S
+        )
+        return R, position(keyframes), velocity, bias
 
     def _attitude(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """R_frame_imu (n, 3, 3) and biases (n, 6) at t (n,) s, in order."""

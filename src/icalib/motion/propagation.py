@@ -1,4 +1,4 @@
-"""From nodes to the instants that hang on them, forwards or backwards, by the IMU's readings."""
+"""From keyframes to the instants that hang on them, forwards or backwards, by the IMU's readings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icalib.motion.integration_step import SIZE, D, start
 from icalib.optim.state import State
 
 
-class Nodes(NamedTuple):
+class Keyframes(NamedTuple):
     """Those of a `State`, as kernels take them, and gravity [m/s^2]."""
 
     seconds: np.ndarray
@@ -24,16 +24,16 @@ class Nodes(NamedTuple):
     gravity: float
 
 
-def nodes_of(state: State, gravity: float) -> Nodes:
-    return Nodes(state.seconds, state.rotation, state.position, state.velocity, state.bias, gravity)
+def keyframes_of(state: State, gravity: float) -> Keyframes:
+    return Keyframes(state.seconds, state.rotation, state.position, state.velocity, state.bias, gravity)
 
 
 class Ways(NamedTuple):
-    """How n instants are reached: times (n,) seconds on the IMU's clock, node (n,) of each, first (n,) the interval of
-    the readings in which its way begins, order (n,) in which to go."""
+    """How n instants are reached: times (n,) seconds on the IMU's clock, keyframe (n,) of each, first (n,) the interval
+    of the readings in which its way begins, order (n,) in which to go."""
 
     times: np.ndarray
-    node: np.ndarray
+    keyframe: np.ndarray
     first: np.ndarray
     order: np.ndarray
 
@@ -53,12 +53,12 @@ class Moving(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def integrate_from_node(node, t0, t1, first, bias, readings, by, carried, run, width):
-    """As `integrate`, without a covariance and into `run` (SIZE,). What was `carried` from the same node in the same
-    direction, and not as far as t1, is carried on, so that many instants (`in_order_of_nodes`) cost little more than
-    the last one. carried (SIZE + 3,): a run through whole intervals; its way, its interval, its instant."""
+def integrate_from_keyframe(keyframe, t0, t1, first, bias, readings, by, carried, run, width):
+    """As `integrate`, without a covariance and into `run` (SIZE,). What was `carried` from the same keyframe in the
+    same direction, and not as far as t1, is carried on, so that many instants (`in_order_of_keyframes`) cost little
+    more than the last one. carried (SIZE + 3,): a run through whole intervals; its way, its interval, its instant."""
     backwards = t1 < t0
-    way = 2 * node + backwards
+    way = 2 * keyframe + backwards
     if carried[SIZE] != way or (t1 >= carried[SIZE + 2] if backwards else t1 <= carried[SIZE + 2]):
         start(carried)
         carried[SIZE], carried[SIZE + 1], carried[SIZE + 2] = way, first, t0
@@ -75,27 +75,28 @@ def integrate_from_node(node, t0, t1, first, bias, readings, by, carried, run, w
 
 @njit(cache=True, nogil=True)
 def nothing_carried():
-    """See `integrate_from_node`."""
+    """See `integrate_from_keyframe`."""
     carried = np.zeros(SIZE + 3)
     carried[SIZE] = -1.0
     return carried
 
 
 @njit(cache=True, nogil=True)
-def rotation_of(nodes, k):
-    """R_world_imu of node k: nine numbers, row by row."""
-    R = nodes.rotation
+def rotation_of(keyframes, k):
+    """R_world_imu of keyframe k: nine numbers, row by row."""
+    R = keyframes.rotation
     return R[k, 0, 0], R[k, 0, 1], R[k, 0, 2], R[k, 1, 0], R[k, 1, 1], R[k, 1, 2], R[k, 2, 0], R[k, 2, 1], R[k, 2, 2]
 
 
 @njit(cache=True, nogil=True)
-def place(i, seconds, k, nodes, way, rate, out):
-    """Fills entry i of `out`, a `Moving`, `seconds` and increments `way` (15,), see `integration_step`, from node k."""
-    R, g = nodes.rotation, nodes.gravity
+def place(i, seconds, k, keyframes, way, rate, out):
+    """Fills entry i of `out`, a `Moving`, `seconds` and increments `way` (15,), see `integration_step`, from keyframe
+    k."""
+    R, g = keyframes.rotation, keyframes.gravity
     for a in range(3):
         out.rate[i, a] = rate[a]
-        position = nodes.position[k, a] + nodes.velocity[k, a] * seconds
-        velocity = nodes.velocity[k, a]
+        position = keyframes.position[k, a] + keyframes.velocity[k, a] * seconds
+        velocity = keyframes.velocity[k, a]
         for c in range(3):
             out.rotation[i, a, c] = R[k, a, 0] * way[c] + R[k, a, 1] * way[3 + c] + R[k, a, 2] * way[6 + c]
             position += R[k, a, c] * way[12 + c]
@@ -105,17 +106,17 @@ def place(i, seconds, k, nodes, way, rate, out):
     out.velocity[i, 2] -= g * seconds
 
 
-def in_order_of_nodes(times: np.ndarray, node: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """(n,) the order in which instants at `times` (n,), in order themselves, lead away from their `node` (n,), which
-    are at `seconds` (K,): first all behind their nodes, then backwards those before."""
-    before = times < seconds[node]
+def in_order_of_keyframes(times: np.ndarray, keyframe: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """(n,) the order in which instants at `times` (n,), in order themselves, lead away from their `keyframe` (n,),
+    which are at `seconds` (K,): first all behind their keyframes, then backwards those before."""
+    before = times < seconds[keyframe]
     return np.concatenate([np.flatnonzero(~before), np.flatnonzero(before)[::-1]])
 
 
-def ways_from(state: State, times: np.ndarray, node: np.ndarray, imu: ImuData) -> Ways:
-    """To `times` (n,), in order, from their `node` (n,)."""
-    begin = state.seconds[node]
+def ways_from(state: State, times: np.ndarray, keyframe: np.ndarray, imu: ImuData) -> Ways:
+    """To `times` (n,), in order, from their `keyframe` (n,)."""
+    begin = state.seconds[keyframe]
     first = imu.interval(begin)
-    # Integration backwards starts in the interval that ends at the node, if the node lies on a stamp.
+    # Integration backwards starts in the interval that ends at the keyframe, if the keyframe lies on a stamp.
     on_stamp = (times < begin) & (imu.seconds[first] == begin) & (first > 0)
-    return Ways(times, node, first - on_stamp, in_order_of_nodes(times, node, state.seconds))
+    return Ways(times, keyframe, first - on_stamp, in_order_of_keyframes(times, keyframe, state.seconds))

@@ -1,11 +1,11 @@
-"""Where nodes stand: at images, filled in between, none in long gaps."""
+"""Where keyframes stand: at images, filled in between, none in long gaps."""
 
 import numpy as np
 import pytest
 
 from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
-from icalib.motion.nodes import place_nodes, usable
+from icalib.motion.keyframe_placement import place_keyframes, usable
 from icalib.rig import ImuNoise
 
 
@@ -27,56 +27,58 @@ def without(seconds, start, end):
 
 def test_images_within_2_ms_share_the_earlier_one():
     times = [np.array([0.1, 0.15, 0.2]), np.array([0.1019, 0.1521, 0.2])]
-    nodes = place_nodes(imu_at(STEADY), times, spacing=0.1, max_gap=0.5)
-    np.testing.assert_array_equal(nodes, [0.1, 0.15, 0.1521, 0.2])
+    keyframes = place_keyframes(imu_at(STEADY), times, spacing=0.1, max_gap=0.5)
+    np.testing.assert_array_equal(keyframes, [0.1, 0.15, 0.1521, 0.2])
 
 
 def test_order_of_cameras_does_not_matter():
     a, b = np.array([0.1, 0.2, 0.3]), np.array([0.125, 0.225])
     imu = imu_at(STEADY)
-    np.testing.assert_array_equal(place_nodes(imu, [a, b], 0.05, 0.5), place_nodes(imu, [b, a], 0.05, 0.5))
+    np.testing.assert_array_equal(place_keyframes(imu, [a, b], 0.05, 0.5), place_keyframes(imu, [b, a], 0.05, 0.5))
 
 
-def test_long_stretches_are_filled_evenly_and_all_images_are_nodes():
+def test_long_stretches_are_filled_evenly_and_all_images_are_keyframes():
     images = np.array([0.1, 0.15, 0.38, 0.48, 1.0])
-    nodes = place_nodes(imu_at(STEADY), [images], spacing=0.05, max_gap=0.5)
-    assert np.isin(images, nodes).all()
-    counts = np.histogram(nodes, images)[0]  # nodes from each image to before the next; the last node counts too
+    keyframes = place_keyframes(imu_at(STEADY), [images], spacing=0.05, max_gap=0.5)
+    assert np.isin(images, keyframes).all()
+    counts = np.histogram(keyframes, images)[
+        0
+    ]  # keyframes from each image to before the next; the last keyframe counts too
     np.testing.assert_array_equal(counts, [1, 5, 2, 12])
     for a, b in zip(images[:-1], images[1:], strict=True):
-        steps = np.diff(nodes[(nodes >= a) & (nodes <= b)])
+        steps = np.diff(keyframes[(keyframes >= a) & (keyframes <= b)])
         np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize(("distance", "steps"), [(0.04, 1), (0.0545, 1), (0.0555, 2), (0.104, 2), (0.106, 3)])
-def test_jitter_of_a_tenth_of_the_spacing_needs_no_node(distance, steps):
-    nodes = place_nodes(imu_at(STEADY), [np.array([0.1, 0.1 + distance])], spacing=0.05, max_gap=0.5)
-    assert len(nodes) == 1 + steps
-    assert np.diff(nodes).max() <= 1.1 * 0.05
+def test_jitter_of_a_tenth_of_the_spacing_needs_no_keyframe(distance, steps):
+    keyframes = place_keyframes(imu_at(STEADY), [np.array([0.1, 0.1 + distance])], spacing=0.05, max_gap=0.5)
+    assert len(keyframes) == 1 + steps
+    assert np.diff(keyframes).max() <= 1.1 * 0.05
 
 
-def test_images_outside_the_recording_have_no_node():
-    nodes = place_nodes(imu_at(STEADY), [np.array([-0.1, 0.0, 0.05, 2.0, 2.01])], 3.0, 0.5)
-    np.testing.assert_array_equal(nodes, [0.0, 0.05, 2.0])
+def test_images_outside_the_recording_have_no_keyframe():
+    keyframes = place_keyframes(imu_at(STEADY), [np.array([-0.1, 0.0, 0.05, 2.0, 2.01])], 3.0, 0.5)
+    np.testing.assert_array_equal(keyframes, [0.0, 0.05, 2.0])
 
 
 def test_short_gaps_are_filled():
     imu = imu_at(without(STEADY, 0.5, 0.8))
     np.testing.assert_allclose(imu.gaps, [(0.5, 0.8)])
     images = np.arange(0.1, 1.0, 0.1)
-    nodes = place_nodes(imu, [images], spacing=0.05, max_gap=0.5)
-    assert np.isin(images, nodes).all()
-    assert np.diff(nodes).max() <= 0.05 + 1e-9
+    keyframes = place_keyframes(imu, [images], spacing=0.05, max_gap=0.5)
+    assert np.isin(images, keyframes).all()
+    assert np.diff(keyframes).max() <= 0.05 + 1e-9
 
 
-def test_long_gaps_hold_no_node():
+def test_long_gaps_hold_no_keyframe():
     imu = imu_at(without(STEADY, 0.5, 1.3))
     images = np.arange(0.1, 1.6, 0.1)
-    nodes = place_nodes(imu, [images], spacing=0.05, max_gap=0.5)
-    assert not ((nodes > 0.5 + 1e-9) & (nodes < 1.3 - 1e-9)).any()
-    assert nodes[0] == images[0] and nodes[-1] == images[-1]
+    keyframes = place_keyframes(imu, [images], spacing=0.05, max_gap=0.5)
+    assert not ((keyframes > 0.5 + 1e-9) & (keyframes < 1.3 - 1e-9)).any()
+    assert keyframes[0] == images[0] and keyframes[-1] == images[-1]
     # Up to the gap and after it the spacing holds, but for the ends towards the gap.
-    assert np.sort(np.diff(nodes))[-2] <= 0.05 + 1e-9
+    assert np.sort(np.diff(keyframes))[-2] <= 0.05 + 1e-9
 
 
 def test_usable_is_what_lies_inside_the_recording_and_outside_long_gaps():

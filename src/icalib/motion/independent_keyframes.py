@@ -1,4 +1,4 @@
-"""In place of an IMU: nodes that nothing ties to each other. Each is an instant at which images were taken."""
+"""In place of an IMU: keyframes that nothing ties to each other. Each is an instant at which images were taken."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece
-from icalib.optim.state import NODE, State
+from icalib.optim.state import KEYFRAME_DIM, State
 
 POSE = 6
 WEAK = (
@@ -18,15 +18,15 @@ WEAK = (
 
 
 @dataclass(frozen=True)
-class FreeNodes(RowFactor):
+class IndependentKeyframes(RowFactor):
     """Velocity and biases, which nothing sees, are held where they are."""
 
     name: str  # of the body's sensor
-    n_nodes: int
+    n_keyframes: int
 
     @property
     def key(self) -> FactorKey:
-        return self.name, "nodes"
+        return self.name, "keyframes"
 
     @property
     def kinds(self) -> dict[str, slice]:
@@ -38,21 +38,21 @@ class FreeNodes(RowFactor):
         """One chain: where nothing ties neighbours, recordings make no difference."""
         return (0,)
 
-    def with_imu(self, imu: ImuData) -> FreeNodes:
+    def with_imu(self, imu: ImuData) -> IndependentKeyframes:
         """The same: there is none."""
         del imu
         return self
 
     def output(self) -> Whitened:
         """Rows (K - 1, 15) that stay empty."""
-        return Whitened.without_loss(self.n_nodes - 1, NODE)
+        return Whitened.without_loss(self.n_keyframes - 1, KEYFRAME_DIM)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """Defines what corners leave open in the nodes of `piece`. Returns half a chi^2 of nothing."""
+        """Defines what corners leave open in the keyframes of `piece`. Returns half a chi^2 of nothing."""
         del state, out, curved
         if sums:
-            own = np.concatenate([np.full(POSE, WEAK), np.ones(NODE - POSE)])
-            piece.diagonal[:, range(NODE), range(NODE)] += own
+            own = np.concatenate([np.full(POSE, WEAK), np.ones(KEYFRAME_DIM - POSE)])
+            piece.diagonal[:, range(KEYFRAME_DIM), range(KEYFRAME_DIM)] += own
         return 0.0
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:

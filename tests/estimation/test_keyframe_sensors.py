@@ -1,4 +1,4 @@
-"""What nodes are placed at: images, though wheels report relative poses whose ends then lie beside them."""
+"""What keyframes are placed at: images, though wheels report relative poses whose ends then lie beside them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.estimate.problem.assembly import host_times, image_times, nodes_for
+from icalib.estimate.problem.assembly import image_times, keyframe_times, keyframes_for
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate
@@ -22,11 +22,11 @@ def inputs():
 
 
 @pytest.mark.parametrize("offset", [0.0, -0.013])
-def test_every_image_has_a_node_of_its_own(inputs, offset):
+def test_every_image_has_a_keyframe_of_its_own(inputs, offset):
     values = {(c.name, "time_offset"): np.zeros(1) for c in inputs.rig.cameras}
     values |= {("wheel0", "time_offset"): np.array([offset])}
     images = np.concatenate(image_times(inputs, values))
-    nodes = nodes_for(inputs, host_times(inputs, values))
-    recorded = images[(images >= nodes[0]) & (images <= nodes[-1])]
+    keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
+    recorded = images[(images >= keyframes[0]) & (images <= keyframes[-1])]
     assert len(recorded) > 100
-    assert np.abs(nodes[:, None] - recorded).min(axis=0).max() < 2e-3 + 1e-9
+    assert np.abs(keyframes[:, None] - recorded).min(axis=0).max() < 2e-3 + 1e-9

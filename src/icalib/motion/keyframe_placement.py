@@ -1,4 +1,4 @@
-"""Where the nodes of the chain stand: at every distinct image instant, and often enough in between."""
+"""Where the keyframes of the chain stand: at every distinct image instant, and often enough in between."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import numpy as np
 
 from icalib.motion.imu_data import ImuData, clear_of
 
-MERGED_WITHIN_S = 2e-3  # images closer than this share a node
-SLACK = 0.1  # of the spacing: a camera of 20 Hz whose stamps jitter needs no node in between
+MERGED_WITHIN_S = 2e-3  # images closer than this share a keyframe
+SLACK = 0.1  # of the spacing: a camera of 20 Hz whose stamps jitter needs no keyframe in between
 
 
-def place_nodes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max_gap: float) -> np.ndarray:
-    """(K,) node times, seconds on the imu clock: all image instants, none further apart than 1.1 `spacing`.
+def place_keyframes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max_gap: float) -> np.ndarray:
+    """(K,) keyframe times, seconds on the imu clock: all image instants, none further apart than 1.1 `spacing`.
 
-    IMU gaps are filled too, up to `max_gap` seconds; in longer ones there is no node, and none between recordings.
+    IMU gaps are filled too, up to `max_gap` seconds; in longer ones there is no keyframe, and none between recordings.
     """
     times = np.sort(np.concatenate(image_times))
     own = distinct(times[usable(imu, times, max_gap)])
-    parts = [_filled(recorded, spacing) for recorded in np.split(own, first_nodes(imu, own)[1:])]
-    nodes = np.concatenate(parts)
-    return nodes[clear_of(_long_gaps(imu, max_gap), nodes, nodes)]
+    parts = [_filled(recorded, spacing) for recorded in np.split(own, first_keyframes(imu, own)[1:])]
+    keyframes = np.concatenate(parts)
+    return keyframes[clear_of(_long_gaps(imu, max_gap), keyframes, keyframes)]
 
 
 def _filled(times: np.ndarray, spacing: float) -> np.ndarray:
@@ -33,10 +33,10 @@ def _filled(times: np.ndarray, spacing: float) -> np.ndarray:
     return filled
 
 
-def first_nodes(imu: ImuData | None, nodes: np.ndarray) -> tuple[int, ...]:
-    """The first of the `nodes` (K,) of each recording; without an IMU nodes know of no recordings."""
+def first_keyframes(imu: ImuData | None, keyframes: np.ndarray) -> tuple[int, ...]:
+    """The first of the `keyframes` (K,) of each recording; without an IMU keyframes know of no recordings."""
     seams = () if imu is None else imu.seams
-    return (0, *(int(k) for k in np.searchsorted(nodes, [end for end, _ in seams], side="right")))
+    return (0, *(int(k) for k in np.searchsorted(keyframes, [end for end, _ in seams], side="right")))
 
 
 def distinct(times: np.ndarray) -> np.ndarray:
