@@ -24,8 +24,8 @@ from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.trajectory import first_state
-from icalib.sensors.camera.initialize.with_imu import initial_guess
+from icalib.sensors.camera.initialize.initial_state import initial_state
+from icalib.sensors.camera.initialize.target_with_imu import initial_guess
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "euroc"
 PLAIN_CORNER_NOISE_PX = 0.3
@@ -108,7 +108,7 @@ def whole(name: str, rig: Rig, measurements: Measurements, repeats: int = 5) -> 
 def sums(name: str, rig: Rig, measurements: Measurements) -> list[Figure]:
     """Residuals, Jacobians and sums of the normal equations at the first state."""
     inputs = inputs_for(rig, [measurements])
-    state = first_state(inputs, initial_guess(rig, measurements))
+    state = initial_state(inputs, initial_guess(rig, measurements))
     pairs = list(zip(rig.cameras, measurements.cameras, strict=True))
     noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in pairs}
     problem = assemble(inputs, state, noise, [np.ones(len(s.uv), dtype=bool) for _, s in pairs])

@@ -25,8 +25,8 @@ from icalib.estimate.estimate import Estimate, estimate
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.optim.state import State
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.trajectory import first_state
-from icalib.sensors.camera.initialize.with_imu import initial_guess
+from icalib.sensors.camera.initialize.initial_state import initial_state
+from icalib.sensors.camera.initialize.target_with_imu import initial_guess
 from icalib.sensors.parameter import fixed
 
 SECONDS = 20.0  # of the recording, from its first image on
@@ -38,7 +38,7 @@ def compare(rig: Rig, measurements: Measurements) -> Iterator[tuple[str, float, 
     """(name, value, unit) of each figure; `rig` has the plain model with fixed intrinsics."""
     rig, measurements = _like_for_like(rig), excerpt(measurements, SECONDS)
     inputs = inputs_for(rig, [measurements])
-    state = first_state(inputs, initial_guess(rig, measurements))
+    state = initial_state(inputs, initial_guess(rig, measurements))
     estimate(inputs, state)
     started = time.perf_counter()
     ours = estimate(inputs, state)

@@ -23,8 +23,8 @@ from icalib.geometry.targets import NoTarget
 from icalib.optim.arrowhead import Piece, solve
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.initialize.recordings import initial_guesses
-from icalib.sensors.camera.initialize.trajectory import first_state
+from icalib.sensors.camera.initialize.initial_state import initial_state
+from icalib.sensors.camera.initialize.multi_recording import initial_guesses
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 
 SCENARIO = Path(__file__).parents[1] / "examples" / "paper" / "table2-3d.yaml"
@@ -44,7 +44,7 @@ def main() -> None:
     with threadpool_limits(limits=1, user_api="blas"):
         inputs = inputs_for(rig, [simulation.measurements])
         guesses, _ = _spent(lambda: initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
-        state = first_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
+        state = initial_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
         print(f"first guess               {guesses:>8.2f} s of the processor")
         passes, _ = _spent(lambda: estimate(inputs, state))
         print(f"all passes                {passes:>8.2f} s")

@@ -11,7 +11,7 @@ from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.with_imu import initial_guess
+from icalib.sensors.camera.initialize.target_with_imu import initial_guess
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
 

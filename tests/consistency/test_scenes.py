@@ -18,8 +18,8 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
 from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
-from icalib.sensors.camera.initialize.boards.scene_changes import check_scene, scene_changes
-from icalib.sensors.camera.initialize.boards.scene_lens import find_scene
+from icalib.sensors.camera.initialize.boards.moved_bodies import check_bodies_still, scene_error_ratios
+from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, tag_map
 
 
@@ -121,7 +121,7 @@ def test_a_small_change_is_named_beside_noise():
     rig, pair = moved_between([0.0, 0.01, 0.02], noiseless=False)
     bodies, recordings = chosen(rig, pair)
     with pytest.raises(EstimationError, match="^(new|old): the poses of the targets relative to each other"):
-        check_scene(rig, find_scene(rig, bodies, recordings), recordings)
+        check_bodies_still(rig, find_scene(rig, bodies, recordings), recordings)
 
 
 def images(recording: Measurements, count: int) -> Measurements:
@@ -141,8 +141,8 @@ def test_a_scene_that_stayed_is_no_change(count: int):
     rig, (first, second) = moved_between([0.0, 0.0, 0.0], noiseless=False)
     bodies, recordings = chosen(rig, [first, images(second, count)])
     scene = find_scene(rig, bodies, recordings)
-    check_scene(rig, scene, recordings)
-    np.testing.assert_allclose(scene_changes(rig, scene, recordings), 1.0, atol=0.15)
+    check_bodies_still(rig, scene, recordings)
+    np.testing.assert_allclose(scene_error_ratios(rig, scene, recordings), 1.0, atol=0.15)
 
 
 def test_a_wrong_lens_is_no_change_of_the_scene():
@@ -156,7 +156,7 @@ def test_a_wrong_lens_is_no_change_of_the_scene():
     cameras = tuple(dataclasses.replace(c, distortion=wrong(c.distortion)) for c in rig.cameras)
     rig = rig.with_(cameras=cameras)
     bodies, recordings = chosen(rig, [first, images(second, 10)])
-    check_scene(rig, find_scene(rig, bodies, recordings), recordings)
+    check_bodies_still(rig, find_scene(rig, bodies, recordings), recordings)
 
 
 def test_of_three_recordings_the_one_that_was_changed_is_named():
@@ -164,7 +164,7 @@ def test_of_three_recordings_the_one_that_was_changed_is_named():
     third = dataclasses.replace(simulate(tag_map(12.0), 2).measurements, name="third")
     bodies, recordings = chosen(rig, [old, new, third])
     with pytest.raises(EstimationError, match="^new: the poses of the targets relative to each other"):
-        check_scene(rig, find_scene(rig, bodies, recordings), recordings)
+        check_bodies_still(rig, find_scene(rig, bodies, recordings), recordings)
 
 
 def test_tags_that_no_image_ties_to_the_others_are_left_out_and_named():

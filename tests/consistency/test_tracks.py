@@ -19,8 +19,8 @@ from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.initialize.recordings import initial_guesses
-from icalib.sensors.camera.initialize.trajectory import first_state
+from icalib.sensors.camera.initialize.initial_state import initial_state
+from icalib.sensors.camera.initialize.multi_recording import initial_guesses
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -55,7 +55,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
     )
     simulation, rig = simulate(scenario, 1), rig_of(scenario, 1.03)
     inputs = inputs_for(rig, [simulation.measurements])
-    state = first_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
+    state = initial_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
     state = replace(state, bias=np.zeros_like(state.bias))  # the prior on the first biases then pulls nothing
     streams = inputs.measurements.cameras
     noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)}

@@ -22,8 +22,8 @@ from icalib.motion.keyframe_placement import first_keyframes, place_keyframes, u
 from icalib.optim.state import KEYFRAME_DIM, State
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.initialize.recordings import initial_guesses
-from icalib.sensors.camera.initialize.trajectory import first_state
+from icalib.sensors.camera.initialize.initial_state import initial_state
+from icalib.sensors.camera.initialize.multi_recording import initial_guesses
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.parameter import fixed
 from icalib.tools.simulation import handheld, rig_for, simulate
@@ -108,7 +108,7 @@ def problem(rig, recordings, request):
     real = request.param != "plain"
     settings = dataclasses.replace(rig.settings, bloom=real, board_shape=real, common_error=real, blur_noise=real)
     inputs = inputs_for(dataclasses.replace(rig, settings=settings), recordings)
-    state = first_state(inputs, *initial_guesses(rig, inputs.bodies, recordings))
+    state = initial_state(inputs, *initial_guesses(rig, inputs.bodies, recordings))
     if real:
         state.values["board0", "shape"][:] = 1e-3
     models = [NoiseModel(0.2, tau=(0.1,) if real else ()) for _ in rig.cameras]

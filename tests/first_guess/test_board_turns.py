@@ -12,7 +12,7 @@ from icalib.geometry import so3
 from icalib.geometry.targets import Checkerboard, Circles, Target
 from icalib.initialize.start import start
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.boards.numbering import number_alike
+from icalib.sensors.camera.initialize.boards.symmetry import resolve_symmetry
 from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
@@ -90,7 +90,7 @@ def test_the_gyroscope_bridges_gaps_of_all_cameras(simulation):
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
     wrong, truth = shown(simulation, rig, gaps=(0, 1))
     assert not same_but_one_turn(wrong, truth, rig.target)
-    (found,) = number_alike(rig, [wrong])
+    (found,) = resolve_symmetry(rig, [wrong])
     assert same_but_one_turn(found, truth, rig.target)
 
 
@@ -99,7 +99,7 @@ def test_a_camera_bridges_gaps_of_the_other(simulation):
     for gaps in ((0,), (1,)):
         wrong, truth = shown(simulation, rig, gaps)
         assert not same_but_one_turn(wrong, truth, rig.target)
-        (found,) = number_alike(rig, [wrong])
+        (found,) = resolve_symmetry(rig, [wrong])
         assert same_but_one_turn(found, truth, rig.target)
 
 
@@ -117,5 +117,5 @@ def test_a_camera_alone_keeps_its_numbers(simulation):
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
     wrong, _ = shown(simulation, rig, gaps=(0,))
     alone = wrong.only(wrong.cameras[0].name)
-    (found,) = number_alike(rig.with_(imu=None, cameras=rig.cameras[:1]), [alone])
+    (found,) = resolve_symmetry(rig.with_(imu=None, cameras=rig.cameras[:1]), [alone])
     assert _as_sets(found.cameras[0]) == _as_sets(alone.cameras[0])

@@ -15,7 +15,7 @@ from icalib.geometry.targets import AprilGrid
 from icalib.initialize.steps.target_poses import Flat, target_poses
 from icalib.rig import Parameter, Rig
 from icalib.sensors.camera.initialize.boards.intrinsics import guess_intrinsics
-from icalib.sensors.camera.initialize.with_imu import initial_guess, initial_trajectory
+from icalib.sensors.camera.initialize.target_with_imu import initial_guess, initial_trajectory
 from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from icalib.geometry.cameras import camera_model
 from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.corner_factor import Views
-from icalib.sensors.camera.initialize.boards.scene import body_poses, scene_poses
-from icalib.sensors.camera.initialize.boards.scene_growth import place_bodies
+from icalib.sensors.camera.initialize.boards.incremental_scene import place_bodies
+from icalib.sensors.camera.initialize.boards.target_scene import scene_poses, view_poses
 from icalib.tools.simulation import simulate, tag_map
 
 
@@ -46,7 +46,7 @@ def in_camera(simulation, stream, body):
 def test_one_of_two_mirrored_poses_is_near_the_truth_where_one_alone_often_is_not(far):
     simulation, bodies, (stream, _) = far
     views = Views.of(stream, bodies.target.body)
-    poses = body_poses(stream, views, bodies, *lens(simulation, "cam0"))
+    poses = view_poses(stream, views, bodies, *lens(simulation, "cam0"))
     true = np.stack([in_camera(simulation, stream, k) for k in range(12)], axis=1)[views.image, views.body]
     found = poses.rotation.transpose(0, 1, 3, 2)
     error = np.stack(

@@ -17,7 +17,7 @@ from icalib.geometry.targets import Markers
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
 from icalib.sensors.camera.connected_bodies import choose_bodies
-from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, is_possible, scene_params
+from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene, is_plausible_lens, scene_intrinsics
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate, tag_map
 
@@ -56,7 +56,7 @@ def test_lenses_are_found_from_tags_alone(robot):
     simulation = simulate(robot, 1)
     rig = rig_for(robot, intrinsics="free", distortion="free")
     for camera, stream in zip(rig.cameras, simulation.measurements.cameras, strict=True):
-        params = scene_params(rig.target, camera, stream)
+        params = scene_intrinsics(rig.target, camera, stream)
         np.testing.assert_allclose(params[:2], simulation.truth.values[camera.name]["intrinsics"][:2], rtol=0.01)
         np.testing.assert_allclose(params[2:4], simulation.truth.values[camera.name]["intrinsics"][2:], atol=5.0)
 
@@ -78,7 +78,7 @@ def test_a_rough_focal_length_is_a_start_only(robot):
     rig = rig_for(robot, intrinsics="free", distortion="free")
     guess = Parameter("free", np.array([600.0, 600.0, 375.5, 239.5]))
     stream = simulation.measurements.cameras[0]
-    params = scene_params(rig.target, replace(rig.cameras[0], intrinsics=guess), stream)
+    params = scene_intrinsics(rig.target, replace(rig.cameras[0], intrinsics=guess), stream)
     np.testing.assert_allclose(params[:2], simulation.truth.values["cam0"]["intrinsics"][:2], rtol=0.01)
 
 
@@ -89,11 +89,11 @@ def test_a_rough_focal_length_is_a_start_only(robot):
 )
 def test_what_is_no_lens(changed):
     corners = np.stack(np.meshgrid(np.linspace(20, 730, 20), np.linspace(20, 460, 15)), axis=-1).reshape(-1, 2)
-    assert is_possible(RADTAN, EUROC, (752, 480), corners)
+    assert is_plausible_lens(RADTAN, EUROC, (752, 480), corners)
     params = EUROC.copy()
     for place, value in changed.items():
         params[place] = value
-    assert not is_possible(RADTAN, params, (752, 480), corners)
+    assert not is_plausible_lens(RADTAN, params, (752, 480), corners)
 
 
 def scrambled(stream: CornerStream, target: Markers, body: int) -> CornerStream:

@@ -18,7 +18,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"
 
 @pytest.fixture(scope="module", params=[1, 2])
 def planar(request):
-    """A planar drive with cameras alone, their lenses guessed roughly; and what `align_together` made of its start."""
+    """A planar drive with cameras alone, their lenses guessed roughly; and what `align_jointly` made of its start."""
     scenario = replace(load_scenario(EXAMPLES / "table2-planar.yaml"), duration_s=20.0, sensors=())
     simulation = simulate(scenario, request.param)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, request.param)
@@ -28,9 +28,9 @@ def planar(request):
         kept["begin"], kept["end"] = begin, aligned(gyro, pairs, begin, fixed)
         return kept["end"]
 
-    aligned = from_tracks.align_together
+    aligned = from_tracks.align_jointly
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(from_tracks, "align_together", watched)
+        patch.setattr(from_tracks, "align_jointly", watched)
         _, state, _ = start(rig, [simulation.measurements])
     return simulation.truth, state, kept["begin"], kept["end"]
 

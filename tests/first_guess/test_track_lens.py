@@ -16,7 +16,7 @@ from icalib.initialize.steps.track_rotation import start_direction, track_rates,
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Parameter
-from icalib.sensors.camera.initialize.tracks.lens import find_lens
+from icalib.sensors.camera.initialize.tracks.track_intrinsics import find_intrinsics
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Drive, Simulation, load_scenario, rig_for, simulate
 
@@ -52,7 +52,7 @@ def camera_of(simulation: Simulation) -> Camera:
 
 
 def found_lens(simulation: Simulation, camera: Camera | None = None) -> np.ndarray:
-    return find_lens(camera or camera_of(simulation), simulation.measurements.tracks[0], imu_of(simulation), None)
+    return find_intrinsics(camera or camera_of(simulation), simulation.measurements.tracks[0], imu_of(simulation), None)
 
 
 def imu_of(simulation: Simulation) -> ImuData:
@@ -116,7 +116,7 @@ def test_turns_about_the_line_of_sight_do_not_show_the_focal_length():
 def test_tracks_of_another_drive_do_not_match():
     simulation, other = drive(), drive(seed=2)
     with pytest.raises(EstimationError, match="cam0 does not match that of imu0 at any time offset"):
-        find_lens(camera_of(simulation), simulation.measurements.tracks[0], imu_of(other), None)
+        find_intrinsics(camera_of(simulation), simulation.measurements.tracks[0], imu_of(other), None)
 
 
 @pytest.mark.slow

@@ -18,8 +18,8 @@ from icalib.initialize.steps.by_recording import one_after_another
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.rig import Parameter
-from icalib.sensors.camera.initialize.tracks.extrinsics import NEAREST_M, _misses, lens_slopes
-from icalib.sensors.camera.initialize.tracks.on_motion import track_camera_values
+from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import NEAREST_M, _misses, lens_slopes
+from icalib.sensors.camera.initialize.tracks.placement import track_camera_values
 from icalib.tools.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow

@@ -23,8 +23,8 @@ from icalib.initialize.steps.initializer import (
 from icalib.optim.state import State
 from icalib.rig import Rig
 from icalib.sensors.camera.connected_bodies import without_bodies
-from icalib.sensors.camera.initialize.boards.numbering import number_alike
-from icalib.sensors.camera.initialize.boards.scene_growth import UntiedBodiesError
+from icalib.sensors.camera.initialize.boards.incremental_scene import UnconnectedBodiesError
+from icalib.sensors.camera.initialize.boards.symmetry import resolve_symmetry
 
 Start = tuple[Inputs, State, Values]
 
@@ -38,11 +38,11 @@ def start(
     placed on it. Bodies of the target that images do not tie to the others are left out. Raises EstimationError where
     the recordings do not carry it.
     """
-    recordings = number_alike(rig, recordings)
+    recordings = resolve_symmetry(rig, recordings)
     while True:
         try:
             return _start(rig, recordings, lap)
-        except UntiedBodiesError as untied:
+        except UnconnectedBodiesError as untied:
             recordings = [without_bodies(rig.target, untied.names, m) for m in recordings]
 
 

@@ -15,12 +15,12 @@ from icalib.initialize.steps.initializer import BY_TARGET, BY_TRACKS, Initialize
 from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.initialize.boards.on_motion import with_mounts_guessed
+from icalib.sensors.camera.initialize.boards.hand_eye_guess import with_hand_eye_guess
 from icalib.sensors.camera.initialize.guess import Guess
+from icalib.sensors.camera.initialize.initial_state import initial_state
+from icalib.sensors.camera.initialize.multi_recording import initial_guesses
 from icalib.sensors.camera.initialize.parallax import no_parallax
-from icalib.sensors.camera.initialize.recordings import initial_guesses
-from icalib.sensors.camera.initialize.tracks.on_motion import track_camera_values
-from icalib.sensors.camera.initialize.trajectory import first_state
+from icalib.sensors.camera.initialize.tracks.placement import track_camera_values
 
 
 class CameraInitializer(Initializer[Camera]):
@@ -38,7 +38,7 @@ class CameraInitializer(Initializer[Camera]):
         return None if rig.imu is None else BY_TRACKS
 
     def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
-        return first_state(inputs, *_guesses(inputs, other))
+        return initial_state(inputs, *_guesses(inputs, other))
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
         return inputs, first_pass(inputs, state), state.values
@@ -76,7 +76,7 @@ def _guesses(inputs: Inputs, other: Callable[[], Moving]) -> tuple[Guess, ...]:
         if not rig.has_target:
             raise
         try:
-            rig = with_mounts_guessed(rig, inputs, *other())
+            rig = with_hand_eye_guess(rig, inputs, *other())
         except EstimationError:
             raise error from None
         return initial_guesses(rig, inputs.bodies, seen)

@@ -12,8 +12,8 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.track_rotation import start_turn, turn_between, turn_error
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.tracks.alignment import Pair, pairs_of
-from icalib.sensors.camera.initialize.tracks.from_tracks import lens_start
+from icalib.sensors.camera.initialize.tracks.from_tracks import start_intrinsics
+from icalib.sensors.camera.initialize.tracks.joint_alignment import SharedRays, shared_rays
 
 # Times the error of rays: what is left of two images by rotation alone is two errors on two axes, and that by epipolar
 # geometry one on one axis, so that noise alone makes up to 2.3.
@@ -29,10 +29,10 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
             if imu is None:
                 return None
             try:
-                lens = lens_start(camera, stream, imu, m)
+                lens = start_intrinsics(camera, stream, imu, m)
             except EstimationError:
                 return None
-            shown = [_parallax(pair) for pair in pairs_of(k, stream, camera_model(camera.model), lens)]
+            shown = [_parallax(pair) for pair in shared_rays(k, stream, camera_model(camera.model), lens)]
             if shown:
                 found.append((*np.median(shown, axis=0).tolist(), camera.name))
     if not found:
@@ -47,7 +47,7 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
     )
 
 
-def _parallax(pair: Pair) -> tuple[float, float]:
+def _parallax(pair: SharedRays) -> tuple[float, float]:
     """By how much the rays of two images differ beside a rotation, and by how much they miss their epipolar planes
     [rad]."""
     R, t = start_turn(pair.f, pair.h)

@@ -1,7 +1,7 @@
 """The first guess where there is no target: rotations from the gyroscope, everything else linearly from tracks.
 
 Cameras turn as the epipolar geometry of their tracks says; what the gyroscope says of the same turns gives time
-offsets, rotations and its bias. With the gyroscope's rotations the rest is linear (`track_motion`).
+offsets, rotations and its bias. With the gyroscope's rotations the rest is linear (`solve_linear_motion`).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, trusted
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
-from icalib.sensors.camera.initialize.tracks.alignment import align_together, pairs_of
-from icalib.sensors.camera.initialize.tracks.lens import find_lens
-from icalib.sensors.camera.initialize.tracks.motion import Rays, WindowMotion, track_motion
+from icalib.sensors.camera.initialize.tracks.joint_alignment import align_jointly, shared_rays
+from icalib.sensors.camera.initialize.tracks.linear_motion import Rays, WindowMotion, solve_linear_motion
+from icalib.sensors.camera.initialize.tracks.track_intrinsics import find_intrinsics
 from icalib.sensors.sensor import ROTATION
 
 APART_S, FEWEST_SEEN = 0.15, 3
@@ -33,7 +33,7 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     """Raises EstimationError, one sentence, where the tracks do not carry a guess, or do not show the lens."""
     imu = imu_data(rig, measurements)
     assert imu is not None  # tracks without an IMU are refused before
-    params = [lens_start(c, t, imu, measurements) for c, t in zip(rig.cameras, measurements.tracks, strict=True)]
+    params = [start_intrinsics(c, t, imu, measurements) for c, t in zip(rig.cameras, measurements.tracks, strict=True)]
     rates = [
         telling_rates(imu, t, camera_model(c.model), p)
         for c, t, p in zip(rig.cameras, measurements.tracks, params, strict=True)
@@ -47,7 +47,7 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     rays = _rays(rig, measurements, imu, params, [a.offset for a in aligned])
     arms = [trusted(c.translation) for c in rig.cameras]
     _check_units(imu, rig.gravity)
-    motion = track_motion(gyro, rays, [a.rotation for a in aligned], arms, rig.gravity)
+    motion = solve_linear_motion(gyro, rays, [a.rotation for a in aligned], arms, rig.gravity)
     cameras = {}
     for k, (camera, stream, found) in enumerate(zip(rig.cameras, measurements.cameras, aligned, strict=True)):
         raw = camera.time_offset.value
@@ -64,9 +64,9 @@ def _aligned_together(
 ) -> list[Alignment]:
     pairs = []
     for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
-        pairs += pairs_of(k, stream, camera_model(camera.model), params[k])
+        pairs += shared_rays(k, stream, camera_model(camera.model), params[k])
     held = [(trusted(c.rotation) is not None, trusted(c.time_offset) is not None) for c in rig.cameras]
-    return align_together(GyroRotation.integrate(imu, aligned[0].gyro_bias), pairs, aligned, held)
+    return align_jointly(GyroRotation.integrate(imu, aligned[0].gyro_bias), pairs, aligned, held)
 
 
 def _check_units(imu: ImuData, gravity: float) -> None:
@@ -79,12 +79,16 @@ def _check_units(imu: ImuData, gravity: float) -> None:
         )
 
 
-def lens_start(camera: Camera, stream: TrackStream, imu: ImuData, measurements: Measurements) -> np.ndarray:
-    """(P,) intrinsics and distortion as the rig file gives them, or as the tracks show them where it does not; beside
-    intrinsics that are given, distortion starts where its model does. Raises EstimationError as `find_lens` does."""
+def start_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, measurements: Measurements) -> np.ndarray:
+    """(P,) intrinsics and distortion: those of the rig file, else those estimated from the tracks.
+
+    If the rig file gives intrinsics without distortion, the distortion is the first start value of the camera model.
+    Raises EstimationError as `find_intrinsics` does.
+    """
     if camera.intrinsics.value is None:
-        held = trusted(camera.time_offset)
-        return find_lens(camera, stream, imu, None if held is None else relative_offset(held, stream, measurements))
+        fixed = trusted(camera.time_offset)
+        offset = None if fixed is None else relative_offset(fixed, stream, measurements)
+        return find_intrinsics(camera, stream, imu, offset)
     distortion = camera.distortion.value
     if distortion is None:
         distortion = np.array(camera_model(camera.model).start_distortions[0])

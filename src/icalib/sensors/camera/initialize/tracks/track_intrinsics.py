@@ -33,8 +33,8 @@ from icalib.initialize.steps.rate_shifts import best_regressions, telling_rates
 from icalib.initialize.steps.track_rotation import track_rates, turns_information
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
-from icalib.sensors.camera.initialize.tracks.alignment import gyro_turns
-from icalib.sensors.camera.initialize.tracks.extrinsics import ImagePairs, lens_slopes
+from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import ImagePairs, lens_slopes
+from icalib.sensors.camera.initialize.tracks.joint_alignment import gyro_turns
 
 ANY_LENS = "pinhole-equidistant"  # its start, r = f theta, is near every lens, wide and narrow
 STARTS = (1.0, 0.35)  # of the image width: near a usual lens, and a fisheye one
@@ -68,7 +68,7 @@ class _Fit:
     cost: float = np.inf
 
 
-def find_lens(camera: Camera, stream: TrackStream, imu: ImuData, offset: float | None) -> np.ndarray:
+def find_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, offset: float | None) -> np.ndarray:
     """(P,) intrinsics and distortion; the distortion of the rig file, where it has one. offset: t_imu - t_camera, both
     since their clock's first stamp [s], where it is known.
 

@@ -11,10 +11,10 @@ from icalib.initialize.steps.by_recording import each_clock
 from icalib.motion.keyframe_placement import first_keyframes
 from icalib.optim.state import State, in_recording
 from icalib.sensors.camera.initialize.guess import Guess
-from icalib.sensors.camera.initialize.with_imu import initial_trajectory
+from icalib.sensors.camera.initialize.target_with_imu import initial_trajectory
 
 
-def first_state(inputs: Inputs, *guesses: Guess) -> State:
+def initial_state(inputs: Inputs, *guesses: Guess) -> State:
     """The guess of each of `inputs.motions` at all keyframes."""
     values = guesses[0].values()
     for k, guess in enumerate(guesses):

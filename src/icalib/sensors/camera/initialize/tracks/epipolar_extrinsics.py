@@ -239,7 +239,7 @@ def _after(poses: Poses, dt: float) -> tuple[np.ndarray, np.ndarray]:
     return poses.rotation @ so3.exp_many(dt * poses.rate), poses.position + dt * poses.velocity
 
 
-def place_on_motion(
+def extrinsics_on_motion(
     followed: ImagePairs, motion: Motion, starts: Sequence[CameraExtrinsics], axis: np.ndarray | None, held: np.ndarray
 ) -> CameraExtrinsics:
     """The camera that fits best what it `followed`, sought from each of the `starts`, turned all round about `axis`

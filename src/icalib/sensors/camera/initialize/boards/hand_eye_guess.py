@@ -18,13 +18,13 @@ from icalib.initialize.paths.path import SensorPath
 from icalib.initialize.steps.by_recording import Held, alone, motion_alone, naming_recording
 from icalib.optim.state import State
 from icalib.rig import Camera, Parameter, Rig
-from icalib.sensors.camera.initialize.boards.scene import scene_poses
-from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, lens_of
+from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene, intrinsics_of
+from icalib.sensors.camera.initialize.boards.target_scene import scene_poses
 from icalib.sensors.sensor import mounted
 from icalib.sensors.stream import seconds_since
 
 
-def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) -> Rig:
+def with_hand_eye_guess(rig: Rig, seen: Inputs, others: Inputs, state: State) -> Rig:
     """`rig` with a guess of how each camera stands whose rotation it does not give. Of several recordings the one in
     which it saw most says so. seen: what the cameras are estimated from; others: what `state`, which has the motion,
     is made from.
@@ -37,7 +37,7 @@ def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) ->
     def placed(number: int, camera: Camera) -> Camera:
         best = int(np.argmax([len(r.cameras[number].uv) for r in recordings]))
         stream, own = recordings[best].cameras[number], alone(others, best)
-        poses = scene_poses(stream, camera_model(camera.model), lens_of(camera, stream, rig.target, scene), scene)
+        poses = scene_poses(stream, camera_model(camera.model), intrinsics_of(camera, stream, rig.target, scene), scene)
         ok, stamps = poses.ok, stream.stamps_ns[poses.ok]
         seconds = seconds_since(stamps, int(stamps[0]))
         path = SensorPath(seconds, poses.rotation[ok], poses.position[ok], np.ones(len(stamps), dtype=bool))

@@ -21,10 +21,10 @@ from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, trusted
-from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
-from icalib.sensors.camera.initialize.boards.scene_lens import find_scene, lens_of
+from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene, intrinsics_of
+from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, scene_poses
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
-from icalib.sensors.camera.initialize.without_imu import guess_without_imu, trajectory_without_imu
+from icalib.sensors.camera.initialize.target_without_imu import guess_without_imu, trajectory_without_imu
 from icalib.sensors.sensor import ROTATION
 
 __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
@@ -32,7 +32,7 @@ __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
 VELOCITY_STEP_S = 0.04
 
 
-def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = None) -> Guess:
+def initial_guess(rig: Rig, measurements: Measurements, scene: TargetScene | None = None) -> Guess:
     """`scene`: where the bodies of the target stand, if that is known already, and all streams hold only theirs.
 
     Raises EstimationError, one sentence, where the recording does not carry a guess.
@@ -41,7 +41,7 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
         bodies = choose_bodies(rig.target, [measurements], bent=False, rig=rig)
         measurements = restrict(bodies, measurements)
         scene = find_scene(rig, bodies, [measurements])
-    params = [lens_of(c, s, rig.target, scene) for c, s in zip(rig.cameras, measurements.cameras, strict=True)]
+    params = [intrinsics_of(c, s, rig.target, scene) for c, s in zip(rig.cameras, measurements.cameras, strict=True)]
     poses = [
         scene_poses(s, camera_model(c.model), p, scene)
         for c, s, p in zip(rig.cameras, measurements.cameras, params, strict=True)

@@ -14,12 +14,12 @@ from icalib.initialize.steps.clocks import OneAxisError, better_offset, camera_r
 from icalib.model.bodies import Bodies
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
-from icalib.sensors.camera.initialize.boards.scene_changes import check_scene
-from icalib.sensors.camera.initialize.boards.scene_lens import find_scene
+from icalib.sensors.camera.initialize.boards.moved_bodies import check_bodies_still
+from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene
+from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, scene_poses
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess
+from icalib.sensors.camera.initialize.target_with_imu import initial_guess
 from icalib.sensors.camera.initialize.tracks.from_tracks import guess_from_tracks
-from icalib.sensors.camera.initialize.with_imu import initial_guess
 from icalib.sensors.parameter import fixed
 
 
@@ -34,7 +34,7 @@ def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]
     scene = find_scene(rig, bodies, recordings)
     if len(recordings) == 1:
         return (initial_guess(rig, recordings[0], scene),)
-    check_scene(rig, scene, recordings)
+    check_bodies_still(rig, scene, recordings)
     order = sorted(range(len(recordings)), key=lambda k: -sum(len(c.stamps_ns) for c in recordings[k].cameras))
     best, guess = _first_that_works(rig, scene, [(k, recordings[k]) for k in order])
     held = _held(rig, guess, recordings[best])
@@ -56,7 +56,7 @@ def _guesses_from_tracks(rig: Rig, recordings: Sequence[Measurements]) -> tuple[
     return tuple(guess if r is best else guess_from_tracks(held, r) for r in recordings)
 
 
-def _first_that_works(rig: Rig, scene: Placed, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
+def _first_that_works(rig: Rig, scene: TargetScene, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
     """The calibration needs one recording that shows all of it; the error is that of the one that showed most."""
     failed: list[EstimationError] = []
     for k, recording in recordings:
@@ -67,7 +67,7 @@ def _first_that_works(rig: Rig, scene: Placed, recordings: list[tuple[int, Measu
     raise failed[0]
 
 
-def _named(rig: Rig, scene: Placed, recording: Measurements) -> Guess:
+def _named(rig: Rig, scene: TargetScene, recording: Measurements) -> Guess:
     try:
         return initial_guess(rig, recording, scene)
     except CalibrationError as error:
@@ -93,7 +93,7 @@ def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
     return rig.with_sensors(*(camera(c, guess.cameras[c.name], s.origin_ns) for c, s in pairs))
 
 
-def _check_clocks(rig: Rig, scene: Placed, guess: Guess, reference: Measurements, recording: Measurements) -> None:
+def _check_clocks(rig: Rig, scene: TargetScene, guess: Guess, reference: Measurements, recording: Measurements) -> None:
     """Raises EstimationError where a camera and the IMU turn alike at another time offset than in `reference`, which
     `guess` was made from."""
     imu = imu_data(rig, recording)

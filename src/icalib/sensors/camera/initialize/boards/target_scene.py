@@ -36,7 +36,7 @@ MIRRORS = 2
 
 
 @dataclass(frozen=True)
-class Placed:
+class TargetScene:
     """Where the bodies stand: R_scene_body, p_scene_body by body and name, as in a state. params: those (P,) of the
     cameras that saw it, by name, where there are several bodies."""
 
@@ -58,27 +58,27 @@ class Placed:
         return np.array(have)[self.bodies.target.body]
 
 
-def body_poses(stream: CornerStream, views: Views, bodies: Bodies, model: CameraModel, params: np.ndarray):
+def view_poses(stream: CornerStream, views: Views, bodies: Bodies, model: CameraModel, params: np.ndarray):
     """Both poses (V, 2, ...) of the camera in the frame of each view's body."""
     size = np.bincount(bodies.target.body)
     fewest = np.minimum(size, FEWEST_CORNERS)[views.body]
     return flat_poses(stream, views.start, fewest, model, params, bodies.target.points, MIRRORS)
 
 
-def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: Placed) -> TargetPoses:
+def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: TargetScene) -> TargetPoses:
     """Poses of the camera in the scene, image by image, from all its bodies together. Raises EstimationError where
     images are mirrored."""
     if not scene.bodies.several:
         poses = target_poses(stream, model, params, Flat(scene.bodies.target.points))
         check_side(stream.name, poses)
         return poses
-    return poses_by_bodies(stream, model, params, scene)
+    return multi_body_poses(stream, model, params, scene)
 
 
-def poses_by_bodies(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: Placed) -> TargetPoses:
+def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: TargetScene) -> TargetPoses:
     """Poses of the camera in the scene from the bodies of the target that have a pose in it."""
     views = Views.of(stream, scene.bodies.target.body)
-    seen = body_poses(stream, views, scene.bodies, model, params)
+    seen = view_poses(stream, views, scene.bodies, model, params)
     R_sb, p_sb = scene.bodies.poses(scene.values)
     rays, density, good = usable_rays(stream.uv, model, params)
     n = len(stream.stamps_ns)

@@ -75,7 +75,7 @@ class SceneViews:
         )
 
 
-def adjust(seen: SceneViews, state: SceneState, fixed_image: int, rounds: int) -> SceneState:
+def bundle_adjust(seen: SceneViews, state: SceneState, fixed_image: int, rounds: int) -> SceneState:
     """`state` after up to `rounds` steps; bodies and images that are in no view of `seen` stay."""
     damping, sums = FIRST_DAMPING, _Sums.of(seen, state)
     for _ in range(rounds):
@@ -93,7 +93,7 @@ def adjust(seen: SceneViews, state: SceneState, fixed_image: int, rounds: int) -
     return state
 
 
-def errors(seen: SceneViews, state: SceneState) -> np.ndarray:
+def reprojection_errors(seen: SceneViews, state: SceneState) -> np.ndarray:
     """(N,) px: how far each corner is from where it is predicted; `UNSEEN_PX` at most."""
     size = np.full(len(seen.uv), UNSEEN_PX)
     local = _in_camera(seen, state)

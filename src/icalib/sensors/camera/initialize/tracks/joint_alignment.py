@@ -26,7 +26,7 @@ ROUNDS = 6
 
 
 @dataclass(frozen=True)
-class Pair:
+class SharedRays:
     """Two images of camera `camera` at t1, t2 on its clock, rays f and h (n, 3) of the points they share."""
 
     camera: int
@@ -36,17 +36,17 @@ class Pair:
     h: np.ndarray
 
 
-def pairs_of(camera: int, stream: TrackStream, model: CameraModel, params: np.ndarray) -> list[Pair]:
+def shared_rays(camera: int, stream: TrackStream, model: CameraModel, params: np.ndarray) -> list[SharedRays]:
     rays, valid = model.unproject(params, stream.uv)
     t = stream.seconds
     return [
-        Pair(camera, float(t[i]), float(t[j]), rays[p], rays[q])
+        SharedRays(camera, float(t[i]), float(t[j]), rays[p], rays[q])
         for i, j, p, q in pairs_sharing(stream, valid, STEPS_S, MOST_PAIRS)
     ]
 
 
-def align_together(
-    gyro: GyroRotation, pairs: list[Pair], start: list[Alignment], fixed: list[tuple[bool, bool]]
+def align_jointly(
+    gyro: GyroRotation, pairs: list[SharedRays], start: list[Alignment], fixed: list[tuple[bool, bool]]
 ) -> list[Alignment]:
     """The alignments improved, the bias that of `gyro` and more, the same for all; fixed: whether the rotation and the
     time offset of each camera are known."""
@@ -89,7 +89,7 @@ def _solve(N: np.ndarray, r: np.ndarray, held: np.ndarray, still: np.ndarray) ->
 
 
 def _normal(
-    pairs: list[Pair], start: list[Alignment], D: np.ndarray, swept: np.ndarray, turned: np.ndarray
+    pairs: list[SharedRays], start: list[Alignment], D: np.ndarray, swept: np.ndarray, turned: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal matrix and right-hand side of all alignments and the bias; see `gyro_turns`."""
     n, m, camera = 4 * len(start), len(pairs), np.array([p.camera for p in pairs], dtype=np.int64)

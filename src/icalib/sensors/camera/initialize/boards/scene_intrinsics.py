@@ -16,11 +16,11 @@ from icalib.geometry.targets.base import Target
 from icalib.model.bodies import Bodies
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import choose_bodies, restrict, tied_by_images
+from icalib.sensors.camera.initialize.boards.body_groups import register_groups
+from icalib.sensors.camera.initialize.boards.bundle_adjustment import CameraIntrinsics
+from icalib.sensors.camera.initialize.boards.incremental_scene import place_bodies, reconstruct_scene
 from icalib.sensors.camera.initialize.boards.intrinsics import camera_params
-from icalib.sensors.camera.initialize.boards.scene import Placed
-from icalib.sensors.camera.initialize.boards.scene_bundle import CameraIntrinsics
-from icalib.sensors.camera.initialize.boards.scene_groups import place_groups
-from icalib.sensors.camera.initialize.boards.scene_growth import grow, place_bodies
+from icalib.sensors.camera.initialize.boards.target_scene import TargetScene
 
 TRIAL_WIDTHS = (0.6, 1.0, 0.35)  # focal lengths to try, in image widths: views of 80, 53 and 110 degrees
 JUDGED_SHARE = 0.9  # of the images tell whether a scene fits: where a part of it stands wrongly, most still do
@@ -36,24 +36,24 @@ MOST_STRETCHED = 2.0  # fx over fy
 UNSEEN_SHARE = 0.05  # of the corners, that a lens may not be able to see
 
 
-def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> Placed:
+def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> TargetScene:
     """How the bodies stand to each other, from the images of all recordings, whose streams hold corners of these bodies
-    only. Raises EstimationError where images do not tell; `UntiedBodiesError` where they do not of some."""
+    only. Raises EstimationError where images do not tell; `UnconnectedBodiesError` where they do not of some."""
     if not bodies.several:
-        return Placed(bodies)
+        return TargetScene(bodies)
     streams = [CornerStream.joined([r.cameras[i] for r in recordings]) for i in range(len(rig.cameras))]
-    params = {c.name: scene_params(rig.target, c, s) for c, s in zip(rig.cameras, streams, strict=True)}
+    params = {c.name: scene_intrinsics(rig.target, c, s) for c, s in zip(rig.cameras, streams, strict=True)}
     if rig.cameras_alone and len(tied_by_images(bodies, recordings)) > 1:
-        return place_groups(rig, bodies, recordings, params)
+        return register_groups(rig, bodies, recordings, params)
     return place_bodies(bodies, streams, [camera_model(c.model) for c in rig.cameras], params)
 
 
-def lens_of(camera: Camera, stream: CornerStream, target: Target, scene: Placed) -> np.ndarray:
+def intrinsics_of(camera: Camera, stream: CornerStream, target: Target, scene: TargetScene) -> np.ndarray:
     """(P,) parameters: what the scene has, or else a camera by itself."""
     return scene.params[camera.name] if camera.name in scene.params else camera_params(camera, stream, target)
 
 
-def scene_params(target: Target, camera: Camera, stream: CornerStream) -> np.ndarray:
+def scene_intrinsics(target: Target, camera: Camera, stream: CornerStream) -> np.ndarray:
     """(P,) what the rig gives, else the lens that fits all bodies together best, among those that growing a scene from
     several starts leads to. A camera that shows one body only is judged by that.
 
@@ -86,9 +86,9 @@ def _best(
     for start in starts:
         before = np.inf
         for _ in range(REGROWN):
-            grown = grow(bodies, [seen], [start])
+            grown = reconstruct_scene(bodies, [seen], [start])
             lens, rms = grown.state.lenses[0], grown.rms_of(JUDGED_SHARE)
-            if not is_possible(lens.model, lens.params, camera.resolution, seen.uv):
+            if not is_plausible_lens(lens.model, lens.params, camera.resolution, seen.uv):
                 break
             if rms < best:
                 best, median, params = rms, grown.rms_of(0.5), lens.params
@@ -100,7 +100,7 @@ def _best(
     return median, params
 
 
-def is_possible(model: CameraModel, params: np.ndarray, resolution: tuple[int, int], uv: np.ndarray) -> bool:
+def is_plausible_lens(model: CameraModel, params: np.ndarray, resolution: tuple[int, int], uv: np.ndarray) -> bool:
     """Whether parameters (P,) are those of a lens: sane focal lengths, a principal point in or near the image, and rays
     for nearly all corners uv (N, 2), so that the distortion is monotone where it is used."""
     if not np.isfinite(params).all():
@@ -134,7 +134,7 @@ def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[Ca
 
     with suppress(EstimationError):
         params = camera_params(camera, stream, target)
-        if is_possible(model, params, camera.resolution, stream.uv):
+        if is_plausible_lens(model, params, camera.resolution, stream.uv):
             yield lens(params)
     for distortion in model.start_distortions:
         params = np.array([1.0, 1.0, *middle, *distortion])

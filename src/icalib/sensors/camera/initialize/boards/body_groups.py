@@ -31,14 +31,16 @@ from icalib.sensors.camera.connected_bodies import (
     taken_at_once,
     tied_by_images,
 )
-from icalib.sensors.camera.initialize.boards.scene import Placed, scene_poses
-from icalib.sensors.camera.initialize.boards.scene_growth import UntiedBodiesError, place_bodies
+from icalib.sensors.camera.initialize.boards.incremental_scene import UnconnectedBodiesError, place_bodies
+from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, scene_poses
 
 
-def place_groups(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]) -> Placed:
+def register_groups(
+    rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]
+) -> TargetScene:
     """How the bodies stand to each other: those that images tie by these, groups of them by what cameras see at once.
 
-    params: (P,) by camera, which are held. Raises UntiedBodiesError naming bodies that nothing ties to the others,
+    params: (P,) by camera, which are held. Raises UnconnectedBodiesError naming bodies that nothing ties to the others,
     EstimationError where images are mirrored, or cameras do not move alike.
     """
     used = tied_by_images(bodies, recordings)
@@ -49,11 +51,11 @@ def place_groups(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], p
         g, h, best = max(tied, key=lambda item: len(item[2].pairs.p_body))
         if len(best.pairs.p_body) < FEWEST_TOGETHER:
             lost = [x.scene.bodies.names for k, x in enumerate(groups) if k not in frames]
-            raise UntiedBodiesError(tuple(name for names in lost for name in names))
+            raise UnconnectedBodiesError(tuple(name for names in lost for name in names))
         found = _solved(best, rig.cameras)
         frames[h] = Frame(frames[g].R @ found.R, frames[g].p + frames[g].R @ found.p)
         values |= groups[h].values_at(frames[h])
-    return Placed(bodies, values, params)
+    return TargetScene(bodies, values, params)
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class _Group:
     """Bodies that images tie, in the frame of their first; by recording and camera the instants [s] of images that show
     them, and poses in that frame."""
 
-    scene: Placed
+    scene: TargetScene
     times: list[list[np.ndarray]]
     poses: list[list[TargetPoses]]
 
@@ -69,7 +71,7 @@ class _Group:
     def of(cls, rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]) -> _Group:
         own = [restrict(bodies, r) for r in recordings]
         models = [camera_model(c.model) for c in rig.cameras]
-        scene = Placed(bodies)
+        scene = TargetScene(bodies)
         if bodies.several:
             seeing = [i for i in range(len(models)) if any(len(r.cameras[i].point) for r in own)]
             streams = [CornerStream.joined([r.cameras[i] for r in own]) for i in seeing]

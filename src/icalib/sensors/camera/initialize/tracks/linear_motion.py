@@ -108,7 +108,7 @@ class _Integrals:
         return D[:, :3], D[:, 3:].reshape(-1, 3, 3)
 
 
-def track_motion(
+def solve_linear_motion(
     gyro: GyroRotation, rays: Rays, R_imu_cam: list[np.ndarray], arms: list[np.ndarray | None], gravity: float
 ) -> WindowMotion:
     """The IMU's motion while `rays` were seen, by cameras of known rotation; `arms` where they are known; `gravity`

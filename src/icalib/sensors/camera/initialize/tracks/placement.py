@@ -25,8 +25,12 @@ from icalib.optim.arrowhead import THREADS
 from icalib.optim.state import Key, State
 from icalib.rig import Camera
 from icalib.sensors.camera.initialize.guess import relative_offset
-from icalib.sensors.camera.initialize.tracks.extrinsics import CameraExtrinsics, ImagePairs, place_on_motion
-from icalib.sensors.camera.initialize.tracks.from_tracks import lens_start
+from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import (
+    CameraExtrinsics,
+    ImagePairs,
+    extrinsics_on_motion,
+)
+from icalib.sensors.camera.initialize.tracks.from_tracks import start_intrinsics
 from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 
 
@@ -52,7 +56,7 @@ def _lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
     """(P,) where a lens is sought from."""
     own = alone(inputs, recording)
     assert own.imu is not None
-    return lens_start(inputs.rig.cameras[number], own.measurements.tracks[number], own.imu, own.measurements)
+    return start_intrinsics(inputs.rig.cameras[number], own.measurements.tracks[number], own.imu, own.measurements)
 
 
 def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
@@ -93,7 +97,7 @@ def _mount_in(
     motion = motion_of(own, motion_alone(inputs, recording, state))
     held = np.repeat([name in known for name in MOUNTED_NAMES], [3, 3, 1])
     axis = None if "rotation" in known else main_axis(own.imu.gyro)
-    found = place_on_motion(followed, motion, starts, axis, held)
+    found = extrinsics_on_motion(followed, motion, starts, axis, held)
     return found, followed.lens_of(found)
 
 

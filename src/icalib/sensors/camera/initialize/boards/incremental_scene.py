@@ -20,15 +20,15 @@ from icalib.initialize.steps.target_poses import LARGEST_RMS_PX, MOST_CORNERS, T
 from icalib.model.bodies import Bodies
 from icalib.optim.state import Key
 from icalib.sensors.camera.corner_factor import Views
-from icalib.sensors.camera.initialize.boards.scene import Placed, body_poses, poses_by_bodies
-from icalib.sensors.camera.initialize.boards.scene_bundle import (
+from icalib.sensors.camera.initialize.boards.bundle_adjustment import (
     UNSEEN_PX,
     CameraIntrinsics,
     SceneState,
     SceneViews,
-    adjust,
-    errors,
+    bundle_adjust,
+    reprojection_errors,
 )
+from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, multi_body_poses, view_poses
 
 MOST_IMAGES = 60  # spread over the recording
 OF_EACH_PAIR = 4  # images that tie two bodies
@@ -47,7 +47,7 @@ STRONGEST = np.array([0, 1, 4])  # fx, fy and the strongest distortion
 
 
 @dataclass(frozen=True)
-class Grown:
+class ReconstructedScene:
     """Where bodies stand in the scene, those that could be placed; the lenses; rms_px (M,) of each image, NaN where it
     could not be placed."""
 
@@ -70,7 +70,7 @@ class Grown:
         return values
 
 
-class UntiedBodiesError(EstimationError):
+class UnconnectedBodiesError(EstimationError):
     """Images do not tell how some bodies, given by `names`, stand to the others."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
@@ -83,13 +83,13 @@ class UntiedBodiesError(EstimationError):
 
 def place_bodies(
     bodies: Bodies, streams: Sequence[CornerStream], models: Sequence[CameraModel], params: dict[str, np.ndarray]
-) -> Placed:
+) -> TargetScene:
     """How the bodies stand to each other, as the images of all cameras show it; params (P,) by camera, which are held.
 
-    Raises UntiedBodiesError naming those that no image ties to the others, EstimationError where these are most.
+    Raises UnconnectedBodiesError naming those that no image ties to the others, EstimationError where these are most.
     """
     held = [fixed_lens(model, params[s.name]) for s, model in zip(streams, models, strict=True)]
-    grown = grow(bodies, streams, held)
+    grown = reconstruct_scene(bodies, streams, held)
     lost = tuple(bodies.target.bodies[k] for k in bodies.used if not grown.placed[k])
     if 2 * len(lost) > len(bodies.used):
         raise EstimationError(
@@ -98,10 +98,10 @@ def place_bodies(
             "sizes of the target."
         )
     if lost:
-        raise UntiedBodiesError(lost)
+        raise UnconnectedBodiesError(lost)
     values = grown.in_frame_of(bodies.used[0], bodies)
     reference = bodies.target.bodies[bodies.used[0]]
-    return Placed(bodies, {key: value for key, value in values.items() if key[0] != reference}, params)
+    return TargetScene(bodies, {key: value for key, value in values.items() if key[0] != reference}, params)
 
 
 def fixed_lens(model: CameraModel, params: np.ndarray) -> CameraIntrinsics:
@@ -109,13 +109,15 @@ def fixed_lens(model: CameraModel, params: np.ndarray) -> CameraIntrinsics:
     return CameraIntrinsics(model, params, params, np.ones(len(params)), np.zeros(len(params), dtype=bool))
 
 
-def grow(bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[CameraIntrinsics]) -> Grown:
+def reconstruct_scene(
+    bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[CameraIntrinsics]
+) -> ReconstructedScene:
     """The scene that images of all cameras show together, those that tell most. streams: corners of bodies in use only,
     body by body."""
-    streams = [telling_images(s, bodies.target.body) for s in streams]
+    streams = [informative_images(s, bodies.target.body) for s in streams]
     growth = _Growth.begin(bodies, streams, lenses)
     if not growth.placed.any():
-        return Grown(growth.state, growth.placed, np.full(len(growth.posed), np.nan))
+        return ReconstructedScene(growth.state, growth.placed, np.full(len(growth.posed), np.nan))
     while growth.extend():
         growth.adjust(ROUNDS)
     for _ in range(AGAIN):  # what was placed wrongly while little was known
@@ -124,7 +126,7 @@ def grow(bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[Camer
     growth.adjust(ROUNDS)
     growth.adjust(LAST_ROUNDS)
     growth.drop_misfits()
-    return Grown(growth.state, growth.placed, growth.image_rms())
+    return ReconstructedScene(growth.state, growth.placed, growth.image_rms())
 
 
 @dataclass
@@ -184,7 +186,7 @@ class _Growth:
             elif n >= LENS_IMAGES:
                 free[STRONGEST] = True
             lenses.append(replace(lens, free=free & lens.free))
-        moved = adjust(used, replace(self.state, lenses=tuple(lenses)), self.seed, rounds)
+        moved = bundle_adjust(used, replace(self.state, lenses=tuple(lenses)), self.seed, rounds)
         back = tuple(replace(new, free=old.free) for new, old in zip(moved.lenses, self.state.lenses, strict=True))
         self.state = replace(moved, lenses=back)
 
@@ -192,7 +194,8 @@ class _Growth:
         """Takes back bodies that few of their views show where they are, if the rest then fits much better; not where
         these are many: then it is the scene that is wrong."""
         used = self.views.some(self.posed[self.views.image] & self.placed[self.views.body])
-        square = np.add.reduceat(errors(used, self.state) ** 2, used.start[:-1]) / (2 * np.diff(used.start))
+        square = reprojection_errors(used, self.state) ** 2
+        square = np.add.reduceat(square, used.start[:-1]) / (2 * np.diff(used.start))
         b = len(self.placed)
         fits, count = (np.bincount(used.body, x, b) for x in (square < LARGEST_RMS_PX**2, None))
         misfit = self.placed & (fits < LEAST_FITTING * count)
@@ -209,14 +212,14 @@ class _Growth:
         used = self.views.some(self.posed[self.views.image] & self.placed[self.views.body])
         image = used.image[used.of_corner]
         m = len(self.posed)
-        square, count = (np.bincount(image, x, m) for x in (errors(used, self.state) ** 2, None))
+        square, count = (np.bincount(image, x, m) for x in (reprojection_errors(used, self.state) ** 2, None))
         return np.sqrt(square / np.where(count > 0, 2 * count, np.nan))
 
     def _seen_alone(self) -> list[TargetPoses]:
         """Of each camera, both poses of each view by itself."""
         own = self.bodies.target.body
         return [
-            body_poses(s, Views.of(s, own), self.bodies, lens.model, lens.params)
+            view_poses(s, Views.of(s, own), self.bodies, lens.model, lens.params)
             for s, lens in zip(self.streams, self.state.lenses, strict=True)
         ]
 
@@ -243,9 +246,10 @@ class _Growth:
         first = int(placed[0])
         R0, p0 = self.state.R_body[first], self.state.p_body[first]
         known = replace(self.bodies, used=tuple(placed.tolist()))
-        scene = Placed(known, Grown(self.state, self.placed, np.empty(0)).in_frame_of(first, self.bodies), {})
+        found = ReconstructedScene(self.state, self.placed, np.empty(0))
+        scene = TargetScene(known, found.in_frame_of(first, self.bodies), {})
         poses = [
-            poses_by_bodies(s, lens.model, lens.params, scene)
+            multi_body_poses(s, lens.model, lens.params, scene)
             for s, lens in zip(self.streams, self.state.lenses, strict=True)
         ]
         rms, R, p = (np.concatenate([getattr(q, name) for q in poses]) for name in ("rms_px", "rotation", "position"))
@@ -296,11 +300,11 @@ class _Growth:
             np.tile(seen.uv, (n, 1)),
             seen.camera,
         )
-        size = errors(many, replace(self.state, R_body=R, p_body=p))
+        size = reprojection_errors(many, replace(self.state, R_body=R, p_body=p))
         return (size.reshape(n, corners) ** 2).mean(axis=1)
 
 
-def telling_images(stream: CornerStream, body: np.ndarray) -> CornerStream:
+def informative_images(stream: CornerStream, body: np.ndarray) -> CornerStream:
     """Images spread over the recording, and `OF_EACH_PAIR` that show both bodies of each pair along which images tie
     bodies best (a maximum spanning forest); body (n_points,)."""
     n, m = len(stream.stamps_ns), int(body.max()) + 1

@@ -71,7 +71,7 @@ class _Mount(NamedTuple):
     offset: float
 
 
-def number_alike(rig: Rig, recordings: Sequence[Measurements]) -> list[Measurements]:
+def resolve_symmetry(rig: Rig, recordings: Sequence[Measurements]) -> list[Measurements]:
     """The recordings, with the points of each symmetric target renumbered.
 
     Numbers stay where no lens is found, and those of a camera stay where the motion does not show how it is mounted.
