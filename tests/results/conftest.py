@@ -63,6 +63,7 @@ def calibration() -> Calibration:
         groups=groups,
         covariance=_covariance(groups, rng),
         covariance_names=names,
+        null_space=_null_space(names),
         undetermined=("cam1 translation y: turn the rig about a second axis to determine it.",),
         fits=tuple(_fits()),
         residuals=by_key(
@@ -159,6 +160,11 @@ def _covariance(groups: tuple[ParameterGroup, ...], rng: np.random.Generator) ->
     return full * np.outer(scale, scale)
 
 
+def _null_space(names: tuple[str, ...]) -> np.ndarray:
+    """(B, 1): the component that is undetermined."""
+    return np.eye(len(names))[:, [names.index("cam1.translation.y")]]
+
+
 def _trajectory() -> Trajectory:
     t = 0.05 * np.arange(N_KEYFRAMES)
     angles = np.stack([0.5 * np.sin(2.1 * t), 0.4 * np.sin(1.7 * t + 1), 0.6 * np.sin(1.3 * t)], axis=1)
@@ -237,6 +243,7 @@ def robot(calibration: Calibration) -> Calibration:
         groups=tuple(groups),
         covariance=_covariance(tuple(groups), rng),
         covariance_names=names,
+        null_space=_null_space(names),
         cross_validation=_held_out(tuple(groups)),
         rig=rig_to_dict(rig),
         fits=(*calibration.fits, *fits),
@@ -263,6 +270,7 @@ def without_cameras(robot: Calibration) -> Calibration:
         groups=tuple(groups),
         covariance=robot.covariance[np.ix_(columns, columns)],
         covariance_names=tuple(robot.covariance_names[k] for k in columns),
+        null_space=np.zeros((len(columns), 0)),
         fits=tuple(f for f in robot.fits if f.sensor not in gone),
         residuals={key: r for key, r in robot.residuals.items() if key[0] not in gone},
         undetermined=(),

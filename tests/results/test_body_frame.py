@@ -65,6 +65,25 @@ def test_relative_poses_are_the_same_in_either_frame(of_cam0: Calibration):
     assert "undetermined" in moved.verdict  # as that of cam1 relative to the IMU
 
 
+def test_poses_are_undetermined_where_the_null_space_moves_them(of_cam0: Calibration):
+    """Both cameras move in the IMU's frame together, so that only the IMU moves in the frame of cam0. Small standard
+    deviations, as a prior gives them, do not hide it."""
+    step = np.array([0.28, 0.96, 0.0])  # in the frame of cam0; squares 0.08, 0.92, 0
+    null = np.zeros((len(of_cam0.covariance), 1))
+    for camera in ("cam0", "cam1"):
+        null[columns_of(of_cam0, camera)[3:], 0] = np.sqrt(0.5) * of_cam0.T_imu_sensor("cam0")[:3, :3] @ step
+    small = replace(of_cam0, covariance=1e-2 * of_cam0.covariance, null_space=null)
+    found = in_body_frame(small)
+    assert found.group("imu0", "translation").verdict == ("determined", "undetermined", "determined")
+    for sensor, name in (("imu0", "rotation"), ("cam1", "rotation"), ("cam1", "translation")):
+        assert set(found.group(sensor, name).verdict) == {"determined"}
+    moved = np.zeros(len(found.covariance))
+    moved[columns_of(found, "imu0")[3:]] = step
+    np.testing.assert_allclose(np.abs(found.null_space.T @ moved), 1.0)
+    failed = in_body_frame(replace(small, converged=False))
+    assert set(failed.group("imu0", "rotation").verdict) == {"undetermined"}
+
+
 def test_without_a_body_of_its_own_nothing_changes(calibration: Calibration):
     same = replace(calibration, rig={**calibration.rig, "body": "imu0"})
     assert in_body_frame(calibration) is calibration and in_body_frame(same) is same

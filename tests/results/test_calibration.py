@@ -205,6 +205,7 @@ ARRAYS = ("trajectory/position", "residuals/imu0/intervals/whitened", "residuals
         *ARRAYS,
         *(f"residuals/{r}" for r in ("lidar0/points/world", "cam0/corners/uv", "cam0/corners/start")),
         "covariance",
+        "null_space",
     ],
 )
 def test_arrays_that_do_not_fit_the_others(robot: Calibration, tmp_path: Path, name: str, how: str):

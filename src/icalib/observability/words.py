@@ -9,10 +9,9 @@ import numpy as np
 
 from icalib.observability.determination import Determined
 from icalib.result import Verdict
-from icalib.result.verdict import by_size
+from icalib.result.verdict import by_size, in_null_space
 from icalib.rig import ParameterSpec
 
-SHARE = 0.25  # a parameter that makes up this much of an undetermined direction is undetermined itself
 NAMED = 0.2  # parts of a direction smaller than this are not named
 MOST_NAMED = 4  # of the largest
 
@@ -47,11 +46,10 @@ def observe(
     or empty.
     """
     directions = sparse_basis(found.held)
-    share = (directions**2).sum(axis=1)
     verdicts: list[Verdict] = []
-    for part, spread in zip(share, found.spread, strict=True):
-        is_open = part > SHARE or not found.estimate.outcome.converged
-        verdicts.append("undetermined" if is_open else by_size(spread))
+    for is_null, spread in zip(in_null_space(directions), found.spread, strict=True):
+        is_undetermined = is_null or not found.estimate.outcome.converged
+        verdicts.append("undetermined" if is_undetermined else by_size(spread))
     sentences = []
     for direction in directions.T:
         words, first = _words_of(direction, names)

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import radians
 
 import numpy as np
+from scipy.linalg import orth
 
 from icalib.result.calibration import Calibration, ParameterGroup, Verdict
 from icalib.result.relative import pose_groups, relative_jacobian
-from icalib.result.verdict import by_size, tolerance
+from icalib.result.verdict import by_size, in_null_space, tolerance
 from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 _POSE = (ROTATION, TRANSLATION)
 _NAMES = tuple(spec.name for spec in _POSE)
-_GOOD_PART = 0.1  # 1 % of the variance; twice as much would call fewer components undetermined
 _SI = {"rotation_tolerance_deg": radians(1.0), "translation_tolerance_m": 1.0}  # of one unit of these settings
 
 
@@ -24,7 +24,8 @@ def in_body_frame(c: Calibration) -> Calibration:
 
     The body has the identity, fixed. An IMU that is not the body has a pose like all others. Covariance: J C J^T, to
     first order. The empirical factor of a pose is the ratio of its standard deviations with and without the factors of
-    the groups that it comes from. Other groups keep their values, and clocks stay relative to the reference.
+    the groups that it comes from. The null space becomes span(J N); verdicts on poses follow from it and from the
+    standard deviations, as those of `c` do. Other groups stay as they are, and clocks stay relative to the reference.
     """
     if c.body == c.reference:
         return c
@@ -36,7 +37,14 @@ def in_body_frame(c: Calibration) -> Calibration:
             J.append(rows)
             names += [f"{group.sensor}.{group.name}.{label}" for label in group.labels]
     whole = np.vstack(J)
-    return replace(c, groups=tuple(groups), covariance=whole @ c.covariance @ whole.T, covariance_names=tuple(names))
+    null = _null_space(c, whole, groups)
+    return replace(
+        c,
+        groups=tuple(_with_null_space(c, g, null) for g in groups),
+        covariance=whole @ c.covariance @ whole.T,
+        covariance_names=tuple(names),
+        null_space=null,
+    )
 
 
 def _reframed(c: Calibration) -> Iterator[tuple[ParameterGroup, np.ndarray]]:
@@ -58,12 +66,7 @@ def _pose(c: Calibration, sensor: str) -> Iterator[tuple[ParameterGroup, np.ndar
     scale = _scales(c)
     for spec, value, rows in zip(_POSE, (T[:3, :3], T[:3, 3]), (J[:3], J[3:]), strict=True):
         formal, std = (np.sqrt(np.einsum("ij,jk,ik->i", r, c.covariance, r)) for r in (rows, rows * scale))
-        assert isinstance(spec.tolerance, str)
-        allowed = tolerance(c, spec.tolerance) * _SI[spec.tolerance]
-        # Undetermined by a component that is, and that moves it beyond its tolerance or makes a good part of its std.
-        moves = np.abs(rows * scale * np.sqrt(np.diag(c.covariance)))[:, _undetermined(c)]
-        is_open = (moves > np.minimum(allowed, _GOOD_PART * std)[:, None]).any(axis=1)
-        sizes = np.where(is_open, np.inf, std / allowed)
+        sizes = std / _allowed(c, spec.tolerance)
         verdict: tuple[Verdict, ...] = tuple("fixed" if s == 0.0 else by_size(s) for s in sizes)
         factor = np.divide(std, formal, out=np.ones(3), where=formal > 0.0)
         mode = "free" if rows.any() else "fixed"
@@ -90,7 +93,37 @@ def _scales(c: Calibration) -> np.ndarray:
     return scale
 
 
-def _undetermined(c: Calibration) -> list[int]:
-    """Columns of the components that the data do not determine."""
-    groups = (g for g in c.groups if g.columns is not None)
-    return [k for g in groups for k, v in zip(g.columns or (), g.verdict, strict=True) if v == "undetermined"]
+def _null_space(c: Calibration, J: np.ndarray, groups: Sequence[ParameterGroup]) -> np.ndarray:
+    """(B', m) orthonormal basis of the null space of the parameters of `groups`, in tolerance units. J (B', B): their
+    Jacobian by the estimated parameters of `c`."""
+    if not c.null_space.size:
+        return np.zeros((len(J), 0))
+    before, after = _pose_tolerances(c, c.groups, J.shape[1]), _pose_tolerances(c, groups, len(J))
+    return orth(J * before / after[:, None] @ c.null_space)
+
+
+def _pose_tolerances(c: Calibration, groups: Sequence[ParameterGroup], size: int) -> np.ndarray:
+    """(size,) tolerances of the columns that are rotations and translations, SI; 1 of the others, which J leaves as
+    they are."""
+    found = np.ones(size)
+    for spec in _POSE:
+        columns = [k for g in groups if g.name == spec.name for k in g.columns or ()]
+        found[columns] = _allowed(c, spec.tolerance)
+    return found
+
+
+def _allowed(c: Calibration, setting: object) -> float:
+    """The tolerance of rotations [rad] or translations [m]; `setting`: its field in the settings."""
+    assert isinstance(setting, str)
+    return tolerance(c, setting) * _SI[setting]
+
+
+def _with_null_space(c: Calibration, group: ParameterGroup, null: np.ndarray) -> ParameterGroup:
+    """The group, undetermined where a pose of a sensor moves along the null space (B', m)."""
+    if group.name not in _NAMES or group.columns is None or group.sensor not in c.rig["sensors"]:
+        return group
+    is_null = in_null_space(null)[list(group.columns)] | (not c.converged)
+    verdict: tuple[Verdict, ...] = tuple(
+        "undetermined" if n else v for n, v in zip(is_null, group.verdict, strict=True)
+    )
+    return replace(group, verdict=verdict)

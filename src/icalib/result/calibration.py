@@ -121,6 +121,7 @@ class Calibration:
     groups: tuple[ParameterGroup, ...]
     covariance: np.ndarray  # (B, B) formal covariance of all estimated parameters, SI, right perturbation
     covariance_names: tuple[str, ...]  # B names: "cam0.rotation.x", ...
+    null_space: np.ndarray  # (B, m) unobservable directions, orthonormal in units of the tolerances
     undetermined: tuple[str, ...]  # sentences: unobservable combinations, and the missing motion
     fits: tuple[SensorFit, ...]
     residuals: dict[tuple[str, str], Residuals]  # (sensor, kind), such as ("cam0", "corners"); see `by_key`

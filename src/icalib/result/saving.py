@@ -103,6 +103,7 @@ def _without_arrays(record: Any) -> dict[str, Any]:
 
 def _npz(c: Calibration) -> bytes:
     arrays = {"covariance": c.covariance, "covariance_names": np.array(c.covariance_names, dtype=np.str_)}
+    arrays["null_space"] = c.null_space
     for (sensor, kind), r in c.residuals.items():
         arrays |= {f"residuals/{sensor}/{kind}/{name}": getattr(r, name) for name in _array_names(type(r))}
     if c.cross_validation is not None:
@@ -160,6 +161,7 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         groups=tuple(_group(g) for g in plain["groups"]),
         covariance=arrays["covariance"],
         covariance_names=tuple(arrays["covariance_names"].tolist()),
+        null_space=arrays["null_space"],
         fits=tuple(SensorFit(**f) for f in plain["fits"]),
         residuals=by_key(_residuals(r, of) for r in plain["residuals"]),
         planes=tuple(
@@ -216,6 +218,8 @@ def _check(c: Calibration) -> None:
     check_arrays(c)
     if c.covariance.shape != (n, n):
         raise ValueError(f"the covariance has shape {c.covariance.shape}, but {n} names")
+    if c.null_space.ndim != 2 or len(c.null_space) != n:
+        raise ValueError(f"the null space has shape {c.null_space.shape}, but there are {n} names")
     for g in c.groups:
         size = len(g.labels)
         sizes = {len(g.std), len(g.std_formal), len(g.verdict), size}

@@ -23,9 +23,10 @@ _TRAJECTORY: Shapes = {
 def check_arrays(c: Calibration) -> None:
     """Raises ValueError, naming the array, where one has another kind of numbers or does not fit the rest in shape.
 
-    The shape of the covariance is not checked here.
+    The shapes of the covariance and of the null space are not checked here.
     """
     _check_kind("the covariance", c.covariance, "f")
+    _check_kind("the null space", c.null_space, "f")
     for (sensor, _), record in c.residuals.items():
         _check(record, sensor, record.shapes)
     _check(c.trajectory, Trajectory.__name__, _TRAJECTORY)

@@ -18,6 +18,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
 from icalib.rig import LENS, Settings
@@ -42,6 +44,7 @@ NEXT: dict[Usability, str] = {
 AUXILIARY = tuple(spec.name for spec in ALL_SPECS if spec.is_auxiliary)
 WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
 UNDETERMINED = 10.0  # tolerances: a standard deviation above this says no more than a guess does
+NULL_SPACE_SHARE = 0.25  # squared length in the null space, tolerance units, beyond which a component is undetermined
 MOST_NAMED = 6  # components in one sentence
 
 
@@ -73,6 +76,12 @@ def reasons(c: Calibration) -> tuple[str, ...]:
 def by_size(tolerances: float) -> Verdict:
     """The verdict on a component whose standard deviation is so many times its tolerance."""
     return "undetermined" if not tolerances <= UNDETERMINED else "determined" if tolerances <= 1.0 else "weak"
+
+
+def in_null_space(directions: np.ndarray) -> np.ndarray:
+    """(B,) whether each component moves along the null space, whose orthonormal basis is `directions` (B, m), in
+    tolerance units."""
+    return (directions**2).sum(axis=1) > NULL_SPACE_SHARE
 
 
 def worst(verdicts: tuple[Verdict, ...]) -> Verdict:

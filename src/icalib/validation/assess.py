@@ -88,6 +88,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         groups=groups,
         covariance=seen.covariance,
         covariance_names=names,
+        null_space=determined.held,
         undetermined=seen.undetermined,
         fits=tuple(judged),
         residuals=by_key(_residuals(inputs, found, timeline)),
