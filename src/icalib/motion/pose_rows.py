@@ -15,8 +15,8 @@ from icalib.geometry import so3
 
 
 @dataclass(frozen=True)
-class Mount:
-    """Extrinsics: R_imu_sensor (3, 3), p_imu_sensor (3,) m."""
+class Extrinsics:
+    """R_imu_sensor (3, 3), p_imu_sensor (3,) m; or the pose of a sensor in the frame of another one."""
 
     R: np.ndarray
     p: np.ndarray

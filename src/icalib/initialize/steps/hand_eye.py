@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.geometry import so3
-from icalib.motion.pose_rows import Frame, Mount, absolute_residuals
+from icalib.motion.pose_rows import Frame, Extrinsics, absolute_residuals
 
 MOST_PAIRS = 2000  # of instants between which turns are compared
 ONE_AXIS = 0.1  # of the turns about the main axis: below, those about a second axis may be noise
@@ -51,7 +51,7 @@ class PosePairs:
 class HandEye(NamedTuple):
     """T_body_sensor and T_world_frame; residual (n, 6): rotation [rad] and position [m] of each pair."""
 
-    mount: Mount
+    extrinsics: Extrinsics
     frame: Frame
     residual: np.ndarray
 
@@ -66,7 +66,7 @@ class Turns(NamedTuple):
     way_sensor: np.ndarray
 
 
-def hand_eye(pairs: PosePairs, start: Mount | None, held: tuple[bool, bool]) -> HandEye:
+def hand_eye(pairs: PosePairs, start: Extrinsics | None, held: tuple[bool, bool]) -> HandEye:
     """The mount and the frame that fit the pairs best, robustly. start: T_body_sensor where the poses leave it open;
     held: whether its rotation and its translation stay there. Needs at least three pairs."""
     turns = turns_of(pairs)
@@ -74,7 +74,7 @@ def hand_eye(pairs: PosePairs, start: Mount | None, held: tuple[bool, bool]) -> 
     if start is not None and not held[0]:
         rotations.append(start.R)
     p = np.zeros(3) if start is None else start.p
-    found = [_refined(pairs, Mount(R, p), held) for R in rotations]
+    found = [_refined(pairs, Extrinsics(R, p), held) for R in rotations]
     return min(found, key=lambda f: _cost(f.residual))
 
 
@@ -125,7 +125,7 @@ def _aligned(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return so3.closest_rotation((a * weight[:, None]).T @ b)
 
 
-def _refined(pairs: PosePairs, start: Mount, held: tuple[bool, bool]) -> HandEye:
+def _refined(pairs: PosePairs, start: Extrinsics, held: tuple[bool, bool]) -> HandEye:
     """By Gauss-Newton from a mount; the frame starts where it fits this one."""
     mount, frame = start, _frame_for(pairs, start)
     free = np.repeat([not held[0], not held[1], True, True], 3)
@@ -146,14 +146,14 @@ def _refined(pairs: PosePairs, start: Mount, held: tuple[bool, bool]) -> HandEye
         d = np.zeros(12)
         d[free] = -np.linalg.lstsq(A, b, rcond=None)[0]
         d *= min(1.0, LARGEST_STEP / max(np.linalg.norm(d[:3]), np.linalg.norm(d[6:9]), LEAST_SCALE))
-        mount = Mount(mount.R @ so3.exp(d[:3].copy()), mount.p + d[3:6])
+        mount = Extrinsics(mount.R @ so3.exp(d[:3].copy()), mount.p + d[3:6])
         frame = Frame(frame.R @ so3.exp(d[6:9].copy()), frame.p + d[9:])
         if np.abs(d).max() < DONE:
             break
     return HandEye(mount, frame, residual)
 
 
-def _frame_for(pairs: PosePairs, mount: Mount) -> Frame:
+def _frame_for(pairs: PosePairs, mount: Extrinsics) -> Frame:
     """The mean over the pairs."""
     R = so3.closest_rotation((pairs.R_body @ mount.R @ pairs.R_sensor.transpose(0, 2, 1)).sum(axis=0))
     return Frame(R, np.median(pairs.p_body + pairs.R_body @ mount.p - pairs.p_sensor @ R.T, axis=0))

@@ -22,7 +22,7 @@ from icalib.initialize.steps.hand_eye import LARGEST_LEFT, HandEye, PosePairs, h
 from icalib.initialize.steps.known_values import given
 from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.model.frames import FRAME, frame_of
-from icalib.motion.pose_rows import Mount
+from icalib.motion.pose_rows import Extrinsics
 from icalib.optim.state import Key, State, in_recording
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.parameter import fixed
@@ -115,12 +115,12 @@ def _mounted(
     best = int(np.argmax([len(x.stream.stamps_ns) for x in paired]))
     found = _solved(rig, sensor, paired[best])
     values: dict[Key, np.ndarray] = {
-        (sensor.name, "rotation"): found.mount.R,
-        (sensor.name, "translation"): found.mount.p,
+        (sensor.name, "rotation"): found.extrinsics.R,
+        (sensor.name, "translation"): found.extrinsics.p,
     }
     out = []
     for k, (m, own) in enumerate(zip(recordings, paired, strict=True)):
-        here = found if k == best else hand_eye(own.pairs, found.mount, (True, True))
+        here = found if k == best else hand_eye(own.pairs, found.extrinsics, (True, True))
         values |= {
             (frame_of(sensor.name, k), FRAME[0]): here.frame.R,
             (frame_of(sensor.name, k), FRAME[1]): here.frame.p,
@@ -171,7 +171,9 @@ def _paired(rig: Rig, sensor: PoseSensor, m: Measurements, stream: PoseStream, s
 def _solved(rig: Rig, sensor: PoseSensor, own: _Paired) -> HandEye:
     """Raises EstimationError where body and sensor do not move alike, or would if poses were written another way."""
     R, p = sensor.rotation.value, sensor.translation.value
-    start = None if R is None and p is None else Mount(np.eye(3) if R is None else R, np.zeros(3) if p is None else p)
+    start = (
+        None if R is None and p is None else Extrinsics(np.eye(3) if R is None else R, np.zeros(3) if p is None else p)
+    )
     held = sensor.rotation.mode == "fixed", sensor.translation.mode == "fixed"
 
     def place(stream: PoseStream) -> tuple[tuple[HandEye, float], float]:

@@ -34,7 +34,7 @@ from icalib.sensors.wheels.initialize.drive import (
     wheel_offset,
     wheel_rates,
 )
-from icalib.sensors.wheels.initialize.relative_poses import mount_guess, poses_offset
+from icalib.sensors.wheels.initialize.relative_poses import extrinsics_guess, poses_offset
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
 SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of start, middle and end of a span
@@ -161,8 +161,8 @@ def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray
         offset = np.array([poses_offset(inputs.imu, stream)])
     times = stream.seconds + offset[0]  # there is but one recording of relative poses
     inside, rate, velocity = _means(inputs, state, times[:-1], times[1:])
-    found = mount_guess(stream, inside, rate, velocity)
-    values = mounted(found.rotation, found.position, offset)
+    found = extrinsics_guess(stream, inside, rate, velocity)
+    values = mounted(found.R, found.p, offset)
     return {(stream.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 

@@ -7,28 +7,19 @@ Over a short interval, with u and w the velocity and rate of the IMU in its own 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from icalib.data.measurements import WheelPoses
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
+from icalib.motion.pose_rows import Extrinsics
 
 GRID_HZ = 100.0
 LEAST_EXPLAINED = 0.5  # of the variance of the yaw rate, by the gyroscope
 WEAK = 0.02  # of the largest singular value: directions that move less say nothing
 ROUNDS = 6
 CANDIDATES = 30  # shifts that are tried in earnest
-
-
-@dataclass(frozen=True)
-class MountGuess:
-    """R_imu_wheel, p_imu_wheel (3,) m."""
-
-    rotation: np.ndarray
-    position: np.ndarray
 
 
 def yaw_rates(stream: WheelPoses) -> tuple[np.ndarray, np.ndarray]:
@@ -73,8 +64,12 @@ def _at(t: np.ndarray, imu: ImuData, x: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(t, imu.seconds, own) for own in x.T], axis=1)
 
 
-def mount_guess(stream: WheelPoses, inside: np.ndarray, rate: np.ndarray, velocity: np.ndarray) -> MountGuess:
-    """From the poses of the intervals `inside` (K,), and the IMU's rate and velocity (n, 3) over these, in its axes."""
+def extrinsics_guess(stream: WheelPoses, inside: np.ndarray, rate: np.ndarray, velocity: np.ndarray) -> Extrinsics:
+    """Extrinsics of the wheels from relative poses and the motion of the IMU.
+
+    inside (K,): the intervals that are used, n; rate [rad/s], velocity [m/s] (n, 3): means over each of the IMU's, in
+    its axes.
+    """
     pose, dt = stream.pose[inside], np.diff(stream.seconds)[inside]
     half = 0.5 * pose[:, 0]
     c, s = np.cos(half), np.sin(half)
@@ -84,7 +79,7 @@ def mount_guess(stream: WheelPoses, inside: np.ndarray, rate: np.ndarray, veloci
     ahead, left = (_least_squares(moving, way / dt) for way in (x, y))
     R = so3.closest_rotation(np.stack([ahead[:3], left[:3], up]))
     rows = np.concatenate([-_cross(R[0]), -_cross(R[1])])  # p x r = -r x p
-    return MountGuess(R.T, _least_squares(rows, np.concatenate([ahead[3:], left[3:]])))
+    return Extrinsics(R.T, _least_squares(rows, np.concatenate([ahead[3:], left[3:]])))
 
 
 def _least_squares(A: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, PosePairs, hand_eye, left_over
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.model.bodies import Bodies
-from icalib.motion.pose_rows import Frame, Mount
+from icalib.motion.pose_rows import Frame, Extrinsics
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import (
@@ -129,7 +129,7 @@ def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
     return found.frame
 
 
-def _given(a: Camera, b: Camera, a_is_body: bool, b_is_body: bool) -> Mount | None:
+def _given(a: Camera, b: Camera, a_is_body: bool, b_is_body: bool) -> Extrinsics | None:
     """T_a_b where the rig file gives it."""
     mounts = []
     for camera, is_body in ((a, a_is_body), (b, b_is_body)):
@@ -138,6 +138,6 @@ def _given(a: Camera, b: Camera, a_is_body: bool, b_is_body: bool) -> Mount | No
             R, p = np.eye(3), np.zeros(3)
         if R is None or p is None:
             return None
-        mounts.append(Mount(R, p))
+        mounts.append(Extrinsics(R, p))
     one, other = mounts
-    return Mount(one.R.T @ other.R, one.R.T @ (other.p - one.p))
+    return Extrinsics(one.R.T @ other.R, one.R.T @ (other.p - one.p))
