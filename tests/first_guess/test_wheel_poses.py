@@ -11,7 +11,7 @@ import pytest
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
-from icalib.sensors.wheels.initialize.relative_poses import intervals_inside, mount_guess, poses_offset
+from icalib.sensors.wheels.initialize.relative_poses import extrinsics_guess, intervals_inside, poses_offset
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, simulate
 
@@ -37,17 +37,17 @@ def test_time_offset(free_motion):
     assert poses_offset(imu, stream) == pytest.approx(true, abs=5e-3)
 
 
-def test_mount(free_motion):
+def test_extrinsics(free_motion):
     imu, stream, offset = setting(free_motion)
     inside = intervals_inside(imu, stream, offset)
     t = (0.5 * (stream.seconds[1:] + stream.seconds[:-1]) + offset)[inside] + free_motion.truth.seconds[0]
     R, _, velocity = free_motion.truth.pose_at(t)
     rate = free_motion.truth.trajectory.rate_at(t)
-    found = mount_guess(stream, inside, rate, np.einsum("nji,nj->ni", R, velocity))
+    found = extrinsics_guess(stream, inside, rate, np.einsum("nji,nj->ni", R, velocity))
     T = free_motion.truth.T_imu_sensor["wheel0"]
-    turn = so3.log(np.ascontiguousarray(T[:3, :3].T @ found.rotation))
+    turn = so3.log(np.ascontiguousarray(T[:3, :3].T @ found.R))
     assert np.abs(np.rad2deg(turn)).max() < 1.0
-    assert np.abs(found.position - T[:3, 3]).max() < 0.02
+    assert np.abs(found.p - T[:3, 3]).max() < 0.02
 
 
 def test_a_frame_of_another_recording_is_refused(free_motion):

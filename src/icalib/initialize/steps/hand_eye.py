@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.geometry import so3
-from icalib.motion.pose_rows import Frame, Extrinsics, absolute_residuals
+from icalib.motion.pose_rows import Extrinsics, Frame, absolute_residuals
 
 MOST_PAIRS = 2000  # of instants between which turns are compared
 ONE_AXIS = 0.1  # of the turns about the main axis: below, those about a second axis may be noise

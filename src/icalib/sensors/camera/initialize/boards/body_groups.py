@@ -21,7 +21,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, PosePairs, hand_eye, left_over
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.model.bodies import Bodies
-from icalib.motion.pose_rows import Frame, Extrinsics
+from icalib.motion.pose_rows import Extrinsics, Frame
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import (

@@ -243,7 +243,7 @@ def extrinsics_on_motion(
     followed: ImagePairs, motion: Motion, starts: Sequence[CameraExtrinsics], axis: np.ndarray | None, held: np.ndarray
 ) -> CameraExtrinsics:
     """The camera that fits best what it `followed`, sought from each of the `starts`, turned all round about `axis`
-    (3,) of the IMU where there is one. held (7,): what is not sought, as in `Mount.moved`.
+    (3,) of the IMU where there is one. held (7,): what is not sought, as in `CameraExtrinsics.moved`.
 
     Raises EstimationError where none fits, or the motion does not show how the camera is turned.
     """
