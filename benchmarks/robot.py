@@ -23,7 +23,7 @@ from icalib.data.measurements import Measurements
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability.determination import Determined, determine
 from icalib.rig import Rig
 from icalib.sensors.lidar.binning import Associated, take_moments
@@ -56,7 +56,7 @@ def main() -> None:
 def _run(rig: Rig, measurements: Measurements, show: bool = False) -> tuple[Inputs, Determined]:
     """Measurements to covariance, stage by stage."""
     begun, clock = time.process_time(), time.perf_counter()
-    (inputs, state, guess), starting = _spent(lambda: start(rig, [measurements]))
+    (inputs, state, guess), starting = _spent(lambda: guess_of_rig(rig, [measurements]))
     found, solving = _spent(lambda: determine(inputs, state, guess=guess))
     _, judging = _spent(lambda: assess(inputs, found))
     if show:

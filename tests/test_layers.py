@@ -48,7 +48,7 @@ ORDER = (
     ("estimate",),
     ("result",),
     ("observability", "initialize.steps"),
-    ("initialize.paths",),
+    ("initialize.trajectories",),
     ("sensors.*.initialize",),
     ("initialize",),
     ("sensors.*.assess",),

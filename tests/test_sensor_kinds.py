@@ -21,7 +21,7 @@ FREE = ("sensors/", "export/")  # exporters write the files of programs for cert
 NAMING = {
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
-    "initialize/dead_reckoning.py",
+    "initialize/cameras_on_odometry.py",
     "motion/clouds.py",
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users

@@ -18,7 +18,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.data.measurements import ImuStream, Measurements, PoseStream
-from icalib.initialize.steps.clocks import align
+from icalib.initialize.steps.rate_alignment import align_rates
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
@@ -90,7 +90,7 @@ def absolute(logs) -> Calibration:
 def test_rates_alone_give_the_rotation_within_a_degree_and_the_lag_within_15_ms(logs):
     _, measured, published = logs
     imu, (stream,) = ImuData.build(measured.imu, ALIASED), measured.poses
-    found = align(imu, "lidar0", pose_rates(stream), None)
+    found = align_rates(imu, "lidar0", pose_rates(stream), None)
     assert degrees(published.rotation[0], found.rotation) < 1.0
     raw = found.offset - (stream.origin_ns - measured.imu.origin_ns) * 1e-9
     assert raw == pytest.approx(published.offset, abs=0.015)

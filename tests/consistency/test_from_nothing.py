@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.montecarlo.one_run import RunTask, run
@@ -58,4 +58,4 @@ def test_where_the_lidar_shows_nothing_either_the_camera_says_what_is_missing(ro
     (lidar,) = seen.lidars
     scattered = np.random.default_rng(0).uniform(-20.0, 20.0, lidar.xyz.shape).astype(np.float32)
     with pytest.raises(EstimationError, match="cam0 turned about one axis only"):
-        start(rig_for(scenario), [seen.with_streams(replace(lidar, xyz=scattered))])
+        guess_of_rig(rig_for(scenario), [seen.with_streams(replace(lidar, xyz=scattered))])

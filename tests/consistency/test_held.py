@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from icalib.estimate.problem.outcome import Step
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability import determination
 from icalib.observability.determination import determine
 from icalib.tools.simulation import rig_for, simulate, with_drawn_guess
@@ -23,7 +23,7 @@ def test_of_an_estimate_that_failed_no_answers_are_looked_for(robot, monkeypatch
     monkeypatch.setattr(determination, "owed_to_guess", None)
     scenario = robot("planar", 4.0, "lw")
     rig = with_drawn_guess(rig_for(scenario), scenario, 0)
-    found = determine(*start(rig, [simulate(scenario, 0).measurements])[:2])
+    found = determine(*guess_of_rig(rig, [simulate(scenario, 0).measurements])[:2])
     assert not found.estimate.outcome.converged
     assert found.held.shape[1] == found.shifts.shape[0] > 0
 
@@ -34,7 +34,7 @@ def test_held_directions_are_moved_in_the_estimate_without_them(robot):
     scenario = robot("planar", 12.0, "lw")
     simulation = simulate(scenario, 0)
     rig = with_drawn_guess(rig_for(scenario), scenario, 0)
-    inputs, state, guess = start(rig, [simulation.measurements])
+    inputs, state, guess = guess_of_rig(rig, [simulation.measurements])
     held, steps = [0], list[tuple[int, str, Step]]()
     found = determine(
         inputs,

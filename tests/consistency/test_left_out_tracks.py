@@ -10,7 +10,7 @@ import pytest
 
 from icalib.estimate.estimate import ENOUGH_TRACKED, estimate
 from icalib.geometry import so3
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.motion.factor import of_type
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.lidar.simulate import SimLidar
@@ -25,7 +25,7 @@ def settled():
     scenario = load_scenario(EXAMPLE)
     scenario = replace(scenario, duration_s=8.0, sensors=scenario.of(SimLidar))
     rig = with_drawn_guess(rig_for(scenario), scenario, 0)
-    inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
+    inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 0).measurements])
     return inputs, estimate(inputs, state)
 
 

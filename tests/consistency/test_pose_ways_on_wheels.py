@@ -8,7 +8,7 @@ from tests.consistency.test_upwards import level
 from tests.first_guess.test_pose_ways import conjugated, inverted, w_first, y_up
 
 from icalib.errors import EstimationError
-from icalib.initialize.assumed_motion import start_without_imu
+from icalib.initialize.assumed_motion import guess_with_assumed_motion
 
 WRONG = [
     (inverted, "the poses of mocap0 are inverted"),
@@ -28,9 +28,9 @@ def test_the_way_that_wheels_fit_is_named(recorded, way, words):
     rig, measurements, _ = recorded
     written = measurements.with_streams(*(way(x) for x in measurements.poses))
     with pytest.raises(EstimationError, match=words):
-        start_without_imu(rig, [written])
+        guess_with_assumed_motion(rig, [written])
 
 
 def test_poses_as_they_should_be(recorded):
     rig, measurements, _ = recorded
-    start_without_imu(rig, [measurements])
+    guess_with_assumed_motion(rig, [measurements])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability.determination import determine, judge
 from icalib.observability.relaxed import freed_inputs, relaxed
 from icalib.optim.arrowhead import solve
@@ -23,7 +23,7 @@ def estimated():
     simulation, rig = simulate(made, 3), rig_for(made)
     p = simulation.truth.T_imu_sensor["cam0"][:3, 3]
     own = replace(rig.cameras[0], translation=Parameter("prior", p + 1e-3, np.full(3, 1e-3)))
-    inputs, state, guess = start(rig.with_(cameras=(own, *rig.cameras[1:])), [simulation.measurements])
+    inputs, state, guess = guess_of_rig(rig.with_(cameras=(own, *rig.cameras[1:])), [simulation.measurements])
     return inputs, determine(inputs, state, guess=guess).estimate
 
 

@@ -11,7 +11,7 @@ import pytest
 from icalib.errors import CalibrationError
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.optim.state import State
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Rig, Wheels
@@ -94,7 +94,7 @@ def drawn(rig: Rig, rng: np.random.Generator) -> Rig:
 def test_no_guess_ends_the_first_guess_but_in_a_sentence(simulation, seed):
     rig = drawn(rig_for(simulation.scenario, **STARTS), np.random.default_rng(seed))
     try:
-        inputs, state, _ = start(rig, [simulation.measurements])
+        inputs, state, _ = guess_of_rig(rig, [simulation.measurements])
     except CalibrationError as error:
         assert str(error).endswith(".")
         return

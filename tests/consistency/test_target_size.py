@@ -11,7 +11,7 @@ from tests.typed import instance
 
 from icalib.estimate.evidence.target_size import TargetSize, target_size
 from icalib.geometry.targets import AprilGrid, Markers
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability.determination import determine
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
@@ -28,7 +28,7 @@ def of_size(rig: Rig, size: float) -> Rig:
 
 def found(seed: int, said: float, **scenario) -> TargetSize:
     made = handheld(SECONDS, **scenario)
-    inputs, state, guess = start(of_size(rig_for(made), said), [simulate(made, seed).measurements])
+    inputs, state, guess = guess_of_rig(of_size(rig_for(made), said), [simulate(made, seed).measurements])
     estimate = determine(inputs, state, guess=guess).estimate
     size = target_size(estimate.problem, estimate.outcome.state)
     assert size is not None
@@ -45,7 +45,7 @@ def test_of_tags_in_a_room_all_sizes_and_distances_grow_together():
     rig = rig_for(made)
     target = instance(rig.target, Markers)
     smaller = replace(rig, target=replace(target, size=0.95 * target.size))
-    inputs, state, guess = start(smaller, [simulate(made, 0).measurements])
+    inputs, state, guess = guess_of_rig(smaller, [simulate(made, 0).measurements])
     estimate = determine(inputs, state, guess=guess).estimate
     size = target_size(estimate.problem, estimate.outcome.state)
     assert size is not None
@@ -61,7 +61,7 @@ def test_a_length_that_is_known_shows_the_size_too():
         replace(c, translation=replace(c.translation, mode="fixed", value=simulation.truth.T_imu_sensor[c.name][:3, 3]))
         for c in rig.cameras
     )
-    inputs, state, guess = start(rig.with_(cameras=cameras), [simulation.measurements])
+    inputs, state, guess = guess_of_rig(rig.with_(cameras=cameras), [simulation.measurements])
     estimate = determine(inputs, state, guess=guess).estimate
     size = target_size(estimate.problem, estimate.outcome.state)
     assert size is not None

@@ -16,7 +16,7 @@ from icalib.estimate.problem.guess_priors import guess_priors, guess_sigma
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.solver import _Descent
 from icalib.estimate.problem.tolerances import FROM_NOTHING_M
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.optim.arrowhead import solve
 from icalib.optim.state import State
 from icalib.rig import Parameter
@@ -34,7 +34,7 @@ def begun() -> tuple[Inputs, State]:
     rig = rig_for(scenario)
     given = Parameter("prior", np.array([0.01]), np.array([0.003]))
     rig = rig.with_(cameras=(replace(rig.cameras[0], time_offset=given), *rig.cameras[1:]))
-    inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
+    inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 0).measurements])
     return inputs, state
 
 
@@ -62,7 +62,7 @@ def test_the_focal_length_of_a_sphere_model_is_as_uncertain_as_its_xi():
     }
     scenario = replace(scenario, cameras=(replace(scenario.cameras[0], **lens),))
     rig = rig_for(scenario, intrinsics="free", distortion="free")
-    inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
+    inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 0).measurements])
     fx, xi = state.values["cam0", "intrinsics"][0], state.values["cam0", "distortion"][0]
     sigma = guess_sigma(inputs, state)[inputs.layout.columns("cam0", "intrinsics", "distortion")]
     expected = np.hypot(INTRINSICS.prior_sigma, fx / (1.0 + xi) * DISTORTION.prior_sigma)

@@ -25,7 +25,7 @@ from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.model.bodies import Bodies
 from icalib.motion.factor import look, of_type
 from icalib.optim.calib_block import restricted_inverse
@@ -51,7 +51,7 @@ def solved() -> tuple[Problem, Outcome]:
     exact = {"imu_noise_enabled": False, "robot_noise_enabled": False}
     scenario = replace(followers(5.0), **exact)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
-    inputs, state, _ = start(rig, [simulate(scenario, 1).measurements])
+    inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 1).measurements])
     streams = inputs.measurements.cameras
     noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)}
     following = first_following(inputs)
@@ -153,7 +153,7 @@ def drifting(stream: TrackStream, sigma: float, rng: np.random.Generator) -> Tra
 
 def track_spread(measurements: Measurements, rig: Rig) -> float:
     """Mean over the intrinsics of the standard deviations by feature tracks, over the formal ones."""
-    inputs, state, _ = start(rig, [measurements])
+    inputs, state, _ = guess_of_rig(rig, [measurements])
     found = estimate(inputs, state)
     V = cluster_covariances(found.problem, found.outcome).tracks
     assert V is not None

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.initialize.attempts import explained
+from icalib.initialize.attempts import explained_failure
 from icalib.optim.arrowhead import BROKEN_DOWN, NotDefiniteError
 from icalib.rig import Camera, ImuNoise, ImuSensor, PoseSensor, Rig, by_name
 
@@ -25,7 +25,7 @@ def failing(rig: Rig):
 
 
 def test_relative_poses_that_would_work_as_absolute_ones_are_named():
-    found = explained(RELATIVE, [], converging, BROKEN)  # pyright: ignore
+    found = explained_failure(RELATIVE, [], converging, BROKEN)  # pyright: ignore
     assert str(found).startswith("odom: ") and "write kind: absolute" in str(found)
 
 
@@ -39,4 +39,4 @@ def test_relative_poses_that_would_work_as_absolute_ones_are_named():
     ],
 )
 def test_what_was_not_tried_or_did_not_work_is_not_said(rig, make, failed):
-    assert explained(rig, [], make, failed) is failed
+    assert explained_failure(rig, [], make, failed) is failed

@@ -10,7 +10,7 @@ import pytest
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.geometry import so3
 from icalib.geometry.targets import Checkerboard, Circles, Target
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.rig import Rig
 from icalib.sensors.camera.initialize.boards.symmetry import resolve_symmetry
 from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
@@ -107,7 +107,7 @@ def test_a_camera_bridges_gaps_of_the_other(simulation):
 def test_an_estimate_starts_from_the_same_numbers(simulation):
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
     wrong, truth = shown(simulation, rig, gaps=(0,))
-    inputs, _, _ = start(rig, [wrong])
+    inputs, _, _ = guess_of_rig(rig, [wrong])
     assert same_but_one_turn(inputs.measurements, truth, rig.target)
 
 

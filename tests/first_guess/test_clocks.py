@@ -7,8 +7,8 @@ import pytest
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.initialize.steps.clock_shifts import CameraRates
-from icalib.initialize.steps.clocks import Alignment, align, check_axes
+from icalib.initialize.steps.rate_alignment import RateAlignment, align_rates, check_two_axes
+from icalib.initialize.steps.rate_correlation import SensorRates
 from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
@@ -32,17 +32,17 @@ def _imu(scale: float) -> ImuData:
     return ImuData.build(stream, ImuNoise(1e-3, 1e-2, 1e-5, 1e-4))
 
 
-def _camera(seed: int) -> CameraRates:
+def _camera(seed: int) -> SensorRates:
     """20 Hz: an error of an image is in the rate before it and, the other way round, in the rate after it."""
     seconds = np.arange(0.5, 39.0, 0.05)
     error = np.random.default_rng(seed).normal(scale=NOISE_RAD, size=(len(seconds), 3))
     rate = _rate(0.5 * (seconds[:-1] + seconds[1:])) @ R_IMU_CAM + np.diff(error, axis=0) / 0.05
-    return CameraRates(seconds[:-1] - OFFSET, seconds[1:] - OFFSET, rate, least_correlation=0.3)
+    return SensorRates(seconds[:-1] - OFFSET, seconds[1:] - OFFSET, rate, least_correlation=0.3)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_of_the_images_is_not_taken_for_another_scale(seed: int):
-    found = align(_imu(1.0), "cam0", _camera(seed), None)
+    found = align_rates(_imu(1.0), "cam0", _camera(seed), None)
     assert found.offset == pytest.approx(OFFSET, abs=0.02)
     assert np.trace(found.rotation.T @ R_IMU_CAM) > 2.99
 
@@ -50,7 +50,7 @@ def test_noise_of_the_images_is_not_taken_for_another_scale(seed: int):
 @pytest.mark.parametrize(("scale", "words"), [(1.4, "turns 1.[34]"), (180.0 / np.pi, "deg/s")])
 def test_another_scale_is_named(scale: float, words: str):
     with pytest.raises(EstimationError, match=words):
-        align(_imu(scale), "cam0", _camera(0), None)
+        align_rates(_imu(scale), "cam0", _camera(0), None)
 
 
 def _found_where_alike(own: np.ndarray, another: np.ndarray, nearer: bool) -> None:
@@ -63,8 +63,8 @@ def _found_where_alike(own: np.ndarray, another: np.ndarray, nearer: bool) -> No
     gyro[there] = another
     imu = ImuStream("imu0", (1e9 * seconds).astype(np.int64), gyro, np.zeros((len(seconds), 3)))
     images = np.arange(0.0, SPAN_S - 0.01, 0.05)
-    rates = CameraRates(images[:-1], images[1:], _rate(0.5 * (images[:-1] + images[1:])) @ R_IMU_CAM)
-    found = align(ImuData.build(imu, ImuNoise(1e-3, 1e-2, 1e-5, 1e-4)), "cam0", rates, None)
+    rates = SensorRates(images[:-1], images[1:], _rate(0.5 * (images[:-1] + images[1:])) @ R_IMU_CAM)
+    found = align_rates(ImuData.build(imu, ImuNoise(1e-3, 1e-2, 1e-5, 1e-4)), "cam0", rates, None)
     assert found.offset == pytest.approx(12.0 if nearer else 24.0, abs=0.01)
     assert np.trace(found.rotation.T @ R_IMU_CAM) > 2.999
 
@@ -100,6 +100,6 @@ def test_turns_about_one_axis_are_refused_with_what_the_rig_can_do(on_wheels: bo
     gyro[:, 2] = np.sin(seconds)
     stream = ImuStream("imu0", (1e9 * seconds).astype(np.int64), gyro, np.zeros_like(gyro))
     imu = ImuData.build(stream, ImuNoise(1e-3, 1e-2, 1e-5, 1e-4))
-    rates = CameraRates(seconds[100:-101:10], seconds[110:-91:10], gyro[105:-96:10], least_correlation=0.3)
+    rates = SensorRates(seconds[100:-101:10], seconds[110:-91:10], gyro[105:-96:10], least_correlation=0.3)
     with pytest.raises(EstimationError, match=f"cam0 turned about one axis only.*; {advice}, or give `rotation`"):
-        check_axes(imu, rates, Alignment(0.0, np.eye(3), np.zeros(3)), "cam0", on_wheels)
+        check_two_axes(imu, rates, RateAlignment(0.0, np.eye(3), np.zeros(3)), "cam0", on_wheels)

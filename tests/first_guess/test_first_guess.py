@@ -12,7 +12,7 @@ from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid
-from icalib.initialize.steps.target_poses import Flat, target_poses
+from icalib.initialize.steps.target_poses import FlatPoints, target_poses
 from icalib.rig import Parameter, Rig
 from icalib.sensors.camera.initialize.boards.intrinsics import guess_intrinsics
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess, initial_trajectory
@@ -98,9 +98,9 @@ def test_lenses_that_see_all_round_are_found_in_few_images(wanted: str):
     stream, target = stills_of("double-sphere", (339.0, 338.0, 647.0, 405.0), (-0.05, 0.73), 18)
     model = camera_model(wanted)
     params = guess_intrinsics(
-        stream, Flat(target.points), model, (1280, 800), np.full(len(model.parameter_names), np.nan)
+        stream, FlatPoints(target.points), model, (1280, 800), np.full(len(model.parameter_names), np.nan)
     )
-    assert np.median(target_poses(stream, model, params, Flat(target.points)).rms_px) < 0.35
+    assert np.median(target_poses(stream, model, params, FlatPoints(target.points)).rms_px) < 0.35
     assert model.central_scale(params) == pytest.approx(339.0 / 0.95, rel=0.03)
 
 
@@ -109,9 +109,9 @@ def test_a_wide_rational_lens_is_found_by_way_of_a_fisheye():
     lens = (3.1, 0.9, 2e-4, 1e-4, 0.02, 3.4, 1.9, 0.15)
     stream, target = stills_of("pinhole-rational", (560.0, 561.0, 650.0, 395.0), lens, 24)
     model = camera_model("pinhole-rational")
-    params = guess_intrinsics(stream, Flat(target.points), model, (1280, 800), np.full(12, np.nan))
+    params = guess_intrinsics(stream, FlatPoints(target.points), model, (1280, 800), np.full(12, np.nan))
     assert params[:4] == pytest.approx([560.0, 561.0, 650.0, 395.0], abs=4.0)
-    assert np.median(target_poses(stream, model, params, Flat(target.points)).rms_px) < 0.3
+    assert np.median(target_poses(stream, model, params, FlatPoints(target.points)).rms_px) < 0.3
 
 
 def test_a_camera_without_a_pose_is_refused_in_a_sentence(simulation: Simulation):
@@ -289,7 +289,7 @@ def test_corners_on_a_line_have_no_pose_and_stop_nothing(simulation: Simulation)
     params = np.concatenate(
         [simulation.truth.values["cam0"]["intrinsics"], simulation.truth.values["cam0"]["distortion"]]
     )
-    poses = target_poses(on_a_line, camera_model(camera.model), params, Flat(simulation.scenario.target.points))
+    poses = target_poses(on_a_line, camera_model(camera.model), params, FlatPoints(simulation.scenario.target.points))
     assert not poses.ok.any()
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from icalib.data.measurements import Measurements, PoseStream, WheelStream
 from icalib.geometry import so3
-from icalib.initialize.assumed_motion import LEAST_SPACING_S, keyframe_spacing
+from icalib.initialize.assumed_motion import MIN_KEYFRAME_SPACING_S, keyframe_spacing
 from icalib.initialize.steps.keyframe_spacing import SmoothMotion
-from icalib.initialize.steps.smooth_path import smooth_path
+from icalib.initialize.steps.smooth_trajectory import smooth_trajectory
 from icalib.rig import PoseSensor, Rig, Settings, Wheels, by_name
 from icalib.sensors.pose.initialize.initial_noise import pose_noise
 
@@ -37,7 +37,7 @@ def recorded(seconds: float = 20.0) -> Measurements:
 def spacing(noise: float | None, densities=DENSITIES, **settings: Any) -> float:
     m = recorded()
     s = m.poses[0]
-    path = smooth_path(s.seconds, s.rotation, s.position, np.arange(0.0, s.seconds[-1], 0.01))
+    path = smooth_trajectory(s.seconds, s.rotation, s.position, np.arange(0.0, s.seconds[-1], 0.01))
     rig = Rig(by_name(PoseSensor("mocap0", "")), settings=Settings(**settings))
     if noise is not None:
         rig = rig.with_(wheels=(Wheels("wheel0", "", wheel_noise=noise),))
@@ -66,4 +66,4 @@ def test_good_encoders_ask_for_closer_keyframes():
     noise, densities = 0.1, (0.3, 0.2)
     yaw = noise * np.sqrt(2.0) * RADIUS / BASELINE
     assert spacing(noise, densities, keyframe_spacing_s=2.0) == pytest.approx(np.sqrt(3.0) * 0.25 * yaw / 0.3, rel=0.05)
-    assert spacing(0.1 * noise, densities) == LEAST_SPACING_S
+    assert spacing(0.1 * noise, densities) == MIN_KEYFRAME_SPACING_S

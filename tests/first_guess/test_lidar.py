@@ -11,7 +11,7 @@ from tests.typed import not_none, random_rotations
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.steps.by_recording import Held
+from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 
 pytestmark = pytest.mark.slow
@@ -87,7 +87,7 @@ def test_on_a_floor_the_turn_about_its_axis_comes_from_accelerations(robot):
 def test_a_long_turn_to_one_side_shows_the_clocks(robot, seconds, seed):
     """About its median such a turn is another motion, which goes best with the LiDAR's seconds away or nowhere."""
     r = robot(seconds, seed, {"azimuth_steps": 300}, example="table2-planar")
-    held = Held(r.truth().rotation, r.truth().position)
+    held = KnownExtrinsics(r.truth().rotation, r.truth().position)
     found = lidar_and_motion(r.imu, r.streams[0], 9.81, held)[0]
     assert abs(found.offset - r.truth().offset) < 5e-3
 
@@ -102,7 +102,7 @@ def test_on_a_floor_the_turn_about_its_axis_comes_from_the_known_motion(robot, s
 
 def test_what_is_held_stays(free_robot):
     true = free_robot.truth()
-    held = Held(true.rotation, true.position + [0.1, 0.0, 0.0], true.offset + 1e-3)
+    held = KnownExtrinsics(true.rotation, true.position + [0.1, 0.0, 0.0], true.offset + 1e-3)
     known = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], KEYFRAME_S))
     for found in (
         lidar_and_motion(free_robot.imu, free_robot.streams[0], 9.81, held)[0],
@@ -111,7 +111,7 @@ def test_what_is_held_stays(free_robot):
         np.testing.assert_allclose(found.rotation, not_none(held.rotation), atol=1e-6)
         np.testing.assert_allclose(found.position, not_none(held.position), atol=1e-4)
         assert found.offset == held.offset
-    rotation = Held(rotation=true.rotation)
+    rotation = KnownExtrinsics(rotation=true.rotation)
     assert within(
         free_robot, lidar_and_motion(free_robot.imu, free_robot.streams[0], 9.81, rotation)[0], 1e-4, 0.03, 1e-3
     )
@@ -178,7 +178,7 @@ def test_one_wall_does_not_crash(free_robot):
     largest = np.bincount(stream.plane[stream.plane >= 0]).argmax()
     wall = changed(stream, stream.xyz, stream.plane == largest)
     known = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], KEYFRAME_S))
-    held = Held(true.rotation, true.position, true.offset)
+    held = KnownExtrinsics(true.rotation, true.position, true.offset)
     try:
         found = lidar_on_motion(free_robot.imu, wall, known, held)
     except EstimationError as error:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from icalib.geometry import so3
-from icalib.initialize.paths.path import ExtrinsicsGuess
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
+from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess
 from icalib.sensors.parameter import Mode, Parameter
 from icalib.tools.simulation import rig_for
 
@@ -33,7 +33,7 @@ def guessed(robot, mode: Mode = "free", mode_of_clock: Mode = "free"):
 
 def started(robot, rig):
     """The start's and the guess's rotation and time offset."""
-    inputs, state, guess = start(rig, [robot.sim.measurements])
+    inputs, state, guess = guess_of_rig(rig, [robot.sim.measurements])
     assert inputs.guess is not None
     np.testing.assert_array_equal(inputs.guess.values["lidar0", "rotation"], guess["lidar0", "rotation"])
     names = ("rotation", "time_offset")

@@ -11,9 +11,9 @@ from tests.typed import random_rotations
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.paths.imu_motion import ImuMotion, Integrals
-from icalib.initialize.paths.lever_arm_rows import against_motion, against_readings
-from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.trajectories.imu_trajectory import ImuTrajectory, SignalIntegrals
+from icalib.initialize.trajectories.lever_arm_rows import system_from_readings, system_from_trajectory
 from icalib.sensors.lidar.initialize import odometry
 from icalib.sensors.lidar.initialize.odometry import lidar_path, scans_of
 from icalib.sensors.lidar.initialize.registration import (
@@ -118,7 +118,7 @@ def test_way_against_a_known_motion(free_robot, path):
     t, R, p, R_lidar, p_lidar = path
     true = free_robot.truth()
     Q = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix()  # the map stands anyhow
-    system = against_motion(R, p, t, Q @ R_lidar, (p_lidar - 3.0) @ Q.T)
+    system = system_from_trajectory(R, p, t, Q @ R_lidar, (p_lidar - 3.0) @ Q.T)
     x = np.concatenate([np.zeros(3), true.position])
     np.testing.assert_allclose(residual(system(true.rotation, true.position), x), 0.0, atol=1e-9)
     check_turn(system, true, x, 1e-9)
@@ -136,7 +136,7 @@ def test_positions_against_the_readings(free_robot, path):
     t, _, _, R_lidar, p_lidar = path
     true, imu, sim = free_robot.truth(), free_robot.imu, free_robot.sim.truth
     gyro = GyroRotation.integrate(imu, sim.gyro_bias.mean(axis=0))
-    system = against_readings(imu, lambda R: gyro.carry(t, R, imu.seconds), t, R_lidar, p_lidar)
+    system = system_from_readings(imu, lambda R: gyro.carry(t, R, imu.seconds), t, R_lidar, p_lidar)
     bias = sim.accel_bias.mean(axis=0)
     x = np.concatenate([np.zeros(3), true.position, [0.0, 0.0, -9.81], bias])
     left = residual(system(true.rotation, true.position), x)
@@ -149,7 +149,7 @@ def test_positions_against_the_readings(free_robot, path):
 def test_integrals_of_a_line_are_exact(free_robot):
     imu = free_robot.imu
     x = np.column_stack([np.ones_like(imu.seconds), imu.seconds])
-    once, twice = Integrals.of(imu, x).at(np.array([0.0, 1.2345, 7.7]))
+    once, twice = SignalIntegrals.of(imu, x).at(np.array([0.0, 1.2345, 7.7]))
     t = np.array([0.0, 1.2345, 7.7])
     np.testing.assert_allclose(once, np.column_stack([t, t**2 / 2]), atol=1e-10)
     np.testing.assert_allclose(twice, np.column_stack([t**2 / 2, t**3 / 6]), atol=1e-9)
@@ -163,7 +163,7 @@ def test_motion_between_noisy_positions(free_robot, path):
     kept = (t < 6.0) | (t > 6.4)
     seen = p[kept] + 0.01 * rng.normal(size=p[kept].shape)
     bias = sim.accel_bias.mean(axis=0)
-    rough = ImuMotion(gyro, t[kept], R[kept], seen, np.zeros_like(seen), sim.gyro_bias.mean(axis=0), bias, 9.81)
+    rough = ImuTrajectory(gyro, t[kept], R[kept], seen, np.zeros_like(seen), sim.gyro_bias.mean(axis=0), bias, 9.81)
     at = np.linspace(1.0, 14.5, 400)
     _, p_found, v_found = rough.smoothed().at(at)
     _, p_true, v_true = free_robot.pose_at(at)

@@ -12,7 +12,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
-from icalib.initialize.paths.path import ExtrinsicsGuess
+from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess
 from icalib.motion.factor import keyed
 from icalib.motion.keyframe_placement import place_keyframes
 from icalib.motion.sweep import Motion

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import ImuStream
-from icalib.initialize.steps.clock_shifts import CameraRates
-from icalib.initialize.steps.rate_shifts import LEAST_SCORE, best_regressions, unlike
+from icalib.initialize.steps.rate_correlation import SensorRates
+from icalib.initialize.steps.rate_regression import MIN_REGRESSION_SCORE, best_regressions, no_match_error
 from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
@@ -33,23 +33,23 @@ def _imu(scale: float = 1.0, gaps: bool = False) -> ImuData:
     return ImuData.build(stream, ImuNoise(1e-3, 1e-2, 1e-5, 1e-4))
 
 
-def _camera(seed: int = 0, noise: float = 0.05, scale: float = 1.0) -> CameraRates:
+def _camera(seed: int = 0, noise: float = 0.05, scale: float = 1.0) -> SensorRates:
     seconds = np.arange(0.5, 20.0, 0.1)
     rate = scale * _rate(seconds + OFFSET + 0.2, seed) @ np.linalg.inv(M).T
     rate += np.random.default_rng(9).normal(scale=noise, size=rate.shape)
-    return CameraRates(seconds, seconds + 0.4, rate, noise=noise)
+    return SensorRates(seconds, seconds + 0.4, rate, noise=noise)
 
 
 @pytest.mark.parametrize("gaps", [False, True])
 def test_the_shift_is_found(gaps: bool):
     found = best_regressions(_imu(gaps=gaps), _camera())
     assert found[0].offset == pytest.approx(OFFSET, abs=0.03)
-    assert found[0].score > max(3.0 * found[1].score, LEAST_SCORE)
+    assert found[0].score > max(3.0 * found[1].score, MIN_REGRESSION_SCORE)
 
 
 def test_noise_goes_with_no_motion():
     found = best_regressions(_imu(), replace(_camera(), rate=np.random.default_rng(1).normal(size=(195, 3))))
-    assert found[0].score < LEAST_SCORE
+    assert found[0].score < MIN_REGRESSION_SCORE
 
 
 def test_an_imu_that_has_gaps_all_over_gives_no_shift():
@@ -58,5 +58,5 @@ def test_an_imu_that_has_gaps_all_over_gives_no_shift():
 
 
 def test_slow_motion_is_named_and_another_motion_is_not_called_slow():
-    assert "turn too slowly or too steadily" in str(unlike(_imu(0.1), "cam0", _camera(scale=0.1)))
-    assert "does not match that of imu0" in str(unlike(_imu(), "cam0", _camera(seed=1)))
+    assert "turn too slowly or too steadily" in str(no_match_error(_imu(0.1), "cam0", _camera(scale=0.1)))
+    assert "does not match that of imu0" in str(no_match_error(_imu(), "cam0", _camera(seed=1)))

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.initialize.steps.rate_windows import rate_window, rotation_noise, window_rates
-from icalib.initialize.steps.smooth_path import HALF_S, smooth_path
+from icalib.initialize.steps.smooth_trajectory import MIN_HALF_WINDOW_S, smooth_trajectory
 
 
 def turning(hz: float, noise: float, seconds: float = 20.0, seed: int = 0):
@@ -45,8 +45,8 @@ def test_half_a_degree_needs_a_third_of_a_second():
 def test_a_path_through_good_poses_is_smoothed_as_little_as_before(noise):
     t, R, _ = turning(100.0, noise)
     at = np.array([5.003, 10.001])
-    path = smooth_path(t, R, np.zeros((len(t), 3)), at)
-    near = [np.flatnonzero(np.abs(t - s) <= HALF_S) for s in at]
+    path = smooth_trajectory(t, R, np.zeros((len(t), 3)), at)
+    near = [np.flatnonzero(np.abs(t - s) <= MIN_HALF_WINDOW_S) for s in at]
     for s, k, rate in zip(at, near, path.rate, strict=True):
         vectors = (Rotation.from_matrix(R[k[len(k) // 2]]).inv() * Rotation.from_matrix(R[k])).as_rotvec()
         slope = np.polyfit(t[k] - s, vectors, 2)[1]
@@ -55,6 +55,6 @@ def test_a_path_through_good_poses_is_smoothed_as_little_as_before(noise):
 
 def test_a_path_through_noisy_poses_is_smoothed_more():
     t, R, w = turning(30.0, np.deg2rad(0.5))
-    path = smooth_path(t, R, np.zeros((len(t), 3)), t)
+    path = smooth_trajectory(t, R, np.zeros((len(t), 3)), t)
     inner = (t > 1.0) & (t < 19.0)
     assert np.sqrt(np.mean((path.rate - w)[inner] ** 2)) < 0.05  # 0.1 where +-0.1 s are taken

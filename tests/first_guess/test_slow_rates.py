@@ -13,8 +13,8 @@ from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.geometry import so3
-from icalib.initialize.steps.clock_shifts import longest_step
-from icalib.initialize.steps.slow_rates import ChainedRates, slow_offsets
+from icalib.initialize.steps.rate_correlation import max_rate_step
+from icalib.initialize.steps.turned_angles import ChainedRates, offsets_by_angle
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Wheels
 from icalib.sensors.pose.simulate import SimPoses
@@ -112,13 +112,13 @@ def test_offsets_by_angles(with_poses):
     start = np.arange(5.0, 30.0)
     exact = ChainedRates.of(inputs.imu)
     rate = exact.over(start, start + 1.0)
-    offset, left = slow_offsets(inputs.imu, start - 3.2, start - 2.2, rate)[0]
+    offset, left = offsets_by_angle(inputs.imu, start - 3.2, start - 2.2, rate)[0]
     assert abs(offset - 3.2) < 0.03 and left < 0.1
     slope = (exact.over(start + 1e-3, start + 1.001) - rate) / 1e-3
     np.testing.assert_allclose(exact.slope(start, start + 1.0), slope, atol=0.1 * np.abs(slope).max())
 
 
 def test_how_far_apart_neighbours_may_be():
-    assert longest_step("a", 0.05 * np.arange(9), "images") == 0.25
-    assert longest_step("a", 1.0 * np.arange(9), "images") == 1.5
-    assert longest_step("a", 1.9 * np.arange(9), "images") == 2.0
+    assert max_rate_step("a", 0.05 * np.arange(9), "images") == 0.25
+    assert max_rate_step("a", 1.0 * np.arange(9), "images") == 1.5
+    assert max_rate_step("a", 1.9 * np.arange(9), "images") == 2.0

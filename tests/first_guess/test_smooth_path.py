@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.initialize.steps.smooth_path import smooth_path
+from icalib.initialize.steps.smooth_trajectory import smooth_trajectory
 
 TURN = np.array([0.3, -1.2, 2.0])  # rad/s
 
@@ -18,7 +18,7 @@ def moving(t):
 def test_what_is_a_parabola_is_met():
     t = np.sort(np.random.default_rng(0).uniform(0.0, 4.0, 300))
     at = np.linspace(t[0], t[-1], 57)
-    path = smooth_path(t, *moving(t), at)
+    path = smooth_trajectory(t, *moving(t), at)
     R, p = moving(at)
     np.testing.assert_allclose(path.rotation, R, atol=1e-11)
     np.testing.assert_allclose(path.position, p, atol=1e-11)
@@ -34,7 +34,7 @@ def test_rates_are_those_of_the_body_where_the_axis_turns():
         return Rotation.from_euler("zyx", np.stack([np.sin(s), 0.5 * np.cos(1.3 * s), 0.4 * np.sin(0.7 * s)], axis=1))
 
     t, at, h = np.arange(0.0, 5.0, 0.01), np.linspace(0.5, 4.5, 41), 1e-5
-    path = smooth_path(t, rotation(t).as_matrix(), np.zeros((len(t), 3)), at)
+    path = smooth_trajectory(t, rotation(t).as_matrix(), np.zeros((len(t), 3)), at)
     rate = (rotation(at - h).inv() * rotation(at + h)).as_rotvec() / (2.0 * h)
     np.testing.assert_allclose(path.rate, rate, atol=0.01)
 
@@ -46,7 +46,7 @@ def test_noise_is_smoothed_and_gaps_are_known(step):
     t = t[(t < 10.0) | (t > 14.0)]
     R, p = moving(t)
     at = np.linspace(0.5, 29.5, 200)
-    path = smooth_path(t, R, p + 1e-3 * rng.standard_normal(p.shape), at)
+    path = smooth_trajectory(t, R, p + 1e-3 * rng.standard_normal(p.shape), at)
     inside = (at > 10.0) & (at < 14.0)
     far = (at > 4.0 * step) & (np.abs(at - 12.0) > 2.0 + 4.0 * step) & (at < 30.0 - 5.0 * step)
     assert not path.near[inside].any() and path.near[far].all()

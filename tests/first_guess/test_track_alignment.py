@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icalib.geometry import so3
-from icalib.initialize.start import start
+from icalib.initialize.rig_guess import guess_of_rig
 from icalib.sensors.camera.initialize.tracks import from_tracks
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
@@ -31,7 +31,7 @@ def planar(request):
     aligned = from_tracks.align_jointly
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(from_tracks, "align_jointly", watched)
-        _, state, _ = start(rig, [simulation.measurements])
+        _, state, _ = guess_of_rig(rig, [simulation.measurements])
     return simulation.truth, state, kept["begin"], kept["end"]
 
 

@@ -12,7 +12,7 @@ from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import NoTarget
-from icalib.initialize.steps.track_rotation import start_direction, track_rates, turn_information
+from icalib.initialize.steps.epipolar_rotation import direction_for_rotation, rotation_information, track_rates
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Parameter
@@ -181,7 +181,7 @@ def test_slopes_by_the_lens_are_those_of_the_epipolar_errors():
     bent_f, bent_h = (x - np.einsum("l,nlk->nk", bend, by) for x, by in ((f, f_by), (h, h_by)))
     turned = np.ascontiguousarray(so3.exp(-turn) @ R)
     H, g = np.empty((5, 5)), np.empty(5)
-    turn_information(bent_f, bent_h, f_by, h_by, turned, start_direction(bent_f, bent_h, turned), H, g)
+    rotation_information(bent_f, bent_h, f_by, h_by, turned, direction_for_rotation(bent_f, bent_h, turned), H, g)
     np.testing.assert_allclose(np.linalg.solve(H, g), [*turn, *bend], atol=3e-6)
 
 

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.by_recording import one_after_another
+from icalib.initialize.steps.single_recording import joined_states
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.rig import Parameter
@@ -117,7 +117,7 @@ def test_of_several_recordings_one_shows_how_the_camera_stands(restarts):
     rig = true_rig(drives[0][0])
     rig = rig.with_(cameras=(replace(rig.cameras[0], clock_restarts=restarts),))
     inputs = inputs_for(rig, [simulation.measurements for simulation, _ in drives])
-    state = one_after_another(inputs, [s for _, s in drives], drives[0][1].values)
+    state = joined_states(inputs, [s for _, s in drives], drives[0][1].values)
     values = track_camera_values(inputs, state)
     T = drives[0][0].truth.T_imu_sensor["cam0"]
     turn = Rotation.from_matrix(values["cam0", "rotation"] @ T[:3, :3].T).magnitude()

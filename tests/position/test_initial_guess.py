@@ -12,7 +12,7 @@ from tests.typed import not_none
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.initialize.steps.by_recording import Held
+from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
 from icalib.motion.sweep import Motion
 from icalib.optim.state import State
@@ -58,7 +58,7 @@ def world(request):
 
 def test_everything_from_fixes_and_readings(world):
     sim, imu, fix, t, offset = world
-    found = motion_from_fixes(imu, "gnss0", fix, GRAVITY, Held())
+    found = motion_from_fixes(imu, "gnss0", fix, GRAVITY, KnownExtrinsics())
     assert found.best.at.offset == pytest.approx(offset, abs=0.02)
     planar = 0.3 if sim.scenario.motion.kind == "ramps" else 0.08
     np.testing.assert_allclose(found.best.at.arm, ARM, atol=planar)
@@ -73,7 +73,7 @@ def test_everything_from_fixes_and_readings(world):
 
 def test_what_is_known_stays(world):
     _, imu, fix, _, offset = world
-    found = motion_from_fixes(imu, "gnss0", fix, GRAVITY, Held(position=ARM, offset=offset))
+    found = motion_from_fixes(imu, "gnss0", fix, GRAVITY, KnownExtrinsics(position=ARM, offset=offset))
     np.testing.assert_allclose(found.best.at.arm, ARM, atol=5e-3)
     assert found.best.at.offset == pytest.approx(offset, abs=5e-3)
 
@@ -86,7 +86,7 @@ def test_placed_on_a_known_motion(world, levelled):
     values = {("imu0", "intrinsics"): sim.truth.imu_intrinsics}
     R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
     state = State(keyframes, R, p, v, bias, values)
-    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, levelled, Held())
+    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, levelled, KnownExtrinsics())
     assert found.offset == pytest.approx(offset, abs=0.01)
     planar = 0.1 if sim.scenario.motion.kind == "ramps" else 0.04
     np.testing.assert_allclose(found.arm, ARM, atol=planar)
@@ -117,7 +117,9 @@ def test_placed_on_a_rig_that_turns_in_place():
     state = State(keyframes, R[100:-100:20], still, still, np.zeros((len(keyframes), 6)), values)
     k = np.arange(200, 5800, 40)
     position = (R[k] @ ARM - ORIGIN) @ yaw(FRAME_YAW) + 0.005 * np.random.default_rng(1).normal(size=(len(k), 3))
-    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), True, Held())
+    found = place(
+        Motion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), True, KnownExtrinsics()
+    )
     assert found.offset == pytest.approx(seconds[k[0]], abs=5e-3)
     np.testing.assert_allclose(found.arm, ARM, atol=0.01)
     np.testing.assert_allclose(found.R_wf, yaw(FRAME_YAW), atol=0.02)
@@ -138,4 +140,6 @@ def test_fixes_that_do_not_fit(world, change, sentence):
     _, imu, fix, _, _ = world
     position = change(fix.position)
     with pytest.raises(EstimationError, match=sentence):
-        motion_from_fixes(imu, "gnss0", replace(fix, t=fix.t[: len(position)], position=position), GRAVITY, Held())
+        motion_from_fixes(
+            imu, "gnss0", replace(fix, t=fix.t[: len(position)], position=position), GRAVITY, KnownExtrinsics()
+        )

@@ -20,8 +20,8 @@ from icalib.estimate.problem.groups import groups_of, with_groups
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Step, Visit
 from icalib.estimate.problem.problem import Problem
-from icalib.initialize.start import start
-from icalib.initialize.steps.contradicted import FarOffError, is_contradicted, refusing_far_off
+from icalib.initialize.rig_guess import guess_of_rig
+from icalib.initialize.steps.contradicted_guesses import FarOffError, is_contradicted, refusing_far_off
 from icalib.initialize.steps.initializer import kinds_of, motion_kinds
 from icalib.observability.contradictions import Contradiction, contradicted_by
 from icalib.observability.determination import Determined, determine
@@ -29,8 +29,8 @@ from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.pages import give_back
 from icalib.rig import LENS, Parameter, Rig, Sensor
 
-POOR_FIT = 4.0  # times as large as their noise are the residuals of some sensor
-CLEARLY = 0.5  # times the misfit of another estimate
+POOR_FIT_RATIO = 4.0  # times as large as their noise are the residuals of some sensor
+CLEARLY_BETTER_RATIO = 0.5  # times the misfit of another estimate
 OnVisit = Callable[[Inputs, str, Problem, Visit], None]
 
 
@@ -65,30 +65,30 @@ def attempt(
 ) -> Attempt:
     """The estimate of `rig`, or where it fails or hardly fits one without guesses that fits better; or else the first,
     with what contradicts it. Raises EstimationError where the data do not carry an estimate."""
-    make = partial(_made, recordings=recordings, lap=lap, on_step=on_step, on_visit=on_visit)
+    make = partial(_make_attempt, recordings=recordings, lap=lap, on_step=on_step, on_visit=on_visit)
     try:
         with refusing_far_off():
-            first, failed = _or_error(rig, make)
+            first, failed = _attempt_or_error(rig, make)
     except FarOffError as error:
-        if (other := _against(rig, make)) is not None:
+        if (other := _contradicting_attempt(rig, make)) is not None:
             return replace(other, error=error)
-        first, failed = _or_error(rig, make)
+        first, failed = _attempt_or_error(rig, make)
     misfit = np.inf if first is None else first.misfit
-    if first is not None and misfit < POOR_FIT:
+    if first is not None and misfit < POOR_FIT_RATIO:
         return first
-    other = _from_nothing(rig, make)
-    if other is not None and other.misfit < CLEARLY * misfit:
+    other = _without_guesses(rig, make)
+    if other is not None and other.misfit < CLEARLY_BETTER_RATIO * misfit:
         return other
-    other = _against(rig, make)
-    if other is not None and other.misfit < CLEARLY * misfit:
+    other = _contradicting_attempt(rig, make)
+    if other is not None and other.misfit < CLEARLY_BETTER_RATIO * misfit:
         return replace(other, error=failed) if first is None else replace(first, against=other.against)
     if first is None:
         assert failed is not None
-        raise explained(rig, recordings, make, failed)
+        raise explained_failure(rig, recordings, make, failed)
     return first
 
 
-def _or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] | tuple[None, EstimationError]:
+def _attempt_or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] | tuple[None, EstimationError]:
     """The estimate, or why there is none. Raises FarOffError."""
     try:
         return make(rig), None
@@ -98,24 +98,24 @@ def _or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] 
         return None, error
 
 
-def explained(
+def explained_failure(
     rig: Rig, recordings: Sequence[Measurements], make: Callable[[Rig], Attempt], failed: EstimationError
 ) -> EstimationError:
     """Why an estimate `failed`, as the kind of sensor that gave the motion explains a breakdown; else `failed`."""
     if not isinstance(failed, NotDefiniteError):
         return failed
     source = motion_kinds(rig)[0]
-    return source.explained(rig, recordings, lambda changed: _converged(changed, make) is not None) or failed
+    return source.explained(rig, recordings, lambda changed: _converged_attempt(changed, make) is not None) or failed
 
 
-def _made(
+def _make_attempt(
     rig: Rig,
     recordings: Sequence[Measurements],
     lap: Callable[[str], None],
     on_step: Callable[[str, Step], None],
     on_visit: OnVisit,
 ) -> Attempt:
-    inputs, state, guess = start(rig, recordings, lap)
+    inputs, state, guess = guess_of_rig(rig, recordings, lap)
     give_back()
     with ExitStack() as explaining:
         for kind in kinds_of(rig):
@@ -124,10 +124,10 @@ def _made(
     return Attempt(inputs, found)
 
 
-def _from_nothing(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
+def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     """The estimate without guesses, or with those that it does not contradict where it needs them; None where there are
     none, or it fails as well."""
-    found = _first_converged(rig, make, lambda p: p.mode == "free") if _has(rig, "free") else None
+    found = _without_values(rig, make, lambda p: p.mode == "free") if _has_values(rig, "free") else None
     if found is None:
         return None
     values = found.found.estimate.outcome.state.values
@@ -139,12 +139,12 @@ def _from_nothing(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
         return Parameter() if is_contradicted(sensor.spec(name), p.value, other) else p
 
     kept = with_groups(rig, agreeing)
-    if found.found.held.size and _has(kept, "free") and (other := _converged(kept, make)) is not None:
+    if found.found.held.size and _has_values(kept, "free") and (other := _converged_attempt(kept, make)) is not None:
         found = other
     return replace(found, inputs=replace(found.inputs, asked=rig))
 
 
-def _first_converged(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[[Parameter], bool]) -> Attempt | None:
+def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[[Parameter], bool]) -> Attempt | None:
     """The estimate without the values that are `dropped`; of cameras that follow points, where it fails, with those of
     lenses as mere guesses: not every motion shows a lens from nothing."""
 
@@ -156,28 +156,28 @@ def _first_converged(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable
             ),
         )
 
-    found = _converged(bare(False), make)
-    return found if found is not None or rig.has_target else _converged(bare(True), make)
+    found = _converged_attempt(bare(False), make)
+    return found if found is not None or rig.has_target else _converged_attempt(bare(True), make)
 
 
-def _against(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
+def _contradicting_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     """The estimate of all that the rig file states, from nothing, with what it contradicts; None where it fails as well
     or contradicts nothing."""
-    if not (_has(rig, "fixed") or _has(rig, "prior")):
+    if not (_has_values(rig, "fixed") or _has_values(rig, "prior")):
         return None
-    found = _first_converged(rig, make, lambda p: True)
+    found = _without_values(rig, make, lambda p: True)
     if found is None:
         return None
     against = contradicted_by(replace(found.inputs, asked=rig), found.found)
     return replace(found, against=against) if against else None
 
 
-def _has(rig: Rig, mode: str) -> bool:
+def _has_values(rig: Rig, mode: str) -> bool:
     """Whether the rig file gives some value in this way."""
     return any(p.mode == mode and p.value is not None for _, _, p in groups_of(rig))
 
 
-def _converged(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
+def _converged_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     try:
         found = make(rig)
     except EstimationError:

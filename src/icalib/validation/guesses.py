@@ -10,7 +10,7 @@ from icalib.estimate.problem.groups import groups_of
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.contradicted import is_contradicted
+from icalib.initialize.steps.contradicted_guesses import is_contradicted
 from icalib.result import ParameterGroup
 from icalib.rig import LENS, Camera
 from icalib.sensors.camera.spec import INTRINSICS

@@ -18,14 +18,14 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets import NoTarget
 from icalib.initialize.steps.keyframe_spacing import SmoothMotion
-from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.optim.state import Key, State
 from icalib.rig import Rig, Sensor
 from icalib.sensors import SENSOR_KINDS, facet
 
 S = TypeVar("S", bound=Sensor)
 Values = dict[Key, np.ndarray]
-Moving = tuple[Inputs, State]  # inputs, and a state that has the motion
+InputsWithMotion = tuple[Inputs, State]  # inputs, and a state that has the motion
 
 # Preference among the kinds that give the motion, the best first: see `Initializer.motion_rank`.
 BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = range(6)
@@ -48,7 +48,7 @@ class Initializer(Generic[S]):
         """Names of the sensors that give the motion: all of the kind."""
         return tuple(s.name for s in rig.mounted if initializer_of(s) is self)
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
         """The motion and the guess of its sensors, from these and the IMU: where the solver starts. inputs: of
         `sources` alone; other: the motion by the kinds that come after it.
 
@@ -132,13 +132,13 @@ class Initializer(Generic[S]):
         return None
 
 
-NOTHING: Initializer[Sensor] = Initializer()
+NO_INITIALIZER: Initializer[Sensor] = Initializer()
 
 
 def initializer(kind: str) -> Initializer[Any]:
     """That of a kind of sensors."""
     module = facet(kind, "initialize")
-    return NOTHING if module is None else module.INITIALIZER
+    return NO_INITIALIZER if module is None else module.INITIALIZER
 
 
 def initializer_of(sensor: Sensor) -> Initializer[Any]:
@@ -158,7 +158,7 @@ def motion_kinds(rig: Rig) -> list[Initializer[Any]]:
     return sorted(ranked, key=lambda kind: ranked[kind])
 
 
-def placed(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Values:
+def place_sensors(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Values:
     """Values of all `sensors` on the motion in `state`, kind by kind; those that ask for the vertical last."""
     out: Values = {}
     sensors = list(sensors)
@@ -169,7 +169,7 @@ def placed(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Values:
     return out
 
 
-def inputs_of(whole: Inputs, recordings: Sequence[Measurements], names: Sequence[str]) -> Inputs:
+def inputs_of_sensors(whole: Inputs, recordings: Sequence[Measurements], names: Sequence[str]) -> Inputs:
     """The inputs of the sensors `names` and the IMU, on the clock of `whole`."""
     rig = whole.rig
     if len(names) == len(rig.mounted):

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 
-from icalib.initialize.steps.smooth_path import SmoothPath
+from icalib.initialize.steps.smooth_trajectory import SmoothTrajectory
 
-NEGLIGIBLE = 0.25  # of the noise; it adds 6 % to the variance
+MAX_PROPAGATION_SHARE = 0.25  # of the noise; it adds 6 % to the variance
 
 
 @dataclass(frozen=True)
@@ -23,20 +23,20 @@ class SmoothMotion:
     """The assumption: densities `turning` [rad/s^2/sqrt(Hz)] and `jerking` [m/s^3/sqrt(Hz)] of the body, which moved
     along `paths`, one for each recording."""
 
-    paths: Sequence[SmoothPath]
+    paths: Sequence[SmoothTrajectory]
     turning: float
     jerking: float
 
     def spacing_for_poses(self, turn: float, way: float) -> float:
         """The largest spacing [s] for poses with noise `turn` [rad] and `way` [m]."""
         return min(
-            2.0 * (3.0 * (NEGLIGIBLE * turn / self.turning) ** 2) ** (1 / 3),
-            2.0 * (20.0 * (NEGLIGIBLE * way / self.jerking) ** 2) ** 0.2,
+            2.0 * (3.0 * (MAX_PROPAGATION_SHARE * turn / self.turning) ** 2) ** (1 / 3),
+            2.0 * (20.0 * (MAX_PROPAGATION_SHARE * way / self.jerking) ** 2) ** 0.2,
         )
 
     def spacing_for_increments(self, turn: float, way: float) -> float:
         """The largest spacing [s] for increments with noise `turn` [rad/sqrt(s)] and `way` [m/sqrt(s)]."""
         return min(
-            sqrt(3.0) * NEGLIGIBLE * turn / self.turning,
-            (20.0 * (NEGLIGIBLE * way / self.jerking) ** 2) ** 0.25,
+            sqrt(3.0) * MAX_PROPAGATION_SHARE * turn / self.turning,
+            (20.0 * (MAX_PROPAGATION_SHARE * way / self.jerking) ** 2) ** 0.25,
         )

@@ -15,20 +15,20 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.initialize.steps.clock_shifts import USUAL_STEPS
-from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.steps.rate_correlation import MAX_USUAL_STEPS
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.motion.imu_data import ImuData, clear_of
 
-STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
-READINGS = 8192  # of the IMU at a time, whose rotations are made together
-BIAS_SIGMA = 0.3  # m/s^2
-SHARED = 2.0  # rows share images: the error of their mean falls as if they were a quarter as many
-ROW_SIGMA = 0.05  # m/s, of a row of the system; more where the poses of the target are worse
-G_TOLERANCE = 0.1
-GIVEN_TOLERANCE = 0.5  # of both, where a guess that may be degrees off goes into them
-UNLIKE = 1.2  # times the acceleration that was seen, which is left of it
-SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
+TRIPLE_STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
+READINGS_PER_BLOCK = 8192  # of the IMU at a time, whose rotations are made together
+ACCEL_BIAS_PRIOR_M_S2 = 0.3  # m/s^2
+SHARED_IMAGE_FACTOR = 2.0  # rows share images: the error of their mean falls as if they were a quarter as many
+MIN_ROW_SIGMA_M_S = 0.05  # m/s, of a row of the system; more where the poses of the target are worse
+TARGET_GRAVITY_TOLERANCE = 0.1
+GUESSED_ROTATION_TOLERANCE = 0.5  # of both, where a guess that may be degrees off goes into them
+MAX_UNEXPLAINED_ACCELERATION = 1.2  # times the acceleration that was seen, which is left of it
+TARGET_SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
 
 
 class Triples(NamedTuple):
@@ -78,10 +78,10 @@ class LeverArm:
     @property
     def unlike(self) -> bool:
         """Whether the accelerometer felt another motion than the camera saw; noise alone leaves as much as was seen."""
-        return self.left > UNLIKE
+        return self.left > MAX_UNEXPLAINED_ACCELERATION
 
 
-def lever_arm(
+def solve_camera_lever_arm(
     imu: ImuData,
     times: np.ndarray,
     poses: TargetPoses,
@@ -98,7 +98,7 @@ def lever_arm(
     # The error of one image's rotation goes with that of its position, as if the lever arm reached to the target.
     R_bi = gyro.smoothed(t, poses.rotation[ok] @ R_imu_cam.T)
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
-    triples = _triples(t, imu.gaps)
+    triples = _image_triples(t, imu.gaps)
     n, second = len(triples.i), triples.second
     if n < 10:
         raise EstimationError("too few images are close enough in time to estimate gravity; record for longer.")
@@ -111,11 +111,11 @@ def lever_arm(
         rhs = rhs - rows[:, :, 0:3] @ given
         rows[:, :, 0:3] = 0.0
     x, covariance = _solve(rows, rhs)
-    arm, left = x[0:3] if given is None else given, _share(rhs - rows @ x, second(p))
-    return LeverArm(arm, covariance, x[3:6], x[6:9], *size_of(rows, rhs, second(D_f)), left)
+    arm, left = x[0:3] if given is None else given, _median_ratio(rhs - rows @ x, second(p))
+    return LeverArm(arm, covariance, x[3:6], x[6:9], *scale_by_accelerometer(rows, rhs, second(D_f)), left)
 
 
-def _share(off: np.ndarray, seen: np.ndarray) -> float:
+def _median_ratio(off: np.ndarray, seen: np.ndarray) -> float:
     """The usual size of vectors (n, 3) over that of others."""
     size = [float(np.median(np.linalg.norm(x, axis=1))) for x in (off, seen)]
     return size[0] / max(size[1], 1e-12)
@@ -124,19 +124,19 @@ def _share(off: np.ndarray, seen: np.ndarray) -> float:
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least squares with a weak prior on lever arm and bias, again without rows that stand far off: x (9,), and the
     covariance (3, 3) of the lever arm."""
-    prior = np.diag(1.0 / np.array([1.0] * 3 + [1e3] * 3 + [BIAS_SIGMA] * 3))
-    weight, sigma, x, A = np.ones(len(rows)), ROW_SIGMA, np.zeros(9), np.zeros((0, 9))
+    prior = np.diag(1.0 / np.array([1.0] * 3 + [1e3] * 3 + [ACCEL_BIAS_PRIOR_M_S2] * 3))
+    weight, sigma, x, A = np.ones(len(rows)), MIN_ROW_SIGMA_M_S, np.zeros(9), np.zeros((0, 9))
     for _ in range(4):
         A = np.concatenate([(rows * weight[:, None, None]).reshape(-1, 9), sigma * prior])
         b = np.concatenate([(rhs * weight[:, None]).ravel(), np.zeros(9)])
         x = np.linalg.lstsq(A, b, rcond=None)[0]
         size = np.linalg.norm(rhs - rows @ x, axis=1)
         weight = (size < 4.0 * np.median(size) + 1e-9).astype(float)
-        sigma = max(ROW_SIGMA, SHARED * float(np.median(size)))
+        sigma = max(MIN_ROW_SIGMA_M_S, SHARED_IMAGE_FACTOR * float(np.median(size)))
     return x, sigma**2 * np.linalg.inv(A.T @ A)[:3, :3]
 
 
-def size_of(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
+def scale_by_accelerometer(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
     """True size of the target, or of a motion, over the one given, and its standard deviation: the inverse of the
     factor that the accelerometer's part asks for; rows (n, 3, m), rhs, felt (n, 3). (A factor on the noisy positions
     instead would be pulled to zero.)"""
@@ -149,15 +149,15 @@ def size_of(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float,
     return 1.0 / factor, float(np.sqrt(variance * np.linalg.inv(information)[-1, -1])) / factor**2
 
 
-def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Triples:
+def _image_triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Triples:
     """Images (i, j, k) about STEP_S apart, within a factor of two, or neighbours where most are further apart, and no
     part of them in a gap of the IMU."""
     i = np.arange(len(t))
-    j = np.searchsorted(t, t + STEP_S - 1e-3)
-    k = np.searchsorted(t, t + 2 * STEP_S - 1e-3)
-    longest, usual = 2 * STEP_S, float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-    if usual > STEP_S:
-        k, longest = np.maximum(k, j + 1), max(longest, USUAL_STEPS * usual)
+    j = np.searchsorted(t, t + TRIPLE_STEP_S - 1e-3)
+    k = np.searchsorted(t, t + 2 * TRIPLE_STEP_S - 1e-3)
+    longest, usual = 2 * TRIPLE_STEP_S, float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    if usual > TRIPLE_STEP_S:
+        k, longest = np.maximum(k, j + 1), max(longest, MAX_USUAL_STEPS * usual)
     good = (k < len(t)) & (j < k) & (i < j)
     i, j, k = i[good], j[good], k[good]
     close = (t[j] - t[i] < longest) & (t[k] - t[j] < longest)
@@ -171,8 +171,8 @@ def _double_integrals(
     """Double integrals of R_board_imu f (n, 3) and of R_board_imu (n, 3, 3) at image times t, from the first IMU
     stamp."""
     s, x = imu.seconds, np.empty((12, len(imu.seconds)))
-    for a in range(0, len(s), READINGS):
-        own = slice(a, min(a + READINGS, len(s)))
+    for a in range(0, len(s), READINGS_PER_BLOCK):
+        own = slice(a, min(a + READINGS_PER_BLOCK, len(s)))
         R = gyro.carry(t, R_bi, s[own])
         x[:3, own] = (R @ imu.accel[own, :, None])[:, :, 0].T
         x[3:, own] = R.reshape(-1, 9).T
@@ -191,10 +191,10 @@ def _double_integral(s: np.ndarray, x: np.ndarray, t: np.ndarray, j: np.ndarray)
     return second[j] + first[j] * tau + 0.5 * x[j] * tau**2
 
 
-def check_size(arm: LeverArm, camera: str, given: bool) -> None:
+def check_target_size(arm: LeverArm, camera: str, given: bool) -> None:
     """Raises EstimationError where the accelerometer contradicts the size of the target. given: the camera's rotation
     is a guess, whose error moves it, too."""
-    if abs(arm.size - 1.0) > max(GIVEN_TOLERANCE if given else SIZE_TOLERANCE, 5.0 * arm.size_std):
+    if abs(arm.size - 1.0) > max(GUESSED_ROTATION_TOLERANCE if given else TARGET_SIZE_TOLERANCE, 5.0 * arm.size_std):
         raise EstimationError(
             f"{camera}: the accelerometer shows the target to be {arm.size:.2f} +- {arm.size_std:.2f} times as "
             "large as in the rig file; check tag_size or square_size (in metres) and tag_spacing (gap over "
@@ -205,7 +205,7 @@ def check_size(arm: LeverArm, camera: str, given: bool) -> None:
 def check_gravity(measured: float, expected: float, imu: str, given: bool) -> None:
     """Raises EstimationError where gravity as the IMU and the target's size show it is not `expected` m/s^2. given: see
     `check_size`."""
-    if abs(measured / expected - 1.0) <= (GIVEN_TOLERANCE if given else G_TOLERANCE):
+    if abs(measured / expected - 1.0) <= (GUESSED_ROTATION_TOLERANCE if given else TARGET_GRAVITY_TOLERANCE):
         return
     raise EstimationError(
         f"{imu} and the target together give a gravity of {measured:.3g} m/s^2 instead of {expected:.3g}; "

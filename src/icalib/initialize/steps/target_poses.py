@@ -13,13 +13,13 @@ from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
 
-MOST_CORNERS = 48  # of an image; more do not make a first guess better
-FEWEST_CORNERS = 6  # of a board; fewer lie on a line too easily
-SMALLEST_COSINE = 0.15  # rays closer to the image plane than this have no place in a homography
-LARGEST_RMS_PX = 3.0
-HUBER_PX = 2.0
-ROUNDS = 5
-BLOCK = 512  # poses at a time: what all corners need at once fills the memory
+MAX_POSE_CORNERS = 48  # of an image; more do not make a first guess better
+MIN_POSE_CORNERS = 6  # of a board; fewer lie on a line too easily
+MIN_RAY_COSINE = 0.15  # rays closer to the image plane than this have no place in a homography
+MAX_POSE_RMS_PX = 3.0
+POSE_HUBER_PX = 2.0
+POSE_ITERATIONS = 5
+POSES_PER_BLOCK = 512  # poses at a time: what all corners need at once fills the memory
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def _normalise(v):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _move(turn, g, R, t):
+def _apply_step(turn, g, R, t):
     """R <- turn R, t <- turn t - g[3:]."""
     old, shift = R.copy(), t.copy()
     for i in range(3):
@@ -99,7 +99,7 @@ def _move(turn, g, R, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refine(points, seen, R, t, rounds):
+def refine_pose(points, seen, R, t, rounds):
     """Gauss-Newton on x / z, y / z in pixels, Huber weights beyond `HUBER_PX`; returns the last RMS error [px], errors
     capped at 4 times that. Points behind the camera count as so far off; 1e9 where as few as 3 are in front of it.
 
@@ -114,13 +114,13 @@ def refine(points, seen, R, t, rounds):
                 X[i] = R[i, 0] * points[n, 0] + R[i, 1] * points[n, 1] + R[i, 2] * points[n, 2] + t[i]
             if X[2] < 1e-6:
                 behind += 1
-                total += 16.0 * HUBER_PX * HUBER_PX
+                total += 16.0 * POSE_HUBER_PX * POSE_HUBER_PX
                 continue
             iz, density = 1.0 / X[2], seen[n, 2]
             r0, r1 = density * (X[0] * iz - seen[n, 0]), density * (X[1] * iz - seen[n, 1])
             e = np.sqrt(r0 * r0 + r1 * r1)
-            total += min(e, 4.0 * HUBER_PX) ** 2
-            w = 1.0 if e <= HUBER_PX else HUBER_PX / e
+            total += min(e, 4.0 * POSE_HUBER_PX) ** 2
+            w = 1.0 if e <= POSE_HUBER_PX else POSE_HUBER_PX / e
             for k in range(2):
                 a = density * iz if k == 0 else 0.0
                 b = density * iz if k == 1 else 0.0
@@ -138,12 +138,12 @@ def refine(points, seen, R, t, rounds):
             return 1e9
         if not solve_definite(H, g):
             return 1e9
-        _move(so3.exp(-g[:3]), g, R, t)
+        _apply_step(so3.exp(-g[:3]), g, R, t)
     return rms
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def chosen_corners(a, b, point, rays, density, good, target, points, seen):
+def select_corners(a, b, point, rays, density, good, target, points, seen):
     """Fills points (n, 3) and seen (n, 3), as `refine` wants them, with corners a..b that are good, as many as have
     room, spread; returns their number."""
     most, total = len(points), 0
@@ -172,7 +172,7 @@ def camera_in_target(R, t, rotation, position):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _mirror(centre, R, t):
+def _mirrored_pose(centre, R, t):
     """The other pose from which a flat target looks nearly alike: its depths mirrored about its middle (Schweighofer
     and Pinz 2006)."""
     c, d = np.empty(3), np.empty(3)
@@ -191,13 +191,13 @@ def _mirror(centre, R, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _all_poses(start, point, rays, density, good, target, fewest, rounds, rotation, position, rms):
+def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, rotation, position, rms):
     """Poses (n, 1 or 2, ...): with two, the mirrored one second."""
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
-    points, seen = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
+    points, seen = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     for i in range(len(start) - 1):
         rms[i] = 1e9
-        count = chosen_corners(start[i], start[i + 1], point, rays, density, good, target, points, seen)
+        count = select_corners(start[i], start[i + 1], point, rays, density, good, target, points, seen)
         if count < fewest[i]:
             continue
         for k in range(2):
@@ -211,8 +211,8 @@ def _all_poses(start, point, rays, density, good, target, fewest, rounds, rotati
             t[k] -= R[k, 0] * centre[0] + R[k, 1] * centre[1]
         for turn in range(rms.shape[1]):
             if turn == 1:
-                _mirror(centre, R, t)
-            rms[i, turn] = refine(points[:count], seen[:count], R, t, rounds)
+                _mirrored_pose(centre, R, t)
+            rms[i, turn] = refine_pose(points[:count], seen[:count], R, t, rounds)
             if not rms[i, turn] < 1e9:  # corners on a line, or in one point
                 rms[i, turn] = 1e9
                 break
@@ -220,21 +220,21 @@ def _all_poses(start, point, rays, density, good, target, fewest, rounds, rotati
 
 
 @dataclass(frozen=True)
-class Flat:
+class FlatPoints:
     """Points (n, 3) of flat bodies, each in its body's frame, and how many make a pose."""
 
     points: np.ndarray
-    fewest: int = FEWEST_CORNERS
+    fewest: int = MIN_POSE_CORNERS
 
 
-def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, target: Flat) -> TargetPoses:
+def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, target: FlatPoints) -> TargetPoses:
     """Poses of the camera in the frame of the one body that each image shows, from up to 48 corners each."""
     fewest = np.full(len(stream.stamps_ns), target.fewest)
     found = flat_poses(stream, stream.start, fewest, model, params, target.points, 1)
     return TargetPoses(found.rotation[:, 0], found.position[:, 0], found.ok[:, 0], found.rms_px[:, 0])
 
 
-def check_side(camera: str, poses: TargetPoses) -> None:
+def check_front_side(camera: str, poses: TargetPoses) -> None:
     """Raises EstimationError where most `poses` of the camera in the frame of a flat body are behind its sheet: a
     mirrored image looks as the sheet would through its back."""
     behind = poses.position[poses.ok, 2] < 0.0
@@ -261,11 +261,11 @@ def flat_poses(
     n = len(start) - 1
     rotation, position = np.tile(np.eye(3), (n, sides, 1, 1)), np.zeros((n, sides, 3))
     rms = np.empty((n, sides))
-    for a in range(0, n, BLOCK):
-        i = slice(a, min(a + BLOCK, n))
+    for a in range(0, n, POSES_PER_BLOCK):
+        i = slice(a, min(a + POSES_PER_BLOCK, n))
         own = slice(int(start[i.start]), int(start[i.stop]))
         rays, density, good = usable_rays(stream.uv[own], model, params)
-        _all_poses(
+        _poses_of_images(
             start[i.start : i.stop + 1] - own.start,
             stream.point[own],
             rays,
@@ -273,19 +273,19 @@ def flat_poses(
             good,
             target,
             fewest[i],
-            ROUNDS,
+            POSE_ITERATIONS,
             rotation[i],
             position[i],
             rms[i],
         )
-    return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)
+    return TargetPoses(rotation, position, rms < MAX_POSE_RMS_PX, rms)
 
 
 def usable_rays(uv: np.ndarray, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N, 3) unit rays of corners at uv (N, 2), (N,) pixels per unit of x / z and y / z there, the geometric mean over
     directions, and (N,) whether the ray is far enough from the image plane."""
     rays, valid = model.unproject(params, uv)
-    good = valid & (rays[:, 2] > SMALLEST_COSINE)
+    good = valid & (rays[:, 2] > MIN_RAY_COSINE)
     J = model.project_with_jacobians(params, rays)[2]
     # Derivatives by x / z are z times those by x.
     density = np.abs(rays[:, 2]) * np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]))

@@ -10,7 +10,9 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.initializer import initializer_of
 from icalib.optim.state import State
 
-LEVEL = 0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
+MIN_LEVEL_COSINE = (
+    0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Verticals:
     level: str | None = None
 
 
-def verticals(inputs: Inputs, state: State) -> Verticals:
+def possible_verticals(inputs: Inputs, state: State) -> Verticals:
     """By gravity. Without it, along the axis that the vehicle turns about most; the level frame of a sensor tells which
     of both ways. Without such a frame both are possible: a vehicle whose left and right are swapped drives upside
     down."""
@@ -30,21 +32,21 @@ def verticals(inputs: Inputs, state: State) -> Verticals:
         return Verticals((np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0]),))
     assert inputs.imu is not None
     axis = np.linalg.svd(inputs.imu.gyro.T @ inputs.imu.gyro)[0][:, 0]
-    along, level = _by_frames(inputs, state, axis)
+    along, level = _vertical_by_frames(inputs, state, axis)
     return Verticals((np.sign(along) * axis,), level) if level else Verticals((axis, -axis))
 
 
 def level_sensor(inputs: Inputs, state: State) -> str | None:
     """The sensor whose frame is level and tells which way is up, where gravity does not."""
     turns = state.bias[:, :3]  # of an assumed motion: minus the angular rate
-    return _by_frames(inputs, state, np.linalg.svd(turns.T @ turns)[0][:, 0])[1]
+    return _vertical_by_frames(inputs, state, np.linalg.svd(turns.T @ turns)[0][:, 0])[1]
 
 
-def _by_frames(inputs: Inputs, state: State, axis: np.ndarray) -> tuple[float, str | None]:
+def _vertical_by_frames(inputs: Inputs, state: State, axis: np.ndarray) -> tuple[float, str | None]:
     """The component upwards of the `axis` (3,) that the body turns about, and the sensor whose frame tells it."""
     in_world = np.einsum("nij,j->i", state.rotation, axis) / len(state.rotation)
     for sensor in inputs.rig.mounted:
         up = initializer_of(sensor).vertical(state, sensor)
-        if up is not None and abs(along := float(in_world @ up)) > LEVEL:
+        if up is not None and abs(along := float(in_world @ up)) > MIN_LEVEL_COSINE:
             return along, sensor.name
     return 0.0, None

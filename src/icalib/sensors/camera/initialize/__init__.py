@@ -10,9 +10,9 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.inputs import Inputs, inputs_for
-from icalib.initialize.steps.clocks import OneAxisError
-from icalib.initialize.steps.initializer import BY_TARGET, BY_TRACKS, Initializer, Moving, Values
-from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.initialize.steps.initializer import BY_TARGET, BY_TRACKS, Initializer, InputsWithMotion, Values
+from icalib.initialize.steps.rate_alignment import OneAxisError
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.initialize.boards.hand_eye_guess import with_hand_eye_guess
@@ -37,7 +37,7 @@ class CameraInitializer(Initializer[Camera]):
             return BY_TARGET
         return None if rig.imu is None else BY_TRACKS
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
         return initial_state(inputs, *_guesses(inputs, other))
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
@@ -66,7 +66,7 @@ class CameraInitializer(Initializer[Camera]):
         return None if rig.has_target else no_parallax(rig, recordings)
 
 
-def _guesses(inputs: Inputs, other: Callable[[], Moving]) -> tuple[Guess, ...]:
+def _guesses(inputs: Inputs, other: Callable[[], InputsWithMotion]) -> tuple[Guess, ...]:
     """A guess for each recording. If the rig turned about one axis only, the motion of `other` kinds shows the rotation
     about it."""
     rig, seen = inputs.rig, [m.measurements for m in inputs.motions]

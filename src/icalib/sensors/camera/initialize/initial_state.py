@@ -7,7 +7,7 @@ import numpy as np
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.steps.by_recording import each_clock
+from icalib.initialize.steps.single_recording import offset_of_each_clock
 from icalib.motion.keyframe_placement import first_keyframes
 from icalib.optim.state import State, in_recording
 from icalib.sensors.camera.initialize.guess import Guess
@@ -22,7 +22,7 @@ def initial_state(inputs: Inputs, *guesses: Guess) -> State:
     for camera in inputs.rig.cameras if len(guesses) > 1 else ():
         if camera.clock_restarts:
             own = [g.cameras[camera.name].offset for g in guesses]
-            values[camera.name, "time_offset"] = each_clock(inputs, camera.name, own.__getitem__)
+            values[camera.name, "time_offset"] = offset_of_each_clock(inputs, camera.name, own.__getitem__)
     values = start_values(inputs, values)
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     starts = first_keyframes(inputs.imu, keyframes)

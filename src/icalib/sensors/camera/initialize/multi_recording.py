@@ -10,7 +10,7 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.clocks import OneAxisError, better_offset, camera_rates
+from icalib.initialize.steps.rate_alignment import OneAxisError, camera_rates, contradicting_offset
 from icalib.model.bodies import Bodies
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Camera, Rig
@@ -110,7 +110,7 @@ def _check_clocks(rig: Rig, scene: TargetScene, guess: Guess, reference: Measure
             rates = camera_rates(stream, poses)
         except EstimationError as error:
             raise EstimationError(f"{recording.name}: {error}") from error
-        found = better_offset(imu, camera.name, rates, expected)
+        found = contradicting_offset(imu, camera.name, rates, expected)
         if found is not None:
             raise EstimationError(
                 f"{recording.name}: the time offset of {camera.name} differs by {found - expected:+.3f} s from "

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.track_rotation import start_turn, turn_between, turn_error
+from icalib.initialize.steps.epipolar_rotation import refine_relative_pose, rotation_error, rotation_without_translation
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Rig
 from icalib.sensors.camera.initialize.tracks.from_tracks import start_intrinsics
@@ -50,7 +50,7 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
 def _parallax(pair: SharedRays) -> tuple[float, float]:
     """By how much the rays of two images differ beside a rotation, and by how much they miss their epipolar planes
     [rad]."""
-    R, t = start_turn(pair.f, pair.h)
+    R, t = rotation_without_translation(pair.f, pair.h)
     beside = float(np.median(np.linalg.norm(pair.f @ R.T - pair.h, axis=1)))
-    turn_between(pair.f, pair.h, R, t)
-    return beside, turn_error(pair.f, pair.h, R, t)[1] + 1e-12
+    refine_relative_pose(pair.f, pair.h, R, t)
+    return beside, rotation_error(pair.f, pair.h, R, t)[1] + 1e-12

@@ -10,17 +10,17 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.paths.imu_axes import refuse_other_axes
-from icalib.initialize.steps.clocks import Alignment, camera_rates
-from icalib.initialize.steps.contradicted import chosen, chosen_along
-from icalib.initialize.steps.gyro import GyroRotation
-from icalib.initialize.steps.lever_arm import LeverArm, check_gravity, check_size, lever_arm
+from icalib.initialize.steps.contradicted_guesses import merged_translation, merged_value
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.steps.lever_arm import LeverArm, check_gravity, check_target_size, solve_camera_lever_arm
+from icalib.initialize.steps.rate_alignment import RateAlignment, camera_rates
 from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.initialize.trajectories.imu_axes import refuse_other_axes
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
-from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, trusted
+from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, known_value
 from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene, intrinsics_of
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, scene_poses
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
@@ -79,7 +79,7 @@ class _TargetViews:
         arms = [self._arm(imu, k, a, gyro) for k, a in enumerate(aligned)]
         self._check_gravity(imu, arms[best], aligned[best])
         for c, arm, a in zip(self.rig.cameras, arms, aligned, strict=True):
-            check_size(arm, c.name, a.given)
+            check_target_size(arm, c.name, a.given)
         cameras = {
             c.name: _camera_guess(c, self._offset(imu, k, a), self.params[k], a, arm, self.poses[k])
             for k, (c, a, arm) in enumerate(zip(self.rig.cameras, aligned, arms, strict=True))
@@ -99,35 +99,35 @@ class _TargetViews:
     def _best(self) -> int:
         return int(np.argmax([q.ok.sum() for q in self.poses]))
 
-    def _aligned(self, imu: ImuData, k: int) -> Alignment:
+    def _aligned(self, imu: ImuData, k: int) -> RateAlignment:
         stream = self.measurements.cameras[k]
         return align_camera(self.rig.cameras[k], stream, camera_rates(stream, self.poses[k]), imu, self.measurements)
 
-    def _offset(self, imu: ImuData, k: int, found: Alignment) -> float:
+    def _offset(self, imu: ImuData, k: int, found: RateAlignment) -> float:
         camera, stream = self.rig.cameras[k], self.measurements.cameras[k]
         raw = camera.time_offset.value
         given = None if raw is None else relative_offset(raw, stream, self.measurements)
         return chosen_offset(camera, camera_rates(stream, self.poses[k]), imu, given, found)
 
-    def _arm(self, imu: ImuData, k: int, aligned: Alignment, gyro: GyroRotation) -> LeverArm:
-        t, known = self.measurements.cameras[k].seconds + aligned.offset, trusted(self.rig.cameras[k].translation)
-        return lever_arm(imu, t, self.poses[k], aligned.rotation, gyro, known)
+    def _arm(self, imu: ImuData, k: int, aligned: RateAlignment, gyro: GyroRotation) -> LeverArm:
+        t, known = self.measurements.cameras[k].seconds + aligned.offset, known_value(self.rig.cameras[k].translation)
+        return solve_camera_lever_arm(imu, t, self.poses[k], aligned.rotation, gyro, known)
 
-    def _check_gravity(self, imu: ImuData, arm: LeverArm, aligned: Alignment) -> None:
+    def _check_gravity(self, imu: ImuData, arm: LeverArm, aligned: RateAlignment) -> None:
         check_gravity(float(np.linalg.norm(arm.gravity)), self.rig.gravity, imu.name, aligned.given)
 
 
 def _camera_guess(
-    camera: Camera, offset: float, params: np.ndarray, aligned: Alignment, arm: LeverArm, poses: TargetPoses
+    camera: Camera, offset: float, params: np.ndarray, aligned: RateAlignment, arm: LeverArm, poses: TargetPoses
 ) -> CameraGuess:
     """What was found, and in its place what the rig gives, but guesses that it contradicts."""
     p = camera.translation.value
     if p is not None and camera.translation.mode == "free":
-        p = chosen_along(p, arm.position, arm.covariance)
+        p = merged_translation(p, arm.position, arm.covariance)
     return CameraGuess(
         params,
         offset,
-        chosen(ROTATION, camera.rotation, camera.rotation.value, aligned.rotation),
+        merged_value(ROTATION, camera.rotation, camera.rotation.value, aligned.rotation),
         arm.position if p is None else p,
         poses,
     )

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 from icalib.data.measurements import Measurements
 from icalib.estimate.problem.inputs import Inputs, with_clouds
-from icalib.initialize.steps.initializer import BY_SCANS, Initializer, Moving, Values
-from icalib.initialize.steps.known_values import given
+from icalib.initialize.steps.initializer import BY_SCANS, Initializer, InputsWithMotion, Values
+from icalib.initialize.steps.rig_file_values import stated_values
 from icalib.optim.state import State
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.initialize.association_rounds import lidar_values, state_from_lidar, with_lidars
@@ -25,7 +25,7 @@ class LidarInitializer(Initializer[Lidar]):
     def motion_rank(self, rig: Rig) -> int | None:
         return BY_SCANS if rig.lidars else None
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
         del other
         return state_from_lidar(inputs)
 
@@ -45,7 +45,7 @@ class LidarInitializer(Initializer[Lidar]):
     def associated(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
         """The points on planes. The rounds of association may stray from the guess where the motion shows nothing, so
         that the guess is kept as it was before."""
-        known = {key: value for lidar in inputs.rig.lidars for key, value in given(inputs, lidar).items()}
+        known = {key: value for lidar in inputs.rig.lidars for key, value in stated_values(inputs, lidar).items()}
         guess = replace(state, values=state.values | known)
         inputs, state = with_lidars(inputs, state)
         return replace(inputs, guess=guess), state, known

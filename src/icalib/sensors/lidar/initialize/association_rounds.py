@@ -18,18 +18,18 @@ from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, motion_of, start_values
 from icalib.estimate.problem.inputs import Inputs, with_clouds
 from icalib.geometry.planes import plane_of
-from icalib.initialize.steps.by_recording import (
-    Held,
-    alone,
-    each_clock,
-    from_the_best,
-    fullest,
-    motion_alone,
+from icalib.initialize.steps.contradicted_guesses import merged_values
+from icalib.initialize.steps.rig_file_values import known_extrinsics, known_names, stated_values
+from icalib.initialize.steps.single_recording import (
+    KnownExtrinsics,
+    converted_offset,
+    fullest_recording,
     naming_recording,
-    other_clocks,
+    offset_of_each_clock,
+    single_recording,
+    state_of_recording,
+    states_from_best,
 )
-from icalib.initialize.steps.contradicted import settled
-from icalib.initialize.steps.known_values import given, held_of, trusted_names
 from icalib.motion.clocks import instants
 from icalib.motion.clouds import Clouds, joined_clouds, known_planes
 from icalib.motion.known_motion import are_near_keyframes
@@ -53,30 +53,32 @@ def state_from_lidar(inputs: Inputs) -> State:
     Raises EstimationError where they do not.
     """
 
-    def state_of(own: Inputs, held: Held | None) -> State:
+    def state_of(own: Inputs, held: KnownExtrinsics | None) -> State:
         with naming_sight(own.measurements.lidars[:1]):
             return _state_of_one(own, held)
 
     first = inputs.rig.lidars[0]
-    return from_the_best(inputs, first, fullest(inputs, first.name), state_of)
+    return states_from_best(inputs, first, fullest_recording(inputs, first.name), state_of)
 
 
-def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
+def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
     """Of one recording; `held`: how the LiDAR stands, where another has shown it."""
     assert inputs.imu is not None
     lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
     try:
-        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, held or held_of(inputs, lidar))
+        guess, motion = lidar_and_motion(
+            inputs.imu, stream, inputs.rig.gravity, held or known_extrinsics(inputs, lidar)
+        )
     except EstimationError:
-        known = held_of(inputs, lidar, guesses=True)
+        known = known_extrinsics(inputs, lidar, guesses=True)
         if held is not None or known.rotation is None or known.offset is None:
             raise
         # The motion shows too little; the rig file's guess stands in.
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
     # What turns show is nearer than a guess, with which planes would be thick, and steps towards them lead astray.
-    names = ("translation", *trusted_names(lidar)) if guess.turned else MOUNTED_NAMES
-    own, known = guess.values(lidar.name), given(inputs, lidar, names)
-    values = start_values(inputs, settled(lidar, known, own) if guess.turned else own | known)
+    names = ("translation", *known_names(lidar)) if guess.turned else MOUNTED_NAMES
+    own, known = guess.values(lidar.name), stated_values(inputs, lidar, names)
+    values = start_values(inputs, merged_values(lidar, known, own) if guess.turned else own | known)
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
     keyframes = keyframes_for(inputs, keyframe_times(inputs, hosts)[:1])
     rotation, position, velocity = motion.at(keyframes)
@@ -207,29 +209,29 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     out: dict[Key, np.ndarray] = {}
     for i, lidar in enumerate(inputs.rig.lidars):
         if (lidar.name, "rotation") in state.values:
-            out |= given(inputs, lidar, trusted_names(lidar))
+            out |= stated_values(inputs, lidar, known_names(lidar))
             continue
-        known = given(inputs, lidar)
+        known = stated_values(inputs, lidar)
         if len(known) < len(MOUNTED_NAMES):
-            k = fullest(inputs, inputs.rig.lidars[i].name)
-            own, motion = alone(inputs, k), motion_alone(inputs, k, state)
+            k = fullest_recording(inputs, inputs.rig.lidars[i].name)
+            own, motion = single_recording(inputs, k), state_of_recording(inputs, k, state)
             assert own.imu is not None
             stream = own.measurements.lidars[i]
             with naming_recording(inputs, k), naming_sight([stream]):
-                found = lidar_on_motion(own.imu, stream, motion, held_of(own, lidar))
-            offsets = np.array([other_clocks(found.offset, lidar.name, own, inputs)])
+                found = lidar_on_motion(own.imu, stream, motion, known_extrinsics(own, lidar))
+            offsets = np.array([converted_offset(found.offset, lidar.name, own, inputs)])
             if lidar.clock_restarts:
-                held = Held(found.rotation, found.position)
+                held = KnownExtrinsics(found.rotation, found.position)
                 others = partial(_offset_on_motion, inputs, state, i, held)
-                offsets = each_clock(inputs, lidar.name, others, {k: found.offset})
+                offsets = offset_of_each_clock(inputs, lidar.name, others, {k: found.offset})
             known = found.values(lidar.name) | {(lidar.name, "time_offset"): offsets} | known
         out |= known
     return out
 
 
-def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: Held, recording: int) -> float:
+def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: KnownExtrinsics, recording: int) -> float:
     """Of a LiDAR in one recording, between its own first stamps, which stands as `held` in all."""
-    own, motion = alone(inputs, recording), motion_alone(inputs, recording, state)
+    own, motion = single_recording(inputs, recording), state_of_recording(inputs, recording, state)
     assert own.imu is not None
     stream = own.measurements.lidars[lidar]
     with naming_sight([stream]):

@@ -15,7 +15,7 @@ import numpy as np
 
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.initialize.paths.path import SensorPath
+from icalib.initialize.trajectories.sensor_trajectory import SensorTrajectory
 from icalib.optim.arrowhead import THREADS
 from icalib.sensors.lidar.initialize.registration import Expected, expected_pose, register
 from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert, pick, turn_back
@@ -70,7 +70,7 @@ def scans_of(stream: LidarStream) -> list[Scan]:
 
 def lidar_path(
     name: str, scans: list[Scan], turning: Turning | None = None, moving: Moving | None = None, whole: bool = True
-) -> SensorPath:
+) -> SensorTrajectory:
     """Scan-to-map odometry of LiDAR `name`. turning, moving: known rotation, translation.
 
     whole: one map for the whole recording, which begins later if hardly any scan fits the first. Else a lost path
@@ -95,7 +95,7 @@ def lidar_path(
         raise EstimationError(
             f"{name}: only {ok.sum()} of {len(scans)} scans match the surfaces of other scans; {why}."
         )
-    return SensorPath(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
+    return SensorTrajectory(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
 
 
 def _share_on_lines(scan: Scan, edge_m: float) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.paths.path import SensorPath
+from icalib.initialize.trajectories.sensor_trajectory import SensorTrajectory
 from icalib.sensors.lidar.initialize.odometry import MOST_MAPPED, lidar_path, scans_of
 
 REACH_M = 2.5  # a robot does not reach further from its LiDAR
@@ -122,7 +122,7 @@ class _Near:
         return seen.sum(axis=1) >= max(STEADY * len(groups), 1.0)
 
 
-def _path_without(stream: LidarStream, steady: np.ndarray) -> SensorPath | None:
+def _path_without(stream: LidarStream, steady: np.ndarray) -> SensorTrajectory | None:
     """How the LiDAR moved, by its other points; None where they do not show it."""
     step = max(1, len(stream.xyz) // (MOST_MAPPED * len(stream.stamps_ns))) | 1
     kept = np.zeros(len(stream.xyz), dtype=bool)
@@ -134,14 +134,14 @@ def _path_without(stream: LidarStream, steady: np.ndarray) -> SensorPath | None:
         return None
 
 
-def _scan_of(path: SensorPath, stream: LidarStream, scan: np.ndarray) -> np.ndarray:
+def _scan_of(path: SensorTrajectory, stream: LidarStream, scan: np.ndarray) -> np.ndarray:
     """(n,) which of the path's scans each of the stream's scans is, or is nearest to."""
     middle = stream.seconds[scan] + path.seconds[0] - stream.seconds[0]
     k = np.clip(np.searchsorted(path.seconds, middle), 1, len(path.seconds) - 1)
     return k - (middle - path.seconds[k - 1] < path.seconds[k] - middle)
 
 
-def _apart(path: SensorPath, at: np.ndarray) -> np.ndarray:
+def _apart(path: SensorTrajectory, at: np.ndarray) -> np.ndarray:
     """Those of the groups, which are at scans `at` (n,) of the path, between which the LiDAR moved."""
     chosen: list[int] = []
     for group, k in enumerate(at):
@@ -157,7 +157,7 @@ def _apart(path: SensorPath, at: np.ndarray) -> np.ndarray:
 
 
 def _seen_from_afar(
-    stream: LidarStream, path: SensorPath, near: _Near, groups: np.ndarray, steady: np.ndarray
+    stream: LidarStream, path: SensorTrajectory, near: _Near, groups: np.ndarray, steady: np.ndarray
 ) -> np.ndarray:
     """(PLACES,) whether most of the places of the world where a `steady` voxel was in these groups of scans are seen
     from afar at another time."""
@@ -169,7 +169,7 @@ def _seen_from_afar(
     return of_them >= SEEN_FROM_AFAR * np.maximum(times, 1)
 
 
-def _in_world(stream: LidarStream, path: SensorPath, point: np.ndarray) -> np.ndarray:
+def _in_world(stream: LidarStream, path: SensorTrajectory, point: np.ndarray) -> np.ndarray:
     """(n,) the voxel of the world that each point is in; -1: where the LiDAR was is not known."""
     k = _scan_of(path, stream, np.searchsorted(stream.start, point, side="right") - 1)
     world = np.einsum("nab,nb->na", path.rotation[k], stream.xyz[point]) + path.position[k]

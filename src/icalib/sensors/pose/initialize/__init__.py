@@ -11,9 +11,9 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.steps.initializer import BY_POSES, Initializer, Moving, Values
+from icalib.initialize.steps.initializer import BY_POSES, Initializer, InputsWithMotion, Values
 from icalib.initialize.steps.keyframe_spacing import SmoothMotion
-from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.model.frames import FRAME, frame_of
 from icalib.optim.state import State
 from icalib.rig import PoseSensor, Rig
@@ -32,7 +32,7 @@ class PoseInitializer(Initializer[PoseSensor]):
     def sources(self, rig: Rig) -> tuple[str, ...]:
         return (rig.poses[0].name,)
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
         del other
         return state_from_poses(inputs)
 

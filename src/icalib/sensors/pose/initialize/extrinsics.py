@@ -18,26 +18,35 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
-from icalib.initialize.paths.alignment import align_path
-from icalib.initialize.paths.lever_arm_rows import LeverArmRows, against_motion, against_readings
-from icalib.initialize.paths.on_motion import path_on_motion, path_rates, poses_in, too_short
-from icalib.initialize.paths.path import ExtrinsicsGuess, SensorPath
-from icalib.initialize.paths.with_imu import G_TOLERANCE, PathMotion, motion_of_path
-from icalib.initialize.steps.by_recording import (
-    Held,
-    alone,
-    each_clock,
-    from_the_best,
-    fullest,
-    motion_alone,
+from icalib.initialize.steps.contradicted_guesses import has_guesses, merged_values
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.steps.lever_arm import TARGET_SIZE_TOLERANCE, scale_by_accelerometer
+from icalib.initialize.steps.rate_alignment import RateAlignment
+from icalib.initialize.steps.rate_correlation import SensorRates
+from icalib.initialize.steps.rig_file_values import known_extrinsics, stated_values
+from icalib.initialize.steps.single_recording import (
+    KnownExtrinsics,
+    fullest_recording,
     naming_recording,
+    offset_of_each_clock,
+    single_recording,
+    state_of_recording,
+    states_from_best,
 )
-from icalib.initialize.steps.clock_shifts import CameraRates
-from icalib.initialize.steps.clocks import Alignment
-from icalib.initialize.steps.contradicted import has_guesses, settled
-from icalib.initialize.steps.gyro import GyroRotation
-from icalib.initialize.steps.known_values import given, held_of
-from icalib.initialize.steps.lever_arm import SIZE_TOLERANCE, size_of
+from icalib.initialize.trajectories.known_trajectory import (
+    extrinsics_on_trajectory,
+    imu_poses_at,
+    too_few_poses,
+    trajectory_rates,
+)
+from icalib.initialize.trajectories.lever_arm_rows import LeverArmRows, system_from_readings, system_from_trajectory
+from icalib.initialize.trajectories.rotation_alignment import align_trajectory
+from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess, SensorTrajectory
+from icalib.initialize.trajectories.trajectory_fit import (
+    TRAJECTORY_GRAVITY_TOLERANCE,
+    TrajectoryFit,
+    fit_imu_trajectory,
+)
 from icalib.model.frames import FRAME, frame_of
 from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
@@ -62,12 +71,12 @@ def pose_values(inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> 
     for sensor in sensors:
         stream = inputs.stream(sensor.name)
         assert isinstance(stream, PoseStream)
-        known = given(inputs, sensor)
+        known = stated_values(inputs, sensor)
         if len(known) < len(MOUNTED_NAMES):
-            known = settled(sensor, known, _placed(inputs, state, sensor, stream))
+            known = merged_values(sensor, known, _placed(inputs, state, sensor, stream))
         elif has_guesses(sensor, known):
             with suppress(EstimationError):
-                known = settled(sensor, known, _placed(inputs, state, sensor, stream))
+                known = merged_values(sensor, known, _placed(inputs, state, sensor, stream))
         out |= known | _frames(inputs.imu, sensor, stream, state, known) | {(sensor.name, "scale"): np.ones(1)}
     return out
 
@@ -76,27 +85,27 @@ def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream
     """Extrinsics and time offsets of a sensor, given the motion in `state`. If its clock restarts between recordings,
     the extrinsics are those of the recording with most poses."""
     assert inputs.imu is not None
-    held = held_of(inputs, sensor)
+    held = known_extrinsics(inputs, sensor)
     if not sensor.clock_restarts:
         known = {"known": state, "held": held}
         turn = partial(_turn_on_motion, inputs.imu, **known)
         return placed(stream, partial(_on_motion, inputs.imu, **known), turn).values(sensor.name)
     streams = [_alone(inputs, k, sensor.name) for k in range(len(inputs.parts))]
-    k = fullest(inputs, sensor.name)
+    k = fullest_recording(inputs, sensor.name)
     imu, own = streams[k]
     with naming_recording(inputs, k):
-        known = {"known": motion_alone(inputs, k, state), "held": held}
+        known = {"known": state_of_recording(inputs, k, state), "held": held}
         found = placed(own, partial(_on_motion, imu, **known), partial(_turn_on_motion, imu, **known))
 
     def offset(recording: int) -> float:
-        return _aligned(*streams[recording], Held(found.rotation))[0].offset
+        return _aligned(*streams[recording], KnownExtrinsics(found.rotation))[0].offset
 
-    offsets = each_clock(inputs, sensor.name, offset, {k: found.offset})
+    offsets = offset_of_each_clock(inputs, sensor.name, offset, {k: found.offset})
     return found.values(sensor.name) | {(sensor.name, "time_offset"): offsets}
 
 
 def _alone(inputs: Inputs, recording: int, sensor: str) -> tuple[ImuData, PoseStream]:
-    own = alone(inputs, recording)
+    own = single_recording(inputs, recording)
     stream = own.stream(sensor)
     assert own.imu is not None and isinstance(stream, PoseStream)
     return own.imu, stream
@@ -109,16 +118,16 @@ def state_from_poses(inputs: Inputs) -> State:
     Raises EstimationError where they do not.
     """
     sensor = inputs.rig.poses[0]
-    return from_the_best(inputs, sensor, fullest(inputs, sensor.name), _state_of_one)
+    return states_from_best(inputs, sensor, fullest_recording(inputs, sensor.name), _state_of_one)
 
 
-def _state_of_one(inputs: Inputs, held: Held | None) -> State:
+def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None) -> State:
     """Of one recording; `held`: how the sensor stands, where another has shown it."""
     assert inputs.imu is not None
     sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
-    known = held or held_of(inputs, sensor)
+    known = held or known_extrinsics(inputs, sensor)
     found = placed(stream, lambda x: _with_motion(imu, x, gravity, known), lambda x: _turn_alone(imu, x, known))
-    own = settled(sensor, given(inputs, sensor), found.guess.values(sensor.name))
+    own = merged_values(sensor, stated_values(inputs, sensor), found.guess.values(sensor.name))
     values = start_values(inputs, own)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
     keyframes = keyframes_for(inputs, keyframe_times(inputs, hosts))
@@ -126,9 +135,9 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
     return State(keyframes, rotation, position, velocity, np.tile(found.motion.bias, (len(keyframes), 1)), values)
 
 
-def pose_rates(stream: PoseStream) -> CameraRates:
+def pose_rates(stream: PoseStream) -> SensorRates:
     """See `path_rates`."""
-    return path_rates(stream.name, _path(stream))
+    return trajectory_rates(stream.name, _path(stream))
 
 
 def check_rate(stream: PoseStream) -> None:
@@ -142,50 +151,54 @@ def check_rate(stream: PoseStream) -> None:
         )
 
 
-def _path(stream: PoseStream) -> SensorPath:
-    return SensorPath(stream.seconds, stream.rotation, stream.position, np.ones(len(stream.stamps_ns), dtype=bool))
+def _path(stream: PoseStream) -> SensorTrajectory:
+    return SensorTrajectory(
+        stream.seconds, stream.rotation, stream.position, np.ones(len(stream.stamps_ns), dtype=bool)
+    )
 
 
-def _aligned(imu: ImuData, stream: PoseStream, held: Held) -> tuple[Alignment, CameraRates]:
+def _aligned(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> tuple[RateAlignment, SensorRates]:
     rates = pose_rates(stream)
-    return align_path(imu, stream.name, rates, held), rates
+    return align_trajectory(imu, stream.name, rates, held), rates
 
 
-def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -> tuple[PathMotion, float]:
+def _with_motion(
+    imu: ImuData, stream: PoseStream, gravity: float, held: KnownExtrinsics
+) -> tuple[TrajectoryFit, float]:
     """What the poses show with the IMU alone, and what is left of them. Raises EstimationError where they do not."""
     aligned, rates = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
     path = path.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
     gyro, R_is = GyroRotation.integrate(imu, aligned.gyro_bias), aligned.rotation
     path = replace(path, rotation=gyro.smoothed(path.seconds + aligned.offset, path.rotation @ R_is.T) @ R_is)
-    found = motion_of_path(imu, path, rates, aligned, gravity, held)
+    found = fit_imu_trajectory(imu, path, rates, aligned, gravity, held)
     if found is None:
-        raise too_short(stream.name)
+        raise too_few_poses(stream.name)
     off = abs(found.gravity / gravity - 1.0)
     if off <= G_OTHER_UNITS:
         _check_size(imu, stream.name, path, aligned, found)
-    if off > G_TOLERANCE:
+    if off > TRAJECTORY_GRAVITY_TOLERANCE:
         raise EstimationError(
             f"{imu.name} and {stream.name} together give a gravity of {found.gravity:.3g} m/s^2 instead of "
             f"{gravity:.3g}; check that the accelerometer is in m/s^2, not in g (accel_unit), and the "
             f"positions of {stream.name} in metres."
         )
     step = max(1, round(APART_S / float(np.median(np.diff(path.seconds)))))
-    apart = motion_of_path(imu, path.only(np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
+    apart = fit_imu_trajectory(imu, path.only(np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
     return found, 0.0 if apart is None else apart.left
 
 
-def _turn_alone(imu: ImuData, stream: PoseStream, held: Held) -> np.ndarray | None:
+def _turn_alone(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> np.ndarray | None:
     """See `turn_of_positions`: by the IMU's readings."""
     aligned, _ = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
     path = path.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
     carry = partial(GyroRotation.integrate(imu, aligned.gyro_bias).carry, path.seconds + aligned.offset, to=imu.seconds)
-    system = against_readings(imu, carry, path.seconds + aligned.offset, path.rotation, path.position)
+    system = system_from_readings(imu, carry, path.seconds + aligned.offset, path.rotation, path.position)
     return turn_of_positions(system(aligned.rotation, np.zeros(3)))
 
 
-def _turn_on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> np.ndarray | None:
+def _turn_on_motion(imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics) -> np.ndarray | None:
     """See `turn_of_positions`: by a motion that others showed."""
     aligned, _ = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
@@ -193,33 +206,33 @@ def _turn_on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) 
     t = path.seconds + aligned.offset
     if not len(t):
         return None
-    R, p = poses_in(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t)
+    R, p = imu_poses_at(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t)
     U, _, Vt = np.linalg.svd((R @ aligned.rotation @ path.rotation.transpose(0, 2, 1)).sum(axis=0))
-    rows = against_motion(R, p, t, path.rotation, path.position)(aligned.rotation, np.zeros(3))
+    rows = system_from_trajectory(R, p, t, path.rotation, path.position)(aligned.rotation, np.zeros(3))
     return turn_of_positions(rows, U @ Vt)
 
 
-def _check_size(imu: ImuData, name: str, path: SensorPath, aligned: Alignment, found: PathMotion) -> None:
+def _check_size(imu: ImuData, name: str, path: SensorTrajectory, aligned: RateAlignment, found: TrajectoryFit) -> None:
     """Raises EstimationError where the accelerometer contradicts the size of the motion: the rows of `against_readings`
     with what it felt as one more column, as of a target in `lever_arm`."""
     gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
 
     def rows_at(position: np.ndarray) -> LeverArmRows:
         carry = partial(gyro.carry, t, to=imu.seconds)
-        return against_readings(imu, carry, t, path.rotation, position)(found.guess.rotation, found.guess.position)
+        return system_from_readings(imu, carry, t, path.rotation, position)(found.guess.rotation, found.guess.position)
 
     rows, felt = rows_at(path.position), -rows_at(np.zeros_like(path.position)).b
-    size, std = size_of(rows.A[:, :, 3:], rows.b, felt)
-    if abs(size - 1.0) > max(SIZE_TOLERANCE, 5.0 * std):
+    size, std = scale_by_accelerometer(rows.A[:, :, 3:], rows.b, felt)
+    if abs(size - 1.0) > max(TARGET_SIZE_TOLERANCE, 5.0 * std):
         raise EstimationError(
             f"{name}: the accelerometer shows its motion to be {size:.2f} +- {std:.2f} times as large as its "
             "positions; these must be in metres (an odometry from one camera has no scale)."
         )
 
 
-def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> tuple[ExtrinsicsGuess, float]:
+def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics) -> tuple[ExtrinsicsGuess, float]:
     """See `path_on_motion`."""
-    return path_on_motion(imu, stream.name, _path(stream), known, held)
+    return extrinsics_on_trajectory(imu, stream.name, _path(stream), known, held)
 
 
 def _frames(
@@ -233,8 +246,8 @@ def _frames(
         part = _keyframes(known, keyframes)
         own = np.flatnonzero((t >= part.seconds[0]) & (t <= part.seconds[-1]))
         if not len(own):
-            raise too_short(stream.name)
-        R, p = poses_in(part, GyroRotation.integrate(imu, part.bias[:, :3].mean(axis=0)), t[own])
+            raise too_few_poses(stream.name)
+        R, p = imu_poses_at(part, GyroRotation.integrate(imu, part.bias[:, :3].mean(axis=0)), t[own])
         R_wf = so3.closest_rotation((R @ R_is @ stream.rotation[own].transpose(0, 2, 1)).sum(axis=0))
         origin = np.median(p + R @ p_is - stream.position[own] @ R_wf.T, axis=0)
         frame = frame_of(sensor.name, k)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.data.checks.stops import moved
-from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.motion.keyframe_placement import MERGED_WITHIN_S
 
 AROUND_S = 0.2  # before and behind an instant at which a sensor must be at rest: clocks may be so far apart

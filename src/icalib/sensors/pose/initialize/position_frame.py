@@ -14,7 +14,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from icalib.initialize.paths.lever_arm_rows import LeverArmRows
+from icalib.initialize.trajectories.lever_arm_rows import LeverArmRows
 
 SQUARE = 0.35  # cosine with the next axes: turns within 20 degrees of these are meant to be about right angles
 EVEN = 0.5  # the least over the largest stretch of M: a turn has 1

@@ -18,9 +18,17 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.steps.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
-from icalib.initialize.steps.known_values import given
-from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.initialize.steps.hand_eye import (
+    MAX_UNEXPLAINED_MOTION,
+    HandEye,
+    PosePairs,
+    hand_eye,
+    outlier_pairs,
+    relative_motions,
+    unexplained_motion,
+)
+from icalib.initialize.steps.rig_file_values import stated_values
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.model.frames import FRAME, frame_of
 from icalib.motion.pose_rows import Extrinsics
 from icalib.optim.state import Key, State, in_recording
@@ -67,7 +75,7 @@ def start_from_pairs(
         found |= values
     inputs = replace(inputs_for(still, at), asked=rig)
     for sensor in still.poses:
-        found |= given(inputs, sensor, MOUNTED_NAMES if sensor.name == rig.reference else ("time_offset",))
+        found |= stated_values(inputs, sensor, MOUNTED_NAMES if sensor.name == rig.reference else ("time_offset",))
     for k in range(len(recordings)):
         frame = frame_of(rig.reference, k)
         world = {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}
@@ -125,7 +133,7 @@ def _mounted(
             (frame_of(sensor.name, k), FRAME[0]): here.frame.R,
             (frame_of(sensor.name, k), FRAME[1]): here.frame.p,
         }
-        bad = outliers(here.residual)
+        bad = outlier_pairs(here.residual)
         good = np.flatnonzero(~bad)
         columns = {name: getattr(own.stream, name)[good] for name in ("stamps_ns", "rotation", "position")}
         out.append(
@@ -179,12 +187,12 @@ def _solved(rig: Rig, sensor: PoseSensor, own: _Paired) -> HandEye:
     def place(stream: PoseStream) -> tuple[tuple[HandEye, float], float]:
         pairs = replace(own.pairs, R_sensor=stream.rotation, p_sensor=stream.position)
         found = hand_eye(pairs, start, held)
-        left = left_over(pairs, found)
+        left = unexplained_motion(pairs, found)
         return (found, left), left
 
     found, left = placed(own.stream, place)
-    if left > LARGEST_LEFT:
-        turns = turns_of(own.pairs)
+    if left > MAX_UNEXPLAINED_MOTION:
+        turns = relative_motions(own.pairs)
         seen, told = (np.rad2deg(np.median(np.linalg.norm(w, axis=1))) for w in (turns.body, turns.sensor))
         if told < NO_TURN_DEG < seen:
             raise EstimationError(

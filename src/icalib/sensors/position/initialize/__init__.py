@@ -11,18 +11,18 @@ from icalib.data.measurements import Measurements
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, motion_of, start_values
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.steps.by_recording import (
-    Held,
-    alone,
-    from_the_best,
-    fullest,
-    motion_alone,
+from icalib.initialize.steps.contradicted_guesses import merged_values
+from icalib.initialize.steps.initializer import BY_POSITIONS, Initializer, InputsWithMotion, Values
+from icalib.initialize.steps.rig_file_values import known_value, stated_values
+from icalib.initialize.steps.single_recording import (
+    KnownExtrinsics,
+    converted_offset,
+    fullest_recording,
     naming_recording,
-    other_clocks,
+    single_recording,
+    state_of_recording,
+    states_from_best,
 )
-from icalib.initialize.steps.contradicted import settled
-from icalib.initialize.steps.initializer import BY_POSITIONS, Initializer, Moving, Values
-from icalib.initialize.steps.known_values import given, trusted
 from icalib.model.frames import frame_of
 from icalib.optim.state import State
 from icalib.rig import Rig
@@ -47,10 +47,10 @@ class PositionInitializer(Initializer[PositionSensor]):
     def sources(self, rig: Rig) -> tuple[str, ...]:
         return (rig.of(PositionSensor)[0].name,)
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], Moving]) -> State:
+    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
         del other
         sensor = inputs.rig.of(PositionSensor)[0]
-        state = from_the_best(inputs, sensor, fullest(inputs, sensor.name), _state_of_one)
+        state = states_from_best(inputs, sensor, fullest_recording(inputs, sensor.name), _state_of_one)
         frames = _frames(inputs, sensor, [(np.eye(3), np.zeros(3))] * len(inputs.parts))
         return replace(state, values=state.values | frames)
 
@@ -75,7 +75,7 @@ class PositionInitializer(Initializer[PositionSensor]):
 INITIALIZER = PositionInitializer()
 
 
-def _state_of_one(inputs: Inputs, held: Held | None) -> State:
+def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None) -> State:
     """Of one recording, in the frame of the fixes; `held`: what another recording has shown of the sensor."""
     assert inputs.imu is not None
     sensor = inputs.rig.of(PositionSensor)[0]
@@ -85,7 +85,7 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
         (sensor.name, name): value
         for name, value in zip(NAMES, (found.best.at.arm, np.array([found.best.at.offset])), strict=True)
     }
-    values = start_values(inputs, settled(sensor, given(inputs, sensor, NAMES), shown))
+    values = start_values(inputs, merged_values(sensor, stated_values(inputs, sensor, NAMES), shown))
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     rotation, position, velocity, bias = found.at(keyframes)
     return State(keyframes, rotation, position, velocity, bias, values)
@@ -94,30 +94,30 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
 def _on_motion(inputs: Inputs, state: State, sensor: PositionSensor) -> Values:
     """What one sensor shows on the motion of `state`. Of several recordings the one with most fixes gives the lever
     arm, and the time offset if the clock runs on."""
-    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
-    best = fullest(inputs, sensor.name)
+    recordings = [single_recording(inputs, k) for k in range(len(inputs.parts))]
+    best = fullest_recording(inputs, sensor.name)
     found: dict[int, PlacedSensor] = {}
     for k in sorted(range(len(recordings)), key=lambda k: k != best):
         known = _held(recordings[k], sensor)
         if k != best:
-            offset = other_clocks(found[best].offset, sensor.name, recordings[best], recordings[k])
-            known = Held(position=found[best].arm, offset=known.offset if sensor.clock_restarts else offset)
+            offset = converted_offset(found[best].offset, sensor.name, recordings[best], recordings[k])
+            known = KnownExtrinsics(position=found[best].arm, offset=known.offset if sensor.clock_restarts else offset)
         with naming_recording(inputs, k):
-            motion = motion_of(recordings[k], motion_alone(inputs, k, state))
+            motion = motion_of(recordings[k], state_of_recording(inputs, k, state))
             found[k] = place(motion, sensor.name, _fix(recordings[k], sensor), _is_levelled(inputs, sensor), known)
     clocks = range(len(recordings)) if sensor.clock_restarts else (best,)
-    offsets = [other_clocks(found[k].offset, sensor.name, recordings[k], inputs) for k in clocks]
+    offsets = [converted_offset(found[k].offset, sensor.name, recordings[k], inputs) for k in clocks]
     shown = {(sensor.name, NAMES[0]): found[best].arm, (sensor.name, NAMES[1]): np.array(offsets)}
     frames = _frames(inputs, sensor, [(found[k].R_wf, found[k].p_wf) for k in range(len(recordings))])
-    return settled(sensor, given(inputs, sensor, NAMES), shown) | frames
+    return merged_values(sensor, stated_values(inputs, sensor, NAMES), shown) | frames
 
 
-def _held(inputs: Inputs, sensor: PositionSensor) -> Held:
+def _held(inputs: Inputs, sensor: PositionSensor) -> KnownExtrinsics:
     """What the rig file fixes of the sensor or gives as a prior."""
-    known = {name: value for (_, name), value in given(inputs, sensor, NAMES).items()}
-    known = {name: value for name, value in known.items() if trusted(getattr(sensor, name)) is not None}
+    known = {name: value for (_, name), value in stated_values(inputs, sensor, NAMES).items()}
+    known = {name: value for name, value in known.items() if known_value(getattr(sensor, name)) is not None}
     offset = known.get("time_offset")
-    return Held(position=known.get("translation"), offset=None if offset is None else float(offset[0]))
+    return KnownExtrinsics(position=known.get("translation"), offset=None if offset is None else float(offset[0]))
 
 
 def _fix(inputs: Inputs, sensor: PositionSensor) -> Fix:

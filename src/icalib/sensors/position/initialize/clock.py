@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.initialize.steps.correlation import Shift, best_shifts
+from icalib.initialize.steps.cross_correlation import CorrelationPeak, best_shifts
 from icalib.motion.imu_data import ImuData
 from icalib.sensors.position.initialize.attitude import Fix
 from icalib.sensors.position.initialize.triples import Carried
@@ -23,7 +23,7 @@ LEAST_CHANGE = 1e-4  # m/s^2 or m/s
 MOST_FELT, LEVERED = 1.5, 5.0  # times, and at least m/s^2: a long lever arm adds its own where the rig turns
 
 
-def likely_offsets(imu: ImuData, fix: Fix) -> list[Shift]:
+def likely_offsets(imu: ImuData, fix: Fix) -> list[CorrelationPeak]:
     """Offsets in steps of 1 / GRID_HZ s from the sensor's clock to the IMU's, most likely first."""
     seen, is_seen = _of_fixes(fix)
     felt, is_felt = _of_imu(imu)

@@ -9,8 +9,8 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.steps.by_recording import Held
-from icalib.initialize.steps.correlation import best_shifts
+from icalib.initialize.steps.cross_correlation import best_shifts
+from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
 from icalib.motion.sweep import Motion
@@ -44,7 +44,7 @@ class PlacedSensor(NamedTuple):
     left: float
 
 
-def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: Held) -> PlacedSensor:
+def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: KnownExtrinsics) -> PlacedSensor:
     """From the fixes of one recording, whose keyframes `motion` has. levelled: the frame turns against the world about
     z alone. Raises EstimationError where they do not show it."""
     found = [x for offset in _offsets(motion, fix, known) if (x := _placed(motion, fix, offset, levelled, known))]
@@ -65,7 +65,7 @@ def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: Held) -> P
     return best
 
 
-def _offsets(motion: Motion, fix: Fix, known: Held) -> list[float]:
+def _offsets(motion: Motion, fix: Fix, known: KnownExtrinsics) -> list[float]:
     """Candidate time offsets [s]: peaks of the correlation of mean speeds, then of third differences with the IMU's
     readings. The latter are needed where the rig turns and hardly moves: a long lever arm makes speeds differ."""
     if known.offset is not None:
@@ -80,7 +80,7 @@ def _offsets(motion: Motion, fix: Fix, known: Held) -> list[float]:
     return [*(peak.samples / GRID_HZ for peak in peaks), *felt]
 
 
-def _scanned(motion: Motion, fix: Fix, levelled: bool, known: Held) -> list[float]:
+def _scanned(motion: Motion, fix: Fix, levelled: bool, known: KnownExtrinsics) -> list[float]:
     """The offsets of a grid at which frame and lever arm fit best, however the rig moves: where it turns in place,
     neither its speed nor its acceleration is like those of the antenna. Half of the fixes must be used."""
     some = np.linspace(0, len(fix.t) - 1, min(len(fix.t), SCANNED_FIXES)).astype(int)
@@ -125,7 +125,7 @@ class _Unknowns:
         )
 
 
-def _placed(motion: Motion, fix: Fix, offset: float, levelled: bool, known: Held) -> PlacedSensor | None:
+def _placed(motion: Motion, fix: Fix, offset: float, levelled: bool, known: KnownExtrinsics) -> PlacedSensor | None:
     """By Gauss-Newton from a linear solution, at an offset that is refined."""
     t = fix.t + offset
     ok = is_known(motion.state.seconds, t - OFFSET_SIGMA) & is_known(motion.state.seconds, t + OFFSET_SIGMA)

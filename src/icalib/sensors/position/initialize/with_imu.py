@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.initialize.steps.by_recording import Held
 from icalib.initialize.steps.lever_arm import Triples
+from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
 from icalib.sensors.position.initialize.attitude import FEWEST, Fitted, Fix, Unknowns, first_attitude, fit, sigmas
 from icalib.sensors.position.initialize.clock import GRID_HZ, LEAST_CORRELATION, likely_offsets
@@ -79,7 +79,7 @@ class PositionMotion:
         return R, bias
 
 
-def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: Held) -> PositionMotion:
+def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: KnownExtrinsics) -> PositionMotion:
     """Raises EstimationError, one sentence, where fixes and readings do not belong together or do not move."""
     triples = triples_of(fix.t)
     if len(triples.i) < FEWEST:
@@ -128,7 +128,7 @@ def _motionless(name: str, rms: float) -> EstimationError:
     )
 
 
-def _offsets(imu: ImuData, fix: Fix, known: Held) -> list[float]:
+def _offsets(imu: ImuData, fix: Fix, known: KnownExtrinsics) -> list[float]:
     """Those to be tried, likely ones first."""
     if known.offset is not None:
         return [known.offset]
@@ -147,7 +147,7 @@ def _moves_evenly(fix: Fix, triples: Triples) -> float | None:
 
 
 def _tried(
-    imu: ImuData, fix: Fix, triples: Triples, offset: float, gravity: float, known: Held
+    imu: ImuData, fix: Fix, triples: Triples, offset: float, gravity: float, known: KnownExtrinsics
 ) -> tuple[Fitted, tuple[float, float]] | None:
     """What the largest window about the one with most motion shows, and the window on the sensor's clock; None where
     there are too few triples."""

@@ -8,7 +8,7 @@ from icalib.data.measurements import Measurements
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.initializer import BY_DEAD_RECKONING, Initializer, Values
 from icalib.initialize.steps.keyframe_spacing import SmoothMotion
-from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.initialize.dead_reckoning import wheel_path

@@ -7,7 +7,7 @@ import numpy as np
 from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.rig import Wheels
 from icalib.sensors.wheels.wheel_angles import integrals_of
 

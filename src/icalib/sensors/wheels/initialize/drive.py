@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.initialize.steps.clock_shifts import LONGEST_STEP_S, how_alike, longest_step
-from icalib.initialize.steps.contradicted import MotionContradictedError
-from icalib.initialize.steps.correlation import best_shift
+from icalib.initialize.steps.contradicted_guesses import MotionContradictedError
+from icalib.initialize.steps.cross_correlation import best_shift
+from icalib.initialize.steps.rate_correlation import MAX_RATE_STEP_S, correlation_in_words, max_rate_step
 from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.stamp_intervals import LONGEST_S
 from icalib.rig import WheelKind, drive_names
@@ -61,7 +61,7 @@ class WheelRates:
     end: np.ndarray
     rate: np.ndarray
     kind: WheelKind = "pair"
-    longest_step_s: float = LONGEST_STEP_S
+    longest_step_s: float = MAX_RATE_STEP_S
 
     @property
     def turning(self) -> np.ndarray:
@@ -96,7 +96,7 @@ def wheel_rates(name: str, seconds: np.ndarray, integrals: np.ndarray, kind: Whe
     b = np.searchsorted(seconds, seconds + WINDOW_S - 1e-9)
     good = (b < len(seconds)) & (b > a)
     a, b = a[good], b[good]
-    longest = longest_step(name, seconds, "readings", LONGEST_S)
+    longest = max_rate_step(name, seconds, "readings", LONGEST_S)
     near = seconds[b] - seconds[a] <= longest
     a, b = a[near], b[near]
     if len(a) < LEAST_WINDOWS:
@@ -315,7 +315,7 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     seen = (np.interp(wheels, middle, near.astype(float)) > 0.99) & (wheels >= middle[0])
     turning = np.interp(wheels, middle, rates.turn)
     turned = np.interp(grid, imu.seconds, turn)
-    if rates.longest_step_s > LONGEST_STEP_S:  # over which the wheels' rates are means
+    if rates.longest_step_s > MAX_RATE_STEP_S:  # over which the wheels' rates are means
         count = max(1, round(float(np.median(rates.end - rates.start)) * GRID_HZ))
         turned = np.convolve(turned, np.full(count, 1.0 / count), "same")
     found, opposite = (
@@ -331,6 +331,7 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
             )
         raise EstimationError(
             f"the yaw rate of {name} does not match that of {imu.name} at any time offset "
-            f"({how_alike(found.largest)}); check that both come from the same recording and overlap in time."
+            f"({correlation_in_words(found.largest)}); check that both come from the same recording and overlap "
+            "in time."
         )
     return found.samples / GRID_HZ

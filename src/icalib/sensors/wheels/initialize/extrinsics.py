@@ -11,16 +11,16 @@ from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.steps.by_recording import alone, each_clock
-from icalib.initialize.steps.contradicted import (
+from icalib.initialize.steps.contradicted_guesses import (
     MotionContradictedError,
     has_guesses,
     is_contradicted,
+    merged_values,
     refuse_far_off,
-    settled,
 )
-from icalib.initialize.steps.known_values import given
-from icalib.initialize.steps.vertical import verticals
+from icalib.initialize.steps.rig_file_values import stated_values
+from icalib.initialize.steps.single_recording import offset_of_each_clock, single_recording
+from icalib.initialize.steps.vertical import possible_verticals
 from icalib.motion.clocks import instants
 from icalib.motion.imu_data import clear_of
 from icalib.motion.known_motion import imu_poses, is_known
@@ -55,11 +55,11 @@ def wheel_values(inputs: Inputs, state: State, sensors: Sequence[Wheels]) -> dic
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
     names = [spec.name for spec in wheels.specs()]
-    known = given(inputs, wheels, names)
+    known = stated_values(inputs, wheels, names)
     if isinstance(stream, WheelPoses):
         known |= {(wheels.name, spec.name): np.ones(spec.size) for spec in wheels.drive_specs}
     complete = len(known) == len(names)
-    if complete and isinstance(stream, WheelPoses) and not has_guesses(wheels, given(inputs, wheels, names)):
+    if complete and isinstance(stream, WheelPoses) and not has_guesses(wheels, stated_values(inputs, wheels, names)):
         return known
     clock = wheels.name, "time_offset"
     offset = known.get(clock)
@@ -79,12 +79,12 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     refuse_far_off(wheels, found | {mount: level})
     if arm is not None and not is_contradicted(TRANSLATION, arm, level):
         found[mount] = arm
-    return settled(wheels, known, found)
+    return merged_values(wheels, known, found)
 
 
 def _as_high(inputs: Inputs, state: State, arm: np.ndarray, found: np.ndarray) -> np.ndarray:
     """The lever arm that was `found`, as high as `arm`: on a floor wheels do not show their height."""
-    up = verticals(inputs, state).ways[0]
+    up = possible_verticals(inputs, state).ways[0]
     up = up / np.linalg.norm(up)
     return found + up * (up @ (arm - found))
 
@@ -101,7 +101,7 @@ def _found(
     if isinstance(stream, WheelPoses):
         return _posing(inputs, state, stream, offset)
     rates = wheel_rates(wheels.name, stream.seconds, integrals_of(stream), stream.kind)
-    up = verticals(inputs, state)
+    up = possible_verticals(inputs, state)
     failed: list[EstimationError] = []
     for way in up.ways:
         found = _try(inputs, state, stream, rates, way, offset)
@@ -135,7 +135,7 @@ def _turning(
     assert inputs.imu is not None
     name = stream.name
     if offset is None and inputs.sensor(name).clock_restarts:
-        offset = each_clock(inputs, name, partial(_offset_alone, inputs, name, up))
+        offset = offset_of_each_clock(inputs, name, partial(_offset_alone, inputs, name, up))
     elif offset is None:
         offset = np.array([wheel_offset(inputs.imu, up, name, rates)])
     clock = {(name, "time_offset"): offset}
@@ -148,7 +148,7 @@ def _turning(
 
 def _offset_alone(inputs: Inputs, name: str, up: np.ndarray, recording: int) -> float:
     """Of wheels in one recording, between its own first stamps; `up` (3,) in the IMU's axes."""
-    own = alone(inputs, recording)
+    own = single_recording(inputs, recording)
     stream = own.stream(name)
     assert own.imu is not None and isinstance(stream, WheelStream)
     return wheel_offset(own.imu, up, name, wheel_rates(name, stream.seconds, integrals_of(stream), stream.kind))

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from icalib.data.measurements import WheelStream
-from icalib.initialize.steps.smooth_path import SmoothPath
+from icalib.initialize.steps.smooth_trajectory import SmoothTrajectory
 from icalib.rig import Wheels
 
 
-def wheel_noise(wheels: Wheels, streams: Sequence[object], paths: Sequence[SmoothPath]) -> tuple[float, float]:
+def wheel_noise(wheels: Wheels, streams: Sequence[object], paths: Sequence[SmoothTrajectory]) -> tuple[float, float]:
     """Densities of path [m/sqrt(s)] and yaw [rad/sqrt(s)]; zeros if they are unknown. Radius and baseline of a pair are
     the ratios of RMS speeds and RMS rates of `paths` to those of the wheels, which no time offset changes."""
     if wheels.kind == "twist":

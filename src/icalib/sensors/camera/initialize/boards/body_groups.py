@@ -18,7 +18,7 @@ import numpy as np
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.hand_eye import LARGEST_LEFT, PosePairs, hand_eye, left_over
+from icalib.initialize.steps.hand_eye import MAX_UNEXPLAINED_MOTION, PosePairs, hand_eye, unexplained_motion
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.model.bodies import Bodies
 from icalib.motion.pose_rows import Extrinsics, Frame
@@ -120,7 +120,7 @@ def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
     """Where the second group stands in the first. Raises EstimationError where the cameras do not move alike."""
     a, b = cameras[tied.a], cameras[tied.b]
     found = hand_eye(tied.pairs, _given(a, b, tied.a == 0, tied.b == 0), (False, False))
-    if (left := left_over(tied.pairs, found)) > LARGEST_LEFT:
+    if (left := unexplained_motion(tied.pairs, found)) > MAX_UNEXPLAINED_MOTION:
         raise EstimationError(
             f"{a.name} and {b.name} see different bodies of the target and do not move alike: {left:.0%} of "
             "the motion is unexplained; check that the bodies stand still, and that one clock stamps both "

@@ -13,9 +13,14 @@ import numpy as np
 
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.paths.on_motion import path_on_motion
-from icalib.initialize.paths.path import SensorPath
-from icalib.initialize.steps.by_recording import Held, alone, motion_alone, naming_recording
+from icalib.initialize.steps.single_recording import (
+    KnownExtrinsics,
+    naming_recording,
+    single_recording,
+    state_of_recording,
+)
+from icalib.initialize.trajectories.known_trajectory import extrinsics_on_trajectory
+from icalib.initialize.trajectories.sensor_trajectory import SensorTrajectory
 from icalib.optim.state import State
 from icalib.rig import Camera, Parameter, Rig
 from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene, intrinsics_of
@@ -36,14 +41,16 @@ def with_hand_eye_guess(rig: Rig, seen: Inputs, others: Inputs, state: State) ->
 
     def placed(number: int, camera: Camera) -> Camera:
         best = int(np.argmax([len(r.cameras[number].uv) for r in recordings]))
-        stream, own = recordings[best].cameras[number], alone(others, best)
+        stream, own = recordings[best].cameras[number], single_recording(others, best)
         poses = scene_poses(stream, camera_model(camera.model), intrinsics_of(camera, stream, rig.target, scene), scene)
         ok, stamps = poses.ok, stream.stamps_ns[poses.ok]
         seconds = seconds_since(stamps, int(stamps[0]))
-        path = SensorPath(seconds, poses.rotation[ok], poses.position[ok], np.ones(len(stamps), dtype=bool))
+        path = SensorTrajectory(seconds, poses.rotation[ok], poses.position[ok], np.ones(len(stamps), dtype=bool))
         assert own.imu is not None
         with naming_recording(others, best):
-            found, _ = path_on_motion(own.imu, camera.name, path, motion_alone(others, best, state), Held())
+            found, _ = extrinsics_on_trajectory(
+                own.imu, camera.name, path, state_of_recording(others, best, state), KnownExtrinsics()
+            )
         offset = found.offset - 1e-9 * (int(stamps[0]) - recordings[best].origin_ns)
         guess = mounted(found.rotation, found.position, np.array([offset]))
         return replace(

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.steps.target_poses import LARGEST_RMS_PX, MOST_CORNERS, TargetPoses
+from icalib.initialize.steps.target_poses import MAX_POSE_CORNERS, MAX_POSE_RMS_PX, TargetPoses
 from icalib.model.bodies import Bodies
 from icalib.optim.state import Key
 from icalib.sensors.camera.corner_factor import Views
@@ -197,7 +197,7 @@ class _Growth:
         square = reprojection_errors(used, self.state) ** 2
         square = np.add.reduceat(square, used.start[:-1]) / (2 * np.diff(used.start))
         b = len(self.placed)
-        fits, count = (np.bincount(used.body, x, b) for x in (square < LARGEST_RMS_PX**2, None))
+        fits, count = (np.bincount(used.body, x, b) for x in (square < MAX_POSE_RMS_PX**2, None))
         misfit = self.placed & (fits < LEAST_FITTING * count)
         if not misfit.any() or misfit.sum() > MOST_MISFITS * self.placed.sum():
             return
@@ -342,5 +342,5 @@ def _spread_corners(views: Views) -> np.ndarray:
     length = np.diff(views.start)
     place = np.arange(int(views.start[-1])) - np.repeat(views.start[:-1], length)
     length = np.repeat(length, length)
-    most = np.minimum(length, MOST_CORNERS)
+    most = np.minimum(length, MAX_POSE_CORNERS)
     return (place * most) // length != ((place - 1) * most) // length

@@ -17,7 +17,7 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
 from icalib.geometry.targets import Target
 from icalib.geometry.vectors import cross
-from icalib.initialize.steps.target_poses import FEWEST_CORNERS, Flat, TargetPoses, target_poses, usable_rays
+from icalib.initialize.steps.target_poses import MIN_POSE_CORNERS, FlatPoints, TargetPoses, target_poses, usable_rays
 from icalib.rig import Camera
 from icalib.sensors.camera.corner_factor import Views
 
@@ -70,21 +70,21 @@ def _given(camera: Camera, guesses: bool) -> np.ndarray:
     return given
 
 
-def _one_body_each(stream: CornerStream, target: Target) -> tuple[CornerStream, Flat]:
+def _one_body_each(stream: CornerStream, target: Target) -> tuple[CornerStream, FlatPoints]:
     """Each body in each image as an image of its own; of boards alone where there are any: a tag says little."""
     if len(target.bodies) == 1:
-        return stream, Flat(target.points)
+        return stream, FlatPoints(target.points)
     views = Views.of(stream, target.body)
     size = np.bincount(target.body)
-    boards = size[views.body] >= FEWEST_CORNERS
+    boards = size[views.body] >= MIN_POSE_CORNERS
     used = np.flatnonzero(boards if boards.any() else ~boards)
     rows = np.isin(views.of_corners(0, len(views.image)), used)
     alone = stream.of_rows(rows, stream.stamps_ns[views.image[used]], np.diff(views.start)[used])
-    return alone, Flat(target.points, FEWEST_CORNERS if boards.any() else int(size.min()))
+    return alone, FlatPoints(target.points, MIN_POSE_CORNERS if boards.any() else int(size.min()))
 
 
 def guess_intrinsics(
-    stream: CornerStream, target: Flat, model: CameraModel, resolution: tuple[int, int], given: np.ndarray
+    stream: CornerStream, target: FlatPoints, model: CameraModel, resolution: tuple[int, int], given: np.ndarray
 ) -> np.ndarray:
     """Model parameters (P,) that explain the corners. Raises EstimationError if none are found that do.
 
@@ -106,13 +106,13 @@ def guess_intrinsics(
     return params
 
 
-def _best_rms(stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: Flat) -> float:
+def _best_rms(stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: FlatPoints) -> float:
     """Of the parameters `found`, over the images [px]; infinity where there are none."""
     return min((_median_rms(stream, model, params, target) for params in found), default=np.inf)
 
 
 def _starts_by_another(
-    stream: CornerStream, model: CameraModel, resolution: tuple[int, int], given: np.ndarray, target: Flat
+    stream: CornerStream, model: CameraModel, resolution: tuple[int, int], given: np.ndarray, target: FlatPoints
 ) -> Iterator[np.ndarray]:
     """Parameters (1, P) that project as the lens found in the model `STARTS_ANYWHERE` does, where corners are.
 
@@ -141,7 +141,7 @@ def _candidates(
     bundle: CornerStream,
     model: CameraModel,
     kinds: Iterator[np.ndarray],
-    target: Flat,
+    target: FlatPoints,
     wanted: np.ndarray,
 ) -> list[np.ndarray]:
     """Parameters (P,) that a bundle adjustment of those `wanted` (P,) finds from each kind of lens, started at its best
@@ -159,7 +159,7 @@ def _candidates(
     return found
 
 
-def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, target: Flat) -> np.ndarray:
+def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, target: FlatPoints) -> np.ndarray:
     """The rows of `starts` (F, P) that explain the corners best; several, far apart, where they are about as good: a
     target that is always seen from straight ahead looks the same through every focal length."""
     medians = np.array([_median_rms(trial, model, start, target) for start in starts])
@@ -167,7 +167,9 @@ def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, ta
     return starts[np.unique(good[[0, len(good) // 2, -1]])] if len(good) > MOST_TIED else starts[[np.argmin(medians)]]
 
 
-def _fit(bundle: CornerStream, model: CameraModel, params: np.ndarray, target: Flat, wanted: np.ndarray) -> np.ndarray:
+def _fit(
+    bundle: CornerStream, model: CameraModel, params: np.ndarray, target: FlatPoints, wanted: np.ndarray
+) -> np.ndarray:
     """The `wanted` (P,) of `params`: focal length and the strongest distortion first, the rest once these are near."""
     for stage in (FIRST, np.arange(len(params))):
         if wanted[stage].any():
@@ -176,7 +178,7 @@ def _fit(bundle: CornerStream, model: CameraModel, params: np.ndarray, target: F
 
 
 def _roughly_fitted(
-    trial: CornerStream, model: CameraModel, starts: np.ndarray, target: Flat, wanted: np.ndarray
+    trial: CornerStream, model: CameraModel, starts: np.ndarray, target: FlatPoints, wanted: np.ndarray
 ) -> np.ndarray:
     """(P,) the best of `starts` after focal length and the strongest distortion were fitted, where `wanted` (P,)."""
     if len(starts) == 1 or not wanted[FIRST].any():
@@ -188,19 +190,21 @@ def _roughly_fitted(
     return min(fitted, key=lambda pair: pair[1])[0] if fitted else starts[0]
 
 
-def _near_the_best(stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: Flat) -> list[np.ndarray]:
+def _near_the_best(
+    stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: FlatPoints
+) -> list[np.ndarray]:
     """Those of `found` whose error is near the least. To judge all of them on many images takes seconds."""
     rms = [_median_rms(stream, model, params, target) for params in found]
     return [params for params, error in zip(found, rms, strict=True) if error <= NEAR * min(rms)]
 
 
-def _median_rms(stream: CornerStream, model: CameraModel, params: np.ndarray, target: Flat) -> float:
+def _median_rms(stream: CornerStream, model: CameraModel, params: np.ndarray, target: FlatPoints) -> float:
     """Over the images [px]."""
     return float(np.median(target_poses(stream, model, params, target).rms_px))
 
 
 def _cheapest(
-    stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: Flat, free: np.ndarray
+    stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: FlatPoints, free: np.ndarray
 ) -> np.ndarray:
     """The candidate that costs least: a model of two shape parameters can settle in the wrong valley.
 
@@ -255,7 +259,7 @@ def _bundle(
     stream: CornerStream,
     model: CameraModel,
     params: np.ndarray,
-    target: Flat,
+    target: FlatPoints,
     free: np.ndarray,
     used: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
@@ -298,7 +302,7 @@ class _Seen(NamedTuple):
     start: np.ndarray
 
     @classmethod
-    def of(cls, stream: CornerStream, target: Flat, own: np.ndarray) -> _Seen:
+    def of(cls, stream: CornerStream, target: FlatPoints, own: np.ndarray) -> _Seen:
         """Those of the images `own` (m,)."""
         rows = np.flatnonzero(np.isin(stream.image, own))
         count = np.diff(stream.start)[own]

@@ -20,9 +20,9 @@ from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Target
-from icalib.initialize.steps.clocks import camera_rates
-from icalib.initialize.steps.gyro import GyroRotation
-from icalib.initialize.steps.target_poses import Flat, TargetPoses, target_poses
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.steps.rate_alignment import camera_rates
+from icalib.initialize.steps.target_poses import FlatPoints, TargetPoses, target_poses
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import taken_at_once
@@ -120,7 +120,9 @@ def _views_of(camera: Camera, stream: CornerStream, part: Part, params: np.ndarr
     count = np.bincount(stream.image[rows], minlength=len(stream.stamps_ns))
     images = stream.of_rows(rows, stream.stamps_ns[count > 0], count[count > 0])
     images = replace(images, point=images.point - first)
-    return _Views(camera, rows, images, target_poses(images, camera_model(camera.model), params, Flat(target.points)))
+    return _Views(
+        camera, rows, images, target_poses(images, camera_model(camera.model), params, FlatPoints(target.points))
+    )
 
 
 def _chosen_turns(rig: Rig, measured: Measurements, views: list[_Views], turns: _Turns) -> list[np.ndarray]:

@@ -14,17 +14,17 @@ from icalib.base.compiled import njit
 from icalib.data.measurements import CornerStream
 from icalib.geometry.cameras.base import CameraModel
 from icalib.initialize.steps.target_poses import (
-    FEWEST_CORNERS,
-    LARGEST_RMS_PX,
-    MOST_CORNERS,
-    ROUNDS,
-    Flat,
+    MAX_POSE_CORNERS,
+    MAX_POSE_RMS_PX,
+    MIN_POSE_CORNERS,
+    POSE_ITERATIONS,
+    FlatPoints,
     TargetPoses,
     camera_in_target,
-    check_side,
-    chosen_corners,
+    check_front_side,
     flat_poses,
-    refine,
+    refine_pose,
+    select_corners,
     target_poses,
     usable_rays,
 )
@@ -61,7 +61,7 @@ class TargetScene:
 def view_poses(stream: CornerStream, views: Views, bodies: Bodies, model: CameraModel, params: np.ndarray):
     """Both poses (V, 2, ...) of the camera in the frame of each view's body."""
     size = np.bincount(bodies.target.body)
-    fewest = np.minimum(size, FEWEST_CORNERS)[views.body]
+    fewest = np.minimum(size, MIN_POSE_CORNERS)[views.body]
     return flat_poses(stream, views.start, fewest, model, params, bodies.target.points, MIRRORS)
 
 
@@ -69,8 +69,8 @@ def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, sc
     """Poses of the camera in the scene, image by image, from all its bodies together. Raises EstimationError where
     images are mirrored."""
     if not scene.bodies.several:
-        poses = target_poses(stream, model, params, Flat(scene.bodies.target.points))
-        check_side(stream.name, poses)
+        poses = target_poses(stream, model, params, FlatPoints(scene.bodies.target.points))
+        check_front_side(stream.name, poses)
         return poses
     return multi_body_poses(stream, model, params, scene)
 
@@ -102,7 +102,7 @@ def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarra
         position,
         rms,
     )
-    return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)
+    return TargetPoses(rotation, position, rms < MAX_POSE_RMS_PX, rms)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -110,11 +110,11 @@ def _best_poses(
     start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms
 ):
     """Of each image: the pose that one of its views suggests and all its corners like best, refined on all of them."""
-    points, seen = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
+    points, seen = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     R, t, trial_R, trial_t = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     R_sc, p_sc = np.empty((3, 3)), np.empty(3)
     for i in range(len(start) - 1):
-        count = chosen_corners(start[i], start[i + 1], point, rays, density, good, scene_points, points, seen)
+        count = select_corners(start[i], start[i + 1], point, rays, density, good, scene_points, points, seen)
         best = 1e9
         for v in range(first[i], first[i + 1]):
             for side in range(R_bc.shape[1]):
@@ -129,12 +129,12 @@ def _best_poses(
                         for c in range(3):
                             R_sc[a, b] += R_sb[k, a, c] * R_bc[v, side, c, b]
                 camera_in_target(R_sc, p_sc, trial_R, trial_t)
-                error = refine(points[:count], seen[:count], trial_R.copy(), trial_t.copy(), 1)
+                error = refine_pose(points[:count], seen[:count], trial_R.copy(), trial_t.copy(), 1)
                 if error < best:
                     best = error
                     R[:], t[:] = trial_R, trial_t
         if best < 1e9:
-            rms[i] = refine(points[:count], seen[:count], R, t, ROUNDS)
+            rms[i] = refine_pose(points[:count], seen[:count], R, t, POSE_ITERATIONS)
             if rms[i] < 1e9:
                 camera_in_target(R, t, rotation[i], position[i])
             else:

@@ -20,7 +20,7 @@ from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.steps.track_rotation import pairs_sharing
+from icalib.initialize.steps.epipolar_rotation import pairs_with_shared_points
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
 from icalib.motion.sweep import Motion
@@ -84,7 +84,7 @@ class ImagePairs:
         """`directions` (L, P): in which the lens is open. Raises EstimationError where hardly any images share enough
         points."""
         rays, valid = model.unproject(lens, stream.uv)
-        pairs = list(pairs_sharing(stream, valid, STEPS_S, MOST_PAIRS))
+        pairs = list(pairs_with_shared_points(stream, valid, STEPS_S, MOST_PAIRS))
         if len(pairs) < FEWEST_PAIRS:
             raise EstimationError(
                 f"{stream.name}: only {len(pairs)} pairs of images {STEPS_S[0]} s or more apart share enough "

@@ -11,14 +11,14 @@ import numpy as np
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.clocks import Alignment
-from icalib.initialize.steps.contradicted import chosen
-from icalib.initialize.steps.gyro import GyroRotation
-from icalib.initialize.steps.rate_shifts import telling_rates
+from icalib.initialize.steps.contradicted_guesses import merged_value
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.steps.rate_alignment import RateAlignment
+from icalib.initialize.steps.rate_regression import matching_track_rates
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, trusted
+from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, known_value
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 from icalib.sensors.camera.initialize.tracks.joint_alignment import align_jointly, shared_rays
 from icalib.sensors.camera.initialize.tracks.linear_motion import Rays, WindowMotion, solve_linear_motion
@@ -35,7 +35,7 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     assert imu is not None  # tracks without an IMU are refused before
     params = [start_intrinsics(c, t, imu, measurements) for c, t in zip(rig.cameras, measurements.tracks, strict=True)]
     rates = [
-        telling_rates(imu, t, camera_model(c.model), p)
+        matching_track_rates(imu, t, camera_model(c.model), p)
         for c, t, p in zip(rig.cameras, measurements.tracks, params, strict=True)
     ]
     aligned = [
@@ -45,7 +45,7 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     aligned = _aligned_together(rig, measurements, imu, params, aligned)
     gyro = GyroRotation.integrate(imu, aligned[0].gyro_bias)
     rays = _rays(rig, measurements, imu, params, [a.offset for a in aligned])
-    arms = [trusted(c.translation) for c in rig.cameras]
+    arms = [known_value(c.translation) for c in rig.cameras]
     _check_units(imu, rig.gravity)
     motion = solve_linear_motion(gyro, rays, [a.rotation for a in aligned], arms, rig.gravity)
     cameras = {}
@@ -53,19 +53,19 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
         raw = camera.time_offset.value
         given = None if raw is None else relative_offset(raw, stream, measurements)
         offset = chosen_offset(camera, rates[k], imu, given, found)
-        R = chosen(ROTATION, camera.rotation, camera.rotation.value, found.rotation)
+        R = merged_value(ROTATION, camera.rotation, camera.rotation.value, found.rotation)
         p = motion.arms[k] if camera.translation.value is None else camera.translation.value
         cameras[camera.name] = CameraGuess(params[k], offset, R, p, _poses(motion, stream.seconds + offset, R, p))
     return Guess(cameras, gyro_bias=aligned[0].gyro_bias, accel_bias=motion.accel_bias, R_world_board=np.eye(3))
 
 
 def _aligned_together(
-    rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], aligned: list[Alignment]
-) -> list[Alignment]:
+    rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], aligned: list[RateAlignment]
+) -> list[RateAlignment]:
     pairs = []
     for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
         pairs += shared_rays(k, stream, camera_model(camera.model), params[k])
-    held = [(trusted(c.rotation) is not None, trusted(c.time_offset) is not None) for c in rig.cameras]
+    held = [(known_value(c.rotation) is not None, known_value(c.time_offset) is not None) for c in rig.cameras]
     return align_jointly(GyroRotation.integrate(imu, aligned[0].gyro_bias), pairs, aligned, held)
 
 
@@ -86,7 +86,7 @@ def start_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, measurem
     Raises EstimationError as `find_intrinsics` does.
     """
     if camera.intrinsics.value is None:
-        fixed = trusted(camera.time_offset)
+        fixed = known_value(camera.time_offset)
         offset = None if fixed is None else relative_offset(fixed, stream, measurements)
         return find_intrinsics(camera, stream, imu, offset)
     distortion = camera.distortion.value

@@ -15,9 +15,9 @@ import numpy as np
 from icalib.data.measurements import TrackStream
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.steps.clocks import LEAST_SECOND_AXIS, Alignment, only_axis
-from icalib.initialize.steps.gyro import GyroRotation
-from icalib.initialize.steps.track_rotation import pairs_sharing, turns_information
+from icalib.initialize.steps.epipolar_rotation import pairs_with_shared_points, rotation_information_of_pairs
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.steps.rate_alignment import MIN_SECOND_AXIS_RATIO, RateAlignment, only_axis
 from icalib.optim.calib_block import complement
 
 STEPS_S = (0.5, 1.0)
@@ -41,13 +41,13 @@ def shared_rays(camera: int, stream: TrackStream, model: CameraModel, params: np
     t = stream.seconds
     return [
         SharedRays(camera, float(t[i]), float(t[j]), rays[p], rays[q])
-        for i, j, p, q in pairs_sharing(stream, valid, STEPS_S, MOST_PAIRS)
+        for i, j, p, q in pairs_with_shared_points(stream, valid, STEPS_S, MOST_PAIRS)
     ]
 
 
 def align_jointly(
-    gyro: GyroRotation, pairs: list[SharedRays], start: list[Alignment], fixed: list[tuple[bool, bool]]
-) -> list[Alignment]:
+    gyro: GyroRotation, pairs: list[SharedRays], start: list[RateAlignment], fixed: list[tuple[bool, bool]]
+) -> list[RateAlignment]:
     """The alignments improved, the bias that of `gyro` and more, the same for all; fixed: whether the rotation and the
     time offset of each camera are known."""
     imu, n, bias = gyro.imu, 4 * len(start), np.mean([a.gyro_bias for a in start], axis=0)
@@ -69,9 +69,9 @@ def align_jointly(
     return [replace(a, gyro_bias=bias) for a in start]
 
 
-def _open(start: list[Alignment], turns: np.ndarray) -> np.ndarray:
+def _open(start: list[RateAlignment], turns: np.ndarray) -> np.ndarray:
     """(4 C + 3, C or 0) what turns (m, 3) of the gyroscope about one axis leave open: each camera's turn about it."""
-    axis = only_axis(turns, LEAST_SECOND_AXIS)
+    axis = only_axis(turns, MIN_SECOND_AXIS_RATIO)
     if axis is None:
         return np.zeros((4 * len(start) + 3, 0))
     out = np.zeros((4 * len(start) + 3, len(start)))
@@ -89,7 +89,7 @@ def _solve(N: np.ndarray, r: np.ndarray, held: np.ndarray, still: np.ndarray) ->
 
 
 def _normal(
-    pairs: list[SharedRays], start: list[Alignment], D: np.ndarray, swept: np.ndarray, turned: np.ndarray
+    pairs: list[SharedRays], start: list[RateAlignment], D: np.ndarray, swept: np.ndarray, turned: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal matrix and right-hand side of all alignments and the bias; see `gyro_turns`."""
     n, m, camera = 4 * len(start), len(pairs), np.array([p.camera for p in pairs], dtype=np.int64)
@@ -99,7 +99,7 @@ def _normal(
     begin, empty = np.cumsum([0] + [len(p.f) for p in pairs]), [np.zeros((0, 3))]
     f, h = (np.concatenate([getattr(p, side) for p in pairs] or empty) for side in ("f", "h"))
     stiff = np.zeros((len(f), 0, 3))
-    turns_information(f, h, stiff, stiff, begin, R, H, g, np.empty(m))
+    rotation_information_of_pairs(f, h, stiff, stiff, begin, R, H, g, np.empty(m))
     for c in range(len(start)):
         own = camera == c
         J[own, :, 4 * c : 4 * c + 3] = R[own] - np.eye(3)

@@ -18,7 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.gyro_rotation import GyroRotation
 
 WINDOW_S = 4.0
 ROUNDS = 5

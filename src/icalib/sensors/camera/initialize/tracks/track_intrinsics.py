@@ -25,12 +25,12 @@ from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
-from icalib.initialize.steps.clock_shifts import CameraRates
-from icalib.initialize.steps.clocks import Alignment, covered, kabsch, no_overlap
-from icalib.initialize.steps.gyro import GyroRotation
-from icalib.initialize.steps.mean_rates import MeanRates
-from icalib.initialize.steps.rate_shifts import best_regressions, telling_rates
-from icalib.initialize.steps.track_rotation import track_rates, turns_information
+from icalib.initialize.steps.epipolar_rotation import rotation_information_of_pairs, track_rates
+from icalib.initialize.steps.gyro_rates import MeanRates
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.steps.rate_alignment import RateAlignment, covered, kabsch, no_overlap
+from icalib.initialize.steps.rate_correlation import SensorRates
+from icalib.initialize.steps.rate_regression import best_regressions, matching_track_rates
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
 from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import ImagePairs, lens_slopes
@@ -63,7 +63,7 @@ class _Fit:
     and the cost."""
 
     lens: np.ndarray
-    aligned: Alignment
+    aligned: RateAlignment
     sigma: float = np.inf
     cost: float = np.inf
 
@@ -99,7 +99,7 @@ def _rough(
     stream: TrackStream, imu: ImuData, model: CameraModel, starts: list[np.ndarray], offset: float | None
 ) -> _Fit:
     """The focal length by the regression of rates. Raises EstimationError where they do not match."""
-    rates, best = [telling_rates(imu, stream, model, starts[0])], 0
+    rates, best = [matching_track_rates(imu, stream, model, starts[0])], 0
     step = float(np.median(rates[0].end - rates[0].start))
     rates += [track_rates(stream, model, lens, step, thinned=True) for lens in starts[1:]]
     if offset is None:
@@ -125,7 +125,7 @@ def _rough(
     return _Fit(lens, aligned)
 
 
-def _scaled(imu: ImuData, rates: CameraRates, offset: float, name: str) -> tuple[Alignment, float, float]:
+def _scaled(imu: ImuData, rates: SensorRates, offset: float, name: str) -> tuple[RateAlignment, float, float]:
     """How camera and IMU go together, how many times as fast the camera turns about the axes of its image plane as it
     says, and what share of the rate is unexplained then."""
     inside = covered(imu, rates, offset)
@@ -135,7 +135,7 @@ def _scaled(imu: ImuData, rates: CameraRates, offset: float, name: str) -> tuple
     found = [(*_turned(gyro, rates.rate[inside] * [scale, scale, 1.0]), float(scale)) for scale in SCALES]
     left, R, bias, scale = min(found, key=lambda x: x[0])
     spread = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1)))
-    return Alignment(offset, R, bias), scale, left / max(spread, 1e-9)
+    return RateAlignment(offset, R, bias), scale, left / max(spread, 1e-9)
 
 
 def _turned(gyro: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -179,7 +179,7 @@ def _directions(lens: np.ndarray, bends: int) -> np.ndarray:
 
 
 def _normal(
-    followed: ImagePairs, imu: ImuData, bent: np.ndarray, aligned: Alignment
+    followed: ImagePairs, imu: ImuData, bent: np.ndarray, aligned: RateAlignment
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Normal matrix and right-hand side of rotation, time offset, bias of the gyroscope, and the lens (7 + L,); and
     minus the logarithm of the likelihood, where the noise of each pair of images is not known."""
@@ -195,7 +195,7 @@ def _normal(
     m, n, R_ci = len(own), len(bent), aligned.rotation.T
     R = np.ascontiguousarray(R_ci @ D @ aligned.rotation)
     H, g, left = np.empty((m, 3 + n, 3 + n)), np.empty((m, 3 + n)), np.empty(m)
-    turns_information(rays[p], rays[q], by[p], by[q], seen.begin, R, H, g, left)
+    rotation_information_of_pairs(rays[p], rays[q], by[p], by[q], seen.begin, R, H, g, left)
     J = np.zeros((m, 3 + n, 7 + n))
     J[:, :3, :3], J[:, :3, 3], J[:, :3, 4:7] = R - np.eye(3), swept @ aligned.rotation, R_ci @ turned
     J[:, 3:, 7:] = np.eye(n)

@@ -7,22 +7,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.initialize.steps.correlation import Shift, best_shifts
-from icalib.initialize.steps.slow_rates import slow_offsets
+from icalib.initialize.steps.cross_correlation import CorrelationPeak, best_shifts
+from icalib.initialize.steps.turned_angles import offsets_by_angle
 from icalib.motion.imu_data import ImuData
 
-GRID_HZ = 100.0
-LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate, unless all are:
-USUAL_STEPS, SLOWEST_STEP_S = 1.5, 2.0  # then this many usual steps are near, up to 2 s; further apart motion is lost
-SHORTEST_OVERLAP_S = 4.0
-LEAST_CORRELATION = 0.7
-MOST_PEAKS, PEAKS_APART_S = 5, 0.25  # of the correlation, that are tried
-AVERAGED_S = 0.25  # over which the two are compared
-MOST_LEFT = 0.5  # of the spread of angles turned in long intervals
+CORRELATION_GRID_HZ = 100.0
+MAX_RATE_STEP_S = 0.25  # images further apart do not give an angular rate, unless all are:
+MAX_USUAL_STEPS, MAX_SLOW_STEP_S = (
+    1.5,
+    2.0,
+)  # then this many usual steps are near, up to 2 s; further apart motion is lost
+MIN_RATE_OVERLAP_S = 4.0
+MIN_RATE_CORRELATION = 0.7
+MAX_OFFSET_PEAKS, MIN_PEAK_DISTANCE_S = 5, 0.25  # of the correlation, that are tried
+RATE_MEAN_S = 0.25  # over which the two are compared
+MAX_ANGLE_MISFIT = 0.5  # of the spread of angles turned in long intervals
 
 
 @dataclass(frozen=True)
-class CameraRates:
+class SensorRates:
     """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
     [rad/s]; least_correlation: with the IMU's, below which the two do not match; longest_step_s: between neighbours.
     noise: standard deviation [rad/s] about each axis, where it is known; offsets [s]: at which they go with the IMU's
@@ -31,18 +34,18 @@ class CameraRates:
     start: np.ndarray
     end: np.ndarray
     rate: np.ndarray
-    least_correlation: float = LEAST_CORRELATION
-    longest_step_s: float = LONGEST_STEP_S
+    least_correlation: float = MIN_RATE_CORRELATION
+    longest_step_s: float = MAX_RATE_STEP_S
     noise: float = 0.0
     offsets: tuple[float, ...] | None = None
 
     @property
     def are_slow(self) -> bool:
         """Whether their intervals are so long that the rate changes much in them."""
-        return self.longest_step_s > LONGEST_STEP_S
+        return self.longest_step_s > MAX_RATE_STEP_S
 
 
-def longest_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = SLOWEST_STEP_S) -> float:
+def max_rate_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = MAX_SLOW_STEP_S) -> float:
     """How far apart neighbours among instants (n,) [s] may be to give an angular rate: a slow stream is no row of gaps.
     what: the word for its readings. Raises EstimationError where its usual step is longer than slowest_s."""
     usual = float(np.median(np.diff(seconds)))
@@ -51,101 +54,109 @@ def longest_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = S
             f"{name}: the rate of {1.0 / usual:.2g} {what} per second is too low to follow its motion, at "
             f"least {1.0 / slowest_s:g} are needed; record at a higher rate."
         )
-    return min(max(LONGEST_STEP_S, USUAL_STEPS * usual), slowest_s)
+    return min(max(MAX_RATE_STEP_S, MAX_USUAL_STEPS * usual), slowest_s)
 
 
-def likely_offsets(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
+def likely_offsets(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
     """Offsets [s] at peaks of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are or
     of their means, whichever is higher at its best: fast motion shows in the ones, slow motion in the others. Where
     they were sought by regression, these."""
     if rates.are_slow:
-        return _slow(imu, name, rates)
+        return _offsets_of_slow_rates(imu, name, rates)
     if rates.offsets:
         return list(rates.offsets)
-    peaks = max(_shifts(imu, rates), key=lambda p: _likeness(p[0]))
+    peaks = max(_correlation_peaks(imu, rates), key=lambda p: _correlation_or_least(p[0]))
     if not peaks[0].correlation > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any time offset "
-            f"({how_alike(peaks[0].largest)}); check that both come from the same recording, overlap in time, "
-            "and are in rad/s."
+            f"({correlation_in_words(peaks[0].largest)}); check that both come from the same recording, overlap in "
+            "time, and are in rad/s."
         )
-    return [p.samples / GRID_HZ for p in peaks if p.correlation > rates.least_correlation]
+    return [p.samples / CORRELATION_GRID_HZ for p in peaks if p.correlation > rates.least_correlation]
 
 
-def _slow(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
+def _offsets_of_slow_rates(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
     """The same of slow rates, by how far was turned in each interval."""
-    found = slow_offsets(imu, rates.start, rates.end, rates.rate)
-    alike = [offset for offset, left in found if left < MOST_LEFT]
+    found = offsets_by_angle(imu, rates.start, rates.end, rates.rate)
+    alike = [offset for offset, left in found if left < MAX_ANGLE_MISFIT]
     if not alike:
         in_radians = replace(imu, gyro=np.deg2rad(imu.gyro))
-        if any(left < MOST_LEFT for _, left in slow_offsets(in_radians, rates.start, rates.end, rates.rate)):
+        if any(left < MAX_ANGLE_MISFIT for _, left in offsets_by_angle(in_radians, rates.start, rates.end, rates.rate)):
             raise EstimationError(
                 f"the angular rate of {imu.name} matches {name} if it is in deg/s; set gyro_unit: deg/s of "
                 f"{imu.name} in the rig file."
             )
         left = f"at best {found[0][1]:.0%} of the rotation is unexplained" if found else "they do not overlap in time"
         raise EstimationError(
-            f"the rotation of {name}, {USUAL_STEPS / rates.longest_step_s:.2g} poses per second, does not "
+            f"the rotation of {name}, {MAX_USUAL_STEPS / rates.longest_step_s:.2g} poses per second, does not "
             f"match that of {imu.name} at any time offset ({left}). Check that both come from the same "
             "recording, overlap in time, and are in rad/s, or record at a higher rate."
         )
     return alike
 
 
-def how_alike(largest: float) -> str:
+def correlation_in_words(largest: float) -> str:
     """The largest correlation at any shift, in words."""
     if not np.isfinite(largest):
-        return f"they never overlap for {SHORTEST_OVERLAP_S:g} s without a gap"
+        return f"they never overlap for {MIN_RATE_OVERLAP_S:g} s without a gap"
     return f"best correlation {max(largest, 0.0):.2f}"
 
 
-def best_offsets(imu: ImuData, rates: CameraRates) -> list[float]:
+def best_offsets(imu: ImuData, rates: SensorRates) -> list[float]:
     """Offsets [s] at which rates, and means of them, go together best, however little that is."""
     if rates.offsets:
         return list(rates.offsets)
     if rates.are_slow:
-        return [offset for offset, _ in slow_offsets(imu, rates.start, rates.end, rates.rate)]
-    return [p[0].samples / GRID_HZ for p in _shifts(imu, rates) if np.isfinite(p[0].correlation)]
+        return [offset for offset, _ in offsets_by_angle(imu, rates.start, rates.end, rates.rate)]
+    return [p[0].samples / CORRELATION_GRID_HZ for p in _correlation_peaks(imu, rates) if np.isfinite(p[0].correlation)]
 
 
-def _shifts(imu: ImuData, rates: CameraRates) -> list[list[Shift]]:
-    return [_peaks(imu, rates, count) for count in (1, round(AVERAGED_S * GRID_HZ))]
+def _correlation_peaks(imu: ImuData, rates: SensorRates) -> list[list[CorrelationPeak]]:
+    return [_peaks_of_means(imu, rates, count) for count in (1, round(RATE_MEAN_S * CORRELATION_GRID_HZ))]
 
 
-def _peaks(imu: ImuData, rates: CameraRates, count: int) -> list[Shift]:
+def _peaks_of_means(imu: ImuData, rates: SensorRates, count: int) -> list[CorrelationPeak]:
     """Peaks of the correlation of camera rates with gyroscope rates, both averaged over `count` grid points.
 
     The gyroscope's median is subtracted or not, whichever correlates better: it holds the bias, and any steady turn."""
     known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < rates.longest_step_s
-    seen = _grid(middle, rates.rate, near, count)
-    own = (_grid(imu.seconds, imu.gyro - about, known, count) for about in (0.0, np.median(imu.gyro, axis=0)))
-    least, apart = SHORTEST_OVERLAP_S * GRID_HZ, round(PEAKS_APART_S * GRID_HZ)
-    return max((best_shifts(*a, *seen, least, MOST_PEAKS, apart) for a in own), key=lambda p: _likeness(p[0]))
+    seen = _rate_size_on_grid(middle, rates.rate, near, count)
+    own = (
+        _rate_size_on_grid(imu.seconds, imu.gyro - about, known, count) for about in (0.0, np.median(imu.gyro, axis=0))
+    )
+    least, apart = MIN_RATE_OVERLAP_S * CORRELATION_GRID_HZ, round(MIN_PEAK_DISTANCE_S * CORRELATION_GRID_HZ)
+    return max(
+        (best_shifts(*a, *seen, least, MAX_OFFSET_PEAKS, apart) for a in own), key=lambda p: _correlation_or_least(p[0])
+    )
 
 
-def _grid(t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _rate_size_on_grid(
+    t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Size of rates (n, 3) on a regular grid from 0 to the last of `t`, each a mean over `count` points of the grid,
     and a mask of where all of these are known."""
-    grid = np.arange(int(t[-1] * GRID_HZ) + 1) / GRID_HZ
+    grid = np.arange(int(t[-1] * CORRELATION_GRID_HZ) + 1) / CORRELATION_GRID_HZ
     count = min(count, len(grid))
     known = np.interp(grid, t, covered.astype(float)) > 0.99
-    fine = at(t, rate, grid)
-    return np.linalg.norm(means(fine, count), axis=1), means(np.tile(known[:, None], 3), count)[:, 0] > 0.99
+    fine = interpolated(t, rate, grid)
+    return np.linalg.norm(moving_means(fine, count), axis=1), moving_means(np.tile(known[:, None], 3), count)[
+        :, 0
+    ] > 0.99
 
 
-def _likeness(shift: Shift) -> float:
+def _correlation_or_least(shift: CorrelationPeak) -> float:
     """Its correlation, where there is one."""
     return shift.correlation if np.isfinite(shift.correlation) else -1.0
 
 
-def means(values: np.ndarray, count: int) -> np.ndarray:
+def moving_means(values: np.ndarray, count: int) -> np.ndarray:
     """(n - count + 1, 3) means over `count` neighbours of (n, 3)."""
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])
     return (total[count:] - total[:-count]) / count
 
 
-def at(known: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+def interpolated(known: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """(n, 3) of values (N, 3) that are `known` (N,) s at some times, at others."""
     return np.stack([np.interp(seconds, known, values[:, k]) for k in range(3)], axis=1)

@@ -10,7 +10,7 @@ from icalib.optim.state import Key
 
 
 @dataclass(frozen=True)
-class SensorPath:
+class SensorTrajectory:
     """Poses of a sensor in a frame of its own, the map: seconds (n,) on its clock since its first stamp, R_map_sensor
     (n, 3, 3), p_map_sensor (n, 3) m; ok (n,): whether the pose is known."""
 
@@ -19,9 +19,9 @@ class SensorPath:
     position: np.ndarray
     ok: np.ndarray
 
-    def only(self, chosen: np.ndarray) -> SensorPath:
+    def only(self, chosen: np.ndarray) -> SensorTrajectory:
         """The poses that are `chosen` (n,)."""
-        return SensorPath(self.seconds[chosen], self.rotation[chosen], self.position[chosen], self.ok[chosen])
+        return SensorTrajectory(self.seconds[chosen], self.rotation[chosen], self.position[chosen], self.ok[chosen])
 
 
 @dataclass(frozen=True)

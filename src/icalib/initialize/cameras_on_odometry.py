@@ -12,15 +12,15 @@ import numpy as np
 
 from icalib.data.measurements import Measurements, PoseStream
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.steps.contradicted import settled
+from icalib.initialize.steps.contradicted_guesses import merged_values
 from icalib.initialize.steps.initializer import Values
-from icalib.initialize.steps.known_values import given
-from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.initialize.steps.rig_file_values import stated_values
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.rig import Parameter, PoseSensor, Rig
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 
-def in_place_of(rig: Rig, sensor: str) -> Rig:
+def with_pose_sensor(rig: Rig, sensor: str) -> Rig:
     """The cameras of `rig` and a pose sensor in place of `sensor`; the extrinsics of the cameras are unknown."""
     free = dict.fromkeys(MOUNTED_NAMES, Parameter())
     cameras = tuple(replace(c, clock_restarts=False, **free) for c in rig.cameras)
@@ -33,7 +33,7 @@ def pose_streams(recordings: Sequence[Measurements], sensor: str, paths: Sequenc
     return [PoseStream(sensor, t, p.rotation, p.position) for t, p in zip(stamps, paths, strict=True)]
 
 
-def camera_paths(
+def camera_poses(
     rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses], values: Values
 ) -> list[BodyPoses]:
     """Poses of the first camera, on its own clock, from `paths` of `sensor`; values: extrinsics of cameras on these."""
@@ -46,7 +46,7 @@ def camera_paths(
     ]
 
 
-def seen_from_first(rig: Rig, sensor: str, values: Values) -> Values:
+def relative_to_first_camera(rig: Rig, sensor: str, values: Values) -> Values:
     """Extrinsics of cameras and `sensor` relative to the first camera, from `values` relative to `sensor`; lenses; and
     the other parameters of `sensor` as the rig file gives them."""
     first, *others = rig.cameras
@@ -64,16 +64,16 @@ def seen_from_first(rig: Rig, sensor: str, values: Values) -> Values:
     return out
 
 
-def as_given(inputs: Inputs, sensor: str, found: Values) -> Values:
+def with_stated_values(inputs: Inputs, sensor: str, found: Values) -> Values:
     """`found`, but what the rig file gives of cameras and `sensor` unless that contradicts it. The height of `sensor`
     is as given: on a floor nothing shows it."""
     out, rig = dict(found), inputs.rig
     for other in (*rig.cameras[1:], rig.sensors[sensor]):
         names = MOUNTED_NAMES if other.name != sensor else [spec.name for spec in other.specs()]
-        known, own = given(inputs, other, names), {k: v for k, v in found.items() if k[0] == other.name}
+        known, own = stated_values(inputs, other, names), {k: v for k, v in found.items() if k[0] == other.name}
         arm = sensor, "translation"
         if arm in known and arm in own:
             up = own[sensor, "rotation"][:, 2]
             own[arm] = own[arm] + up * (up @ (known[arm] - own[arm]))
-        out |= settled(other, known, own)
+        out |= merged_values(other, known, own)
     return out

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.initialize.steps.clock_shifts import at
+from icalib.initialize.steps.rate_correlation import interpolated
 from icalib.motion.imu_data import ImuData
 
 
@@ -27,9 +27,9 @@ class MeanRates:
     def over(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """(n, 3) rad/s."""
         t = self.imu.seconds
-        return (at(t, self.angle, end) - at(t, self.angle, start)) / (end - start)[:, None]
+        return (interpolated(t, self.angle, end) - interpolated(t, self.angle, start)) / (end - start)[:, None]
 
     def slope(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """(n, 3) rad/s^2: how they change where both ends are later."""
         t, gyro = self.imu.seconds, self.imu.gyro
-        return (at(t, gyro, end) - at(t, gyro, start)) / (end - start)[:, None]
+        return (interpolated(t, gyro, end) - interpolated(t, gyro, start)) / (end - start)[:, None]

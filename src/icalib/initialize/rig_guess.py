@@ -10,15 +10,15 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, resample, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
-from icalib.initialize.assumed_motion import start_without_imu
+from icalib.initialize.assumed_motion import guess_with_assumed_motion
 from icalib.initialize.steps.initializer import (
     Initializer,
     Values,
     initializer_of,
-    inputs_of,
+    inputs_of_sensors,
     kinds_of,
     motion_kinds,
-    placed,
+    place_sensors,
 )
 from icalib.optim.state import State
 from icalib.rig import Rig
@@ -26,10 +26,10 @@ from icalib.sensors.camera.connected_bodies import without_bodies
 from icalib.sensors.camera.initialize.boards.incremental_scene import UnconnectedBodiesError
 from icalib.sensors.camera.initialize.boards.symmetry import resolve_symmetry
 
-Start = tuple[Inputs, State, Values]
+InitialGuess = tuple[Inputs, State, Values]
 
 
-def start(
+def guess_of_rig(
     rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None] = lambda stage: None
 ) -> tuple[Inputs, State, Values]:
     """What the estimate is made from, where it starts, and the guess at which stays what the data do not determine.
@@ -41,29 +41,29 @@ def start(
     recordings = resolve_symmetry(rig, recordings)
     while True:
         try:
-            return _start(rig, recordings, lap)
+            return _guess(rig, recordings, lap)
         except UnconnectedBodiesError as untied:
             recordings = [without_bodies(rig.target, untied.names, m) for m in recordings]
 
 
-def _start(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None]) -> Start:
+def _guess(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None]) -> InitialGuess:
     if rig.imu is None and not rig.cameras_alone:
-        found = start_without_imu(rig, recordings)
+        found = guess_with_assumed_motion(rig, recordings)
         lap("first guess")
         return found
     for kind in kinds_of(rig):
         recordings = [kind.cleaned(m) for m in recordings]
     whole = inputs_for(rig, recordings)
-    source, own, state = _motion(whole, recordings, motion_kinds(rig))
+    source, own, state = _trajectory(whole, recordings, motion_kinds(rig))
     lap("first guess")
     if own is whole and not source.refined_alone:
         return whole, state, state.values
-    found = _with_others(whole, source, *source.refined(own, state))
+    found = _place_others(whole, source, *source.refined(own, state))
     lap("other sensors")
     return found
 
 
-def _motion(
+def _trajectory(
     whole: Inputs, recordings: Sequence[Measurements], kinds: Sequence[Initializer[Any]]
 ) -> tuple[Initializer[Any], Inputs, State]:
     """The first of `kinds` whose sensors show the motion, their own inputs, and the motion. Cameras that see a target
@@ -71,30 +71,30 @@ def _motion(
     if not kinds:
         raise EstimationError("no sensor of the rig shows its motion; add a camera, a LiDAR or a pose sensor.")
     kind, *others = kinds
-    own = inputs_of(whole, recordings, kind.sources(whole.rig))
+    own = inputs_of_sensors(whole, recordings, kind.sources(whole.rig))
 
     def other() -> tuple[Inputs, State]:
-        return _motion(whole, recordings, others)[1:]
+        return _trajectory(whole, recordings, others)[1:]
 
     try:
         return kind, own, kind.trajectory(own, other)
     except EstimationError:
         if own.rig.has_target or not others:
             raise
-    return _motion(whole, recordings, others)
+    return _trajectory(whole, recordings, others)
 
 
-def _with_others(whole: Inputs, source: Initializer[Any], own: Inputs, state: State, guess: Values) -> Start:
+def _place_others(whole: Inputs, source: Initializer[Any], own: Inputs, state: State, guess: Values) -> InitialGuess:
     """All of `start`, where the sensors of `own` have shown the motion: the others are placed on it."""
     inputs = source.adopted(whole, own)
     known = {s.name for s in own.rig.mounted}
     others = [s for s in whole.rig.mounted if s.name not in known]
     hosts = [s for s in others if initializer_of(s).hosts_keyframes]
-    found = placed(inputs, state, hosts)
+    found = place_sensors(inputs, state, hosts)
     if hosts or source.moves_keyframes:
         values = start_values(inputs, state.values | found)
         state = resample(replace(state, values=values), keyframes_for(inputs, keyframe_times(inputs, values)), inputs)
-    found |= placed(inputs, state, [s for s in others if s not in hosts])
+    found |= place_sensors(inputs, state, [s for s in others if s not in hosts])
     state, guess = replace(state, values=state.values | found), guess | found
     for kind in kinds_of(whole.rig):
         if kind is not source:

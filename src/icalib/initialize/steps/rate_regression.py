@@ -15,21 +15,28 @@ import numpy as np
 from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.steps.clock_shifts import MOST_PEAKS, PEAKS_APART_S, SHORTEST_OVERLAP_S, CameraRates
-from icalib.initialize.steps.mean_rates import MeanRates
-from icalib.initialize.steps.track_rotation import STEP_S, track_rates
+from icalib.initialize.steps.epipolar_rotation import TRACK_RATE_STEP_S, track_rates
+from icalib.initialize.steps.gyro_rates import MeanRates
+from icalib.initialize.steps.rate_correlation import (
+    MAX_OFFSET_PEAKS,
+    MIN_PEAK_DISTANCE_S,
+    MIN_RATE_OVERLAP_S,
+    SensorRates,
+)
 from icalib.motion.imu_data import ImuData, clear_of
 
-STEPS_S = (STEP_S, 0.2, 0.1, 0.05)  # between images
-SHORTEST_STEP = 0.75  # times the period of the images
+RATE_STEPS_S = (TRACK_RATE_STEP_S, 0.2, 0.1, 0.05)  # between images
+MIN_STEP_PERIODS = 0.75  # times the period of the images
 # Of the logarithm of the likelihood ratio of three times three coefficients, twice which is chi^2 of nine degrees of
 # freedom: by chance less than once in 1000, at any of some hundred shifts.
-LEAST_SCORE = 15.0
-CLEARLY_BETTER = 1.3  # times the score
-SLOW = 3.0  # times the noise of rates: those that vary by less may not show
+MIN_REGRESSION_SCORE = 15.0
+MIN_SCORE_RATIO = 1.3  # times the score
+MIN_RATE_TO_NOISE = 3.0  # times the noise of rates: those that vary by less may not show
 NORM_MEDIAN = 1.538  # of three standard normal components
-POINTS = 10  # of the grid in an interval: shifts are found to a twentieth of it
-LEAST_SPREAD = 1e-3  # of the mean square, that rates count with about each axis: about one axis there may be none
+GRID_POINTS_PER_INTERVAL = 10  # of the grid in an interval: shifts are found to a twentieth of it
+REGULARISING_SPREAD = (
+    1e-3  # of the mean square, that rates count with about each axis: about one axis there may be none
+)
 
 
 @dataclass(frozen=True)
@@ -41,29 +48,31 @@ class Regression:
     score: float
 
 
-def best_regressions(imu: ImuData, rates: CameraRates) -> list[Regression]:
+def best_regressions(imu: ImuData, rates: SensorRates) -> list[Regression]:
     """At the best shifts, best first; empty where the two overlap at none. What lies in gaps does not count."""
     length = float(np.median(rates.end - rates.start))
-    step = length / POINTS
+    step = length / GRID_POINTS_PER_INTERVAL
     middle = 0.5 * (rates.start + rates.end)
     seen, seen_known = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
     start = np.arange(0.0, imu.seconds[-1] - length, step)
     felt, felt_known = MeanRates.of(imu).over(start, start + length), clear_of(imu.gaps, start, start + length)
     if not felt_known.any() or not seen_known.any():
         return []
-    explained, count = _explained(felt, felt_known, seen, seen_known)
-    enough = count > min(SHORTEST_OVERLAP_S / step, 0.5 * min(felt_known.sum(), seen_known.sum()))
-    score = np.where(enough, -0.5 * count / POINTS * np.log(1.0 - np.minimum(explained, 1.0 - 1e-9)), -np.inf)
+    explained, count = _explained_share(felt, felt_known, seen, seen_known)
+    enough = count > min(MIN_RATE_OVERLAP_S / step, 0.5 * min(felt_known.sum(), seen_known.sum()))
+    score = np.where(
+        enough, -0.5 * count / GRID_POINTS_PER_INTERVAL * np.log(1.0 - np.minimum(explained, 1.0 - 1e-9)), -np.inf
+    )
     found: list[Regression] = []
-    apart = round(PEAKS_APART_S / step)
-    while len(found) < MOST_PEAKS and np.isfinite(score).any():
+    apart = round(MIN_PEAK_DISTANCE_S / step)
+    while len(found) < MAX_OFFSET_PEAKS and np.isfinite(score).any():
         k = int(np.argmax(score))
         found.append(Regression((k - (len(seen) - 1)) * step + 0.5 * length - float(middle[0]), float(score[k])))
         score[max(k - apart, 0) : k + apart + 1] = -np.inf
     return found
 
 
-def telling_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray) -> CameraRates:
+def matching_track_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray) -> SensorRates:
     """Rates over the longest of STEPS_S at which they go with the gyroscope's by more than chance, with the offsets at
     which they do: over less, turning and moving sideways look alike; over more, a rig that only shakes does not turn.
     Where they do at none, those that go with it best, and no offsets.
@@ -71,12 +80,12 @@ def telling_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: n
     Raises EstimationError as `track_rates` does at the first.
     """
     period = float(np.median(np.diff(stream.seconds)))
-    steps = [s for s in STEPS_S if s > SHORTEST_STEP * period] or [period]
+    steps = [s for s in RATE_STEPS_S if s > MIN_STEP_PERIODS * period] or [period]
     failed: EstimationError | None = None
-    found: list[tuple[float, CameraRates]] = []
+    found: list[tuple[float, SensorRates]] = []
     for step in steps:
         try:
-            found += _scored(imu, stream, model, lens, step)
+            found += _rates_and_score(imu, stream, model, lens, step)
         except EstimationError as error:
             failed = failed or error
             continue
@@ -88,9 +97,9 @@ def telling_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: n
     return max(found, key=lambda x: x[0])[1]
 
 
-def _scored(
+def _rates_and_score(
     imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray, step: float
-) -> list[tuple[float, CameraRates]]:
+) -> list[tuple[float, SensorRates]]:
     """Tries two choices of starts for each relative pose: no translation, or this and the previous interval's pose.
     Returns score and rates of the second if they match the gyroscope clearly better, else of the first.
 
@@ -100,13 +109,13 @@ def _scored(
     for chained in (False, True):
         rates = track_rates(stream, model, lens, step, chained=chained)
         shifts = best_regressions(imu, rates)
-        likely = tuple(s.offset for s in shifts if s.score > LEAST_SCORE)
+        likely = tuple(s.offset for s in shifts if s.score > MIN_REGRESSION_SCORE)
         found.append((max((s.score for s in shifts), default=-np.inf), replace(rates, offsets=likely)))
     (plain, _), (score, _) = found
-    return found[1:] if score > CLEARLY_BETTER * plain else found[:1]
+    return found[1:] if score > MIN_SCORE_RATIO * plain else found[:1]
 
 
-def noise_beside(imu: ImuData, rates: CameraRates, averaged: float = 0.0) -> float:
+def rate_difference_noise(imu: ImuData, rates: SensorRates, averaged: float = 0.0) -> float:
     """Standard deviation [rad/s] of how the rates of camera and gyroscope differ about each axis, as means over
     `averaged` s where that is longer than an interval; zero where that of the camera is not known."""
     if not rates.noise:
@@ -116,13 +125,13 @@ def noise_beside(imu: ImuData, rates: CameraRates, averaged: float = 0.0) -> flo
     return float(np.sqrt(variance * min(1.0, length / averaged if averaged else 1.0)))
 
 
-def unlike(imu: ImuData, name: str, rates: CameraRates) -> EstimationError:
+def no_match_error(imu: ImuData, name: str, rates: SensorRates) -> EstimationError:
     """Why rates go with those of the IMU at no shift by more than chance."""
     length = float(np.median(rates.end - rates.start))
-    start = np.arange(0.0, imu.seconds[-1] - length, length / POINTS)
+    start = np.arange(0.0, imu.seconds[-1] - length, length / GRID_POINTS_PER_INTERVAL)
     gyro = MeanRates.of(imu).over(start, start + length)
     turned = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1))) / NORM_MEDIAN
-    if turned < SLOW * noise_beside(imu, rates):
+    if turned < MIN_RATE_TO_NOISE * rate_difference_noise(imu, rates):
         return EstimationError(
             f"{imu.name} and {name} turn too slowly or too steadily for a time offset: the angular rate varies "
             f"by {np.rad2deg(turned):.2g} deg/s, and the images show it to {np.rad2deg(rates.noise):.2g} "
@@ -143,7 +152,9 @@ def _on_grid(t: np.ndarray, rate: np.ndarray, near: np.ndarray, step: float) -> 
     return np.stack([np.interp(grid, t, rate[:, k]) for k in range(3)], axis=1), known
 
 
-def _explained(a: np.ndarray, known_a: np.ndarray, b: np.ndarray, known_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _explained_share(
+    a: np.ndarray, known_a: np.ndarray, b: np.ndarray, known_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(n + m - 1,) the share of the spread of a (n, 3) that a regression on b (m, 3) explains, where both are known, b
     shifted by -(m - 1) to n - 1 samples; and the number of these."""
     n = len(a) + len(b) - 1
@@ -169,7 +180,7 @@ def _explained(a: np.ndarray, known_a: np.ndarray, b: np.ndarray, known_b: np.nd
             across[:, i, j] = correlated(fa[:, i], fb[:, j]) - sa[:, i] * sb[:, j] / count
             own[:, i, j] = correlated(ma, transformed(b[:, i] * b[:, j])) - sb[:, i] * sb[:, j] / count
     spread = correlated(transformed((a**2).sum(axis=1)), mb) - (sa**2).sum(axis=1) / count
-    least = LEAST_SPREAD * count * float((b**2).sum(axis=1).mean()) + 1e-12
+    least = REGULARISING_SPREAD * count * float((b**2).sum(axis=1).mean()) + 1e-12
     slope = np.linalg.solve(own + least[:, None, None] * np.eye(3), across.transpose(0, 2, 1))
-    spread = spread + LEAST_SPREAD * count * float((a**2).sum(axis=1).mean()) + 1e-12
+    spread = spread + REGULARISING_SPREAD * count * float((a**2).sum(axis=1).mean()) + 1e-12
     return np.clip(np.einsum("nij,nji->n", across, slope) / spread, 0.0, 1.0), count

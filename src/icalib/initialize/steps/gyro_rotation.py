@@ -9,7 +9,7 @@ import numpy as np
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 
-SMOOTHED_S = 0.5  # to both sides: short against the drift of the gyroscope
+SMOOTHING_HALF_WINDOW_S = 0.5  # to both sides: short against the drift of the gyroscope
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,9 @@ class GyroRotation:
         start = rotation @ turned.transpose(0, 2, 1)
         total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(start, axis=0)])
         part = np.searchsorted([gap for gap, _ in self.imu.gaps], t)
-        low = np.maximum(np.searchsorted(t, t - SMOOTHED_S), np.searchsorted(part, part))
-        high = np.minimum(np.searchsorted(t, t + SMOOTHED_S, side="right"), np.searchsorted(part, part, side="right"))
+        low = np.maximum(np.searchsorted(t, t - SMOOTHING_HALF_WINDOW_S), np.searchsorted(part, part))
+        high = np.minimum(
+            np.searchsorted(t, t + SMOOTHING_HALF_WINDOW_S, side="right"), np.searchsorted(part, part, side="right")
+        )
         left, _, right = np.linalg.svd(total[high] - total[low])
         return left @ right @ turned

@@ -7,18 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from icalib.estimate.problem.inputs import Inputs, origin_difference
-from icalib.initialize.steps.by_recording import Held
+from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.optim.state import Key
 from icalib.rig import Parameter, Sensor
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 
-def trusted(parameter: Parameter) -> np.ndarray | None:
+def known_value(parameter: Parameter) -> np.ndarray | None:
     """The value of a parameter that is fixed or has a prior: other guesses may rest on it. A guess may be far off."""
     return None if parameter.mode == "free" else parameter.value
 
 
-def given(inputs: Inputs, sensor: Sensor, names: Sequence[str] | None = None) -> dict[Key, np.ndarray]:
+def stated_values(inputs: Inputs, sensor: Sensor, names: Sequence[str] | None = None) -> dict[Key, np.ndarray]:
     """The values of the parameters `names`, or else of its extrinsics and time offset, that the rig file gives; time
     offsets between first stamps, one for each recording where the clock restarts."""
     out: dict[Key, np.ndarray] = {}
@@ -37,16 +37,16 @@ def mounted_names(sensor: Sensor) -> list[str]:
     return [spec.name for spec in sensor.specs() if spec.name in MOUNTED_NAMES]
 
 
-def trusted_names(sensor: Sensor) -> list[str]:
+def known_names(sensor: Sensor) -> list[str]:
     """The extrinsics and time offset that are fixed or have a prior: other guesses may rest on them."""
-    return [name for name in mounted_names(sensor) if trusted(getattr(sensor, name)) is not None]
+    return [name for name in mounted_names(sensor) if known_value(getattr(sensor, name)) is not None]
 
 
-def held_of(inputs: Inputs, sensor: Sensor, guesses: bool = False) -> Held:
+def known_extrinsics(inputs: Inputs, sensor: Sensor, guesses: bool = False) -> KnownExtrinsics:
     """What the rig file fixes of a sensor's extrinsics or gives as a prior; with `guesses` its guesses too."""
-    known = given(inputs, sensor, mounted_names(sensor) if guesses else trusted_names(sensor))
+    known = stated_values(inputs, sensor, mounted_names(sensor) if guesses else known_names(sensor))
     offset = known.get((sensor.name, "time_offset"))
-    return Held(
+    return KnownExtrinsics(
         known.get((sensor.name, "rotation")),
         known.get((sensor.name, "translation")),
         None if offset is None else float(offset[0]),

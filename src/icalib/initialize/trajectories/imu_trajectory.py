@@ -12,16 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.motion.imu_data import ImuData, clear_of
 
-SEEN_SIGMA, FELT_SIGMA, SPEED_SIGMA = 0.02, 2e-3, 0.02  # m, m, m/s: of what the LiDAR shows, of what the IMU feels
-UNFELT = 1e4  # times as much where the IMU did not run
-LONGEST_STEP_S = 1.0
+SENSOR_POSITION_SIGMA_M, IMU_DISPLACEMENT_SIGMA_M, IMU_VELOCITY_SIGMA_M_S = (
+    0.02,
+    2e-3,
+    0.02,
+)  # m, m, m/s: of what the LiDAR shows, of what the IMU feels
+IMU_GAP_SIGMA_FACTOR = 1e4  # times as much where the IMU did not run
+MAX_PROPAGATION_S = 1.0
 
 
 @dataclass(frozen=True)
-class Integrals:
+class SignalIntegrals:
     """First and second integrals over time of a signal x (N, m) that is linear between the IMU's stamps, from the first
     stamp on."""
 
@@ -31,7 +35,7 @@ class Integrals:
     twice: np.ndarray
 
     @classmethod
-    def of(cls, imu: ImuData, x: np.ndarray) -> Integrals:
+    def of(cls, imu: ImuData, x: np.ndarray) -> SignalIntegrals:
         h = np.diff(imu.seconds)[:, None]
         once, twice = np.zeros_like(x), np.zeros_like(x)
         once[1:] = np.cumsum(0.5 * h * (x[1:] + x[:-1]), axis=0)
@@ -48,7 +52,7 @@ class Integrals:
 
 
 @dataclass(frozen=True)
-class ImuMotion:
+class ImuTrajectory:
     """The IMU in a world with z up. At instants seconds (n,), in order: R_world_imu, position and velocity; gyro_bias,
     accel_bias (3,); gravity: how long it is [m/s^2]."""
 
@@ -78,22 +82,26 @@ class ImuMotion:
         position = self.position[k] + h * self.velocity[k] + 0.5 * h**2 * down + twice - twice_k - h * once_k
         return self.gyro.carry(self.seconds, self.rotation, t), position, velocity
 
-    def _felt(self) -> Integrals:
+    def _felt(self) -> SignalIntegrals:
         """Integrals of the accelerometer's readings in world axes."""
         imu = self.gyro.imu
         R = self.gyro.carry(self.seconds, self.rotation, imu.seconds)
-        return Integrals.of(imu, np.einsum("nij,nj->ni", R, imu.accel - self.accel_bias))
+        return SignalIntegrals.of(imu, np.einsum("nij,nj->ni", R, imu.accel - self.accel_bias))
 
-    def smoothed(self) -> ImuMotion:
+    def smoothed(self) -> ImuTrajectory:
         """Positions made better and velocities found by what the IMU feels between them."""
         down, t = np.array([0.0, 0.0, -self.gravity]), self.seconds
         once, twice = self._felt().at(t)
         h = np.diff(t)[:, None]
         speed = np.diff(once, axis=0) + h * down
         way = np.diff(twice, axis=0) - h * once[:-1] + 0.5 * h**2 * down
-        unfelt = (h[:, 0] > LONGEST_STEP_S) | ~clear_of(self.gyro.imu.gaps, t[:-1], t[1:])
-        position, velocity = _least_squares(h[:, 0], self.position, way, speed, np.where(unfelt, UNFELT, 1.0))
-        return ImuMotion(self.gyro, t, self.rotation, position, velocity, self.gyro_bias, self.accel_bias, self.gravity)
+        unfelt = (h[:, 0] > MAX_PROPAGATION_S) | ~clear_of(self.gyro.imu.gaps, t[:-1], t[1:])
+        position, velocity = _least_squares(
+            h[:, 0], self.position, way, speed, np.where(unfelt, IMU_GAP_SIGMA_FACTOR, 1.0)
+        )
+        return ImuTrajectory(
+            self.gyro, t, self.rotation, position, velocity, self.gyro_bias, self.accel_bias, self.gravity
+        )
 
 
 def _least_squares(
@@ -103,12 +111,12 @@ def _least_squares(
     whose sigma is `rough` times as much; block tridiagonal."""
     n = len(seen)
     D, U, r = np.zeros((n, 2, 2)), np.zeros((n - 1, 2, 2)), np.zeros((n, 2, 3))
-    D[:, 0, 0] = SEEN_SIGMA**-2
-    r[:, 0] = seen * SEEN_SIGMA**-2
+    D[:, 0, 0] = SENSOR_POSITION_SIGMA_M**-2
+    r[:, 0] = seen * SENSOR_POSITION_SIGMA_M**-2
     A, B = np.zeros((n - 1, 2, 2)), np.tile(np.eye(2), (n - 1, 1, 1))  # rows B x_k+1 + A x_k = (way, speed)
     A[:, 0, 0] = A[:, 1, 1] = -1.0
     A[:, 0, 1] = -h
-    w = np.stack([(FELT_SIGMA * rough) ** -2, (SPEED_SIGMA * rough) ** -2], axis=1)
+    w = np.stack([(IMU_DISPLACEMENT_SIGMA_M * rough) ** -2, (IMU_VELOCITY_SIGMA_M_S * rough) ** -2], axis=1)
     b = np.stack([way, speed], axis=1)
     At, Bt = A.transpose(0, 2, 1) * w[:, None, :], B.transpose(0, 2, 1) * w[:, None, :]
     D[:-1] += At @ A

@@ -11,17 +11,17 @@ from icalib.geometry import so3
 from icalib.geometry.small import tmul3
 from icalib.initialize.steps.rate_windows import rotation_noise
 
-HALF_S = 0.1  # of the window, at least
-HALF_STEPS = 3.2  # and in steps between poses
-FEWEST = 5  # poses under a parabola
-MOST_HALF_S = 0.6  # of the window of very noisy poses
-LEAST_THIRD = 0.3  # rad/s^3, of the motion: what moves less shows little anyway
-SAMPLED = 400  # instants that tell how much it moves
-MEDIAN_CHI2 = 2.366  # of three degrees of freedom
+MIN_HALF_WINDOW_S = 0.1  # of the window, at least
+MIN_HALF_WINDOW_STEPS = 3.2  # and in steps between poses
+MIN_PARABOLA_POSES = 5  # poses under a parabola
+MAX_HALF_WINDOW_S = 0.6  # of the window of very noisy poses
+MIN_THIRD_DERIVATIVE_RAD_S3 = 0.3  # rad/s^3, of the motion: what moves less shows little anyway
+SAMPLED_INSTANTS = 400  # instants that tell how much it moves
+MEDIAN_CHI2_OF_3 = 2.366  # of three degrees of freedom
 
 
 @dataclass(frozen=True)
-class SmoothPath:
+class SmoothTrajectory:
     """At seconds (m,): R_world_body (m, 3, 3), p_world_body (m, 3), the rate (m, 3) rad/s in the body's axes, the
     velocity (m, 3) m/s in the world's, the acceleration (m, 3) m/s^2 in the body's; near (m,): whether there are poses
     within the window, on both sides."""
@@ -44,19 +44,21 @@ class BodyPoses:
     rotation: np.ndarray
     position: np.ndarray
 
-    def at(self, seconds: np.ndarray, narrow: bool = False) -> SmoothPath:
+    def at(self, seconds: np.ndarray, narrow: bool = False) -> SmoothTrajectory:
         """See `smooth_path`."""
-        return smooth_path(self.seconds, self.rotation, self.position, seconds, narrow)
+        return smooth_trajectory(self.seconds, self.rotation, self.position, seconds, narrow)
 
 
-def smooth_path(t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray, narrow: bool = False) -> SmoothPath:
+def smooth_trajectory(
+    t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray, narrow: bool = False
+) -> SmoothTrajectory:
     """Through poses R (n, 3, 3), p (n, 3) at increasing t (n,), n >= FEWEST, looked at at `at` (m,). narrow: in the
     least window, which keeps all of the motion, and more of the noise."""
-    half = _least_half(t) if narrow else _half_window(t, R, p)
+    half = _min_half_window(t) if narrow else _half_window(t, R, p)
     first, last = np.searchsorted(t, at - half), np.searchsorted(t, at + half)
-    few = last - first < FEWEST
-    middle = np.clip(np.searchsorted(t, at) - FEWEST // 2, 0, len(t) - FEWEST)
-    first, last = np.where(few, middle, first), np.where(few, middle + FEWEST, last)
+    few = last - first < MIN_PARABOLA_POSES
+    middle = np.clip(np.searchsorted(t, at) - MIN_PARABOLA_POSES // 2, 0, len(t) - MIN_PARABOLA_POSES)
+    first, last = np.where(few, middle, first), np.where(few, middle + MIN_PARABOLA_POSES, last)
     near = ~few & (t[first] <= at) & (t[last - 1] >= at)
     fitted = np.empty((len(at), 3, 6))
     reference = np.clip(np.searchsorted(0.5 * (t[1:] + t[:-1]), at), 0, len(t) - 1)
@@ -64,11 +66,11 @@ def smooth_path(t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray, nar
     turn, way = fitted[:, 0, :3], fitted[:, 0, 3:]
     rotation = R[reference] @ so3.exp_many(np.ascontiguousarray(turn))
     acceleration = np.einsum("mji,mj->mi", rotation, fitted[:, 2, 3:])
-    return SmoothPath(at, rotation, way, fitted[:, 1, :3], fitted[:, 1, 3:], acceleration, near)
+    return SmoothTrajectory(at, rotation, way, fitted[:, 1, :3], fitted[:, 1, 3:], acceleration, near)
 
 
-def _least_half(t: np.ndarray) -> float:
-    return max(HALF_S, HALF_STEPS * float(np.median(np.diff(t))))
+def _min_half_window(t: np.ndarray) -> float:
+    return max(MIN_HALF_WINDOW_S, MIN_HALF_WINDOW_STEPS * float(np.median(np.diff(t))))
 
 
 def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
@@ -76,24 +78,24 @@ def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
     and HALF_STEPS. The slope of a parabola over +-h has the variance 1.5 s^2 dt / h^3 by white noise s, and lacks
     j h^2 / 10 of a third derivative j, which slopes over +-h and +-2 h show: they differ by 0.3 j h^2 and noise."""
     dt = float(np.median(np.diff(t)))
-    least, h = _least_half(t), max(2.0 * HALF_S, HALF_STEPS * dt)
+    least, h = _min_half_window(t), max(2.0 * MIN_HALF_WINDOW_S, MIN_HALF_WINDOW_STEPS * dt)
     at = t[(t > t[0] + 2.0 * h) & (t < t[-1] - 2.0 * h)]
     noise = rotation_noise(R)
-    if len(at) < FEWEST or 112.5 * noise**2 * dt < (least**7) * LEAST_THIRD**2:
+    if len(at) < MIN_PARABOLA_POSES or 112.5 * noise**2 * dt < (least**7) * MIN_THIRD_DERIVATIVE_RAD_S3**2:
         return least
-    at = at[np.linspace(0, len(at) - 1, min(len(at), SAMPLED)).astype(int)]
+    at = at[np.linspace(0, len(at) - 1, min(len(at), SAMPLED_INSTANTS)).astype(int)]
     slopes = []
     for half in (h, 2.0 * h):
         first, last = np.searchsorted(t, at - half), np.searchsorted(t, at + half)
-        full = last - first >= FEWEST
+        full = last - first >= MIN_PARABOLA_POSES
         fitted = np.zeros((len(at), 3, 6))
         reference = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
-        _parabolas(t, R, p, at, first, np.where(full, last, first + FEWEST), reference, half, fitted)
+        _parabolas(t, R, p, at, first, np.where(full, last, first + MIN_PARABOLA_POSES), reference, half, fitted)
         slopes.append(np.where(full[:, None], fitted[:, 1, :3], np.nan))
-    differ = np.nanmedian(((slopes[1] - slopes[0]) ** 2).sum(axis=1)) / MEDIAN_CHI2
+    differ = np.nanmedian(((slopes[1] - slopes[0]) ** 2).sum(axis=1)) / MEDIAN_CHI2_OF_3
     third = np.sqrt(max(differ - 1.3125 * noise**2 * dt / h**3, 0.0)) / (0.3 * h**2)
-    best = (112.5 * noise**2 * dt / max(third, LEAST_THIRD) ** 2) ** (1.0 / 7.0)
-    return min(max(least, best), max(least, MOST_HALF_S))
+    best = (112.5 * noise**2 * dt / max(third, MIN_THIRD_DERIVATIVE_RAD_S3) ** 2) ** (1.0 / 7.0)
+    return min(max(least, best), max(least, MAX_HALF_WINDOW_S))
 
 
 @njit(cache=True, nogil=True)

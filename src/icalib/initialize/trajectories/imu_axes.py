@@ -14,14 +14,14 @@ from icalib.errors import EstimationError
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Axes, ImuSensor
 
-AS_THEY_ARE: Axes = ("x", "y", "z")
-WELL = 0.4  # of the acceleration that was seen is left: readings that fit so are as they should be
-BETTER = 0.5  # times what is left of the readings as they are
-_NEXT_BEST = 0.8  # times what the next best way leaves; two that fit alike are both named
+UNCHANGED_AXES: Axes = ("x", "y", "z")
+MAX_GOOD_UNEXPLAINED = 0.4  # of the acceleration that was seen is left: readings that fit so are as they should be
+MAX_UNEXPLAINED_RATIO = 0.5  # times what is left of the readings as they are
+_UNIQUE_BEST_RATIO = 0.8  # times what the next best way leaves; two that fit alike are both named
 
 
 @dataclass(frozen=True)
-class ImuWay:
+class AxisConvention:
     """The columns that become x, y, z of each sensor, and words for it."""
 
     gyro: Axes
@@ -38,27 +38,27 @@ class ImuWay:
             ("gyro_axes", sensor.gyro_axes, self.gyro),
             ("accel_axes", sensor.accel_axes, self.accel),
         ):
-            if own != AS_THEY_ARE:
-                found.append(f"{name}: [{', '.join(_composed(given or AS_THEY_ARE, own))}]")
+            if own != UNCHANGED_AXES:
+                found.append(f"{name}: [{', '.join(_composed(given or UNCHANGED_AXES, own))}]")
         return " and ".join(found)
 
 
-def ways() -> Iterator[ImuWay]:
+def axis_conventions() -> Iterator[AxisConvention]:
     """The commonest first. A turn of one sensor's axes against the other's stands as one of the gyroscope's."""
-    yield ImuWay(AS_THEY_ARE, ("-x", "-y", "-z"), "has an inverted accelerometer, which reads -g at rest")
+    yield AxisConvention(UNCHANGED_AXES, ("-x", "-y", "-z"), "has an inverted accelerometer, which reads -g at rest")
     for k, axis in enumerate("xyz"):
-        yield ImuWay(_flipped(k), AS_THEY_ARE, f"has a left-handed gyroscope, axis {axis} reversed")
-    yield ImuWay(("-x", "-y", "-z"), AS_THEY_ARE, "has a gyroscope with all axes reversed")
+        yield AxisConvention(_flipped(k), UNCHANGED_AXES, f"has a left-handed gyroscope, axis {axis} reversed")
+    yield AxisConvention(("-x", "-y", "-z"), UNCHANGED_AXES, "has a gyroscope with all axes reversed")
     for k, axis in enumerate("xyz"):
-        yield ImuWay(AS_THEY_ARE, _flipped(k), f"has a left-handed accelerometer, axis {axis} reversed")
+        yield AxisConvention(UNCHANGED_AXES, _flipped(k), f"has a left-handed accelerometer, axis {axis} reversed")
     for k in range(3):
         others = tuple(j for j in range(3) if j != k)
         names = " and ".join("xyz"[j] for j in others)
-        yield ImuWay(_flipped(*others), AS_THEY_ARE, f"has a gyroscope whose axes {names} are reversed")
-        yield ImuWay(_swapped(*others), AS_THEY_ARE, f"has a gyroscope whose axes {names} are swapped")
-        yield ImuWay(AS_THEY_ARE, _swapped(*others), f"has an accelerometer whose axes {names} are swapped")
+        yield AxisConvention(_flipped(*others), UNCHANGED_AXES, f"has a gyroscope whose axes {names} are reversed")
+        yield AxisConvention(_swapped(*others), UNCHANGED_AXES, f"has a gyroscope whose axes {names} are swapped")
+        yield AxisConvention(UNCHANGED_AXES, _swapped(*others), f"has an accelerometer whose axes {names} are swapped")
     for axes in (("y", "z", "x"), ("z", "x", "y")):
-        yield ImuWay(axes, AS_THEY_ARE, "has a gyroscope whose axes differ from those of its accelerometer")
+        yield AxisConvention(axes, UNCHANGED_AXES, "has a gyroscope whose axes differ from those of its accelerometer")
 
 
 def refuse_other_axes(
@@ -68,18 +68,23 @@ def refuse_other_axes(
     acceleration that was seen, or raises EstimationError; failed: where those as they are did."""
     if sensor.assumed:
         return
-    now = _left(left, imu)
-    found = sorted(((_left(left, way.of(imu)), k, way) for k, way in enumerate(ways())), key=lambda x: x[:2])
+    now = _unexplained_or_inf(left, imu)
+    found = sorted(
+        ((_unexplained_or_inf(left, way.of(imu)), k, way) for k, way in enumerate(axis_conventions())),
+        key=lambda x: x[:2],
+    )
     best, _, way = found[0]
-    if best < min(WELL, BETTER * now):
-        other = f" (or {found[1][2].fields(sensor)}, which fits as well)" if best > _NEXT_BEST * found[1][0] else ""
+    if best < min(MAX_GOOD_UNEXPLAINED, MAX_UNEXPLAINED_RATIO * now):
+        other = (
+            f" (or {found[1][2].fields(sensor)}, which fits as well)" if best > _UNIQUE_BEST_RATIO * found[1][0] else ""
+        )
         raise EstimationError(
             f"{sensor.name} {way.words}: its readings fit the cameras only then; set "
             f"{way.fields(sensor)}{other} of {sensor.name} in the rig file."
         ) from failed
 
 
-def _left(left: Callable[[ImuData], float], imu: ImuData) -> float:
+def _unexplained_or_inf(left: Callable[[ImuData], float], imu: ImuData) -> float:
     try:
         return left(imu)
     except EstimationError:

@@ -16,7 +16,7 @@ from icalib.rig import Sensor
 
 
 @dataclass(frozen=True)
-class Held:
+class KnownExtrinsics:
     """What is known of a sensor, or None: R_imu_sensor (3, 3), p_imu_sensor (3,) m, offset: t_imu - t_sensor, both
     since their clocks' first stamps [s]."""
 
@@ -25,10 +25,10 @@ class Held:
     offset: float | None = None
 
 
-UNKNOWN = Held()
+NOTHING_KNOWN = KnownExtrinsics()
 
 
-def alone(inputs: Inputs, k: int) -> Inputs:
+def single_recording(inputs: Inputs, k: int) -> Inputs:
     """The recording number `k` of a rig with an IMU, on clocks of its own."""
     if len(inputs.parts) == 1:
         return inputs
@@ -37,7 +37,7 @@ def alone(inputs: Inputs, k: int) -> Inputs:
     return replace(inputs, measurements=part.measurements, imu=imu_data(inputs.rig, part.measurements), parts=(own,))
 
 
-def fullest(inputs: Inputs, key: str) -> int:
+def fullest_recording(inputs: Inputs, key: str) -> int:
     """Number of the recording in which the stream `key` has most rows."""
     return int(np.argmax([part.measurements.streams[key].rows for part in inputs.parts]))
 
@@ -47,7 +47,7 @@ def naming_recording(inputs: Inputs, k: int) -> AbstractContextManager[None]:
     return naming(inputs.parts[k].name if len(inputs.parts) > 1 else "")
 
 
-def motion_alone(inputs: Inputs, k: int, state: State) -> State:
+def state_of_recording(inputs: Inputs, k: int, state: State) -> State:
     """What `state` has of recording `k`, on its own clock."""
     if len(inputs.parts) == 1:
         return state
@@ -56,7 +56,7 @@ def motion_alone(inputs: Inputs, k: int, state: State) -> State:
     return State(seconds, state.rotation[own], state.position[own], state.velocity[own], state.bias[own], state.values)
 
 
-def one_after_another(inputs: Inputs, states: Sequence[State], values: dict[Key, np.ndarray]) -> State:
+def joined_states(inputs: Inputs, states: Sequence[State], values: dict[Key, np.ndarray]) -> State:
     """All recordings' own states as one, with the lasting parameters `values`."""
     if len(states) == 1:
         return replace(states[0], values=values)
@@ -68,37 +68,41 @@ def one_after_another(inputs: Inputs, states: Sequence[State], values: dict[Key,
     return State(seconds, rotation, position, velocity, bias, values, tuple(int(k) for k in starts))
 
 
-def other_clocks(offset: float, sensor: str, before: Inputs, now: Inputs) -> float:
+def converted_offset(offset: float, sensor: str, before: Inputs, now: Inputs) -> float:
     """A time offset between first stamps as `before` has them, between those that `now` has."""
     shifts = (origin_difference(i.measurements, i.stream(sensor)) for i in (now, before))
     return offset + next(shifts) - next(shifts)
 
 
-def from_the_best(inputs: Inputs, sensor: Sensor, best: int, state_of: Callable[[Inputs, Held | None], State]) -> State:
+def states_from_best(
+    inputs: Inputs, sensor: Sensor, best: int, state_of: Callable[[Inputs, KnownExtrinsics | None], State]
+) -> State:
     """All recordings' states, each by itself: of the `best` from nothing, and of the others with the extrinsics of the
     `sensor` that it has shown, and with the time offset unless the clock restarts."""
-    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
+    recordings = [single_recording(inputs, k) for k in range(len(inputs.parts))]
     restarts = sensor.clock_restarts
     with naming_recording(inputs, best):
         states = {best: state_of(recordings[best], None)}
     values, name = dict(states[best].values), sensor.name
     for k, own in enumerate(recordings):
         if k != best:
-            there = None if restarts else _own_offset(states[best], name, recordings[best], own)
+            there = None if restarts else _offset_between(states[best], name, recordings[best], own)
             with naming_recording(inputs, k):
-                states[k] = state_of(own, Held(values.get((name, "rotation")), values[name, "translation"], there))
+                states[k] = state_of(
+                    own, KnownExtrinsics(values.get((name, "rotation")), values[name, "translation"], there)
+                )
     clocks = range(len(recordings)) if restarts else (best,)
-    offsets = [_own_offset(states[k], name, recordings[k], inputs) for k in clocks]
+    offsets = [_offset_between(states[k], name, recordings[k], inputs) for k in clocks]
     values[name, "time_offset"] = np.array(offsets)
-    return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
+    return joined_states(inputs, [states[k] for k in range(len(recordings))], values)
 
 
-def _own_offset(state: State, sensor: str, before: Inputs, now: Inputs) -> float:
+def _offset_between(state: State, sensor: str, before: Inputs, now: Inputs) -> float:
     """The time offset that `state` of one recording, `before`, has, as one of `now`."""
-    return other_clocks(float(state.values[sensor, "time_offset"][0]), sensor, before, now)
+    return converted_offset(float(state.values[sensor, "time_offset"][0]), sensor, before, now)
 
 
-def each_clock(
+def offset_of_each_clock(
     inputs: Inputs, sensor: str, find: Callable[[int], float], known: Mapping[int, float] | None = None
 ) -> np.ndarray:
     """(R,) time offsets of a clock that restarts; `find`: that of a recording alone, given by its number, where it is
@@ -108,4 +112,6 @@ def each_clock(
         if k not in found:
             with naming_recording(inputs, k):
                 found[k] = find(k)
-    return np.array([other_clocks(found[k], sensor, alone(inputs, k), inputs) for k in range(len(inputs.parts))])
+    return np.array(
+        [converted_offset(found[k], sensor, single_recording(inputs, k), inputs) for k in range(len(inputs.parts))]
+    )

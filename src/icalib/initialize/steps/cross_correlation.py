@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Shift(NamedTuple):
+class CorrelationPeak(NamedTuple):
     """b(t) is most like a(t + samples); their correlation there, and the largest at any shift."""
 
     samples: int
@@ -15,7 +15,7 @@ class Shift(NamedTuple):
     largest: float
 
 
-def best_shift(a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float) -> Shift:
+def best_shift(a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float) -> CorrelationPeak:
     """Between a (n,) and b (m,) on one regular grid, where both masks hold; at least `least` samples must overlap, or
     half of all there are."""
     return best_shifts(a, mask_a, b, mask_b, least, 1, 0)[0]
@@ -23,7 +23,7 @@ def best_shift(a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndar
 
 def best_shifts(
     a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float, most: int, apart: int
-) -> list[Shift]:
+) -> list[CorrelationPeak]:
     """The `most` best shifts, best first, each more than `apart` samples from those before; see `best_shift`."""
     n = len(a) + len(b) - 1
     size = 1 << (n - 1).bit_length()
@@ -48,7 +48,7 @@ def best_shifts(
     found = []
     for _ in range(most):
         k = int(np.argmax(score))
-        found.append(Shift(k - (len(b) - 1), float(r[k]), float(r.max())))
+        found.append(CorrelationPeak(k - (len(b) - 1), float(r[k]), float(r.max())))
         score[max(k - apart, 0) : k + apart + 1] = -np.inf
         if not np.isfinite(score).any():
             break

@@ -22,24 +22,26 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.geometry import so3
-from icalib.initialize.paths.imu_motion import Integrals
-from icalib.initialize.steps.clocks import only_axis
 from icalib.initialize.steps.lever_arm import Triples
+from icalib.initialize.steps.rate_alignment import only_axis
+from icalib.initialize.trajectories.imu_trajectory import SignalIntegrals
 from icalib.motion.imu_data import ImuData, clear_of
 
-ARM_SIGMA = 0.5  # m: what the motion leaves open stays small
-BIAS_SIGMA = 0.3  # m/s^2
-ANY_SIGMA = 1e3
-HELD_SIGMA = 1e-6
-WAY_SIGMA, SPEED_SIGMA = 0.1, 0.05  # m, m/s: of a row
-RATE_SIGMA = 0.02  # rad/s, of a rate of the LiDAR
-SPANS_S = (0.5, 2.0)  # of ways
-STEP_S = 0.1  # between the scans of a triple, at least
-FEWEST_ROWS = 10
-ONE_AXIS = 0.1  # of the spread of rates about the first axis: below, turns about the second are lost in noise
-CANDIDATES = 24  # turns about that axis
-ROUNDS = 5
-MIRRORED = 1.4  # times what was seen is left: 2 without noise, and 1 or less where axes are right-handed
+LEVER_ARM_PRIOR_M = 0.5  # m: what the motion leaves open stays small
+ACCEL_BIAS_PRIOR = 0.3  # m/s^2
+UNKNOWN_SIGMA = 1e3
+FIXED_SIGMA = 1e-6
+DISPLACEMENT_SIGMA_M, VELOCITY_CHANGE_SIGMA_M_S = 0.1, 0.05  # m, m/s: of a row
+SENSOR_RATE_SIGMA_RAD_S = 0.02  # rad/s, of a rate of the LiDAR
+DISPLACEMENT_SPANS_S = (0.5, 2.0)  # of ways
+MIN_TRIPLE_STEP_S = 0.1  # between the scans of a triple, at least
+MIN_LEVER_ARM_ROWS = 10
+SINGLE_AXIS_RATE_RATIO = (
+    0.1  # of the spread of rates about the first axis: below, turns about the second are lost in noise
+)
+AXIS_TURN_CANDIDATES = 24  # turns about that axis
+LEVER_ARM_ITERATIONS = 5
+MIN_MIRRORED_SHARE = 1.4  # times what was seen is left: 2 without noise, and 1 or less where axes are right-handed
 
 
 class LeverArmRows(NamedTuple):
@@ -51,7 +53,9 @@ class LeverArmRows(NamedTuple):
     seen: np.ndarray
 
 
-System = Callable[[np.ndarray, np.ndarray], LeverArmRows]  # of R_imu_lidar, and p_imu_lidar for the derivative by d
+LeverArmSystem = Callable[
+    [np.ndarray, np.ndarray], LeverArmRows
+]  # of R_imu_lidar, and p_imu_lidar for the derivative by d
 
 
 @dataclass(frozen=True)
@@ -63,24 +67,28 @@ class GaussianPrior:
     information: np.ndarray
 
 
-def arm_prior(others: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_held: bool, held: np.ndarray | None):
+def lever_arm_prior(
+    others: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_held: bool, held: np.ndarray | None
+):
     """Of a system with unknowns of sigma `others` (k,) beside d and p, and rates (n, 3) of the LiDAR; held (3,): the
     lever arm where it is known."""
-    d = HELD_SIGMA if rotation_held else ANY_SIGMA
-    arm = ARM_SIGMA if held is None else HELD_SIGMA
+    d = FIXED_SIGMA if rotation_held else UNKNOWN_SIGMA
+    arm = LEVER_ARM_PRIOR_M if held is None else FIXED_SIGMA
     mean = np.concatenate([np.zeros(3), np.zeros(3) if held is None else held, np.zeros(len(others))])
     w = rates - rates.mean(axis=0)
     information = (w**2).sum() * np.eye(3) - w.T @ w
     return GaussianPrior(
-        mean, np.concatenate([[d] * 3, [arm] * 3, others]) / row_sigma, information * (row_sigma / RATE_SIGMA) ** 2
+        mean,
+        np.concatenate([[d] * 3, [arm] * 3, others]) / row_sigma,
+        information * (row_sigma / SENSOR_RATE_SIGMA_RAD_S) ** 2,
     )
 
 
-def against_motion(
+def system_from_trajectory(
     R_imu: np.ndarray, p_imu: np.ndarray, seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
-) -> System:
+) -> LeverArmSystem:
     """Of a LiDAR at seconds (n,), R_map_lidar and p_map_lidar, while the IMU was at R_imu, p_imu in any world."""
-    i, j = _pairs(seconds)
+    i, j = _displacement_pairs(seconds)
     u = np.einsum("nji,nj->ni", rotation[i], position[j] - position[i])
     hat_u = so3.hat_many(u)
 
@@ -94,16 +102,16 @@ def against_motion(
     return rows
 
 
-def against_readings(
+def system_from_readings(
     imu: ImuData,
     carry: Callable[[np.ndarray], np.ndarray],
     seconds: np.ndarray,
     rotation: np.ndarray,
     position: np.ndarray,
-) -> System:
+) -> LeverArmSystem:
     """Of a LiDAR at seconds (n,) on the imu clock; carry: R_map_imu (N, 3, 3) at the IMU's stamps from that (n, 3, 3)
     at the scans. The unknowns after p are gravity in the map and the accelerometer's bias."""
-    triples = _triples(seconds, imu.gaps)
+    triples = _pose_triples(seconds, imu.gaps)
     n, second = len(triples.i), triples.second
     bend = second(position)
 
@@ -114,7 +122,7 @@ def against_readings(
         # R_map_lidar is what is known: with R_imu_lidar Exp(d) what is felt turns by -d in the LiDAR's axes.
         by_turn = so3.hat_many(felt) @ R @ R_il
         x = np.concatenate([felt, R.reshape(-1, 9), by_turn.reshape(-1, 9)], axis=1)
-        D = Integrals.of(imu, x).at(seconds)[1]
+        D = SignalIntegrals.of(imu, x).at(seconds)[1]
         A = np.zeros((n, 3, 12))
         A[:, :, :3] = second(rotation @ so3.hat_many((R_il.T @ p_il)[None])[0] + D[:, 12:].reshape(-1, 3, 3))
         A[:, :, 3:6] = second(at_scans)
@@ -125,46 +133,46 @@ def against_readings(
     return rows
 
 
-def solve(
-    rows: System, prior: GaussianPrior, R_il: np.ndarray, rates: np.ndarray
+def solve_lever_arm(
+    rows: LeverArmSystem, prior: GaussianPrior, R_il: np.ndarray, rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """R_imu_lidar and x (m,) that fit the rows best, from a rotation that fits rates (n, 3) of the LiDAR; None where
     rows are too few."""
     start = prior.mean[3:6]
-    if len(rows(R_il, start).b) < FEWEST_ROWS:
+    if len(rows(R_il, start).b) < MIN_LEVER_ARM_ROWS:
         return None
     held = prior.sigma[0] < 1.0
-    axis = only_axis(rates, ONE_AXIS)
+    axis = only_axis(rates, SINGLE_AXIS_RATE_RATIO)
     if not held and axis is not None:
-        angles = 2.0 * np.pi * np.arange(CANDIDATES) / CANDIDATES
+        angles = 2.0 * np.pi * np.arange(AXIS_TURN_CANDIDATES) / AXIS_TURN_CANDIDATES
         turns = so3.exp_many(angles[:, None] * axis)
-        R_il = min((R_il @ turn for turn in turns), key=lambda R: _misfit(rows(R, start), prior))
+        R_il = min((R_il @ turn for turn in turns), key=lambda R: _misfit_of_rotation(rows(R, start), prior))
     x = prior.mean
-    for _ in range(ROUNDS):
-        x = _fit(rows(R_il, x[3:6]), prior, 0)[0]
+    for _ in range(LEVER_ARM_ITERATIONS):
+        x = _robust_least_squares(rows(R_il, x[3:6]), prior, 0)[0]
         R_il = R_il @ so3.exp(x[:3].copy())
     return R_il, x
 
 
-def left_over(rows: System, R_il: np.ndarray, x: np.ndarray) -> float:
+def unexplained_displacement(rows: LeverArmSystem, R_il: np.ndarray, x: np.ndarray) -> float:
     """How much of what the path has part in the solution x (m,) and `R_il` leave: the ratio of the medians."""
     A, b, seen = rows(R_il, x[3:6])
     left = b - A[:, :, 3:] @ x[3:]
     return float(np.median(np.linalg.norm(left, axis=1)) / max(np.median(np.linalg.norm(seen, axis=1)), 1e-30))
 
 
-def is_mirrored(rows: System, R_il: np.ndarray, x: np.ndarray) -> bool:
+def is_mirrored(rows: LeverArmSystem, R_il: np.ndarray, x: np.ndarray) -> bool:
     """Whether the LiDAR moved the other way than the solution x (m,) and `R_il` say. Rates of mirrored axes are those
     of axes turned by half a turn, and fit; of ways twice their length is left then."""
-    return left_over(rows, R_il, x) > MIRRORED
+    return unexplained_displacement(rows, R_il, x) > MIN_MIRRORED_SHARE
 
 
-def _misfit(rows: LeverArmRows, prior: GaussianPrior) -> float:
+def _misfit_of_rotation(rows: LeverArmRows, prior: GaussianPrior) -> float:
     """RMS of what rows lack with d = 0."""
-    return _fit(rows, prior, 3)[1]
+    return _robust_least_squares(rows, prior, 3)[1]
 
 
-def _fit(rows: LeverArmRows, prior: GaussianPrior, without: int) -> tuple[np.ndarray, float]:
+def _robust_least_squares(rows: LeverArmRows, prior: GaussianPrior, without: int) -> tuple[np.ndarray, float]:
     """Least squares for x without its first `without`, twice more without rows that stand far off; RMS of the rest."""
     A, free = rows.A[:, :, without:], slice(without, None)
     N0, mean = np.diag(prior.sigma[free] ** -2), prior.mean[free]
@@ -180,19 +188,19 @@ def _fit(rows: LeverArmRows, prior: GaussianPrior, without: int) -> tuple[np.nda
     return np.concatenate([np.zeros(without), x]), float(np.sqrt(np.mean(size[weight > 0.0] ** 2)))
 
 
-def _pairs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _displacement_pairs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Instants (i, j) about SPANS_S apart."""
-    i = np.tile(np.arange(len(t)), len(SPANS_S))
-    span = np.repeat(SPANS_S, len(t))
+    i = np.tile(np.arange(len(t)), len(DISPLACEMENT_SPANS_S))
+    span = np.repeat(DISPLACEMENT_SPANS_S, len(t))
     j = np.searchsorted(t, t[i] + span - 1e-3)
     good = (j < len(t)) & (t[np.minimum(j, len(t) - 1)] - t[i] < 2.0 * span)
     return i[good], j[good]
 
 
-def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Triples:
+def _pose_triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Triples:
     """Scans (i, j, k) about STEP_S apart, or next to each other, and no part of them in a gap of the IMU."""
     i = np.arange(len(t))
-    step = max(STEP_S, float(np.median(np.diff(t))))
+    step = max(MIN_TRIPLE_STEP_S, float(np.median(np.diff(t))))
     j = np.searchsorted(t, t + 0.99 * step - 1e-3)
     k = np.searchsorted(t, t + 1.98 * step - 1e-3)
     good = (k < len(t)) & (j < k) & (i < j)

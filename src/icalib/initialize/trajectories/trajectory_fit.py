@@ -1,0 +1,86 @@
+"""The motion of the IMU, and a sensor's lever arm, from the sensor's path and the readings of the IMU alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.geometry import so3
+from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.steps.rate_alignment import RateAlignment, only_axis
+from icalib.initialize.steps.rate_correlation import SensorRates
+from icalib.initialize.steps.single_recording import KnownExtrinsics
+from icalib.initialize.trajectories.imu_trajectory import ImuTrajectory
+from icalib.initialize.trajectories.lever_arm_rows import (
+    ACCEL_BIAS_PRIOR,
+    SINGLE_AXIS_RATE_RATIO,
+    UNKNOWN_SIGMA,
+    VELOCITY_CHANGE_SIGMA_M_S,
+    lever_arm_prior,
+    solve_lever_arm,
+    system_from_readings,
+    unexplained_displacement,
+)
+from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess, SensorTrajectory
+from icalib.motion.imu_data import ImuData
+
+TRAJECTORY_GRAVITY_TOLERANCE = 0.1  # of gravity: further off, units are wrong or the path is
+
+
+@dataclass(frozen=True)
+class TrajectoryFit:
+    """What a path shows with the IMU: the sensor's guess, the motion of the IMU, the size of gravity [m/s^2], and
+    R_world_map, which makes the map level; the origin of the world is the map's. left: see `left_over`."""
+
+    guess: ExtrinsicsGuess
+    motion: ImuTrajectory
+    gravity: float
+    level: np.ndarray
+    left: float
+
+
+def fit_imu_trajectory(
+    imu: ImuData,
+    path: SensorTrajectory,
+    rates: SensorRates,
+    aligned: RateAlignment,
+    gravity: float,
+    held: KnownExtrinsics,
+) -> TrajectoryFit | None:
+    """From the path of one sensor, all of it while the IMU was running; gravity [m/s^2]. None where it is too short."""
+    gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
+
+    def carry(at_poses: np.ndarray) -> np.ndarray:
+        return gyro.carry(t, at_poses, imu.seconds)
+
+    prior = lever_arm_prior(
+        np.array([UNKNOWN_SIGMA] * 3 + [ACCEL_BIAS_PRIOR] * 3),
+        rates.rate,
+        VELOCITY_CHANGE_SIGMA_M_S,
+        held.rotation is not None,
+        held.position,
+    )
+    system = system_from_readings(imu, carry, t, path.rotation, path.position)
+    found = solve_lever_arm(system, prior, aligned.rotation, rates.rate)
+    if found is None:
+        return None
+    R_is, x = found
+    level, R_imu = _levelling_rotation(x[6:9]), path.rotation @ R_is.T
+    position = (path.position - R_imu @ x[3:6]) @ level.T
+    start = ImuTrajectory(
+        gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity
+    )
+    turned = only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is None
+    guess, left = ExtrinsicsGuess(R_is, x[3:6], aligned.offset, turned), unexplained_displacement(system, R_is, x)
+    return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, left)
+
+
+def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:
+    """R_world_map: the smallest rotation that brings gravity (3,) down."""
+    d = -gravity / np.linalg.norm(gravity)
+    axis = np.array([d[1], -d[0], 0.0])  # d x z
+    sine = np.linalg.norm(axis)
+    if sine < 1e-12:
+        return np.diag([1.0, np.sign(d[2]), np.sign(d[2])])
+    return so3.exp(axis * (np.arctan2(sine, d[2]) / sine))
