@@ -10,7 +10,7 @@ from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
 from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
-from icalib.sensors.wheels.initialize.drive import drive_guess, wheel_offset, wheel_rates
+from icalib.sensors.wheels.initialize.drive_guess import drive_guess, wheel_offset, wheel_rates
 
 R_IMU_WHEEL = Rotation.from_euler("zyx", [2.2, 0.3, -0.4]).as_matrix()
 UP, LEVER = R_IMU_WHEEL[:, 2], np.array([-0.3, 0.12, -0.1])  # p_imu_wheel in the wheels' axes

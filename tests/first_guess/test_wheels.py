@@ -12,7 +12,7 @@ from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
 from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
-from icalib.sensors.wheels.initialize.drive import drive_guess, wheel_offset, wheel_rates
+from icalib.sensors.wheels.initialize.drive_guess import drive_guess, wheel_offset, wheel_rates
 
 RADII, BASELINE, LEVER = np.array([0.1, 0.12]), 0.5, np.array([-0.3, 0.12, -0.1])  # p_imu_wheel in the wheels' axes
 R_IMU_WHEEL = Rotation.from_euler("zyx", [2.2, 0.3, -0.4]).as_matrix()

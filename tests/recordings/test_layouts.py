@@ -20,7 +20,7 @@ from icalib.sensors.imu.read.imu_tables import IMU
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.pose.read import readings as pose_readings
 from icalib.sensors.wheels.read import readings as wheel_readings
-from icalib.sensors.wheels.read.wheel_readings import WheelReadings
+from icalib.sensors.wheels.read.raw_readings import WheelReadings
 
 ORIGIN, STEP, N = 1_700_000_000_123_456_789, 5_000_000, 60
 STAMPS = ORIGIN + STEP * np.arange(N)

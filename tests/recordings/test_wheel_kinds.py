@@ -14,7 +14,7 @@ from icalib.errors import RecordingError
 from icalib.rig import Wheels
 from icalib.sensors.wheels.read import readings as wheel_readings
 from icalib.sensors.wheels.read.checks import checked_wheels
-from icalib.sensors.wheels.read.wheel_readings import WheelReadings
+from icalib.sensors.wheels.read.raw_readings import WheelReadings
 
 N, STEP, ORIGIN = 400, 20_000_000, 1_700_000_000_000_000_000
 STAMPS = ORIGIN + STEP * np.arange(N)

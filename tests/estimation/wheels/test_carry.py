@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from icalib.sensors.wheels.wheel_carry import carried_noise
+from icalib.sensors.wheels.propagation_noise import carried_noise
 
 GYRO, ACCEL = 3e-3, 0.4  # rad/sqrt(s), m/s/sqrt(s): so large that both count
 AWAY = np.array([[0.02, 0.005], [0.0, 0.015]])

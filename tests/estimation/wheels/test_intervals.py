@@ -9,8 +9,8 @@ from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
 from icalib.motion.stamp_intervals import LONGEST_S, StampIntervals, choose_intervals
 from icalib.rig import ImuNoise
+from icalib.sensors.wheels.integrals import angles_from_rates
 from icalib.sensors.wheels.quadrature import PANEL_S, quadrature
-from icalib.sensors.wheels.wheel_angles import angles_from_rates
 
 
 @pytest.fixture(scope="module")

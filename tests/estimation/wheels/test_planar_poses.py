@@ -7,8 +7,8 @@ import pytest
 
 from icalib.motion.stamp_intervals import StampIntervals
 from icalib.optim.arrowhead import make_pieces
+from icalib.sensors.wheels.planar_poses import between_given, preintegrated
 from icalib.sensors.wheels.residual import RelativePoseFactor, WheelNoise, drive_of, wheel_intervals
-from icalib.sensors.wheels.wheel_poses import between_given, preintegrated
 
 RNG = np.random.default_rng(3)
 SECONDS = np.cumsum(RNG.uniform(0.01, 0.02, 60))

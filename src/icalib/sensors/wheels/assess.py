@@ -17,7 +17,7 @@ from icalib.result.row_records import row_record
 from icalib.result.timeline import Timeline
 from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
-from icalib.sensors.wheels.initialize.drive import OPPOSITE
+from icalib.sensors.wheels.initialize.drive_guess import OPPOSITE
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor
 
 LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical slip": ("vertical",)} | {

@@ -12,8 +12,8 @@ from icalib.motion.sweep import Motion
 from icalib.optim.state import Key, Layout
 from icalib.rig import Settings, Wheels
 from icalib.sensors.wheels.ground_factor import GroundFactor, floors
+from icalib.sensors.wheels.integrals import integrals_of
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
-from icalib.sensors.wheels.wheel_angles import integrals_of
 
 
 class WheelModel(SensorModel[Wheels, WheelNoise]):

@@ -9,7 +9,7 @@ clock of the IMU, and so the states' poses there, moves with the time offset.
 
 The frame of the wheels has x forward, y to the left, z up, its origin midway between those of the axle that is not
 steered. Their parameters are the blocks rotation, translation (R_imu_wheel, p_imu_wheel), time_offset, and those of
-their kind: of a pair radii (left, right) and baseline, the distance between the wheels; see `wheel_drives`.
+their kind: of a pair radii (left, right) and baseline, the distance between the wheels; see `drive_rows`.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 from icalib.rig import WheelKind, drive_names
+from icalib.sensors.wheels.drive_rows import KINDS, N_DRIVE, UNITS, Kinds, coefficients
+from icalib.sensors.wheels.increment_kernels import Track, Wheels, increment_rows
+from icalib.sensors.wheels.planar_poses import RelativePoses, preintegrated
+from icalib.sensors.wheels.propagation_noise import carried_noise
 from icalib.sensors.wheels.quadrature import Instants, quadrature
-from icalib.sensors.wheels.wheel_carry import carried_noise
-from icalib.sensors.wheels.wheel_drives import KINDS, N_DRIVE, UNITS, Kinds, coefficients
-from icalib.sensors.wheels.wheel_kernels import Track, Wheels, increment_rows
-from icalib.sensors.wheels.wheel_poses import RelativePoses, preintegrated
 
 YAW_X_Y = slice(2, 5)  # of the rows of a relative pose
 
@@ -62,7 +62,7 @@ class WheelNoise:
 class IncrementFactor(RowFactor):
     """Increments over n intervals. With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along the
     `inertial` scheme, X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval of
-    length dt are those of `wheel_drives`; of a pair
+    length dt are those of `drive_rows`; of a pair
 
         (e_1 X -+ b/2 e_3 T) / r - turned, over wheel sqrt(dt)     left, right
         e_2 X, e_3 X, over sideways sqrt(dt), upwards sqrt(dt)

@@ -11,9 +11,9 @@ from icalib.initialize.steps.keyframe_spacing import SmoothMotion
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Rig, Wheels
-from icalib.sensors.wheels.initialize.dead_reckoning import wheel_path
-from icalib.sensors.wheels.initialize.extrinsics import wheel_values
-from icalib.sensors.wheels.initialize.noise import wheel_noise
+from icalib.sensors.wheels.initialize.increment_noise import wheel_noise
+from icalib.sensors.wheels.initialize.placement import wheel_values
+from icalib.sensors.wheels.initialize.planar_path import wheel_path
 
 
 class WheelInitializer(Initializer[Wheels]):

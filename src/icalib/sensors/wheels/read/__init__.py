@@ -15,7 +15,7 @@ from icalib.data.topics import MessageType, TopicInfo
 from icalib.sensors.sensor import TableLayout
 from icalib.sensors.wheels.read.checks import checked_wheels
 from icalib.sensors.wheels.read.joints import read_joints
-from icalib.sensors.wheels.read.wheel_readings import (
+from icalib.sensors.wheels.read.raw_readings import (
     RELATIVE_POSES,
     STAMPS,
     UNITS,

@@ -11,8 +11,8 @@ from icalib.data.stamps.clocks import usual_step
 from icalib.data.stamps.ordered import kept_readings, longest_run
 from icalib.errors import RecordingError
 from icalib.rig import RATE_UNITS, Wheels
-from icalib.sensors.wheels.read.bad_wheels import apart, comes_back, counter_of, range_of, set_back, without_wraps
-from icalib.sensors.wheels.read.wheel_readings import RATE_HZ, WheelReadings
+from icalib.sensors.wheels.read.outliers import apart, comes_back, counter_of, range_of, set_back, without_wraps
+from icalib.sensors.wheels.read.raw_readings import RATE_HZ, WheelReadings
 
 _LEAST_HZ = 2.0  # the motion over longer periods is not followed by the estimate
 _FASTEST_RAD_S = 200.0  # a wheel of 0.1 m at 72 km/h; slow robots reach it in deg/s

@@ -19,12 +19,12 @@ from icalib.geometry.small import tmul3
 from icalib.motion.sensor_pose import N_MOUNTED, OFFSET
 from icalib.optim.rows import KEYFRAME_PAIR_DIM
 from icalib.optim.state import KEYFRAME_DIM
-from icalib.sensors.wheels.wheel_drives import N_DRIVE
+from icalib.sensors.wheels.drive_rows import N_DRIVE
 
 
 class Wheels(NamedTuple):
     """R_imu_wheel (3, 3), p_imu_wheel (3,) m, drive (3,): its own parameters, of a pair left and right radius and
-    baseline [m]; see `wheel_drives`."""
+    baseline [m]; see `drive_rows`."""
 
     R: np.ndarray
     p: np.ndarray
@@ -136,7 +136,7 @@ def _by_drive(i, q, by_X, by_T, X, T, rows):
 
 @njit(cache=True, nogil=True)
 def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
-    """Four rows of each of n increments, not whitened, see `wheel_drives`.
+    """Four rows of each of n increments, not whitened, see `drive_rows`.
 
     start (n + 1,), weights (m,): see Instants; track, moving: motion at these instants; c: Coefficients; measured
     (n, 4).

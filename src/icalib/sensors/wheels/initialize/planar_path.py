@@ -9,7 +9,7 @@ from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.rig import Wheels
-from icalib.sensors.wheels.wheel_angles import integrals_of
+from icalib.sensors.wheels.integrals import integrals_of
 
 
 def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:

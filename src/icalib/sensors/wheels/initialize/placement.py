@@ -27,15 +27,15 @@ from icalib.motion.known_motion import imu_poses, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
 from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION, mounted
-from icalib.sensors.wheels.initialize.drive import (
+from icalib.sensors.wheels.initialize.drive_guess import (
     OPPOSITE,
     WheelRates,
     drive_guess,
     wheel_offset,
     wheel_rates,
 )
-from icalib.sensors.wheels.initialize.relative_poses import extrinsics_guess, poses_offset
-from icalib.sensors.wheels.wheel_angles import integrals_of
+from icalib.sensors.wheels.initialize.relative_pose_guess import extrinsics_guess, poses_offset
+from icalib.sensors.wheels.integrals import integrals_of
 
 SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of start, middle and end of a span
 
