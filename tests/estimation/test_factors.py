@@ -532,16 +532,17 @@ def pose_sample(
 
 
 def position_sample(
-    unlike, setup_of, imu_free=False, levelled=True, loss="none", curved=False, starts=(0,), restarts=False, stated=True
-):
+    unlike, setup_of, imu_free=False, frame="frame_yaw", loss="none", curved=False, starts=(0,), restarts=False,
+    stated=True,
+):  # fmt: skip
     """Fixes that wander by 0.3 m, far from what the state predicts, with correlated covariances where they are
-    `stated`; the frame is levelled or turned anyhow."""
+    `stated`; the frame is levelled, turned anyhow, or that of the target."""
     setup = with_poses(setup_of(unlike, imu_free=imu_free), starts)
     blocks = [b for b in setup.layout.blocks if b.key not in (("mocap0", "rotation"), ("mocap0", "scale"))]
     values = dict(setup.state.values)
     entries = []
     for b in blocks:
-        if levelled and b.name == "frame_rotation":
+        if frame == "frame_yaw" and b.name == "frame_rotation":
             entries.append((b.sensor, "frame_yaw", "vector", 1, True))
             values[b.sensor, "frame_yaw"] = np.array([2.0 + len(entries)])
         else:
@@ -556,8 +557,9 @@ def position_sample(
     joins = (int(stamps[len(stamps) // 2]),) if restarts else ()
     stream = PositionStream("mocap0", stamps, position, root @ root.transpose(0, 2, 1), joins_ns=joins)
     made = PositionFactor.build(
-        stream, Motion(setup.state, setup.imu, 9.81, 0.5), PositionNoise(0.3, 0.5, loss, LOSS_SCALE), setup.layout
-    )
+        stream, Motion(setup.state, setup.imu, 9.81, 0.5), PositionNoise(0.3, 0.5, loss, LOSS_SCALE), setup.layout,
+        "target" if frame == "tilt" else "mocap0",
+    )  # fmt: skip
     state = setup.perturbed(rng, 0.3)
 
     return row_sample(setup, state, made, loss if curved else "none", curved)
@@ -699,8 +701,9 @@ SAMPLES = {
     "positions": ("PositionFactor", lambda u, s, f: position_sample(u, s)),
     "positions, tilted frame, huber, intrinsics": (
         "PositionFactor",
-        lambda u, s, f: position_sample(u, s, True, levelled=False, loss="huber", stated=False),
+        lambda u, s, f: position_sample(u, s, True, "frame_rotation", loss="huber", stated=False),
     ),
+    "positions, frame of the target": ("PositionFactor", lambda u, s, f: position_sample(u, s, frame="tilt")),
     "positions of two recordings, clock that restarts, cauchy, curved": (
         "PositionFactor",
         lambda u, s, f: position_sample(u, s, loss="cauchy", curved=True, starts=(0, 5), restarts=True),

@@ -17,8 +17,9 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.sweep import Motion
 from icalib.optim.state import State
 from icalib.sensors.imu.spec import class_noise
+from icalib.sensors.position.frame import PositionFrame
 from icalib.sensors.position.initialize.attitude import Fix
-from icalib.sensors.position.initialize.placed import place
+from icalib.sensors.position.initialize.placed import KnownPlace, place
 from icalib.sensors.position.initialize.with_imu import motion_from_fixes
 from icalib.sensors.position.simulate import SimPositions
 from icalib.sensors.position.stream import PositionStream
@@ -86,7 +87,7 @@ def test_placed_on_a_known_motion(world, levelled):
     values = {("imu0", "intrinsics"): sim.truth.imu_intrinsics}
     R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
     state = State(keyframes, R, p, v, bias, values)
-    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, levelled, KnownExtrinsics())
+    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, KnownPlace(levelled))
     assert found.offset == pytest.approx(offset, abs=0.01)
     planar = 0.1 if sim.scenario.motion.kind == "ramps" else 0.04
     np.testing.assert_allclose(found.arm, ARM, atol=planar)
@@ -101,8 +102,10 @@ def other_path(n):
     return CubicSpline(8.0 * np.arange(len(knots)), knots)(np.arange(n))
 
 
-def test_placed_on_a_rig_that_turns_in_place():
+@pytest.mark.parametrize("frame", [None, PositionFrame(yaw(FRAME_YAW), ORIGIN, ())], ids=["own", "shared"])
+def test_placed_on_a_rig_that_turns_in_place(frame):
     """A camera before a target: the antenna moves by its lever arm more than the rig does."""
+    known = KnownPlace(frame is None, frame=frame)
     seconds = np.arange(0.0, 30.0, 0.005)
     angle = np.stack([0.5 * np.sin(1.1 * seconds), 0.4 * np.sin(1.7 * seconds), 0.9 * np.sin(0.6 * seconds)], axis=1)
     R = Rotation.from_rotvec(angle).as_matrix()
@@ -117,9 +120,7 @@ def test_placed_on_a_rig_that_turns_in_place():
     state = State(keyframes, R[100:-100:20], still, still, np.zeros((len(keyframes), 6)), values)
     k = np.arange(200, 5800, 40)
     position = (R[k] @ ARM - ORIGIN) @ yaw(FRAME_YAW) + 0.005 * np.random.default_rng(1).normal(size=(len(k), 3))
-    found = place(
-        Motion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), True, KnownExtrinsics()
-    )
+    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), known)
     assert found.offset == pytest.approx(seconds[k[0]], abs=5e-3)
     np.testing.assert_allclose(found.arm, ARM, atol=0.01)
     np.testing.assert_allclose(found.R_wf, yaw(FRAME_YAW), atol=0.02)
@@ -143,3 +144,16 @@ def test_fixes_that_do_not_fit(world, change, sentence):
         motion_from_fixes(
             imu, "gnss0", replace(fix, t=fix.t[: len(position)], position=position), GRAVITY, KnownExtrinsics()
         )
+
+
+def test_fixes_in_another_frame_than_they_are_said_to_share(world):
+    sim, imu, fix, _, _ = world
+    keyframes = np.arange(0.2, imu.seconds[-1] - 0.2, 0.1)
+    R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
+    state = State(keyframes, R, p, v, np.zeros((len(keyframes), 6)), {("imu0", "intrinsics"): sim.truth.imu_intrinsics})
+    known = KnownPlace(False, frame=PositionFrame(yaw(FRAME_YAW + 1.0), ORIGIN, ()))
+    with pytest.raises(EstimationError, match="of their spread; .*in the frame that the rig file names"):
+        place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, known)
+    upright = replace(fix, position=fix.position[:, [0, 2, 1]] * [1.0, -1.0, 1.0])
+    with pytest.raises(EstimationError, match="write frame: tilted if z of its frame does not point up"):
+        place(Motion(state, imu, GRAVITY, 0.5), "gnss0", upright, KnownPlace(True))

@@ -8,7 +8,7 @@ from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
 from icalib.rig.kinds import SENSOR_TYPES
 from icalib.rig.rig import Rig
-from icalib.sensors.sensor import Lack, has_imu
+from icalib.sensors.sensor import TARGET_FRAME, Lack, has_imu
 
 
 def lack_of(rig: Rig) -> Lack | None:
@@ -34,6 +34,7 @@ def _lacks(rig: Rig) -> Iterator[Lack]:
         yield Lack(("sensors",), _no_motion(rig))
     for sensor in rig.sensors.values():
         yield from sensor.lacks(rig.sensors, rig.has_target)
+    yield from _unknown_frames(rig)
     if not has_imu(rig.sensors):
         yield from _clocks_without_reference(rig)
     plane_sensor = any(s.shows_planes for s in rig.mounted)
@@ -49,6 +50,19 @@ def _second_imu(rig: Rig) -> Iterator[Lack]:
     first, *others = [s.name for s in rig.sensors.values() if s.is_inertial] or [""]
     for name in others:
         yield Lack(("sensors", name), f"is a second IMU beside {first}; keep one of them.")
+
+
+def _unknown_frames(rig: Rig) -> Iterator[Lack]:
+    """Sensors that share a frame which the rig does not have."""
+    for sensor in rig.mounted:
+        name, where = sensor.shared_frame, ("sensors", sensor.name, "frame")
+        if name == TARGET_FRAME and len(rig.target.bodies) > 1:
+            yield Lack(where, f"a target of {len(rig.target.bodies)} bodies has no frame of its own; write levelled.")
+        known = [TARGET_FRAME] * rig.has_target + [s.name for s in rig.mounted if s.has_frame]
+        if name and name not in known:
+            valid = ("levelled", "tilted", *known)
+            sentence = f"there is no frame {name}{suggestion(name, valid)}; available are {', '.join(valid)}."
+            yield Lack(where, sentence)
 
 
 def _no_motion(rig: Rig) -> str:

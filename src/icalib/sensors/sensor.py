@@ -49,6 +49,7 @@ TIME_OFFSET = ParameterSpec(
 )
 MOUNTED = (ROTATION, TRANSLATION, TIME_OFFSET)  # of every sensor but the IMU
 MOUNTED_NAMES = tuple(spec.name for spec in MOUNTED)
+TARGET_FRAME = "target"  # name of the target's frame in the rig file
 
 
 def mounted(rotation: T, translation: T, time_offset: T) -> dict[str, T]:
@@ -127,6 +128,16 @@ class Sensor:
     def gives_motion_without_imu(self, has_target: bool) -> bool:
         """Whether this sensor alone determines the motion of the rig; has_target: the cameras of the rig see one."""
         return False
+
+    @property
+    def has_frame(self) -> bool:
+        """Whether the sensor reports in a static frame whose pose in the world is estimated, see `model.frames`."""
+        return False
+
+    @property
+    def shared_frame(self) -> str:
+        """Name of the sensor, or `TARGET_FRAME`, in whose frame this sensor reports; empty: in none that is shared."""
+        return ""
 
     @property
     def tracks_points(self) -> bool:

@@ -92,6 +92,11 @@ class PoseSensor(MountedSensor):
         given["frames"] = None if frames is None else list(frames)
         return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
 
+    @property
+    def has_frame(self) -> bool:
+        """See `Sensor`: absolute poses are relative to a static frame."""
+        return self.kind == "absolute"
+
     def gives_motion_without_imu(self, has_target: bool) -> bool:
         return True
 

@@ -13,8 +13,9 @@ from icalib.model.statistics import ResidualStatistics
 from icalib.optim.state import Entry
 from icalib.rig import Rig, Settings
 from icalib.rig.scene import FRAME, LEVEL_FRAME
+from icalib.sensors.position.frame import frame_owner
 from icalib.sensors.position.residual import PositionFactor, PositionNoise
-from icalib.sensors.position.spec import PositionSensor
+from icalib.sensors.position.spec import LEVELLED, PositionSensor
 from icalib.sensors.position.stream import PositionStream
 
 FIRST_NOISE_M = 0.05  # of each axis where nothing is stated: between differential and carrier-phase fixes
@@ -29,8 +30,11 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
     keyframes = "positions"
 
     def scene_entries(self, sensor: PositionSensor, rig: Rig, n_recordings: int) -> list[Entry]:
-        """The frame of its fixes in the world of each recording: its yaw and origin where both are levelled."""
-        levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == "levelled"
+        """The frame of its fixes in the world of each recording, unless it shares one: its yaw and origin where both
+        are levelled."""
+        if not sensor.has_frame:
+            return []
+        levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == LEVELLED
         return frame_entries(sensor.name, n_recordings, specs=LEVEL_FRAME if levelled else FRAME)
 
     def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
@@ -59,7 +63,7 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
     ) -> Iterator[PositionFactor]:
         """One, of all fixes."""
         assert at.motion is not None
-        yield PositionFactor.build(weighted(sensor, stream), at.motion, noise, at.layout)
+        yield PositionFactor.build(weighted(sensor, stream), at.motion, noise, at.layout, frame_owner(sensor))
 
 
 def weighted(sensor: PositionSensor, stream: PositionStream) -> PositionStream:

@@ -4,7 +4,7 @@
 
 at the instant of the fix on the IMU's clock. The trajectory is carried to that instant by the IMU's readings; fixes are
 never interpolated. Parameters: the sensor's blocks translation (p_imu_sensor) and time_offset; of its frame in each
-recording frame_yaw or frame_rotation, and frame_translation.
+recording frame_yaw or frame_rotation, and frame_translation, or the tilt of the target: see `frame`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from icalib.geometry import so3
-from icalib.model.frames import frame_of
 from icalib.motion.clocks import offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
@@ -26,7 +24,7 @@ from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
-from icalib.rig.scene import FRAME_ROTATION, FRAME_TRANSLATION, FRAME_YAW
+from icalib.sensors.position.frame import PositionFrame
 from icalib.sensors.position.stream import PositionStream
 
 # Fixes further from all keyframes are left out. The noise of an accelerometer of 0.01 m/s^2/sqrt(Hz), a poor one, moves
@@ -54,18 +52,15 @@ class PositionNoise:
         return np.array([self.horizontal, self.horizontal, self.vertical])
 
 
-def yaw_rotation(yaw: float) -> np.ndarray:
-    """(3, 3) rotation about z by `yaw` rad."""
-    return so3.exp(np.array([0.0, 0.0, yaw]))
-
-
 @dataclass(frozen=True)
 class PositionFactor(RowFactor):
-    """n fixes of one sensor. keyframe (n,): of each, in order; root (n, 3, 3): see `PositionStream`."""
+    """n fixes of one sensor. frame: whose frame they are in, see `frame_owner`; keyframe (n,): of each, in order; root
+    (n, 3, 3): see `PositionStream`."""
 
     units: ClassVar[Mapping[str, str]] = {"horizontal": "m", "vertical": "m"}
 
     name: str
+    frame: str
     seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
     position: np.ndarray  # (n, 3) m
     root: np.ndarray
@@ -78,12 +73,14 @@ class PositionFactor(RowFactor):
     layout: Layout
 
     @classmethod
-    def build(cls, stream: PositionStream, motion: Motion, noise: PositionNoise, layout: Layout) -> PositionFactor:
+    def build(
+        cls, stream: PositionStream, motion: Motion, noise: PositionNoise, layout: Layout, frame: str
+    ) -> PositionFactor:
         """The fixes near keyframes and outside gaps of the IMU; their keyframes stay while the solver runs. The
         covariances of `stream` are the weights: see `model.weighted`."""
         state, (k, keyframe) = motion.state, motion.near_keyframes(stream, NEAR_KEYFRAME_S)
         return cls(
-            stream.name, stream.seconds[k], stream.position[k], stream.root[k], keyframe, state.starts,
+            stream.name, frame, stream.seconds[k], stream.position[k], stream.root[k], keyframe, state.starts,
             len(state.seconds), motion.imu, motion.gravity, noise, layout,
         )  # fmt: skip
 
@@ -119,29 +116,21 @@ class PositionFactor(RowFactor):
 
     def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
         """Adds the fixes `own`, of one recording."""
-        frame, v, keyframe = frame_of(self.name, recording), state.values, self.keyframe[own]
-        levelled = (frame, FRAME_YAW.name) in v
-        R_wf = yaw_rotation(v[frame, FRAME_YAW.name][0]) if levelled else v[frame, FRAME_ROTATION.name]
+        frame, keyframe = PositionFrame.of(self.frame, recording, state.values), self.keyframe[own]
         kinematics = Kinematics.of(self)
         at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
-        in_frame = (at.position - v[frame, FRAME_TRANSLATION.name]) @ R_wf
-        rows = _rows(in_frame - self.position[own], in_frame, R_wf, at, levelled, into.sums)
-        turn = (FRAME_YAW if levelled else FRAME_ROTATION).name
-        columns = [kinematics.columns(recording), self.layout.columns(frame, turn, FRAME_TRANSLATION.name)]
+        rows = _rows(self.position[own], frame, at, into.sums)
+        columns = [kinematics.columns(recording), frame.columns(self.layout)]
         noise = RobustNoise(self.root[own] / self.noise.sizes[:, None], self.noise.loss, self.noise.loss_scale)
         interval = rows.on_intervals(keyframe, self.n_keyframes)
         return add_rows(rows, own, interval, np.concatenate(columns), noise, into)
 
 
-def _rows(
-    residual: np.ndarray, in_frame: np.ndarray, R_wf: np.ndarray, at: SensorPose, levelled: bool, jacobians: bool
-) -> Rows:
-    """Rows of residuals (n, 3) m, by calibration parameters of the sensor's pose, then yaw 1 or rotation 3 (on the
-    right) and translation 3 of the frame. in_frame (n, 3): predicted positions; R_wf (3, 3) R_world_frame."""
-    n = len(residual)
+def _rows(measured: np.ndarray, frame: PositionFrame, at: SensorPose, jacobians: bool) -> Rows:
+    """Rows of residuals (n, 3) m of `measured` fixes (n, 3), by the calibration parameters of the sensor's pose, then
+    those of the frame."""
+    n, inside = len(measured), frame.inward(at.position)
     if not jacobians:
-        return rows_at(residual, (), (at,), np.zeros((0, 3, 0)))
-    J_pose = np.concatenate([np.zeros((n, 3, 3)), R_wf.T @ at.rotation], axis=2)
-    J_turn = so3.hat_many(np.ascontiguousarray(in_frame))
-    J_frame = [J_turn[:, :, 2:] if levelled else J_turn, np.tile(-R_wf.T, (n, 1, 1))]
-    return rows_at(residual, (J_pose,), (at,), np.concatenate(J_frame, axis=2))
+        return rows_at(inside - measured, (), (at,), np.zeros((0, 3, 0)))
+    J_pose = np.concatenate([np.zeros((n, 3, 3)), frame.rotation.T @ at.rotation], axis=2)
+    return rows_at(inside - measured, (J_pose,), (at,), frame.jacobian(inside))

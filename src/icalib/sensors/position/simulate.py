@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.sensors.position.spec import PositionSensor
+from icalib.sensors.position.spec import LEVELLED, TILTED, PositionSensor
 from icalib.sensors.position.stream import PositionStream
 from icalib.tools.simulation.output.bag_writer import BagWriter
 from icalib.tools.simulation.output.csv_table import write_table
@@ -35,7 +35,8 @@ class SimPositions(SimSensor):
 
     Errors of a fix: white ones of position_noise [m] on x and y and vertical_noise on z, by default the same; and a
     slow one of drift_noise [m], a Gauss-Markov process of correlation time drift_time_s, as multipath makes it. A share
-    outliers of the fixes is off by up to outlier_m on each axis.
+    outliers of the fixes is off by up to outlier_m on each axis. shared_frame: what the rig file says of the frame
+    where it is one of the target or of another sensor; T_world_frame must then be its pose.
     """
 
     sensor_type: ClassVar[str] = "position"
@@ -45,6 +46,7 @@ class SimPositions(SimSensor):
     T_world_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
     position_noise: float = 0.02
     vertical_noise: float | None = None
+    shared_frame: str = ""
     drift_noise: float = 0.0
     drift_time_s: float = 10.0
     outliers: float = 0.0
@@ -53,10 +55,12 @@ class SimPositions(SimSensor):
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimPositions:
         sizes = ("position_noise", "vertical_noise", "drift_noise", "drift_time_s", "outliers", "outlier_m")
-        found, common = mounted_fields(value, start_ns, options=("T_world_frame", *sizes))
+        found, common = mounted_fields(value, start_ns, options=("T_world_frame", "shared_frame", *sizes))
         chosen: dict[str, Any] = {key: at_least(found[key], 0.0) for key in sizes if key in found}
         if "T_world_frame" in found:
             chosen["T_world_frame"] = pose(found["T_world_frame"])
+        if "shared_frame" in found:
+            chosen["shared_frame"] = found["shared_frame"].text()
         return cls(name, **common, **chosen)
 
     def plain(self) -> dict[str, Any]:
@@ -95,7 +99,7 @@ class SimPositions(SimSensor):
         return PositionSensor(
             self.name,
             f"{self.name}/positions.csv",
-            frame="tilted" if tilted else "levelled",
+            frame=self.shared_frame or (TILTED if tilted else LEVELLED),
             position_noise=self.position_noise if plain and self.position_noise > 0.0 else None,
         )
 

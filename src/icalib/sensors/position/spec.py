@@ -21,7 +21,7 @@ from icalib.sensors.parameter import Parameter
 from icalib.sensors.parameter_spec import ParameterSpec
 from icalib.sensors.sensor import PLAIN_TABLE, TIME_OFFSET, TRANSLATION, ClockedSensor, TableLayout
 
-FrameKind = Literal["levelled", "tilted"]
+LEVELLED, TILTED = "levelled", "tilted"
 Coordinates = Literal["metric", "geodetic"]
 Status = Literal["single", "differential", "float", "fixed"]  # quality of a GNSS fix, worst first
 STATUSES: tuple[Status, ...] = ("single", "differential", "float", "fixed")
@@ -35,7 +35,8 @@ class PositionSensor(ClockedSensor):
 
     coordinates: of a table, metric or geodetic (latitude, longitude, height); None: told by its header. frame:
     levelled, z points up, its yaw and origin in the world are estimated (GNSS, total station); tilted, its whole
-    rotation is (UWB anchors). position_noise [m]: standard deviation of each axis; "messages": the covariances of the
+    rotation is (UWB anchors); else the name of a sensor, or target, whose frame it shares: nothing is estimated of it.
+    position_noise [m]: standard deviation of each axis; "messages": the covariances of the
     recording as they are; None: estimated from the residuals, the covariances of the recording as weights.
     least_status: worse fixes are left out.
     """
@@ -48,12 +49,22 @@ class PositionSensor(ClockedSensor):
 
     path: str
     coordinates: Coordinates | None = None
-    frame: FrameKind = "levelled"
+    frame: str = LEVELLED
     position_noise: float | Literal["messages"] | None = None
     least_status: Status = "single"
     translation: Parameter = Parameter()  # (3,) lever arm: the antenna in the body's frame [m]
     topic: str | None = None  # of its messages; None: the one with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
+
+    @property
+    def has_frame(self) -> bool:
+        """See `Sensor`."""
+        return self.frame in (LEVELLED, TILTED)
+
+    @property
+    def shared_frame(self) -> str:
+        """See `Sensor`."""
+        return "" if self.has_frame else self.frame
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> PositionSensor:
@@ -62,7 +73,7 @@ class PositionSensor(ClockedSensor):
             name=name,
             path=path_or(found, f"{name}/positions.csv"),
             coordinates=choice_or(found, "coordinates", Coordinates, None),
-            frame=choice_or(found, "frame", FrameKind, cls.frame),
+            frame=found["frame"].text() if "frame" in found else cls.frame,
             position_noise=_noise(found["position_noise"]) if "position_noise" in found else None,
             least_status=choice_or(found, "least_status", Status, cls.least_status),
             topic=topic_or_none(found),

@@ -27,8 +27,9 @@ from icalib.model.frames import frame_of
 from icalib.optim.state import State
 from icalib.rig import Rig
 from icalib.rig.scene import FRAME_ROTATION, FRAME_TRANSLATION, FRAME_YAW
+from icalib.sensors.position.frame import PositionFrame, frame_owner
 from icalib.sensors.position.initialize.attitude import Fix
-from icalib.sensors.position.initialize.placed import PlacedSensor, place
+from icalib.sensors.position.initialize.placed import KnownPlace, PlacedSensor, place
 from icalib.sensors.position.initialize.with_imu import motion_from_fixes
 from icalib.sensors.position.read.outliers import single_wrong
 from icalib.sensors.position.spec import PositionSensor
@@ -41,11 +42,11 @@ class PositionInitializer(Initializer[PositionSensor]):
     """The first position sensor gives the motion where no other kind does; all others are placed on it."""
 
     def motion_rank(self, rig: Rig) -> int | None:
-        """Without an IMU positions do not show the attitude."""
-        return BY_POSITIONS if rig.imu is not None and rig.of(PositionSensor) else None
+        """Without an IMU positions do not show the attitude. A sensor whose frame another one has needs that one."""
+        return BY_POSITIONS if rig.imu is not None and self._own_frames(rig) else None
 
     def sources(self, rig: Rig) -> tuple[str, ...]:
-        return (rig.of(PositionSensor)[0].name,)
+        return (self._own_frames(rig)[0].name,)
 
     def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
         del other
@@ -66,10 +67,16 @@ class PositionInitializer(Initializer[PositionSensor]):
         )
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[PositionSensor]) -> Values:
+        """Those whose frames others share come first."""
         out: Values = {}
-        for sensor in sensors:
-            out |= _on_motion(inputs, state, sensor)
+        for sensor in sorted(sensors, key=lambda s: not s.has_frame):
+            out |= _on_motion(inputs, replace(state, values=state.values | out), sensor)
         return out
+
+    @staticmethod
+    def _own_frames(rig: Rig) -> list[PositionSensor]:
+        """The sensors whose frame is their own."""
+        return [s for s in rig.of(PositionSensor) if s.has_frame]
 
 
 INITIALIZER = PositionInitializer()
@@ -98,13 +105,16 @@ def _on_motion(inputs: Inputs, state: State, sensor: PositionSensor) -> Values:
     best = fullest_recording(inputs, sensor.name)
     found: dict[int, PlacedSensor] = {}
     for k in sorted(range(len(recordings)), key=lambda k: k != best):
-        known = _held(recordings[k], sensor)
+        held, frame = _held(recordings[k], sensor), None
         if k != best:
             offset = converted_offset(found[best].offset, sensor.name, recordings[best], recordings[k])
-            known = KnownExtrinsics(position=found[best].arm, offset=known.offset if sensor.clock_restarts else offset)
+            held = KnownExtrinsics(position=found[best].arm, offset=held.offset if sensor.clock_restarts else offset)
+        if not sensor.has_frame:
+            frame = PositionFrame.of(frame_owner(sensor), k, state.values)
+        known = KnownPlace(_is_levelled(inputs, sensor), held.position, held.offset, frame)
         with naming_recording(inputs, k):
             motion = motion_of(recordings[k], state_of_recording(inputs, k, state))
-            found[k] = place(motion, sensor.name, _fix(recordings[k], sensor), _is_levelled(inputs, sensor), known)
+            found[k] = place(motion, sensor.name, _fix(recordings[k], sensor), known)
     clocks = range(len(recordings)) if sensor.clock_restarts else (best,)
     offsets = [converted_offset(found[k].offset, sensor.name, recordings[k], inputs) for k in clocks]
     shown = {(sensor.name, NAMES[0]): found[best].arm, (sensor.name, NAMES[1]): np.array(offsets)}
@@ -132,8 +142,10 @@ def _is_levelled(inputs: Inputs, sensor: PositionSensor) -> bool:
 
 
 def _frames(inputs: Inputs, sensor: PositionSensor, found: Sequence[tuple[np.ndarray, np.ndarray]]) -> Values:
-    """Blocks of the frame in each recording: R_world_frame, p_world_frame."""
+    """Blocks of the sensor's own frame in each recording: R_world_frame, p_world_frame."""
     out: Values = {}
+    if not sensor.has_frame:
+        return out
     levelled = _is_levelled(inputs, sensor)
     for k, (R, p) in enumerate(found):
         name, value = (

@@ -9,11 +9,11 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.steps.cross_correlation import best_shifts
-from icalib.initialize.steps.single_recording import KnownExtrinsics
+from icalib.initialize.steps.correlation import best_shifts
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
 from icalib.motion.sweep import Motion
+from icalib.sensors.position.frame import PositionFrame
 from icalib.sensors.position.initialize.attitude import Fix
 from icalib.sensors.position.initialize.clock import likely_offsets, varies
 
@@ -29,13 +29,14 @@ CONVERGED = 1e-6
 OUTLIER = 4.0  # median sizes of residuals
 LEAST_ROW_SIGMA = 0.01  # m
 ARM_SIGMA, OFFSET_SIGMA = 2.0, 0.3  # m, s: of the prior
-OFFSET_STEP_S = 0.005
+FREE_RAD, FREE_M = 10.0, 1e4  # of a frame of which nothing is known
+KNOWN_M, KNOWN_RAD, KNOWN_S = 1e-3, 1e-6, 1e-4  # of what is known: it stays, and normal equations stay regular
 LARGEST_LEFT = 0.3  # of the spread of the fixes
 
 
 class PlacedSensor(NamedTuple):
-    """arm: p_imu_sensor (3,) m; R_world_frame (3, 3), p_world_frame (3,) m; offset: as in `Held`; left: median size of
-    the residuals over that of the fixes about their median."""
+    """arm: p_imu_sensor (3,) m; R_world_frame (3, 3), p_world_frame (3,) m; offset: t_imu - t_sensor, since the
+    first stamps [s]; left: median size of the residuals over that of the fixes about their median."""
 
     arm: np.ndarray
     R_wf: np.ndarray
@@ -44,13 +45,28 @@ class PlacedSensor(NamedTuple):
     left: float
 
 
-def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: KnownExtrinsics) -> PlacedSensor:
-    """From the fixes of one recording, whose keyframes `motion` has. levelled: the frame turns against the world about
-    z alone. Raises EstimationError where they do not show it."""
-    found = [x for offset in _offsets(motion, fix, known) if (x := _placed(motion, fix, offset, levelled, known))]
+@dataclass(frozen=True)
+class KnownPlace:
+    """What is known before. levelled: the frame differs from the world by a turn about z and its origin; arm:
+    p_imu_sensor (3,) m, offset: as in `PlacedSensor`, and frame, or None."""
+
+    levelled: bool
+    arm: np.ndarray | None = None
+    offset: float | None = None
+    frame: PositionFrame | None = None
+
+    @property
+    def turns(self) -> int:
+        """Parameters of the frame's rotation."""
+        return 1 if self.levelled else 3
+
+
+def place(motion: Motion, name: str, fix: Fix, known: KnownPlace) -> PlacedSensor:
+    """From the fixes of one recording, whose keyframes `motion` has. Raises EstimationError where they do not show
+    it."""
+    found = [x for offset in _offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
     if min((x.left for x in found), default=np.inf) > LARGEST_LEFT and known.offset is None:
-        scanned = _scanned(motion, fix, levelled, known)
-        found += [x for offset in scanned if (x := _placed(motion, fix, offset, levelled, known))]
+        found += [x for offset in _scanned(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
     if not found:
         raise EstimationError(
             f"{name}: too few of its fixes fall within the motion that the other sensors show; check that the clocks "
@@ -58,14 +74,19 @@ def place(motion: Motion, name: str, fix: Fix, levelled: bool, known: KnownExtri
         )
     best = min(found, key=lambda x: x.left)
     if best.left > LARGEST_LEFT:
+        hint = "check that both are on the same vehicle"
+        if known.frame is not None:
+            hint += ", and that its positions are in the frame that the rig file names"
+        elif known.levelled:
+            hint += ", or write frame: tilted if z of its frame does not point up"
         raise EstimationError(
             f"{name}: its fixes do not follow the motion that the other sensors show: at the best time offset the "
-            f"median residual is {best.left:.0%} of their spread; check that both are on the same vehicle."
+            f"median residual is {best.left:.0%} of their spread; {hint}."
         )
     return best
 
 
-def _offsets(motion: Motion, fix: Fix, known: KnownExtrinsics) -> list[float]:
+def _offsets(motion: Motion, fix: Fix, known: KnownPlace) -> list[float]:
     """Candidate time offsets [s]: peaks of the correlation of mean speeds, then of third differences with the IMU's
     readings. The latter are needed where the rig turns and hardly moves: a long lever arm makes speeds differ."""
     if known.offset is not None:
@@ -80,7 +101,7 @@ def _offsets(motion: Motion, fix: Fix, known: KnownExtrinsics) -> list[float]:
     return [*(peak.samples / GRID_HZ for peak in peaks), *felt]
 
 
-def _scanned(motion: Motion, fix: Fix, levelled: bool, known: KnownExtrinsics) -> list[float]:
+def _scanned(motion: Motion, fix: Fix, known: KnownPlace) -> list[float]:
     """The offsets of a grid at which frame and lever arm fit best, however the rig moves: where it turns in place,
     neither its speed nor its acceleration is like those of the antenna. Half of the fixes must be used."""
     some = np.linspace(0, len(fix.t) - 1, min(len(fix.t), SCANNED_FIXES)).astype(int)
@@ -91,7 +112,7 @@ def _scanned(motion: Motion, fix: Fix, levelled: bool, known: KnownExtrinsics) -
         if ok.sum() < max(FEWEST, 0.5 * len(t)):
             continue
         at = imu_poses(motion, t[ok] + offset)
-        x = _linear(at, p[ok], levelled, known.position, offset)
+        x = _linear(at, p[ok], known, offset)
         r = at.position + at.rotation @ x.arm - p[ok] @ x.R_wf.T - x.p_wf
         tried.append((float(np.median(np.linalg.norm(r, axis=1))), offset))
     return [offset for _, offset in sorted(tried)[:MOST_PEAKS]]
@@ -125,21 +146,18 @@ class _Unknowns:
         )
 
 
-def _placed(motion: Motion, fix: Fix, offset: float, levelled: bool, known: KnownExtrinsics) -> PlacedSensor | None:
+def _placed(motion: Motion, fix: Fix, offset: float, known: KnownPlace) -> PlacedSensor | None:
     """By Gauss-Newton from a linear solution, at an offset that is refined."""
     t = fix.t + offset
     ok = is_known(motion.state.seconds, t - OFFSET_SIGMA) & is_known(motion.state.seconds, t + OFFSET_SIGMA)
     if ok.sum() < FEWEST:
         return None
     t, p = fix.t[ok], fix.position[ok]
-    x = _linear(imu_poses(motion, t + offset), p, levelled, known.position, offset)
-    start = x if known.position is not None else replace(x, arm=np.zeros(3))
-    arm_sigma = ARM_SIGMA if known.position is None else 1e-3
-    sigma = np.r_[np.full(3, arm_sigma), np.full(1 if levelled else 3, 10.0), np.full(3, 1e4)]
-    sigma = np.append(sigma, OFFSET_SIGMA if known.offset is None else 1e-4)
+    x = _linear(imu_poses(motion, t + offset), p, known, offset)
+    start, sigma = x if known.arm is not None else replace(x, arm=np.zeros(3)), _sigmas(known)
     r = np.zeros((0, 3))
     for _ in range(ROUNDS):
-        r, J = _rows(motion, t, p, x, levelled)
+        r, J = _rows(motion, t, p, x, known.levelled)
         size = np.linalg.norm(r, axis=1)
         kept = size <= OUTLIER * np.median(size) + 1e-9
         row = max(LEAST_ROW_SIGMA, float(np.median(size)))
@@ -147,7 +165,7 @@ def _placed(motion: Motion, fix: Fix, offset: float, levelled: bool, known: Know
         away = np.zeros(len(sigma))
         away[:3], away[-1] = x.arm - start.arm, x.offset - start.offset
         step = np.linalg.solve(A.T @ A + np.diag(sigma**-2), A.T @ b - away / sigma**2)
-        x = x.moved(step, levelled)
+        x = x.moved(step, known.levelled)
         if abs(x.offset - offset) > OFFSET_SIGMA:
             return None
         if np.abs(step).max() < CONVERGED:
@@ -157,10 +175,20 @@ def _placed(motion: Motion, fix: Fix, offset: float, levelled: bool, known: Know
     return PlacedSensor(x.arm, x.R_wf, x.p_wf, x.offset, left)
 
 
-def _linear(at: Poses, p: np.ndarray, levelled: bool, arm: np.ndarray | None, offset: float) -> _Unknowns:
+def _sigmas(known: KnownPlace) -> np.ndarray:
+    """(8 or 10,) standard deviations of the prior on lever arm, rotation and origin of the frame, and time offset."""
+    arm = ARM_SIGMA if known.arm is None else KNOWN_M
+    turn, origin = (FREE_RAD, FREE_M) if known.frame is None else (KNOWN_RAD, KNOWN_M)
+    offset = OFFSET_SIGMA if known.offset is None else KNOWN_S
+    return np.repeat([arm, turn, origin, offset], [3, known.turns, 3, 1])
+
+
+def _linear(at: Poses, p: np.ndarray, known: KnownPlace, offset: float) -> _Unknowns:
     """Frame and lever arm, linear in p_imu + R_imu p_imu_sensor = M p + origin with the fixes p (n, 3); M is then made
-    a rotation. arm: where it is known."""
-    n = len(p)
+    a rotation."""
+    if known.frame is not None:
+        return _linear_arm(at, p, known.frame, known.arm, offset)
+    n, arm, levelled = len(p), known.arm, known.levelled
     A, b = np.zeros((n, 3, 15)), -at.position.copy()
     A[:, :, 12:] = -np.eye(3)
     if arm is None:
@@ -182,6 +210,14 @@ def _linear(at: Poses, p: np.ndarray, levelled: bool, arm: np.ndarray | None, of
         R = so3.closest_rotation(x[3:12].reshape(3, 3))
     found = x[:3] if arm is None else arm
     return _Unknowns(found, R, np.median(at.position + at.rotation @ found - p @ R.T, axis=0), offset)
+
+
+def _linear_arm(at: Poses, p: np.ndarray, frame: PositionFrame, arm: np.ndarray | None, offset: float) -> _Unknowns:
+    """As `_linear`, in a known frame: the median over the fixes of what leads from the IMU to each, in its axes."""
+    if arm is None:
+        apart = p @ frame.rotation.T + frame.position - at.position
+        arm = np.median(np.einsum("nji,nj->ni", at.rotation, apart), axis=0)
+    return _Unknowns(arm, frame.rotation, frame.position, offset)
 
 
 def _rows(motion: Motion, t: np.ndarray, p: np.ndarray, x: _Unknowns, levelled: bool) -> tuple[np.ndarray, np.ndarray]:
