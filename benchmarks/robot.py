@@ -26,7 +26,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability.determination import Determined, determine
 from icalib.rig import Rig
-from icalib.sensors.lidar.binning import Associated, take_moments
+from icalib.sensors.lidar.binning import AssociatedPoints, take_moments
 from icalib.sensors.lidar.residual import LidarFactor
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 from icalib.validation import assess
@@ -74,7 +74,7 @@ def _parts(inputs: Inputs, found: Estimate) -> None:
     motion, planes = motion_of(inputs, state), np.array([state.values[k] for k in inputs.clouds.keys])
     noises = [found.judged.noise[s.name] for s in inputs.measurements.lidars]
     for stream, plane, noise in zip(inputs.measurements.lidars, inputs.clouds.plane, noises, strict=True):
-        cloud = Associated(stream, plane, planes)
+        cloud = AssociatedPoints(stream, plane, planes)
         spent = min(_spent(lambda c=cloud, n=noise: take_moments(c, motion, n))[1] for _ in range(REPEATS))
         rate = 1e-6 * len(stream.xyz) / spent
         print(f"{stream.name}: {1e-6 * len(stream.xyz):.1f} M points to moments {spent:.2f} s, ", end="")

@@ -323,10 +323,8 @@ def lidar_sample(
         return y, W
 
     def turned(at):
-        return (
-            factor.moments.slant[:, 0].sum()
-            + lidar_rows_turned(factor, at, np.zeros((len(factor.keyframe), 3)))[1].sum()
-        )
+        unturned = np.zeros((len(factor.keyframe), 3))
+        return factor.moments.incidence[:, 0].sum() + lidar_rows_turned(factor, at, unturned)[1].sum()
 
     r, explained = residual(state), 0.0
     for rows, J, slope in walks:
@@ -343,14 +341,14 @@ def lidar_walks(factor, at):
     one standard deviation along the way, and what half the chi^2 changes with it as beams turn (3,)."""
     m, h = factor.moments, 1e-4
     bin_of = np.repeat(np.arange(len(m.seconds)), np.diff(m.start))
-    side = 2 * factor.keyframe[bin_of] + (factor.walked[bin_of] > 0.0)
+    side = 2 * factor.keyframe[bin_of] + (factor.noise_angle[bin_of] > 0.0)
     slopes = []
     for axis in h * np.eye(3):
-        there, back = (lidar_rows_turned(factor, at, sign * factor.walked[:, None] * axis) for sign in (1.0, -1.0))
+        there, back = (lidar_rows_turned(factor, at, sign * factor.noise_angle[:, None] * axis) for sign in (1.0, -1.0))
         slopes.append([(a - b) / (2 * h) for a, b in zip(there, back, strict=True)])
     by_turn, as_beams_turn = (np.array(x) for x in zip(*slopes, strict=True))
     found = []
-    for own in np.unique(side[factor.walked[bin_of] != 0.0]):
+    for own in np.unique(side[factor.noise_angle[bin_of] != 0.0]):
         entries = np.flatnonzero(side == own)
         rows = (4 * entries[:, None] + np.arange(4)).ravel()
         found.append((rows, by_turn[:, entries].reshape(3, -1).T, as_beams_turn[:, entries].sum(axis=1)))
@@ -372,7 +370,7 @@ def lidar_rows_turned(factor, at, turn):
     distance = np.column_stack([distance, np.einsum("eba,eb->ea", R_lidar[bin_of], normal)])
     L = np.zeros((len(plane), 4, 4))
     L[:, *np.tril_indices(4)] = m.root
-    return np.einsum("eji,ej->ei", L, distance), np.einsum("ej,ej->e", m.slant[:, 1:], distance[:, 1:])
+    return np.einsum("eji,ej->ei", L, distance), np.einsum("ej,ej->e", m.incidence[:, 1:], distance[:, 1:])
 
 
 def prior_sample(unlike, setup_of, sensor, name):

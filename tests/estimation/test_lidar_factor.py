@@ -15,7 +15,7 @@ from icalib.motion.factor import chi2 as weighted_squares
 from icalib.motion.poses import Poses, assign_keyframes, poses_at
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import KEYFRAME_DIM
-from icalib.sensors.lidar.binning import Associated, LidarNoise, in_world, take_moments
+from icalib.sensors.lidar.binning import AssociatedPoints, LidarNoise, in_world, take_moments
 from icalib.tools.simulation import simulate
 
 
@@ -23,7 +23,9 @@ def moments_of(setup, noise=None, state=None, stream=None, plane=None, bin_s=1e-
     state = state or setup.state
     values = np.array([state.values[p] for p in setup.planes])
     own = setup.plane if plane is None else plane
-    return take_moments(Associated(stream or setup.stream, own, values), setup.motion(state), not_none(noise), bin_s)
+    return take_moments(
+        AssociatedPoints(stream or setup.stream, own, values), setup.motion(state), not_none(noise), bin_s
+    )
 
 
 def point_times(setup):
@@ -111,7 +113,7 @@ def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, 
     state = setup.perturbed(np.random.default_rng(0), 0.3)
     noise = LidarNoise(0.02, beam, loss, 1.2)
     factor = setup.factor(state, noise, bin_s=bin_s)
-    factor = replace(factor, walked=np.zeros_like(factor.walked))
+    factor = replace(factor, noise_angle=np.zeros_like(factor.noise_angle))
     cost, H, g, _ = sums(setup, factor, state, dense)
     point = pointwise(setup, state, bin_s)
     sigma = np.hypot(noise.sigma, beam * point.incidence)

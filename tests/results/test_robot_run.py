@@ -45,7 +45,7 @@ def out(scenario_file: Path, scenario: Scenario) -> Path:
     rig = folder / "rig.yaml"
     rig.write_text(yaml.safe_dump(rig_to_dict(rig_for(scenario))))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assess, "MOST_POINTS", MOST)
+        patch.setattr(assess, "MAX_KEPT_POINTS", MOST)
         assert main(["calibrate", str(rig), str(folder / "recording"), "-o", str(folder / "out"), "--quiet"]) == 0
     return folder / "out"
 

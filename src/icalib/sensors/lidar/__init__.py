@@ -1,1 +1,1 @@
-"""The factor of a LiDAR: points on planes."""
+"""LiDARs: the factor of points on planes, and all that other stages ask of the sensor."""

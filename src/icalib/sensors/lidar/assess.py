@@ -1,4 +1,4 @@
-"""What a result keeps and says of LiDARs: points on planes, and what speaks against their stamps and planes."""
+"""LiDARs in a result: residuals of points on planes, notes, and warnings about stamps, point times and planes."""
 
 from __future__ import annotations
 
@@ -25,18 +25,19 @@ from icalib.sensors.lidar.initialize.degeneracy import count_of, facing
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
 
-MOST_POINTS = 200_000  # kept of all LiDARs together
-FEWEST_FITTED = 4  # points of a plane
-FEW_ON_PLANES = 0.2  # of the points
-NEARLY_A_PERIOD = 0.15  # of the period
-# Relative error of the times of points within a scan: 0.0015 where they are right, 0.06 and more where they are half or
-# twice as long; and the number of standard deviations at which it is significant.
-STRETCHED, CLEARLY = 0.03, 10.0
-HALF_STEP_S = np.float32(2e-3)  # of a difference of residuals
+MAX_KEPT_POINTS = 200_000  # of all LiDARs together, in a result: some 10 MB
+MIN_PLANE_POINTS = 4  # a plane has 3 unknowns; fewer points leave no residual
+MIN_SHARE_ON_PLANES = 0.2  # of the points; fewer lie on planes only if the scene is not flat, or points are misplaced
+PERIOD_TOLERANCE = 0.15  # of the scan period: a time offset so near a period means stamps at the other end of a scan
+# Relative error of the times of points within a scan: 0.0015 if they are right, 0.06 and more if they are half or
+# twice as long.
+MAX_TIME_STRETCH = 0.03
+SIGNIFICANT_STRETCH = 10.0  # standard deviations: residuals of points in one scan are correlated
+HALF_STEP_S = np.float32(2e-3)  # of the central difference of residuals by time
 
 
 def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
-    """Where the planes are."""
+    """The estimated planes, with their numbers of points."""
     clouds = inputs.clouds
     found = (state.values[key] for key in clouds.keys)
     for name, v, n in zip(clouds.names, found, clouds.points if clouds.count else (), strict=True):
@@ -44,22 +45,24 @@ def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[LidarResiduals]:
-    """Of each LiDAR that takes part, evenly thinned."""
+    """Residuals of each LiDAR that takes part, at the estimate and at the initial guess, evenly thinned."""
     if not inputs.clouds.count:
         return
     state = found.outcome.state
-    now, first = motion_of(inputs, state), motion_of(inputs, inputs.guess or state)
+    now, guess = motion_of(inputs, state), motion_of(inputs, inputs.guess or state)
     values = np.array([state.values[key] for key in inputs.clouds.keys])
     thinned = [_thinned(inputs, k, state) for k in range(len(inputs.rig.lidars))]
-    before = [in_world(first, stream) for stream, _ in thinned]
-    guessed = _fitted([(points, plane) for (points, _), (_, plane) in zip(before, thinned, strict=True)], values)
+    before = [in_world(guess, stream) for stream, _ in thinned]
+    first_planes = _fitted_planes(
+        [(points, plane) for (points, _), (_, plane) in zip(before, thinned, strict=True)], values
+    )
     for whole, (stream, plane), (first_world, seen_from) in zip(
         inputs.measurements.lidars, thinned, before, strict=True
     ):
         seconds = _seconds_of(stream, state)
         world, at = in_world(now, stream)
         residual, cosine = _on_planes(world, at, values[plane])
-        first_residual, _ = _on_planes(first_world, seen_from, guessed[plane])
+        first_residual, _ = _on_planes(first_world, seen_from, first_planes[plane])
         yield LidarResiduals(
             stream.name,
             len(whole.stamps_ns),
@@ -77,23 +80,23 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[L
 
 
 def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.ndarray]:
-    """Fewer points of a LiDAR, all seen while the IMU was running, and the plane (N,) that each lies on."""
+    """Points of a LiDAR on planes while the IMU was running, evenly thinned, and the plane (N,) of each."""
     assert inputs.imu is not None
     stream, plane = inputs.measurements.lidars[index], inputs.clouds.plane[index]
     own = np.flatnonzero(plane >= 0)
-    own = own[:: max(1, -(-len(own) * len(inputs.rig.lidars) // MOST_POINTS))]
+    own = own[:: max(1, -(-len(own) * len(inputs.rig.lidars) // MAX_KEPT_POINTS))]
     one = _some_points(stream, own)
     running = usable(inputs.imu, _seconds_of(one, state), inputs.rig.settings.max_gap_s)
     return _some_points(one, np.flatnonzero(running)), plane[own[running]]
 
 
-def _fitted(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:
-    """(P, 6) planes that fit points (N, 3) best, of which plane (N,) each lies on is known; where there are too few,
-    and which side is up, as in `values` (P, 6)."""
+def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:
+    """(P, 6) planes fitted to clouds: points (N, 3) and the plane (N,) of each. The side of the normal, and planes with
+    too few points, are those of `values` (P, 6)."""
     out = values.copy()
     for k in range(len(values)):
         own = np.concatenate([points[plane == k] for points, plane in clouds]).astype(np.float64)
-        if len(own) >= FEWEST_FITTED:
+        if len(own) >= MIN_PLANE_POINTS:
             centre = own.mean(axis=0)
             normal = np.linalg.eigh(np.cov(own.T))[1][:, 0]
             out[k] = plane_of(np.copysign(1.0, normal @ values[k, :3]) * normal, centre)
@@ -101,21 +104,21 @@ def _fitted(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> 
 
 
 def _some_points(stream: LidarStream, own: np.ndarray) -> LidarStream:
-    """The points `own`, increasing, of all scans."""
+    """The stream with the points numbered `own` (n,), increasing. All scans stay."""
     start = np.searchsorted(own, stream.start)
     columns = {name: getattr(stream, name)[own] for name in ("offset_s", "xyz", "plane")}
     return replace(stream, start=start, **columns)
 
 
 def _seconds_of(stream: LidarStream, state: State) -> np.ndarray:
-    """(N,) instants of the points, seconds on the joined clock of the body."""
+    """(N,) instants of the points on the IMU's clock, all recordings joined [s]."""
     stamps = np.repeat(stream.seconds, np.diff(stream.start))
     return instants(stream, state.values, stamps) + stream.offset_s
 
 
 def _on_planes(points: np.ndarray, seen_from: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of points (N, 3) in the world the distance (N,) of each to its plane (N, 6), float32; cosine (N,) of the angle
-    between its beam and the plane's normal."""
+    """Signed distances (N,) [m], float32, of points (N, 3) in the world from their planes (N, 6); and cosines (N,) of
+    the angle between the beam, from seen_from (N, 3), and the normal."""
     normal, beam = planes[:, :3], points - seen_from
     residual = np.einsum("na,na->n", normal, points - planes[:, 3:])
     cosine = np.einsum("na,na->n", normal, beam) / np.linalg.norm(beam, axis=1)
@@ -123,15 +126,17 @@ def _on_planes(points: np.ndarray, seen_from: np.ndarray, planes: np.ndarray) ->
 
 
 def _sigma(noise: LidarNoise, cosine: np.ndarray) -> np.ndarray:
+    """(N,) standard deviations [m] of distances from planes, given the cosines of incidence."""
     return np.sqrt(noise.sigma**2 + (noise.beam_sigma * cosine) ** 2).astype(np.float32)
 
 
 def _used(found: Estimate, name: str) -> int:
+    """Number of points of LiDAR `name` in the estimate."""
     return sum(int(f.moments.count.sum()) for f in of_type(found.problem.factors, LidarFactor) if f.name == name)
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """How many points are in use, and their noise."""
+    """Number of points used, and their noise."""
     if not inputs.clouds.count:
         return
     ranging = [found.judged.noise[s.name] for s in inputs.rig.lidars]
@@ -147,28 +152,28 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where few points lie on planes, planes face too few directions, or stamps are those of a scan's other end."""
+    """Warnings: degenerate scene, wrong point times, few points on planes, stamps at the other end of a scan."""
     if not inputs.clouds.count:
         return
-    yield from _sight_warnings(inputs, found)
+    yield from _degeneracy_warnings(inputs, found)
     for index, (lidar, stream) in enumerate(zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True)):
-        stretch, std = _stretch(inputs, found, index)
-        if abs(stretch) > max(STRETCHED, CLEARLY * std):
+        stretch, std = _time_stretch(inputs, found, index)
+        if abs(stretch) > max(MAX_TIME_STRETCH, SIGNIFICANT_STRETCH * std):
             yield (
                 f"the times of points within a scan of {lidar.name} seem too {'short' if stretch > 0.0 else 'long'}, "
                 "or in the wrong order: points lie off their planes in proportion to the motion. Check their unit, "
                 "their origin and the sense of rotation, or set point_time in the rig file."
             )
         share = _used(found, lidar.name) / max(len(stream.xyz), 1)
-        if share < FEW_ON_PLANES:
+        if share < MIN_SHARE_ON_PLANES:
             yield (
-                f"only {share:.1%} of the points of {lidar.name} lie on planes; there is little flat in sight, or the "
-                "times of its points, their order within a scan, or its range_noise in the rig file are wrong."
+                f"only {share:.1%} of the points of {lidar.name} lie on planes; the scene has few flat surfaces, or "
+                "the times of its points, their order within a scan, or its range_noise in the rig file are wrong."
             )
         own = found.outcome.state.values[lidar.name, "time_offset"] - origin_difference(inputs.measurements, stream)
         period = float(np.median(np.diff(stream.seconds)))
         offset = float(own[np.argmin(np.abs(np.abs(own) - period))])
-        if abs(abs(offset) - period) < NEARLY_A_PERIOD * period:
+        if abs(abs(offset) - period) < PERIOD_TOLERANCE * period:
             yield (
                 f"the time_offset of {lidar.name}, {offset:+.4f} s, is about the period of its scans: its stamps may "
                 "be those of the end of a scan while times of points count from its start, or the other way; see "
@@ -176,44 +181,44 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
             )
 
 
-def _stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, float]:
-    """By which share of themselves the times of points within a scan look too short, and its standard deviation.
+def _time_stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, float]:
+    """Relative error of point times within a scan, positive if they are too short, and its standard deviation.
 
-    A point that is taken at a wrong instant is off its plane by how fast it moves along the normal; a time offset takes
-    up what all points of a scan have in common.
+    A point taken at a wrong instant is off its plane by the time error times its speed along the normal. The mean over
+    a scan is removed, as a time offset absorbs it.
     """
     state = found.outcome.state
     motion, values = motion_of(inputs, state), np.array([state.values[key] for key in inputs.clouds.keys])
     stream, plane = _thinned(inputs, index, state)
-    if len(plane) < FEWEST_FITTED:
+    if len(plane) < MIN_PLANE_POINTS:
         return 0.0, np.inf
     later, earlier = (
         _on_planes(*in_world(motion, replace(stream, offset_s=stream.offset_s + step)), values[plane])[0].astype(float)
         for step in (HALF_STEP_S, -HALF_STEP_S)
     )
     speed = (later - earlier) / (2.0 * float(HALF_STEP_S))
-    by_stretch = speed * (stream.offset_s - stream.offset_s.mean(dtype=np.float64))
+    J_stretch = speed * (stream.offset_s - stream.offset_s.mean(dtype=np.float64))
     residual = 0.5 * (later + earlier)
-    information = max(float(by_stretch @ by_stretch), 1e-30)
-    return -float(by_stretch @ residual) / information, float(residual.std()) / np.sqrt(information)
+    information = max(float(J_stretch @ J_stretch), 1e-30)
+    return -float(J_stretch @ residual) / information, float(residual.std()) / np.sqrt(information)
 
 
-def _sight_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where LiDARs alone show the motion, and not all of it."""
+def _degeneracy_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+    """A warning if LiDARs alone give the motion, and their planes face fewer than three directions."""
     if any(s.gives_motion for s in inputs.rig.mounted if not isinstance(s, Lidar)):
         return
     normals = np.array([found.outcome.state.values[key][:3] for key in inputs.clouds.keys])
     if count_of(facing(normals, inputs.clouds.points)) < 3:
         names = " and ".join(x.name for x in inputs.rig.lidars)
         yield (
-            f"the planes that {names} saw face two directions only, as in a corridor: how it moved along both the IMU "
-            "alone says. Do not trust the result if the solver did not converge; better record where walls and floor "
-            "face three directions."
+            f"the planes that {names} saw face two directions only, as in a corridor: only the IMU constrains the "
+            "motion along both. Do not trust the result if the solver did not converge; better record where walls and "
+            "floor face three directions."
         )
 
 
 def misfit(lidar: Lidar, f: SensorFit, is_noise: bool) -> str | None:
-    """A sentence where points are farther from planes than the rig file states."""
+    """A sentence if points are farther from planes than the stated range noise predicts, else None."""
     if excess(f) == 1.0 or lidar.range_noise_m is None:
         return None
     return (
@@ -223,5 +228,5 @@ def misfit(lidar: Lidar, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def length(lidar: Lidar, rig: Rig) -> str | None:
-    """What shows how long a metre is."""
+    """The source of the scale, for sentences."""
     return f"the ranges of {lidar.name}"

@@ -1,4 +1,4 @@
-"""LiDARs in a recording: how their points are timed, and what the rig file must say of it."""
+"""LiDARs in a recording: their topics, how their points are timed, and their lines in a draft rig file."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from icalib.tools.inspection.kinds import KindInspector, moving
 
 @dataclass(frozen=True)
 class LidarFacts:
-    """point_time_field and point_time_unit that the rig file must give, None where the data tell; problem: why
-    `calibrate` would refuse its clouds."""
+    """Findings on the clouds of one LiDAR. field, unit: point_time_field and point_time_unit that the rig file must
+    give, None if they are detected from the data; problem: why `calibrate` would refuse the clouds, or empty."""
 
     field: str | None = None
     unit: TimeUnit | None = None
@@ -27,7 +27,7 @@ class LidarFacts:
 
 
 class LidarInspector(KindInspector):
-    """Point clouds are always a LiDAR's on the robot."""
+    """Finds LiDARs. Every topic of point clouds is taken for a LiDAR on the robot."""
 
     sensor: ClassVar[type[Sensor]] = Lidar
     topic_kinds: ClassVar[tuple[str, ...]] = ("points",)
@@ -36,7 +36,7 @@ class LidarInspector(KindInspector):
     is_certain: ClassVar[bool] = True
 
     def facts(self, recording: Recording, name: str, topic: TopicInfo) -> LidarFacts | None:
-        """By the first clouds of a bag."""
+        """Findings from the first clouds of a bag; None for a folder."""
         if not isinstance(recording, BagRecording):
             return None
         try:
@@ -47,7 +47,7 @@ class LidarInspector(KindInspector):
             return LidarFacts(problem=str(error))
 
     def findings(self, found: Inspection) -> Iterator[Finding]:
-        """LiDARs that `calibrate` would refuse: a problem where nothing else gives the motion."""
+        """LiDARs that `calibrate` would refuse: a problem if no other sensor gives the motion, else a warning."""
         own = found.sources.of(Lidar.sensor_type)
         others = found.sources.cameras or set(moving(found)) - own.keys()
         for name in own:
@@ -55,6 +55,7 @@ class LidarInspector(KindInspector):
                 yield Finding("warning" if others else "problem", facts.problem)
 
     def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
+        """Lines of the draft rig file that name field and unit of the point times."""
         facts = found.facts.get(name)
         if facts is not None and facts.field is not None:
             yield f"point_time_field: {json.dumps(facts.field)}  # looks like the time of each point"

@@ -1,7 +1,7 @@
 """Compiled sums of the LiDAR factor: from moments of bins to the normal equations of a piece.
 
-A bin sees a plane as four whitened residuals L^T m with L L^T the moments of its points and m . (1, x) the distance of
-a point x. Sums of their squares and derivatives are those of the points.
+A plane in a bin (an entry) has four whitened residuals L^T m. L L^T are the moments of its points, and m . (1, x) is
+the distance of a point x from the plane. Sums of squares and products of derivatives equal those of the points.
 """
 
 from __future__ import annotations
@@ -17,37 +17,40 @@ from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.lidar.propagation_noise import (
     PLANE,
     POSE,
-    add_entry,
-    add_plane,
-    add_pose,
-    columns_of,
-    no_walk,
-    taken_off,
+    add_entry_noise,
+    add_plane_noise,
+    add_pose_noise,
+    eliminated_noise,
+    empty_noise_sums,
+    noise_columns,
 )
 
-ROWS = 4  # whitened residuals of a plane in a bin
-RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian
+N_WHITENED = 4  # residuals of an entry
+DISTANCE = POSE + PLANE  # row of the residual itself in the Jacobians of an entry, after its derivatives
 
 
 class Bins(NamedTuple):
-    """Bins of a piece: keyframe (n,); walked (n,): by what angle the gyroscope's noise turns the IMU about each axis on
-    the way from the keyframe, one standard deviation [rad], negative before it; entries of bin i are start[i]:start[i +
-    1], with plane, root and slant as in `Moments`; turned (E, 3, 4), slope (E, 3): how their residuals, and what
-    slanted beams add to half the chi^2, change with that turn."""
+    """n bins with E entries. keyframe (n,): from which each is propagated; noise_angle (n,): standard deviation of the
+    rotation error that gyroscope noise makes on the way, about each axis [rad], negative before the keyframe.
+
+    Entries of bin i are start[i]:start[i + 1]; plane, root, incidence: see `Moments`. J_rows_noise (E, 3, 4) and
+    J_incidence_noise (E, 3): derivatives of the whitened residuals, and of the incidence term, by the unknown rotation
+    x, see `propagation_noise`.
+    """
 
     keyframe: np.ndarray
-    walked: np.ndarray
+    noise_angle: np.ndarray
     start: np.ndarray
     plane: np.ndarray
     root: np.ndarray
-    slant: np.ndarray
-    turned: np.ndarray
-    slope: np.ndarray
+    incidence: np.ndarray
+    J_rows_noise: np.ndarray
+    J_incidence_noise: np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _distances(R_lw, p_wl, q, planes, m):
-    """m (4,) with m . (1, x) the distance of point x, in the LiDAR's frame, from plane q."""
+def _fill_distance(R_lw, p_wl, q, planes, m):
+    """m (4,), out: m . (1, x) is the distance of point x, in the LiDAR's frame, from plane q."""
     m[0] = 0.0
     for a in range(3):
         m[0] += planes.normal[q, a] * (p_wl[a] - planes.point[q, a])
@@ -57,11 +60,13 @@ def _distances(R_lw, p_wl, q, planes, m):
 
 
 @njit(cache=True, nogil=True)
-def _jacobian(R_lw, p_wl, q, planes, m, A):
-    """A (10, 4): derivatives of the distance by pose (x cross a; a) and plane, and itself, as factors of (1, x).
+def _fill_jacobian(R_lw, p_wl, q, planes, m, J_distance):
+    """J_distance (10, 4), out: factors of (1, x) in the derivatives of the distance by pose 6 and plane 3, then m.
 
-    With a = R^T n: turning the LiDAR by t moves x by t cross x, and a . (t cross x) = t . (x cross a).
+    With a = R^T n the derivatives by the pose are (x cross a; a): a rotation t of the LiDAR moves x by t cross x, and
+    a . (t cross x) = t . (x cross a).
     """
+    A = J_distance
     A[:] = 0.0
     A[0, 2], A[0, 3] = m[3], -m[2]
     A[1, 3], A[1, 1] = m[1], -m[3]
@@ -74,13 +79,13 @@ def _jacobian(R_lw, p_wl, q, planes, m, A):
             for b in range(3):
                 A[POSE + t, 1 + a] += R_lw[a, b] * planes.tangents[q, t, b]
     A[POSE + 2, 0] = -1.0
-    for c in range(ROWS):
-        A[RESIDUAL, c] = m[c]
+    for c in range(N_WHITENED):
+        A[DISTANCE, c] = m[c]
 
 
 @njit(cache=True, nogil=True)
 def _times_root(A, root, B):
-    """B (n, 4) = A[:n] L with L the lower triangle `root` (10,), row by row."""
+    """B (n, 4) = A[:n] L, with L the lower triangle `root` (10,), row by row."""
     for i in range(len(B)):
         B[i, 0] = A[i, 0] * root[0] + A[i, 1] * root[1] + A[i, 2] * root[3] + A[i, 3] * root[6]
         B[i, 1] = A[i, 1] * root[2] + A[i, 2] * root[4] + A[i, 3] * root[7]
@@ -89,27 +94,37 @@ def _times_root(A, root, B):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_to_pose(B, A, slant, G):
-    """The pose part of one plane in one bin to G (6, 7), with the gradient of slant . (1, R^T n), which bends too
-    little to count."""
+def _add_pose_gram(J_rows, J_distance, incidence, gram):
+    """Adds an entry to gram (6, 7): products of its derivatives by the pose with one another and with the residual,
+    and the gradient of the incidence term, whose second derivative is negligible."""
     for i in range(POSE):
         for j in range(POSE + 1):
-            c = j if j < POSE else RESIDUAL
-            G[i, j] += B[i, 0] * B[c, 0] + B[i, 1] * B[c, 1] + B[i, 2] * B[c, 2] + B[i, 3] * B[c, 3]
-        G[i, POSE] += A[i, 1] * slant[1] + A[i, 2] * slant[2] + A[i, 3] * slant[3]
+            c = j if j < POSE else DISTANCE
+            gram[i, j] += (
+                J_rows[i, 0] * J_rows[c, 0]
+                + J_rows[i, 1] * J_rows[c, 1]
+                + J_rows[i, 2] * J_rows[c, 2]
+                + J_rows[i, 3] * J_rows[c, 3]
+            )
+        gram[i, POSE] += (
+            J_distance[i, 1] * incidence[1] + J_distance[i, 2] * incidence[2] + J_distance[i, 3] * incidence[3]
+        )
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_plane(k, B, T, columns, own, sums, V):
-    """What the columns `own` of one plane in one bin share in, to the sums; V (3, w): work space."""
-    n_b, n_chain = sums.calib.shape[0] - 1, T.shape[1] - len(columns)
+def _add_plane(k, J_rows, J_pose, columns, own, sums, V):
+    """Adds to the sums of keyframe k all products of an entry with the columns `own` (3,) of its plane.
+
+    J_pose (6, w): the pose by keyframes and calibration columns (c,); V (3, w): work space.
+    """
+    B, n_b, n_chain = J_rows, sums.calib.shape[0] - 1, J_pose.shape[1] - len(columns)
     V[:] = 0.0
     for i in range(POSE):
         for t in range(PLANE):
             b = B[POSE + t]
             v = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
-            for j in range(T.shape[1]):
-                V[t, j] += v * T[i, j]
+            for j in range(J_pose.shape[1]):
+                V[t, j] += v * J_pose[i, j]
     for h in range(n_chain // KEYFRAME_DIM):
         for r in range(KEYFRAME_DIM):
             for t in range(PLANE):
@@ -130,19 +145,20 @@ def _add_plane(k, B, T, columns, own, sums, V):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_slant(A, slant, own, sums):
-    """The gradient of slant . (1, R^T n) by the plane, to the sums."""
+def _add_plane_incidence(J_distance, incidence, own, sums):
+    """Adds the gradient of the incidence term by the plane with columns `own` (3,) to the sums."""
     n_b = sums.calib.shape[0] - 1
     for t in range(PLANE):
-        s = A[POSE + t, 1] * slant[1] + A[POSE + t, 2] * slant[2] + A[POSE + t, 3] * slant[3]
+        J = J_distance[POSE + t]
+        s = J[1] * incidence[1] + J[2] * incidence[2] + J[3] * incidence[3]
         sums.calib[own[t], n_b] += s
         sums.calib[n_b, own[t]] += s
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _take_off(k, walk, n_chain, columns, of_plane, sums):
-    """Ends a walk from keyframe k; returns what it takes off the chi^2."""
-    own, V = columns_of(walk, columns, of_plane), taken_off(walk)
+def _eliminate_noise(k, noise, n_chain, columns, plane_columns, sums):
+    """Eliminates the unknown rotation of one side of keyframe k. Returns what the chi^2 loses."""
+    own, V = noise_columns(noise, columns, plane_columns), eliminated_noise(noise)
     last = V.shape[1] - 1
     if len(sums.diagonal) > 0:
         add_product(k, n_chain, last, V, -V, own, sums)
@@ -150,107 +166,129 @@ def _take_off(k, walk, n_chain, columns, of_plane, sums):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _ends_here(i, bins):
-    """Whether bin i is the last on its side of its keyframe."""
+def _is_last_of_side(i, bins):
+    """Whether bin i is the last one on its side of its keyframe."""
     if i + 1 == len(bins.keyframe) or bins.keyframe[i + 1] != bins.keyframe[i]:
         return True
-    return (bins.walked[i + 1] < 0.0) != (bins.walked[i] < 0.0)
+    return (bins.noise_angle[i + 1] < 0.0) != (bins.noise_angle[i] < 0.0)
 
 
 class _BinWork(NamedTuple):
-    """Work space of `accumulate`. T, A_imu: see `fill_chain`; m: see `_distances`; A, B (10, 4): derivatives of an
-    entry, and these times its root; G (6, 7), W (3, 6): products of a bin's derivatives by its pose with themselves and
-    the residual, and with those by the turn that noise makes; F, V: room for sums."""
+    """Work space. J_pose (6, w), J_imu_pose (6, 6): see `fill_chain`; m: see `_fill_distance`; J_distance, J_rows
+    (10, 4): derivatives of an entry, and these times its root; gram (6, 7), gram_noise (3, 6): products of a bin's
+    derivatives by its pose with themselves and the residual, and with those by the unknown rotation; F, V: see
+    `add_gram` and `_add_plane`."""
 
-    T: np.ndarray
-    A_imu: np.ndarray
+    J_pose: np.ndarray
+    J_imu_pose: np.ndarray
     m: np.ndarray
-    A: np.ndarray
-    B: np.ndarray
-    G: np.ndarray
-    W: np.ndarray
+    J_distance: np.ndarray
+    J_rows: np.ndarray
+    gram: np.ndarray
+    gram_noise: np.ndarray
     F: np.ndarray
     V: np.ndarray
 
 
 @njit(cache=True, nogil=True)
 def _work_space(at, n_columns):
+    """Arrays for poses `at` with n_columns calibration columns."""
     width = chain_width(at) + n_columns
+    shape = (DISTANCE + 1, N_WHITENED)
     return _BinWork(
-        np.empty((POSE, width)), np.empty((POSE, POSE)), np.empty(ROWS), np.empty((RESIDUAL + 1, ROWS)),
-        np.empty((RESIDUAL + 1, ROWS)), np.empty((POSE, POSE + 1)), np.empty((3, POSE)), np.empty((POSE, width + 1)),
+        np.empty((POSE, width)),
+        np.empty((POSE, POSE)),
+        np.empty(N_WHITENED),
+        np.empty(shape),
+        np.empty(shape),
+        np.empty((POSE, POSE + 1)),
+        np.empty((3, POSE)),
+        np.empty((POSE, width + 1)),
         np.empty((PLANE, width)),
-    )  # fmt: skip
+    )
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _see(e, R_lw, p_wl, bins, planes, work, rows):
-    """Whitened residuals of entry e, the LiDAR at R_lw, p_wl. Returns half their chi^2 and what their variances add as
-    beams turn."""
-    _distances(R_lw, p_wl, bins.plane[e], planes, work.m)
-    for c in range(ROWS):
-        work.A[0, c] = work.m[c]
-    _times_root(work.A, bins.root[e], rows[e : e + 1])
-    cost = bins.slant[e, 0]
-    for c in range(ROWS):
+def _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows):
+    """Whitened residuals of entry e, with the LiDAR at R_lw, p_wl, into `rows` (E, 4). Returns half their chi^2 plus
+    the incidence term."""
+    m, incidence = work.m, bins.incidence
+    _fill_distance(R_lw, p_wl, bins.plane[e], planes, m)
+    for c in range(N_WHITENED):
+        work.J_distance[0, c] = m[c]
+    _times_root(work.J_distance, bins.root[e], rows[e : e + 1])
+    cost = incidence[e, 0]
+    for c in range(N_WHITENED):
         cost += 0.5 * rows[e, c] ** 2
-        cost += bins.slant[e, c] * work.m[c] if c else 0.0
+        cost += incidence[e, c] * m[c] if c else 0.0
     return cost
 
 
 @njit(cache=True, nogil=True)
-def turn_by_noise(bins, at, columns, planes):
-    """Fills `turned` and `slope` of the bins, which are empty."""
+def linearise_noise(bins, at, columns, planes):
+    """Adds the derivatives by the unknown rotation to J_rows_noise and J_incidence_noise of the bins, which are 0.
+
+    at: poses of the LiDAR at the bins; columns (c,): their calibration columns.
+    """
     work = _work_space(at, len(columns))
+    A, B, J_imu_pose = work.J_distance, work.J_rows, work.J_imu_pose
     for i in range(len(bins.keyframe)):
         R_lw, p_wl = at.R_sensor_world[i], at.p_world_sensor[i]
-        fill_imu_pose(i, at, work.A_imu)
+        fill_imu_pose(i, at, J_imu_pose)
         for e in range(bins.start[i], bins.start[i + 1]):
-            _distances(R_lw, p_wl, bins.plane[e], planes, work.m)
-            _jacobian(R_lw, p_wl, bins.plane[e], planes, work.m, work.A)
-            _times_root(work.A, bins.root[e], work.B[:POSE])
+            _fill_distance(R_lw, p_wl, bins.plane[e], planes, work.m)
+            _fill_jacobian(R_lw, p_wl, bins.plane[e], planes, work.m, A)
+            _times_root(A, bins.root[e], B[:POSE])
             for a in range(3):
                 for j in range(POSE):
-                    w = bins.walked[i] * work.A_imu[j, a]
-                    for c in range(ROWS):
-                        bins.turned[e, a, c] += w * work.B[j, c]
-                        bins.slope[e, a] += w * work.A[j, c] * bins.slant[e, c] if c else 0.0
+                    w = bins.noise_angle[i] * J_imu_pose[j, a]
+                    for c in range(N_WHITENED):
+                        bins.J_rows_noise[e, a, c] += w * B[j, c]
+                        bins.J_incidence_noise[e, a] += w * A[j, c] * bins.incidence[e, c] if c else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise, has_noise):
+    """Adds entry e, of a bin of keyframe k, to the sums where they are wanted. Returns its part of the cost."""
+    q, wanted = bins.plane[e], len(sums.diagonal) > 0
+    own, A, B = planes.columns[q], work.J_distance, work.J_rows
+    cost = _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows)
+    if wanted:
+        _fill_jacobian(R_lw, p_wl, q, planes, work.m, A)
+        _times_root(A, bins.root[e], B)
+        _add_pose_gram(B, A, bins.incidence[e], work.gram)
+    if has_noise:
+        add_entry_noise(bins.J_rows_noise[e], bins.J_incidence_noise[e], rows[e], B, work.gram_noise, noise)
+    if wanted and own[0] >= 0:
+        _add_plane(k, B, work.J_pose, columns, own, sums, work.V)
+        _add_plane_incidence(A, bins.incidence[e], own, sums)
+        if has_noise:
+            add_plane_noise(bins.J_rows_noise[e], B, q, noise)
+    return cost
 
 
 @njit(cache=True, nogil=True)
 def accumulate(bins, at, columns, planes, sums, rows):
-    """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted. at: poses of the
-    LiDAR at the bins; columns (c,): calibration columns of these.
+    """Fills the whitened residuals `rows` (E, 4) of all bins, and adds their normal equations to `sums` if wanted.
 
-    Returns half the chi^2, less what the gyroscope's noise explains, and what the variances add as beams turn.
+    at: poses of the LiDAR at the bins; columns (c,): calibration columns of these. Returns half the chi^2, less
+    the part that propagated noise absorbs, plus the incidence term.
     """
     wanted, work, cost = len(sums.diagonal) > 0, _work_space(at, len(columns)), 0.0
-    T, A, B, G, W = work.T, work.A, work.B, work.G, work.W
-    n_chain, walk = chain_width(at), no_walk(T.shape[1], len(planes.normal))
+    J_pose, n_chain = work.J_pose, chain_width(at)
+    noise = empty_noise_sums(J_pose.shape[1], len(planes.normal))
     for i in range(len(bins.keyframe)):
-        k, walks = bins.keyframe[i] - sums.first, bins.walked[i] != 0.0
+        k, has_noise = bins.keyframe[i] - sums.first, bins.noise_angle[i] != 0.0
         R_lw, p_wl = at.R_sensor_world[i], at.p_world_sensor[i]
         if wanted:
-            fill_chain(i, at, work.A_imu, T)
-        B[:], G[:], W[:] = 0.0, 0.0, 0.0
+            fill_chain(i, at, work.J_imu_pose, J_pose)
+        work.J_rows[:], work.gram[:], work.gram_noise[:] = 0.0, 0.0, 0.0
         for e in range(bins.start[i], bins.start[i + 1]):
-            q = bins.plane[e]
-            cost += _see(e, R_lw, p_wl, bins, planes, work, rows)
-            if wanted:
-                _jacobian(R_lw, p_wl, q, planes, work.m, A)
-                _times_root(A, bins.root[e], B)
-                _add_to_pose(B, A, bins.slant[e], G)
-            if walks:
-                add_entry(bins.turned[e], bins.slope[e], rows[e], B, W, walk)
-            if wanted and planes.columns[q, 0] >= 0:
-                _add_plane(k, B, T, columns, planes.columns[q], sums, work.V)
-                _add_slant(A, bins.slant[e], planes.columns[q], sums)
-                if walks:
-                    add_plane(bins.turned[e], B, q, walk)
+            cost += _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise, has_noise)
         if wanted:
-            add_gram(k, n_chain, G, T, columns, work.F, sums)
-        if wanted and walks:
-            add_pose(W, T, walk)
-        if walks and _ends_here(i, bins):
-            cost -= 0.5 * _take_off(k, walk, n_chain, columns, planes.columns, sums)
+            add_gram(k, n_chain, work.gram, J_pose, columns, work.F, sums)
+        if wanted and has_noise:
+            add_pose_noise(work.gram_noise, J_pose, noise)
+        if has_noise and _is_last_of_side(i, bins):
+            cost -= 0.5 * _eliminate_noise(k, noise, n_chain, columns, planes.columns, sums)
     return cost

@@ -1,4 +1,4 @@
-"""How a LiDAR enters the problem: points on planes, where any are known to lie on planes."""
+"""How a LiDAR enters the problem: by the factor of its points on planes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from icalib.rig import Lidar, Settings
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.residual import LidarFactor
 
-NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the model lacks where beams graze a plane
-FIRST_RANGE_M = 0.03  # where the noise is not stated
-LEAST_RANGE_M = 1e-3
+# Noise of the distance beside stated range noise: without it beams that graze a plane would have infinite weight.
+GRAZING_SIGMA_M = 1e-3
+FIRST_RANGE_SIGMA_M = 0.03  # in the first pass if the rig file states none: typical of a spinning LiDAR
+MIN_RANGE_SIGMA_M = 1e-3  # of estimated noise: keeps weights of simulated points without noise finite
 
 
 class LidarModel(SensorModel[Lidar, LidarNoise]):
-    """Takes part once planes are known. Stated noise is along the beam, estimated noise alike in all directions."""
+    """A LiDAR takes part once planes are known. Stated noise is along the beam; estimated noise is the same in all
+    directions."""
 
     keyframes = "scans"
 
@@ -34,15 +36,15 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         """See `SensorModel`."""
         loss, scale = settings.loss, settings.loss_scale
         if sensor.range_noise_m is None:
-            return LidarNoise(FIRST_RANGE_M, 0.0, loss, scale)
-        return LidarNoise(NEAR_PLANE_M, sensor.range_noise_m, loss, scale)
+            return LidarNoise(FIRST_RANGE_SIGMA_M, 0.0, loss, scale)
+        return LidarNoise(GRAZING_SIGMA_M, sensor.range_noise_m, loss, scale)
 
     def next_noise(self, sensor: Lidar, noise: LidarNoise, found: ResidualStatistics) -> LidarNoise:
-        """The RMS of the whitened distances scales it."""
+        """Noise that the rig file does not state, scaled by the RMS of the whitened distances."""
         points = found.squares.get("points")
         if sensor.range_noise_m is not None or points is None:
             return noise
-        sigma = max(noise.sigma * float(np.sqrt(points.chi2 / points.n)), LEAST_RANGE_M)
+        sigma = max(noise.sigma * float(np.sqrt(points.chi2 / points.n)), MIN_RANGE_SIGMA_M)
         return LidarNoise(sigma, 0.0, noise.loss, noise.loss_scale)
 
     def noise_passes(self, sensor: Lidar) -> int:
@@ -50,7 +52,7 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         return int(sensor.range_noise_m is None)
 
     def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[LidarFactor]:
-        """One; early passes take fewer points, in longer bins."""
+        """One factor. Coarse passes use fewer points and longer bins."""
         assert at.motion is not None
         plane = _plane(sensor, at)
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)

@@ -1,7 +1,7 @@
 """Compiled sums over the points of LiDAR scans: see `binning`.
 
-Points of a scan are first sorted by step of time and plane. Of those that stand together then all is alike but their
-coordinates, and several are added at a time.
+The points of a scan are sorted by time step and plane first. Points of one step and plane share pose, twist and plane,
+so the inner loop works on their coordinates alone and is vectorised.
 """
 
 from __future__ import annotations
@@ -13,97 +13,109 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.optim.robust_weights import weight
 
-MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
-SUMS = MOMENTS + 3  # and the slant
-NO_NOISE = 16.0  # a point's chi^2 beyond this comes of a poor state, or of an outlier, and has no part in the slant
-NO_PIVOT = 1e-13  # of a moment: below this a pivot is rounding
+N_MOMENTS = 10  # products of (1, x, y, z), lower triangle row by row
+N_SUMS = N_MOMENTS + 3  # the moments, then the gradient of the incidence term
+MAX_INCIDENCE_CHI2 = 16.0  # 4 sigma: beyond, a point is an outlier or the state poor, and not in the incidence term
+MIN_PIVOT = 1e-13  # of a diagonal moment: a smaller pivot is rounding of float64
 
 
 class Scans(NamedTuple):
-    """Points of scans and the steps of time that they fall into: start (S + 1,); first step of each scan, counted from
-    its stamp, and its place among all steps (S + 1,), both a multiple of the steps of a bin."""
+    """S scans of N points, and the time steps that these fall into.
+
+    start (S + 1,): points of scan i are start[i]:start[i + 1]; offset_s (N,): from the stamp of the scan; xyz (N, 3)
+    [m]; plane (N,): -1 where a point lies on none. first_step (S,): number of the first step, counted from the stamp of
+    the scan; step_start (S + 1,): its position among all steps. Both are multiples of the steps of a bin.
+    """
 
     start: np.ndarray
     offset_s: np.ndarray
     xyz: np.ndarray
     plane: np.ndarray
-    low: np.ndarray
-    steps: np.ndarray
+    first_step: np.ndarray
+    step_start: np.ndarray
 
 
-class Cells(NamedTuple):
-    """Of each step (n,): whether the LiDAR's motion is known; where the LiDAR is at its middle, seen from its bin's
-    centre (turn, shift). Of each bin (m,): rotation and position of the LiDAR at its centre."""
+class BinPoses(NamedTuple):
+    """Poses of the LiDAR at n steps and m bins. known (n,): whether IMU readings cover the step and its bin; R_bin_step
+    (n, 3, 3), p_bin_step (n, 3): middle of each step, in the frame of the LiDAR at the centre of its bin; R_world_bin
+    (m, 3, 3), p_world_bin (m, 3): centre of each bin."""
 
     known: np.ndarray
-    turn: np.ndarray
-    shift: np.ndarray
-    rotation: np.ndarray
-    position: np.ndarray
+    R_bin_step: np.ndarray
+    p_bin_step: np.ndarray
+    R_world_bin: np.ndarray
+    p_world_bin: np.ndarray
 
 
-class Weights(NamedTuple):
-    """Variances [m^2] of what is alike in all directions, and of what is along the beam; the loss."""
+class RangeWeights(NamedTuple):
+    """Noise and robust loss of points: variance [m^2] of the distance from a plane, the same in all directions;
+    variance [m^2] along the beam; number of the loss, and its scale in standard deviations."""
 
-    alike: float
-    along: float
+    variance: float
+    beam_variance: float
     loss: int
     scale: float
 
 
 @njit(cache=True, nogil=True)
-def step_range(start, offset_s, per_s, each, low, count):
-    """First step of each scan, counted from its stamp, and how many there are: whole bins of `each` steps."""
+def step_range(start, offset_s, per_s, per_bin, first, count):
+    """Fills the first step of each scan, counted from its stamp, and the number of its steps: whole bins of per_bin
+    steps. per_s: steps in a second. A scan without points has no step."""
     for i in range(len(start) - 1):
         least, most = np.inf, -np.inf
         for n in range(start[i], start[i + 1]):
             least, most = min(least, offset_s[n]), max(most, offset_s[n])
         empty = start[i + 1] == start[i]
-        low[i] = 0 if empty else each * (int(np.floor(np.float64(least) * per_s)) // each)
-        count[i] = 0 if empty else each * ((int(np.floor(np.float64(most) * per_s)) - low[i]) // each + 1)
+        first[i] = 0 if empty else per_bin * (int(np.floor(np.float64(least) * per_s)) // per_bin)
+        count[i] = 0 if empty else per_bin * ((int(np.floor(np.float64(most) * per_s)) - first[i]) // per_bin + 1)
 
 
 @njit(cache=True, nogil=True)
-def to_centres(motion, each, ok, cells):
-    """Fills `cells` for bins of `each` steps."""
-    for c in range(len(ok) // each):
-        m = c * each + each // 2
+def fill_bin_poses(motion, per_bin, ok, poses):
+    """Fills `poses` for bins of per_bin steps. motion: `Sweep` at the middles of the steps (n,), of which ok (n,) are
+    covered by IMU readings."""
+    for c in range(len(ok) // per_bin):
+        m = c * per_bin + per_bin // 2
         R, p = motion.rotation[m], motion.position[m]
         for i in range(3):
-            cells.position[c, i] = p[i]
+            poses.p_world_bin[c, i] = p[i]
             for j in range(3):
-                cells.rotation[c, i, j] = R[i, j]
-        for b in range(c * each, (c + 1) * each):
-            cells.known[b] = ok[b] and ok[m]
+                poses.R_world_bin[c, i, j] = R[i, j]
+        for b in range(c * per_bin, (c + 1) * per_bin):
+            poses.known[b] = ok[b] and ok[m]
             for i in range(3):
-                cells.shift[b, i] = 0.0
+                poses.p_bin_step[b, i] = 0.0
                 for j in range(3):
-                    cells.shift[b, i] += R[j, i] * (motion.position[b, j] - p[j])
-                    cells.turn[b, i, j] = 0.0
+                    poses.p_bin_step[b, i] += R[j, i] * (motion.position[b, j] - p[j])
+                    poses.R_bin_step[b, i, j] = 0.0
                     for k in range(3):
-                        cells.turn[b, i, j] += R[k, i] * motion.rotation[b, k, j]
+                        poses.R_bin_step[b, i, j] += R[k, i] * motion.rotation[b, k, j]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _see_plane(R, p, plane, seen):
-    """seen (4,): (n . p - d, R^T n), so that seen . (1, x) is the distance of a point x in the LiDAR's frame."""
-    seen[0] = 0.0
+def _fill_distance_at(R, p, plane, m):
+    """m (4,), out: (n . p - d, R^T n), so that m . (1, x) is the distance of point x, in the LiDAR's frame, from the
+    plane (6,): normal, point."""
+    m[0] = 0.0
     for a in range(3):
-        seen[0] += plane[a] * (p[a] - plane[3 + a])
-        seen[1 + a] = R[0, a] * plane[0] + R[1, a] * plane[1] + R[2, a] * plane[2]
+        m[0] += plane[a] * (p[a] - plane[3 + a])
+        m[1 + a] = R[0, a] * plane[0] + R[1, a] * plane[1] + R[2, a] * plane[2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sort_scan(i, scans, per_s, n_planes, ends, points):
-    """Points (4, n) of scan i: x, y, z, and how long after the middle of its step. Those of one step and plane stand
-    together, and end at ends[step * n_planes + plane], where the next begin."""
-    low, step_s = scans.low[i], 1.0 / per_s
-    # Unsigned indices spare the test of each whether it counts from the end.
+    """Sorts the points of scan i by step and plane (counting sort).
+
+    points (4, n), out: x, y, z [m], and time since the middle of the step [s]. The group of a step and plane ends at
+    ends[step * n_planes + plane], where the next group begins.
+    """
+    first_step, step_s = scans.first_step[i], 1.0 / per_s
+    # Unsigned indices spare the test whether an index counts from the end.
     first, last = np.uint64(scans.start[i]), np.uint64(scans.start[i + 1])
     ends[:] = 0
     for n in range(first, last):
         if scans.plane[n] >= 0:
-            k = int(np.floor(np.float64(scans.offset_s[n]) * per_s)) - low
+            k = int(np.floor(np.float64(scans.offset_s[n]) * per_s)) - first_step
             ends[np.uint64(k * n_planes + scans.plane[n])] += 1
     before = 0
     for key in range(len(ends)):
@@ -112,61 +124,68 @@ def _sort_scan(i, scans, per_s, n_planes, ends, points):
         if scans.plane[n] >= 0:
             offset = np.float64(scans.offset_s[n])
             k = int(np.floor(offset * per_s))
-            key = np.uint64((k - low) * n_planes + scans.plane[n])
+            key = np.uint64((k - first_step) * n_planes + scans.plane[n])
             to = np.uint64(ends[key])
             points[0, to], points[1, to], points[2, to] = scans.xyz[n, 0], scans.xyz[n, 1], scans.xyz[n, 2]
             points[3, to] = offset - (k + 0.5) * step_s
             ends[key] += 1
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _moved_by_twist(x, y, z, dt, rate, velocity):
+    """Point (x, y, z), seen dt seconds after the middle of its step, in the LiDAR's frame at that middle: the twist is
+    integrated to second order. rate [rad/s], velocity [m/s]: of the LiDAR, in its own axes."""
+    (w0, w1, w2), (v0, v1, v2), h = rate, velocity, 0.5 * dt
+    mx, my, mz = x + h * (w1 * z - w2 * y), y + h * (w2 * x - w0 * z), z + h * (w0 * y - w1 * x)
+    return (
+        x + dt * (v0 + w1 * mz - w2 * my),
+        y + dt * (v1 + w2 * mx - w0 * mz),
+        z + dt * (v2 + w0 * my - w1 * mx),
+    )
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def _add_points(points, begin, end, turn, shift, rate, velocity, seen, weights, sums):
-    """Adds the weighted points from begin to end, of one step and plane, to the sums. Only numbers within the loop, no
-    arrays but the points: so the compiler makes it take several points at a time."""
+def _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums):
+    """Adds the weighted points begin:end, of one step and plane, to sums (13,): see N_SUMS.
+
+    R, p: pose of the step at the centre of its bin; rate, velocity: twist; m (4,): distance from the plane, see
+    `_fill_distance_at`. The loop holds scalars only, so that the compiler vectorises it.
+    """
     xs, ys, zs, dts = points[0, begin:end], points[1, begin:end], points[2, begin:end], points[3, begin:end]
-    w0, w1, w2, v0, v1, v2 = rate[0], rate[1], rate[2], velocity[0], velocity[1], velocity[2]
-    R00, R01, R02, t0 = turn[0, 0], turn[0, 1], turn[0, 2], shift[0]
-    R10, R11, R12, t1 = turn[1, 0], turn[1, 1], turn[1, 2], shift[1]
-    R20, R21, R22, t2 = turn[2, 0], turn[2, 1], turn[2, 2], shift[2]
-    off0, n0, n1, n2 = seen[0], seen[1], seen[2], seen[3]
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = slant0 = slant1 = slant2 = 0.0
+    rate, velocity = (rate[0], rate[1], rate[2]), (velocity[0], velocity[1], velocity[2])
+    R00, R01, R02, p0 = R[0, 0], R[0, 1], R[0, 2], p[0]
+    R10, R11, R12, p1 = R[1, 0], R[1, 1], R[1, 2], p[1]
+    R20, R21, R22, p2 = R[2, 0], R[2, 1], R[2, 2], p[2]
+    m0, n0, n1, n2 = m[0], m[1], m[2], m[3]
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = g0 = g1 = g2 = 0.0
     for n in range(len(xs)):
         x, y, z, dt = np.float64(xs[n]), np.float64(ys[n]), np.float64(zs[n]), np.float64(dts[n])
-        h = 0.5 * dt
-        mx, my, mz = x + h * (w1 * z - w2 * y), y + h * (w2 * x - w0 * z), z + h * (w0 * y - w1 * x)
-        mx, my, mz = (
-            x + dt * (v0 + w1 * mz - w2 * my),
-            y + dt * (v1 + w2 * mx - w0 * mz),
-            z + dt * (v2 + w0 * my - w1 * mx),
-        )
-        x, y, z = (
-            R00 * mx + R01 * my + R02 * mz + t0,
-            R10 * mx + R11 * my + R12 * mz + t1,
-            R20 * mx + R21 * my + R22 * mz + t2,
-        )
+        a, b, c = _moved_by_twist(x, y, z, dt, rate, velocity)
+        x, y = R00 * a + R01 * b + R02 * c + p0, R10 * a + R11 * b + R12 * c + p1
+        z = R20 * a + R21 * b + R22 * c + p2
         across = n0 * x + n1 * y + n2 * z
-        off, square = off0 + across, x * x + y * y + z * z
-        over = 1.0 / (weights.alike * square + weights.along * across * across)
+        distance, square = m0 + across, x * x + y * y + z * z
+        over = 1.0 / (weights.variance * square + weights.beam_variance * across * across)
         w = square * over
-        chi2 = off * off * w
+        chi2 = distance * distance * w
         robust = weight(weights.loss, weights.scale, chi2)[0]
-        turns = robust * chi2 * weights.along * across * over if chi2 < NO_NOISE else 0.0
-        slant0, slant1, slant2 = slant0 - turns * x, slant1 - turns * y, slant2 - turns * z
+        g = robust * chi2 * weights.beam_variance * across * over if chi2 < MAX_INCIDENCE_CHI2 else 0.0
+        g0, g1, g2 = g0 - g * x, g1 - g * y, g2 - g * z
         w *= robust
         wx, wy, wz = w * x, w * y, w * z
         s0, s1, s2, s3, s4 = s0 + w, s1 + wx, s2 + wx * x, s3 + wy, s4 + wy * x
         s5, s6, s7, s8, s9 = s5 + wy * y, s6 + wz, s7 + wz * x, s8 + wz * y, s9 + wz * z
-    own = (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, slant0, slant1, slant2)
-    for k in range(SUMS):
+    own = (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, g0, g1, g2)
+    for k in range(N_SUMS):
         sums[k] += own[k]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _root_in_place(M):
-    """Moments (10,) -> their lower Cholesky factor; where a pivot is nothing but rounding, its column is 0."""
+def _factorise(M):
+    """Replaces moments M (10,) by their lower Cholesky factor. A column whose pivot is rounding becomes 0."""
     for j in range(4):
         d = M[j * (j + 1) // 2 + j]
-        least = NO_PIVOT * d
+        least = MIN_PIVOT * d
         for k in range(j):
             d -= M[j * (j + 1) // 2 + k] ** 2
         f = 1.0 / np.sqrt(d) if d > least else 0.0
@@ -179,63 +198,73 @@ def _root_in_place(M):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _bin_scan(i, scans, motion, cells, each, planes, weights, sorted_points, entries, total):
-    """Entries of scan i, from `total` on, in the order of bins and planes; returns how many there are then."""
-    bins, plane, count, root, slant = entries
+def _write_entry(c, q, number, m, sums, entries, total):
+    """Writes the entry of plane q in bin c at `total`: `number` points with the sums (13,)."""
+    bins, plane, count, root, incidence = entries
+    bins[total], plane[total], count[total] = c, q, number
+    for k in range(N_MOMENTS):
+        root[total, k] = sums[k]
+    _factorise(root[total])
+    for k in range(3):
+        incidence[total, 1 + k] = sums[N_MOMENTS + k]
+    incidence[total, 0] = -(sums[10] * m[1] + sums[11] * m[2] + sums[12] * m[3])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bin_scan(i, scans, motion, poses, per_bin, planes, weights, sorted_points, entries, total):
+    """Writes the entries of scan i from `total` on, in the order of bins and planes. Returns the new total."""
     ends, points = sorted_points
-    first, seen, sums = scans.steps[i], np.empty(4), np.empty(SUMS)
-    for c in range(first // each, scans.steps[i + 1] // each):
+    first, m, sums = scans.step_start[i], np.empty(4), np.empty(N_SUMS)
+    for c in range(first // per_bin, scans.step_start[i + 1] // per_bin):
         for q in range(len(planes)):
             number = 0
-            for b in range(c * each, (c + 1) * each):
+            for b in range(c * per_bin, (c + 1) * per_bin):
                 key = (b - first) * len(planes) + q
                 begin, end = ends[key - 1] if key else 0, ends[key]
-                if begin == end or not cells.known[b]:
+                if begin == end or not poses.known[b]:
                     continue
                 if number == 0:
-                    _see_plane(cells.rotation[c], cells.position[c], planes[q], seen)
-                    for k in range(SUMS):
+                    _fill_distance_at(poses.R_world_bin[c], poses.p_world_bin[c], planes[q], m)
+                    for k in range(N_SUMS):
                         sums[k] = 0.0
-                turn, shift, rate, velocity = cells.turn[b], cells.shift[b], motion.rate[b], motion.velocity[b]
-                _add_points(points, begin, end, turn, shift, rate, velocity, seen, weights, sums)
+                R, p, rate, velocity = poses.R_bin_step[b], poses.p_bin_step[b], motion.rate[b], motion.velocity[b]
+                _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums)
                 number += end - begin
             if number:
-                bins[total], plane[total], count[total] = c, q, number
-                for k in range(MOMENTS):
-                    root[total, k] = sums[k]
-                _root_in_place(root[total])
-                for k in range(3):
-                    slant[total, 1 + k] = sums[MOMENTS + k]
-                slant[total, 0] = -(sums[10] * seen[1] + sums[11] * seen[2] + sums[12] * seen[3])
+                _write_entry(c, q, number, m, sums, entries, total)
                 total += 1
     return total
 
 
 @njit(cache=True, nogil=True)
-def bin_scans(scans, motion, cells, each, planes, weights, per_s, entries):
-    """All scans one after the other, bins of `each` steps: entries' bin, plane, count, root and slant; returns how
-    many."""
-    room, most, total = 0, 0, 0
+def bin_scans(scans, motion, poses, per_bin, planes, weights, per_s, entries):
+    """Sums the points of all scans in bins of per_bin steps. Returns the number of entries.
+
+    motion: `Sweep` at the steps; planes (P, 6): normal, point; per_s: steps in a second. entries, out: bin, plane,
+    count, root and incidence of each, see `Moments`.
+    """
+    n_keys, n_points, total = 0, 0, 0
     for i in range(len(scans.start) - 1):
-        room = max(room, (scans.steps[i + 1] - scans.steps[i]) * len(planes))
-        most = max(most, scans.start[i + 1] - scans.start[i])
-    ends, points = np.empty(room, np.int64), np.empty((4, most), np.float32)
+        n_keys = max(n_keys, (scans.step_start[i + 1] - scans.step_start[i]) * len(planes))
+        n_points = max(n_points, scans.start[i + 1] - scans.start[i])
+    ends, points = np.empty(n_keys, np.int64), np.empty((4, n_points), np.float32)
     for i in range(len(scans.start) - 1):
-        own = ends[: (scans.steps[i + 1] - scans.steps[i]) * len(planes)]
+        own = ends[: (scans.step_start[i + 1] - scans.step_start[i]) * len(planes)]
         _sort_scan(i, scans, per_s, len(planes), own, points)
-        # int: the literal 0 would be a type of its own, for which all is compiled once more
-        total = _bin_scan(i, scans, motion, cells, each, planes, weights, (own, points), entries, int(total))
+        # int: the literal 0 has a type of its own, for which numba would compile everything again
+        total = _bin_scan(i, scans, motion, poses, per_bin, planes, weights, (own, points), entries, int(total))
     return total
 
 
 @njit(cache=True, nogil=True)
 def move_to_world(scans, motion, step_s, points, seen_from):
-    """World coordinates of all points, and where the LiDAR was when it saw them."""
+    """Fills `points` (N, 3), all points in the world [m], and `seen_from` (N, 3), where the LiDAR was at each. motion:
+    `Sweep` at the middles of steps of step_s."""
     for i in range(len(scans.start) - 1):
         for n in range(scans.start[i], scans.start[i + 1]):
             offset = np.float64(scans.offset_s[n])
             k = int(np.floor(offset * (1.0 / step_s)))
-            b, dt = scans.steps[i] + k - scans.low[i], offset - (k + 0.5) * step_s
+            b, dt = scans.step_start[i] + k - scans.first_step[i], offset - (k + 0.5) * step_s
             x, v, w = scans.xyz[n], motion.velocity[b], motion.rate[b]
             for a in range(3):
                 points[n, a] = seen_from[n, a] = motion.position[b, a]

@@ -1,13 +1,14 @@
-"""What the gyroscope's noise between a keyframe and the bins that hang on it takes from what a LiDAR tells.
+"""Propagated gyroscope noise between a keyframe and the bins of a LiDAR, eliminated from the normal equations.
 
-A bin is where the readings carry the keyframe, and these have noise: on the way it turns the IMU by an angle that walks
-away from nothing. On one side of a keyframe that walk is taken for one unknown turn x, N(0, I), by which a bin is
-turned as far as the walk gets there: `walked` x. |x|^2 is added to the chi^2, and the best x taken: with H = J^T J and
-u = J^T (J_all, r) of x, summed over the bins, u^T (I + H)^-1 u is taken off the normal equations. J is that of the
-state that a pass starts from: were it taken anew, the cost would draw to where noise explains more.
+IMU readings propagate the pose of a keyframe to a bin. Their noise makes the rotation error of the bin a random walk
+that starts at the keyframe. Bins on one side of a keyframe share one unknown x ~ N(0, I): bin i is rotated by
+noise_angle[i] x, with the standard deviation of the walk at its instant as noise_angle. The chi^2 gets the prior term
+|x|^2, and x is eliminated by its Schur complement (M = J^T J and u = J^T (J_all, r) by x, summed over the bins): the
+normal equations lose u^T (I + M)^-1 u. J is evaluated at the state that a pass starts from. A Jacobian of the current
+state would pull the estimate to states where the noise absorbs more.
 
-In 12 ms an industrial IMU loses less than a spinning LiDAR sees. A ten times noisier one loses as much: the LiDAR would
-be believed more than it can be, and rotations be off by 1.6 times what is said of them.
+An industrial IMU loses less in 12 ms than a spinning LiDAR measures. An IMU with ten times its noise loses as much:
+without this model rotations are off by 1.6 times their standard deviations.
 """
 
 from __future__ import annotations
@@ -19,99 +20,107 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry.small import cholesky
 
-POSE, PLANE = 6, 3
+POSE, PLANE = 6, 3  # number of columns by a pose, and by a plane
 
 
-class Walk(NamedTuple):
-    """Sums over bins on one side of a keyframe, by the unknown turn: information (3, 3); by_pose (3, w + 1), with the w
-    keyframes and columns that act through the pose, and with the residual; by_plane (P, 3, 3), with the columns of each
-    plane, of which those in `met` (P,) are not empty, `n_met` (1,) of them."""
+class NoiseSums(NamedTuple):
+    """Products of Jacobians by the unknown rotation x, summed over the bins on one side of a keyframe.
+
+    information (3, 3): x with itself; by_pose (3, w + 1): x with the w columns of keyframes and calibration parameters
+    that act through the pose, and with the residual; by_plane (P, 3, 3): x with the columns of each plane, filled for
+    the planes in `seen` (P,) alone, of which there are n_seen (1,).
+    """
 
     information: np.ndarray
     by_pose: np.ndarray
     by_plane: np.ndarray
-    met: np.ndarray
-    n_met: np.ndarray
+    seen: np.ndarray
+    n_seen: np.ndarray
 
 
 @njit(cache=True, nogil=True, inline="always")
-def no_walk(width, n_planes):
-    """No bin yet."""
-    nothing = np.zeros((n_planes, 3, PLANE))
-    return Walk(
-        np.zeros((3, 3)), np.zeros((3, width + 1)), nothing, np.zeros(n_planes, np.int64), np.zeros(1, np.int64)
+def empty_noise_sums(width, n_planes):
+    """Sums of no bin, for `width` columns that act through the pose."""
+    by_plane = np.zeros((n_planes, 3, PLANE))
+    return NoiseSums(
+        np.zeros((3, 3)), np.zeros((3, width + 1)), by_plane, np.zeros(n_planes, np.int64), np.zeros(1, np.int64)
     )
 
 
 @njit(cache=True, nogil=True, inline="always")
-def add_entry(turned, slope, row, B, by_pose, walk):
-    """One plane in a bin: turned (3, 4), slope (3,) as in `Bins`; row (4,) its whitened residuals; B (>= 6, 4) their
-    derivatives by the bin's pose first, of which by_pose (3, 6) gathers what they share with the turn."""
-    last = walk.by_pose.shape[1] - 1
+def add_entry_noise(J_rows_noise, J_incidence_noise, row, J_rows, gram, noise):
+    """Adds one plane in a bin to the information and the residual's column.
+
+    J_rows_noise (3, 4), J_incidence_noise (3,): see `Bins`; row (4,): whitened residuals; J_rows (>= 6, 4): their
+    derivatives, by the pose of the bin first; gram (3, 6), which is added to: x with the pose of the bin.
+    """
+    last = noise.by_pose.shape[1] - 1
     for a in range(3):
-        walk.by_pose[a, last] += slope[a]
+        noise.by_pose[a, last] += J_incidence_noise[a]
         for c in range(4):
-            d = turned[a, c]
-            walk.by_pose[a, last] += d * row[c]
+            d = J_rows_noise[a, c]
+            noise.by_pose[a, last] += d * row[c]
             for b in range(3):
-                walk.information[a, b] += d * turned[b, c]
+                noise.information[a, b] += d * J_rows_noise[b, c]
             for j in range(POSE):
-                by_pose[a, j] += d * B[j, c]
+                gram[a, j] += d * J_rows[j, c]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def add_pose(by_pose, T, walk):
-    """What a bin's entries gathered, T (6, w) its pose by keyframes and columns."""
+def add_pose_noise(gram, J_pose, noise):
+    """Adds the products gram (3, 6) of a bin by the chain rule J_pose (6, w): its pose by keyframes and columns."""
     for a in range(3):
         for j in range(POSE):
-            for i in range(T.shape[1]):
-                walk.by_pose[a, i] += by_pose[a, j] * T[j, i]
+            for i in range(J_pose.shape[1]):
+                noise.by_pose[a, i] += gram[a, j] * J_pose[j, i]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def add_plane(turned, B, q, walk):
-    """Plane q in a bin, B (10, 4) with the derivatives by the plane after those by the pose."""
+def add_plane_noise(J_rows_noise, J_rows, q, noise):
+    """Adds plane q in a bin to its columns. J_rows (10, 4): derivatives by the plane follow those by the pose."""
     known = False
-    for i in range(walk.n_met[0]):
-        known = known or walk.met[i] == q
+    for i in range(noise.n_seen[0]):
+        known = known or noise.seen[i] == q
     if not known:
-        walk.met[walk.n_met[0]] = q
-        walk.n_met[0] += 1
+        noise.seen[noise.n_seen[0]] = q
+        noise.n_seen[0] += 1
     for a in range(3):
         for t in range(PLANE):
             for c in range(4):
-                walk.by_plane[q, a, t] += turned[a, c] * B[POSE + t, c]
+                noise.by_plane[q, a, t] += J_rows_noise[a, c] * J_rows[POSE + t, c]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def columns_of(walk, columns, of_plane):
-    """(m,) calibration columns of what was summed: `columns` (c,), which act through the pose, then those of the
-    planes, of_plane (P, 3)."""
-    n_c, n = len(columns), walk.n_met[0]
+def noise_columns(noise, columns, plane_columns):
+    """(m,) calibration columns of the sums: `columns` (c,), which act through the pose, then those of the planes seen,
+    from plane_columns (P, 3)."""
+    n_c, n = len(columns), noise.n_seen[0]
     own = np.empty(n_c + PLANE * n, np.int64)
     for j in range(n_c):  # in loops: copies of arrays take seconds to compile
         own[j] = columns[j]
     for i in range(n):
         for t in range(PLANE):
-            own[n_c + PLANE * i + t] = of_plane[walk.met[i], t]
+            own[n_c + PLANE * i + t] = plane_columns[noise.seen[i], t]
     return own
 
 
 @njit(cache=True, nogil=True, inline="always")
-def taken_off(walk):
-    """V (3, w + 3 n + 1): V^T V is the Schur term of the walk's three unknowns, to be subtracted from the normal
-    equations. Columns: keyframes, calibration parameters in the order of `columns_of` (n planes met), residual. Resets
-    the walk."""
-    n, width, L = walk.n_met[0], walk.by_pose.shape[1] - 1, walk.information
+def eliminated_noise(noise):
+    """V (3, w + 3 n + 1) such that V^T V is the Schur complement term of x, which the normal equations lose.
+
+    Columns: keyframes, calibration parameters in the order of `noise_columns` (n planes seen), residual. Resets the
+    sums.
+    """
+    n, width, L = noise.n_seen[0], noise.by_pose.shape[1] - 1, noise.information
     last = width + PLANE * n
     V = np.empty((3, last + 1))
     for a in range(3):
         for j in range(width):
-            V[a, j] = walk.by_pose[a, j]
-        V[a, last] = walk.by_pose[a, width]
+            V[a, j] = noise.by_pose[a, j]
+        V[a, last] = noise.by_pose[a, width]
         for i in range(n):
             for t in range(PLANE):
-                V[a, width + PLANE * i + t] = walk.by_plane[walk.met[i], a, t]
+                V[a, width + PLANE * i + t] = noise.by_plane[noise.seen[i], a, t]
         L[a, a] += 1.0
     cholesky(L)
     for a in range(3):
@@ -120,7 +129,7 @@ def taken_off(walk):
                 V[a, j] -= L[a, b] * V[b, j]
             V[a, j] /= L[a, a]
     for i in range(n):
-        walk.by_plane[walk.met[i]] = 0.0
-    walk.information[:], walk.by_pose[:] = 0.0, 0.0
-    walk.n_met[0] = 0
+        noise.by_plane[noise.seen[i]] = 0.0
+    noise.information[:], noise.by_pose[:] = 0.0, 0.0
+    noise.n_seen[0] = 0
     return V

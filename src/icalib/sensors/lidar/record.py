@@ -1,4 +1,4 @@
-"""Residuals of points on planes."""
+"""Residuals of points on planes that a result keeps."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from icalib.sensors.records import Shapes, Successive
 
-SAME_WALL_S = 0.3  # within which two points of a plane are neighbours in time; a LiDAR turns several times a second
+MAX_SUCCESSIVE_S = 0.3  # between successive points of a plane: longer than a turn of a spinning LiDAR
 
 
 @dataclass(frozen=True)
 class LidarResiduals:
-    """Points of one LiDAR on planes, evenly thinned. residual = n . x - d [m], positive on the normal's side.
+    """Points of one LiDAR on planes, evenly thinned. residual = n . x - d [m], positive on the side of the normal.
 
-    points_read and points_used count all points of the recording and of the estimate. `first_world` and
-    `first_residual` are of the initial guess: points, and their residuals from the planes that fit them best.
+    points_read counts all points of the recording, points_used those of the estimate. first_world and first_residual
+    belong to the initial guess: points, and their distances from the planes that fit these points best.
     """
 
     kind: str = field(default="points", init=False)
@@ -36,23 +36,23 @@ class LidarResiduals:
     scans: int
     points_read: int
     points_used: int
-    seconds: np.ndarray  # (N,) of each point, imu clock, s since the first IMU stamp; see RecordingSpan for several
+    seconds: np.ndarray  # (N,) s since the first IMU stamp, IMU clock; several recordings: see RecordingSpan
     plane: np.ndarray  # (N,) int32, index into the calibration's planes
     distance: np.ndarray  # (N,) float32 m, from the LiDAR
-    sigma: np.ndarray  # (N,) float32 m, standard deviation that the residual was given
+    sigma: np.ndarray  # (N,) float32 m, assumed standard deviation of the residual
     world: np.ndarray  # (N, 3) float32 m, world frame
     residual: np.ndarray  # (N,) float32 m
     first_world: np.ndarray  # (N, 3) float32 m
     first_residual: np.ndarray  # (N,) float32 m
 
     def normalised(self) -> dict[str, np.ndarray]:
-        """Of all points."""
+        """Residuals (N,) over their standard deviations, by kind."""
         return {"points": self.residual / self.sigma}
 
     def successive(self) -> dict[str, Successive]:
-        """A point's next one is on the same plane, and soon after."""
+        """Normalised residuals by plane and time. Successive points are on one plane, within MAX_SUCCESSIVE_S."""
         order = np.lexsort((self.seconds, self.plane))
-        follows = (np.diff(self.plane[order]) == 0) & (np.diff(self.seconds[order]) < SAME_WALL_S)
+        follows = (np.diff(self.plane[order]) == 0) & (np.diff(self.seconds[order]) < MAX_SUCCESSIVE_S)
         return {self.kind: Successive((self.residual[order] / self.sigma[order])[:, None], follows)}
 
 

@@ -1,4 +1,4 @@
-"""What report and 3D view show of LiDARs: points on planes, before and after, and residuals over time and distance."""
+"""LiDARs in report and 3D view: points on planes before and after, and residuals over time and distance."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from icalib.report.tables import Html, element, html
 from icalib.result import Calibration, Plane
 from icalib.sensors.lidar.record import LidarResiduals
 
-MOST_DOTS = 2500  # in a figure of residuals
-MOST_IN_SPACE = 20_000  # points in a picture of the planes
-BINS = 60
-FEWEST_IN_BIN = 20
-BIN_S = 0.1  # of time in a curve: some thousand points of a usual LiDAR
-WIDEST = 4.0  # of a scale of colours, in RMS of the result
-TOP = 5.0  # of a scale of residuals, in their RMS
-NEARLY_LEVEL = 0.1  # sine of a slope; below it a plane lies along the axes of the world
+MAX_DOTS = 2500  # points in a figure of residuals: more hide one another
+MAX_MAP_POINTS = 20_000  # points in a 3D map of the planes: keeps the page small
+N_FIGURE_BINS = 60  # along the x axis of RMS and mean
+MIN_BIN_POINTS = 20  # for an RMS to 16 %
+CURVE_BIN_S = 0.1  # of a curve in the 3D view: some thousand points of a usual LiDAR
+MAX_COLOR_RMS = 4.0  # end of the colour scale, in RMS of the result
+MAX_RESIDUAL_RMS = 5.0  # end of the residual axis, in RMS of the residuals
+MIN_SLOPE = 0.1  # sine; the outline of a flatter plane is aligned with the axes of the world
 _WALL = "#64748b"
 _MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-after"))
 _WORDS = (
-    "Where planes are in the world, and how far points lie off them. A good calibration leaves thin planes, one "
-    "colour all over, and a mean without a pattern in time and distance. As the first guess had them planes are "
-    "those that fit its points best. Each recording has a world of its own; of several the menu above each map "
-    f"chooses one. At most {MOST_IN_SPACE} points are drawn in space, {MOST_DOTS} of a kind below, evenly picked."
+    "Planes in the world, and distances of points from them. A good calibration leaves thin planes of one colour, and "
+    "a mean without a pattern in time and distance. The planes of the first guess are those that fit its points "
+    "best. Each recording has a world of its own; the menu above each map chooses among several. At most "
+    f"{MAX_MAP_POINTS} points are drawn in space, {MAX_DOTS} of a kind below, evenly picked."
 )
 LEGEND = "rings are LiDARs"
 
 
 def sections(c: Calibration) -> Iterator[Section]:
-    """The planes before and after, then each LiDAR."""
+    """One section: maps of the planes before and after, then residuals of each LiDAR."""
     if not c.lidar_residuals:
         return
     maps = [element("div", [element("h3", title), plot_place(name, "")]) for title, name in _MAPS]
@@ -54,33 +54,33 @@ def sections(c: Calibration) -> Iterator[Section]:
 
 
 def curves(r: LidarResiduals) -> Iterator[ResidualCurve]:
-    """RMS [mm] of the points in each stretch of time."""
-    number, of = np.unique(np.floor(r.seconds / BIN_S).astype(np.int64), return_inverse=True)
+    """RMS [mm] of the points in each CURVE_BIN_S."""
+    number, of = np.unique(np.floor(r.seconds / CURVE_BIN_S).astype(np.int64), return_inverse=True)
     total = np.bincount(of, r.residual.astype(np.float64) ** 2, len(number))
     rms = np.sqrt(total / np.bincount(of, minlength=len(number)))
-    yield ResidualCurve("", BIN_S * (number + 0.5), 1e3 * rms[:, None], ("RMS [mm]",))
+    yield ResidualCurve("", CURVE_BIN_S * (number + 0.5), 1e3 * rms[:, None], ("RMS [mm]",))
 
 
 def clouds(c: Calibration) -> Iterator[ResidualCloud]:
-    """Points on the planes that they were found to lie on."""
+    """Points on planes in the world, with their distances from these."""
     for r in c.lidar_residuals:
         yield ResidualCloud(r.sensor, r.seconds, r.world, np.abs(r.residual.astype(np.float64)))
 
 
 def amounts(c: Calibration) -> Iterator[str]:
-    """How much was used."""
+    """Numbers of scans, points and planes, for the summary."""
     if c.lidar_residuals:
         points = sum(r.points_used for r in c.lidar_residuals)
         yield f"{sum(r.scans for r in c.lidar_residuals)} scans with {points} points on {len(c.planes)} planes"
 
 
 def shape(c: Calibration, name: str, spread: float) -> np.ndarray:
-    """Rings about a LiDAR, in its frame; spread: of the rig [m]."""
+    """Rings that depict a LiDAR, in its frame (n, 3) [m]. spread: size of the rig [m]."""
     return rings(0.3 * spread)
 
 
 def rings(radius: float) -> np.ndarray:
-    """Three circles about z, as a spinning LiDAR looks level, up and down."""
+    """(n, 3) three circles about z, as the beams of a spinning LiDAR at elevations -15, 0 and 15 deg."""
     x, y = CIRCLE.T
     tilted = ((np.cos(e), np.sin(e)) for e in np.deg2rad([-15.0, 0.0, 15.0]))
     circles = [radius * np.stack([a * x, a * y, np.full_like(x, b)], axis=1) for a, b in tilted]
@@ -88,26 +88,28 @@ def rings(radius: float) -> np.ndarray:
 
 
 def residuals_over_time(r: LidarResiduals) -> Figure:
-    """Distance of points to their planes over time, and its RMS and mean in stretches of it."""
+    """Distances of points from their planes over time, with RMS and mean."""
     return _residuals_over(r, r.seconds, "time [s]")
 
 
 def residuals_over_distance(r: LidarResiduals) -> Figure:
-    """The same over the distance from the LiDAR."""
+    """Distances of points from their planes over the range, with RMS and mean."""
     return _residuals_over(r, r.distance, "distance from the LiDAR [m]")
 
 
 def _residuals_over(r: LidarResiduals, x: np.ndarray, title: str) -> Figure:
-    size, some = 1e3 * r.residual, thin(len(x), MOST_DOTS)
+    """Residuals [mm] over x (N,), with RMS and mean in N_FIGURE_BINS bins."""
+    size, some = 1e3 * r.residual, thin(len(x), MAX_DOTS)
     if not len(x):
         return figure([], 340, xaxis=axis(title), yaxis=axis("residual [mm]"))
-    edges = np.linspace(x.min(), np.nextafter(x.max(), np.inf), BINS + 1)
-    own = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
-    count = np.bincount(own, minlength=BINS)
-    enough = np.where(count >= FEWEST_IN_BIN, count, np.nan)
-    rms = np.sqrt(np.bincount(own, size.astype(np.float64) ** 2, BINS) / enough)
-    mean = np.bincount(own, size, BINS) / enough
-    middle, top = 0.5 * (edges[1:] + edges[:-1]), TOP * float(np.sqrt(np.mean(size.astype(np.float64) ** 2)))
+    edges = np.linspace(x.min(), np.nextafter(x.max(), np.inf), N_FIGURE_BINS + 1)
+    own = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, N_FIGURE_BINS - 1)
+    count = np.bincount(own, minlength=N_FIGURE_BINS)
+    enough = np.where(count >= MIN_BIN_POINTS, count, np.nan)
+    rms = np.sqrt(np.bincount(own, size.astype(np.float64) ** 2, N_FIGURE_BINS) / enough)
+    mean = np.bincount(own, size, N_FIGURE_BINS) / enough
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    top = MAX_RESIDUAL_RMS * float(np.sqrt(np.mean(size.astype(np.float64) ** 2)))
     return figure(
         [
             dots(x[some], np.clip(size[some], -top, top), "points (clipped to the frame)", "#93b7dc"),
@@ -121,16 +123,16 @@ def _residuals_over(r: LidarResiduals, x: np.ndarray, title: str) -> Figure:
 
 
 def plane_maps(c: Calibration) -> dict[str, Figure]:
-    """The planes with points of all LiDARs, coloured by how far they lie off: as the first guess had them, and now.
+    """Maps of all planes at the first guess and at the estimate, with points coloured by their distance.
 
-    Each recording has a world of its own: of several one is shown, and a menu chooses it.
+    Each recording has a world frame of its own. A menu chooses among several.
     """
-    most = MOST_IN_SPACE // len(c.lidar_residuals)
+    most = MAX_MAP_POINTS // len(c.lidar_residuals)
     kept = [(r, thin(len(r.seconds), most)) for r in c.lidar_residuals]
     plane, seconds = (np.concatenate([getattr(r, name)[k] for r, k in kept]) for name in ("plane", "seconds"))
     before = np.concatenate([r.first_world[k] for r, k in kept]), np.concatenate([r.first_residual[k] for r, k in kept])
     after = np.concatenate([r.world[k] for r, k in kept]), np.concatenate([r.residual[k] for r, k in kept])
-    top = WIDEST * 1e3 * float(np.sqrt(np.mean(after[1].astype(np.float64) ** 2))) if len(plane) else 1.0
+    top = MAX_COLOR_RMS * 1e3 * float(np.sqrt(np.mean(after[1].astype(np.float64) ** 2))) if len(plane) else 1.0
     names = [span.name for span in c.recordings] or [""]
     of_recording = c.recording_of(seconds)
     found: list[tuple[list[dict[str, Any]], list[dict[str, Any]]]] = []
@@ -143,7 +145,7 @@ def plane_maps(c: Calibration) -> dict[str, Figure]:
 
 
 def _cloud(cloud: tuple[np.ndarray, np.ndarray], own: np.ndarray, top: float) -> dict[str, Any]:
-    """The points `own` (N,) bool of a cloud: points and residuals, colours up to `top` mm."""
+    """Trace of the points `own` (N,) bool of a cloud: points (N, 3) and residuals (N,) [m]; colours end at `top` mm."""
     points, residual = (x[own] for x in cloud)
     size = np.minimum(np.abs(1e3 * residual.astype(np.float64)), top)
     marker: dict[str, Any] = {"size": 1.6, "color": numbers(np.round(size, 1)), "colorscale": "Viridis"}
@@ -153,7 +155,7 @@ def _cloud(cloud: tuple[np.ndarray, np.ndarray], own: np.ndarray, top: float) ->
 
 
 def _map(traces: list[list[dict[str, Any]]], names: list[str]) -> Figure:
-    """Traces of each recording, of which the first is shown."""
+    """Figure of the traces of each recording. The first recording is shown at the start."""
     scene = {name: {"title": {"text": f"world {name[0]} [m]"}, "nticks": 6} for name in ("xaxis", "yaxis", "zaxis")}
     layout: dict[str, Any] = {"scene": scene | VIEW, "margin": {"l": 0, "r": 0, "t": 10, "b": 0}}
     of = [k for k, own in enumerate(traces) for _ in own]
@@ -168,7 +170,7 @@ def _map(traces: list[list[dict[str, Any]]], names: list[str]) -> Figure:
 
 
 def _outlines(planes: tuple[Plane, ...], points: np.ndarray, plane: np.ndarray) -> dict[str, Any]:
-    """The rectangle of each plane about its points, one side level; the pen is lifted between them."""
+    """Trace of a rectangle around the points (N, 3) of each plane, one side level, separated by NaN."""
     pen = []
     for k, p in enumerate(planes):
         own = points[plane == k]
@@ -184,8 +186,8 @@ def _outlines(planes: tuple[Plane, ...], points: np.ndarray, plane: np.ndarray) 
 
 
 def _level_axes(normal: np.ndarray) -> np.ndarray:
-    """(2, 3) unit vectors across a unit normal, the first of them level."""
+    """(2, 3) orthonormal vectors in the plane of a unit normal. The first is level."""
     level = np.array([-normal[1], normal[0], 0.0])
     length = float(np.linalg.norm(level))
-    level = level / length if length > NEARLY_LEVEL else np.array([0.0, normal[2], -normal[1]]) / np.hypot(*normal[1:])
+    level = level / length if length > MIN_SLOPE else np.array([0.0, normal[2], -normal[1]]) / np.hypot(*normal[1:])
     return np.stack([level, np.cross(normal, level)])

@@ -1,4 +1,4 @@
-"""A simulated LiDAR reports points of the room, each seen from the pose of the sensor at the point's own instant."""
+"""Simulated LiDARs: points of the room, each measured from the pose of the sensor at the instant of the point."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from icalib.tools.simulation.scenario.room import Room, RoomSurfaces, nearest
 from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
-_FIRING_S = 2.304e-6  # between two lasers of a column, as in a VLP-16
+_FIRING_S = 2.304e-6  # between two lasers of a column (Velodyne VLP-16 manual)
 _POINTS = "sensor_msgs/msg/PointCloud2"
-_FLOAT32 = 7  # of PointField
+_FLOAT32 = 7  # datatype of sensor_msgs/PointField
 
 
 @dataclass(frozen=True, eq=False)
 class SimLidar(SimSensor):
-    """One true LiDAR that turns about its z axis, against the clock.
+    """True parameters of one LiDAR that spins counterclockwise about its z axis.
 
-    A scan has azimuth_steps columns of `rings` points, at elevations spread evenly over elevation_deg. The lasers of a
-    column fire one after another, 2.304 us apart, or closer where they would not fit. The scan is stamped at its first
-    point. Noise is along the beam.
+    A scan is one turn of azimuth_steps columns with `rings` points, at elevations evenly over elevation_deg. The lasers
+    of a column fire 2.304 us apart, or faster if a column is shorter. The stamp of a scan is the instant of its first
+    column. Points outside range_m are missing. Noise is along the beam.
     """
 
     sensor_type: ClassVar[str] = "lidar"
@@ -66,23 +66,24 @@ class SimLidar(SimSensor):
 
     @property
     def points(self) -> int:
+        """Most points of a scan."""
         return self.rings * self.azimuth_steps
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
-        """All scans of the room; each scan's noise is a random stream of its own."""
-        assert scene.room is not None  # `check` sees to it
+        """All scans. The noise of each scan has its own random stream."""
+        assert scene.room is not None  # ensured by `check`
         stamps, seconds = stamped(self, scene.duration_s - LEAD_S - 1.0 / self.rate_hz)
         noise_m = self.range_noise_m * float(scene.noisy)
         start = np.zeros(len(stamps) + 1, dtype=np.int64)
-        xyz = np.empty((len(stamps) * self.points, 3), dtype=np.float32)  # what stays empty takes no memory
+        xyz = np.empty((len(stamps) * self.points, 3), dtype=np.float32)  # pages that stay empty take no memory
         offset, plane = np.empty(len(xyz), dtype=np.float32), np.empty(len(xyz), dtype=np.int32)
         column_s = 1.0 / (self.rate_hz * self.azimuth_steps)
         for i, begin in enumerate(seconds):
             noise = noise_m * np.random.default_rng([*seed, i]).standard_normal((self.azimuth_steps, self.rings))
-            sweep = _sweep(self, scene.trajectory, begin, noise)
+            turn = _turn(self, scene.trajectory, begin, noise)
             free = slice(start[i], None)
             into = _Points(xyz[free], offset[free], plane[free])
-            start[i + 1] = start[i] + _shoot(scene.room.surfaces, sweep, column_s, into)
+            start[i + 1] = start[i] + _fill_points(scene.room.surfaces, turn, column_s, into)
             progress((i + 1) / len(seconds))
         n = start[-1]
         return Report(LidarStream(self.name, stamps, start, offset[:n], xyz[:n], plane[:n]))
@@ -97,7 +98,7 @@ class SimLidar(SimSensor):
         np.savez(folder / "scans.npz", **arrays)
 
     def bag_topic(self, stream: LidarStream, offset_ns: int) -> BagTopic:
-        """PointCloud2: x, y, z and `time` [s] from the stamp."""
+        """PointCloud2 with x, y, z [m] and `time` [s] since the stamp."""
         return BagTopic(f"/{self.name}/points", _POINTS, _clouds(stream, offset_ns))
 
 
@@ -105,7 +106,7 @@ SIMULATED = SimLidar
 
 
 def _clouds(lidar: LidarStream, offset_ns: int) -> Iterator[BagEvent]:
-    """A cloud is received when its last point was measured."""
+    """Messages of all scans, each at the instant of its last point."""
     for i, stamp_ns in enumerate(lidar.stamps_ns.tolist()):
         points = slice(lidar.start[i], lidar.start[i + 1])
         xyz, offset_s = lidar.xyz[points], lidar.offset_s[points]
@@ -117,7 +118,7 @@ def _clouds(lidar: LidarStream, offset_ns: int) -> Iterator[BagEvent]:
 
 
 def _cloud(bag: BagWriter, stamp_ns: int, frame: str, xyz: np.ndarray, offset_s: np.ndarray) -> Any:
-    """xyz (N, 3) [m] and `time` (N,) [s] from the stamp, float32 each."""
+    """PointCloud2 of points xyz (N, 3) [m] at offset_s (N,) since the stamp, float32."""
     names = ("x", "y", "z", "time")
     fields = [bag.make("sensor_msgs/msg/PointField", name, 4 * i, _FLOAT32, 1) for i, name in enumerate(names)]
     rows = np.ascontiguousarray(np.column_stack([xyz, offset_s]), dtype="<f4")
@@ -126,31 +127,32 @@ def _cloud(bag: BagWriter, stamp_ns: int, frame: str, xyz: np.ndarray, offset_s:
     return bag.make(_POINTS, header, 1, len(rows), fields, False, size, size * len(rows), data, True)
 
 
-class _Sweep(NamedTuple):
-    """One turn of A columns of K lasers. The pose in the room is that of each column's beginning and of the end."""
+class _Turn(NamedTuple):
+    """One turn of A columns of K lasers, with poses in the room at the start of each column and at the end."""
 
     rotation: np.ndarray  # (A + 1, 3, 3) R_world_lidar
     position: np.ndarray  # (A + 1, 3)
     beam: np.ndarray  # (A, K, 3) unit directions in the LiDAR's frame
-    firing: np.ndarray  # (K,) instants within a column, as a share of it
+    firing: np.ndarray  # (K,) instants as a share of a column
     noise: np.ndarray  # (A, K) m
-    reach: tuple[float, float]  # m
+    range_m: tuple[float, float]
 
 
 class _Points(NamedTuple):
-    """Where a sweep's points go, at most A K."""
+    """Arrays for the points of a turn, at most A K."""
 
     xyz: np.ndarray
     offset_s: np.ndarray
     plane: np.ndarray
 
 
-def _sweep(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.ndarray) -> _Sweep:
+def _turn(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.ndarray) -> _Turn:
+    """The turn that begins at `begin` [s], with range noise (A, K) [m]."""
     steps, rings = lidar.azimuth_steps, lidar.rings
     column_s = 1.0 / (lidar.rate_hz * steps)
     rotation, position, _ = trajectory.pose_at(begin + column_s * np.arange(steps + 1))
     firing = np.arange(rings) * min(_FIRING_S / column_s, 1.0 / rings)
-    return _Sweep(
+    return _Turn(
         rotation @ lidar.T_imu_sensor[:3, :3],
         position + rotation @ lidar.T_imu_sensor[:3, 3],
         _beams(lidar),
@@ -161,6 +163,7 @@ def _sweep(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.
 
 
 def _beams(lidar: SimLidar) -> np.ndarray:
+    """(A, K, 3) unit directions in the LiDAR's frame."""
     azimuth = 2.0 * np.pi * np.arange(lidar.azimuth_steps)[:, None] / lidar.azimuth_steps
     elevation = np.deg2rad(np.linspace(*lidar.elevation_deg, lidar.rings))
     level, up = np.cos(elevation), np.sin(elevation)
@@ -168,26 +171,26 @@ def _beams(lidar: SimLidar) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shoot(surfaces: RoomSurfaces, sweep: _Sweep, column_s: float, points: _Points) -> int:
-    """Fills the points in the order of their instants; returns how many there are.
+def _fill_points(surfaces: RoomSurfaces, turn: _Turn, column_s: float, points: _Points) -> int:
+    """Fills the points in the order of their instants. Returns their number.
 
-    Within a column, of some 0.1 ms, the pose runs straight: 5 m/s^2 and 2 rad/s bend it by 1e-8 m and rad.
+    Within a column of some 0.1 ms the pose is interpolated linearly: wrong by 1e-8 m and rad at 5 m/s^2 and 2 rad/s.
     """
     count = 0
     d, p = np.empty(3), np.empty(3)
-    for a in range(len(sweep.beam)):
-        R0, R1, p0, p1 = sweep.rotation[a], sweep.rotation[a + 1], sweep.position[a], sweep.position[a + 1]
-        for k in range(len(sweep.firing)):
-            s, x, y, z = sweep.firing[k], sweep.beam[a, k, 0], sweep.beam[a, k, 1], sweep.beam[a, k, 2]
+    for a in range(len(turn.beam)):
+        R0, R1, p0, p1 = turn.rotation[a], turn.rotation[a + 1], turn.position[a], turn.position[a + 1]
+        for k in range(len(turn.firing)):
+            s, x, y, z = turn.firing[k], turn.beam[a, k, 0], turn.beam[a, k, 1], turn.beam[a, k, 2]
             for i in range(3):
                 before = R0[i, 0] * x + R0[i, 1] * y + R0[i, 2] * z
                 after = R1[i, 0] * x + R1[i, 1] * y + R1[i, 2] * z
                 d[i] = before + s * (after - before)
                 p[i] = p0[i] + s * (p1[i] - p0[i])
             distance, face = nearest(surfaces, p[0], p[1], p[2], d[0], d[1], d[2])
-            if not (sweep.reach[0] <= distance <= sweep.reach[1]):
+            if not (turn.range_m[0] <= distance <= turn.range_m[1]):
                 continue
-            measured = distance + sweep.noise[a, k]
+            measured = distance + turn.noise[a, k]
             points.xyz[count, 0] = measured * x
             points.xyz[count, 1] = measured * y
             points.xyz[count, 2] = measured * z

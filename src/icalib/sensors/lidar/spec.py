@@ -1,4 +1,4 @@
-"""A LiDAR, and its fields in the rig file."""
+"""A LiDAR of the rig, and its fields in the rig file."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _FIELDS = (
 class Lidar(MountedSensor):
     """One LiDAR. Points closer than min_range_m or farther than max_range_m are not used.
 
-    point_time: the instant from which the times of points count; see `read.point_times`. point_time_field,
-    point_time_unit: field and unit of these times; None: found from the data.
+    point_time: what the stamp of a scan and the times of its points mean; see `read.point_times`. point_time_field,
+    point_time_unit: field and unit of these times; None: detected from the data.
     """
 
     sensor_type: ClassVar[str] = "lidar"
@@ -38,11 +38,11 @@ class Lidar(MountedSensor):
     shows_planes: ClassVar[bool] = True
 
     path: str
-    range_noise_m: float | None = None  # along the beam; None: estimated from the residuals
+    range_noise_m: float | None = None  # sigma along the beam; None: estimated from the residuals
     min_range_m: float = 0.5
     max_range_m: float = 100.0
     point_time: PointTime = "auto"
-    topic: str | None = None  # of its clouds; None: the one with the LiDAR's name, or the only one
+    topic: str | None = None  # of its clouds; None: the topic with the LiDAR's name, or the only one
     point_time_field: str | None = None
     point_time_unit: TimeUnit | None = None
 
@@ -77,7 +77,7 @@ class Lidar(MountedSensor):
 
 
 def _point_time(found: dict[str, YamlValue]) -> PointTime:
-    """Raises RigError if fields of point times contradict point_time."""
+    """The field point_time. Raises RigError if a field or unit of point times is given although it uses none."""
     chosen = choice_or(found, "point_time", PointTime, Lidar.point_time)
     for name in ("point_time_field", "point_time_unit"):
         if name in found and chosen in ("azimuth", "snapshot"):

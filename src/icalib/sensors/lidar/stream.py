@@ -1,4 +1,4 @@
-"""What a LiDAR measured: points, scan by scan."""
+"""Measurements of a LiDAR: scans of points."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from icalib.sensors.stream import Stream, check, check_groups
 
 @dataclass(frozen=True)
 class LidarStream(Stream):
-    """Points of one LiDAR, scan by scan.
+    """S scans of one LiDAR with N points.
 
-    stamps_ns (S,) int64, one per scan, strictly increasing; start (S + 1,) int64, points of scan i are
-    start[i]:start[i+1]; offset_s (N,) float32, instant of each point from its scan's stamp; xyz (N, 3) float32 [m] in
-    the sensor's frame at the point's own instant; plane (N,) int32, the plane that it is known to lie on, -1: unknown.
+    stamps_ns (S,) int64: strictly increasing; start (S + 1,) int64: points of scan i are start[i]:start[i + 1];
+    offset_s (N,) float32: instant of each point since the stamp of its scan; xyz (N, 3) float32 [m]: in the frame of
+    the LiDAR at the instant of the point; plane (N,) int32: known plane of each point, -1: unknown.
     """
 
     sensor_type: ClassVar[str] = "lidar"
@@ -35,7 +35,7 @@ class LidarStream(Stream):
         check(self.plane.dtype == np.int32, f"{self.name}: plane must be int32.")
 
     def some(self, kept: np.ndarray) -> LidarStream:
-        """The points in `kept` (N,) bool; all scans stay, if empty."""
+        """The stream with the points `kept` (N,) bool. All scans stay, even without points."""
         if kept.all():
             return self
         start = np.concatenate([[0], np.cumsum(kept)])[self.start].astype(np.int64)
@@ -43,5 +43,5 @@ class LidarStream(Stream):
         return replace(self, start=start, **columns)
 
     def unassociated(self) -> LidarStream:
-        """The same points, of which nobody knows on what planes they lie."""
+        """The stream without known planes."""
         return replace(self, plane=np.full(len(self.plane), -1, np.int32))

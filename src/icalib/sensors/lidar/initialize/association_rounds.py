@@ -36,11 +36,11 @@ from icalib.motion.known_motion import are_near_keyframes
 from icalib.motion.point_planes import are_somewhere, thinned
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.state import Key, State
-from icalib.sensors.lidar.binning import COARSE_BIN_S, Associated, LidarNoise, Moments, take_moments
+from icalib.sensors.lidar.binning import COARSE_BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.initialize.association import ROUNDS, Association, associate, odd_step, round_search
 from icalib.sensors.lidar.initialize.degeneracy import naming_sight
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
-from icalib.sensors.lidar.model import FIRST_RANGE_M
+from icalib.sensors.lidar.model import FIRST_RANGE_SIGMA_M
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
@@ -120,7 +120,7 @@ def _associated(
     inputs: Inputs, state: State, k: int, before: Sequence[Association | None]
 ) -> tuple[Inputs, State, list[Association]]:
     """Round k: points on planes as the state has them; `before`: of each recording, what the round before found."""
-    noise = max(x.range_noise_m or FIRST_RANGE_M for x in inputs.rig.lidars)
+    noise = max(x.range_noise_m or FIRST_RANGE_SIGMA_M for x in inputs.rig.lidars)
     found = []
     for r, streams in enumerate(points_by_recording(inputs)):
         with naming_recording(inputs, r):
@@ -243,7 +243,7 @@ def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.
     motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
     for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
         if (plane >= 0).any():
-            some = Associated(stream, thinned(plane), np.zeros((clouds.count, 6)))
+            some = AssociatedPoints(stream, thinned(plane), np.zeros((clouds.count, 6)))
             moments = take_moments(some, motion, LidarNoise(1.0), COARSE_BIN_S)
             _add_in_world(moments, motion, stream, sums)
     out = {}
