@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.steps.correlation import best_shifts
+from icalib.initialize.steps.cross_correlation import best_shifts
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
 from icalib.motion.sweep import Motion
