@@ -1,4 +1,7 @@
-"""Initial guess of cameras: lens, poses or tracks, extrinsics, and the motion that they show."""
+"""Initial guess of cameras: intrinsics, distortion, extrinsics, time offsets, and the trajectory by their images.
+
+Cameras see a target (`boards`) or have feature tracks (`tracks`).
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,14 @@ from icalib.sensors.camera.initialize.tracks.placement import track_camera_value
 
 
 class CameraInitializer(Initializer[Camera]):
-    """Cameras that see a target give the motion before all others; those with feature tracks after LiDARs, or they are
-    placed on a motion."""
+    """Initial guess of all cameras of a rig.
+
+    Cameras that see a target are the preferred source of the trajectory. Cameras with feature tracks come after LiDARs;
+    if another sensor gives the trajectory, they are aligned to it.
+    """
 
     hosts_keyframes = True
-    refined_alone = False  # the estimate begins with the same pass
+    refined_alone = False  # the estimator begins with the same pass
 
     def motion_rank(self, rig: Rig) -> int | None:
         if not rig.cameras:
@@ -38,40 +44,45 @@ class CameraInitializer(Initializer[Camera]):
         return None if rig.imu is None else BY_TRACKS
 
     def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
-        return initial_state(inputs, *_guesses(inputs, other))
+        return initial_state(inputs, *_guesses_by_recording(inputs, other))
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
         return inputs, first_pass(inputs, state), state.values
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Camera]) -> Values:
-        """Cameras with feature tracks."""
+        """Values of cameras with feature tracks, aligned to the trajectory in `state`."""
         del sensors
         return track_camera_values(inputs, state)
 
     def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
-        seeing = rig.only(*(c.name for c in rig.cameras))
-        alone = inputs_for(seeing, [m.only(*seeing.sensors) for m in recordings])
-        (guess,) = initial_guesses(seeing, alone.bodies, [m.measurements for m in alone.motions])
-        t, R, p = guess.body_poses(alone.measurements)
-        begins = [part.begin for part in alone.parts]
-        own = np.searchsorted(begins, t, side="right") - 1
-        found = [BodyPoses(t[own == k] - begin, R[own == k], p[own == k]) for k, begin in enumerate(begins)]
-        return found, guess.values()
+        cameras_only = rig.only(*(c.name for c in rig.cameras))
+        inputs = inputs_for(cameras_only, [m.only(*cameras_only.sensors) for m in recordings])
+        (guess,) = initial_guesses(cameras_only, inputs.bodies, [m.measurements for m in inputs.motions])
+        t, R, p = guess.body_poses(inputs.measurements)
+        begins = [part.begin for part in inputs.parts]
+        recording = np.searchsorted(begins, t, side="right") - 1
+        poses = [
+            BodyPoses(t[recording == k] - begin, R[recording == k], p[recording == k]) for k, begin in enumerate(begins)
+        ]
+        return poses, guess.values()
 
     def explained(
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
     ) -> EstimationError | None:
-        """Of feature tracks: whether they have parallax."""
+        """The error if feature tracks lack parallax, else None."""
         del converges
         return None if rig.has_target else no_parallax(rig, recordings)
 
 
-def _guesses(inputs: Inputs, other: Callable[[], InputsWithMotion]) -> tuple[Guess, ...]:
-    """A guess for each recording. If the rig turned about one axis only, the motion of `other` kinds shows the rotation
-    about it."""
-    rig, seen = inputs.rig, [m.measurements for m in inputs.motions]
+def _guesses_by_recording(inputs: Inputs, other: Callable[[], InputsWithMotion]) -> tuple[Guess, ...]:
+    """The initial guess of each recording.
+
+    A rig that rotated about one axis only leaves the camera's rotation about that axis unobservable from angular rates.
+    The trajectory of `other` kinds of sensors then determines it by hand-eye calibration.
+    """
+    rig, recordings = inputs.rig, [m.measurements for m in inputs.motions]
     try:
-        return initial_guesses(rig, inputs.bodies, seen)
+        return initial_guesses(rig, inputs.bodies, recordings)
     except OneAxisError as error:
         if not rig.has_target:
             raise
@@ -79,7 +90,7 @@ def _guesses(inputs: Inputs, other: Callable[[], InputsWithMotion]) -> tuple[Gue
             rig = with_hand_eye_guess(rig, inputs, *other())
         except EstimationError:
             raise error from None
-        return initial_guesses(rig, inputs.bodies, seen)
+        return initial_guesses(rig, inputs.bodies, recordings)
 
 
 INITIALIZER = CameraInitializer()

@@ -1,4 +1,4 @@
-"""One camera against the IMU: time offset and rotation, as far as the rig file leaves them open."""
+"""Time offset and rotation of one camera relative to the IMU, from angular rates and the values of the rig file."""
 
 from __future__ import annotations
 
@@ -27,50 +27,69 @@ from icalib.sensors.sensor import TIME_OFFSET
 
 
 def chosen_offset(camera: Camera, rates: SensorRates, imu: ImuData, given: float | None, found: RateAlignment) -> float:
-    """What was found, or the guess of the rig file, as an offset between first stamps: a mere guess that is far from
-    what was found goes only where the two do not turn alike at it, for slow motion hardly shows an offset."""
+    """The time offset [s] to start from: `given`, the value of the rig file, or the estimate in `found`.
+
+    Both offsets are t_imu - t_camera, each clock counted from its first stamp. An initial guess that is far from the
+    estimate is replaced only if the angular rates contradict it, because slow motion hardly determines an offset.
+    """
     if given is None:
         return found.offset
     far = is_contradicted(TIME_OFFSET, np.array([given]), np.array([found.offset]))
     if known_value(camera.time_offset) is not None or not far:
         return given
     try:
-        there = alignment_as_stated(imu, camera.name, rates, given, found.rotation)
+        at_given = alignment_as_stated(imu, camera.name, rates, given, found.rotation)
     except EstimationError:  # the clocks do not overlap
         return found.offset
-    return found.offset if rates_contradict(imu, rates, there) else given
+    return found.offset if rates_contradict(imu, rates, at_given) else given
 
 
 def align_camera(
     camera: Camera, stream: CornerStream, rates: SensorRates, imu: ImuData, measurements: Measurements
 ) -> RateAlignment:
-    """What the motion shows; in its place what the rig trusts, and where it shows nothing what the rig guesses."""
-    given, held = camera.time_offset.value, known_value(camera.time_offset)
-    rotation = camera.rotation.value
+    """Rotation, time offset and gyroscope bias of `camera` from its angular `rates` and those of the IMU.
+
+    Fixed values and priors of the rig file take precedence over the estimate. An initial guess of the rig file is used
+    if the motion does not determine the value. Raises EstimationError if neither determines it.
+    """
+    found = _aligned_by_rates(camera, stream, rates, imu, measurements)
+    offset, rotation = camera.time_offset.value, camera.rotation.value
+    if rotation is None or (known_value(camera.rotation) is None and turns_about_two_axes(imu, rates, found)):
+        return found
+    at_given = alignment_as_stated(imu, camera.name, rates, found.offset, rotation)
+    if offset is not None and known_value(camera.time_offset) is None:
+        at_given = better_at_offset(imu, camera.name, rates, at_given, relative_offset(offset, stream, measurements))
+    if known_value(camera.rotation) is not None or found.given or not rates_contradict(imu, rates, at_given):
+        return at_given
+    # The rates determine the rotation except about one axis. Only that component is taken from the guess.
+    nearest = nearest_about_axis(main_axis(rates.rate), rotation, found.rotation)
+    return better_alignment(imu, rates, at_given, alignment_as_stated(imu, camera.name, rates, found.offset, nearest))
+
+
+def _aligned_by_rates(
+    camera: Camera, stream: CornerStream, rates: SensorRates, imu: ImuData, measurements: Measurements
+) -> RateAlignment:
+    """The alignment by angular rates, at the time offset of the rig file if that is known or no other fits.
+
+    If the rates do not determine the rotation either, that of the rig file is kept. Raises EstimationError if there is
+    none, or the rates contradict it.
+    """
+    given, known = camera.time_offset.value, known_value(camera.time_offset)
+    rotation, on_wheels = camera.rotation.value, bool(measurements.wheels)
     try:
-        found = align_rates(
-            imu, camera.name, rates, None if held is None else relative_offset(held, stream, measurements)
-        )
+        offset = None if known is None else relative_offset(known, stream, measurements)
+        found = align_rates(imu, camera.name, rates, offset)
         if rotation is None:
-            check_two_axes(imu, rates, found, camera.name, bool(measurements.wheels))
+            check_two_axes(imu, rates, found, camera.name, on_wheels)
     except EstimationError:
         if given is None:
             raise
-        at = relative_offset(given, stream, measurements)
+        offset = relative_offset(given, stream, measurements)
         if rotation is None:
-            found = align_rates(imu, camera.name, rates, at)
-            check_two_axes(imu, rates, found, camera.name, bool(measurements.wheels))
+            found = align_rates(imu, camera.name, rates, offset)
+            check_two_axes(imu, rates, found, camera.name, on_wheels)
         else:
-            found = alignment_as_stated(imu, camera.name, rates, at, rotation)
+            found = alignment_as_stated(imu, camera.name, rates, offset, rotation)
             if rates_contradict(imu, rates, found):
                 raise
-    if rotation is None or (known_value(camera.rotation) is None and turns_about_two_axes(imu, rates, found)):
-        return found
-    own = alignment_as_stated(imu, camera.name, rates, found.offset, rotation)
-    if given is not None and held is None:
-        own = better_at_offset(imu, camera.name, rates, own, relative_offset(given, stream, measurements))
-    if known_value(camera.rotation) is not None or found.given or not rates_contradict(imu, rates, own):
-        return own
-    # The motion shows all of the rotation but the turn about one axis, and for that alone the guess is needed.
-    nearest = nearest_about_axis(main_axis(rates.rate), rotation, found.rotation)
-    return better_alignment(imu, rates, own, alignment_as_stated(imu, camera.name, rates, found.offset, nearest))
+    return found

@@ -1,4 +1,4 @@
-"""What a first guess is: where the solver starts."""
+"""The initial guess of cameras: calibration parameters, biases and camera poses."""
 
 from __future__ import annotations
 
@@ -11,11 +11,20 @@ from icalib.geometry.targets.base import BOARD
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.optim.state import Key
 
+# s; images of several cameras that are closer were taken at the same instant. Clocks synchronised by hardware agree to
+# microseconds, and no camera takes images at 10 kHz.
+MIN_IMAGE_SPACING_S = 1e-4
+
 
 @dataclass(frozen=True)
 class CameraGuess:
-    """params (P,); offset: t_body - t_cam, each since its clock's first stamp [s]; T_body_cam; poses in the board
-    frame."""
+    """Initial guess of one camera.
+
+    params: (P,) intrinsics and distortion, in the order of the camera model.
+    offset: t_body - t_camera [s], each clock counted from its first stamp.
+    rotation, position: R_body_cam (3, 3) and p_body_cam (3,) [m].
+    poses: of the camera in the frame of the target, one for each image.
+    """
 
     params: np.ndarray
     offset: float
@@ -26,8 +35,13 @@ class CameraGuess:
 
 @dataclass(frozen=True)
 class Guess:
-    """Where the solver starts. R_world_board: world z is up, its origin the scene's; its x axis horizontal in the
-    scene. Without an IMU the world is the scene. scene: poses of the target's bodies in it, where there are several."""
+    """Initial guess of all cameras of a rig, for one recording.
+
+    gyro_bias: (3,) [rad/s]; accel_bias: (3,) [m/s^2].
+    R_world_board: (3, 3) attitude of the target's frame; world z is up, and both frames have the same origin. Without
+    an IMU the two frames are the same.
+    scene: poses of the target's bodies in its frame by body and name, if it has several bodies.
+    """
 
     cameras: dict[str, CameraGuess]
     gyro_bias: np.ndarray
@@ -36,7 +50,7 @@ class Guess:
     scene: dict[Key, np.ndarray] = field(default_factory=dict)
 
     def values(self) -> dict[Key, np.ndarray]:
-        """The lasting parameters by sensor and name."""
+        """The calibration parameters by sensor and name, as in a state."""
         out: dict[Key, np.ndarray] = self.scene | {(BOARD, "tilt"): self.R_world_board}
         for name, c in self.cameras.items():
             out[name, "rotation"], out[name, "translation"] = c.rotation, c.position
@@ -45,12 +59,15 @@ class Guess:
         return out
 
     def biases(self, n: int) -> np.ndarray:
-        """(n, 6) the biases, the same at all keyframes."""
+        """(n, 6) gyroscope and accelerometer biases, the same at all n keyframes."""
         return np.tile(np.concatenate([self.gyro_bias, self.accel_bias]), (n, 1))
 
     def body_poses(self, measurements: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Instants (n,) on the body's clock, increasing, R_world_body (n, 3, 3), p_world_body (n, 3), as the images of
-        all cameras show them."""
+        """Poses of the body from the images of all cameras.
+
+        Returns instants (n,) [s] on the body's clock, strictly increasing, R_world_body (n, 3, 3) and p_world_body
+        (n, 3) [m]. Images less than 0.1 ms after another one are left out.
+        """
         times, rotations, positions = [], [], []
         for stream in measurements.cameras:
             c = self.cameras[stream.name]
@@ -61,10 +78,13 @@ class Guess:
             positions.append((c.poses.position[ok] - R @ c.position) @ self.R_world_board.T)
         t = np.concatenate(times)
         order = np.argsort(t, kind="stable")
-        order = order[np.diff(t[order], prepend=-np.inf) > 1e-4]
+        order = order[np.diff(t[order], prepend=-np.inf) > MIN_IMAGE_SPACING_S]
         return t[order], np.concatenate(rotations)[order], np.concatenate(positions)[order]
 
 
 def relative_offset(value: np.ndarray, stream: CornerStream | TrackStream, measurements: Measurements) -> float:
-    """A raw time offset (1,) as one between clocks that each start at their first stamp."""
+    """The offset [s] between two clocks that count from their first stamp, for `value` (1,) [s] between raw stamps.
+
+    The clocks are those of `stream` and of the body, whose first stamp is `measurements.origin_ns`.
+    """
     return float(value[0]) + (stream.origin_ns - measurements.origin_ns) * 1e-9

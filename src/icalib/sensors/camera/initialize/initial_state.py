@@ -1,4 +1,4 @@
-"""The state that the estimate starts from, by the guesses of cameras."""
+"""The state that the estimator starts from, by the initial guesses of cameras."""
 
 from __future__ import annotations
 
@@ -15,21 +15,24 @@ from icalib.sensors.camera.initialize.target_with_imu import initial_trajectory
 
 
 def initial_state(inputs: Inputs, *guesses: Guess) -> State:
-    """The guess of each of `inputs.motions` at all keyframes."""
+    """Keyframe states and calibration parameters, from one guess for each recording in `inputs.motions`.
+
+    All guesses have the same calibration, except the time offsets of cameras whose clock restarts.
+    """
     values = guesses[0].values()
     for k, guess in enumerate(guesses):
         values[in_recording(BOARD, k), "tilt"] = guess.R_world_board
     for camera in inputs.rig.cameras if len(guesses) > 1 else ():
         if camera.clock_restarts:
-            own = [g.cameras[camera.name].offset for g in guesses]
-            values[camera.name, "time_offset"] = offset_of_each_clock(inputs, camera.name, own.__getitem__)
+            offsets = [g.cameras[camera.name].offset for g in guesses]
+            values[camera.name, "time_offset"] = offset_of_each_clock(inputs, camera.name, offsets.__getitem__)
     values = start_values(inputs, values)
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     starts = first_keyframes(inputs.imu, keyframes)
-    own = [
+    parts = [
         (g, m, t - m.begin) for g, m, t in zip(guesses, inputs.motions, np.split(keyframes, starts[1:]), strict=True)
     ]
-    paths = [initial_trajectory(guess, inputs.rig, motion.measurements, t) for guess, motion, t in own]
-    rotation, position, velocity = (np.concatenate(x) for x in zip(*paths, strict=True))
-    bias = np.concatenate([guess.biases(len(t)) for guess, _, t in own])
+    trajectories = [initial_trajectory(guess, inputs.rig, motion.measurements, t) for guess, motion, t in parts]
+    rotation, position, velocity = (np.concatenate(x) for x in zip(*trajectories, strict=True))
+    bias = np.concatenate([guess.biases(len(t)) for guess, _, t in parts])
     return State(keyframes, rotation, position, velocity, bias, values, starts)

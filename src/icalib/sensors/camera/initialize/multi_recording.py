@@ -1,4 +1,4 @@
-"""First guesses of several recordings: the calibration from the one that shows most, and held for the others."""
+"""Initial guesses of several recordings: one recording gives the calibration, which is fixed for the others."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from icalib.sensors.parameter import fixed
 
 
 def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
-    """A guess for each recording, all with the same calibration and the same scene.
+    """The initial guess of each recording, all with the same calibration and the same scene.
 
-    Raises EstimationError, one sentence; where there are several recordings it names the one that carries no guess, or
-    whose clocks stand elsewhere.
+    Raises EstimationError if a recording gives no guess, or if its time offsets differ from the others'. With several
+    recordings the message names the recording.
     """
     if not rig.has_target:
         return _guesses_from_tracks(rig, recordings)
@@ -36,38 +36,43 @@ def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]
         return (initial_guess(rig, recordings[0], scene),)
     check_bodies_still(rig, scene, recordings)
     order = sorted(range(len(recordings)), key=lambda k: -sum(len(c.stamps_ns) for c in recordings[k].cameras))
-    best, guess = _first_that_works(rig, scene, [(k, recordings[k]) for k in order])
-    held = _held(rig, guess, recordings[best])
+    best, guess = _first_successful(rig, scene, [(k, recordings[k]) for k in order])
+    fixed_rig = _with_fixed_calibration(rig, guess, recordings[best])
     guesses = []
     for k, recording in enumerate(recordings):
         if k == best:
             guesses.append(guess)
             continue
         _check_clocks(rig, scene, guess, recordings[best], recording)
-        guesses.append(_named(held, scene, recording))
+        guesses.append(_guess_of(fixed_rig, scene, recording))
     return tuple(guesses)
 
 
 def _guesses_from_tracks(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
-    """The calibration from the recording that shows most, and held for the others."""
+    """Guesses from feature tracks. The recording with most observations gives the calibration of all."""
     best = max(recordings, key=lambda r: sum(len(t.uv) for t in r.tracks))
     guess = guess_from_tracks(rig, best)
-    held = _held(rig, guess, best)
-    return tuple(guess if r is best else guess_from_tracks(held, r) for r in recordings)
+    fixed_rig = _with_fixed_calibration(rig, guess, best)
+    return tuple(guess if r is best else guess_from_tracks(fixed_rig, r) for r in recordings)
 
 
-def _first_that_works(rig: Rig, scene: TargetScene, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
-    """The calibration needs one recording that shows all of it; the error is that of the one that showed most."""
+def _first_successful(rig: Rig, scene: TargetScene, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
+    """Number and guess of the first of `recordings` that gives a guess of the whole calibration.
+
+    `recordings` are pairs of number and recording, the one with most images first. If none gives a guess, the error of
+    that first one is raised.
+    """
     failed: list[EstimationError] = []
     for k, recording in recordings:
         try:
-            return k, _named(rig, scene, recording)
+            return k, _guess_of(rig, scene, recording)
         except EstimationError as error:
             failed.append(error)
     raise failed[0]
 
 
-def _named(rig: Rig, scene: TargetScene, recording: Measurements) -> Guess:
+def _guess_of(rig: Rig, scene: TargetScene, recording: Measurements) -> Guess:
+    """The guess of one recording. Errors name the recording."""
     try:
         return initial_guess(rig, recording, scene)
     except CalibrationError as error:
@@ -75,8 +80,11 @@ def _named(rig: Rig, scene: TargetScene, recording: Measurements) -> Guess:
         raise named(f"{recording.name}: {error}") from error
 
 
-def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
-    """The rig with the calibration of `guess`, made from `recording`, fixed, but for clocks that restart."""
+def _with_fixed_calibration(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
+    """The rig with all camera parameters fixed at `guess`, which is that of `recording`.
+
+    Time offsets of clocks that restart stay free.
+    """
 
     def camera(c: Camera, found: CameraGuess, origin_ns: int) -> Camera:
         offset = found.offset - (origin_ns - recording.origin_ns) * 1e-9
@@ -94,18 +102,20 @@ def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
 
 
 def _check_clocks(rig: Rig, scene: TargetScene, guess: Guess, reference: Measurements, recording: Measurements) -> None:
-    """Raises EstimationError where a camera and the IMU turn alike at another time offset than in `reference`, which
-    `guess` was made from."""
+    """Raises EstimationError if a camera's time offset in `recording` differs from that in `reference`.
+
+    `guess` is the guess of `reference`. Clocks that restart are not checked.
+    """
     imu = imu_data(rig, recording)
     if imu is None:
         return
     for camera, stream, before in zip(rig.cameras, recording.cameras, reference.cameras, strict=True):
         if camera.clock_restarts:
             continue
-        known = guess.cameras[camera.name]
+        estimate = guess.cameras[camera.name]
         origins_ns = (stream.origin_ns - recording.origin_ns) - (before.origin_ns - reference.origin_ns)
-        expected = known.offset + origins_ns * 1e-9
-        poses = scene_poses(stream, camera_model(camera.model), known.params, scene)
+        expected = estimate.offset + origins_ns * 1e-9
+        poses = scene_poses(stream, camera_model(camera.model), estimate.params, scene)
         try:
             rates = camera_rates(stream, poses)
         except EstimationError as error:

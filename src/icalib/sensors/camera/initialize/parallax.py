@@ -1,4 +1,4 @@
-"""Whether tracked points move as they would if the rig only rotated: then nothing shows how far away they are."""
+"""Detects feature tracks without parallax, from which no translation can be estimated."""
 
 from __future__ import annotations
 
@@ -15,14 +15,18 @@ from icalib.rig import Rig
 from icalib.sensors.camera.initialize.tracks.from_tracks import start_intrinsics
 from icalib.sensors.camera.initialize.tracks.joint_alignment import SharedRays, shared_rays
 
-# Times the error of rays: what is left of two images by rotation alone is two errors on two axes, and that by epipolar
-# geometry one on one axis, so that noise alone makes up to 2.3.
-NO_MORE_THAN_NOISE = 3.0
+# Parallax over the median epipolar error. Noise alone gives up to 2.3: the parallax holds the errors of two rays in two
+# axes, the epipolar error those in one axis. Twice the value would refuse motion with usable parallax.
+MIN_PARALLAX_RATIO = 3.0
 
 
 def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError | None:
-    """The sentence about the camera that sees most parallax, where even that is no more than noise; else None."""
-    found = []
+    """The error if no camera in any recording has parallax beyond noise, else None.
+
+    The error names the camera with the largest ratio of parallax to noise. Returns None as well if a recording has no
+    IMU data, or if the intrinsics of a camera are not found.
+    """
+    found: list[tuple[float, float, str]] = []
     for m in recordings:
         imu = imu_data(rig, m)
         for k, (camera, stream) in enumerate(zip(rig.cameras, m.tracks, strict=True)):
@@ -32,13 +36,14 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
                 lens = start_intrinsics(camera, stream, imu, m)
             except EstimationError:
                 return None
-            shown = [_parallax(pair) for pair in shared_rays(k, stream, camera_model(camera.model), lens)]
-            if shown:
-                found.append((*np.median(shown, axis=0).tolist(), camera.name))
+            pairs = [_parallax(pair) for pair in shared_rays(k, stream, camera_model(camera.model), lens)]
+            if pairs:
+                parallax, error = np.median(pairs, axis=0).tolist()
+                found.append((parallax, error, camera.name))
     if not found:
         return None
     parallax, error, name = max(found, key=lambda x: x[0] / x[1])
-    if parallax > NO_MORE_THAN_NOISE * error:
+    if parallax > MIN_PARALLAX_RATIO * error:
         return None
     return EstimationError(
         f"{name}: the tracked points move as in a pure rotation (parallax {np.rad2deg(parallax):.2g} deg, "
@@ -48,9 +53,12 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
 
 
 def _parallax(pair: SharedRays) -> tuple[float, float]:
-    """By how much the rays of two images differ beside a rotation, and by how much they miss their epipolar planes
-    [rad]."""
+    """Parallax and epipolar error of two images, medians over their shared points [rad].
+
+    The parallax is the distance of unit rays after the best rotation; the epipolar error is the angle between a ray and
+    its epipolar plane.
+    """
     R, t = rotation_without_translation(pair.f, pair.h)
-    beside = float(np.median(np.linalg.norm(pair.f @ R.T - pair.h, axis=1)))
+    parallax = float(np.median(np.linalg.norm(pair.f @ R.T - pair.h, axis=1)))
     refine_relative_pose(pair.f, pair.h, R, t)
-    return beside, rotation_error(pair.f, pair.h, R, t)[1] + 1e-12
+    return parallax, rotation_error(pair.f, pair.h, R, t)[1] + 1e-12

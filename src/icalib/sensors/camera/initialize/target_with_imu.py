@@ -1,5 +1,8 @@
-"""The first guess, from nothing: intrinsics, poses, clocks, rotation, gravity, lever arms. What the rig gives is
-used."""
+"""Initial guess of cameras that see a target, and of the IMU's biases and the attitude of the target.
+
+Steps: intrinsics; camera poses; time offset and rotation by angular rates; gravity, accelerometer bias and lever arm by
+double-integrated accelerations. Values of the rig file are used at each step.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +32,16 @@ from icalib.sensors.sensor import ROTATION
 
 __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
 
-VELOCITY_STEP_S = 0.04
+# s, half the interval of the difference quotient for velocities. Two images at 25 Hz: over shorter intervals the noise
+# of poses dominates, over longer ones the acceleration.
+VELOCITY_HALF_STEP_S = 0.04
 
 
 def initial_guess(rig: Rig, measurements: Measurements, scene: TargetScene | None = None) -> Guess:
-    """`scene`: where the bodies of the target stand, if that is known already, and all streams hold only theirs.
+    """The initial guess of one recording.
 
-    Raises EstimationError, one sentence, where the recording does not carry a guess.
+    scene: poses of the target's bodies, if they are known. All streams then hold corners of these bodies only.
+    Raises EstimationError if the recording does not determine a guess.
     """
     if scene is None:
         bodies = choose_bodies(rig.target, [measurements], bent=False, rig=rig)
@@ -50,20 +56,24 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: TargetScene | Non
     if imu is None:
         return guess_without_imu(rig, measurements, params, poses, scene.values)
     assert rig.imu is not None
-    seen = _TargetViews(rig, measurements, params, poses, scene.values)
+    views = _TargetViews(rig, measurements, params, poses, scene.values)
     try:
-        guess, unlike = seen.guess(imu)
+        guess, is_contradicted = views.guess(imu)
     except EstimationError as error:
-        refuse_other_axes(rig.imu, imu, seen.left, error)
+        refuse_other_axes(rig.imu, imu, views.unexplained_acceleration, error)
         raise
-    if unlike:
-        refuse_other_axes(rig.imu, imu, seen.left, None)
+    if is_contradicted:
+        refuse_other_axes(rig.imu, imu, views.unexplained_acceleration, None)
     return guess
 
 
 @dataclass(frozen=True)
 class _TargetViews:
-    """What cameras saw of the target: params (P,) and poses of each; scene: poses of the target's bodies."""
+    """Camera poses from images of the target, in one recording.
+
+    params: (P,) intrinsics and distortion of each camera; poses: of each camera in the frame of the target.
+    scene: poses of the target's bodies by body and name, as in a state.
+    """
 
     rig: Rig
     measurements: Measurements
@@ -72,8 +82,11 @@ class _TargetViews:
     scene: dict[Key, np.ndarray]
 
     def guess(self, imu: ImuData) -> tuple[Guess, bool]:
-        """By the IMU's readings; and whether the accelerometer felt another motion than a camera saw."""
-        best = self._best
+        """The guess from camera poses and `imu`, and whether the accelerometer contradicts the camera poses.
+
+        Raises EstimationError if the measurements do not determine the guess.
+        """
+        best = self._best_camera
         aligned = [self._aligned(imu, k) for k in range(len(self.poses))]
         gyro = GyroRotation.integrate(imu, aligned[best].gyro_bias)
         arms = [self._arm(imu, k, a, gyro) for k, a in enumerate(aligned)]
@@ -84,32 +97,40 @@ class _TargetViews:
             c.name: _camera_guess(c, self._offset(imu, k, a), self.params[k], a, arm, self.poses[k])
             for k, (c, a, arm) in enumerate(zip(self.rig.cameras, aligned, arms, strict=True))
         }
-        guess = Guess(cameras, aligned[best].gyro_bias, _mean_bias(arms), _level(arms[best].gravity), self.scene)
+        guess = Guess(
+            cameras, aligned[best].gyro_bias, _mean_bias(arms), _attitude_of_board(arms[best].gravity), self.scene
+        )
         return guess, arms[best].unlike
 
-    def left(self, imu: ImuData) -> float:
-        """What readings leave of the acceleration that the camera with most poses saw. Raises EstimationError where
-        they do not fit it at all."""
-        a = self._aligned(imu, self._best)
-        arm = self._arm(imu, self._best, a, GyroRotation.integrate(imu, a.gyro_bias))
+    def unexplained_acceleration(self, imu: ImuData) -> float:
+        """Share of the acceleration, by the camera with most poses, that the accelerometer does not explain.
+
+        Raises EstimationError if the two do not fit together at all.
+        """
+        a = self._aligned(imu, self._best_camera)
+        arm = self._arm(imu, self._best_camera, a, GyroRotation.integrate(imu, a.gyro_bias))
         self._check_gravity(imu, arm, a)
         return arm.left
 
     @property
-    def _best(self) -> int:
+    def _best_camera(self) -> int:
+        """The number of the camera with most poses."""
         return int(np.argmax([q.ok.sum() for q in self.poses]))
 
     def _aligned(self, imu: ImuData, k: int) -> RateAlignment:
+        """Time offset, rotation and gyroscope bias by camera `k`."""
         stream = self.measurements.cameras[k]
         return align_camera(self.rig.cameras[k], stream, camera_rates(stream, self.poses[k]), imu, self.measurements)
 
     def _offset(self, imu: ImuData, k: int, found: RateAlignment) -> float:
+        """The time offset [s] of camera `k` between first stamps, from the rig file or from `found`."""
         camera, stream = self.rig.cameras[k], self.measurements.cameras[k]
         raw = camera.time_offset.value
         given = None if raw is None else relative_offset(raw, stream, self.measurements)
         return chosen_offset(camera, camera_rates(stream, self.poses[k]), imu, given, found)
 
     def _arm(self, imu: ImuData, k: int, aligned: RateAlignment, gyro: GyroRotation) -> LeverArm:
+        """Lever arm, gravity and accelerometer bias by camera `k`."""
         t, known = self.measurements.cameras[k].seconds + aligned.offset, known_value(self.rig.cameras[k].translation)
         return solve_camera_lever_arm(imu, t, self.poses[k], aligned.rotation, gyro, known)
 
@@ -120,7 +141,10 @@ class _TargetViews:
 def _camera_guess(
     camera: Camera, offset: float, params: np.ndarray, aligned: RateAlignment, arm: LeverArm, poses: TargetPoses
 ) -> CameraGuess:
-    """What was found, and in its place what the rig gives, but guesses that it contradicts."""
+    """The guess of one camera: values of the rig file, else the estimates.
+
+    An estimate replaces an initial guess of the rig file that it contradicts.
+    """
     p = camera.translation.value
     if p is not None and camera.translation.mode == "free":
         p = merged_translation(p, arm.position, arm.covariance)
@@ -134,11 +158,15 @@ def _camera_guess(
 
 
 def _mean_bias(arms: list[LeverArm]) -> np.ndarray:
+    """(3,) [m/s^2] accelerometer bias, the mean over the estimates by each camera."""
     return np.mean([a.accel_bias for a in arms], axis=0)
 
 
-def _level(gravity_board: np.ndarray) -> np.ndarray:
-    """R_world_board with z against gravity and x along the horizontal direction nearest to the board's x (or y)."""
+def _attitude_of_board(gravity_board: np.ndarray) -> np.ndarray:
+    """R_world_board (3, 3) from gravity (3,) in the board's frame: world z is up.
+
+    World x is the projection of the board's x axis on the horizontal plane, or of its y axis if x is nearly vertical.
+    """
     up = -gravity_board / np.linalg.norm(gravity_board)
     reference = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
     x = reference - (reference @ up) * up
@@ -149,9 +177,10 @@ def _level(gravity_board: np.ndarray) -> np.ndarray:
 def initial_trajectory(
     guess: Guess, rig: Rig, measurements: Measurements, keyframes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R_world_imu (K, 3, 3), position and velocity (K, 3) at `keyframes` [s on the imu clock since its first stamp].
+    """R_world_imu (K, 3, 3), position [m] and velocity [m/s] (K, 3) at `keyframes` (K,).
 
-    From the nearest camera pose, rotation carried by the gyroscope, position interpolated.
+    keyframes: [s] on the IMU's clock since its first stamp. The gyroscope propagates the rotation from the nearest
+    camera pose; positions are interpolated linearly; velocities are their central differences.
     """
     imu = imu_data(rig, measurements)
     if imu is None:
@@ -162,5 +191,6 @@ def initial_trajectory(
         return np.stack([np.interp(s, t, p[:, k]) for k in range(3)], axis=1)
 
     rotation = GyroRotation.integrate(imu, guess.gyro_bias).carry(t, R, keyframes)
-    velocity = (position(keyframes + VELOCITY_STEP_S) - position(keyframes - VELOCITY_STEP_S)) / (2.0 * VELOCITY_STEP_S)
+    step = VELOCITY_HALF_STEP_S
+    velocity = (position(keyframes + step) - position(keyframes - step)) / (2.0 * step)
     return np.ascontiguousarray(rotation), position(keyframes), velocity

@@ -1,4 +1,4 @@
-"""The first guess of cameras alone: each one's place beside the first, from images of the target taken together."""
+"""Initial guess of a rig without IMU: relative poses of cameras, from images of the target at the same instants."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from icalib.rig import Rig
 from icalib.sensors.camera.connected_bodies import taken_at_once
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 
-MOST_PAIRS = 200  # of images taken together; more do not make a first guess better
+# Pairs of images that give the relative pose of two cameras, spread over the recording. The cost grows with the square
+# of the number, and the initial guess needs no better mean.
+MAX_IMAGE_PAIRS = 200
 Scene = dict[Key, np.ndarray]
 Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3), p (3,)
 
@@ -21,12 +23,16 @@ Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3), p (3,)
 def guess_without_imu(
     rig: Rig, measurements: Measurements, params: list[np.ndarray], poses: list[TargetPoses], scene: Scene
 ) -> Guess:
-    """Raises EstimationError naming a camera that has a pose in no image, or that no images taken together tie to the
-    first one."""
-    for camera, own in zip(rig.cameras, poses, strict=True):
-        if not own.ok.any():
+    """The initial guess of one recording; the first camera is the body, and the world is the target's frame.
+
+    params: (P,) intrinsics and distortion of each camera; poses: of each camera in the frame of the target; scene:
+    poses of the target's bodies. Raises EstimationError naming a camera without any pose, or a camera that no pair of
+    simultaneous images connects to the first one.
+    """
+    for camera, camera_poses in zip(rig.cameras, poses, strict=True):
+        if not camera_poses.ok.any():
             raise EstimationError(
-                f"{camera.name}: its lens explains the corners in none of its {len(own.ok)} images; check its "
+                f"{camera.name}: its lens explains the corners in none of its {len(camera_poses.ok)} images; check its "
                 "model and resolution in the rig file, and remove intrinsics and distortion so that they are "
                 "estimated."
             )
@@ -35,33 +41,40 @@ def guess_without_imu(
         for c, s in zip(rig.cameras, measurements.cameras, strict=True)
     ]
     times = [s.seconds + o for s, o in zip(measurements.cameras, offsets, strict=True)]
-    places = _places(rig, times, poses)
-    cameras = {c.name: CameraGuess(params[i], offsets[i], *places[i], poses[i]) for i, c in enumerate(rig.cameras)}
+    extrinsics = _extrinsics(rig, times, poses)
+    cameras = {c.name: CameraGuess(params[i], offsets[i], *extrinsics[i], poses[i]) for i, c in enumerate(rig.cameras)}
     return Guess(cameras, np.zeros(3), np.zeros(3), np.eye(3), scene)
 
 
 def trajectory_without_imu(
     guess: Guess, measurements: Measurements, keyframes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R_world_body (K, 3, 3), position and velocity (K, 3) at `keyframes`: the pose of the nearest image, at rest."""
+    """R_world_body (K, 3, 3), position [m] and velocity [m/s] (K, 3) at `keyframes` (K,) [s].
+
+    Each pose is that of the nearest image; velocities are zero.
+    """
     t, R, p = guess.body_poses(measurements)
     nearest = np.searchsorted(0.5 * (t[1:] + t[:-1]), keyframes)
     return np.ascontiguousarray(R[nearest]), p[nearest], np.zeros((len(keyframes), 3))
 
 
-def _places(rig: Rig, times: list[np.ndarray], poses: list[TargetPoses]) -> list[Pose]:
-    """T_body_cam of every camera: given, or along images taken together, from the first camera outwards."""
+def _extrinsics(rig: Rig, times: list[np.ndarray], poses: list[TargetPoses]) -> list[Pose]:
+    """T_body_cam of each camera: that of the rig file, else a chain of relative poses that begins at the first camera.
+
+    The chain always takes the pair of cameras with most simultaneous images. times: (M,) [s] of the images of each
+    camera on the body's clock.
+    """
     found: dict[int, Pose] = {0: (np.eye(3), np.zeros(3))}
     for i, c in enumerate(rig.cameras[1:], 1):
         if c.rotation.value is not None and c.translation.value is not None:
             found[i] = c.rotation.value, c.translation.value
     while len(found) < len(rig.cameras):
-        reached = [(a, b) for a in found for b in range(len(rig.cameras)) if b not in found]
-        beside = {(a, b): _beside(times[a], poses[a], times[b], poses[b]) for a, b in reached}
-        (a, b), relative = max(beside.items(), key=lambda item: len(item[1]))
+        pairs = [(a, b) for a in found for b in range(len(rig.cameras)) if b not in found]
+        relative_poses = {(a, b): _relative_poses(times[a], poses[a], times[b], poses[b]) for a, b in pairs}
+        (a, b), relative = max(relative_poses.items(), key=lambda item: len(item[1]))
         if not relative:
-            _nothing_shared(rig, found)
-        R, p = _middle(relative)
+            raise _not_connected(rig, found)
+        R, p = _medoid(relative)
         found[b] = found[a][0] @ R, found[a][1] + found[a][0] @ p
     for i, c in enumerate(rig.cameras[1:], 1):
         R, p = c.rotation.value, c.translation.value
@@ -69,27 +82,28 @@ def _places(rig: Rig, times: list[np.ndarray], poses: list[TargetPoses]) -> list
     return [found[i] for i in range(len(rig.cameras))]
 
 
-def _beside(ta: np.ndarray, a: TargetPoses, tb: np.ndarray, b: TargetPoses) -> list[Pose]:
-    """T_a_b of each pair of images taken together."""
-    together = np.column_stack(taken_at_once(ta, tb))
-    together = together[a.ok[together[:, 0]] & b.ok[together[:, 1]]]
-    if len(together) > MOST_PAIRS:
-        together = together[np.linspace(0, len(together) - 1, MOST_PAIRS).astype(int)]
-    return [(a.rotation[i].T @ b.rotation[j], a.rotation[i].T @ (b.position[j] - a.position[i])) for i, j in together]
+def _relative_poses(ta: np.ndarray, a: TargetPoses, tb: np.ndarray, b: TargetPoses) -> list[Pose]:
+    """T_a_b of two cameras, one for each pair of simultaneous images at times `ta` and `tb` [s]."""
+    pairs = np.column_stack(taken_at_once(ta, tb))
+    pairs = pairs[a.ok[pairs[:, 0]] & b.ok[pairs[:, 1]]]
+    if len(pairs) > MAX_IMAGE_PAIRS:
+        pairs = pairs[np.linspace(0, len(pairs) - 1, MAX_IMAGE_PAIRS).astype(int)]
+    return [(a.rotation[i].T @ b.rotation[j], a.rotation[i].T @ (b.position[j] - a.position[i])) for i, j in pairs]
 
 
-def _middle(poses: list[Pose]) -> Pose:
-    """The one whose median distance to the others is least; a radian counts as much as a metre."""
+def _medoid(poses: list[Pose]) -> Pose:
+    """The pose with the least median distance to the others, a robust mean. One radian counts as one metre."""
     R, p = np.array([R for R, _ in poses]), np.array([p for _, p in poses])
-    turns = np.linalg.norm(so3.log_many((R[:, None].swapaxes(-1, -2) @ R[None]).reshape(-1, 3, 3)), axis=1)
-    apart = turns.reshape(len(R), -1) + np.linalg.norm(p[:, None] - p[None], axis=2)
-    return poses[int(np.argmin(np.median(apart, axis=1)))]
+    angles = np.linalg.norm(so3.log_many((R[:, None].swapaxes(-1, -2) @ R[None]).reshape(-1, 3, 3)), axis=1)
+    distance = angles.reshape(len(R), -1) + np.linalg.norm(p[:, None] - p[None], axis=2)
+    return poses[int(np.argmin(np.median(distance, axis=1)))]
 
 
-def _nothing_shared(rig: Rig, found: dict[int, Pose]) -> None:
+def _not_connected(rig: Rig, found: dict[int, Pose]) -> EstimationError:
+    """The error that no simultaneous images connect the other cameras to those in `found`."""
     lost = ", ".join(c.name for i, c in enumerate(rig.cameras) if i not in found)
     known = ", ".join(c.name for i, c in enumerate(rig.cameras) if i in found)
-    raise EstimationError(
+    return EstimationError(
         f"{lost} and {known} never saw the target at the same instant, and there is no IMU to connect them; "
         "show it to both at once with synchronised stamps, add the IMU, or give rotation and translation in "
         "the rig file."
