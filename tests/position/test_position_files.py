@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Never
 
 import numpy as np
 import pytest
+from tests.typed import instance
 
+from icalib.data.recordings import open_recording
+from icalib.data.recordings.base import Reading
 from icalib.errors import RecordingError
+from icalib.rig import Rig, by_name
+from icalib.sensors.position.read import read
 from icalib.sensors.position.read.checks import checked_positions
 from icalib.sensors.position.read.messages import from_navsat, from_positions
 from icalib.sensors.position.read.readings import (
+    AS_RECORDED,
     NO_COVARIANCE,
     PositionReadings,
     about_first,
@@ -22,6 +29,7 @@ from icalib.sensors.position.read.readings import (
 from icalib.sensors.position.read.rtklib import read_pos
 from icalib.sensors.position.read.tables import read_position_table
 from icalib.sensors.position.spec import PositionSensor
+from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.sensor import TableLayout
 
 HEADER = (
@@ -121,6 +129,44 @@ def test_what_is_wrong_with_latitude_and_longitude(degrees, sentence):
     degrees = np.array(degrees)
     with pytest.raises(RecordingError, match=sentence):
         from_geodetic("gnss.csv", readings(degrees), degrees, np.ones(4, bool))
+
+
+def test_two_antennas_with_one_east_north_and_up():
+    """Two routes to metres about the first fix of one antenna: directly, and about the first fix of the other."""
+    degrees = np.array([[40.0, 8.0, 500.0], [40.01, 8.02, 530.0], [39.99, 8.0, 505.0], [40.02, 7.97, 480.0]])
+    all_good = np.ones(4, bool)
+    expected, _ = from_geodetic("a", readings(degrees), degrees, all_good)
+    first, _ = from_geodetic("a", readings(degrees[:2]), degrees[:2], all_good[:2])
+    other, _ = from_geodetic("b", readings(degrees[2:]), degrees[2:], all_good[2:])
+    other = replace(other, covariance=np.tile(np.diag([1.0, 4.0, 9.0]), (2, 1, 1)))
+    moved = other.inside("b", first.frame, "a")
+    np.testing.assert_allclose(moved.position, expected.position[2:], atol=1e-6)
+    turned = first.frame.axes @ other.frame.axes.T
+    np.testing.assert_allclose(moved.covariance[0], turned @ np.diag([1.0, 4.0, 9.0]) @ turned.T, atol=1e-12)
+    with pytest.raises(RecordingError, match="latitudes and longitudes cannot be in the frame of mocap0"):
+        other.inside("b", AS_RECORDED, "mocap0")
+
+
+def never(*_) -> Never:
+    raise AssertionError("no camera is read")
+
+
+def test_two_antennas_far_from_one_origin(tmp_path):
+    """Metric tables that are counted from where each begins are counted from one place where they share a frame."""
+    far = np.array([400_000.4, 5_000_000.0, 300.0])
+    for k in range(2):
+        folder = tmp_path / f"gnss{k}"
+        folder.mkdir()
+        p = walk() + far + [200.0 * k, 0.0, 0.0]
+        rows = [",".join((str(200_000_000 * i), *(f"{x:.6f}" for x in row))) for i, row in enumerate(p)]
+        (folder / "positions.csv").write_text("t [ns],x [m],y [m],z [m]\n" + "\n".join(rows) + "\n")
+    rig = Rig(by_name(PositionSensor("gnss0", "gnss0/positions.csv"), PositionSensor("gnss1", "gnss1/positions.csv")))
+    rig = rig.with_("gnss1", frame="gnss0")
+    reading = Reading(rig, lambda stream, what: stream, never, never)
+    found = read(open_recording(tmp_path), rig.of(PositionSensor), reading)
+    first, other = (instance(stream, PositionStream) for stream, _ in found)
+    np.testing.assert_allclose(other.position - first.position, np.tile([200.0, 0.0, 0.0], (100, 1)), atol=1e-5)
+    assert "converted to the frame of gnss0" in found[1][1][-1]
 
 
 def test_metric_positions_far_from_their_origin():

@@ -15,6 +15,8 @@ from icalib.geometry.geodesy import east_north_up, latitude_longitude
 from icalib.sensors.position.read.checks import checked_positions
 from icalib.sensors.position.read.messages import from_navsat, from_positions
 from icalib.sensors.position.read.readings import (
+    AS_RECORDED,
+    LocalFrame,
     PositionReadings,
     about_first,
     from_geodetic,
@@ -50,11 +52,18 @@ TABLES = (
 def read(recording: Recording, sensors: Sequence[PositionSensor], reading: Reading) -> list[ReadStream]:
     """The checked streams, and notes. Raises RecordingError where data are missing, cannot be read or cannot be
     right."""
+    places = {sensor.name: f"{recording.where(sensor)} ({sensor.name})" for sensor in sensors}
+    written = {sensor.name: _readings(recording, sensor, places[sensor.name]) for sensor in sensors}
     found = []
     for sensor in sensors:
-        what = f"{recording.where(sensor)} ({sensor.name})"
-        written, notes = _readings(recording, sensor, what)
-        stream, more = checked_positions(reading.cut(written, what), what)
+        what, (own, notes) = places[sensor.name], written[sensor.name]
+        if sensor.shared_frame:
+            owner = written.get(sensor.shared_frame)
+            frame = AS_RECORDED if owner is None else owner[0].frame
+            if own.frame is not frame:
+                own = own.inside(what, frame, sensor.shared_frame)
+                notes += (f"{what}: its positions were then converted to the frame of {sensor.shared_frame}.",)
+        stream, more = checked_positions(reading.cut(own, what), what)
         found.append((stream, notes + more))
     return found
 
@@ -127,4 +136,5 @@ def _levelled(written: PositionReadings) -> PositionReadings:
     """Earth-centred positions as east, north and up of the first."""
     R = east_north_up(*latitude_longitude(written.position[0]))
     covariance = R @ written.covariance @ R.T if len(written.covariance) else written.covariance
-    return replace(written, position=(written.position - written.position[0]) @ R.T, covariance=covariance)
+    frame = LocalFrame(written.position[0], R, True)
+    return replace(written, position=(written.position - frame.origin) @ R.T, covariance=covariance, frame=frame)

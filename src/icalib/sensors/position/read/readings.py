@@ -16,13 +16,43 @@ FAR_M = 20_000.0  # from the first fix: over more, "up" turns by 3 mrad, 0.03 m/
 
 
 @dataclass(frozen=True)
+class LocalFrame:
+    """The frame of positions p (3,) that were recorded as origin + axes^T p. origin (3,) m; axes (3, 3)
+    R_local_recorded; on_earth: what was recorded is Earth-centred, or latitude, longitude and height."""
+
+    origin: np.ndarray
+    axes: np.ndarray
+    on_earth: bool = False
+
+    def moved(self, by: np.ndarray) -> LocalFrame:
+        """The same axes at `by` (3,) m in them."""
+        return replace(self, origin=self.origin + by @ self.axes)
+
+
+AS_RECORDED = LocalFrame(np.zeros(3), np.eye(3))
+
+
+@dataclass(frozen=True)
 class PositionReadings(RawReadings):
-    """position (N, 3) m, or latitude, longitude [deg] and height [m] until they are converted; covariance (N, 3, 3)
-    m^2, or (0, 3, 3); status (N,) index into `STATUSES`, -1: no fix, or (0,) where none is stated."""
+    """position (N, 3) m in `frame`, or latitude, longitude [deg] and height [m] until they are converted; covariance
+    (N, 3, 3) m^2, or (0, 3, 3); status (N,) index into `STATUSES`, -1: no fix, or (0,) where none is stated."""
 
     position: np.ndarray
     covariance: np.ndarray
     status: np.ndarray
+    frame: LocalFrame = AS_RECORDED
+
+    def inside(self, what: str, frame: LocalFrame, owner: str) -> PositionReadings:
+        """In another frame, that of `owner`. Raises RecordingError where one of the two is on the Earth."""
+        if self.frame.on_earth != frame.on_earth:
+            kind = "latitudes and longitudes" if self.frame.on_earth else "positions in metres"
+            raise RecordingError(
+                f"{what}: {kind} cannot be in the frame of {owner}; write frame: levelled in the rig file."
+            )
+        R = frame.axes @ self.frame.axes.T
+        covariance = R @ self.covariance @ R.T if len(self.covariance) else self.covariance
+        position = self.position @ R.T + frame.axes @ (self.frame.origin - frame.origin)
+        return replace(self, position=position, covariance=covariance, frame=frame)
 
 
 def good_fixes(status: np.ndarray, least: Status, n: int) -> np.ndarray:
@@ -61,7 +91,7 @@ def from_geodetic(
         )
     xyz = earth_centred(np.deg2rad(latitude), np.deg2rad(longitude), height)
     first = int(np.argmax(own))
-    position, _ = local_metres(xyz, xyz[first])
+    position, axes = local_metres(xyz, xyz[first])
     away = float(np.linalg.norm(position[own], axis=1).max())
     if away > FAR_M:
         raise RecordingError(
@@ -72,7 +102,7 @@ def from_geodetic(
         f"{what}: metres are east, north and up of the first fix, latitude {latitude[first]:.8f}, longitude "
         f"{longitude[first]:.8f}, height {height[first]:.3f} m."
     )
-    return replace(readings, position=position).some(own), (note,)
+    return replace(readings, position=position, frame=LocalFrame(xyz[first], axes, True)).some(own), (note,)
 
 
 def _refuse_heights(what: str, degrees: np.ndarray, good: np.ndarray) -> None:
@@ -96,4 +126,4 @@ def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings
         return readings, ()
     x, y, z = origin
     note = f"{what}: positions are relative to ({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away."
-    return replace(readings, position=p - origin), (note,)
+    return replace(readings, position=p - origin, frame=readings.frame.moved(origin)), (note,)
