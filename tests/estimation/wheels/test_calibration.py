@@ -76,7 +76,7 @@ def noisy(world, rng, noise, pose_sigma):
     n, k = len(world.seconds), len(world.state.seconds)
     period = world.seconds[1] - world.seconds[0]
     angles = world.angles + np.cumsum(noise.wheel * np.sqrt(period) * rng.normal(size=(n, 2)), axis=0)
-    slip = rng.normal(size=(k, 2)) * [noise.sideways, noise.upwards]
+    slip = rng.normal(size=(k, 2)) * [noise.lateral_slip, noise.vertical_slip]
     turn = so3.exp_many(pose_sigma[0] * rng.normal(size=(k, 3)))
     return angles, slip, world.state.rotation @ turn, world.state.position + pose_sigma[1] * rng.normal(size=(k, 3))
 
@@ -187,7 +187,7 @@ def test_a_vehicle_that_drifts_sideways_is_within_its_slip_density_or_shows_in_i
     low, high = chi2_of_rows
     assert low < np.mean(square) < high
     dof = seeds * len(kept)
-    if density == NOISE.sideways:
+    if density == NOISE.lateral_slip:
         assert chi2.ppf(5e-4, dof) < sum(nees) < chi2.ppf(1.0 - 5e-4, dof)
 
 

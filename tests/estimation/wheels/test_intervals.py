@@ -9,7 +9,7 @@ from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
 from icalib.motion.stamp_intervals import LONGEST_S, StampIntervals, choose_intervals
 from icalib.rig import ImuNoise
-from icalib.sensors.wheels.integrals import angles_from_rates
+from icalib.sensors.wheels.integrals import integrated
 from icalib.sensors.wheels.quadrature import PANEL_S, quadrature
 
 
@@ -108,22 +108,20 @@ def turned(t):
 def test_mean_rates_add_up_to_what_was_turned():
     rates = np.zeros((200, 2))
     rates[1:] = np.diff(turned(T), axis=0) / np.diff(T)[:, None]
-    np.testing.assert_allclose(
-        angles_from_rates(T, rates, "interval-mean"), turned(T) - turned(T[0]), rtol=0, atol=1e-12
-    )
+    np.testing.assert_allclose(integrated(T, rates, "interval-mean"), turned(T) - turned(T[0]), rtol=0, atol=1e-12)
 
 
 def test_instant_rates_are_integrated_by_trapezoids():
     rates = np.stack([2.0 + 1.3 * np.cos(1.3 * T), 1.5 + 0.8 * np.sin(2.0 * T)], axis=-1)
-    got, want = angles_from_rates(T, rates, "instantaneous"), turned(T) - turned(T[0])
+    got, want = integrated(T, rates, "instantaneous"), turned(T) - turned(T[0])
     np.testing.assert_allclose(got, want, rtol=0, atol=5e-4)
     # Read as means they are late: angle(t) of what was turned half a period earlier.
-    late = angles_from_rates(T, rates, "interval-mean") - want
+    late = integrated(T, rates, "interval-mean") - want
     assert np.abs(late).max() > 5e-3
 
 
 def test_the_two_readings_of_a_driver_differ_by_half_a_period():
     t = np.arange(0.0, 4.0, 0.02)
     rates = np.stack([np.cos(t), np.sin(2.0 * t)], axis=-1)
-    shift = angles_from_rates(t, rates, "interval-mean") - angles_from_rates(t, rates, "instantaneous")
+    shift = integrated(t, rates, "interval-mean") - integrated(t, rates, "instantaneous")
     np.testing.assert_allclose(shift, 0.01 * (rates - rates[0]), rtol=0, atol=1e-12)

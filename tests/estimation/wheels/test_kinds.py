@@ -128,8 +128,8 @@ def test_derivatives_of_the_coefficients(kind, drive):
     rng, drive = np.random.default_rng(0), np.array(drive)
     mean = rng.uniform(0.1, 0.9, (3, 3))
     made = coefficients(kind, drive, mean)
-    assert np.abs(made.by_X).max() + np.abs(made.by_T).max() > 0.1
+    assert np.abs(made.J_g_X).max() + np.abs(made.J_g_T).max() > 0.1
     for k in range(2 if kind == "twist" else 3):
         up, down = (coefficients(kind, drive + s * 1e-6 * np.eye(3)[k], mean) for s in (1.0, -1.0))
-        np.testing.assert_allclose(made.by_X[:, :, k], (up.X - down.X) / 2e-6, rtol=1e-7, atol=1e-7)
-        np.testing.assert_allclose(made.by_T[:, :, k], (up.T - down.T) / 2e-6, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(made.J_g_X[:, :, k], (up.g_X - down.g_X) / 2e-6, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(made.J_g_T[:, :, k], (up.g_T - down.g_T) / 2e-6, rtol=1e-7, atol=1e-7)

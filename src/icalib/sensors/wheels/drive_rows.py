@@ -1,17 +1,18 @@
-"""What each kind of wheels measures: the rows of the increment factor.
+"""The rows of the increment factor, by kind of wheels.
 
-A row is g_X X + g_T T - measured, with X the way of the wheels' frame and T its turn over an interval, in its own axes.
-The first two rows of an interval, by kind, and what they are called:
+A row is g_X X + g_T T - measured, where X [m] is the displacement and T [rad] the rotation vector of the wheels' frame
+over an interval, in its own axes. The first two rows by kind, with the names of their residuals:
 
-    pair      (e_1 X -+ b/2 e_3 T) / r - turned            left, right                [rad]
-    twist     e_1 X / s_v - path,  e_3 T / s_w - yaw       speed, yaw                 [m], [rad]
-    steered   e_1 X / r - turned                           wheel                      [rad]
+    pair      (e_1 X -+ b/2 e_3 T) / r - angle             left, right                [rad]
+    twist     e_1 X / s_v - distance,  e_3 T / s_w - yaw   speed, yaw                 [m], [rad]
+    steered   e_1 X / r - angle                            wheel                      [rad]
               L cos(d) e_3 T - sin(d) e_1 X                steering                   [m]
 
-The last says that the front axle, L ahead, moves along its wheels, which point to d = steering angle + offset: the
-kinematic bicycle. It is L e_3 T = tan(d) e_1 X, times cos(d), so that neither a steep angle nor standing still is
-special, and so that the noise of the angle enters the derivative by L through cos(d) alone. cos and sin are means over
-the interval. The other two rows, e_2 X and e_3 X, are the slip sideways and upwards [m], of all kinds.
+The steering row is the kinematic bicycle: the front axle, L ahead, moves along its wheels, which point to d = steering
+angle + offset. It is L e_3 T = tan(d) e_1 X times cos(d): a steep angle and standing still are no special cases, and
+the noise of the angle enters the derivative by L through cos(d) alone. cos and sin are means over the interval.
+
+All kinds have the rows e_2 X and e_3 X, the lateral and the vertical slip [m].
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ import numpy as np
 
 from icalib.rig import WheelKind
 
-N_DRIVE = 3  # the most parameters of a kind
-LEFT, RIGHT = -0.5, 0.5
+N_DRIVE = 3  # largest number of parameters of a kind
+LEFT, RIGHT = -0.5, 0.5  # position of each wheel along y, in baselines, with the sign of e_3 T in its row
 Kinds = dict[str, slice]
 SLIP: Kinds = {"lateral slip": slice(2, 3), "vertical slip": slice(3, 4)}
 KINDS: dict[WheelKind, Kinds] = {
@@ -38,51 +39,60 @@ UNITS = {
 
 
 class Coefficients(NamedTuple):
-    """Of k = n intervals, or of one for all: X, T (k, 4, 3) are g_X, g_T of each row, in wheel axes; by_X, by_T
-    (k, 4, 3, 3) their derivatives: row, parameter, axis."""
+    """Coefficients of the rows in wheel axes, of each of k = n intervals or of one for all.
 
-    X: np.ndarray
-    T: np.ndarray
-    by_X: np.ndarray
-    by_T: np.ndarray
+    g_X, g_T (k, 4, 3); J_g_X, J_g_T (k, 4, 3, 3): their derivatives by the parameters of the drive, indexed by row,
+    parameter and axis.
+    """
+
+    g_X: np.ndarray
+    g_T: np.ndarray
+    J_g_X: np.ndarray
+    J_g_T: np.ndarray
 
 
 def coefficients(kind: WheelKind, drive: np.ndarray, mean: np.ndarray) -> Coefficients:
-    """At the parameters drive (3,), zeros where a kind has fewer; mean (n, m - 1): means over each interval of the
-    rates whose integrals are the columns of `integrals_of` after the first."""
+    """The coefficients at the parameters drive (3,), padded with zeros.
+
+    mean (n, m - 1): means over each interval of the rates whose integrals are columns 1: of `integrals_of`.
+    """
     c = _slip_rows(len(mean) if kind == "steered" else 1)
     {"pair": _pair, "twist": _twist, "steered": _steered}[kind](c, drive, mean)
     return c
 
 
 def _slip_rows(k: int) -> Coefficients:
+    """Coefficients of k intervals that are zero but in the two slip rows."""
     c = Coefficients(np.zeros((k, 4, 3)), np.zeros((k, 4, 3)), np.zeros((k, 4, 3, 3)), np.zeros((k, 4, 3, 3)))
-    c.X[:, 2, 1] = c.X[:, 3, 2] = 1.0
+    c.g_X[:, 2, 1] = c.g_X[:, 3, 2] = 1.0
     return c
 
 
 def _pair(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
+    """Fills the first two rows of a pair."""
     del mean
     b = drive[2]
     for q, side in enumerate((LEFT, RIGHT)):
         r = drive[q]
-        c.X[:, q, 0], c.T[:, q, 2] = 1.0 / r, side * b / r
-        c.by_X[:, q, q, 0], c.by_T[:, q, q, 2] = -1.0 / r**2, -side * b / r**2
-        c.by_T[:, q, 2, 2] = side / r
+        c.g_X[:, q, 0], c.g_T[:, q, 2] = 1.0 / r, side * b / r
+        c.J_g_X[:, q, q, 0], c.J_g_T[:, q, q, 2] = -1.0 / r**2, -side * b / r**2
+        c.J_g_T[:, q, 2, 2] = side / r
 
 
 def _twist(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
+    """Fills the first two rows of a twist."""
     del mean
     speed, yaw = drive[:2]
-    c.X[:, 0, 0], c.T[:, 1, 2] = 1.0 / speed, 1.0 / yaw
-    c.by_X[:, 0, 0, 0], c.by_T[:, 1, 1, 2] = -1.0 / speed**2, -1.0 / yaw**2
+    c.g_X[:, 0, 0], c.g_T[:, 1, 2] = 1.0 / speed, 1.0 / yaw
+    c.J_g_X[:, 0, 0, 0], c.J_g_T[:, 1, 1, 2] = -1.0 / speed**2, -1.0 / yaw**2
 
 
 def _steered(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
+    """Fills the first two rows of a steered vehicle; mean (n, 2 or more): of cos and sin of the steering angle."""
     r, base, offset = drive
-    c.X[:, 0, 0], c.by_X[:, 0, 0, 0] = 1.0 / r, -1.0 / r**2
+    c.g_X[:, 0, 0], c.J_g_X[:, 0, 0, 0] = 1.0 / r, -1.0 / r**2
     cosine = mean[:, 0] * np.cos(offset) - mean[:, 1] * np.sin(offset)
     sine = mean[:, 1] * np.cos(offset) + mean[:, 0] * np.sin(offset)
-    c.X[:, 1, 0], c.T[:, 1, 2] = -sine, base * cosine
-    c.by_T[:, 1, 1, 2] = cosine
-    c.by_X[:, 1, 2, 0], c.by_T[:, 1, 2, 2] = -cosine, -base * sine
+    c.g_X[:, 1, 0], c.g_T[:, 1, 2] = -sine, base * cosine
+    c.J_g_T[:, 1, 1, 2] = cosine
+    c.J_g_X[:, 1, 2, 0], c.J_g_T[:, 1, 2, 2] = -cosine, -base * sine

@@ -1,17 +1,18 @@
-"""The wheels stand on a plane: their frame is upright on it, and its origin at a height over it, at every keyframe.
+"""The ground factor: at every keyframe the wheels' frame is parallel to a plane, its origin at a constant height.
 
-With n the plane's normal (3,) upwards, q a point on it, R_k, p_k the IMU's pose at keyframe k and R, p that of the
-wheels in the IMU's frame, the rows of a keyframe are
+With n (3,) the upward normal of the plane, q a point on it, R_k = R_world_imu and p_k = p_world_imu at keyframe k,
+R = R_imu_wheel and p = p_imu_wheel, the rows of a keyframe are
 
-    e_1, e_2 of (R_k R)^T n                  over tilt_noise         how the frame is tilted on the plane [rad]
-    n . (p_k + R_k p - q) - h                over bump_noise         its height [m]
-    (h - height) / sqrt(keyframes)           over height_sigma       what was measured of the height [m]
+    e_1, e_2 of (R_k R)^T n                  over tilt_noise         tilt of the frame against the plane [rad]
+    n . (p_k + R_k p - q) - h                over bump_noise         height [m]
+    (h - height) / sqrt(keyframes)           over height_sigma       the stated height [m]
 
-The first three are noise of each keyframe: springs and an uneven floor. The last are together one measurement of h: a
-tape has the same error all the time. It is a measurement and no prior, so that verdicts are those of the data with it.
+The first three have independent noise at each keyframe: suspension and an uneven floor. The last rows of all keyframes
+are together one measurement of h, whose error is constant. It is a measurement and not a prior, so that verdicts
+include it.
 
-`level`: n is upwards, q the origin of the world. `floor`: the plane that the LiDARs see most of, of those that are
-nearly level and below the IMU, in each recording its own.
+Plane `level`: n = e_3, q the origin of the world. Plane `floor`: in each recording the plane with most LiDAR points
+among those that are nearly level and below the IMU.
 """
 
 from __future__ import annotations
@@ -33,34 +34,39 @@ from icalib.rig import Ground
 from icalib.sensors.wheels.spec import GROUND_HEIGHT
 
 LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
-NEARLY_LEVEL = np.cos(np.deg2rad(20.0))
-LEAST_BELOW_M = 0.02
+MIN_FLOOR_COSINE = np.cos(np.deg2rad(20.0))  # between the normal of a floor and the vertical: steeper than any ramp
+MIN_BELOW_M = 0.02  # of a floor below the mean position of the IMU: farther than planes are off by noise
 TILT, HEIGHT = "ground tilt", "ground height"
 N_COLUMNS = 10  # of the calibration parameters: rotation 3, translation 3, height 1, plane 3
 
 
 def floors(state: State, keys: tuple[Key, ...], points: np.ndarray, recording: np.ndarray) -> tuple[Key | None, ...]:
-    """The key of the floor in each recording, None where it is not seen; points (P,): how many lie on each of the
-    planes `keys`, which belong to `recording` (P,)."""
+    """The key of the floor in each recording, None without one.
+
+    keys: of the P planes that LiDARs see; points (P,): number of points on each; recording (P,): to which each belongs.
+    """
     found = []
     for r, keyframes in enumerate(state.recordings):
         own = np.flatnonzero(recording == r)
         middle = state.position[keyframes].mean(axis=0)
-        seen = [k for k in own if _is_floor(state.values[keys[k]], middle)]
-        found.append(keys[max(seen, key=lambda k: points[k])] if seen else None)
+        below = [k for k in own if _is_floor(state.values[keys[k]], middle)]
+        found.append(keys[max(below, key=lambda k: points[k])] if below else None)
     return tuple(found)
 
 
 def _is_floor(plane: np.ndarray, above: np.ndarray) -> bool:
+    """Whether the plane (6,), normal and point, is nearly level and below the point `above` (3,), all in the world."""
     n = plane[:3] * np.sign(plane[2])
-    return bool(n[2] > NEARLY_LEVEL and n @ (above - plane[3:]) > LEAST_BELOW_M)
+    return bool(n[2] > MIN_FLOOR_COSINE and n @ (above - plane[3:]) > MIN_BELOW_M)
 
 
 @dataclass(frozen=True)
 class GroundFactor(RowFactor):
-    """Rows of the wheels `name` at n keyframes: tilt about both level axes, height, and what was measured of it; those
-    that `ground` does not ask for weigh nothing. floor: the key of the plane in each recording; None: the horizon's, or
-    none where `ground` asks for a floor that is not seen."""
+    """Four rows of the wheels `name` at n keyframes: tilt about x and y, height, stated height. Rows that `ground` does
+    not state have infinite sigma.
+
+    floor: the key of the plane in each recording; None for a level plane, or for a floor that no LiDAR sees.
+    """
 
     units: ClassVar[Mapping[str, str]] = {TILT: "rad", HEIGHT: "m"}
 
@@ -76,7 +82,7 @@ class GroundFactor(RowFactor):
     def build(
         cls, name: str, ground: Ground, floor: tuple[Key | None, ...], state: State, imu: ImuData, layout: Layout
     ) -> GroundFactor:
-        """At all keyframes of recordings that have the plane, but the last of each."""
+        """The factor at all keyframes of recordings with a plane, except the last keyframe of each."""
         used = [
             np.arange(r.start, r.stop - 1)
             for r, key in zip(state.recordings, floor, strict=True)
@@ -97,31 +103,31 @@ class GroundFactor(RowFactor):
 
     @property
     def sigma(self) -> np.ndarray:
-        """(4,) of the rows, infinite where they are not asked for."""
+        """(4,) standard deviations of the rows [rad, rad, m, m], infinite for those that `ground` does not state."""
         tilt, height = self.ground.tilt_noise, self.ground.height_sigma
         bump = np.inf if height is None else self.ground.bump_noise
         once = np.inf if height is None else height * np.sqrt(len(self.keyframes))
         return np.array([*[np.inf if tilt is None else tilt] * 2, bump, once])
 
     def with_imu(self, imu: ImuData) -> GroundFactor:
-        """The same: no reading carries it anywhere."""
+        """See `Factor`; rows at keyframes do not depend on readings."""
         del imu
         return self
 
     def output(self) -> Whitened:
-        """Empty arrays for `accumulate` to fill."""
+        """See `Factor`."""
         return Whitened.empty(len(self.keyframes), 4)
 
     def times(self, state: State) -> np.ndarray:
-        """(n,) of the keyframes."""
+        """See `RowFactor`."""
         return state.seconds[self.keyframes]
 
     def raw(self, out: Whitened) -> np.ndarray:
-        """(n, 4) rad and m; 0 in rows that are not asked for."""
+        """(n, 4) residuals [rad, rad, m, m]; 0 in rows that `ground` does not state."""
         return out.residual * np.where(np.isfinite(self.sigma), self.sigma, 0.0)
 
     def raw_sigma(self) -> np.ndarray:
-        """(n, 4) rad and m."""
+        """(n, 4) standard deviations, see `sigma`."""
         return np.tile(self.sigma, (len(self.keyframes), 1))
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
@@ -141,7 +147,7 @@ class GroundFactor(RowFactor):
         return cost
 
     def _columns(self, key: Key | None) -> np.ndarray:
-        """(10,) of the calibration parameters, -1 where a row does not hang on it."""
+        """(10,) calibration columns: rotation 3, translation 3, height 1, plane 3; -1 if not estimated."""
         columns = np.full(N_COLUMNS, -1)
         columns[:6] = self.layout.columns(self.name, "rotation", "translation")
         if self.ground.height_sigma is not None:
@@ -151,26 +157,29 @@ class GroundFactor(RowFactor):
         return columns
 
     def _rows(self, state: State, keyframes: np.ndarray, floor: np.ndarray | None) -> Rows:
+        """Rows at `keyframes` (n,) and their Jacobians, not whitened; floor (6,): normal and point, None: level."""
         plane = LEVEL if floor is None else floor
         sign = 1.0 if plane[2] >= 0.0 else -1.0
         n, across = sign * plane[:3], sign * planes.tangents(np.ascontiguousarray(plane[:3]))
         R, p = state.values[self.name, "rotation"], state.values[self.name, "translation"]
         R_k = state.rotation[keyframes]
-        up = np.einsum("kji,j->ki", R_k, n)  # in the axes of the IMU
-        way = state.position[keyframes] + R_k @ p - plane[3:]
+        up = np.einsum("kji,j->ki", R_k, n)  # normal in IMU axes
+        from_plane = state.position[keyframes] + R_k @ p - plane[3:]
         h = state.values.get((self.name, GROUND_HEIGHT.name), np.zeros(1))[0]
         rows = Rows.empty(len(keyframes), 4, N_COLUMNS, True)
-        own, J_keyframe = rows.J_calib, rows.J_keyframe
+        J_calib, J_keyframe = rows.J_calib, rows.J_keyframe
         tilt = up @ R
-        # R_k <- R_k Exp(d) takes up to up + up x d, and R <- R Exp(d) the tilt to tilt + tilt x d.
+        # R_k <- R_k Exp(d) changes up by up x d, and R <- R Exp(d) changes tilt by tilt x d.
         J_keyframe[:, :2, :3] = np.cross(R[:, :2].T, up[:, None])
-        own[:, :2, :3] = np.cross(np.eye(3)[:2], tilt[:, None])
-        own[:, :2, 7:9] = np.einsum("kji,tj->kit", R_k @ R[:, :2], across)
+        J_calib[:, :2, :3] = np.cross(np.eye(3)[:2], tilt[:, None])
+        J_calib[:, :2, 7:9] = np.einsum("kji,tj->kit", R_k @ R[:, :2], across)
         J_keyframe[:, 2, :3] = np.cross(p, up)
         J_keyframe[:, 2, 3:6] = n
-        own[:, 2, 3:6] = up
-        own[:, 2, 7:9] = way @ across.T
-        own[:, 2, 9] = -sign
-        own[:, 2:, 6] = [-1.0, 1.0]
-        rows.residual[:] = np.column_stack([tilt[:, :2], way @ n - h, np.full(len(keyframes), h - self.ground.height)])
+        J_calib[:, 2, 3:6] = up
+        J_calib[:, 2, 7:9] = from_plane @ across.T
+        J_calib[:, 2, 9] = -sign
+        J_calib[:, 2:, 6] = [-1.0, 1.0]
+        rows.residual[:] = np.column_stack(
+            [tilt[:, :2], from_plane @ n - h, np.full(len(keyframes), h - self.ground.height)]
+        )
         return rows

@@ -1,10 +1,12 @@
-"""Rows of the increments of wheels: residuals and Jacobians between two instants.
+"""Compiled kernels of the increment factor: residuals and Jacobians of the motion between two instants.
 
-An increment is compared with (X, T), a displacement and a turn in wheel axes, made of (Y, Theta) in those of the IMU:
+An increment is compared with a displacement X [m] and a rotation vector T [rad] in wheel axes. They follow from the
+motion of the IMU, with D the integral of R_world_imu^T v over the interval and Y = D + Theta x p_imu_wheel:
 
-    X = R_imu_wheel^T Y,  T = R_imu_wheel^T Theta,  Theta = Log(R(s_0)^T R(s_1))
+    X = R_imu_wheel^T Y,  T = R_imu_wheel^T Theta,  Theta = Log(R_world_imu(s_0)^T R_world_imu(s_1))
 
-A row of the model is g_X X + g_T T; the derivatives of (Y, Theta) by what they hang on are common to all rows.
+A row of the model is g_X X + g_T T = a_Y Y + a_T Theta. All rows share the Jacobians of (D, Theta), J (6, ...): rows 0
+to 2 are D, rows 3 to 5 Theta. J_calib (6, 1 + 24 or 0): by the time offset and the IMU intrinsics.
 """
 
 from __future__ import annotations
@@ -22,17 +24,17 @@ from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.wheels.drive_rows import N_DRIVE
 
 
-class Wheels(NamedTuple):
-    """R_imu_wheel (3, 3), p_imu_wheel (3,) m, drive (3,): its own parameters, of a pair left and right radius and
-    baseline [m]; see `drive_rows`."""
+class WheelParameters(NamedTuple):
+    """R_imu_wheel (3, 3), p_imu_wheel (3,) m, drive (3,): the parameters of the kind, see `drive_rows`; of a pair left
+    radius, right radius and baseline [m]."""
 
     R: np.ndarray
     p: np.ndarray
     drive: np.ndarray
 
 
-class Track(NamedTuple):
-    """Of `Poses` what the kernels need, at m instants, and the keyframe that each hangs on."""
+class MotionSamples(NamedTuple):
+    """The motion of the IMU at m instants, each propagated from a keyframe: keyframe (m,) and fields of `Poses`."""
 
     keyframe: np.ndarray
     rotation: np.ndarray
@@ -50,74 +52,82 @@ def _cross(a, b):
 
 @njit(cache=True, nogil=True)
 def _add(R, x, scale, sign, out):
-    """out (3,) += scale R x, or R^T x where sign is negative."""
+    """out (3,) += scale R x, or scale R^T x if sign is negative."""
     for i in range(3):
         for j in range(3):
             out[i] += scale * (R[i, j] if sign > 0 else R[j, i]) * x[j]
 
 
 @njit(cache=True, nogil=True)
-def _turn(a, b, track, M0, M1, Mc, wanted):
-    """Theta (3,) between instants a and b; its derivatives, where `wanted`, by their keyframes into rows 3: of M0, M1
-    (6, 15), by time and the IMU intrinsics into those of Mc (6, 1 + 24 or 0)."""
-    theta = so3.log(tmul3(track.rotation[a], track.rotation[b]))
-    if not wanted:
+def _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians):
+    """Theta (3,) between instants a and b. Adds its derivatives by the two keyframes to rows 3: of J_first and J_second
+    (6, 15), and those by time offset and IMU intrinsics to rows 3: of J_calib."""
+    theta = so3.log(tmul3(samples.rotation[a], samples.rotation[b]))
+    if not with_jacobians:
         return theta
-    before, after = so3.left_jacobian_inverse(theta), so3.right_jacobian_inverse(theta)
+    J_left, J_right = so3.left_jacobian_inverse(theta), so3.right_jacobian_inverse(theta)
     for i in range(3):
         for j in range(3):
-            Mc[3 + i, 0] += after[i, j] * track.rate[b, j] - before[i, j] * track.rate[a, j]
+            J_calib[3 + i, 0] += J_right[i, j] * samples.rate[b, j] - J_left[i, j] * samples.rate[a, j]
             for c in range(KEYFRAME_DIM):
-                M0[3 + i, c] -= before[i, j] * track.J_keyframe[a, j, c]
-                M1[3 + i, c] += after[i, j] * track.J_keyframe[b, j, c]
-            for c in range(track.J_imu.shape[2]):
-                Mc[3 + i, 1 + c] += after[i, j] * track.J_imu[b, j, c] - before[i, j] * track.J_imu[a, j, c]
+                J_first[3 + i, c] -= J_left[i, j] * samples.J_keyframe[a, j, c]
+                J_second[3 + i, c] += J_right[i, j] * samples.J_keyframe[b, j, c]
+            for c in range(samples.J_imu.shape[2]):
+                J_calib[3 + i, 1 + c] += (
+                    J_right[i, j] * samples.J_imu[b, j, c] - J_left[i, j] * samples.J_imu[a, j, c]
+                )  # fmt: skip
     return theta
 
 
 @njit(cache=True, nogil=True)
-def _add_travel(j, w, track, moving, D, M, Mc, wanted):
-    """Adds w R^T v of instant j to D (3,), its derivatives to the first rows of M (6, 15) and Mc."""
-    R, u = track.rotation[j], np.zeros(3)
-    _add(R, track.velocity[j], 1.0, -1, u)
+def _add_displacement(j, weight, samples, velocities, D, J_keyframe, J_calib, with_jacobians):
+    """Adds weight * R^T v of instant j to D (3,), and its derivatives to rows :3 of J_keyframe (6, 15) and J_calib."""
+    R, u = samples.rotation[j], np.zeros(3)
+    _add(R, samples.velocity[j], 1.0, -1, u)
     for i in range(3):
-        D[i] += w * u[i]
-    if not wanted:
+        D[i] += weight * u[i]
+    if not with_jacobians:
         return
-    spin = _cross(u, track.rate[j])  # hat(u) rate: how u moves as the body turns
-    pull = np.zeros(3)
-    _add(R, moving.acceleration[j], 1.0, -1, pull)
-    U = so3.hat(u)
+    # d u / dt = u x rate + R^T acceleration: the IMU turns and accelerates.
+    turning = _cross(u, samples.rate[j])
+    acceleration = np.zeros(3)
+    _add(R, velocities.acceleration[j], 1.0, -1, acceleration)
+    J_u_rotation = so3.hat(u)
     for i in range(3):
-        Mc[i, 0] += w * (spin[i] + pull[i])
+        J_calib[i, 0] += weight * (turning[i] + acceleration[i])
         for k in range(3):
             for c in range(KEYFRAME_DIM):
-                M[i, c] += w * (U[i, k] * track.J_keyframe[j, k, c] + R[k, i] * moving.J_keyframe[j, k, c])
-            for c in range(track.J_imu.shape[2]):
-                Mc[i, 1 + c] += w * (U[i, k] * track.J_imu[j, k, c] + R[k, i] * moving.J_imu[j, k, c])
+                J_keyframe[i, c] += weight * (
+                    J_u_rotation[i, k] * samples.J_keyframe[j, k, c] + R[k, i] * velocities.J_keyframe[j, k, c]
+                )
+            for c in range(samples.J_imu.shape[2]):
+                J_calib[i, 1 + c] += weight * (
+                    J_u_rotation[i, k] * samples.J_imu[j, k, c] + R[k, i] * velocities.J_imu[j, k, c]
+                )
 
 
 @njit(cache=True, nogil=True)
-def _fill_row(i, q, gX, gT, aY, aT, X, T, M0, M1, Mc, rows):
-    """Derivatives of row q of interval i, g_X X + g_T T = a_Y Y + a_T Theta: keyframes, rotation, time, IMU
-    intrinsics."""
-    # R <- R Exp(d) turns X and T by -d: d X = X x d.
+def _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows):
+    """Derivatives of row q of interval i by keyframes, R_imu_wheel, time offset and IMU intrinsics."""
+    # R <- R Exp(d) turns X and T by -d: dX = X x d, dT = T x d.
     x, t = _cross(gX, X), _cross(gT, T)
     for c in range(3):
         rows.J[i, q, KEYFRAME_PAIR_DIM + c] = x[c] + t[c]
     for k in range(3):
         for c in range(KEYFRAME_DIM):
-            rows.J[i, q, c] += aY[k] * M0[k, c] + aT[k] * M0[3 + k, c]
-            rows.J[i, q, KEYFRAME_DIM + c] += aY[k] * M1[k, c] + aT[k] * M1[3 + k, c]
-        rows.J[i, q, KEYFRAME_PAIR_DIM + OFFSET] += aY[k] * Mc[k, 0] + aT[k] * Mc[3 + k, 0]
-        for c in range(Mc.shape[1] - 1):
-            rows.J[i, q, KEYFRAME_PAIR_DIM + N_MOUNTED + c] += aY[k] * Mc[k, 1 + c] + aT[k] * Mc[3 + k, 1 + c]
+            rows.J[i, q, c] += aY[k] * J_first[k, c] + aT[k] * J_first[3 + k, c]
+            rows.J[i, q, KEYFRAME_DIM + c] += aY[k] * J_second[k, c] + aT[k] * J_second[3 + k, c]
+        rows.J[i, q, KEYFRAME_PAIR_DIM + OFFSET] += aY[k] * J_calib[k, 0] + aT[k] * J_calib[3 + k, 0]
+        for c in range(J_calib.shape[1] - 1):
+            rows.J[i, q, KEYFRAME_PAIR_DIM + N_MOUNTED + c] += (
+                aY[k] * J_calib[k, 1 + c] + aT[k] * J_calib[3 + k, 1 + c]
+            )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def _in_imu_axes(wheels, gX, gT, aY, aT):
-    """Of a row g_X, g_T (3,) in wheel axes: a_Y, a_T (3,) in those of the IMU. Y = D + Theta x p, so that
-    a_T = R g_T + p x a_Y."""
+def _to_imu_axes(wheels, gX, gT, aY, aT):
+    """Fills the coefficients a_Y, a_T (3,) of a row in IMU axes from g_X, g_T (3,) in wheel axes: a_Y = R g_X, and
+    a_T = R g_T + p x a_Y, as Y = D + Theta x p."""
     aY[:], aT[:] = 0.0, 0.0
     _add(wheels.R, gX, 1.0, 1, aY)
     _add(wheels.R, gT, 1.0, 1, aT)
@@ -125,47 +135,47 @@ def _in_imu_axes(wheels, gX, gT, aY, aT):
 
 
 @njit(cache=True, nogil=True)
-def _by_drive(i, q, by_X, by_T, X, T, rows):
-    """Derivatives of row q of interval i by the drive's parameters, from by_X, by_T (3, 3) of its coefficients."""
+def _fill_drive(i, q, J_gX, J_gT, X, T, rows):
+    """Derivatives of row q of interval i by the parameters of the drive; J_gX, J_gT (3, 3): of its coefficients."""
     for d in range(3):
         s = 0.0
         for k in range(3):
-            s += by_X[d, k] * X[k] + by_T[d, k] * T[k]
+            s += J_gX[d, k] * X[k] + J_gT[d, k] * T[k]
         rows.J[i, q, rows.J.shape[2] - N_DRIVE + d] = s
 
 
 @njit(cache=True, nogil=True)
-def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
-    """Four rows of each of n increments, not whitened, see `drive_rows`.
+def increment_rows(start, weights, samples, velocities, wheels, coefficients, measured, rows):
+    """Fills the four rows of each of n increments, not whitened; see `drive_rows`.
 
-    start (n + 1,), weights (m,): see Instants; track, moving: motion at these instants; c: Coefficients; measured
-    (n, 4).
+    start (n + 1,), weights (m,) s: see `Instants`; samples, velocities: the motion at these instants; measured (n, 4).
+    rows: without Jacobians if its J is empty.
     """
-    wanted = len(rows.J) > 0
-    n_c = 1 + track.J_imu.shape[2]
-    M0, M1, Mc, D = np.empty((6, KEYFRAME_DIM)), np.empty((6, KEYFRAME_DIM)), np.empty((6, n_c)), np.empty(3)
-    X, T, aY, aT = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    with_jacobians = len(rows.J) > 0
+    n_calib = 1 + samples.J_imu.shape[2]
+    J_first, J_second, J_calib = np.empty((6, KEYFRAME_DIM)), np.empty((6, KEYFRAME_DIM)), np.empty((6, n_calib))
+    D, X, T, aY, aT = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(len(start) - 1):
-        a, b, g = start[i], start[i + 1] - 1, min(i, len(c.X) - 1)
-        M0[:], M1[:], Mc[:], D[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        a, b, g = start[i], start[i + 1] - 1, min(i, len(coefficients.g_X) - 1)
+        J_first[:], J_second[:], J_calib[:], D[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(a + 1, b):
-            _add_travel(
-                j, weights[j], track, moving, D, M0 if track.keyframe[j] == track.keyframe[a] else M1, Mc, wanted
-            )  # fmt: skip
-        theta = _turn(a, b, track, M0, M1, Mc, wanted)
+            J_own = J_first if samples.keyframe[j] == samples.keyframe[a] else J_second
+            _add_displacement(j, weights[j], samples, velocities, D, J_own, J_calib, with_jacobians)
+        theta = _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians)
         Y = D + _cross(theta, wheels.p)
         _add(wheels.R, Y, 1.0, -1, X)
         _add(wheels.R, theta, 1.0, -1, T)
         for q in range(4):
+            gX, gT = coefficients.g_X[g, q], coefficients.g_T[g, q]
             s = 0.0
             for k in range(3):
-                s += c.X[g, q, k] * X[k] + c.T[g, q, k] * T[k]
+                s += gX[k] * X[k] + gT[k] * T[k]
             rows.residual[i, q] = s - measured[i, q]
-            if not wanted:
+            if not with_jacobians:
                 continue
-            _in_imu_axes(wheels, c.X[g, q], c.T[g, q], aY, aT)
-            _fill_row(i, q, c.X[g, q], c.T[g, q], aY, aT, X, T, M0, M1, Mc, rows)
-            lever = _cross(aY, theta)
+            _to_imu_axes(wheels, gX, gT, aY, aT)
+            _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows)
+            J_lever_arm = _cross(aY, theta)
             for k in range(3):
-                rows.J[i, q, KEYFRAME_PAIR_DIM + 3 + k] = lever[k]
-            _by_drive(i, q, c.by_X[g, q], c.by_T[g, q], X, T, rows)
+                rows.J[i, q, KEYFRAME_PAIR_DIM + 3 + k] = J_lever_arm[k]
+            _fill_drive(i, q, coefficients.J_g_X[g, q], coefficients.J_g_T[g, q], X, T, rows)

@@ -1,4 +1,4 @@
-"""Wheels in a recording: joints, twists, and tables of what wheels report."""
+"""Inspection of wheels in a recording: topics of joints and twists, and tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icalib.tools.inspection.kinds import KindInspector
 
 
 class WheelInspector(KindInspector):
-    """Joints may be an arm's as well."""
+    """Drafts a rig file for wheels. A topic of joints may belong to an arm, so that the draft asks."""
 
     sensor: ClassVar[type[Sensor]] = Wheels
     topic_kinds: ClassVar[tuple[str, ...]] = ("joints", "twist", "wheels")
@@ -25,6 +25,7 @@ class WheelInspector(KindInspector):
     rolls: ClassVar[bool] = True
 
     def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
+        """See `KindInspector`."""
         if topic.kind == "twist" or "twist" in topic.type:
             yield "measures: twist"
 

@@ -1,4 +1,4 @@
-"""How wheels enter the problem: by what they turn or report, and by the ground that they stand on."""
+"""The factors of wheels: their readings, and the ground that they stand on."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, 
 
 
 class WheelModel(SensorModel[Wheels, WheelNoise]):
-    """Their noise is stated."""
+    """The model of wheels; their noise is stated in the rig file."""
 
     def first_noise(self, sensor: Wheels, settings: Settings) -> WheelNoise:
-        """As stated."""
+        """See `SensorModel`."""
         return WheelNoise(
             sensor.wheel_noise, sensor.lateral_slip, sensor.vertical_slip, settings.loss, settings.loss_scale,
             sensor.speed_noise, sensor.yaw_noise, sensor.steering_noise,
@@ -29,7 +29,7 @@ class WheelModel(SensorModel[Wheels, WheelNoise]):
     def factors(
         self, sensor: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, at: Pass
     ) -> Iterator[Factor]:
-        """One of what they turn or report, and one of the ground where it is stated."""
+        """The factor of the readings, and that of the ground if the rig file states one."""
         assert at.motion is not None
         yield wheel_factor(sensor, stream, noise, at.motion, at.layout)
         if sensor.ground is not None:
@@ -42,7 +42,7 @@ class WheelModel(SensorModel[Wheels, WheelNoise]):
 def wheel_factor(
     wheels: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, motion: Motion, layout: Layout
 ) -> IncrementFactor | RelativePoseFactor:
-    """The factor that the wheels' `measures` and `factor` ask for."""
+    """The factor of the readings, as the fields `measures` and `factor` of the rig file choose it."""
     if isinstance(stream, WheelPoses):
         return RelativePoseFactor.of_poses(stream, motion.imu, motion.gravity, noise, layout, motion.state)
     own = wheels.name, stream.seconds, integrals_of(stream), motion.imu, motion.gravity, noise, layout, motion.state

@@ -1,7 +1,9 @@
-"""What the IMU's noise adds to a relative pose of wheels whose ends lie beside the keyframes that they hang on.
+"""IMU noise in relative poses of wheels whose ends lie between keyframes.
 
-Sideways such a pose may be good to 0.01 mm, as no wheel slips in (27). In 20 ms from a keyframe to an end the IMU loses
-as much, and where that is not allowed for, the pose is believed more than it can be."""
+The pose of each end is propagated by the IMU from its keyframe. Relative poses of (27) have hardly any lateral noise,
+as no wheel slips there: 0.01 mm, as much as 20 ms of propagation. The noise of a relative pose therefore includes that
+of the propagation.
+"""
 
 from __future__ import annotations
 
@@ -9,27 +11,29 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
+from icalib.motion.pose_rows import Extrinsics
 from icalib.motion.poses import Poses
 
 
-def carried_noise(
-    first: Poses, last: Poses, away: np.ndarray, rotation: np.ndarray, lever: np.ndarray, imu: ImuData
+def propagation_noise(
+    first: Poses, last: Poses, propagated: np.ndarray, wheels: Extrinsics, imu: ImuData
 ) -> np.ndarray:
-    """(n, 3, 3) covariance of yaw, x and y of the wheels over n stretches, where the IMU was carried over `away` (n, 2)
-    s from the keyframes to the ends, `first` and `last`.
+    """(n, 3, 3) covariance of yaw, x and y [rad, m, m] of n relative poses by the noise of the IMU.
 
-    Its orientation walks by the gyroscope's density g, turning the lever arm too, and its position by the
-    accelerometer's a: g^2 t of each angle, a^2 t^3 / 3 of each axis. R_imu_wheel: `rotation`, p_imu_wheel: `lever`.
+    first, last: poses of the IMU at the ends; propagated (n, 2): time from keyframe to first and to last end [s]. After
+    t seconds each angle has the variance g^2 t, each axis of position a^2 t^3 / 3, with the densities g and a of
+    gyroscope and accelerometer. Errors of the angles also turn the lever arm.
     """
-    forth = np.swapaxes(first.rotation, 1, 2)
-    between = forth @ last.rotation
-    reached = np.einsum("nij,nj->ni", forth, last.position - first.position) + between @ lever
-    turned = rotation.T @ so3.hat_many(reached), -rotation.T @ between @ so3.hat_many(lever)
-    yaw = rotation.T[2]
+    R, p = wheels.R, wheels.p
+    R_first_world = np.swapaxes(first.rotation, 1, 2)
+    R_first_last = R_first_world @ last.rotation
+    end = np.einsum("nij,nj->ni", R_first_world, last.position - first.position) + R_first_last @ p
+    J_position_rotation = R.T @ so3.hat_many(end), -R.T @ R_first_last @ so3.hat_many(p)
+    yaw = R.T[2]
     gyro, accel = np.median(imu.variance[:, :2], axis=0)
-    out = np.zeros((len(away), 3, 3))
-    for t, path, sign in zip(away.T, turned, (-1.0, 1.0), strict=True):
-        rows = np.concatenate([np.broadcast_to(sign * yaw, (len(t), 1, 3)), path[:, :2]], axis=1)
-        out += (gyro * t)[:, None, None] * rows @ np.swapaxes(rows, 1, 2)
+    out = np.zeros((len(propagated), 3, 3))
+    for t, J_position, sign in zip(propagated.T, J_position_rotation, (-1.0, 1.0), strict=True):
+        J = np.concatenate([np.broadcast_to(sign * yaw, (len(t), 1, 3)), J_position[:, :2]], axis=1)
+        out += (gyro * t)[:, None, None] * J @ np.swapaxes(J, 1, 2)
         out += (accel * t**3 / 3.0)[:, None, None] * np.diag([0.0, 1.0, 1.0])
     return out

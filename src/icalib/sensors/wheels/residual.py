@@ -1,15 +1,15 @@
-"""Wheels against the motion between neighbouring keyframes: two factors.
+"""The two factors of wheels, between neighbouring keyframes.
 
-`IncrementFactor`, the default: what the wheels have turned, or what is reported of speed and yaw rate, and that the
-vehicle moves neither sideways nor off the ground beyond a slip density. `RelativePoseFactor`: paper (27)-(28), a planar
-pose integrated from a left and a right wheel.
+`IncrementFactor`, the default, compares the angles that the wheels turned, or integrals of speed and yaw rate. Lateral
+and vertical motion are noise of a slip density. `RelativePoseFactor` is the paper's (27)-(28), a planar pose integrated
+from a left and a right wheel.
 
-Both look at stretches between two fixed instants of the wheels' clock (`wheel_intervals`). Only where these lie on the
-clock of the IMU, and so the states' poses there, moves with the time offset.
+Both use intervals between two stamps of the wheels' clock (`wheel_intervals`). The time offset moves these instants on
+the clock of the IMU, and with them the poses of the trajectory.
 
-The frame of the wheels has x forward, y to the left, z up, its origin midway between those of the axle that is not
-steered. Their parameters are the blocks rotation, translation (R_imu_wheel, p_imu_wheel), time_offset, and those of
-their kind: of a pair radii (left, right) and baseline, the distance between the wheels; see `drive_rows`.
+The wheels' frame has x forward, y to the left, z up; its origin is midway between the wheels of the axle that is not
+steered. The parameters are the blocks rotation (R_imu_wheel), translation (p_imu_wheel), time_offset, and those of the
+kind of wheels: of a pair radii (left, right) and baseline; see `drive_rows`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from icalib.data.measurements import WheelPoses
 from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.pose_rows import relative_residuals
+from icalib.motion.pose_rows import Extrinsics, relative_residuals
 from icalib.motion.poses import Poses, Velocities, motion_at, poses_alone, poses_at
 from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
 from icalib.motion.sensor_pose import N_MOUNTED, Kinematics, SensorPose, rows_at
@@ -34,41 +34,42 @@ from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 from icalib.rig import WheelKind, drive_names
 from icalib.sensors.wheels.drive_rows import KINDS, N_DRIVE, UNITS, Kinds, coefficients
-from icalib.sensors.wheels.increment_kernels import Track, Wheels, increment_rows
+from icalib.sensors.wheels.increment_kernels import MotionSamples, WheelParameters, increment_rows
 from icalib.sensors.wheels.planar_poses import RelativePoses, preintegrated
-from icalib.sensors.wheels.propagation_noise import carried_noise
+from icalib.sensors.wheels.propagation_noise import propagation_noise
 from icalib.sensors.wheels.quadrature import Instants, quadrature
 
-YAW_X_Y = slice(2, 5)  # of the rows of a relative pose
+YAW_X_Y = slice(2, 5)  # planar rows among rotation x, y, z, position x, y, z of a relative pose
 
 
 @dataclass(frozen=True)
 class WheelNoise:
-    """Densities: of each wheel's angle, rad/sqrt(s); of slip sideways and off the ground, m/sqrt(s). The robust loss of
-    each whitened row, and where it bends, in standard deviations. Of the path [m/sqrt(s)] and the yaw [rad/sqrt(s)]
-    that a twist reports, and of a steering angle [rad/sqrt(Hz)]."""
+    """Noise densities of wheels, and the robust loss of each whitened row."""
 
-    wheel: float
-    sideways: float = 5e-3
-    upwards: float = 5e-3
+    wheel: float  # of each wheel's angle [rad/sqrt(s)]
+    lateral_slip: float = 5e-3  # m/sqrt(s)
+    vertical_slip: float = 5e-3  # m/sqrt(s)
     loss: str = "none"
-    loss_scale: float = 2.5
-    speed: float = 2e-3
-    yaw: float = 1e-2
-    steering: float = 1e-3
+    loss_scale: float = 2.5  # standard deviations
+    speed: float = 2e-3  # of the distance that a twist reports [m/sqrt(s)]
+    yaw: float = 1e-2  # of the yaw that a twist reports [rad/sqrt(s)]
+    steering: float = 1e-3  # of a steering angle [rad/sqrt(Hz)]
 
 
 @dataclass(frozen=True)
 class IncrementFactor(RowFactor):
-    """Increments over n intervals. With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along the
-    `inertial` scheme, X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval of
-    length dt are those of `drive_rows`; of a pair
+    """Increments over n intervals.
 
-        (e_1 X -+ b/2 e_3 T) / r - turned, over wheel sqrt(dt)     left, right
-        e_2 X, e_3 X, over sideways sqrt(dt), upwards sqrt(dt)
+    With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along the `inertial` scheme,
+    X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval of length dt are those
+    of `drive_rows`; of a pair, over their standard deviations
 
-    X and T stand for integrals of rates; Theta differs from that of the angular rate w by dt^3 / 12 |w x w'|: 1e-5 rad
-    where a vehicle on a ramp turns at 1 rad/s and pitches at 1 rad/s^2, over 50 ms.
+        (e_1 X -+ b/2 e_3 T) / r - angle     over wheel sqrt(dt)            left, right
+        e_2 X                                over lateral_slip sqrt(dt)
+        e_3 X                                over vertical_slip sqrt(dt)
+
+    Assumption: Theta is the integral of the angular rate w. The error is dt^3 / 12 |w x w'|: 1e-5 rad in 50 ms for a
+    vehicle on a ramp that turns at 1 rad/s and pitches at 1 rad/s^2.
     """
 
     units: ClassVar[Mapping[str, str]] = UNITS
@@ -76,7 +77,7 @@ class IncrementFactor(RowFactor):
     name: str
     kind: WheelKind
     intervals: StampIntervals
-    measured: np.ndarray  # (n, 4): what the wheels turned, rad; slip, which nobody measured: 0 m
+    measured: np.ndarray  # (n, 4): increments, of a pair angles [rad]; slip 0 m
     mean: np.ndarray  # (n, m - 1): see `coefficients`
     whitening: np.ndarray  # (n, 4, 4)
     instants: Instants
@@ -107,9 +108,11 @@ class IncrementFactor(RowFactor):
         kind: WheelKind = "pair",
         times: np.ndarray | None = None,
     ) -> IncrementFactor:
-        """From `integrals_of` (N, m), of a pair the angles in rad that the left and the right wheel have turned, at
-        stamps seconds (N,) since the first on the wheels' clock. Chooses the intervals at the keyframes of `state`,
-        with stamps at `times` (N,) on the IMU's clock, by default those of the only time offset."""
+        """Chooses intervals at the keyframes of `state`, and their noise.
+
+        seconds (N,): stamps since the first, on the wheels' clock; integrals (N, m): see `integrals_of`, of a pair the
+        angles of both wheels [rad]. times (N,): the stamps on the IMU's clock; by default by the only time offset.
+        """
         found = wheel_intervals(name, seconds, imu, state, times)
         dt = seconds[found.last] - seconds[found.first]
         whole = integrals[found.last] - integrals[found.first]
@@ -124,7 +127,7 @@ class IncrementFactor(RowFactor):
         return cls(name, kind, found, measured, mean, whitening, instants, imu, gravity, noise, layout)
 
     def output(self) -> Whitened:
-        """Empty arrays for `accumulate` to fill."""
+        """See `Factor`."""
         return Whitened.empty(len(self.measured), 4)
 
     def times(self, state: State) -> np.ndarray:
@@ -150,15 +153,15 @@ class IncrementFactor(RowFactor):
     def _added(self, own: slice, state: State, into: Into) -> float:
         """Adds the intervals `own`; returns half their robust chi^2."""
         start = self.instants.start[own.start : own.stop + 1]
-        seen = slice(int(start[0]), int(start[-1]))
-        keyframe = self.instants.keyframe[seen]
-        times = self.instants.times[seen] + offset_at(state, self.name, keyframe)
-        poses, moving = _motion(self, times, keyframe, state, into.sums)
+        used = slice(int(start[0]), int(start[-1]))
+        keyframe = self.instants.keyframe[used]
+        times = self.instants.times[used] + offset_at(state, self.name, keyframe)
+        poses, velocities = _motion(self, times, keyframe, state, into.sums)
         rows = Rows.empty(len(start) - 1, 4, N_MOUNTED + poses.J_imu.shape[2] + N_DRIVE, into.sums)
-        wheels = _wheels(self.name, state, self.kind)
+        wheels = _wheel_parameters(self.name, state, self.kind)
         c = coefficients(self.kind, wheels.drive, self.mean[own])
         increment_rows(
-            start - start[0], self.instants.weight[seen], _track(keyframe, poses), moving, wheels, c,
+            start - start[0], self.instants.weight[used], _samples(keyframe, poses), velocities, wheels, c,
             self.measured[own], rows,
         )  # fmt: skip
         return _add(self, own, rows, state, into)
@@ -166,15 +169,15 @@ class IncrementFactor(RowFactor):
 
 @dataclass(frozen=True)
 class RelativePoseFactor(RowFactor):
-    """Planar poses of the wheels over n intervals, paper (27)-(28):
+    """Relative planar poses of the wheels over n intervals, the paper's (27)-(28), whitened jointly:
 
         e_3 Log(R_wheel(k)_wheel(k+1)) - yaw
         Lambda [R_wheel_imu R_imu(k)_world (p(k+1) + R_world_imu(k+1) p_imu_wheel - p(k)) + p_wheel_imu] - (x, y)
 
-    whitened jointly. The measured pose follows radii and baseline to first order; build it anew from pass to pass. It
-    is that of planar motion: on ramps consistent for intervals up to 0.05 s only. And since the measured yaw, noise and
-    all, is what the baseline scales, the baseline comes out too long, by the share of that noise in yaw^2 (errors in
-    variables): the shorter the intervals, the more.
+    The measured pose depends on radii and baseline to first order about `RelativePoses.drive0`, so that each pass
+    builds the factor anew. Assumption: planar motion; on ramps it is consistent only for intervals up to 0.05 s. The
+    baseline scales the measured yaw with its noise. It is therefore too long by the share of that noise in yaw^2
+    (errors in variables), which grows as intervals become shorter.
     """
 
     kind: ClassVar[WheelKind] = "pair"
@@ -193,21 +196,22 @@ class RelativePoseFactor(RowFactor):
     def of_poses(
         cls, stream: WheelPoses, imu: ImuData, gravity: float, noise: WheelNoise, layout: Layout, state: State
     ) -> RelativePoseFactor:
-        """Of relative poses that were measured as such: they say nothing of radii and baseline. What the IMU loses from
-        the keyframes to their ends is part of their noise."""
+        """The factor of relative poses that were recorded as such; they do not depend on radii and baseline. Their
+        noise includes that of the IMU between keyframes and stamps."""
         times = instants(stream, state.values)
         found = pose_intervals(imu, state.seconds, state.starts, times)
         k, ends = found.first, [(found.keyframe, times[found.first]), (found.keyframe + 1, times[found.last])]
         first, last = (poses_at("inertial", t, keyframe, state, imu, gravity, False) for keyframe, t in ends)
-        away = np.stack([np.abs(t - state.seconds[keyframe]) for keyframe, t in ends], axis=1)
-        wheels = _wheels(stream.name, state, cls.kind)
-        covariance = stream.covariance[k] + carried_noise(first, last, away, wheels.R, wheels.p, imu)
+        propagated = np.stack([np.abs(t - state.seconds[keyframe]) for keyframe, t in ends], axis=1)
+        wheels = Extrinsics(state.values[stream.name, "rotation"], state.values[stream.name, "translation"])
+        covariance = stream.covariance[k] + propagation_noise(first, last, propagated, wheels, imu)
         W = np.linalg.inv(np.linalg.cholesky(covariance))
         poses = RelativePoses(stream.pose[k], np.zeros((len(k), 3, 3)), W, np.zeros(3))
         return cls(stream.name, stream.seconds, found, poses, imu, gravity, noise, layout)
 
     @property
     def whitening(self) -> np.ndarray:
+        """(n, 3, 3), see `RelativePoses.W`."""
         return self.poses.W
 
     @classmethod
@@ -223,10 +227,9 @@ class RelativePoseFactor(RowFactor):
         state: State,
         times: np.ndarray | None = None,
     ) -> RelativePoseFactor:
-        """See IncrementFactor.build; integrated at the radii and the baseline of `state`. Of the slip densities it uses
-        `sideways`."""
+        """See `IncrementFactor.build`. angles (N, 2) rad, integrated with the radii and the baseline of `state`."""
         found = wheel_intervals(name, seconds, imu, state, times)
-        poses = preintegrated(seconds, angles, found, drive_of(name, state), noise.wheel, noise.sideways)
+        poses = preintegrated(seconds, angles, found, drive_of(name, state), noise.wheel, noise.lateral_slip)
         return cls(name, seconds, found, poses, imu, gravity, noise, layout)
 
     @property
@@ -239,7 +242,7 @@ class RelativePoseFactor(RowFactor):
         return {"yaw": slice(0, 1), "path": slice(1, 3)}
 
     def output(self) -> Whitened:
-        """Empty arrays for `accumulate` to fill."""
+        """See `Factor`."""
         return Whitened.empty(len(self.poses.z), 3)
 
     def times(self, state: State) -> np.ndarray:
@@ -255,7 +258,7 @@ class RelativePoseFactor(RowFactor):
         return _raw_sigma(self.whitening)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See IncrementFactor.accumulate."""
+        """See `IncrementFactor.accumulate`."""
         into = Into(piece, out, sums, curved)
         return sum(self._added(own, state, into) for own in in_chunks(_in_piece(self.intervals, piece)))
 
@@ -272,16 +275,16 @@ class RelativePoseFactor(RowFactor):
             np.zeros((n, 3)),
             into.sums,
         )
-        residual = found.residual[:, YAW_X_Y] - z.z[own] - z.J[own] @ (drive - z.drive0)
+        residual = found.residual[:, YAW_X_Y] - z.z[own] - z.J_drive[own] @ (drive - z.drive0)
         J_pose = [np.ascontiguousarray(J[:, YAW_X_Y]) for J in found.J_pose]
-        rows = rows_at(residual, J_pose, (first, last), -z.J[own] if into.sums else z.J[:0])
+        rows = rows_at(residual, J_pose, (first, last), -z.J_drive[own] if into.sums else z.J_drive[:0])
         return _add(self, own, rows, state, into)
 
 
 def wheel_intervals(
     name: str, seconds: np.ndarray, imu: ImuData, state: State, times: np.ndarray | None = None
 ) -> StampIntervals:
-    """The intervals of the wheels `name`, stamped at `seconds` (N,), at the keyframes in `state`; `times` as in
+    """The intervals of the wheels `name` between stamps nearest to the keyframes of `state`; seconds, times: see
     `IncrementFactor.build`."""
     if times is not None:
         return choose_intervals(imu, state.seconds, state.starts, times)
@@ -290,63 +293,66 @@ def wheel_intervals(
 
 
 def drive_of(name: str, state: State, kind: WheelKind = "pair") -> np.ndarray:
-    """(3,) parameters of the wheels `name` beside pose and clock, in the order of `rig.DRIVES`, zeros after the last:
-    of a pair left radius, right radius, baseline [m]."""
+    """(3,) parameters of the drive of the wheels `name` in the order of `rig.DRIVES`, padded with zeros; of a pair
+    left radius, right radius, baseline [m]."""
     found = np.concatenate([state.values[name, group] for group in drive_names(kind)])
     return np.concatenate([found, np.zeros(N_DRIVE - len(found))])
 
 
 def _row_sigma(kind: WheelKind, noise: WheelNoise, dt: np.ndarray, whole: np.ndarray, drive: np.ndarray) -> np.ndarray:
-    """(n, 4) standard deviations of the rows of intervals of dt (n,) s, over which the integrals are whole (n, m).
+    """(n, 4) standard deviations of the rows of intervals of length dt (n,) s; whole (n, m): the integrals over them.
 
-    The front wheels of a steered vehicle slip sideways as the rear ones do; and by an angle that is off, the way of the
-    front axle, at v / cos(angle), goes aside.
+    The steering row has the lateral slip of the front wheels, and the lateral motion of the front axle by an error of
+    the steering angle: its speed is v / cos(angle).
     """
     first, second = {"pair": (noise.wheel, noise.wheel), "twist": (noise.speed, noise.yaw)}.get(
-        kind, (noise.wheel, noise.sideways)
+        kind, (noise.wheel, noise.lateral_slip)
     )
-    sigma = np.array([first, second, noise.sideways, noise.upwards]) * np.sqrt(dt)[:, None]
+    sigma = np.array([first, second, noise.lateral_slip, noise.vertical_slip]) * np.sqrt(dt)[:, None]
     if kind == "steered":
         sigma[:, 1] = np.hypot(sigma[:, 1], noise.steering * drive[0] * np.sqrt(whole[:, 3]))
     return sigma
 
 
-def _wheels(name: str, state: State, kind: WheelKind) -> Wheels:
+def _wheel_parameters(name: str, state: State, kind: WheelKind) -> WheelParameters:
     rotation = np.ascontiguousarray(state.values[name, "rotation"])
-    return Wheels(rotation, state.values[name, "translation"], drive_of(name, state, kind))
+    return WheelParameters(rotation, state.values[name, "translation"], drive_of(name, state, kind))
 
 
 def _motion(
     factor: IncrementFactor, times: np.ndarray, keyframe: np.ndarray, state: State, jacobians: bool
 ) -> tuple[Poses, Velocities]:
+    """Poses and velocities of the IMU at times (m,) on its clock, propagated from keyframe (m,); without `jacobians`
+    the velocities are empty, as nothing needs their derivatives."""
     if not jacobians:
         return poses_alone(times, keyframe, state, factor.imu, factor.gravity), Velocities.empty(0, 0)
     free = factor.layout.is_free(factor.imu.name, "intrinsics")
     return motion_at(times, keyframe, state, factor.imu, factor.gravity, free)
 
 
-def _track(keyframe: np.ndarray, poses: Poses) -> Track:
-    return Track(keyframe, poses.rotation, poses.position, poses.rate, poses.velocity, poses.J_keyframe, poses.J_imu)
+def _samples(keyframe: np.ndarray, p: Poses) -> MotionSamples:
+    return MotionSamples(keyframe, p.rotation, p.position, p.rate, p.velocity, p.J_keyframe, p.J_imu)
 
 
 def _unwhitened(out: Whitened, whitening: np.ndarray) -> np.ndarray:
-    """(n, m) residuals in their own units."""
+    """(n, m) residuals in the units of the rows."""
     return np.linalg.solve(whitening, out.residual[:, :, None])[:, :, 0]
 
 
 def _raw_sigma(whitening: np.ndarray) -> np.ndarray:
-    """(n, m) marginal standard deviations: the covariance is (W^T W)^-1."""
+    """(n, m) marginal standard deviations of the rows; the covariance is (W^T W)^-1."""
     return np.linalg.norm(np.linalg.inv(whitening), axis=2)
 
 
 def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
-    """The intervals of which both keyframes lie in `piece`."""
+    """The intervals whose two keyframes lie in `piece`."""
     i0, i1 = np.searchsorted(intervals.keyframe, [piece.first, piece.last])
     return slice(int(i0), int(i1))
 
 
 def _add(factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, state: State, into: Into) -> float:
-    """Adds the rows of intervals `own`, by calibration parameters of the pose, then those of the drive."""
+    """Adds the rows of the intervals `own` to the sums; returns half their robust chi^2. Calibration columns of the
+    rows: those of the pose, then those of the drive."""
     cost, keyframe, layout = 0.0, factor.intervals.keyframe[own], factor.layout
     drive = layout.columns(factor.name, *drive_names(factor.kind))
     drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])

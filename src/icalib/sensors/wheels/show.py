@@ -1,4 +1,4 @@
-"""What report and 3D view show of wheels: residuals over time, and two discs on an axle."""
+"""Wheels in the report and the 3D view: residuals over time, and two discs on an axle."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ _WORDS = (
 
 
 def sections(c: Calibration) -> Iterator[Section]:
-    """Residuals of each set of wheels."""
+    """A section with the residuals of each set of wheels."""
     yield from row_sections(c, "wheels", "wheels", "Wheel residuals", _WORDS)
 
 
 def amounts(c: Calibration) -> Iterator[str]:
-    """How much was used."""
+    """The number of intervals that were used, in words."""
     if c.wheel_residuals:
         yield f"{sum(len(r.seconds) for r in c.wheel_residuals)} stretches of wheel turns"
 
 
 def shape(c: Calibration, name: str, spread: float) -> np.ndarray:
-    """The wheels of a set, in its frame."""
+    """(n, 3) m, a polyline of the wheels in their own frame; see `axle`."""
     return axle(c, name)
 
 
 def axle(c: Calibration, name: str) -> np.ndarray:
-    """The two wheels as discs, and the axle between them; nothing where radii and baseline are not known."""
+    """(n, 3) m, a polyline of two discs and their axle, interrupted by NaN; empty for wheels without radii."""
     known = {g.name: g.value for g in c.groups if g.sensor == name}
     if "radii" not in known:
         return PEN_UP

@@ -1,4 +1,4 @@
-"""What wheels measured: rates, or relative planar poses."""
+"""Streams of wheels: rates, or relative planar poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icalib.sensors.stream import Stream, check
 
 @dataclass(frozen=True)
 class WheelStream(Stream):
-    """What wheels, or the driver of a vehicle, report of its motion.
+    """Rates or velocities that wheels or the driver of a vehicle report.
 
     stamps_ns (N,) int64, strictly increasing; rate (N, 2), by kind: "pair", rates of the left and the right wheel
     [rad/s], positive forwards; "steered", rate of the driven wheel [rad/s] and steering angle [rad], positive to the
@@ -37,10 +37,10 @@ class WheelStream(Stream):
 
 @dataclass(frozen=True)
 class WheelPoses(Stream):
-    """Relative planar poses of a wheel frame between consecutive instants, the paper's z_W of (27).
+    """Relative planar poses of the wheels' frame between consecutive stamps, z_W of the paper's (27).
 
-    stamps_ns (K + 1,) int64, strictly increasing; pose (K, 3) yaw [rad], x, y [m] of the wheel frame at stamp k+1 in
-    the wheel frame at stamp k; covariance (K, 3, 3) of the same.
+    stamps_ns (K + 1,) int64, strictly increasing; pose (K, 3): yaw [rad], x, y [m] of the frame at stamp k+1 in the
+    frame at stamp k; covariance (K, 3, 3) of these.
     """
 
     sensor_type: ClassVar[str] = "wheels"

@@ -1,4 +1,4 @@
-"""What the IMU loses from a keyframe to the end of a relative pose, against walks that are drawn."""
+"""IMU noise in a relative pose by propagation from the keyframes, against sampled random walks."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from icalib.sensors.wheels.propagation_noise import carried_noise
+from icalib.motion.pose_rows import Extrinsics
+from icalib.sensors.wheels.propagation_noise import propagation_noise
 
 GYRO, ACCEL = 3e-3, 0.4  # rad/sqrt(s), m/s/sqrt(s): so large that both count
 AWAY = np.array([[0.02, 0.005], [0.0, 0.015]])
@@ -37,7 +38,7 @@ def test_against_walks_of_orientation_and_speed():
     p[2:] = p[:2] + 0.3 * rng.standard_normal((2, 3))
     poses: list[Any] = [SimpleNamespace(rotation=R[k], position=p[k]) for k in (slice(0, 2), slice(2, 4))]
     imu: Any = SimpleNamespace(variance=np.tile([GYRO**2, ACCEL**2, 1e-4 * ACCEL**2], (10, 1)))
-    found = carried_noise(poses[0], poses[1], AWAY, R_iw, lever, imu)
+    found = propagation_noise(poses[0], poses[1], AWAY, Extrinsics(R_iw, lever), imu)
     for n in range(2):
         ends = [(R[n], p[n], AWAY[n, 0]), (R[2 + n], p[2 + n], AWAY[n, 1])]
         drawn = np.array([planar(*walked(*ends[0], rng), *walked(*ends[1], rng), R_iw, lever) for _ in range(DRAWS)])
@@ -50,4 +51,6 @@ def test_against_walks_of_orientation_and_speed():
 def test_at_the_keyframes_nothing_is_lost():
     eye: Any = SimpleNamespace(rotation=np.eye(3)[None], position=np.zeros((1, 3)))
     imu: Any = SimpleNamespace(variance=np.ones((3, 3)))
-    np.testing.assert_array_equal(carried_noise(eye, eye, np.zeros((1, 2)), np.eye(3), np.ones(3), imu), 0.0)
+    np.testing.assert_array_equal(
+        propagation_noise(eye, eye, np.zeros((1, 2)), Extrinsics(np.eye(3), np.ones(3)), imu), 0.0
+    )
