@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+MEDIAN_NORM = 1.538  # median length of a vector of three standard normal components
+
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(..., 3) cross products of a and b (..., 3), broadcast. numpy.cross takes several times as long for a few

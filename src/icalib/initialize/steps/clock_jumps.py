@@ -1,4 +1,5 @@
-"""A clock that was set forward by seconds while it ran: it looks like a gap, but another time offset holds before."""
+"""Refuses recordings in which a clock was set forward by seconds. Such a jump looks like a gap, but the time offset
+differs before and after it."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ from icalib.errors import EstimationError
 from icalib.initialize.steps.rate_correlation import SensorRates
 from icalib.motion.imu_data import ImuData
 
-MIN_CLOCK_JUMP_S = 0.5  # shorter ones are gaps that are bridged
-MIN_RATES_BESIDE_JUMP = 10  # rates on either side, that tell
+MIN_CLOCK_JUMP_S = 0.5  # s: shorter gaps are bridged by interpolation
+MIN_RATES_BESIDE_JUMP = 10  # rates on a side of the gap: with fewer the unexplained share is mostly noise
 MAX_MATCHING_UNEXPLAINED, MIN_DIFFERENT_UNEXPLAINED = (
     0.35,
     0.7,
@@ -22,8 +23,9 @@ UnexplainedShare = Callable[[SensorRates, float], float]
 
 @dataclass(frozen=True)
 class _ClockJump:
-    """Of whose clock, if a gap is one: its size [s]; where the rates before it end and those after it begin on their
-    own clock, if the time offset at hand is that of the other side; and by how much the offset grows over it."""
+    """A gap that may be a jump of a clock. whose: the sensor of this clock; size: length of the gap [s]; before, after:
+    ends of the rates before the gap and starts of those after it [s, clock of the rates], each by the time offset of
+    the other side; growth: change of the time offset over the gap [s]."""
 
     whose: str
     size: float
@@ -35,8 +37,9 @@ class _ClockJump:
 def refuse_clock_jumps(
     imu: ImuData, name: str, rates: SensorRates, offset: float, unexplained: UnexplainedShare
 ) -> None:
-    """Raises EstimationError where a gap is a step of the clock: one side turns as the IMU does at the `offset`, the
-    other only if its clock is shifted by the gap. `unexplained`: share of the rates that is left at an offset."""
+    """Raises EstimationError if a gap is a jump of a clock: on one side of it both sensors turn alike at the `offset`
+    [s], on the other only at an offset that differs by the length of the gap. unexplained(rates, offset): share of the
+    angular rate that the IMU does not explain, from 0 to 1."""
     for step in _possible_jumps(imu, name, rates, offset):
         for side, shift in ((rates.start < step.before, -step.growth), (rates.start >= step.after, step.growth)):
             own, other = _selected(rates, side), _selected(rates, ~side)
@@ -58,7 +61,7 @@ def refuse_clock_jumps(
 
 
 def _possible_jumps(imu: ImuData, name: str, rates: SensorRates, offset: float) -> list[_ClockJump]:
-    """Gaps of the IMU and of the rates that may be steps of their clocks."""
+    """Gaps of the IMU and of the rates that are long enough for a jump."""
     step = float(np.median(np.diff(imu.seconds)))
     found = [_ClockJump(imu.name, b - a - step, b - offset, a - offset, b - a - step) for a, b in imu.gaps]
     size = rates.start[1:] - np.maximum.accumulate(rates.end)[:-1] - float(np.median(np.diff(rates.start)))
@@ -69,4 +72,5 @@ def _possible_jumps(imu: ImuData, name: str, rates: SensorRates, offset: float) 
 
 
 def _selected(rates: SensorRates, kept: np.ndarray) -> SensorRates:
+    """The rates where `kept` (n,) is true."""
     return replace(rates, start=rates.start[kept], end=rates.end[kept], rate=rates.rate[kept])

@@ -1,6 +1,8 @@
-"""What the rig file says against what the data show: a guess has no weight, and one that is far off is replaced.
+"""Values of the rig file that the data contradict.
 
-What is fixed has weight. Where it is far off the solver does not come to an end, so that it is told beforehand.
+An initial guess has no weight in the estimate, so a contradicted guess is replaced by the value that the data show. A
+fixed value is not replaced. If it is far off, the solver does not converge, so `refuse_far_off` reports it before the
+solve.
 """
 
 from __future__ import annotations
@@ -17,17 +19,18 @@ from icalib.optim.state import Key
 from icalib.rig import Parameter, ParameterSpec, Sensor
 from icalib.sensors.sensor import TRANSLATION
 
-MAX_GUESS_SIGMAS = 4.0  # times what a guess is worth
-FACTOR_PRIOR_SIGMA = 0.1  # of a length or factor, by which its guess is off
+MAX_GUESS_SIGMAS = 4.0  # prior standard deviations of a guess: a larger deviation contradicts it
+FACTOR_PRIOR_SIGMA = 0.1  # prior standard deviation of the logarithm of a guessed length or factor
 
 
 def is_contradicted(spec: ParameterSpec, guess: np.ndarray, found: np.ndarray) -> bool:
-    """Whether a guess of a group is farther from what the data show than guesses are worth."""
+    """Whether a `guess` deviates from the estimate `found` by more than MAX_GUESS_SIGMAS prior standard deviations."""
     return largest_deviation(spec, guess, found) > MAX_GUESS_SIGMAS
 
 
 def largest_deviation(spec: ParameterSpec, guess: np.ndarray, found: np.ndarray) -> float:
-    """How far a guess is off, in what one is worth; infinite for a length of no size."""
+    """The largest deviation of a guess from an estimate, over the prior standard deviation of a guess. Infinite if a
+    length or factor is not positive."""
     if spec.manifold == "rotation":
         return float(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ found)))) / spec.prior_sigma
     if spec.is_positive:
@@ -38,8 +41,8 @@ def largest_deviation(spec: ParameterSpec, guess: np.ndarray, found: np.ndarray)
 
 
 def merged_value(spec: ParameterSpec, parameter: Parameter, given: np.ndarray | None, found: np.ndarray) -> np.ndarray:
-    """Where the solver starts: at the `given` value of the parameter, as a state has it, but at what was `found` where
-    there is none, or a mere guess that this contradicts."""
+    """Start value of a parameter: `given`, the value of the rig file in units of a state. It is `found` instead if the
+    rig file has no value, or only a guess that `found` contradicts."""
     if given is None or (parameter.mode == "free" and is_contradicted(spec, given, found)):
         return found
     return given
@@ -49,16 +52,16 @@ _REFUSES_FAR_OFF = ContextVar("_REFUSING", default=False)
 
 
 class MotionContradictedError(EstimationError):
-    """A sensor contradicts the motion that another one showed."""
+    """A sensor contradicts the motion that another sensor measured."""
 
 
 class FarOffError(EstimationError):
-    """A length or a lever arm that the rig file fixes is far from what the first guess finds."""
+    """A length or a lever arm that the rig file fixes is far from the initial guess by the data."""
 
 
 @contextmanager
 def refusing_far_off() -> Iterator[None]:
-    """Within, `refuse_far_off` refuses."""
+    """Within this context `refuse_far_off` raises; outside it does nothing."""
     token = _REFUSES_FAR_OFF.set(True)
     try:
         yield
@@ -67,8 +70,8 @@ def refusing_far_off() -> Iterator[None]:
 
 
 def refuse_far_off(sensor: Sensor, found: dict[Key, np.ndarray]) -> None:
-    """Raises FarOffError where a length or a lever arm that is fixed is farther from what was `found` than first
-    guesses are off."""
+    """Raises FarOffError if a fixed length or lever arm of the sensor contradicts the estimate `found`. Needs the
+    context `refusing_far_off`."""
     for (_, name), value in found.items() if _REFUSES_FAR_OFF.get() else ():
         stated, spec = getattr(sensor, name), sensor.spec(name)
         checked = spec.is_positive or spec == TRANSLATION
@@ -77,8 +80,9 @@ def refuse_far_off(sensor: Sensor, found: dict[Key, np.ndarray]) -> None:
 
 
 def merged_values(sensor: Sensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
-    """Start values of a sensor: the rig file's, `known`, else those `found`. A found value replaces a guess (or a prior
-    on a length or factor) that it contradicts, as the solver may not recover from that."""
+    """Start values of a sensor: `known` values of the rig file, completed by `found` ones. An estimate in `found`
+    replaces a guess that it contradicts. It also replaces a prior on a length or factor, as the solver may not recover
+    from a wrong one."""
     leaves = {
         key
         for key, value in known.items()
@@ -88,19 +92,19 @@ def merged_values(sensor: Sensor, known: dict[Key, np.ndarray], found: dict[Key,
 
 
 def _is_replaceable(sensor: Sensor, name: str) -> bool:
-    """Whether what the rig file gives of a group may be left for what the data show."""
+    """Whether an estimate may replace the value of the rig file for the parameter `name`."""
     mode = getattr(sensor, name).mode
     return mode == "free" or (mode == "prior" and sensor.spec(name).is_positive)
 
 
 def has_guesses(sensor: Sensor, known: dict[Key, np.ndarray]) -> bool:
-    """Whether some of the `known` values are mere guesses."""
+    """Whether some of the `known` values are guesses: neither fixed nor with a prior."""
     return any(getattr(sensor, name).mode == "free" for _, name in known)
 
 
 def merged_translation(given: np.ndarray, found: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """A guess of a translation (3,), moved to what was `found` along the directions that this knows, with covariance
-    (3, 3), to better than guesses are worth, and that contradict the guess."""
+    """The guess `given` of a translation (3,) m, replaced by `found` along some principal axes of its `covariance` (3,
+    3) m^2. These are the axes along which `found` is more certain than a guess, and contradicts it."""
     variance, axes = np.linalg.eigh(covariance)
     way = axes.T @ (found - given)
     worth = TRANSLATION.prior_sigma
@@ -108,7 +112,8 @@ def merged_translation(given: np.ndarray, found: np.ndarray, covariance: np.ndar
 
 
 def nearest_about_axis(axis: np.ndarray, guess: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """(3, 3) of the rotations found Exp(t axis), of which the data do not show t, the one nearest to the guess."""
+    """The rotation found Exp(t axis), over all t, that is nearest to the `guess` (3, 3). axis (3,): unit vector, about
+    which the data do not show the rotation."""
     turn = guess.T @ found
     sine = axis @ np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     cosine = np.trace(turn) - axis @ turn @ axis

@@ -1,4 +1,5 @@
-"""By how much one signal lags behind another: masked, normalised cross-correlation over all shifts."""
+"""The lag between two signals: masked, normalised cross-correlation over all shifts, by FFT (Padfield, IEEE Trans.
+Image Processing, 2012)."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ import numpy as np
 
 
 class CorrelationPeak(NamedTuple):
-    """b(t) is most like a(t + samples); their correlation there, and the largest at any shift."""
+    """Signal b(t) is most like a(t + samples). correlation: Pearson's coefficient at this shift; largest: at
+    any shift."""
 
     samples: int
     correlation: float
@@ -16,20 +18,23 @@ class CorrelationPeak(NamedTuple):
 
 
 def best_shift(a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float) -> CorrelationPeak:
-    """Between a (n,) and b (m,) on one regular grid, where both masks hold; at least `least` samples must overlap, or
-    half of all there are."""
+    """The shift between a (n,) and b (m,), sampled on one regular grid, at which they are most alike. Only samples
+    where both masks are true count. At least `least` samples must overlap, or half of the known ones if these are
+    fewer."""
     return best_shifts(a, mask_a, b, mask_b, least, 1, 0)[0]
 
 
 def best_shifts(
     a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float, most: int, apart: int
 ) -> list[CorrelationPeak]:
-    """The `most` best shifts, best first, each more than `apart` samples from those before; see `best_shift`."""
+    """At most `most` peaks, the best first, each more than `apart` samples from the better ones. See `best_shift`.
+    Peaks are ranked by Fisher's z (atanh of the correlation) times the root of the overlap, so that a long overlap
+    outweighs a short one."""
     n = len(a) + len(b) - 1
     size = 1 << (n - 1).bit_length()
 
     def correlate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """sum_t x(t + lag) y(t), lag from -(len(y) - 1) to len(x) - 1."""
+        """sum_t x(t + lag) y(t) for lags from -(len(y) - 1) to len(x) - 1."""
         product = np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size)
         return np.concatenate([product[-(len(b) - 1) :], product[: len(a)]]) if len(b) > 1 else product[: len(a)]
 

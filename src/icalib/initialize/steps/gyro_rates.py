@@ -1,4 +1,4 @@
-"""How fast an IMU turned on average over the intervals between images or poses."""
+"""Mean angular rate of an IMU over the intervals between images or poses."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from icalib.motion.imu_data import ImuData
 
 @dataclass(frozen=True)
 class MeanRates:
-    """Mean rates of the gyroscope over intervals, start to end (n,) on its clock [s]; angle (N, 3) rad: the integral of
-    its readings from the first to each."""
+    """Means of the gyroscope's readings. angle (N, 3) rad: their integral from the first stamp to each."""
 
     imu: ImuData
     angle: np.ndarray
 
     @classmethod
     def of(cls, imu: ImuData) -> MeanRates:
+        """Integrates the readings of `imu` by the trapezoidal rule."""
         angle = np.zeros((len(imu.seconds), 3))
         angle[1:] = np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0)
         return cls(imu, angle)
 
     def over(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n, 3) rad/s."""
+        """Mean rates (n, 3) rad/s over intervals from start to end (n,), in s on the IMU's clock."""
         t = self.imu.seconds
         return (interpolated(t, self.angle, end) - interpolated(t, self.angle, start)) / (end - start)[:, None]
 
     def slope(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n, 3) rad/s^2: how they change where both ends are later."""
+        """Derivatives (n, 3) rad/s^2 of the mean rates by a common shift of start and end."""
         t, gyro = self.imu.seconds, self.imu.gyro
         return (interpolated(t, gyro, end) - interpolated(t, gyro, start)) / (end - start)[:, None]

@@ -1,4 +1,4 @@
-"""Dead reckoning of rotation by the gyroscope, to carry poses from image instants to any other."""
+"""Rotation by integrating the gyroscope, which interpolates between rotations that are known at some instants."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 
-SMOOTHING_HALF_WINDOW_S = 0.5  # to both sides: short against the drift of the gyroscope
+SMOOTHING_HALF_WINDOW_S = 0.5  # s on both sides of an instant: the gyroscope drifts little over it
 
 
 @dataclass(frozen=True)
 class GyroRotation:
-    """R_start_imu (N, 3, 3) at every IMU stamp, integrated with a constant bias; rate (N - 1, 3) between stamps."""
+    """Rotations R_start_imu (N, 3, 3) at the stamps of the IMU; `start` is the IMU's frame at the first stamp. rate (N
+    - 1, 3) rad/s: mean rate between stamps, without the bias."""
 
     imu: ImuData
     rotation: np.ndarray
@@ -22,6 +23,7 @@ class GyroRotation:
 
     @classmethod
     def integrate(cls, imu: ImuData, bias: np.ndarray) -> GyroRotation:
+        """Integrates the readings with a constant `bias` (3,) rad/s, by the trapezoidal rule between stamps."""
         rate = 0.5 * (imu.gyro[1:] + imu.gyro[:-1]) - bias
         steps = so3.exp_many(rate * np.diff(imu.seconds)[:, None])
         rotation = np.empty((len(imu.seconds), 3, 3))
@@ -30,20 +32,25 @@ class GyroRotation:
         return cls(imu, rotation, rate)
 
     def at(self, t: np.ndarray) -> np.ndarray:
-        """(n, 3, 3) R_start_imu at times t; beyond the recording the last rate is continued."""
+        """R_start_imu (n, 3, 3) at times t (n,) s. Outside the recording the first or last rate is extrapolated."""
         j = self.imu.interval(t)
         return self.rotation[j] @ so3.exp_many(self.rate[j] * (t - self.imu.seconds[j])[:, None])
 
     def carry(self, t: np.ndarray, rotation: np.ndarray, to: np.ndarray) -> np.ndarray:
-        """(n, 3, 3) rotations at `to`, each from the nearest of the known `rotation` at times t (in order)."""
+        """Rotations R_any_imu (n, 3, 3) at times `to` (n,) s: each is the nearest of the known rotations (m, 3, 3), at
+        increasing t (m,), times the gyroscope's rotation since."""
         after = np.clip(np.searchsorted(t, to), 1, len(t) - 1)
         near = after - (to - t[after - 1] < t[after] - to)
         start = self.at(t)[near]
         return rotation[near] @ start.transpose(0, 2, 1) @ self.at(to)
 
     def smoothed(self, t: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """(n, 3, 3) means of the R_any_imu that are known around times t (in order), carried by the gyroscope, and over
-        no gap of it. Where rotations are coefficients of unknowns, their noise would pull these to zero."""
+        """The rotations R_any_imu (n, 3, 3) at increasing t (n,), with less noise: means of those within
+        SMOOTHING_HALF_WINDOW_S, carried to t by the gyroscope. No mean spans a gap of the IMU.
+
+        Use them where rotations are coefficients of unknowns: noise in coefficients biases least squares towards zero
+        (errors in variables).
+        """
         turned = self.at(t)
         start = rotation @ turned.transpose(0, 2, 1)
         total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(start, axis=0)])

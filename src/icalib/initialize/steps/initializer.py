@@ -1,7 +1,7 @@
-"""How sensors of one kind take part in the initial guess.
+"""How the sensors of one kind take part in the initial guess.
 
-The facet `initialize` of a kind holds an `Initializer` as `INITIALIZER`. A kind overrides what it can do; the defaults
-are those of a sensor that gives no motion and needs no guess.
+The facet `initialize` of a kind holds an `Initializer` as `INITIALIZER`. A kind overrides what it supports. The
+defaults are those of a sensor that does not show the motion and needs no guess.
 """
 
 from __future__ import annotations
@@ -25,109 +25,113 @@ from icalib.sensors import SENSOR_KINDS, facet
 
 S = TypeVar("S", bound=Sensor)
 Values = dict[Key, np.ndarray]
-InputsWithMotion = tuple[Inputs, State]  # inputs, and a state that has the motion
+InputsWithMotion = tuple[Inputs, State]  # inputs, and a state whose poses are the trajectory
 
-# Preference among the kinds that give the motion, the best first: see `Initializer.motion_rank`.
+# Ranks of the kinds that show the motion, the preferred one first: see `Initializer.motion_rank`.
 BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = range(6)
 
 
 class Initializer(Generic[S]):
-    """What the initial guess asks of a kind of sensor. `sensors`: those of its kind, in the order of the rig file."""
+    """What the initial guess asks of a kind of sensor. `sensors` are those of its kind, in the order of the rig
+    file."""
 
-    asks_for_vertical = False  # placed after the kinds whose frames tell the vertical
-    hosts_keyframes = False  # keyframes lie at its measurements even if another kind gives the motion
-    refined_alone = True  # its motion is refined even if no other sensor is to be placed on it
-    moves_keyframes = False  # keyframes are placed anew once its motion is refined: its clock has moved since
+    asks_for_vertical = False  # aligned after the kinds whose frames show the vertical
+    hosts_keyframes = False  # keyframes are at its measurements even if another kind shows the motion
+    refined_alone = True  # its trajectory is refined even if no other sensor is aligned to it
+    moves_keyframes = False  # keyframes are set anew after the refinement, which has changed its time offset
 
     def motion_rank(self, rig: Rig) -> int | None:
-        """Its place among the kinds that give the motion of `rig`, the least first; None: it does not."""
+        """Its rank among the kinds that show the motion of `rig`; the smallest is preferred. None if it does not show
+        the motion."""
         del rig
         return None
 
     def sources(self, rig: Rig) -> tuple[str, ...]:
-        """Names of the sensors that give the motion: all of the kind."""
+        """Names of the sensors that show the motion; by default all of the kind."""
         return tuple(s.name for s in rig.mounted if initializer_of(s) is self)
 
     def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
-        """The motion and the guess of its sensors, from these and the IMU: where the solver starts. inputs: of
-        `sources` alone; other: the motion by the kinds that come after it.
+        """The trajectory and the guess of its sensors, from these and the IMU. inputs: of `sources` alone. other:
+        returns the trajectory by the next kind in rank.
 
-        Raises EstimationError where they do not show the motion.
+        Raises EstimationError if the sensors do not show the motion.
         """
         raise NotImplementedError
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        """`inputs` and `state` of its own `trajectory` after a solve, so that others can be placed on it; and the guess
-        at which parameters stay that the data do not show."""
+        """Refines its own `trajectory` by a solve, so that other sensors can be aligned to it. Returns inputs, state,
+        and the guess to which unobservable parameters are reset."""
         raise NotImplementedError
 
     def adopted(self, whole: Inputs, own: Inputs) -> Inputs:
-        """The inputs of all sensors, `whole`, with what `refined` has changed in its `own`."""
+        """`whole`, the inputs of all sensors, with the changes that `refined` made in its `own` inputs."""
         del own
         return whole
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[S]) -> Values:
-        """Calibration parameters of `sensors`, of its kind, and of their frames, as the rig file gives them or as the
-        motion in `state` shows them. Raises EstimationError where neither does."""
+        """Calibration parameters of `sensors` and of their frames: values of the rig file, or values that align them to
+        the trajectory in `state`. Raises EstimationError if neither determines them."""
         del inputs, state, sensors
         return {}
 
     def associated(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        """`inputs` and `state`, which has the motion and a guess of all sensors, with what is known only once all are
-        placed; and what the guess changes by."""
+        """Associates measurements that need the extrinsics of all sensors. `state` has the trajectory and a guess of
+        all sensors. Returns inputs, state, and the changed values of the guess."""
         return inputs, state, {}
 
     def cleaned(self, recording: Measurements) -> Measurements:
-        """The recording without measurements that are to be left out."""
+        """The recording without measurements that must not be used."""
         return recording
 
     def vertical(self, state: State, sensor: S) -> np.ndarray | None:
-        """Upwards (3,) in the world, if the sensor's own frame tells it."""
+        """Unit vector (3,) in the world that points upwards, if the sensor's own frame is level; else None."""
         del state, sensor
         return None
 
     # Without an IMU
 
     def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
-        """Poses in each recording of the sensor that is the body, if it is of this kind, or else of the first of its
-        `sources`; and what is found of its sensors. Raises EstimationError where these do not show them."""
+        """Poses of the body in each recording, and values of its sensors that were estimated with them. The body is the
+        reference sensor if it is of this kind, else the first of `sources`. Raises EstimationError if the sensors do
+        not show the poses."""
         raise NotImplementedError
 
     def check_moving(self, recording: Measurements) -> None:
-        """Raises EstimationError where its sensors measure too seldom to show a motion."""
+        """Raises EstimationError if its sensors measure too rarely to show a motion."""
         del recording
 
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], found: Values
     ) -> tuple[Inputs, State, Values] | None:
-        """All of `start.start` if everything was measured at rest, so that no motion is to be assumed; else None. body,
-        found: see `body_poses`."""
+        """The whole initial guess if all measurements were taken at rest, so that no motion is assumed; else None.
+        body, found: results of `body_poses`."""
         del rig, recordings, body, found
         return None
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
-        """The largest spacing of keyframes [s] at which the assumed motion adds little to the noise of its sensors."""
+        """The largest spacing of keyframes [s] at which the error of the assumed motion is small against the noise of
+        its sensors."""
         del rig, recordings, motion
         return np.inf
 
     def rewritten(self, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
-        """The recordings with measurements of its `sources` in other conventions, and the words for each: tried where
-        others contradict the motion."""
+        """Recordings in which measurements of `sources` are converted from another convention, each with the sentence
+        that names it. They are tried if other sensors contradict the motion."""
         del recordings
         return iter(())
 
     # Errors
 
     def explaining(self, inputs: Inputs) -> AbstractContextManager[None]:
-        """Errors raised within name what the sensors do not show, if they gave the motion."""
+        """A context in which errors name what the sensors do not show, if these sensors give the motion."""
         del inputs
         return nullcontext()
 
     def explained(
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
     ) -> EstimationError | None:
-        """Why the estimate broke down whose motion the kind gave, if that is known. converges: whether an estimate of a
-        changed rig does."""
+        """The error that explains why the estimate broke down, if the cause is known; else None. converges: whether the
+        estimate of a changed rig converges."""
         del rig, recordings, converges
         return None
 
@@ -136,30 +140,31 @@ NO_INITIALIZER: Initializer[Sensor] = Initializer()
 
 
 def initializer(kind: str) -> Initializer[Any]:
-    """That of a kind of sensors."""
+    """The initializer of a kind of sensor; `NO_INITIALIZER` if the kind has none."""
     module = facet(kind, "initialize")
     return NO_INITIALIZER if module is None else module.INITIALIZER
 
 
 def initializer_of(sensor: Sensor) -> Initializer[Any]:
-    """That of a sensor's kind."""
+    """The initializer of the sensor's kind."""
     return initializer(sensor.sensor_type)
 
 
 def kinds_of(rig: Rig) -> list[Initializer[Any]]:
-    """Of all kinds of which `rig` has a sensor."""
+    """Initializers of all kinds of which `rig` has a sensor, in the order of `SENSOR_KINDS`."""
     own = {s.sensor_type for s in rig.mounted}
     return [initializer(kind) for kind in SENSOR_KINDS if kind in own]
 
 
 def motion_kinds(rig: Rig) -> list[Initializer[Any]]:
-    """The kinds that give the motion of `rig`, the preferred one first."""
+    """Initializers of the kinds that show the motion of `rig`, by rank, the preferred one first."""
     ranked = {kind: rank for kind in kinds_of(rig) if (rank := kind.motion_rank(rig)) is not None}
     return sorted(ranked, key=lambda kind: ranked[kind])
 
 
 def place_sensors(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Values:
-    """Values of all `sensors` on the motion in `state`, kind by kind; those that ask for the vertical last."""
+    """Values of all `sensors`, aligned to the trajectory in `state`, kind by kind. Kinds with `asks_for_vertical` come
+    last."""
     out: Values = {}
     sensors = list(sensors)
     kinds = [initializer(kind) for kind in SENSOR_KINDS]
@@ -170,7 +175,7 @@ def place_sensors(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Va
 
 
 def inputs_of_sensors(whole: Inputs, recordings: Sequence[Measurements], names: Sequence[str]) -> Inputs:
-    """The inputs of the sensors `names` and the IMU, on the clock of `whole`."""
+    """Inputs of the sensors `names` and the IMU alone, on the time base of `whole`."""
     rig = whole.rig
     if len(names) == len(rig.mounted):
         return whole

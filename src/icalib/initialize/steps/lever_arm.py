@@ -1,10 +1,11 @@
-"""Gravity, lever arms and accelerometer bias: linear in the camera's positions and the accelerometer.
+"""Gravity, lever arm and accelerometer bias, linear in a camera's positions and the accelerometer's readings.
 
 With D'' = R_board_imu f and the operator A[x] = (x_2 - x_1) / h_2 - (x_1 - x_0) / h_1 over three images,
 
     A[p_board_cam] = A[R_board_imu] p_imu_cam + A[D_f] - A[D_R] b_a + g (h_1 + h_2) / 2
 
-where D_R is the double integral of R_board_imu itself; velocities have dropped out.
+where D_f and D_R are the double integrals of R_board_imu f and of R_board_imu. The operator removes velocities: it is a
+difference of mean velocities.
 """
 
 from __future__ import annotations
@@ -20,19 +21,21 @@ from icalib.initialize.steps.rate_correlation import MAX_USUAL_STEPS
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.motion.imu_data import ImuData, clear_of
 
-TRIPLE_STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
-READINGS_PER_BLOCK = 8192  # of the IMU at a time, whose rotations are made together
-ACCEL_BIAS_PRIOR_M_S2 = 0.3  # m/s^2
-SHARED_IMAGE_FACTOR = 2.0  # rows share images: the error of their mean falls as if they were a quarter as many
-MIN_ROW_SIGMA_M_S = 0.05  # m/s, of a row of the system; more where the poses of the target are worse
-TARGET_GRAVITY_TOLERANCE = 0.1
-GUESSED_ROTATION_TOLERANCE = 0.5  # of both, where a guess that may be degrees off goes into them
-MAX_UNEXPLAINED_ACCELERATION = 1.2  # times the acceleration that was seen, which is left of it
-TARGET_SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
+TRIPLE_STEP_S = 0.12  # s between images of a triple: long against pose noise, short against the loss of the target
+READINGS_PER_BLOCK = 8192  # IMU readings whose rotations are computed at once: bounds the memory
+ACCEL_BIAS_PRIOR_M_S2 = 0.3  # m/s^2: prior standard deviation
+# on the residuals' size: rows share images, so the variance of a mean falls as if n were a quarter
+SHARED_IMAGE_FACTOR = 2.0
+MIN_ROW_SIGMA_M_S = 0.05  # m/s: floor of the standard deviation of a row
+TARGET_GRAVITY_TOLERANCE = 0.1  # relative error of gravity: more means wrong units or a wrong target size
+# the same for gravity and size, if the camera's rotation is a guess that may be degrees off
+GUESSED_ROTATION_TOLERANCE = 0.5
+MAX_UNEXPLAINED_ACCELERATION = 1.2  # median residual over median acceleration
+TARGET_SIZE_TOLERANCE = 0.15  # relative error of the target's size
 
 
 class Triples(NamedTuple):
-    """Numbers (n,) of the instants i < j < k of each triple, and h_1, h_2 (n,) s between them."""
+    """Indices (n,) of the instants i < j < k of each triple, and the intervals h1, h2 (n,) s between them."""
 
     i: np.ndarray
     j: np.ndarray
@@ -42,30 +45,30 @@ class Triples(NamedTuple):
 
     @classmethod
     def at(cls, t: np.ndarray, i: np.ndarray, j: np.ndarray, k: np.ndarray) -> Triples:
-        """Of the instants i, j, k (n,) of t (N,) s."""
+        """Triples of the instants i, j, k (n,) among increasing times t (N,) s."""
         return cls(i, j, k, t[j] - t[i], t[k] - t[j])
 
     def some(self, kept: np.ndarray) -> Triples:
-        """Those `kept` (n,), a mask or indices."""
+        """The triples selected by `kept`, a mask or indices (n,)."""
         return Triples(*(x[kept] for x in self))
 
     def second(self, x: np.ndarray) -> np.ndarray:
-        """A[x] (n, ...) of x (N, ...) at the instants."""
+        """A[x] (n, ...) of x (N, ...) at the instants: differences of its mean slopes, see the module's equation."""
         flat, h1, h2 = x.reshape(len(x), -1), self.h1[:, None], self.h2[:, None]
         found = (flat[self.k] - flat[self.j]) / h2 - (flat[self.j] - flat[self.i]) / h1
         return found.reshape(-1, *x.shape[1:])
 
     @property
     def half(self) -> np.ndarray:
-        """(n,) (h_1 + h_2) / 2 [s], A of t^2 / 2."""
+        """(n,) (h_1 + h_2) / 2 [s], which is A[t^2 / 2]."""
         return 0.5 * (self.h1 + self.h2)
 
 
 @dataclass(frozen=True)
 class LeverArm:
-    """p_imu_cam (3,) m, with its covariance (3, 3); gravity (3,) in board axes, m/s^2; accel_bias (3,) m/s^2; true size
-    of the target over the one given, with its standard deviation. left: share of the acceleration that the camera saw
-    which is not explained."""
+    """position: p_imu_cam (3,) m, with covariance (3, 3); gravity (3,) m/s^2 in board axes; accel_bias (3,) m/s^2;
+    size: true size of the target over the stated one, with standard deviation size_std; unexplained: median residual
+    over the median acceleration that the camera shows."""
 
     position: np.ndarray
     covariance: np.ndarray
@@ -73,12 +76,12 @@ class LeverArm:
     accel_bias: np.ndarray
     size: float
     size_std: float
-    left: float
+    unexplained: float
 
     @property
-    def unlike(self) -> bool:
-        """Whether the accelerometer felt another motion than the camera saw; noise alone leaves as much as was seen."""
-        return self.left > MAX_UNEXPLAINED_ACCELERATION
+    def contradicts_camera(self) -> bool:
+        """Whether the accelerometer measured another motion than the camera. Noise alone leaves a share of 1."""
+        return self.unexplained > MAX_UNEXPLAINED_ACCELERATION
 
 
 def solve_camera_lever_arm(
@@ -87,15 +90,14 @@ def solve_camera_lever_arm(
     poses: TargetPoses,
     R_imu_cam: np.ndarray,
     gyro: GyroRotation,
-    given: np.ndarray | None,
+    known: np.ndarray | None,
 ) -> LeverArm:
-    """Solves for one camera; times (M,) of its images on the imu clock. `given` holds the lever arm where it is known.
-
-    Raises EstimationError where too few images can be used.
-    """
+    """Solves for one camera. times (M,): of its images on the IMU's clock [s]; known: p_imu_cam (3,) m if it is known.
+    Raises EstimationError if too few images can be used."""
     ok = poses.ok & (times >= imu.seconds[1]) & (times <= imu.seconds[-2])
     t, p = times[ok], poses.position[ok]
-    # The error of one image's rotation goes with that of its position, as if the lever arm reached to the target.
+    # Errors of rotation and position of one image are correlated: unsmoothed, they bias the lever arm towards the
+    # target.
     R_bi = gyro.smoothed(t, poses.rotation[ok] @ R_imu_cam.T)
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
     triples = _image_triples(t, imu.gaps)
@@ -107,23 +109,23 @@ def solve_camera_lever_arm(
     rows[:, :, 3:6] = triples.half[:, None, None] * np.eye(3)
     rows[:, :, 6:9] = -second(D_R)
     rhs = second(p) - second(D_f)
-    if given is not None:
-        rhs = rhs - rows[:, :, 0:3] @ given
+    if known is not None:
+        rhs = rhs - rows[:, :, 0:3] @ known
         rows[:, :, 0:3] = 0.0
     x, covariance = _solve(rows, rhs)
-    arm, left = x[0:3] if given is None else given, _median_ratio(rhs - rows @ x, second(p))
-    return LeverArm(arm, covariance, x[3:6], x[6:9], *scale_by_accelerometer(rows, rhs, second(D_f)), left)
+    arm, unexplained = x[0:3] if known is None else known, _median_ratio(rhs - rows @ x, second(p))
+    return LeverArm(arm, covariance, x[3:6], x[6:9], *scale_by_accelerometer(rows, rhs, second(D_f)), unexplained)
 
 
-def _median_ratio(off: np.ndarray, seen: np.ndarray) -> float:
-    """The usual size of vectors (n, 3) over that of others."""
-    size = [float(np.median(np.linalg.norm(x, axis=1))) for x in (off, seen)]
+def _median_ratio(a: np.ndarray, b: np.ndarray) -> float:
+    """Median length of vectors `a` (n, 3) over that of `b` (m, 3)."""
+    size = [float(np.median(np.linalg.norm(x, axis=1))) for x in (a, b)]
     return size[0] / max(size[1], 1e-12)
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares with a weak prior on lever arm and bias, again without rows that stand far off: x (9,), and the
-    covariance (3, 3) of the lever arm."""
+    """Least squares for x (9,): lever arm, gravity, bias, with a weak prior on lever arm and bias. Repeated without
+    outliers. Returns x and the covariance (3, 3) of the lever arm."""
     prior = np.diag(1.0 / np.array([1.0] * 3 + [1e3] * 3 + [ACCEL_BIAS_PRIOR_M_S2] * 3))
     weight, sigma, x, A = np.ones(len(rows)), MIN_ROW_SIGMA_M_S, np.zeros(9), np.zeros((0, 9))
     for _ in range(4):
@@ -137,9 +139,9 @@ def _solve(rows: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scale_by_accelerometer(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
-    """True size of the target, or of a motion, over the one given, and its standard deviation: the inverse of the
-    factor that the accelerometer's part asks for; rows (n, 3, m), rhs, felt (n, 3). (A factor on the noisy positions
-    instead would be pulled to zero.)"""
+    """True size of the target, or of a trajectory, over the stated one, and its standard deviation. It is the inverse
+    of a factor on the accelerometer's part of the equations; a factor on the noisy positions would be biased towards
+    zero. rows (n, 3, m), rhs (n, 3): of the linear system; felt (n, 3): the accelerometer's part of rhs."""
     A = np.concatenate([rows, felt[:, :, None]], axis=2).reshape(felt.size, -1)
     b = rhs.ravel()
     information = A.T @ A + 1e-9 * np.eye(A.shape[1])
@@ -150,8 +152,8 @@ def scale_by_accelerometer(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) 
 
 
 def _image_triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Triples:
-    """Images (i, j, k) about STEP_S apart, within a factor of two, or neighbours where most are further apart, and no
-    part of them in a gap of the IMU."""
+    """Triples of images about TRIPLE_STEP_S apart, within a factor of two, or of neighbours if most are further apart.
+    None spans a gap of the IMU."""
     i = np.arange(len(t))
     j = np.searchsorted(t, t + TRIPLE_STEP_S - 1e-3)
     k = np.searchsorted(t, t + 2 * TRIPLE_STEP_S - 1e-3)
@@ -168,8 +170,8 @@ def _image_triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Trip
 def _double_integrals(
     imu: ImuData, t: np.ndarray, R_bi: np.ndarray, gyro: GyroRotation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Double integrals of R_board_imu f (n, 3) and of R_board_imu (n, 3, 3) at image times t, from the first IMU
-    stamp."""
+    """Double integrals of R_board_imu f (n, 3) and of R_board_imu (n, 3, 3) at image times t (n,) s, from the first
+    stamp of the IMU."""
     s, x = imu.seconds, np.empty((12, len(imu.seconds)))
     for a in range(0, len(s), READINGS_PER_BLOCK):
         own = slice(a, min(a + READINGS_PER_BLOCK, len(s)))
@@ -191,10 +193,10 @@ def _double_integral(s: np.ndarray, x: np.ndarray, t: np.ndarray, j: np.ndarray)
     return second[j] + first[j] * tau + 0.5 * x[j] * tau**2
 
 
-def check_target_size(arm: LeverArm, camera: str, given: bool) -> None:
-    """Raises EstimationError where the accelerometer contradicts the size of the target. given: the camera's rotation
-    is a guess, whose error moves it, too."""
-    if abs(arm.size - 1.0) > max(GUESSED_ROTATION_TOLERANCE if given else TARGET_SIZE_TOLERANCE, 5.0 * arm.size_std):
+def check_target_size(arm: LeverArm, camera: str, guessed: bool) -> None:
+    """Raises EstimationError if the accelerometer contradicts the stated size of the target. guessed: whether the
+    camera's rotation is a guess, whose error also changes the size."""
+    if abs(arm.size - 1.0) > max(GUESSED_ROTATION_TOLERANCE if guessed else TARGET_SIZE_TOLERANCE, 5.0 * arm.size_std):
         raise EstimationError(
             f"{camera}: the accelerometer shows the target to be {arm.size:.2f} +- {arm.size_std:.2f} times as "
             "large as in the rig file; check tag_size or square_size (in metres) and tag_spacing (gap over "
@@ -202,10 +204,9 @@ def check_target_size(arm: LeverArm, camera: str, given: bool) -> None:
         )
 
 
-def check_gravity(measured: float, expected: float, imu: str, given: bool) -> None:
-    """Raises EstimationError where gravity as the IMU and the target's size show it is not `expected` m/s^2. given: see
-    `check_size`."""
-    if abs(measured / expected - 1.0) <= (GUESSED_ROTATION_TOLERANCE if given else TARGET_GRAVITY_TOLERANCE):
+def check_gravity(measured: float, expected: float, imu: str, guessed: bool) -> None:
+    """Raises EstimationError if the `measured` gravity is not `expected` [m/s^2]. guessed: see `check_target_size`."""
+    if abs(measured / expected - 1.0) <= (GUESSED_ROTATION_TOLERANCE if guessed else TARGET_GRAVITY_TOLERANCE):
         return
     raise EstimationError(
         f"{imu} and the target together give a gravity of {measured:.3g} m/s^2 instead of {expected:.3g}; "

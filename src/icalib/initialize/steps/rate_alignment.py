@@ -10,6 +10,7 @@ import numpy as np
 from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
+from icalib.geometry.vectors import MEDIAN_NORM
 from icalib.initialize.steps.clock_jumps import refuse_clock_jumps
 from icalib.initialize.steps.gyro_rates import MeanRates
 from icalib.initialize.steps.rate_correlation import (
@@ -21,7 +22,7 @@ from icalib.initialize.steps.rate_correlation import (
     max_rate_step,
     moving_means,
 )
-from icalib.initialize.steps.rate_regression import NORM_MEDIAN, no_match_error, rate_difference_noise
+from icalib.initialize.steps.rate_regression import no_match_error, rate_difference_noise
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.initialize.steps.turned_angles import ChainedRates
 from icalib.motion.axes import other_axes
@@ -160,7 +161,7 @@ def _unexplained(imu: ImuData, rates: SensorRates, found: RateAlignment, average
     gyro, seen = _side_by_side(imu, rates, found.offset, averaged)
     gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
     left = float(np.median(np.linalg.norm(gyro - seen, axis=1)))
-    left = np.sqrt(max(left**2 - (NORM_MEDIAN * rate_difference_noise(imu, rates, averaged)) ** 2, 0.0))
+    left = np.sqrt(max(left**2 - (MEDIAN_NORM * rate_difference_noise(imu, rates, averaged)) ** 2, 0.0))
     return float(left / np.median(np.linalg.norm(gyro, axis=1)))
 
 

@@ -1,4 +1,4 @@
-"""How far a camera's clock may be from the IMU's: where the sizes of their angular rates go together, at any shift."""
+"""Time offsets between a sensor and the IMU, by cross-correlation of the norms of their angular rates."""
 
 from __future__ import annotations
 
@@ -26,10 +26,13 @@ MAX_ANGLE_MISFIT = 0.5  # of the spread of angles turned in long intervals
 
 @dataclass(frozen=True)
 class SensorRates:
-    """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
-    [rad/s]; least_correlation: with the IMU's, below which the two do not match; longest_step_s: between neighbours.
-    noise: standard deviation [rad/s] about each axis, where it is known; offsets [s]: at which they go with the IMU's
-    by regression, best first, where this was sought."""
+    """Mean angular rates of a sensor between neighbouring images, scans or poses: start, end (n,) s on its clock; rate
+    (n, 3) rad/s in its axes.
+
+    least_correlation: smallest correlation with the IMU's rates that counts as a match; longest_step_s: between
+    neighbours; noise: standard deviation [rad/s] about each axis, 0 if unknown; offsets [s]: candidates by regression,
+    best first, None if there was no regression.
+    """
 
     start: np.ndarray
     end: np.ndarray
@@ -41,13 +44,14 @@ class SensorRates:
 
     @property
     def are_slow(self) -> bool:
-        """Whether their intervals are so long that the rate changes much in them."""
+        """Whether intervals are so long that the rate changes much within them."""
         return self.longest_step_s > MAX_RATE_STEP_S
 
 
 def max_rate_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = MAX_SLOW_STEP_S) -> float:
-    """How far apart neighbours among instants (n,) [s] may be to give an angular rate: a slow stream is no row of gaps.
-    what: the word for its readings. Raises EstimationError where its usual step is longer than slowest_s."""
+    """The longest step [s] between neighbours of increasing instants (n,) s that gives an angular rate; a longer step
+    is a gap. what: plural noun for the sensor's measurements. Raises EstimationError if the median step exceeds
+    `slowest_s`."""
     usual = float(np.median(np.diff(seconds)))
     if usual > slowest_s:
         raise EstimationError(
@@ -58,9 +62,9 @@ def max_rate_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = 
 
 
 def likely_offsets(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
-    """Offsets [s] at peaks of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are or
-    of their means, whichever is higher at its best: fast motion shows in the ones, slow motion in the others. Where
-    they were sought by regression, these."""
+    """Candidate time offsets [s], the best first: peaks of the correlation of angular speed. Rates and their moving
+    means are both tried, as fast motion shows in the former and slow motion in the latter. Candidates by regression are
+    preferred if there are some. Raises EstimationError if no offset matches."""
     if rates.are_slow:
         return _offsets_of_slow_rates(imu, name, rates)
     if rates.offsets:
@@ -76,7 +80,7 @@ def likely_offsets(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
 
 
 def _offsets_of_slow_rates(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
-    """The same of slow rates, by how far was turned in each interval."""
+    """The same for long intervals, by rotation angles. Raises EstimationError if no offset matches."""
     found = offsets_by_angle(imu, rates.start, rates.end, rates.rate)
     alike = [offset for offset, left in found if left < MAX_ANGLE_MISFIT]
     if not alike:
@@ -96,14 +100,14 @@ def _offsets_of_slow_rates(imu: ImuData, name: str, rates: SensorRates) -> list[
 
 
 def correlation_in_words(largest: float) -> str:
-    """The largest correlation at any shift, in words."""
+    """The largest correlation over all shifts, as a clause."""
     if not np.isfinite(largest):
         return f"they never overlap for {MIN_RATE_OVERLAP_S:g} s without a gap"
     return f"best correlation {max(largest, 0.0):.2f}"
 
 
 def best_offsets(imu: ImuData, rates: SensorRates) -> list[float]:
-    """Offsets [s] at which rates, and means of them, go together best, however little that is."""
+    """The best offset [s] for rates and for their moving means, however poor the match."""
     if rates.offsets:
         return list(rates.offsets)
     if rates.are_slow:
@@ -112,13 +116,13 @@ def best_offsets(imu: ImuData, rates: SensorRates) -> list[float]:
 
 
 def _correlation_peaks(imu: ImuData, rates: SensorRates) -> list[list[CorrelationPeak]]:
+    """Peaks of the correlation of the rates, and of their moving means over RATE_MEAN_S."""
     return [_peaks_of_means(imu, rates, count) for count in (1, round(RATE_MEAN_S * CORRELATION_GRID_HZ))]
 
 
 def _peaks_of_means(imu: ImuData, rates: SensorRates, count: int) -> list[CorrelationPeak]:
-    """Peaks of the correlation of camera rates with gyroscope rates, both averaged over `count` grid points.
-
-    The gyroscope's median is subtracted or not, whichever correlates better: it holds the bias, and any steady turn."""
+    """Peaks of the correlation with gyroscope rates, both averaged over `count` grid points. The gyroscope's median,
+    which holds its bias and any steady rotation, is subtracted if that correlates better."""
     known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < rates.longest_step_s
@@ -135,8 +139,8 @@ def _peaks_of_means(imu: ImuData, rates: SensorRates, count: int) -> list[Correl
 def _rate_size_on_grid(
     t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Size of rates (n, 3) on a regular grid from 0 to the last of `t`, each a mean over `count` points of the grid,
-    and a mask of where all of these are known."""
+    """Norms of rates (n, 3) on a regular grid from 0 to t[-1], each of a mean over `count` grid points; and a mask of
+    the points at which all of these are covered."""
     grid = np.arange(int(t[-1] * CORRELATION_GRID_HZ) + 1) / CORRELATION_GRID_HZ
     count = min(count, len(grid))
     known = np.interp(grid, t, covered.astype(float)) > 0.99
@@ -147,16 +151,16 @@ def _rate_size_on_grid(
 
 
 def _correlation_or_least(shift: CorrelationPeak) -> float:
-    """Its correlation, where there is one."""
+    """The correlation of a peak, -1 if there is none."""
     return shift.correlation if np.isfinite(shift.correlation) else -1.0
 
 
 def moving_means(values: np.ndarray, count: int) -> np.ndarray:
-    """(n - count + 1, 3) means over `count` neighbours of (n, 3)."""
+    """(n - count + 1, 3) means over `count` neighbours of values (n, 3)."""
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])
     return (total[count:] - total[:-count]) / count
 
 
 def interpolated(known: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """(n, 3) of values (N, 3) that are `known` (N,) s at some times, at others."""
+    """(n, 3) values at `seconds` (n,), by linear interpolation of values (N, 3) at `known` (N,) s."""
     return np.stack([np.interp(seconds, known, values[:, k]) for k in range(3)], axis=1)

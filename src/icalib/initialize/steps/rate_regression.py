@@ -1,9 +1,9 @@
-"""By how much a camera's clock is apart from the IMU's: where the gyroscope's rates regress best on the camera's.
+"""Time offset between a camera with feature tracks and the IMU, by regression of the gyroscope on the camera's rates.
 
     w_imu = M w_cam + b
 
-With M free the rotation between both need not be known, nor how long the lens is, and a bias has no say. Of all shifts
-the one is taken at which the regression explains most, by the logarithm of the likelihood ratio -n/2 log(1 - R^2).
+M (3, 3) is free, so neither the rotation between both nor the focal length must be known, and b takes the bias. The
+offset is the shift with the largest logarithm of the likelihood ratio, -n/2 log(1 - R^2).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.vectors import MEDIAN_NORM
 from icalib.initialize.steps.epipolar_rotation import TRACK_RATE_STEP_S, track_rates
 from icalib.initialize.steps.gyro_rates import MeanRates
 from icalib.initialize.steps.rate_correlation import (
@@ -25,15 +26,16 @@ from icalib.initialize.steps.rate_correlation import (
 )
 from icalib.motion.imu_data import ImuData, clear_of
 
-RATE_STEPS_S = (TRACK_RATE_STEP_S, 0.2, 0.1, 0.05)  # between images
-MIN_STEP_PERIODS = 0.75  # times the period of the images
+RATE_STEPS_S = (TRACK_RATE_STEP_S, 0.2, 0.1, 0.05)  # s between the two images of a rate
+MIN_STEP_PERIODS = 0.75  # of a step, in periods of the images
 # Of the logarithm of the likelihood ratio of three times three coefficients, twice which is chi^2 of nine degrees of
 # freedom: by chance less than once in 1000, at any of some hundred shifts.
 MIN_REGRESSION_SCORE = 15.0
-MIN_SCORE_RATIO = 1.3  # times the score
-MIN_RATE_TO_NOISE = 3.0  # times the noise of rates: those that vary by less may not show
-NORM_MEDIAN = 1.538  # of three standard normal components
-GRID_POINTS_PER_INTERVAL = 10  # of the grid in an interval: shifts are found to a twentieth of it
+# rates from the second choice of starts replace the first if their score is larger by this factor
+MIN_SCORE_RATIO = 1.3
+MIN_RATE_TO_NOISE = 3.0  # variation of rates over their noise: below, a match may not be significant
+GRID_POINTS_PER_INTERVAL = 10  # offsets are found to a twentieth of an interval
+# of the mean square rate, added to each axis: rotation about one axis leaves the others singular
 REGULARISING_SPREAD = (
     1e-3  # of the mean square, that rates count with about each axis: about one axis there may be none
 )
@@ -41,15 +43,16 @@ REGULARISING_SPREAD = (
 
 @dataclass(frozen=True)
 class Regression:
-    """offset: t_imu - t_camera, both since their clock's first stamp [s]; score: the logarithm of the likelihood
-    ratio, with as many samples as intervals fit side by side."""
+    """offset: t_imu - t_camera [s], both since their clocks' first stamps; score: logarithm of the likelihood ratio,
+    where the number of samples is that of non-overlapping intervals."""
 
     offset: float
     score: float
 
 
 def best_regressions(imu: ImuData, rates: SensorRates) -> list[Regression]:
-    """At the best shifts, best first; empty where the two overlap at none. What lies in gaps does not count."""
+    """Regressions at the best shifts, the best first; empty if the recordings overlap at none. Samples in gaps are left
+    out."""
     length = float(np.median(rates.end - rates.start))
     step = length / GRID_POINTS_PER_INTERVAL
     middle = 0.5 * (rates.start + rates.end)
@@ -73,11 +76,11 @@ def best_regressions(imu: ImuData, rates: SensorRates) -> list[Regression]:
 
 
 def matching_track_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray) -> SensorRates:
-    """Rates over the longest of STEPS_S at which they go with the gyroscope's by more than chance, with the offsets at
-    which they do: over less, turning and moving sideways look alike; over more, a rig that only shakes does not turn.
-    Where they do at none, those that go with it best, and no offsets.
+    """Rates over the longest of RATE_STEPS_S whose match with the gyroscope is significant, with the matching offsets.
+    Over short steps rotation and translation look alike; over long steps vibration averages out. If none is
+    significant, the best rates, without offsets.
 
-    Raises EstimationError as `track_rates` does at the first.
+    Raises EstimationError as `track_rates` does for the first step.
     """
     period = float(np.median(np.diff(stream.seconds)))
     steps = [s for s in RATE_STEPS_S if s > MIN_STEP_PERIODS * period] or [period]
@@ -116,8 +119,8 @@ def _rates_and_score(
 
 
 def rate_difference_noise(imu: ImuData, rates: SensorRates, averaged: float = 0.0) -> float:
-    """Standard deviation [rad/s] of how the rates of camera and gyroscope differ about each axis, as means over
-    `averaged` s where that is longer than an interval; zero where that of the camera is not known."""
+    """Standard deviation [rad/s] of the difference between camera and gyroscope rates about each axis, for means over
+    `averaged` s if that is longer than an interval. Zero if the noise of the camera's rates is unknown."""
     if not rates.noise:
         return 0.0
     length = float(np.median(rates.end - rates.start))
@@ -126,11 +129,11 @@ def rate_difference_noise(imu: ImuData, rates: SensorRates, averaged: float = 0.
 
 
 def no_match_error(imu: ImuData, name: str, rates: SensorRates) -> EstimationError:
-    """Why rates go with those of the IMU at no shift by more than chance."""
+    """The error if no shift gives a significant regression: the rig turns too slowly, or the recordings differ."""
     length = float(np.median(rates.end - rates.start))
     start = np.arange(0.0, imu.seconds[-1] - length, length / GRID_POINTS_PER_INTERVAL)
     gyro = MeanRates.of(imu).over(start, start + length)
-    turned = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1))) / NORM_MEDIAN
+    turned = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1))) / MEDIAN_NORM
     if turned < MIN_RATE_TO_NOISE * rate_difference_noise(imu, rates):
         return EstimationError(
             f"{imu.name} and {name} turn too slowly or too steadily for a time offset: the angular rate varies "
@@ -145,8 +148,8 @@ def no_match_error(imu: ImuData, name: str, rates: SensorRates) -> EstimationErr
 
 
 def _on_grid(t: np.ndarray, rate: np.ndarray, near: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rates (n, 3) on a regular grid of `step` s from 0 to the last of `t`; and where they are known: between
-    neighbours that are `near` (n - 1,)."""
+    """Rates (n, 3) at increasing t (n,), interpolated on a grid of `step` s from 0; and a mask: between neighbours
+    whose step is `near` (n - 1,)."""
     grid = np.arange(int(t[-1] / step) + 1) * step
     known = near[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(near) - 1)]
     return np.stack([np.interp(grid, t, rate[:, k]) for k in range(3)], axis=1), known
@@ -155,8 +158,8 @@ def _on_grid(t: np.ndarray, rate: np.ndarray, near: np.ndarray, step: float) -> 
 def _explained_share(
     a: np.ndarray, known_a: np.ndarray, b: np.ndarray, known_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n + m - 1,) the share of the spread of a (n, 3) that a regression on b (m, 3) explains, where both are known, b
-    shifted by -(m - 1) to n - 1 samples; and the number of these."""
+    """R^2 of the regression of a (n, 3) on b (m, 3), at shifts of b by -(m - 1) to n - 1 samples, and the number of
+    samples that are known in both; each (n + m - 1,). By FFT, as in masked cross-correlation."""
     n = len(a) + len(b) - 1
     size = 1 << (n - 1).bit_length()
 

@@ -1,31 +1,32 @@
-"""Mean angular rates of noisy poses: over windows so long that noise has little part in them."""
+"""Mean angular rates of noisy rotations, over windows so long that noise is a small part of the rates."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from icalib.geometry import so3
+from icalib.geometry.vectors import MEDIAN_NORM
 
-MAX_RATE_NOISE_SHARE = 0.15  # of the rates: with more the sizes of two sensors' rates are hardly alike
-WINDOW_FACTORS = (1.5, 2.5, 4.0, 6.0)  # windows that are tried, times the shortest: 0.15 to 0.6 s of poses
-MAX_WINDOW_STRETCH = 2.5  # windows, at most: poses further apart are those of a gap
-THIRD_DIFFERENCE_SIGMA = np.sqrt(20.0)  # the standard deviation of x_3 - 3 x_2 + 3 x_1 - x_0, of white x
-NORM_MEDIAN = 1.538  # of three standard normal components
+MAX_RATE_NOISE_SHARE = 0.15  # noise over variation of the rates: with more, rates of two sensors hardly correlate
+WINDOW_FACTORS = (1.5, 2.5, 4.0, 6.0)  # longer windows, in units of the shortest: 0.15 to 0.6 s for poses
+MAX_WINDOW_STRETCH = 2.5  # actual length over nominal length of a window: more spans a gap
+THIRD_DIFFERENCE_SIGMA = np.sqrt(20.0)  # standard deviation of x_3 - 3 x_2 + 3 x_1 - x_0, for white x of variance 1
 
 
 def rotation_noise(rotation: np.ndarray) -> float:
-    """Standard deviation [rad] of each axis of rotations (n, 3, 3), white from one to the next: by third differences,
-    in which smooth motion hardly counts, and their median, in which single bad ones do not."""
+    """Standard deviation [rad] of white noise about each axis of rotations (n, 3, 3). It uses third differences, in
+    which smooth motion cancels, and their median, which is robust to outliers."""
     if len(rotation) < 4:
         return 0.0
     turn = so3.log_many(np.ascontiguousarray(rotation[:-1].transpose(0, 2, 1) @ rotation[1:]))
     third = turn[2:] - 2.0 * turn[1:-1] + turn[:-2]
-    return float(np.median(np.linalg.norm(third, axis=1))) / (NORM_MEDIAN * THIRD_DIFFERENCE_SIGMA)
+    return float(np.median(np.linalg.norm(third, axis=1))) / (MEDIAN_NORM * THIRD_DIFFERENCE_SIGMA)
 
 
 def rate_window(seconds: np.ndarray, rotation: np.ndarray, shortest: float, longest_step: float) -> float:
-    """The window [s], no shorter than `shortest`, over which rates of rotations (n, 3, 3) at seconds (n,) hold less
-    noise than LARGEST_NOISE of what the rates vary by; if none does, the one with least noise in that."""
+    """The shortest window [s] over which the noise of the rates is below MAX_RATE_NOISE_SHARE of their variation; if
+    none is, the one with the smallest share. rotation (n, 3, 3) at seconds (n,); shortest: of all windows [s];
+    longest_step: see `window_rates`."""
     noise, shares = rotation_noise(rotation), []
     windows = [shortest, *(shortest * k for k in WINDOW_FACTORS)]
     for window in windows:
@@ -43,9 +44,9 @@ def rate_window(seconds: np.ndarray, rotation: np.ndarray, shortest: float, long
 def window_rates(
     seconds: np.ndarray, rotation: np.ndarray, window: float, longest_step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices (m,) of first and last pose of windows about so long [s], one from each pose; across steps longer than
-    longest_step [s] there is none, unless the window is long itself. And the mean rates (m, 3)
-    [rad/s] in axes of the first."""
+    """Mean rates over windows of about `window` s, one from each pose: indices (m,) of first and last pose, and rates
+    (m, 3) rad/s in axes of the first. A window over a step longer than `longest_step` [s] is left out, unless all
+    windows are long."""
     a = np.arange(len(seconds))
     b = np.searchsorted(seconds, seconds + window - 1e-9)
     a, b = a[b < len(seconds)], b[b < len(seconds)]

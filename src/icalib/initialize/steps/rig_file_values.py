@@ -1,4 +1,4 @@
-"""What the rig file gives of a sensor, in the clocks of the first stamps."""
+"""Extrinsics and time offsets that the rig file gives, with offsets relative to the first stamps."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from icalib.sensors.sensor import MOUNTED_NAMES
 
 
 def known_value(parameter: Parameter) -> np.ndarray | None:
-    """The value of a parameter that is fixed or has a prior: other guesses may rest on it. A guess may be far off."""
+    """The value of a parameter that is fixed or has a prior, else None. A mere guess may be far off, so other guesses
+    must not depend on it."""
     return None if parameter.mode == "free" else parameter.value
 
 
 def stated_values(inputs: Inputs, sensor: Sensor, names: Sequence[str] | None = None) -> dict[Key, np.ndarray]:
-    """The values of the parameters `names`, or else of its extrinsics and time offset, that the rig file gives; time
-    offsets between first stamps, one for each recording where the clock restarts."""
+    """Values that the rig file gives for the parameters `names`, by default extrinsics and time offset, whatever their
+    mode. Time offsets refer to first stamps; a clock that restarts has one for each recording."""
     out: dict[Key, np.ndarray] = {}
     for name in mounted_names(sensor) if names is None else names:
         value = getattr(sensor, name).value
@@ -33,17 +34,18 @@ def stated_values(inputs: Inputs, sensor: Sensor, names: Sequence[str] | None = 
 
 
 def mounted_names(sensor: Sensor) -> list[str]:
-    """The extrinsics and time offset that sensors of its kind have."""
+    """Names of the extrinsics and time offset that this kind of sensor has."""
     return [spec.name for spec in sensor.specs() if spec.name in MOUNTED_NAMES]
 
 
 def known_names(sensor: Sensor) -> list[str]:
-    """The extrinsics and time offset that are fixed or have a prior: other guesses may rest on them."""
+    """Names of the extrinsics and time offset that are fixed or have a prior."""
     return [name for name in mounted_names(sensor) if known_value(getattr(sensor, name)) is not None]
 
 
 def known_extrinsics(inputs: Inputs, sensor: Sensor, guesses: bool = False) -> KnownExtrinsics:
-    """What the rig file fixes of a sensor's extrinsics or gives as a prior; with `guesses` its guesses too."""
+    """Extrinsics and time offset that the rig file fixes or gives a prior for; with `guesses`, those that it only
+    guesses as well."""
     known = stated_values(inputs, sensor, mounted_names(sensor) if guesses else known_names(sensor))
     offset = known.get((sensor.name, "time_offset"))
     return KnownExtrinsics(

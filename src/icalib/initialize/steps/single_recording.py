@@ -1,4 +1,4 @@
-"""One of several recordings by itself: each has a world of its own, and first guesses look at one at a time."""
+"""One recording of several. Each has a world frame of its own, and initial guesses use one recording at a time."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from icalib.rig import Sensor
 
 @dataclass(frozen=True)
 class KnownExtrinsics:
-    """What is known of a sensor, or None: R_imu_sensor (3, 3), p_imu_sensor (3,) m, offset: t_imu - t_sensor, both
-    since their clocks' first stamps [s]."""
+    """Known values of a sensor, None if unknown: R_imu_sensor (3, 3), p_imu_sensor (3,) m, offset: t_imu - t_sensor
+    [s], both since their clocks' first stamps."""
 
     rotation: np.ndarray | None = None
     position: np.ndarray | None = None
@@ -29,7 +29,7 @@ NOTHING_KNOWN = KnownExtrinsics()
 
 
 def single_recording(inputs: Inputs, k: int) -> Inputs:
-    """The recording number `k` of a rig with an IMU, on clocks of its own."""
+    """Inputs of recording `k` alone, on its own clock. The rig needs an IMU."""
     if len(inputs.parts) == 1:
         return inputs
     part = inputs.parts[k]
@@ -38,17 +38,17 @@ def single_recording(inputs: Inputs, k: int) -> Inputs:
 
 
 def fullest_recording(inputs: Inputs, key: str) -> int:
-    """Number of the recording in which the stream `key` has most rows."""
+    """Index of the recording in which the stream `key` has most measurements."""
     return int(np.argmax([part.measurements.streams[key].rows for part in inputs.parts]))
 
 
 def naming_recording(inputs: Inputs, k: int) -> AbstractContextManager[None]:
-    """Errors raised within begin with the name of recording `k`, where there are several."""
+    """A context in which errors are prefixed with the name of recording `k`, if there are several."""
     return naming(inputs.parts[k].name if len(inputs.parts) > 1 else "")
 
 
 def state_of_recording(inputs: Inputs, k: int, state: State) -> State:
-    """What `state` has of recording `k`, on its own clock."""
+    """The part of `state` that belongs to recording `k`, on its own clock."""
     if len(inputs.parts) == 1:
         return state
     own = state.recordings[k]
@@ -57,7 +57,7 @@ def state_of_recording(inputs: Inputs, k: int, state: State) -> State:
 
 
 def joined_states(inputs: Inputs, states: Sequence[State], values: dict[Key, np.ndarray]) -> State:
-    """All recordings' own states as one, with the lasting parameters `values`."""
+    """The states of all recordings as one, with the calibration parameters `values`."""
     if len(states) == 1:
         return replace(states[0], values=values)
     seconds = np.concatenate([s.seconds + part.begin for s, part in zip(states, inputs.parts, strict=True)])
@@ -69,7 +69,7 @@ def joined_states(inputs: Inputs, states: Sequence[State], values: dict[Key, np.
 
 
 def converted_offset(offset: float, sensor: str, before: Inputs, now: Inputs) -> float:
-    """A time offset between first stamps as `before` has them, between those that `now` has."""
+    """Converts a time offset [s] between the first stamps in `before` to one between the first stamps in `now`."""
     shifts = (origin_difference(i.measurements, i.stream(sensor)) for i in (now, before))
     return offset + next(shifts) - next(shifts)
 
@@ -77,8 +77,9 @@ def converted_offset(offset: float, sensor: str, before: Inputs, now: Inputs) ->
 def states_from_best(
     inputs: Inputs, sensor: Sensor, best: int, state_of: Callable[[Inputs, KnownExtrinsics | None], State]
 ) -> State:
-    """All recordings' states, each by itself: of the `best` from nothing, and of the others with the extrinsics of the
-    `sensor` that it has shown, and with the time offset unless the clock restarts."""
+    """The states of all recordings as one. Recording `best` starts without known values. The other recordings start
+    with the extrinsics that `best` has shown, and with its time offset unless the clock restarts. state_of: estimates
+    the state of one recording."""
     recordings = [single_recording(inputs, k) for k in range(len(inputs.parts))]
     restarts = sensor.clock_restarts
     with naming_recording(inputs, best):
@@ -98,15 +99,15 @@ def states_from_best(
 
 
 def _offset_between(state: State, sensor: str, before: Inputs, now: Inputs) -> float:
-    """The time offset that `state` of one recording, `before`, has, as one of `now`."""
+    """The time offset in `state`, whose recording is `before`, converted to the first stamps of `now`."""
     return converted_offset(float(state.values[sensor, "time_offset"][0]), sensor, before, now)
 
 
 def offset_of_each_clock(
     inputs: Inputs, sensor: str, find: Callable[[int], float], known: Mapping[int, float] | None = None
 ) -> np.ndarray:
-    """(R,) time offsets of a clock that restarts; `find`: that of a recording alone, given by its number, where it is
-    not among the `known` ones."""
+    """(R,) time offsets [s] of a clock that restarts, one for each recording. find(k): the offset of recording k alone;
+    it is not called for recordings in `known`."""
     found = dict(known or {})
     for k in range(len(inputs.parts)):
         if k not in found:

@@ -1,4 +1,5 @@
-"""A path through noisy poses: around each instant a parabola of rotation and position, fitted to the poses nearby."""
+"""A smooth trajectory through noisy poses: local quadratic regression of rotation and position (Savitzky-Golay
+smoothing for uneven stamps)."""
 
 from __future__ import annotations
 
@@ -11,20 +12,20 @@ from icalib.geometry import so3
 from icalib.geometry.small import tmul3
 from icalib.initialize.steps.rate_windows import rotation_noise
 
-MIN_HALF_WINDOW_S = 0.1  # of the window, at least
-MIN_HALF_WINDOW_STEPS = 3.2  # and in steps between poses
-MIN_PARABOLA_POSES = 5  # poses under a parabola
-MAX_HALF_WINDOW_S = 0.6  # of the window of very noisy poses
-MIN_THIRD_DERIVATIVE_RAD_S3 = 0.3  # rad/s^3, of the motion: what moves less shows little anyway
-SAMPLED_INSTANTS = 400  # instants that tell how much it moves
-MEDIAN_CHI2_OF_3 = 2.366  # of three degrees of freedom
+MIN_HALF_WINDOW_S = 0.1  # s: half of the smallest window
+MIN_HALF_WINDOW_STEPS = 3.2  # the same in steps between poses: seven poses for three coefficients
+MIN_PARABOLA_POSES = 5  # poses that a parabola is fitted to, at least
+MAX_HALF_WINDOW_S = 0.6  # s: half of the largest window, for very noisy poses
+MIN_THIRD_DERIVATIVE_RAD_S3 = 0.3  # floor of the motion's third derivative: bounds the window of slow motion
+SAMPLED_INSTANTS = 400  # instants at which the third derivative is estimated
+MEDIAN_CHI2_OF_3 = 2.366  # median of chi^2 with three degrees of freedom
 
 
 @dataclass(frozen=True)
 class SmoothTrajectory:
-    """At seconds (m,): R_world_body (m, 3, 3), p_world_body (m, 3), the rate (m, 3) rad/s in the body's axes, the
-    velocity (m, 3) m/s in the world's, the acceleration (m, 3) m/s^2 in the body's; near (m,): whether there are poses
-    within the window, on both sides."""
+    """The trajectory at seconds (m,): R_world_body (m, 3, 3), p_world_body (m, 3) m, angular rate (m, 3) rad/s in body
+    axes, velocity (m, 3) m/s in world axes, acceleration (m, 3) m/s^2 in body axes. near (m,): whether poses on both
+    sides lie within the window."""
 
     seconds: np.ndarray
     rotation: np.ndarray
@@ -37,7 +38,7 @@ class SmoothTrajectory:
 
 @dataclass(frozen=True)
 class BodyPoses:
-    """Poses of the body in one recording, on its clock since its first stamp: seconds (n,), R_world_body (n, 3, 3),
+    """Poses of the body in one recording: seconds (n,) since the first stamp of its clock, R_world_body (n, 3, 3),
     p_world_body (n, 3) m."""
 
     seconds: np.ndarray
@@ -45,15 +46,15 @@ class BodyPoses:
     position: np.ndarray
 
     def at(self, seconds: np.ndarray, narrow: bool = False) -> SmoothTrajectory:
-        """See `smooth_path`."""
+        """The smoothed trajectory at `seconds` (m,), see `smooth_trajectory`."""
         return smooth_trajectory(self.seconds, self.rotation, self.position, seconds, narrow)
 
 
 def smooth_trajectory(
     t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray, narrow: bool = False
 ) -> SmoothTrajectory:
-    """Through poses R (n, 3, 3), p (n, 3) at increasing t (n,), n >= FEWEST, looked at at `at` (m,). narrow: in the
-    least window, which keeps all of the motion, and more of the noise."""
+    """Smooths poses R (n, 3, 3), p (n, 3) at increasing t (n,) s, and evaluates them at `at` (m,) s. Needs
+    MIN_PARABOLA_POSES poses. narrow: uses the smallest window, which keeps all of the motion and more of the noise."""
     half = _min_half_window(t) if narrow else _half_window(t, R, p)
     first, last = np.searchsorted(t, at - half), np.searchsorted(t, at + half)
     few = last - first < MIN_PARABOLA_POSES
@@ -70,13 +71,14 @@ def smooth_trajectory(
 
 
 def _min_half_window(t: np.ndarray) -> float:
+    """Half of the smallest window [s] for poses at t (n,)."""
     return max(MIN_HALF_WINDOW_S, MIN_HALF_WINDOW_STEPS * float(np.median(np.diff(t))))
 
 
 def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
-    """Half the window [s] at which noise and lost motion together make the least error of the rate, no less than HALF_S
-    and HALF_STEPS. The slope of a parabola over +-h has the variance 1.5 s^2 dt / h^3 by white noise s, and lacks
-    j h^2 / 10 of a third derivative j, which slopes over +-h and +-2 h show: they differ by 0.3 j h^2 and noise."""
+    """Half of the window [s] at which noise and bias of the rate together are smallest. The slope of a parabola over
+    +-h has variance 1.5 s^2 dt / h^3 by white noise s, and bias j h^2 / 10 by a third derivative j. Slopes over +-h and
+    +-2 h differ by 0.3 j h^2 and noise, which shows j."""
     dt = float(np.median(np.diff(t)))
     least, h = _min_half_window(t), max(2.0 * MIN_HALF_WINDOW_S, MIN_HALF_WINDOW_STEPS * dt)
     at = t[(t > t[0] + 2.0 * h) & (t < t[-1] - 2.0 * h)]
@@ -100,8 +102,9 @@ def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True)
 def _parabolas(t, R, p, at, first, last, reference, half, out):
-    """out (m, 3, 6): value, slope and curvature of rotation vectors from R[reference] and of positions; in place of the
-    slope of the former the rate in the body's axes."""
+    """Fits a parabola around each instant at[m], to poses first[m]..last[m]. Fills out (m, 3, 6) with value, slope and
+    curvature of rotation vectors relative to R[reference[m]] and of positions. The slope of the rotation is the angular
+    rate in body axes."""
     row, y = np.empty(3), np.empty(6)
     for m in range(len(at)):
         A, b = np.zeros((3, 3)), np.zeros((3, 6))

@@ -1,7 +1,7 @@
-"""Clocks of streams that are slow: a second between images or poses, in which the rate changes much.
+"""Time offset of a slow stream: images or poses up to 2 s apart, between which the angular rate changes much.
 
-The mean rate of an interval says little then, but how far was turned in it is known exactly, and so is how far the IMU
-turned, whose rotations are chained over the interval. The two angles are the same, however the sensors stand.
+The mean rate of such an interval says little. The rotation angle over it is exact, though, and so is the angle that the
+gyroscope integrates to. Both angles are equal, whatever the extrinsics.
 """
 
 from __future__ import annotations
@@ -14,40 +14,43 @@ from icalib.geometry import so3
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.motion.imu_data import ImuData, clear_of
 
-OFFSET_GRID_S = 0.05  # between the offsets that are tried: short against the intervals
-MAX_COMPARED_INTERVALS = 100  # that are compared at each offset
-MIN_COVERED_SHARE = 0.5  # of the intervals that must lie within the IMU's recording
-MIN_OFFSET_DISTANCE_S = 0.5  # of offsets that are two
-MAX_ANGLE_OFFSETS = 5
-SLOPE_STEP_S = 5e-3  # of the differences that give a slope
-OFFSETS_PER_BATCH = 1000  # offsets at a time
+OFFSET_GRID_S = 0.05  # s between offsets that are compared: short against the intervals
+MAX_COMPARED_INTERVALS = 100  # intervals compared at each offset: more do not change which offset is best
+MIN_COVERED_SHARE = 0.5  # share of the intervals that the IMU's recording must cover
+MIN_OFFSET_DISTANCE_S = 0.5  # s between two candidate offsets
+MAX_ANGLE_OFFSETS = 5  # candidate offsets, at most
+SLOPE_STEP_S = 5e-3  # s: step of the central differences
+OFFSETS_PER_BATCH = 1000  # offsets compared at once: bounds the memory
 
 
 @dataclass(frozen=True)
 class ChainedRates:
-    """The rotation vectors of an IMU over intervals, divided by their length: exact where mean rates are not."""
+    """Rotation vectors of an IMU over intervals, divided by their length: exact also where the axis changes within an
+    interval."""
 
     turned: GyroRotation
 
     @classmethod
     def of(cls, imu: ImuData) -> ChainedRates:
+        """Integrates the readings of `imu`, without a bias."""
         return cls(GyroRotation.integrate(imu, np.zeros(3)))
 
     def over(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n, 3) rad/s from start to end (n,) on the IMU's clock [s]."""
+        """Rates (n, 3) rad/s over intervals from start to end (n,), in s on the IMU's clock."""
         a, b = self.turned.at(start), self.turned.at(end)
         return so3.log_many(np.ascontiguousarray(a.transpose(0, 2, 1) @ b)) / (end - start)[:, None]
 
     def slope(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n, 3) rad/s^2: how they change where both ends are later, by central differences."""
+        """Derivatives (n, 3) rad/s^2 of the rates by a common shift of start and end, by central differences."""
         return (
             self.over(start + SLOPE_STEP_S, end + SLOPE_STEP_S) - self.over(start - SLOPE_STEP_S, end - SLOPE_STEP_S)
         ) / (2.0 * SLOPE_STEP_S)
 
 
 def offsets_by_angle(imu: ImuData, start: np.ndarray, end: np.ndarray, rate: np.ndarray) -> list[tuple[float, float]]:
-    """Offsets [s] at which the angles turned between start and end (n,), rate (n, 3) times their length, are most like
-    those of the IMU, the best first; and how much is left of the angles there, 0 to 1."""
+    """Time offsets [s] at which rotation angles over intervals match those of the IMU, the best first, each with its
+    misfit: RMS difference over the spread of the angles. start, end (n,): of the intervals [s]; rate (n, 3): rotation
+    vectors over their length [rad/s]."""
     chosen = np.unique(np.linspace(0, len(start) - 1, min(len(start), MAX_COMPARED_INTERVALS)).astype(np.int64))
     start, end = start[chosen], end[chosen]
     angle = np.linalg.norm(rate[chosen], axis=1) * (end - start)
@@ -78,8 +81,9 @@ def offsets_by_angle(imu: ImuData, start: np.ndarray, end: np.ndarray, rate: np.
 def _angle_misfit(
     R: np.ndarray, unknown: np.ndarray, begin: np.ndarray, length: np.ndarray, angle: np.ndarray, shifts: np.ndarray
 ) -> np.ndarray:
-    """(m,) what is left of the angles (n,) at each of the shifts (m,), as a share of their spread; infinite where too
-    few intervals lie within the grid of rotations R (k, 9), whose `unknown` (k + 1,) points are counted."""
+    """(m,) misfit of angles (n,) at each of the shifts (m,), in steps of the grid; infinite if too few intervals are
+    covered. R (k, 9): rotations on the grid; unknown (k + 1,): cumulative count of grid points in gaps; begin, length
+    (n,): of the intervals, in steps."""
     first = shifts[:, None] + begin
     last = first + length
     inside = (first >= 0) & (last < len(R))

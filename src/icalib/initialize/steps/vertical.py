@@ -1,4 +1,4 @@
-"""Which way is up: by gravity, or where it is not known by the level frame of a sensor."""
+"""The upward direction: by gravity, or by a level frame of a sensor if gravity is not observed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.initializer import initializer_of
 from icalib.optim.state import State
 
+# between the vehicle's axis of rotation and z of a frame: a frame more than 45 degrees off is not level
 MIN_LEVEL_COSINE = (
     0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
 )
@@ -17,17 +18,17 @@ MIN_LEVEL_COSINE = (
 
 @dataclass(frozen=True)
 class Verticals:
-    """ways: upwards (3,) in the IMU's axes, the likely one first; level: the sensor whose frame tells it, if one
-    does."""
+    """candidates: upward unit vectors (3,) in IMU axes, the more likely one first; level_sensor: the sensor whose level
+    frame decides between both directions, or None."""
 
-    ways: tuple[np.ndarray, ...]
-    level: str | None = None
+    candidates: tuple[np.ndarray, ...]
+    level_sensor: str | None = None
 
 
 def possible_verticals(inputs: Inputs, state: State) -> Verticals:
-    """By gravity. Without it, along the axis that the vehicle turns about most; the level frame of a sensor tells which
-    of both ways. Without such a frame both are possible: a vehicle whose left and right are swapped drives upside
-    down."""
+    """Upward directions by gravity. Without an IMU, the main axis of rotation of the vehicle, whose sign follows from
+    the level frame of a sensor. Without such a frame both signs are possible: a vehicle whose left and right are
+    swapped drives upside down."""
     if not inputs.rig.assumes_motion:
         return Verticals((np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0]),))
     assert inputs.imu is not None
@@ -37,13 +38,14 @@ def possible_verticals(inputs: Inputs, state: State) -> Verticals:
 
 
 def level_sensor(inputs: Inputs, state: State) -> str | None:
-    """The sensor whose frame is level and tells which way is up, where gravity does not."""
+    """The sensor whose frame is level and shows the upward direction, if there is no IMU."""
     turns = state.bias[:, :3]  # of an assumed motion: minus the angular rate
     return _vertical_by_frames(inputs, state, np.linalg.svd(turns.T @ turns)[0][:, 0])[1]
 
 
 def _vertical_by_frames(inputs: Inputs, state: State, axis: np.ndarray) -> tuple[float, str | None]:
-    """The component upwards of the `axis` (3,) that the body turns about, and the sensor whose frame tells it."""
+    """The upward component of the main axis of rotation `axis` (3,) in the IMU's axes, and the sensor whose frame shows
+    it."""
     in_world = np.einsum("nij,j->i", state.rotation, axis) / len(state.rotation)
     for sensor in inputs.rig.mounted:
         up = initializer_of(sensor).vertical(state, sensor)

@@ -36,8 +36,8 @@ class TrajectoryFit:
     guess: ExtrinsicsGuess
     motion: ImuTrajectory
     gravity: float
-    level: np.ndarray
-    left: float
+    R_world_map: np.ndarray
+    unexplained: float
 
 
 def fit_imu_trajectory(
@@ -72,8 +72,11 @@ def fit_imu_trajectory(
         gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity
     )
     turned = only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is None
-    guess, left = ExtrinsicsGuess(R_is, x[3:6], aligned.offset, turned), unexplained_displacement(system, R_is, x)
-    return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, left)
+    guess, unexplained = (
+        ExtrinsicsGuess(R_is, x[3:6], aligned.offset, turned),
+        unexplained_displacement(system, R_is, x),
+    )
+    return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, unexplained)
 
 
 def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:

@@ -100,7 +100,7 @@ class _TargetViews:
         guess = Guess(
             cameras, aligned[best].gyro_bias, _mean_bias(arms), _attitude_of_board(arms[best].gravity), self.scene
         )
-        return guess, arms[best].unlike
+        return guess, arms[best].contradicts_camera
 
     def unexplained_acceleration(self, imu: ImuData) -> float:
         """Share of the acceleration, by the camera with most poses, that the accelerometer does not explain.
@@ -110,7 +110,7 @@ class _TargetViews:
         a = self._aligned(imu, self._best_camera)
         arm = self._arm(imu, self._best_camera, a, GyroRotation.integrate(imu, a.gyro_bias))
         self._check_gravity(imu, arm, a)
-        return arm.left
+        return arm.unexplained
 
     @property
     def _best_camera(self) -> int:

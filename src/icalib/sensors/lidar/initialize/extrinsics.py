@@ -48,7 +48,7 @@ def lidar_and_motion(
     found = fit_imu_trajectory(imu, path, rates, aligned, gravity, held)
     if found is None:
         raise _too_short(stream)
-    _check_axes(stream.name, imu.name, found.left > MIN_MIRRORED_SHARE)
+    _check_axes(stream.name, imu.name, found.unexplained > MIN_MIRRORED_SHARE)
     _check_gravity(found.gravity, gravity, imu.name, stream.name)
     return found.guess, found.motion
 

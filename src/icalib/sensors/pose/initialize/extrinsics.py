@@ -185,7 +185,7 @@ def _with_motion(
         )
     step = max(1, round(APART_S / float(np.median(np.diff(path.seconds)))))
     apart = fit_imu_trajectory(imu, path.only(np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
-    return found, 0.0 if apart is None else apart.left
+    return found, 0.0 if apart is None else apart.unexplained
 
 
 def _turn_alone(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> np.ndarray | None:

@@ -193,7 +193,7 @@ def _solved(rig: Rig, sensor: PoseSensor, own: _Paired) -> HandEye:
     found, left = placed(own.stream, place)
     if left > MAX_UNEXPLAINED_MOTION:
         turns = relative_motions(own.pairs)
-        seen, told = (np.rad2deg(np.median(np.linalg.norm(w, axis=1))) for w in (turns.body, turns.sensor))
+        seen, told = (np.rad2deg(np.median(np.linalg.norm(w, axis=1))) for w in (turns.turn_body, turns.turn_sensor))
         if told < NO_TURN_DEG < seen:
             raise EstimationError(
                 f"{sensor.name}: its rotation is the same in all poses, although {rig.reference} turns by "

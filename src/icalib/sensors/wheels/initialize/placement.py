@@ -84,7 +84,7 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
 
 def _as_high(inputs: Inputs, state: State, arm: np.ndarray, found: np.ndarray) -> np.ndarray:
     """The lever arm that was `found`, as high as `arm`: on a floor wheels do not show their height."""
-    up = possible_verticals(inputs, state).ways[0]
+    up = possible_verticals(inputs, state).candidates[0]
     up = up / np.linalg.norm(up)
     return found + up * (up @ (arm - found))
 
@@ -103,16 +103,16 @@ def _found(
     rates = wheel_rates(wheels.name, stream.seconds, integrals_of(stream), stream.kind)
     up = possible_verticals(inputs, state)
     failed: list[EstimationError] = []
-    for way in up.ways:
+    for way in up.candidates:
         found = _try(inputs, state, stream, rates, way, offset)
         if not isinstance(found, EstimationError):
             return found
         failed.append(found)
-    other = _try(inputs, state, stream, rates, -up.ways[0], offset) if up.level else failed[0]
+    other = _try(inputs, state, stream, rates, -up.candidates[0], offset) if up.level_sensor else failed[0]
     if not isinstance(other, EstimationError):
         raise EstimationError(
-            f"{wheels.name}: {OPPOSITE[rates.kind]}. If z of the frame of {up.level} points down, write level: "
-            f"false for {up.level} instead."
+            f"{wheels.name}: {OPPOSITE[rates.kind]}. If z of the frame of {up.level_sensor} points down, write level: "
+            f"false for {up.level_sensor} instead."
         )
     # Of a motion that is no vehicle's one way up shows the slip, the other but that it turns the wrong way.
     raise next((error for error in (*failed, other) if isinstance(error, MotionContradictedError)), failed[0])
