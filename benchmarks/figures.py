@@ -19,13 +19,13 @@ import numpy as np
 import icalib
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.data.recordings import open_recording, read_measurements
-from icalib.estimate.evidence.corner_noise import first_noise
 from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.sensors.camera.initialize.initial_state import initial_state
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess
+from icalib.sensors.camera.model import MODEL
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "euroc"
 PLAIN_CORNER_NOISE_PX = 0.3
@@ -109,12 +109,10 @@ def sums(name: str, rig: Rig, measurements: Measurements) -> list[Figure]:
     """Residuals, Jacobians and sums of the normal equations at the first state."""
     inputs = inputs_for(rig, [measurements])
     state = initial_state(inputs, initial_guess(rig, measurements))
-    pairs = list(zip(rig.cameras, measurements.cameras, strict=True))
-    noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in pairs}
-    problem = assemble(inputs, state, noise, [np.ones(len(s.uv), dtype=bool) for _, s in pairs])
+    problem = assemble(inputs, state, MODEL.first_noises(rig.cameras, rig, measurements))
     pieces, out = problem.pieces(), problem.residuals()
     seconds = median_time(lambda: problem.linearise(state, pieces, out), 9)
-    corners = sum(len(s.uv) for _, s in pairs)
+    corners = sum(len(s.uv) for s in measurements.cameras)
     return [Figure(f"{name}.linearise", seconds, "s"), Figure(f"{name}.corners_per_second", corners / seconds, "1/s")]
 
 

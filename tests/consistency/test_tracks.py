@@ -11,9 +11,7 @@ from scipy.spatial.transform import Rotation
 from tests.typed import not_none
 
 from icalib.data.measurements import Measurements, TrackStream
-from icalib.estimate.evidence.corner_noise import first_noise
-from icalib.estimate.evidence.feature_noise import first_following
-from icalib.estimate.problem.assembly import assemble, image_times, keyframes_for, resample
+from icalib.estimate.problem.assembly import assemble, keyframe_times, keyframes_for, resample
 from icalib.estimate.problem.inputs import inputs_for, origin_difference
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import NoTarget
@@ -21,6 +19,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.sensors.camera.initialize.initial_state import initial_state
 from icalib.sensors.camera.initialize.multi_recording import initial_guesses
+from icalib.sensors.camera.model import MODEL
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
@@ -58,16 +57,15 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
     state = initial_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
     state = replace(state, bias=np.zeros_like(state.bias))  # the prior on the first biases then pulls nothing
     streams = inputs.measurements.cameras
-    noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)}
-    nothing = [np.zeros(0, dtype=bool) for _ in streams]
+    noise = MODEL.first_noises(rig.cameras, rig, inputs.measurements)
     last = None
     for _ in range(3):
-        problem = assemble(inputs, state, noise, nothing, following=first_following(inputs))
+        problem = assemble(inputs, state, noise, coarse=True)
         outcome = minimise(problem, state, tolerance=1e-10)
         assert outcome.converged, outcome.status
         last = problem, state, outcome
         state = outcome.state
-        state = resample(state, keyframes_for(inputs, image_times(inputs, state.values)), inputs)
+        state = resample(state, keyframes_for(inputs, keyframe_times(inputs, state.values)), inputs)
     _is_the_same_in_its_own_room(*not_none(last))
     for camera, stream in zip(scenario.cameras, streams, strict=True):
         value, T = {name: state.values[camera.name, name] for name in CALIBRATED}, camera.T_imu_sensor

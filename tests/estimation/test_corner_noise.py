@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.corner_noise import NoiseModel, estimate_noise, image_speed
 from icalib.estimate.problem.inputs import Inputs
 from icalib.rig import Camera, Settings
+from icalib.sensors.camera.corner_noise import NoiseModel, estimate_noise, image_speed
 from icalib.validation import lens_models
 
 BASE, EXPOSURE_S = 0.08, 4e-4

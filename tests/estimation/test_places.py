@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.estimate import estimate
-from icalib.estimate.evidence.corner_noise import first_noise
-from icalib.estimate.evidence.feature_noise import first_following
-from icalib.estimate.evidence.places import (
-    Clusters,
-    _cluster_gradients,
-    _count,
-    _image_cells,
-    _tag_corners,
-    cluster_covariances,
-)
+from icalib.estimate.evidence.places import _cluster_gradients, _count, cluster_covariances
 from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
@@ -27,12 +19,15 @@ from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.model.bodies import Bodies
-from icalib.motion.factor import look, of_type
+from icalib.motion.factor import FactorKey, look, of_type
 from icalib.optim.calib_block import restricted_inverse
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.features.error_clusters import _tag_corners
+from icalib.sensors.camera.features.error_clusters import image_cells as cells_of
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.model import MODEL
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow
@@ -52,12 +47,7 @@ def solved() -> tuple[Problem, Outcome]:
     scenario = replace(followers(5.0), **exact)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
     inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 1).measurements])
-    streams = inputs.measurements.cameras
-    noise = {c.name: first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)}
-    following = first_following(inputs)
-    assert following is not None
-    whole = replace(following, cut=False)  # points of short tracks are far from known, and move far for little
-    problem = assemble(inputs, state, noise, [np.zeros(0, bool)] * len(streams), following=whole)
+    problem = assemble(inputs, state, MODEL.first_noises(rig.cameras, rig, inputs.measurements))
     return problem, minimise(problem, state, tolerance=1e-6)
 
 
@@ -73,9 +63,9 @@ def moved(problem: Problem, by: list[np.ndarray]) -> Problem:
     return problem.replacing([replace(features, streams=streams)])
 
 
-def image_cells(problem: Problem) -> tuple[FeatureFactor, Clusters]:
+def image_cells(problem: Problem) -> tuple[FeatureFactor, dict[FactorKey, Any]]:
     (features,) = of_type(problem.factors, FeatureFactor)
-    return features, _image_cells(of_type(problem.factors, CornerFactor), (features,))
+    return features, cells_of(of_type(problem.factors, CornerFactor), (features,))
 
 
 def test_the_gradient_of_a_cell_is_what_its_residuals_change(solved: tuple[Problem, Outcome]):

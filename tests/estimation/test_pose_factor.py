@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from tests.typed import not_none
 
 from icalib.data.measurements import PoseStream
-from icalib.estimate.problem.assembly import motion_of
+from icalib.estimate.problem.assembly import pass_at
 from icalib.estimate.problem.inputs import inputs_for
-from icalib.model.sensor_model import Pass
 from icalib.motion.pose_rows import Frame, absolute_residuals, relative_residuals
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import State
@@ -74,7 +73,7 @@ def world(request):
 def rows(inputs, state, stream, at=None):
     """Residuals before whitening (n, 6) of the factor built at `state`, evaluated there or at another."""
     sensor = inputs.rig.poses[0]
-    frozen = Pass(inputs.rig, inputs.clouds, inputs.layout, state, motion_of(inputs, state), state.starts)
+    frozen = pass_at(inputs, state)
     (factor,) = MODEL.factors(sensor, stream, PoseNoise(1e-3, 2e-3), frozen)
     out = factor.output()
     for piece in make_pieces(len(state.seconds), inputs.layout.size):

@@ -12,7 +12,6 @@ from icalib.data.joining import PAUSE_NS, join
 from icalib.data.measurements import Measurements
 from icalib.data.recordings.several import naming, open_all
 from icalib.errors import RecordingError
-from icalib.estimate.evidence.corner_noise import NoiseModel
 from icalib.estimate.evidence.parts import segment_ends
 from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
@@ -22,8 +21,10 @@ from icalib.motion.keyframe_placement import first_keyframes, place_keyframes, u
 from icalib.optim.state import KEYFRAME_DIM, State
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.corner_noise import NoiseModel
 from icalib.sensors.camera.initialize.initial_state import initial_state
 from icalib.sensors.camera.initialize.multi_recording import initial_guesses
+from icalib.sensors.camera.model import MODEL
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.parameter import fixed
 from icalib.tools.simulation import handheld, rig_for, simulate
@@ -112,9 +113,10 @@ def problem(rig, recordings, request):
     if real:
         state.values["board0", "shape"][:] = 1e-3
     models = [NoiseModel(0.2, tau=(0.1,) if real else ()) for _ in rig.cameras]
-    streams = inputs.measurements.cameras
-    noise = {c.name: m.noise(s, c, settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)}
-    return assemble(inputs, state, noise, [np.ones(len(s.uv), dtype=bool) for s in streams]), state
+    streams, noise = inputs.measurements.cameras, MODEL.first_noises(rig.cameras, rig, inputs.measurements)
+    for c, m, s in zip(rig.cameras, models, streams, strict=True):
+        noise[c.name] = dataclasses.replace(noise[c.name], corners=m.noise(s, c, settings))
+    return assemble(inputs, state, noise), state
 
 
 def test_nothing_is_known_across_the_seam(problem):

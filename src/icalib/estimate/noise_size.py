@@ -1,10 +1,10 @@
 """Whether another size of the IMU's noise is all that its residuals ask for.
 
-Variance components (Helmert 1924; Foerstner 1979): both densities, and the noise of each camera's corners, are scaled
-by the root of chi^2 over the degrees of freedom after the fit, and the estimate is solved again, until the scales stay.
-If noise is all that was wrong, the residuals that are left are white and as large in every segment. After a fit,
-residuals r of white noise correlate: with a draw x from the posterior, E[r_i r_j] = -E[(J x)_i (J x)_j] for rows i and
-j of different intervals. What is left beside that is correlation that white noise does not have.
+Variance components (Helmert 1924; Foerstner 1979): both densities, and the noise of `refitted` residuals such as
+corners, are scaled by the root of chi^2 over the degrees of freedom after the fit. The estimate is solved again, until
+the scales stay. If noise is all that was wrong, the residuals that are left are white and as large in every segment.
+After a fit, residuals r of white noise correlate: with a draw x from the posterior, E[r_i r_j] = -E[(J x)_i (J x)_j]
+for rows i and j of different intervals. What is left beside that is correlation that white noise does not have.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from icalib.estimate.evidence.evidence import DRAW_STEP
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.solver import minimise
-from icalib.motion.factor import look, of_type, pairs_of
+from icalib.model.sensor_model import model_of
+from icalib.motion.factor import look
 from icalib.motion.imu_data import joined_imu_data
 from icalib.rig import ImuNoise
-from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.imu.residual import ImuFactor
 
 ROUNDS = 12  # the scales converge linearly
@@ -73,12 +73,11 @@ def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
     """None without an IMU, where an estimate with other noise fails, or where a sensor has next to no noise."""
     if inputs.rig.imu is None or inputs.rig.assumes_motion or not isinstance(found.problem.chain, ImuFactor):
         return None
-    cameras = [c.name for c in of_type(found.problem.factors, CornerFactor) if len(c.stream.uv)]
-    scales: dict[str, float] = dict.fromkeys([*KINDS, *cameras], 1.0)
+    scales: dict[str, float] = dict.fromkeys([*KINDS, *_refitted_sizes(inputs, found.outcome)], 1.0)
     outcome, settled = found.outcome, False
     for _ in range(ROUNDS):
         shown = _ImuDraws.of(outcome)
-        sizes = {kind: shown.size(kind) for kind in KINDS} | _corner_sizes(outcome)
+        sizes = {kind: shown.size(kind) for kind in KINDS} | _refitted_sizes(inputs, outcome)
         steps = {key: float(np.clip(size, 1.0 / LARGEST_STEP, LARGEST_STEP)) for key, size in sizes.items()}
         settled = all(abs(np.log(step)) < SETTLED for step in steps.values())
         if settled:
@@ -110,19 +109,19 @@ def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcom
     rig = inputs.rig.with_sensors(replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
     other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
     state, judged = found.outcome.state, found.judged
-    cameras = {c.name: judged.noise[c.name] for c in rig.cameras}
-    noise = {
-        name: replace(n, sigma=(scales.get(name, 1.0) * n.sigma).astype(n.sigma.dtype)) for name, n in cameras.items()
+    scaled = {
+        s.name: model_of(s).scaled_noise(judged.noise[s.name], scales[s.name]) for s in rig.mounted if s.name in scales
     }
-    return minimise(replace(judged, noise={**judged.noise, **noise}).problem(other, state, found.problem.held), state)
+    return minimise(replace(judged, noise={**judged.noise, **scaled}).problem(other, state, found.problem.held), state)
 
 
-def _corner_sizes(outcome: Outcome) -> dict[str, float]:
-    """By camera, the root of chi^2 over the number of residuals of corners; the fit takes few of them."""
-    sizes = {}
-    for camera, out in pairs_of(outcome.problem.factors, outcome.residuals, CornerFactor):
-        if len(camera.stream.uv):
-            sizes[camera.name] = float(np.sqrt(camera.chi2(out) / max(2 * np.count_nonzero(out.root), 1)))
+def _refitted_sizes(inputs: Inputs, outcome: Outcome) -> dict[str, float]:
+    """By sensor, the root of chi^2 over the number of its `refitted` residuals; the fit takes few of them."""
+    sizes, factors = {}, outcome.problem.factors
+    for sensor in inputs.sensors:
+        key = sensor.name, model_of(sensor).refitted
+        if key in factors and (own := factors[key].squares(outcome.residuals[key]).get(key)) is not None:
+            sizes[sensor.name] = float(np.sqrt(own.chi2 / max(own.n, 1)))
     return sizes
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
-from icalib.motion.factor import FitKey, Squares
+from icalib.motion.factor import Factor, FactorKey, FitKey, Residuals, Squares
+from icalib.optim.state import State
+from icalib.rig import Rig
 
 LEAST_DOF_SHARE = 0.2  # of the residuals: where the motion absorbs more, too little is left to show their noise
 # Degrees of freedom off those of sensors at rest, of which there may be few: the mean of a variance that chi^2 shows,
@@ -54,3 +56,24 @@ class ResidualStatistics:
         large as assumed."""
         known = {kind: f for kind, f in self.fits.items() if f.dof > LEAST_DOF_SHARE * f.count}
         return {k: f.chi2 / (max(f.dof - FEW_DOF, 1.0) if self.at_rest else f.dof) for k, f in known.items()}
+
+
+@dataclass(frozen=True)
+class PassEnd:
+    """Where a pass ended: its factors, and their residuals at `state`.
+
+    is_first: whether it was the first pass. at_rest, all_squares, all_fits: as of `ResidualStatistics`.
+    """
+
+    rig: Rig
+    state: State
+    factors: Mapping[FactorKey, Factor]
+    residuals: Residuals
+    is_first: bool
+    at_rest: bool
+    all_squares: Callable[[], dict[FitKey, Squares]]
+    all_fits: Callable[[], list[Fit]]
+
+    def of(self, sensor: str) -> ResidualStatistics:
+        """Residual statistics of one sensor."""
+        return ResidualStatistics(sensor, self.at_rest, self.all_squares, self.all_fits)

@@ -14,7 +14,6 @@ from icalib.estimate.evidence.evidence import fits, raw_sizes
 from icalib.estimate.evidence.inflation import calibration_columns, spread_variance, white_variance
 from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.evidence.places import cluster_covariances
-from icalib.estimate.problem.assembly import image_times
 from icalib.estimate.problem.gauge import IN_THE_WORLD
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.outcome import Visit
@@ -46,6 +45,7 @@ from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.sensors import SENSOR_KINDS, ask, facet
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.images import image_times
 from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.cross_validation import cross_validation
 from icalib.validation.guesses import guess_notes
@@ -73,7 +73,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     groups = _groups(inputs, determined, seen, noise)
     judged = _sensor_fits([f for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
     held = cross_validation(parts, [s for s in (inputs.rig.reference,) if _is_assumed(inputs, s)])
-    timeline = Timeline.of(inputs.parts, image_times(inputs, state.values), inputs.rig.reference)
+    timeline = Timeline.of(inputs.parts, image_times(inputs.measurements, state.values), inputs.rig.reference)
     factors = _factors(inputs, groups)
     factor = factors.max(initial=1.0)
     causes, size_notes = all_causes(AssessedEstimate(inputs, found, groups, judged, factor, parts, timeline), against)
@@ -291,7 +291,7 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
         return state.recording
     if not inputs.rig.cameras:
         return timeline.recording_of(state.seconds)
-    times = np.concatenate(image_times(inputs, state.values))
+    times = np.concatenate(image_times(inputs.measurements, state.values))
     recording = np.concatenate([timeline.recordings_of(c.key) for c in inputs.measurements.cameras])
     order = np.argsort(times, kind="stable")
     return recording[order][np.searchsorted(times[order], state.seconds)]

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.corner_noise import image_speed, residual_noise
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
@@ -24,6 +23,7 @@ from icalib.optim.state import State
 from icalib.rig import Settings
 from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
+from icalib.sensors.camera.corner_noise import image_speed, residual_noise
 from icalib.sensors.camera.corner_outliers import rejected
 
 MOST_IMAGES = 40  # that are compared, half of them tested; the time is proportional to it

@@ -1,14 +1,13 @@
-"""What errors that stay with a place say of the formal standard deviations: of the image, of the target, of a tag.
+"""Covariances that allow for errors which correlate within clusters, such as a region of the image or of the target.
 
 A lens that the model cannot follow and a target that is not as drawn make the same errors in all parts of a recording,
-and splitting it in time does not see them. What is seen in a place is a cluster, whose gradient would be zero but for
-noise; the IMU and all other sensors are one more. Errors of one feature track are correlated as well: its views are
-aligned with the same first one. Groups of whole tracks are clusters, too (Liang and Zeger 1986).
+and splitting it in time does not see them. The gradient of a cluster would be zero but for noise. Measurements that are
+in none, such as those of the IMU, are one more cluster, unless the clusters are a sample (Liang and Zeger 1986).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -18,23 +17,15 @@ import numpy as np
 from icalib.estimate.evidence.evidence import spread_covariance
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
-from icalib.motion.factor import FactorKey, of_type
+from icalib.model.sensor_model import all_models
+from icalib.motion.factor import FactorKey
 from icalib.optim.arrowhead import Piece
-from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
-
-IMAGE_CELLS = (4, 3)  # columns, rows
-TARGET_PARTS = 3  # along each side
-TRACK_GROUPS = 24  # their spread knows a variance to 1 / sqrt(12); twice as many, to 1 / sqrt(24) at twice the cost
-
-
-Clusters = dict[FactorKey, Any]  # of each factor that has any, the cluster of every measurement
 
 
 @dataclass(frozen=True)
 class ClusterCovariances:
-    """(B, B) covariances that allow for correlated errors: of `places`, which are image cells, parts of the target and
-    corners of tags, one each; and of feature `tracks`, None where there are none."""
+    """(B, B) covariances that allow for correlated errors: of `places`, one for each kind of cluster such as image
+    cells; and of feature `tracks`, None where there are none."""
 
     places: list[np.ndarray]
     tracks: np.ndarray | None
@@ -42,78 +33,26 @@ class ClusterCovariances:
 
 def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariances:
     """Cluster-robust (sandwich) covariances of the calibration parameters."""
-    features = of_type(problem.factors, FeatureFactor)
-    kinds = list(_kinds(problem))
-    if not kinds:
-        return ClusterCovariances([], None)
-    # Features by number, so that all views of one, by all cameras, are in one group; corners are in none.
-    kinds += [{f.key: [(s.feature % TRACK_GROUPS).astype(np.int32) for s in f.streams]} for f in features]
-    gradients = _cluster_gradients(problem, outcome, kinds)
-    places = gradients[:-1] if features else gradients
-    places = [spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])) for b in places]
-    if not features:
-        return ClusterCovariances(places, None)
-    b = gradients[-1] - gradients[-1].mean(axis=0)
-    return ClusterCovariances(places, len(b) / (len(b) - 1.0) * spread_covariance(problem, outcome, b))
+    every = [c for model in all_models() for c in model.clusters(problem.factors)]
+    gradients = _cluster_gradients(problem, outcome, [c.of_factor for c in every]) if every else []
+    places, tracks = [], None
+    for clusters, b in zip(every, gradients, strict=True):
+        if clusters.is_sample:
+            centred = b - b.mean(axis=0)
+            tracks = len(b) / (len(b) - 1.0) * spread_covariance(problem, outcome, centred)
+        else:
+            places.append(spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])))
+    return ClusterCovariances(places, tracks)
 
 
-def _kinds(problem: Problem) -> Iterator[Clusters]:
-    cameras, features = of_type(problem.factors, CornerFactor), of_type(problem.factors, FeatureFactor)
-    cornered = any(len(c.stream.uv) for c in cameras)
-    if cornered or features:
-        yield _image_cells(cameras, features)
-    if cornered:
-        yield {c.key: _target_parts(c) for c in cameras}
-        yield {c.key: _tag_corners(c, k) for k, c in enumerate(cameras)}
-
-
-def _image_cells(cameras: tuple[CornerFactor, ...], features: tuple[FeatureFactor, ...]) -> Clusters:
-    """Cells of the image, cameras apart; corners and tracks in the same ones."""
-    clusters: Clusters = {f.key: [] for f in features}
-    for index, camera in enumerate(cameras):
-        n = len(camera.stream.uv)
-        cells = _cells(np.concatenate([camera.stream.uv, *(f.streams[index].uv for f in features)]), index)
-        clusters[camera.key] = cells[:n]
-        for f in features:
-            clusters[f.key].append(cells[n:])
-    return clusters
-
-
-def _count(clusters: Clusters) -> int:
+def _count(clusters: Mapping[FactorKey, Any]) -> int:
     arrays = [a for own in clusters.values() for a in (own if isinstance(own, list) else [own])]
     return 1 + max(int(a.max(initial=-1)) for a in arrays)
 
 
-def _cells(uv: np.ndarray, index: int) -> np.ndarray:
-    """(N,) cell of the part of image `index` in which there is anything."""
-    columns, rows = IMAGE_CELLS
-    low, high = uv.min(axis=0, initial=np.inf), uv.max(axis=0, initial=-np.inf) + 1e-9
-    x, y = (((uv[:, k] - low[k]) / (high - low)[k] * IMAGE_CELLS[k]).astype(np.int32) for k in range(2))
-    return (index * rows + y) * columns + x
-
-
-def _target_parts(camera: CornerFactor) -> np.ndarray:
-    """(N,) part of a body of the target, the same for all cameras; single tags are not divided."""
-    target = camera.bodies.target
-    part, parts = np.zeros(len(target.points), dtype=np.int32), 0
-    for k in camera.bodies.used:
-        own = target.body == k
-        xy = target.points[own, :2]
-        low, high = xy.min(axis=0), xy.max(axis=0) + 1e-9
-        sides = TARGET_PARTS if target.bends[k] else 1
-        cell = ((xy - low) / (high - low) * sides).astype(int)
-        part[own] = parts + cell[:, 1] * sides + cell[:, 0]
-        parts += sides**2
-    return part[camera.stream.point]
-
-
-def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
-    """(N,) which of its tag's four corners, cameras apart: what a detector does to each."""
-    corner = camera.bodies.target.point_identity(camera.stream.point)[1]
-    return 4 * index + (corner % 4).astype(np.int32)
-
-
-def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[Clusters]) -> list[np.ndarray]:
+def _cluster_gradients(
+    problem: Problem, outcome: Outcome, kinds: Sequence[Mapping[FactorKey, Any]]
+) -> list[np.ndarray]:
     """Of each of `kinds` of clusters (clusters, B), the gradient of each cluster; chain and points are marginalised."""
     counts = [_count(kind) for kind in kinds]
     B, state, at = problem.layout.size, outcome.state, problem.scratch(outcome.residuals)

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
+from icalib.model.target_factor import TargetFactor
 from icalib.motion.factor import Residuals, of_type
 from icalib.optim.arrowhead import Piece, solve
 from icalib.optim.state import State
-from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.imu.residual import ImuFactor
 
 STEP = 1e-3  # of the size: small against what bends p, large against rounding
@@ -36,7 +36,7 @@ class TargetSize:
 def target_size(problem: Problem, state: State) -> TargetSize | None:
     """By all that was measured, from where the solver ended; None where nothing but cameras shows a size, or there is
     no target."""
-    seen = any(len(c.stream.uv) for c in of_type(problem.factors, CornerFactor))
+    seen = any(f.sees_target for f in of_type(problem.factors, TargetFactor))
     if not seen or not problem.framed or not isinstance(problem.chain, ImuFactor):
         return None
     ratio = std = 1.0
@@ -58,15 +58,14 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
 def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Problem, State]:
     """The same problem with a target `size` times as large, and all that cameras see grown with it from where it was
     `now`, but for lengths that are fixed."""
-    cameras, by = of_type(problem.factors, CornerFactor), size / now
-    cameras = tuple(replace(c, bodies=replace(c.bodies, size=size)) for c in cameras)
-    bodies = cameras[0].bodies
-    lengths = {(c.name, "translation") for c in cameras} | {(b, "shape") for b in bodies.bending}
+    factors, by = tuple(f.with_target_size(size) for f in of_type(problem.factors, TargetFactor)), size / now
+    bodies = factors[0].bodies
+    lengths = {(f.name, "translation") for f in factors} | {(b, "shape") for b in bodies.bending}
     lengths |= {(b, "translation") for b in bodies.names if bodies.several}
     lengths &= {b.key for b in problem.layout.free}
     values = {key: by * v if key in lengths else v for key, v in state.values.items()}
     begin = replace(state, position=by * state.position, velocity=by * state.velocity, values=values)
-    return problem.replacing(cameras), begin
+    return problem.replacing(factors), begin
 
 
 def _least_cost(problem: Problem, state: State, pieces: tuple[Piece, ...], scratch: Residuals) -> float:

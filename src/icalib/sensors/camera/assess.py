@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.corner_noise import NoiseModel
 from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.clocks import instants
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
@@ -19,8 +18,10 @@ from icalib.rig import Camera, Rig
 from icalib.sensors.camera.circle_centres import centre_shifts
 from icalib.sensors.camera.connected_bodies import words_on_left_out
 from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.corner_noise import NoiseModel
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.surfaces import ON_PLANES
+from icalib.sensors.camera.model import CameraNoise
 
 MOST_NAMED = 10  # images
 GROWN_VIEWS = 10  # after which the noise of tracks is told once more
@@ -86,10 +87,10 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
         yield words
     factors = of_type(found.problem.factors, CornerFactor)
     yield from _outside_imu_notes(inputs, found, factors)
-    apart = found.judged.apart or tuple(np.zeros(len(c.keyframe), dtype=bool) for c in factors)
-    for camera, factor, model, late in zip(inputs.rig.cameras, factors, found.judged.models, apart, strict=True):
-        yield from _corner_notes(camera, factor, model, late, found)
-    if words := late_words(factors, apart):
+    noise: list[CameraNoise] = [found.judged.noise[c.name] for c in inputs.rig.cameras]
+    for camera, factor, own in zip(inputs.rig.cameras, factors, noise, strict=True):
+        yield from _corner_notes(camera, factor, own.model, own.late, found)
+    if words := late_words(factors, [own.late for own in noise]):
         yield words
     yield from _feature_notes(found)
 

@@ -5,6 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.geometry.cameras.base import CameraModel
+from icalib.optim import pages
+from icalib.optim.state import State
+from icalib.sensors.camera.corner_factor import CornerFactor
+
+
+def with_bloom(factor: CornerFactor, state: State) -> CornerFactor:
+    """The factor with the image directions in which its corners bloom: towards the centres of their tags, by lens and
+    poses of `state`."""
+    target = factor.bodies.target
+    inwards = target.tag_centers - target.points
+    params = factor.lens(state)
+    direction = pages.zeros(factor.stream.uv.shape, np.float32)
+    for own, X, R_cam_body in factor.in_camera(state):
+        towards = np.einsum("nij,nj->ni", R_cam_body, inwards[factor.stream.point[own]])
+        direction[own] = bloom_direction(factor.model, params, X, towards)
+    return factor.with_direction(direction)
 
 
 def bloom_direction(model: CameraModel, params: np.ndarray, X: np.ndarray, towards: np.ndarray) -> np.ndarray:

@@ -110,6 +110,15 @@ class CornerFactor(FactorDefaults):
     def name(self) -> str:
         return self.stream.name
 
+    @property
+    def sees_target(self) -> bool:
+        """See `TargetFactor`."""
+        return len(self.stream.uv) > 0
+
+    def with_target_size(self, size: float) -> CornerFactor:
+        """See `TargetFactor`."""
+        return replace(self, bodies=replace(self.bodies, size=size))
+
     @cached_property
     def views(self) -> Views:
         return Views.of(self.stream, self.bodies.target.body)

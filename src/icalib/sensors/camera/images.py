@@ -1,4 +1,4 @@
-"""Corners and tracks of one camera on the same images, so that both share its instants, keyframes and poses."""
+"""Images of a camera: corners and tracks on the same ones, their instants, keyframes, and whether they are used."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ import numpy as np
 
 from icalib.data.measurements import CornerStream, Measurements, TrackStream
 from icalib.errors import EstimationError
-from icalib.rig import Rig
+from icalib.motion.clocks import instants
+from icalib.motion.imu_data import ImuData
+from icalib.motion.keyframe_placement import MERGED_WITHIN_S, usable
+from icalib.motion.poses import assign_keyframes
+from icalib.optim.state import Key, State
+from icalib.rig import Rig, Scheme
 
 _NONE = np.zeros(0, dtype=np.int64)
 
@@ -52,3 +57,25 @@ def _start(stamps: np.ndarray, stream: CornerStream | TrackStream) -> np.ndarray
     count = np.zeros(len(stamps), dtype=np.int64)
     count[np.searchsorted(stamps, stream.stamps_ns)] = np.diff(stream.start)
     return np.concatenate([[0], np.cumsum(count)])
+
+
+def image_times(measurements: Measurements, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
+    """By camera (M,) instants of the images, s on the body's clock since its first stamp."""
+    return [instants(c, values) for c in measurements.cameras]
+
+
+def keyframes_of(
+    scheme: Scheme, state: State, times: np.ndarray, images: list[slice], imu: ImuData | None
+) -> np.ndarray:
+    """(M,) index of the keyframe of each image, one of its own recording. times (M,) s: instants of the images;
+    images: those of each recording."""
+    forwards, pairs = imu is not None and imu.forwards, zip(images, state.recordings, strict=True)
+    return np.concatenate([assign_keyframes(scheme, state.seconds[k], times[i], forwards) + k.start for i, k in pairs])
+
+
+def are_used(imu: ImuData | None, times: np.ndarray, keyframes: np.ndarray, max_gap_s: float) -> np.ndarray:
+    """(M,) bool: images that take part: the IMU was running, with gaps of `max_gap_s` at most; without an IMU, those
+    taken at their keyframe. times (M,) s of the images, keyframes (M,) s of the keyframe of each."""
+    if imu is None:
+        return np.abs(times - keyframes) <= MERGED_WITHIN_S
+    return usable(imu, times, max_gap_s)

@@ -1,20 +1,72 @@
-"""How a camera enters the problem: its parameters, and the keyframes that its images want."""
+"""How a camera enters the problem: by corners of the target, and by feature tracks that several cameras may share."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
 
-from icalib.model.sensor_model import SensorModel
-from icalib.rig import Camera, ParameterSpec, Rig
-from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.data.measurements import CornerStream, Measurements
+from icalib.geometry.cameras import camera_model
+from icalib.model.sensor_model import Clusters, Pass, SensorModel, model_of
+from icalib.model.statistics import PassEnd
+from icalib.motion.clocks import instants
+from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
+from icalib.optim.arrowhead import chain_cuts
+from icalib.rig import Camera, ParameterSpec, Rig, Settings
+from icalib.sensors.camera.bloom import with_bloom
+from icalib.sensors.camera.circle_centres import with_circle_centres
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
+from icalib.sensors.camera.corner_noise import (
+    COMMON_ERRORS,
+    FIRST_TAU_PX,
+    NoiseModel,
+    estimate_noise,
+    first_noise,
+    image_speed,
+    scale_common_errors,
+)
+from icalib.sensors.camera.corner_outliers import inliers
+from icalib.sensors.camera.corner_statistics import CORNERS
+from icalib.sensors.camera.edge_curvature import with_bent_edges
+from icalib.sensors.camera.features.error_clusters import error_clusters
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.feature_noise import TrackSelection, next_selections, observed_at_keyframes
+from icalib.sensors.camera.features.patch_curvature import with_curved_patches
+from icalib.sensors.camera.features.surfaces import Surfaces
+from icalib.sensors.camera.image_pairs import not_simultaneous
+from icalib.sensors.camera.images import are_used, keyframes_of
 from icalib.sensors.camera.spec import BLOOM
 from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 
+NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions need no more
+COARSE_TRACK_S = 0.5  # longest track of an early pass: short ones cost little, and poses far from the truth fit them
+ENOUGH_USED = 0.8  # share of the observations of tracks that take part, above which no further pass is tried
+MORE_USED = 1.1  # ratio of observations that would take part to those that do, above which the pass is repeated
 
-class CameraSensorModel(SensorModel[Camera, CornerNoise]):
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """Noise and inliers of one camera.
+
+    model: the size of its corners' errors; corners: the same for each corner. keep (N,) bool: corners in use; late (M,)
+    bool: images that are rejected because they are not simultaneous with others of their keyframe. tracks: of its
+    feature tracks; None where no camera has any.
+    """
+
+    model: NoiseModel
+    corners: CornerNoise
+    keep: np.ndarray
+    late: np.ndarray
+    tracks: TrackSelection | None = None
+
+
+class CameraSensorModel(SensorModel[Camera, CameraNoise]):
     """Without an IMU images at one stamp are simultaneous, and the first camera that sees a target is the body."""
 
     keyframes = "images"
+    refitted = CORNERS
 
     def is_estimated(self, sensor: Camera, spec: ParameterSpec, rig: Rig) -> bool:
         """See `SensorModel`; bloom only where the target has edges that it moves."""
@@ -27,6 +79,172 @@ class CameraSensorModel(SensorModel[Camera, CornerNoise]):
         if spec == BLOOM and not rig.blooms:
             return np.zeros(BLOOM.size)
         return super().start_value(sensor, spec, rig)
+
+    def scaled_noise(self, noise: CameraNoise, scale: float) -> CameraNoise:
+        """See `SensorModel`; that of the corners."""
+        sigma = noise.corners.sigma
+        return replace(noise, corners=replace(noise.corners, sigma=(scale * sigma).astype(sigma.dtype)))
+
+    def first_noises(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> dict[str, CameraNoise]:
+        """Stated noise or a usual one, and all corners and observations of tracks."""
+        noise, tracks = {}, {t.name: t for t in measurements.tracks}
+        for camera, stream in zip(sensors, measurements.cameras, strict=True):
+            model, keep = first_noise(camera), np.ones(len(stream.uv), dtype=bool)
+            own = TrackSelection.first(camera, tracks[camera.name]) if tracks else None
+            late = np.zeros(len(stream.stamps_ns), dtype=bool)
+            noise[camera.name] = CameraNoise(model, model.noise(stream, camera, rig.settings), keep, late, own)
+        return noise
+
+    def next_noises(
+        self, sensors: Sequence[Camera], noise: Mapping[str, CameraNoise], end: PassEnd
+    ) -> dict[str, CameraNoise]:
+        """Outliers and late images of the pass are rejected; noise that is not stated is estimated."""
+        pairs, settings = pairs_of(end.factors, end.residuals, CornerFactor), end.rig.settings
+        late, found = _late_images(pairs, end), _next_tracks(sensors, noise, end)
+        estimated = _noise_is_estimated(sensors, [c.stream for c, _ in pairs], bool(of_tracks(end.factors)), settings)
+        for camera, (factor, out), apart in zip(sensors, pairs, late, strict=True):
+            keep = inliers(factor, out, settings) & ~apart[factor.stream.image]
+            found[camera.name] = replace(found[camera.name], keep=keep, late=apart)
+            if estimated:
+                model, corners = _next_corner_noise(camera, factor, out, end)
+                found[camera.name] = replace(found[camera.name], model=model, corners=corners)
+        return found
+
+    def passes(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> int:
+        """One for noise, or for outliers of tracks, which show once the lens is known; two for errors that the corners
+        of an image share."""
+        settings, tracked = rig.settings, bool(measurements.tracks)
+        estimated = _noise_is_estimated(sensors, measurements.cameras, tracked, settings)
+        if not (estimated or (tracked and settings.outlier_std > 0.0)):
+            return 0
+        return 2 if settings.common_error else 1
+
+    def factors(self, sensor: Camera, stream: CornerStream, noise: CameraNoise, at: Pass) -> Iterator[CornerFactor]:
+        """One, of the corners of the target, of which there may be none."""
+        yield corner_factor(sensor, stream, noise, at)
+
+    def still_factors(
+        self, sensor: Camera, stream: CornerStream, noise: CameraNoise, at: Pass
+    ) -> Iterator[CornerFactor]:
+        """As `factors`."""
+        yield corner_factor(sensor, stream, noise, at)
+
+    def joint_factors(
+        self, sensors: Sequence[Camera], factors: Sequence[Factor], noise: Mapping[str, CameraNoise], at: Pass
+    ) -> tuple[FeatureFactor, ...]:
+        """One of all feature tracks, where there are any."""
+        cameras = tuple(f for f in factors if isinstance(f, CornerFactor))
+        tracks = [own for s in sensors if (own := noise[s.name].tracks) is not None]
+        return (feature_factor(cameras, tracks, at),) if tracks else ()
+
+    def uses_more(self, used: Mapping[FactorKey, Factor], rebuilt: Callable[[], Mapping[FactorKey, Factor]]) -> bool:
+        """See `SensorModel`: of tracks whose points the first poses of the pass did not find, and its last ones do."""
+        (now,) = of_tracks(used) or (None,)
+        if now is None or now.followed > ENOUGH_USED * sum(int(k.sum()) for k in now.keep):
+            return False
+        return any(f.followed > MORE_USED * now.followed for f in of_tracks(rebuilt()))
+
+    def clusters(self, factors: Mapping[FactorKey, Factor]) -> Iterator[Clusters]:
+        """See `error_clusters`."""
+        return error_clusters(of_type(factors, CornerFactor), of_tracks(factors))
+
+
+def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: Pass) -> CornerFactor:
+    """The corners of one camera with lens and poses of `at`. Early passes leave out corrections that need the lens."""
+    rig, state, imu = at.rig, at.state, at.imu
+    scheme = rig.settings.scheme if imu is not None else "inertial"
+    times, images = instants(stream, state.values), [part.own[camera.name] for part in at.parts]
+    keyframe = keyframes_of(scheme, state, times, images, imu)
+    used = are_used(imu, times, state.seconds[keyframe], rig.settings.max_gap_s)
+    factor = CornerFactor(
+        stream, camera_model(camera.model), imu, rig.gravity, scheme, stream.seconds, keyframe,
+        noise.keep & np.repeat(used, np.diff(stream.start)), noise.corners, NO_BLOOM, at.bodies, at.layout,
+        len(state.seconds), tuple(own.start for own in images[1:]),
+    )  # fmt: skip
+    factor = factor if at.coarse else with_circle_centres(with_bent_edges(factor, state), state)
+    return with_bloom(factor, state) if rig.blooms else factor
+
+
+def feature_factor(cameras: tuple[CornerFactor, ...], selected: Sequence[TrackSelection], at: Pass) -> FeatureFactor:
+    """The feature tracks of all cameras, as far as the poses of `at` find their points; `selected`: by camera."""
+    settings, state = at.rig.settings, at.state
+    streams = tuple(
+        with_curved_patches(t, c.model, c.lens(state)) for t, c in zip(at.measurements.tracks, cameras, strict=True)
+    )
+    seen = observed_at_keyframes(cameras, at.measurements.tracks, state, settings.max_gap_s)
+    keep = tuple(own.keep & s for own, s in zip(selected, seen, strict=True))
+    loss, noise = (settings.loss, settings.loss_scale), tuple(own.noise for own in selected)
+    cuts = chain_cuts(len(state.seconds))
+    if at.coarse:
+        cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / COARSE_TRACK_S)))))
+    factor = FeatureFactor.build(cameras, streams, noise, keep, loss, state, cuts, state.starts[1:], _surfaces(at))
+    factor = replace(factor, outliers=tuple(own.outliers for own in selected))
+    return factor.coarse(state) if at.coarse else factor
+
+
+def of_tracks(factors: Mapping[FactorKey, Factor]) -> tuple[FeatureFactor, ...]:
+    """The factor of feature tracks; empty where there are none."""
+    return of_type(factors, FeatureFactor)
+
+
+def _surfaces(at: Pass) -> Surfaces | None:
+    """Planes that points of the scene lie on, where the rig file says that they do."""
+    clouds, noise, streams = at.clouds, at.rig.settings.points_on_planes_m, at.measurements.streams
+    if not clouds.count or noise == 0.0:
+        return None
+    planes = np.array([at.state.values[key] for key in clouds.keys])
+    found = (model_of(s).points_on_planes(s, streams[s.name], at) for s in at.rig.mounted)
+    seen = (points for points in found if points is not None)
+    return Surfaces.seen(clouds.keys, clouds.recording, planes, seen, noise, at.coarse)
+
+
+def _late_images(pairs: Sequence[tuple[CornerFactor, CornerOutput]], end: PassEnd) -> list[np.ndarray]:
+    """By camera (M,) bool: images that are not simultaneous with others of their keyframe. Tested in rigs of
+    cameras alone."""
+    settings = end.rig.settings
+    if len(pairs) < 2 or not end.rig.cameras_alone or settings.outlier_std <= 0.0:
+        return [np.zeros(len(c.keyframe), dtype=bool) for c, _ in pairs]
+    return not_simultaneous([c for c, _ in pairs], [out for _, out in pairs], settings)
+
+
+def _next_tracks(cameras: Sequence[Camera], noise: Mapping[str, CameraNoise], end: PassEnd) -> dict[str, CameraNoise]:
+    """The noise of each camera with the tracks of the next pass."""
+    found = {c.name: noise[c.name] for c in cameras}
+    for factor, out in pairs_of(end.factors, end.residuals, FeatureFactor):
+        now = [own for c in cameras if (own := noise[c.name].tracks) is not None]
+        tracks = next_selections(cameras, factor, out, now, end.state, end.rig.settings, end.is_first)
+        for camera, own in zip(cameras, tracks, strict=True):
+            found[camera.name] = replace(found[camera.name], tracks=own)
+    return found
+
+
+def _next_corner_noise(
+    camera: Camera, factor: CornerFactor, out: CornerOutput, end: PassEnd
+) -> tuple[NoiseModel, CornerNoise]:
+    """The noise of corners in the next pass, as the residuals of this one show it."""
+    settings = end.rig.settings
+    if not factor.sees_target:
+        return first_noise(camera), factor.noise
+    speed = image_speed(factor, end.state)
+    tau = (FIRST_TAU_PX,) * COMMON_ERRORS if settings.common_error else ()
+    if len(factor.noise.tau):
+        common = [f for kind, f in end.of(camera.name).fits.items() if kind.startswith("common")]
+        tau = scale_common_errors(tuple(factor.noise.tau), common)
+    model, large = estimate_noise(camera, settings, factor, out, speed, tau)
+    model = replace(model, later=large and end.rig.cameras_alone)
+    return model, model.noise(factor.stream, camera, settings, speed)
+
+
+def _noise_is_estimated(
+    cameras: Sequence[Camera], streams: Sequence[CornerStream], tracked: bool, settings: Settings
+) -> bool:
+    """Whether residuals show some of the noise of corners or tracks; streams: the corners of each camera."""
+    cornered = [c for c, s in zip(cameras, streams, strict=True) if len(s.uv)]
+    return (
+        (bool(cornered) and (settings.blur_noise or settings.common_error))
+        or any(c.corner_noise_px is None for c in cornered)
+        or (tracked and any(c.track_noise_px is None for c in cameras))
+    )
 
 
 MODEL = CameraSensorModel()

@@ -13,10 +13,10 @@ import numpy as np
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimate.evidence.corner_noise import SMALLEST_BASE_PX
 from icalib.geometry.cameras import camera_model
 from icalib.rig import Rig
 from icalib.sensors.camera.connected_bodies import restrict
+from icalib.sensors.camera.corner_noise import SMALLEST_BASE_PX
 from icalib.sensors.camera.initialize.boards.incremental_scene import fixed_lens, reconstruct_scene
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, multi_body_poses
 

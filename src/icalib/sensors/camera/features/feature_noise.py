@@ -1,21 +1,24 @@
-"""How large the errors of tracks are, and which observations stand out, judged from what a pass leaves behind."""
+"""Noise and outliers of feature tracks, from the residuals of a pass."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimate.problem.assembly import Following, on_the_chain
-from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.outcome import Outcome
-from icalib.motion.factor import look, pairs_of
+from icalib.data.measurements import TrackStream
+from icalib.motion.clocks import instants
+from icalib.motion.factor import look
 from icalib.optim.arrowhead import chain_cuts
 from icalib.optim.medians import grouped_quantiles, largest_normal, median_variance
+from icalib.optim.state import State
 from icalib.rig import Camera, Settings
+from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.feature_statistics import FeatureOutput
 from icalib.sensors.camera.features.tracks import TrackNoise
+from icalib.sensors.camera.images import are_used
 
 FIRST_GUESS_PX = 1.0
 SMALLEST_PX = 0.005
@@ -25,31 +28,51 @@ GOOD_AT_FIRST, GOOD = 0.9, 0.5
 FEWEST_IN_GROUP = 50  # observations, for their median variance to be known to a fifth
 
 
-def first_following(inputs: Inputs) -> Following | None:
-    """Before anything is known: what the rig file says, or a pixel; everything in use, tracks cut short, which costs
-    little and leads near. None where there are no tracks."""
-    if not inputs.measurements.tracks:
-        return None
-    noise = tuple(TrackNoise(c.track_noise_px or FIRST_GUESS_PX) for c in inputs.rig.cameras)
-    none = tuple(np.zeros(len(t.uv), dtype=bool) for t in inputs.measurements.tracks)
-    return Following(noise, tuple(~x for x in none), none, True)
+@dataclass(frozen=True)
+class TrackSelection:
+    """The feature tracks of one camera: their noise; keep (N,) bool, observations in use; outliers (N,) bool, those not
+    in use because their residuals are large."""
+
+    noise: TrackNoise
+    keep: np.ndarray
+    outliers: np.ndarray
+
+    @classmethod
+    def first(cls, camera: Camera, stream: TrackStream) -> TrackSelection:
+        """Before any pass: stated noise, or a pixel, and all observations."""
+        none = np.zeros(len(stream.uv), dtype=bool)
+        return cls(TrackNoise(camera.track_noise_px or FIRST_GUESS_PX), ~none, none)
 
 
-def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool) -> Following:
-    """Of the next pass: noise as the residuals show it, where it is not given, and all observations but the outliers
-    that stand out after the `first` pass or another."""
-    rig, ((factor, out),) = inputs.rig, pairs_of(outcome.problem.factors, outcome.residuals, FeatureFactor)
-    noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(rig.cameras))
-    if rig.settings.outlier_std <= 0.0:
-        return Following(noise, now.keep, now.outliers)
+def next_selections(
+    cameras: Sequence[Camera],
+    factor: FeatureFactor,
+    out: FeatureOutput,
+    now: Sequence[TrackSelection],
+    state: State,
+    settings: Settings,
+    is_first: bool,
+) -> list[TrackSelection]:
+    """By camera, for the next pass: noise as the residuals `out` at `state` show it, unless it is stated, and all
+    observations but the outliers after the first pass (`is_first`) or a later one."""
+    noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(cameras))
+    if settings.outlier_std <= 0.0:
+        return [replace(own, noise=n) for own, n in zip(now, noise, strict=True)]
     # All that was seen, with the poses of the pass's end: those of its beginning left tracks out that these find, and
     # what a lens that was not found yet made an outlier may be none.
-    shown = on_the_chain(inputs, outcome.state, factor.cameras)
-    anew = replace(factor, noise=noise, keep=shown).cut(outcome.state, chain_cuts(factor.n_keyframes))
-    left, share = look(anew, outcome.state), GOOD_AT_FIRST if first else GOOD
+    shown = observed_at_keyframes(factor.cameras, factor.streams, state, settings.max_gap_s)
+    anew = replace(factor, noise=noise, keep=shown).cut(state, chain_cuts(factor.n_keyframes))
+    left, share = look(anew, state), GOOD_AT_FIRST if is_first else GOOD
     # The next pass uses no observation that was not judged, as those of tracks that the poses do not find.
-    judged = [_judged(anew, left, i, rig.settings, share) for i in range(len(shown))]
-    return Following(noise, tuple(good for good, _ in judged), tuple(outliers for _, outliers in judged))
+    return [TrackSelection(n, *_judged(anew, left, i, settings, share)) for i, n in enumerate(noise)]
+
+
+def observed_at_keyframes(
+    cameras: Sequence[CornerFactor], streams: Sequence[TrackStream], state: State, max_gap_s: float
+) -> tuple[np.ndarray, ...]:
+    """By camera (N,) bool: observations of tracks in images that take part, see `are_used`."""
+    used = (are_used(c.imu, instants(c.stream, state.values), state.seconds[c.keyframe], max_gap_s) for c in cameras)
+    return tuple(np.repeat(u, np.diff(stream.start)) for u, stream in zip(used, streams, strict=True))
 
 
 def _noise(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> TrackNoise:
