@@ -150,7 +150,7 @@ REVISED = (
     "sensors/camera/read",
     "sensors/fields",
     "sensors/imu/read",
-    "sensors/lidar/read",
+    "sensors/lidar",
     "sensors/parameter*",
     "sensors/pose/read",
     "sensors/sensor",

@@ -15,21 +15,21 @@ from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.trajectories.imu_trajectory import ImuTrajectory, SignalIntegrals
 from icalib.initialize.trajectories.lever_arm_rows import system_from_readings, system_from_trajectory
 from icalib.sensors.lidar.initialize import odometry
-from icalib.sensors.lidar.initialize.odometry import lidar_path, scans_of
+from icalib.sensors.lidar.initialize.odometry import lidar_trajectory, sampled_scans
 from icalib.sensors.lidar.initialize.registration import (
-    ACCELERATION,
-    ANGULAR_ACCELERATION,
-    GYRO_SIGMA,
-    KNOWN_SIGMA,
-    MOVE_SIGMA,
+    ACCELERATION_SIGMA,
+    ANGULAR_ACCELERATION_SIGMA,
+    GYRO_RATE_SIGMA,
+    GYRO_ROTATION_SIGMA,
+    KNOWN_TRANSLATION_SIGMA,
     POINT_SIGMA_M,
-    RATE_SIGMA,
-    TURN_SIGMA,
-    Expected,
-    add_expected,
-    expected_pose,
+    STEP_POSITION_SIGMA,
+    STEP_ROTATION_SIGMA,
+    PosePrediction,
+    add_prediction,
+    predicted_pose,
 )
-from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert, moved, sums
+from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, accumulate_scan, corrected_pose, insert
 
 SCALE = 0.3
 
@@ -62,11 +62,14 @@ def distances(pose, xyz, tau):
 def test_normal_equations_of_a_scan(scan):
     voxels, pose, xyz, tau = scan
     H, g = np.empty((12, 12)), np.empty(12)
-    met, near = sums(voxels, pose, xyz, tau, 0, SCALE, H, g)
+    met, near = accumulate_scan(voxels, pose, xyz, tau, 0, SCALE, H, g)
     r, h = distances(pose, xyz, tau), 1e-6
     assert met == len(tau) and near == (np.abs(r) < 2.0).sum()
     J = np.stack(
-        [distances(moved(pose, h * e), xyz, tau) - distances(moved(pose, -h * e), xyz, tau) for e in np.eye(12)]
+        [
+            distances(corrected_pose(pose, h * e), xyz, tau) - distances(corrected_pose(pose, -h * e), xyz, tau)
+            for e in np.eye(12)
+        ]
     )
     J = J.T / (2.0 * h)
     w = (1.0 + (r / SCALE) ** 2) ** -2.0
@@ -198,9 +201,9 @@ def turns_between(free_robot, path, first, last):
 
 def test_a_path_that_lost_its_way_goes_on_in_another_map(free_robot):
     """Scans are missing, and the LiDAR stands elsewhere after them, turned by half a turn."""
-    scans = scans_of(free_robot.streams[0])
+    scans = sampled_scans(free_robot.streams[0])
     turned = [replace(s, xyz=s.xyz * [-1.0, -1.0, 1.0]) for s in scans]
-    path = lidar_path("lidar0", [*scans[:50], *turned[74:]], whole=False)
+    path = lidar_trajectory("lidar0", [*scans[:50], *turned[74:]], single_map=False)
     errors, n = turns_between(free_robot, path, 0, 50)
     assert n == 49 and errors.max() < 0.02
     half = np.diag([-1.0, -1.0, 1.0])
@@ -210,15 +213,15 @@ def test_a_path_that_lost_its_way_goes_on_in_another_map(free_robot):
     known = path.seconds[path.ok]
     assert np.diff(known).max() > 1.0
     with pytest.raises(EstimationError, match="only 50 of 103 scans match"):
-        lidar_path("lidar0", [*scans[:50], *turned[74:]])
+        lidar_trajectory("lidar0", [*scans[:50], *turned[74:]])
 
 
 def test_a_long_path_is_followed_in_two_parts_at_once(free_robot, monkeypatch):
     """As good as in one, but for a second between the two maps."""
-    scans = scans_of(free_robot.streams[0])
-    one = lidar_path("lidar0", scans, whole=False)
-    monkeypatch.setattr(odometry, "MANY", len(scans))
-    two = lidar_path("lidar0", scans, whole=False)
+    scans = sampled_scans(free_robot.streams[0])
+    one = lidar_trajectory("lidar0", scans, single_map=False)
+    monkeypatch.setattr(odometry, "MIN_SCANS_FOR_TWO_MAPS", len(scans))
+    two = lidar_trajectory("lidar0", scans, single_map=False)
     assert one.ok.all()
     n = len(scans) // 2
     np.testing.assert_array_equal(two.rotation[:n], one.rotation[:n])
@@ -237,12 +240,12 @@ def poses_in_first(path):
 
 
 def test_parts_of_a_path_that_is_to_be_whole_are_joined(free_robot, monkeypatch):
-    scans = scans_of(free_robot.streams[0])
-    one = lidar_path("lidar0", scans)
-    monkeypatch.setattr(odometry, "MANY", len(scans))
-    joined = lidar_path("lidar0", scans)
+    scans = sampled_scans(free_robot.streams[0])
+    one = lidar_trajectory("lidar0", scans)
+    monkeypatch.setattr(odometry, "MIN_SCANS_FOR_TWO_MAPS", len(scans))
+    joined = lidar_trajectory("lidar0", scans)
     assert joined.ok.all() and len(joined.seconds) == len(scans)
-    n = len(scans) // 2 + odometry.SHARED
+    n = len(scans) // 2 + odometry.OVERLAP_SCANS
     np.testing.assert_array_equal(joined.rotation[:n], one.rotation[:n])
     assert not np.array_equal(joined.rotation[n:], one.rotation[n:])  # of another map
     (R, p), (R_one, p_one) = poses_in_first(joined), poses_in_first(one)
@@ -254,40 +257,43 @@ def test_parts_of_a_path_that_is_to_be_whole_are_joined(free_robot, monkeypatch)
 @pytest.mark.parametrize("many", [1, 10**6])
 def test_parts_that_share_too_little_are_not_joined(free_robot, monkeypatch, many: int):
     """The scans that both would share are of elsewhere, where the first map ends: the second is worth nothing."""
-    scans = scans_of(free_robot.streams[0])
+    scans = sampled_scans(free_robot.streams[0])
     middle = len(scans) // 2
-    away = slice(middle, middle + odometry.SHARED)
+    away = slice(middle, middle + odometry.OVERLAP_SCANS)
     scans[away] = [replace(s, xyz=s.xyz * [-1.0, -1.0, 1.0] + [3.0, 0.0, 1.0]) for s in scans[away]]
-    monkeypatch.setattr(odometry, "MANY", many)
+    monkeypatch.setattr(odometry, "MIN_SCANS_FOR_TWO_MAPS", many)
     with pytest.raises(EstimationError, match=f"only {middle} of {len(scans)} scans match"):
-        lidar_path("lidar0", scans)
+        lidar_trajectory("lidar0", scans)
 
 
 def test_a_path_begins_later_where_its_first_map_leads_nowhere(free_robot):
     """The first scans are of elsewhere: half a turn away, and 3 m."""
-    scans = scans_of(free_robot.streams[0])
+    scans = sampled_scans(free_robot.streams[0])
     odd = [replace(s, xyz=s.xyz * [-1.0, -1.0, 1.0] + [3.0, 0.0, 1.0]) for s in scans[:3]]
-    path = lidar_path("lidar0", [*odd, *scans[3:]])
+    path = lidar_trajectory("lidar0", [*odd, *scans[3:]])
     assert not path.ok[:3].any() and path.ok[8:].mean() > 0.95
     errors, n = turns_between(free_robot, path, 8, len(path.seconds))
     assert n > 60 and errors.max() < 0.02
 
 
-def expected_rows(e: Expected, pose: ScanPose) -> np.ndarray:
+def expected_rows(e: PosePrediction, pose: ScanPose) -> np.ndarray:
     """(12,) whitened: how a pose departs from what the scan before says of it, written out."""
     b, h = e.before, e.step
     turned = b.rotation.T @ pose.rotation
-    way = b.rotation @ e.way if e.knows_way else b.velocity * h
-    log = Rotation.from_matrix(e.turned.T @ turned if e.knows_turn else turned).as_rotvec()
+    way = b.rotation @ e.translation if e.knows_translation else b.velocity * h
+    log = Rotation.from_matrix(e.rotation.T @ turned if e.knows_rotation else turned).as_rotvec()
     moved = pose.position - b.position
+    mean_rate, mean_velocity = 0.5 * (b.rate + pose.rate), 0.5 * (b.velocity + pose.velocity)
     return POINT_SIGMA_M * np.concatenate(
         [
-            log / GYRO_SIGMA if e.knows_turn else (log - 0.5 * h * (b.rate + pose.rate)) / TURN_SIGMA,
-            (moved - way) / KNOWN_SIGMA
-            if e.knows_way
-            else (moved - 0.5 * h * (b.velocity + pose.velocity)) / MOVE_SIGMA,
-            pose.rate / RATE_SIGMA if e.knows_turn else (pose.rate - b.rate) / (ANGULAR_ACCELERATION * h),
-            (pose.velocity - (way / h if e.knows_way else b.velocity)) / (ACCELERATION * h),
+            log / GYRO_ROTATION_SIGMA if e.knows_rotation else (log - h * mean_rate) / STEP_ROTATION_SIGMA,
+            (moved - way) / KNOWN_TRANSLATION_SIGMA
+            if e.knows_translation
+            else (moved - h * mean_velocity) / STEP_POSITION_SIGMA,
+            pose.rate / GYRO_RATE_SIGMA
+            if e.knows_rotation
+            else (pose.rate - b.rate) / (ANGULAR_ACCELERATION_SIGMA * h),
+            (pose.velocity - (way / h if e.knows_translation else b.velocity)) / (ACCELERATION_SIGMA * h),
         ]
     )
 
@@ -299,15 +305,18 @@ def test_what_is_expected_of_a_pose_is_in_the_normal_equations(knows_turn: bool,
     slow = np.array([1.0, 0.01, 1.0])[:, None]  # turns little: the slope of the logarithm is taken for one
     before = ScanPose(random_rotations(None, seed=1).as_matrix(), *slow * rng.normal(size=(3, 3)))
     turned, way = Rotation.from_rotvec([0.03, -0.02, 0.05]).as_matrix(), rng.normal(scale=0.1, size=3)
-    e = Expected.of(before, 0.1, turned if knows_turn else None, way if knows_way else None)
-    predicted = expected_pose(e)
+    e = PosePrediction.of(before, 0.1, turned if knows_turn else None, way if knows_way else None)
+    predicted = predicted_pose(e)
     np.testing.assert_allclose(expected_rows(e, predicted)[:3], 0.0, atol=1e-9)
     np.testing.assert_allclose(expected_rows(e, predicted)[9:], 0.0, atol=1e-9)
-    pose = moved(predicted, np.array([1e-5, 2e-5, -1e-5, *rng.normal(scale=0.1, size=9)]))
+    pose = corrected_pose(predicted, np.array([1e-5, 2e-5, -1e-5, *rng.normal(scale=0.1, size=9)]))
     H, g, h = np.zeros((12, 12)), np.zeros(12), 1e-6
-    add_expected(e, pose, H, g)
+    add_prediction(e, pose, H, g)
     J = np.array(
-        [(expected_rows(e, moved(pose, h * d)) - expected_rows(e, moved(pose, -h * d))) / (2 * h) for d in np.eye(12)]
+        [
+            (expected_rows(e, corrected_pose(pose, h * d)) - expected_rows(e, corrected_pose(pose, -h * d))) / (2 * h)
+            for d in np.eye(12)
+        ]
     )
     J, r = J.T, expected_rows(e, pose)
     scale = np.sqrt(np.diag(J.T @ J))

@@ -21,7 +21,7 @@ from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.binning import LidarNoise
-from icalib.sensors.lidar.initialize.association import ROUNDS, associate, round_search
+from icalib.sensors.lidar.initialize.association import ASSOCIATION_ROUNDS, associate, round_search
 from icalib.sensors.lidar.initialize.association_rounds import check_shares
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.residual import LidarFactor
@@ -66,7 +66,7 @@ def solved(r, state, found):
     return outcome.state
 
 
-def calibrated(r, rounds=ROUNDS):
+def calibrated(r, rounds=ASSOCIATION_ROUNDS):
     """The state after the rounds, and the associations of all of them."""
     state, found = guessed(r), []
     for k in range(rounds):

@@ -9,8 +9,13 @@ import pytest
 
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.sensors.lidar.initialize.degeneracy import count_of, directions, facing, naming_sight
-from icalib.sensors.lidar.initialize.odometry import lidar_path, scans_of
+from icalib.sensors.lidar.initialize.degeneracy import (
+    count_directions,
+    explaining_degeneracy,
+    n_directions,
+    normal_shares,
+)
+from icalib.sensors.lidar.initialize.odometry import lidar_trajectory, sampled_scans
 
 
 def seeing(stream: LidarStream, faces: list[int]) -> LidarStream:
@@ -25,12 +30,12 @@ def seeing(stream: LidarStream, faces: list[int]) -> LidarStream:
 )
 def test_of_parts_of_a_room(free_robot, faces, count):
     """0: floor, 1: ceiling, 2 and 3, 4 and 5: walls that face each other."""
-    assert directions(seeing(free_robot.streams[0], faces)) == count
+    assert n_directions(seeing(free_robot.streams[0], faces)) == count
 
 
 @pytest.mark.parametrize("example", ["table2-planar", "table2-ramp", "straight-line"])
 def test_of_whole_rooms(robot, example):
-    assert directions(robot(6.0, 1, example=example).streams[0]) == 3
+    assert n_directions(robot(6.0, 1, example=example).streams[0]) == 3
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -40,25 +45,25 @@ def test_rings_that_are_far_apart_show_no_surfaces(robot, seed):
     with pytest.raises(
         EstimationError, match="% of the points of a scan lie on single rings, 0.* m and more apart, so that"
     ):
-        lidar_path("lidar0", scans_of(few))
+        lidar_trajectory("lidar0", sampled_scans(few))
     rng = np.random.default_rng(seed)
     cloud = replace(few, xyz=rng.normal(scale=4.0, size=few.xyz.shape).astype(np.float32))
     with pytest.raises(EstimationError, match="there may be too few flat surfaces, or the point times may be"):
-        lidar_path("lidar0", scans_of(cloud))
+        lidar_trajectory("lidar0", sampled_scans(cloud))
 
 
 def test_shares_of_normals():
     normal = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
-    np.testing.assert_allclose(facing(normal, np.array([1.0, 2.0, 1.0])), [0.0, 0.25, 0.75], atol=1e-12)
-    assert count_of(np.array([0.001, 0.25, 0.75])) == 2
+    np.testing.assert_allclose(normal_shares(normal, np.array([1.0, 2.0, 1.0])), [0.0, 0.25, 0.75], atol=1e-12)
+    assert count_directions(np.array([0.001, 0.25, 0.75])) == 2
 
 
 def test_only_what_a_lidar_saw_too_little_for_is_blamed_on_it(free_robot):
     whole = free_robot.streams[0]
-    with pytest.raises(EstimationError, match="another reason"), naming_sight([whole]):
+    with pytest.raises(EstimationError, match="another reason"), explaining_degeneracy([whole]):
         raise EstimationError("another reason.")
     with (
         pytest.raises(EstimationError, match="lidar0 sees face two directions only"),
-        naming_sight([whole, seeing(whole, [0, 2])]),
+        explaining_degeneracy([whole, seeing(whole, [0, 2])]),
     ):
         raise EstimationError("another reason.")

@@ -12,7 +12,7 @@ from icalib.motion.clouds import Clouds
 from icalib.pipeline import calibrate_measurements
 from icalib.sensors.lidar.initialize import association, association_rounds
 from icalib.sensors.lidar.initialize.association import Association, odd_step
-from icalib.sensors.lidar.initialize.association_rounds import _firsts, _of_all
+from icalib.sensors.lidar.initialize.association_rounds import _first_points, _unthinned
 from icalib.tools.simulation import rig_for
 
 pytestmark = pytest.mark.slow
@@ -34,16 +34,16 @@ def test_what_was_found_of_some_points_is_put_where_they_were(step):
     """Of two recordings, of which the second does not begin with a point that was looked at."""
     number = np.arange(23, dtype=np.int32)
     recordings = [(empty(10),), (empty(13),)]
-    firsts = _firsts(recordings)
+    firsts = _first_points(recordings)
     assert firsts.tolist() == [[0], [10]]
     for own, streams, first in zip((number[:10], number[10:]), recordings, firsts, strict=True):
         looked_at = own[own % step == 0]
         found = Association(Clouds(("plane 0",), (looked_at,)), np.zeros((1, 6)))
-        placed = _of_all(found, streams, first, step)
+        placed = _unthinned(found, streams, first, step)
         assert placed is not None
         (plane,) = placed.clouds.plane
         np.testing.assert_array_equal(plane, np.where(own % step == 0, own, -1))
-    assert _of_all(None, recordings[0], firsts[0], step) is None
+    assert _unthinned(None, recordings[0], firsts[0], step) is None
 
 
 def test_steps_are_odd_and_long_enough():

@@ -9,7 +9,7 @@ import pytest
 
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.sensors.lidar.initialize import self_returns
-from icalib.sensors.lidar.initialize.self_returns import _Near, own_points, without_own_robot
+from icalib.sensors.lidar.initialize.self_returns import _NearPoints, self_returns_of, without_self_returns
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +46,7 @@ PANELS = {
 @pytest.mark.parametrize("example", ["table2-3d", "table2-planar", "table2-ramp"])
 def test_points_on_the_robot_are_found(robot, example, panel):
     stream, hit = with_panel(robot(16.0, 1, {"azimuth_steps": 300}, example=example).streams[0], *panel)
-    own = own_points(stream)
+    own = self_returns_of(stream)
     assert own is not None and hit.mean() > 0.03
     assert own[hit].mean() > 0.99 and own[~hit].mean() < 0.01
 
@@ -58,33 +58,33 @@ def test_points_on_the_robot_are_found(robot, example, panel):
 def test_what_stays_in_place_but_is_not_the_robot_s(robot, example, changes):
     """The floor that a robot drives on, and everything while it stands."""
     stream = raw(robot(16.0, 1, {"azimuth_steps": 300} | changes, example=example).streams[0])
-    near = _Near.of(stream)
-    assert near.steady(np.arange(near.groups))[near.place].sum() > 0.02 * len(stream.xyz)
-    assert own_points(stream) is None
+    near = _NearPoints.of(stream)
+    assert near.occupied(np.arange(near.groups))[near.voxel].sum() > 0.02 * len(stream.xyz)
+    assert self_returns_of(stream) is None
 
 
 def test_that_the_floor_is_seen_from_afar_is_what_saves_it(robot, monkeypatch):
     stream = raw(robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0])
-    monkeypatch.setattr(self_returns, "SEEN_FROM_AFAR", 2.0)
-    assert own_points(stream) is not None
+    monkeypatch.setattr(self_returns, "MIN_SEEN_FROM_FAR", 2.0)
+    assert self_returns_of(stream) is not None
 
 
 def test_of_a_long_recording_its_middle_tells(robot, monkeypatch):
     """And the robot is found in all of it."""
-    monkeypatch.setattr(self_returns, "MOST_SCANS", 70)
+    monkeypatch.setattr(self_returns, "MAX_SEARCHED_SCANS", 70)
     whole = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0]
-    assert len(whole.stamps_ns) > 1.5 * self_returns.MOST_SCANS
+    assert len(whole.stamps_ns) > 1.5 * self_returns.MAX_SEARCHED_SCANS
     stream, hit = with_panel(whole, *PANELS["panel ahead"])
-    own = own_points(stream)
+    own = self_returns_of(stream)
     assert own is not None and own[hit].mean() > 0.99 and own[~hit].mean() < 0.01
-    assert own_points(raw(whole)) is None
+    assert self_returns_of(raw(whole)) is None
 
 
 def test_what_is_said_and_what_stays(robot):
     r = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar")
     stream, hit = with_panel(r.streams[0], *PANELS["panel ahead"])
     recording = replace(Measurements.of_streams(r.sim.measurements.imu, stream), warnings=("before.",))
-    found = without_own_robot(recording)
+    found = without_self_returns(recording)
     before, (said,) = found.warnings[0], found.warnings[1:]
     assert before == "before." and said.startswith("lidar0 has self-returns: ") and said.endswith(".")
     assert "% of its points" in said and "0.86 to 1.3" in said and "azimuth -0 deg" not in said
@@ -92,7 +92,7 @@ def test_what_is_said_and_what_stays(robot):
     (kept,) = found.lidars
     assert len(kept.stamps_ns) == len(stream.stamps_ns)
     assert len(kept.xyz) == pytest.approx((~hit).sum(), rel=0.01)
-    all_round = without_own_robot(recording.with_streams(with_panel(r.streams[0], *PANELS["deck below"])[0]))
+    all_round = without_self_returns(recording.with_streams(with_panel(r.streams[0], *PANELS["deck below"])[0]))
     assert "on all sides" in all_round.warnings[-1]
 
 
@@ -100,4 +100,4 @@ def test_points_of_known_planes_are_left_alone(robot):
     """Whoever knows what lies on which plane knows what is the robot's."""
     stream, _ = with_panel(robot(16.0, 1, {"azimuth_steps": 300}).streams[0], *PANELS["panel ahead"])
     known = Measurements.of_streams(replace(stream, plane=np.where(stream.xyz[:, 0] < 0.0, 1, -1).astype(np.int32)))
-    assert without_own_robot(known).lidars[0] is known.lidars[0]
+    assert without_self_returns(known).lidars[0] is known.lidars[0]

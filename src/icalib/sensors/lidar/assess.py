@@ -21,7 +21,7 @@ from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.binning import LidarNoise, in_world
-from icalib.sensors.lidar.initialize.degeneracy import count_of, facing
+from icalib.sensors.lidar.initialize.degeneracy import count_directions, normal_shares
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
 
@@ -208,7 +208,7 @@ def _degeneracy_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
     if any(s.gives_motion for s in inputs.rig.mounted if not isinstance(s, Lidar)):
         return
     normals = np.array([found.outcome.state.values[key][:3] for key in inputs.clouds.keys])
-    if count_of(facing(normals, inputs.clouds.points)) < 3:
+    if count_directions(normal_shares(normals, inputs.clouds.points)) < 3:
         names = " and ".join(x.name for x in inputs.rig.lidars)
         yield (
             f"the planes that {names} saw face two directions only, as in a corridor: only the IMU constrains the "

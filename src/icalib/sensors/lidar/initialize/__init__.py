@@ -13,12 +13,12 @@ from icalib.initialize.steps.rig_file_values import stated_values
 from icalib.optim.state import State
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.initialize.association_rounds import lidar_values, state_from_lidar, with_lidars
-from icalib.sensors.lidar.initialize.degeneracy import naming_sight
-from icalib.sensors.lidar.initialize.self_returns import without_own_robot
+from icalib.sensors.lidar.initialize.degeneracy import explaining_degeneracy
+from icalib.sensors.lidar.initialize.self_returns import without_self_returns
 
 
 class LidarInitializer(Initializer[Lidar]):
-    """The first LiDAR gives the motion where no camera sees a target; all others are placed on it."""
+    """The first LiDAR gives the trajectory if no camera sees a target. All others are aligned to it."""
 
     moves_keyframes = True
 
@@ -43,18 +43,18 @@ class LidarInitializer(Initializer[Lidar]):
         return lidar_values(inputs, state)
 
     def associated(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        """The points on planes. The rounds of association may stray from the guess where the motion shows nothing, so
-        that the guess is kept as it was before."""
+        """Points on planes. The rounds may change parameters that the motion does not determine, so the inputs keep the
+        initial guess from before the rounds."""
         known = {key: value for lidar in inputs.rig.lidars for key, value in stated_values(inputs, lidar).items()}
         guess = replace(state, values=state.values | known)
         inputs, state = with_lidars(inputs, state)
         return replace(inputs, guess=guess), state, known
 
     def cleaned(self, recording: Measurements) -> Measurements:
-        return without_own_robot(recording)
+        return without_self_returns(recording)
 
     def explaining(self, inputs: Inputs) -> AbstractContextManager[None]:
-        return naming_sight(() if inputs.rig.cameras else inputs.measurements.lidars)
+        return explaining_degeneracy(() if inputs.rig.cameras else inputs.measurements.lidars)
 
 
 INITIALIZER = LidarInitializer()

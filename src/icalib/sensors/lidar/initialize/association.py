@@ -1,7 +1,7 @@
-"""Planes that several LiDARs share, and which of their points lie on which, found anew in every round of a solve.
+"""Association of points with planes that several LiDARs share, repeated in each round of association and solve.
 
-Each round moves all points to where the last state has them, finds planes there and associates points with them,
-allowing for what that state may be off. A plane keeps its name from round to round by the points that it keeps.
+Each round transforms all points to the world by the current state, finds planes there, and associates points with them.
+The tolerance allows for errors of that state. A plane keeps its name from round to round if it keeps its points.
 """
 
 from __future__ import annotations
@@ -20,36 +20,37 @@ from icalib.optim.arrowhead import in_parallel
 from icalib.optim.state import Key
 from icalib.sensors.lidar.binning import in_world
 
-POINTS_AT_A_TIME = 200_000  # by one thread: what association needs beside the clouds stays small
-ROUNDS = 4
-MISPLACED = (0.03, 0.01, 0.003, 0.001)  # m, and rad about the sensor: what the states of the rounds may be off
-LEAST_SHARED = 0.5  # of a plane's points that had a plane before
+POINTS_PER_PART = 200_000  # of a thread at a time: bounds the memory beside the clouds
+ASSOCIATION_ROUNDS = 4
+# Assumed error of the state in each round: position [m], and rotation about the sensor [rad].
+STATE_ERRORS = (0.03, 0.01, 0.003, 0.001)
+MIN_SHARED_POINTS = 0.5  # share of a plane's points that had a plane before: the majority keeps the name
 
 
 @dataclass(frozen=True)
 class Association:
-    """Which of the planes (P, 6), normal and a point on it in the world, each point lies on, in the order of their
-    names."""
+    """Points associated with planes (P, 6): normal, and a point in the world, in the order of the names in `clouds`."""
 
     clouds: Clouds
     planes: np.ndarray
 
     @property
     def values(self) -> dict[Key, np.ndarray]:
+        """The planes as values of a state."""
         return {key: plane.copy() for key, plane in zip(self.clouds.keys, self.planes, strict=True)}
 
 
 def round_search(k: int, noise_m: float) -> PlaneSearch:
-    """What to allow for in round k, counted from 0; noise_m of a point."""
-    misplaced = MISPLACED[min(k, len(MISPLACED) - 1)]
-    return PlaneSearch(noise_m=noise_m, position_m=misplaced, angle_rad=misplaced)
+    """Tolerances of round k, counted from 0. noise_m: of a point."""
+    error = STATE_ERRORS[min(k, len(STATE_ERRORS) - 1)]
+    return PlaneSearch(noise_m=noise_m, position_m=error, angle_rad=error)
 
 
 def associate(
     streams: Sequence[LidarStream], motion: Motion, search: PlaneSearch, before: Association | None = None
 ) -> Association:
-    """Planes and points as the state of `motion` has them; names of planes are those of `before` where they share their
-    points. Raises EstimationError where there is no plane."""
+    """Planes, and their points, at the state of `motion`. Planes get the names of those in `before` with which they
+    share most points. Raises EstimationError if there is no plane."""
     moved = [in_world(motion, s) for s in streams]
     found = find_planes(*_thinned(moved), search)
     if not found.count:
@@ -58,33 +59,34 @@ def associate(
             f"{names} saw no flat surface of {search.smallest_m2} m^2 or more; record among walls and floors, "
             "or check the point times."
         )
-    plane = tuple(_of_points(found, points, seen_from, search) for points, seen_from in moved)
-    clouds = Clouds(_names(found.count, plane, before and before.clouds), plane)
+    plane = tuple(_plane_of_points(found, points, seen_from, search) for points, seen_from in moved)
+    clouds = Clouds(_plane_names(found.count, plane, before and before.clouds), plane)
     return Association(clouds, found.planes.copy())
 
 
 def _thinned(clouds: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Points and where they were seen from, of all clouds together, as many as the search looks at; by an odd step, or
-    only some of a spinning LiDAR's lasers would be left."""
+    """Points and the positions from which they were seen, of all clouds together, at most as many as the search uses.
+    The step is odd, as an even one would keep some lasers of a spinning LiDAR only."""
     step = odd_step(sum(len(points) for points, _ in clouds))
     points, seen_from = zip(*clouds, strict=True)
     return np.concatenate([p[::step] for p in points]), np.concatenate([s[::step] for s in seen_from])
 
 
 def odd_step(points: int) -> int:
-    """Every how manyth of so many points makes no more than the search looks at."""
+    """Odd step that leaves at most as many of so many points as the search uses."""
     return -(-points // MOST_POINTS) | 1
 
 
-def _of_points(found: FoundPlanes, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
-    """(N,) int32 as `FoundPlanes.of_points` has it, on two threads."""
-    parts = [slice(a, a + POINTS_AT_A_TIME) for a in range(0, len(points), POINTS_AT_A_TIME)]
+def _plane_of_points(found: FoundPlanes, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
+    """(N,) int32 plane of each point, -1: none; see `FoundPlanes.of_points`. On two threads."""
+    parts = [slice(a, a + POINTS_PER_PART) for a in range(0, len(points), POINTS_PER_PART)]
     own = in_parallel(lambda part: found.of_points(points[part], seen_from[part], search), parts)
     return np.concatenate([np.zeros(0, np.int32), *own])
 
 
-def _names(count: int, plane: tuple[np.ndarray, ...], before: Clouds | None) -> tuple[str, ...]:
-    """One for each of `count` planes: that of the plane before with which it shares most points, else a new one."""
+def _plane_names(count: int, plane: tuple[np.ndarray, ...], before: Clouds | None) -> tuple[str, ...]:
+    """A name for each of `count` planes: of the plane before with which it shares most points, else a new one. plane:
+    of each LiDAR's points (N,)."""
     if before is None:
         return tuple(f"plane {k}" for k in range(count))
     shared = np.zeros((count, len(before.names)), dtype=np.int64)
@@ -97,7 +99,7 @@ def _names(count: int, plane: tuple[np.ndarray, ...], before: Clouds | None) -> 
     for flat in np.argsort(-shared, axis=None, kind="stable"):
         q, k = divmod(int(flat), len(before.names))
         name = before.names[k]
-        if not names[q] and name not in names and shared[q, k] > LEAST_SHARED * total[q]:
+        if not names[q] and name not in names and shared[q, k] > MIN_SHARED_POINTS * total[q]:
             names[q] = name
     number = 1 + max(int(name.removeprefix("plane ")) for name in before.names)
     for q in range(count):

@@ -1,7 +1,7 @@
-"""Rounds of association and solve: from LiDARs about where they are to points on planes.
+"""Rounds of association and solve: from approximate extrinsics of LiDARs to points on planes.
 
-Cameras, or without any the first LiDAR itself, give the motion; every other LiDAR is placed on it. Then points are
-associated with planes and everything is solved, again and again, each time with less allowed for what may be off.
+Cameras give the trajectory, or else the first LiDAR. All other LiDARs are aligned to it. Then points are associated
+with planes and all parameters are solved, in rounds with decreasing tolerance.
 """
 
 from __future__ import annotations
@@ -37,32 +37,38 @@ from icalib.motion.point_planes import are_somewhere, thinned
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.state import Key, State
 from icalib.sensors.lidar.binning import COARSE_BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
-from icalib.sensors.lidar.initialize.association import ROUNDS, Association, associate, odd_step, round_search
-from icalib.sensors.lidar.initialize.degeneracy import naming_sight
+from icalib.sensors.lidar.initialize.association import (
+    ASSOCIATION_ROUNDS,
+    Association,
+    associate,
+    odd_step,
+    round_search,
+)
+from icalib.sensors.lidar.initialize.degeneracy import explaining_degeneracy
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.model import FIRST_RANGE_SIGMA_M
 from icalib.sensors.sensor import MOUNTED_NAMES
 
-FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
+# The rounds diverge if the share of points on planes is below both: of all points, and of the share in the first round.
+MIN_LAST_SHARE, MIN_RELATIVE_SHARE = 0.2, 0.7
 
 
 def state_from_lidar(inputs: Inputs) -> State:
-    """Where the solver starts where no camera shows the motion: the first LiDAR and the IMU do. Of several recordings
-    the one with most points says how the LiDAR stands.
+    """The initial state from the first LiDAR and the IMU. The recording with most points gives the extrinsics.
 
-    Raises EstimationError where they do not.
+    Raises EstimationError if a recording does not determine the trajectory.
     """
 
     def state_of(own: Inputs, held: KnownExtrinsics | None) -> State:
-        with naming_sight(own.measurements.lidars[:1]):
-            return _state_of_one(own, held)
+        with explaining_degeneracy(own.measurements.lidars[:1]):
+            return _single_state(own, held)
 
     first = inputs.rig.lidars[0]
     return states_from_best(inputs, first, fullest_recording(inputs, first.name), state_of)
 
 
-def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
-    """Of one recording; `held`: how the LiDAR stands, where another has shown it."""
+def _single_state(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
+    """The initial state of one recording. held: extrinsics of the LiDAR from another recording."""
     assert inputs.imu is not None
     lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
     try:
@@ -73,9 +79,9 @@ def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
         known = known_extrinsics(inputs, lidar, guesses=True)
         if held is not None or known.rotation is None or known.offset is None:
             raise
-        # The motion shows too little; the rig file's guess stands in.
+        # Without sufficient motion the initial guess of the rig file is used instead.
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
-    # What turns show is nearer than a guess, with which planes would be thick, and steps towards them lead astray.
+    # Rotation and offset from angular rates are more accurate than a guess, by which planes would be too thick to find.
     names = ("translation", *known_names(lidar)) if guess.turned else MOUNTED_NAMES
     own, known = guess.values(lidar.name), stated_values(inputs, lidar, names)
     values = start_values(inputs, merged_values(lidar, known, own) if guess.turned else own | known)
@@ -86,40 +92,41 @@ def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
 
 
 def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
-    """`inputs` with points of the LiDARs on planes, and `state`, which has the motion and a guess of all, with the
-    planes, led on by the rounds. Raises EstimationError where there are no planes."""
-    inputs = while_known(inputs, state)
+    """Inputs with points associated with planes, and the state after the rounds, with planes. `state` has the
+    trajectory and initial values of all parameters. Raises EstimationError if there are no planes."""
+    inputs = with_known_motion(inputs, state)
     recordings = points_by_recording(inputs)
     if any((s.plane >= 0).any() for streams in recordings for s in streams):
         clouds = joined_clouds([known_planes(streams) for streams in recordings])
         return with_clouds(inputs, clouds), replace(state, values=state.values | fitted_planes(inputs, state, clouds))
-    with naming_sight(inputs.measurements.lidars):
-        return _led_by_rounds(inputs, state, recordings)
+    with explaining_degeneracy(inputs.measurements.lidars):
+        return _after_rounds(inputs, state, recordings)
 
 
-def _led_by_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[LidarStream, ...]]) -> tuple[Inputs, State]:
-    """See `with_lidars`: all rounds but the last with fewer points."""
+def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[LidarStream, ...]]) -> tuple[Inputs, State]:
+    """See `with_lidars`. All rounds except the last use thinned points."""
     step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars))
-    fewer = _thinned(inputs, step)
+    fewer = _thinned_inputs(inputs, step)
     found: Sequence[Association | None] = [None] * len(recordings)
     shares = []
-    for k in range(ROUNDS - 1):
+    for k in range(ASSOCIATION_ROUNDS - 1):
         fewer, state, found = _associated(fewer, state, k, found)
-        shares.append(_share(fewer.clouds))
+        shares.append(_share_on_planes(fewer.clouds))
         state = first_pass(fewer, state)
     before = [
-        _of_all(a, streams, first, step)
-        for a, streams, first in zip(found, recordings, _firsts(recordings), strict=True)
+        _unthinned(a, streams, first, step)
+        for a, streams, first in zip(found, recordings, _first_points(recordings), strict=True)
     ]
-    inputs, state, _ = _associated(inputs, state, ROUNDS - 1, before)
-    check_shares([*shares, _share(inputs.clouds)], " and ".join(s.name for s in inputs.measurements.lidars))
+    inputs, state, _ = _associated(inputs, state, ASSOCIATION_ROUNDS - 1, before)
+    check_shares([*shares, _share_on_planes(inputs.clouds)], " and ".join(s.name for s in inputs.measurements.lidars))
     return inputs, state
 
 
 def _associated(
     inputs: Inputs, state: State, k: int, before: Sequence[Association | None]
 ) -> tuple[Inputs, State, list[Association]]:
-    """Round k: points on planes as the state has them; `before`: of each recording, what the round before found."""
+    """Association of round k at `state`, without a solve: inputs, state with planes, and the association of each
+    recording. before: associations of the round before, None in the first."""
     noise = max(x.range_noise_m or FIRST_RANGE_SIGMA_M for x in inputs.rig.lidars)
     found = []
     for r, streams in enumerate(points_by_recording(inputs)):
@@ -131,24 +138,23 @@ def _associated(
     return with_clouds(inputs, clouds), replace(state, values=values), found
 
 
-def _thinned(inputs: Inputs, step: int) -> Inputs:
-    """With every `step`th point only, no more than the search for planes looks at: where all is does not depend on
-    more, and the last round uses all."""
+def _thinned_inputs(inputs: Inputs, step: int) -> Inputs:
+    """The inputs with each `step`th point. More points than the plane search uses do not improve early rounds."""
     streams = inputs.measurements.lidars
     fewer = [s.some(np.arange(len(s.xyz)) % step == 0) for s in streams]
     return replace(inputs, measurements=inputs.measurements.with_streams(*fewer))
 
 
-def _firsts(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
-    """(R, L) number of the first point of each recording among all of a LiDAR."""
+def _first_points(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
+    """(R, L) number of the first point of each recording among all points of each LiDAR."""
     sizes = np.array([[len(s.xyz) for s in streams] for streams in recordings])
     return np.cumsum(sizes, axis=0) - sizes
 
 
-def _of_all(
+def _unthinned(
     found: Association | None, streams: tuple[LidarStream, ...], first: np.ndarray, step: int
 ) -> Association | None:
-    """What was found of thinned points as of all points of a recording; `first` (L,): see `_firsts`."""
+    """The association of thinned points as one of all points of a recording; first (L,): see `_first_points`."""
     if found is None:
         return None
     planes = tuple(np.full(len(s.xyz), -1, np.int32) for s in streams)
@@ -157,14 +163,16 @@ def _of_all(
     return replace(found, clouds=replace(found.clouds, plane=planes))
 
 
-def _share(clouds: Clouds) -> float:
+def _share_on_planes(clouds: Clouds) -> float:
+    """Share of the points that lie on planes."""
     return float(clouds.points.sum() / max(sum(len(p) for p in clouds.plane), 1))
 
 
 def check_shares(shares: Sequence[float], names: str) -> None:
-    """From round to round walls get thinner and more points lie on them; where fewer do, the estimate leads away."""
+    """Raises EstimationError if the rounds diverge: planes must get thinner from round to round, and have more
+    points."""
     first, last = shares[0], shares[-1]
-    if last < FEW and last < LOST * first:
+    if last < MIN_LAST_SHARE and last < MIN_RELATIVE_SHARE * first:
         raise EstimationError(
             f"fewer and fewer points of {names} lie on planes ({first:.0%}, then {last:.0%}), so the initial "
             "guess is too far off; correct rotation, translation and time_offset in the rig file, or remove "
@@ -173,13 +181,13 @@ def check_shares(shares: Sequence[float], names: str) -> None:
 
 
 def _without_planes(state: State) -> dict[Key, np.ndarray]:
+    """Values of the state without those of planes."""
     return {key: value for key, value in state.values.items() if key[1] != "plane"}
 
 
-def while_known(inputs: Inputs, state: State) -> Inputs:
-    """`inputs` without points that are nowhere, and without scans beyond the keyframes of `state`: carried there by the
-    IMU alone, their points would count as if its readings had no noise. Raises EstimationError where no scan is
-    left."""
+def with_known_motion(inputs: Inputs, state: State) -> Inputs:
+    """Inputs without points that are not finite, and without scans far from the keyframes of `state`: poses propagated
+    there have errors that the model does not contain. Raises EstimationError if no scan is left."""
     measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
     for stream in measured.lidars:
         begin = instants(stream, state.values)
@@ -201,10 +209,10 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
 
 
 def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
-    """Of all LiDARs that `state`, which has the motion, does not have: what the rig gives, or what their scans show; of
-    the others what the rig trusts.
+    """Initial extrinsics and time offsets of all LiDARs, given the trajectory in `state`.
 
-    Raises EstimationError where neither does.
+    A LiDAR that `state` lacks has the values of the rig file, or those from its scans. The others have the known values
+    of the rig file alone. Raises EstimationError if a recording does not determine them.
     """
     out: dict[Key, np.ndarray] = {}
     for i, lidar in enumerate(inputs.rig.lidars):
@@ -217,7 +225,7 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             own, motion = single_recording(inputs, k), state_of_recording(inputs, k, state)
             assert own.imu is not None
             stream = own.measurements.lidars[i]
-            with naming_recording(inputs, k), naming_sight([stream]):
+            with naming_recording(inputs, k), explaining_degeneracy([stream]):
                 found = lidar_on_motion(own.imu, stream, motion, known_extrinsics(own, lidar))
             offsets = np.array([converted_offset(found.offset, lidar.name, own, inputs)])
             if lidar.clock_restarts:
@@ -230,16 +238,17 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
 
 
 def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: KnownExtrinsics, recording: int) -> float:
-    """Of a LiDAR in one recording, between its own first stamps, which stands as `held` in all."""
+    """Time offset [s] of the LiDAR number `lidar` in one recording, between first stamps, with extrinsics `held`."""
     own, motion = single_recording(inputs, recording), state_of_recording(inputs, recording, state)
     assert own.imu is not None
     stream = own.measurements.lidars[lidar]
-    with naming_sight([stream]):
+    with explaining_degeneracy([stream]):
         return lidar_on_motion(own.imu, stream, motion, held).offset
 
 
 def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.ndarray]:
-    """Values of the planes that fit the points best where `state` puts them, some of very many."""
+    """Planes fitted to known points on planes at `state` (total least squares), as values of a state. Of very many
+    points some are used."""
     motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
     for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
         if (plane >= 0).any():
@@ -255,7 +264,7 @@ def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.
 
 
 def _add_in_world(moments: Moments, motion: Motion, stream: LidarStream, sums: np.ndarray) -> None:
-    """Adds to sums (P, 4, 4) those of (1, x) (1, x)^T over the points x of each plane, in the world."""
+    """Adds the sums of (1, x) (1, x)^T over the points x of each plane, in the world, to sums (P, 4, 4)."""
     at = sweep(motion, stream.name, instants(stream, motion.state.values, moments.seconds))
     bin_of = np.repeat(np.arange(len(moments.seconds)), np.diff(moments.start))
     L, A = np.zeros((len(bin_of), 4, 4)), np.zeros((len(bin_of), 4, 4))
@@ -266,7 +275,8 @@ def _add_in_world(moments: Moments, motion: Motion, stream: LidarStream, sums: n
 
 
 def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
-    """All LiDARs' points of each recording, on the joined clock; scans of the others stay, without points."""
+    """Streams of all LiDARs with the points of each recording, on the joined clock. All scans stay, without points of
+    other recordings."""
     streams = inputs.measurements.lidars
     if len(inputs.parts) == 1:
         return [streams]

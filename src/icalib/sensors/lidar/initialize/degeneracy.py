@@ -1,4 +1,4 @@
-"""In how many directions the surfaces face that a LiDAR sees: what a floor, a single wall or a corridor cannot show."""
+"""Geometric degeneracy of a scene: whether the flat surfaces that a LiDAR sees face fewer than three directions."""
 
 from __future__ import annotations
 
@@ -11,59 +11,60 @@ from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert
 
-SCANS = 20
-MOST_POINTS = 6000  # of a scan
-VOXEL_M = 1.0
-CAPACITY = 1 << 13
-FEWEST_SCANS = 5  # with anything flat
-LEAST_SHARE = 0.02  # of all points: 0.2 and more on walls across, 0.002 and less where noise alone tilts voxels
-SEEN = {
+N_SAMPLED_SCANS = 20  # of a recording, evenly spread: enough for a median
+MAX_SAMPLED_POINTS = 6000  # of a scan
+NORMAL_VOXEL_M = 1.0  # edge of the voxels whose normals are counted
+MAX_NORMAL_VOXELS = 1 << 13
+MIN_PLANAR_SCANS = 5  # scans with planar voxels, for a verdict
+MIN_DIRECTION_SHARE = 0.02  # of the points: 0.2 and more on walls that face it, 0.002 and less by noise of normals
+DEGENERACIES = {
     1: "face one direction only, such as a floor or parallel walls, so the motion along them is unobservable",
     2: "face two directions only, as in a corridor, so the motion along both is unobservable",
 }
 
 
 @contextmanager
-def naming_sight(streams: Sequence[LidarStream]) -> Iterator[None]:
-    """An EstimationError raised within speaks of what the LiDARs saw, where one saw too little to tell its motion."""
+def explaining_degeneracy(streams: Sequence[LidarStream]) -> Iterator[None]:
+    """Replaces an EstimationError raised within by one that names the degenerate scene, if a LiDAR saw such a scene."""
     try:
         yield
     except EstimationError as error:
         for stream in streams:
-            if (faces := directions(stream)) in SEEN:
+            if (n := n_directions(stream)) in DEGENERACIES:
                 raise EstimationError(
-                    f"the flat surfaces that {stream.name} sees {SEEN[faces]}; record where walls and floor "
+                    f"the flat surfaces that {stream.name} sees {DEGENERACIES[n]}; record where walls and floor "
                     "face three directions, or together with a camera that sees a target."
                 ) from error
         raise
 
 
-def directions(stream: LidarStream) -> int:
-    """How many directions, 1 to 3, flat surfaces face in most scans; 0 where hardly anything is flat."""
+def n_directions(stream: LidarStream) -> int:
+    """Number of directions, 1 to 3, that flat surfaces face in most scans; 0 if few scans have flat surfaces."""
     filled = np.flatnonzero(np.diff(stream.start) > 0)
-    some = filled[np.linspace(0, len(filled) - 1, min(SCANS, len(filled))).astype(np.int64)]
-    found = [shares for i in some if (shares := _shares(stream, int(i))) is not None]
-    return count_of(np.median(found, axis=0)) if len(found) >= FEWEST_SCANS else 0
+    some = filled[np.linspace(0, len(filled) - 1, min(N_SAMPLED_SCANS, len(filled))).astype(np.int64)]
+    found = [shares for i in some if (shares := _scan_shares(stream, int(i))) is not None]
+    return count_directions(np.median(found, axis=0)) if len(found) >= MIN_PLANAR_SCANS else 0
 
 
-def count_of(shares: np.ndarray) -> int:
-    """Number of independent normal directions, from the shares of `facing`."""
-    return int((shares > LEAST_SHARE).sum())
+def count_directions(shares: np.ndarray) -> int:
+    """Number of independent directions, from the shares (3,) of `normal_shares`."""
+    return int((shares > MIN_DIRECTION_SHARE).sum())
 
 
-def _shares(stream: LidarStream, scan: int) -> np.ndarray | None:
-    """(3,) of the points of a scan on surfaces that face each of three directions, across one another."""
+def _scan_shares(stream: LidarStream, scan: int) -> np.ndarray | None:
+    """`normal_shares` (3,) of a scan, weighted by points; None if no voxel is planar."""
     xyz = stream.xyz[stream.start[scan] : stream.start[scan + 1]].astype(np.float64)
     size2 = (xyz**2).sum(axis=1)
     xyz = xyz[np.isfinite(size2) & (size2 > 0.0)]
-    xyz = xyz[:: -(-len(xyz) // MOST_POINTS) | 1]
-    voxels = VoxelMap.empty(VOXEL_M, CAPACITY)
+    xyz = xyz[:: -(-len(xyz) // MAX_SAMPLED_POINTS) | 1]
+    voxels = VoxelMap.empty(NORMAL_VOXEL_M, MAX_NORMAL_VOXELS)
     here = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
     insert(voxels, here, xyz, np.zeros(len(xyz)), 0, 1.0)
     normal, weight = voxels.normal[voxels.flat], voxels.weight[voxels.flat]
-    return facing(normal, weight) if len(normal) else None
+    return normal_shares(normal, weight) if len(normal) else None
 
 
-def facing(normal: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(3,) shares of the weight (n,), increasing, of normals (n, 3) along their own axes."""
+def normal_shares(normal: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(3,) shares of the weight (n,) of normals (n, 3) along their principal axes, increasing: eigenvalues of the
+    weighted mean of n n^T."""
     return np.linalg.eigvalsh((normal * weight[:, None]).T @ normal / weight.sum())

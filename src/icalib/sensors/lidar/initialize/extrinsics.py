@@ -1,8 +1,8 @@
-"""A LiDAR's extrinsics and time offset from nothing, with the motion of the IMU where nothing else shows it.
+"""Initial extrinsics and time offset of a LiDAR, and the IMU trajectory if no other sensor gives it.
 
-Its scans, registered one after the other, say how it turned; the gyroscope says the same of the IMU, which gives time
-offset and rotation. Turned by the gyroscope, the scans are registered again, and better. Their positions then give the
-lever arm: against a motion that cameras or another LiDAR showed, or against the IMU's own readings, with gravity.
+Odometry gives angular rates of the LiDAR. Alignment with the gyroscope gives time offset and rotation. With rotations
+from the gyroscope, odometry is repeated, and is more accurate. The lever arm follows from its positions: against a
+known trajectory, or against the readings of the IMU, together with gravity.
 """
 
 from __future__ import annotations
@@ -32,20 +32,21 @@ from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess, Se
 from icalib.initialize.trajectories.trajectory_fit import TRAJECTORY_GRAVITY_TOLERANCE, fit_imu_trajectory
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
-from icalib.sensors.lidar.initialize.odometry import Scan, lidar_path, scans_of
+from icalib.sensors.lidar.initialize.odometry import Scan, lidar_trajectory, sampled_scans
 
-LEAST_CORRELATION = 0.6  # of turning rates with the IMU's
-ARM_ROUNDS = 2  # each brings the path nearer to the known motion
-SAME_RAD, SAME_S = 5e-3, 1e-3  # alignments this near turn a scan's points alike, to what the registration allows for
+MIN_LIDAR_RATE_CORRELATION = 0.6  # of angular rates with those of the gyroscope
+LEVER_ARM_ROUNDS = 2  # of odometry near the known trajectory, and lever arm
+# Alignments nearer than this rotate the points of a scan alike, within the noise of the registration.
+SAME_ALIGNMENT_RAD, SAME_ALIGNMENT_S = 5e-3, 1e-3
 
 
 def lidar_and_motion(
     imu: ImuData, stream: LidarStream, gravity: float, held: KnownExtrinsics = NOTHING_KNOWN
 ) -> tuple[ExtrinsicsGuess, ImuTrajectory]:
-    """From one LiDAR and the IMU alone; gravity [m/s^2]. Raises EstimationError, one sentence, where the recording does
-    not show it."""
-    aligned, path, rates = _aligned(imu, stream.name, scans_of(stream), held)
-    found = fit_imu_trajectory(imu, path, rates, aligned, gravity, held)
+    """Extrinsics and IMU trajectory from one LiDAR and the IMU. gravity [m/s^2]; held: known extrinsics. Raises
+    EstimationError if the recording does not determine them."""
+    aligned, trajectory, rates = _aligned(imu, stream.name, sampled_scans(stream), held)
+    found = fit_imu_trajectory(imu, trajectory, rates, aligned, gravity, held)
     if found is None:
         raise _too_short(stream)
     _check_axes(stream.name, imu.name, found.unexplained > MIN_MIRRORED_SHARE)
@@ -56,19 +57,19 @@ def lidar_and_motion(
 def lidar_on_motion(
     imu: ImuData, stream: LidarStream, known: State, held: KnownExtrinsics = NOTHING_KNOWN
 ) -> ExtrinsicsGuess:
-    """From the motion of the IMU in `known`: keyframes no further apart than 50 ms or so. Raises EstimationError, one
-    sentence, where the recording does not show it."""
-    scans = scans_of(stream)
-    aligned, alone, rates = _aligned(imu, stream.name, scans, held)
+    """Extrinsics given the IMU trajectory `known`, with keyframes at most some 50 ms apart. held: known extrinsics.
+    Raises EstimationError if the recording does not determine them."""
+    scans = sampled_scans(stream)
+    aligned, free, rates = _aligned(imu, stream.name, scans, held)
     guess = ExtrinsicsGuess(aligned.rotation, np.zeros(3) if held.position is None else held.position, aligned.offset)
     prior = lever_arm_prior(np.zeros(0), rates.rate, DISPLACEMENT_SIGMA_M, held.rotation is not None, held.position)
     gyro = GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0))
 
-    def against(path: SensorTrajectory, now: ExtrinsicsGuess) -> ExtrinsicsGuess:
-        t = path.seconds + now.offset
-        path = path.only(path.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
-        R, p = imu_poses_at(known, gyro, path.seconds + now.offset)
-        system = system_from_trajectory(R, p, path.seconds, path.rotation, path.position)
+    def fitted(trajectory: SensorTrajectory, now: ExtrinsicsGuess) -> ExtrinsicsGuess:
+        t = trajectory.seconds + now.offset
+        trajectory = trajectory.only(trajectory.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
+        R, p = imu_poses_at(known, gyro, trajectory.seconds + now.offset)
+        system = system_from_trajectory(R, p, trajectory.seconds, trajectory.rotation, trajectory.position)
         found = solve_lever_arm(system, prior, now.rotation, rates.rate)
         if found is None:
             raise _too_short(stream)
@@ -76,62 +77,64 @@ def lidar_on_motion(
         return ExtrinsicsGuess(found[0], found[1][3:6], aligned.offset)
 
     if held.rotation is None and only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is not None:
-        # Which way the known motion is for the LiDAR, that motion itself has to show first.
-        guess = against(alone, guess)
-    for _ in range(ARM_ROUNDS):
-        guess = against(_path_on(stream.name, scans, known, gyro, guess), guess)
+        # Rates about one axis leave the rotation about it free: the known trajectory must fix it first.
+        guess = fitted(free, guess)
+    for _ in range(LEVER_ARM_ROUNDS):
+        guess = fitted(_trajectory_near(stream.name, scans, known, gyro, guess), guess)
     return guess
 
 
-def _path_on(
+def _trajectory_near(
     name: str, scans: list[Scan], known: State, gyro: GyroRotation, guess: ExtrinsicsGuess
 ) -> SensorTrajectory:
-    """The path while the motion is known, near what motion and guess say: scans that show nothing of one direction do
-    not drift."""
+    """Odometry near the trajectory that `known` and `guess` predict, so that it does not drift in degenerate scenes."""
 
-    def moving(t: np.ndarray) -> np.ndarray:
+    def position_at(t: np.ndarray) -> np.ndarray:
         R, p = imu_poses_at(known, gyro, np.clip(t + guess.offset, known.seconds[0], known.seconds[-1]))
         return p + R @ guess.position
 
-    def turned(t: np.ndarray) -> np.ndarray:
+    def rotation_at(t: np.ndarray) -> np.ndarray:
         return gyro.carry(known.seconds, known.rotation, t + guess.offset) @ guess.rotation
 
-    return lidar_path(name, scans, turned, moving)
+    return lidar_trajectory(name, scans, rotation_at, position_at)
 
 
 def _aligned(
     imu: ImuData, name: str, scans: list[Scan], held: KnownExtrinsics
 ) -> tuple[RateAlignment, SensorTrajectory, SensorRates]:
-    """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
-    running, and its rates."""
-    first = align_trajectory(imu, name, _rates(name, lidar_path(name, scans, whole=False)), held)
-    path = _turned_path(imu, name, scans, first)
-    rates = _rates(name, path)
+    """Time offset, rotation and gyroscope bias; LiDAR trajectory with the rotations of the gyroscope, while the IMU was
+    running; and its angular rates."""
+    first = align_trajectory(imu, name, _rates(name, lidar_trajectory(name, scans, single_map=False)), held)
+    trajectory = _trajectory_with_gyro(imu, name, scans, first)
+    rates = _rates(name, trajectory)
     aligned = align_trajectory(imu, name, rates, held)
-    if not _alike(first, aligned):
-        path = _turned_path(imu, name, scans, aligned)
-    t = path.seconds + aligned.offset
-    inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
-    return aligned, path.only(inside), rates
+    if not _is_same(first, aligned):
+        trajectory = _trajectory_with_gyro(imu, name, scans, aligned)
+    t = trajectory.seconds + aligned.offset
+    inside = trajectory.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
+    return aligned, trajectory.only(inside), rates
 
 
-def _alike(a: RateAlignment, b: RateAlignment) -> bool:
+def _is_same(a: RateAlignment, b: RateAlignment) -> bool:
+    """Whether two alignments rotate the points of a scan alike."""
     apart = so3.log(np.ascontiguousarray(a.rotation.T @ b.rotation))
-    return float(np.linalg.norm(apart)) < SAME_RAD and abs(a.offset - b.offset) < SAME_S
+    return float(np.linalg.norm(apart)) < SAME_ALIGNMENT_RAD and abs(a.offset - b.offset) < SAME_ALIGNMENT_S
 
 
-def _turned_path(imu: ImuData, name: str, scans: list[Scan], aligned: RateAlignment) -> SensorTrajectory:
+def _trajectory_with_gyro(imu: ImuData, name: str, scans: list[Scan], aligned: RateAlignment) -> SensorTrajectory:
+    """Odometry with the rotations of the gyroscope."""
     gyro = GyroRotation.integrate(imu, aligned.gyro_bias)
-    return lidar_path(name, scans, lambda t: gyro.at(t + aligned.offset) @ aligned.rotation)
+    return lidar_trajectory(name, scans, lambda t: gyro.at(t + aligned.offset) @ aligned.rotation)
 
 
-def _rates(name: str, path: SensorTrajectory) -> SensorRates:
-    t, R = path.seconds[path.ok], path.rotation[path.ok]
+def _rates(name: str, trajectory: SensorTrajectory) -> SensorRates:
+    """Mean angular rates from scan to scan, in axes of the LiDAR."""
+    t, R = trajectory.seconds[trajectory.ok], trajectory.rotation[trajectory.ok]
     near = np.diff(t) < MAX_PROPAGATION_S
     turn = so3.log_many(np.ascontiguousarray(R[:-1].transpose(0, 2, 1) @ R[1:])) / np.diff(t)[:, None]
     if near.sum() < 2:
         raise EstimationError(f"{name}: its scans are more than {MAX_PROPAGATION_S} s apart; record at a higher rate.")
-    return SensorRates(t[:-1][near], t[1:][near], turn[near], LEAST_CORRELATION)
+    return SensorRates(t[:-1][near], t[1:][near], turn[near], MIN_LIDAR_RATE_CORRELATION)
 
 
 def _too_short(stream: LidarStream) -> EstimationError:
@@ -142,10 +145,11 @@ def _too_short(stream: LidarStream) -> EstimationError:
 
 
 def _check_axes(lidar: str, imu: str, mirrored: bool) -> None:
+    """Raises EstimationError if the positions are mirrored."""
     if mirrored:
         raise EstimationError(
-            f"{lidar} turns as {imu} does, but moves the other way: its points are mirrored, for one of its "
-            "axes or the direction of its azimuth is reversed. Make its axes right-handed. Or the "
+            f"{lidar} turns as {imu} does, but moves the other way: its points are mirrored, as one of its axes, or "
+            "the direction of its azimuth, is reversed. Make its axes right-handed. Or the "
             f"accelerometer is inverted: set accel_axes: [-x, -y, -z] of {imu} in the rig file."
         )
 

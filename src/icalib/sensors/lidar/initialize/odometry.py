@@ -1,8 +1,8 @@
-"""How a LiDAR moved, scan by scan: each is registered to a map of flat voxels that those before it made.
+"""LiDAR odometry: each scan is registered to a map of planar voxels that the scans before it made.
 
-A scan has a pose at its middle and a twist: each point is seen from where the LiDAR was at its own instant. Without the
-gyroscope the twist holds for the turning, too; once the LiDAR is aligned with the IMU, the gyroscope turns the points
-of a scan back to its middle, and says how it stands to the scan before.
+A scan has a pose at its middle and a twist, so that each point is seen from the pose at its own instant. Without the
+gyroscope the twist describes the rotation within a scan, too. Once the LiDAR is aligned with the IMU, the gyroscope
+rotates the points of a scan to its middle and predicts the rotation since the scan before.
 """
 
 from __future__ import annotations
@@ -17,240 +17,286 @@ from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.initialize.trajectories.sensor_trajectory import SensorTrajectory
 from icalib.optim.arrowhead import THREADS
-from icalib.sensors.lidar.initialize.registration import Expected, expected_pose, register
-from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert, pick, turn_back
+from icalib.sensors.lidar.initialize.registration import PosePrediction, predicted_pose, register
+from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert, pick_points, rotate_points
 
-MOST_MATCHED, MOST_MAPPED = 1500, 6000  # points of a scan
-MOST_WIDE = 500  # while the pose is rough, and every point looks into many voxels
-GOLDEN = 0.6180339887498949  # steps of this share of the whole leave no gaps, wherever they end
-FEWEST_POINTS = 100
-FEWEST_SCANS = 20
-NEAREST_M = 0.3  # nearer than this is the LiDAR's own housing
-VOXELS_IN_REACH = 8.0  # edges in the median range
-EDGES_M = (0.3, 2.0)
-CAPACITY = 1 << 17
-LAST_SCALE, LAST_SCALE_TURNED = 0.2, 0.1
-MOST_LOST = 5  # scans in a row that do not fit the map, before there is another
-MANY = 200  # scans: worth two maps
-SHARED, FEWEST_SHARED = 20, 5  # scans that are in both maps, where these are to be one
-FEW = 10  # scans on a map that is no loss: its first scan may show too little of what the next ones see
-MOST_ON_LINES = 0.8  # of a scan's points; where more lie on single rings, the scan has no surfaces
-FEWEST_IN_VOXEL, NARROW = 5, 0.25  # points; width of a line, by its length
-LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
-FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
-KEEP, KEEP_TURNED = 0.85, 0.995  # of what a voxel holds, by the scan
-TURN_STEP_S = 1e-3  # of the gyroscope's turns within a scan
-LONGEST_STEP_S = 1.0
+# Points of a scan:
+MAX_MATCHED_POINTS, MAX_MAPPED_POINTS = 1500, 6000  # registered to the map, and added to it
+MAX_NEIGHBOUR_POINTS = 500  # in steps that search 27 voxels for each point
+MIN_SCAN_POINTS = 100  # of a scan that is used
+MIN_ODOMETRY_RANGE_M = 0.3  # nearer points lie on the housing of the LiDAR
+GOLDEN_RATIO = 0.6180339887498949  # of all points as a step: any number of steps covers a scan evenly
+MIN_SCANS = 20  # of a recording
+# The map:
+VOXELS_PER_MEDIAN_RANGE = 8.0  # edges of a voxel in the median range of points
+VOXEL_EDGE_RANGE_M = (0.3, 2.0)  # shortest and longest edge
+MAX_VOXELS = 1 << 17  # 25 MB
+SCAN_DECAY, SCAN_DECAY_WITH_GYRO = (
+    0.85,
+    0.995,
+)  # of the weight of points, by the scan; drift is faster without gyroscope
+# Scale of the robust weights in the last step, in edges of a voxel.
+FINAL_SCALE, FINAL_SCALE_WITH_GYRO = 0.2, 0.1
+MIN_SHARE_NEAR_MAP = 0.3  # of the matched points, near planes of the map, for a scan that fits
+MAX_LOST_SCANS = 5  # in a row that do not fit, before a new map starts
+MIN_MAP_SCANS = 10  # that fit a map; a single map with fewer is given up, as its first scan showed too little
+FIRST_TWIST_ROUNDS = 4  # to estimate the twist of the first scan of a map
+# Two halves on two threads:
+MIN_SCANS_FOR_TWO_MAPS = 200  # of a recording: the second map costs time, too
+OVERLAP_SCANS, MIN_OVERLAP_SCANS = 20, 5  # in both maps, and those of them that fit both, to join the maps
+# Points of single rings, see `_share_on_lines`:
+MAX_SHARE_ON_LINES = 0.8  # of the points; a scan with more shows no surfaces
+MIN_LINE_POINTS, MAX_LINE_WIDTH = 5, 0.25  # in a voxel; and width of a line as a share of its length
+GYRO_STEP_S = 1e-3  # between rotations by the gyroscope within a scan
+MAX_SCAN_STEP_S = 1.0  # between scans, over which the twist is extrapolated
 
-Turning = Callable[[np.ndarray], np.ndarray]  # instants (n,) on the LiDAR's clock -> R_start_lidar (n, 3, 3)
-Moving = Callable[[np.ndarray], np.ndarray]  # -> p_start_lidar (n, 3) m, roughly
+RotationAt = Callable[[np.ndarray], np.ndarray]  # instants (n,) on the LiDAR's clock -> R_start_lidar (n, 3, 3)
+PositionAt = Callable[[np.ndarray], np.ndarray]  # -> p_start_lidar (n, 3) [m], approximate
 
 
 @dataclass(frozen=True)
 class Scan:
-    """middle [s]; points xyz (n, 3) and instants tau (n,) s from the middle, in an order that spreads them."""
+    """Some points of a scan. middle [s]: on the LiDAR's clock; xyz (n, 3) [m] at tau (n,) [s] from the middle, in an
+    order in which the first points are spread over the scan."""
 
     middle: float
     xyz: np.ndarray
     tau: np.ndarray
 
 
-def scans_of(stream: LidarStream) -> list[Scan]:
-    """Some points of each scan. Raises EstimationError where scans are too few."""
+def sampled_scans(stream: LidarStream) -> list[Scan]:
+    """At most MAX_MAPPED_POINTS of each scan, without scans of few points. Raises EstimationError if scans are too
+    few."""
     with ThreadPoolExecutor(THREADS) as pool:
-        scans = list(pool.map(lambda i: _scan_of(stream, i), range(len(stream.stamps_ns))))
-    scans = [s for s in scans if len(s.tau) >= FEWEST_POINTS]
-    if len(scans) < FEWEST_SCANS:
+        scans = list(pool.map(lambda i: _sampled_scan(stream, i), range(len(stream.stamps_ns))))
+    scans = [s for s in scans if len(s.tau) >= MIN_SCAN_POINTS]
+    if len(scans) < MIN_SCANS:
         raise EstimationError(
-            f"{stream.name}: only {len(scans)} of its {len(stream.stamps_ns)} scans have {FEWEST_POINTS} points or "
+            f"{stream.name}: only {len(scans)} of its {len(stream.stamps_ns)} scans have {MIN_SCAN_POINTS} points or "
             "more; check its topic, or record for longer."
         )
     return scans
 
 
-def lidar_path(
-    name: str, scans: list[Scan], turning: Turning | None = None, moving: Moving | None = None, whole: bool = True
+def lidar_trajectory(
+    name: str,
+    scans: list[Scan],
+    rotation_at: RotationAt | None = None,
+    position_at: PositionAt | None = None,
+    single_map: bool = True,
 ) -> SensorTrajectory:
-    """Scan-to-map odometry of LiDAR `name`. turning, moving: known rotation, translation.
+    """Scan-to-map odometry of LiDAR `name`: poses of the middles of scans in the frame of the map.
 
-    whole: one map for the whole recording, which begins later if hardly any scan fits the first. Else a lost path
-    restarts in a new map, and scans within LONGEST_STEP_S after the last good one are not ok.
+    rotation_at, position_at: known rotations, and approximate positions. single_map: one map for all scans; scans
+    before it, which fit no map, are not ok. Else a lost LiDAR starts a new map, and scans within MAX_SCAN_STEP_S after
+    the last good one are not ok, so that no step leads from map to map.
 
-    Raises EstimationError if scans do not fit one another."""
+    Raises EstimationError if more than half of the scans fit no map.
+    """
     seconds = np.array([s.middle for s in scans])
-    known = _Known.of(seconds, turning, moving)
-    if turning is not None:
-        scans = [_turned(s, turning) for s in scans]
-    reach = float(np.median([np.median(np.linalg.norm(s.xyz, axis=1)) for s in scans]))
-    edge_m = float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M))
-    poses, ok = (_follow_joined if whole else _follow_in_parts)(scans, known, edge_m)
+    known = _KnownSteps.of(seconds, rotation_at, position_at)
+    if rotation_at is not None:
+        scans = [_rotated_to_middle(s, rotation_at) for s in scans]
+    median_range = float(np.median([np.median(np.linalg.norm(s.xyz, axis=1)) for s in scans]))
+    edge_m = float(np.clip(median_range / VOXELS_PER_MEDIAN_RANGE, *VOXEL_EDGE_RANGE_M))
+    poses, ok = (_track_in_single_map if single_map else _track_in_several_maps)(scans, known, edge_m)
     if ok.mean() < 0.5:
-        why = "there may be too few flat surfaces, or the point times may be wrong"
-        if (share := np.median([_share_on_lines(scan, edge_m) for scan in scans])) > MOST_ON_LINES:
-            why = (
-                f"{share:.0%} of the points of a scan lie on single rings, {edge_m:.1g} m and more apart, so "
-                "that a scan shows no surfaces; record at the full resolution of the LiDAR, or use one with "
-                "more rings"
-            )
         raise EstimationError(
-            f"{name}: only {ok.sum()} of {len(scans)} scans match the surfaces of other scans; {why}."
+            f"{name}: only {ok.sum()} of {len(scans)} scans match the surfaces of other scans; "
+            f"{_mismatch_cause(scans, edge_m)}."
         )
     return SensorTrajectory(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
 
 
+def _mismatch_cause(scans: list[Scan], edge_m: float) -> str:
+    """Why scans do not match, and what to do."""
+    if (share := np.median([_share_on_lines(scan, edge_m) for scan in scans])) <= MAX_SHARE_ON_LINES:
+        return "there may be too few flat surfaces, or the point times may be wrong"
+    return (
+        f"{share:.0%} of the points of a scan lie on single rings, {edge_m:.1g} m and more apart, so "
+        "that a scan shows no surfaces; record at the full resolution of the LiDAR, or use one with "
+        "more rings"
+    )
+
+
 def _share_on_lines(scan: Scan, edge_m: float) -> float:
-    """The share of the points in voxels with some of them whose points are one line: those of a single ring."""
+    """Share of the points in voxels whose points form a line, as those of a single ring. Voxels with few points do not
+    count."""
     _, voxel, count = np.unique(np.floor(scan.xyz / edge_m), axis=0, return_inverse=True, return_counts=True)
     voxel = voxel.ravel()
     mean = np.stack([np.bincount(voxel, x) for x in scan.xyz.T], axis=1) / count[:, None]
     off = scan.xyz - mean[voxel]
     spread = np.array([[np.bincount(voxel, a * b) for a in off.T] for b in off.T]).transpose(2, 0, 1)
     size = np.sqrt(np.maximum(np.linalg.eigvalsh(spread), 0.0))
-    used = count >= FEWEST_IN_VOXEL
-    line = used & (size[:, 1] < NARROW * size[:, 2])
+    used = count >= MIN_LINE_POINTS
+    line = used & (size[:, 1] < MAX_LINE_WIDTH * size[:, 2])
     return float(count[line].sum() / max(count[used].sum(), 1))
 
 
-def _scan_of(stream: LidarStream, i: int) -> Scan:
+def _sampled_scan(stream: LidarStream, i: int) -> Scan:
+    """Scan i of the stream, thinned."""
     own = slice(int(stream.start[i]), int(stream.start[i + 1]))
     offset, xyz = stream.offset_s[own], stream.xyz[own]
     if not len(offset):
         return Scan(float(stream.seconds[i]), np.empty((0, 3)), np.empty(0))
     middle = 0.5 * (float(offset.min()) + float(offset.max()))
-    chosen = spread(len(offset), MOST_MAPPED, i)
-    for part in np.split(chosen, (MOST_WIDE, MOST_MATCHED)):
-        part.sort()  # one after the other they mostly fall into the same voxels, which are at hand then
+    chosen = evenly_spread(len(offset), MAX_MAPPED_POINTS, i)
+    for part in np.split(chosen, (MAX_NEIGHBOUR_POINTS, MAX_MATCHED_POINTS)):
+        part.sort()  # successive points mostly share a voxel, which is then in the processor cache
     points, tau = np.empty((len(chosen), 3)), np.empty(len(chosen))
-    n = pick(xyz, offset, chosen, middle, NEAREST_M, points, tau)
+    n = pick_points(xyz, offset, chosen, middle, MIN_ODOMETRY_RANGE_M, points, tau)
     return Scan(float(stream.seconds[i]) + middle, points[:n], tau[:n])
 
 
-def spread(n: int, most: int, begin: int) -> np.ndarray:
-    """(min(n, most),) different indices below n, of which the first few, too, are spread over all."""
-    step = max(int(GOLDEN * n), 1)
+def evenly_spread(n: int, most: int, begin: int) -> np.ndarray:
+    """(min(n, most),) different indices below n. Any first few of them are spread evenly, too."""
+    step = max(int(GOLDEN_RATIO * n), 1)
     while np.gcd(step, n) > 1:
         step += 1
     return (begin + np.arange(min(n, most)) * step) % n
 
 
-def _turned(scan: Scan, turning: Turning) -> Scan:
-    """The scan as seen by a LiDAR that stands as in its middle."""
-    which = np.floor(scan.tau / TURN_STEP_S).astype(np.int64)
+def _rotated_to_middle(scan: Scan, rotation_at: RotationAt) -> Scan:
+    """The scan as a LiDAR would see it that keeps the rotation of its middle."""
+    which = np.floor(scan.tau / GYRO_STEP_S).astype(np.int64)
     low = which.min()
-    steps = scan.middle + (np.arange(low, which.max() + 1) + 0.5) * TURN_STEP_S
-    R = turning(np.append(steps, scan.middle))
+    steps = scan.middle + (np.arange(low, which.max() + 1) + 0.5) * GYRO_STEP_S
+    R = rotation_at(np.append(steps, scan.middle))
     xyz = scan.xyz.copy()
-    turn_back(xyz, which - low, np.ascontiguousarray(R[-1].T @ R[:-1]))
+    rotate_points(xyz, which - low, np.ascontiguousarray(R[-1].T @ R[:-1]))
     return Scan(scan.middle, xyz, scan.tau)
 
 
 @dataclass(frozen=True)
-class _Known:
-    """Of each scan (n,) but the first, as far as it is known: R_before_scan (3, 3), and p_before_scan (3,)."""
+class _KnownSteps:
+    """Known motion from the scan before to each of n scans, None if unknown: rotation R_before_scan (n, 3, 3),
+    translation p_before_scan (n, 3) [m]. The first scan has none."""
 
-    turned: np.ndarray | None
-    way: np.ndarray | None
+    rotation: np.ndarray | None
+    translation: np.ndarray | None
 
     @classmethod
-    def of(cls, seconds: np.ndarray, turning: Turning | None, moving: Moving | None) -> _Known:
-        if turning is None:
+    def of(cls, seconds: np.ndarray, rotation_at: RotationAt | None, position_at: PositionAt | None) -> _KnownSteps:
+        if rotation_at is None:
             return cls(None, None)
-        R = turning(seconds)
+        R = rotation_at(seconds)
         back = np.concatenate([R[:1], R[:-1]]).transpose(0, 2, 1)
-        way = None if moving is None else np.diff(p := moving(seconds), axis=0, prepend=p[:1])
-        return cls(back @ R, None if way is None else np.einsum("nij,nj->ni", back, way))
+        step = None if position_at is None else np.diff(p := position_at(seconds), axis=0, prepend=p[:1])
+        return cls(back @ R, None if step is None else np.einsum("nij,nj->ni", back, step))
 
-    def some(self, own: slice) -> _Known:
-        """Of some of the scans."""
-        return _Known(*(None if x is None else x[own] for x in (self.turned, self.way)))
+    def part(self, own: slice) -> _KnownSteps:
+        """Steps of some of the scans."""
+        return _KnownSteps(*(None if x is None else x[own] for x in (self.rotation, self.translation)))
 
 
-def _follow_in_parts(scans: list[Scan], known: _Known, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
-    """As `_follow`, in several maps: a long path is two, each on a thread."""
+def _track_in_several_maps(scans: list[Scan], known: _KnownSteps, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
+    """Poses and their validity, in as many maps as needed. The halves of a long recording run on two threads."""
     n, seconds = len(scans), np.array([s.middle for s in scans])
-    parts = [slice(0, n)] if n < MANY else [slice(0, n // 2), slice(n // 2, n)]
-    found = _follow_at_once(scans, known, edge_m, parts, False)
+    parts = [slice(0, n)] if n < MIN_SCANS_FOR_TWO_MAPS else [slice(0, n // 2), slice(n // 2, n)]
+    found = _track_parts(scans, known, edge_m, parts, False)
     ok = np.concatenate([fits for _, fits in found])
     for own in parts[1:]:
-        ok[own] &= seconds[own] > seconds[own.start - 1] + LONGEST_STEP_S
+        ok[own] &= seconds[own] > seconds[own.start - 1] + MAX_SCAN_STEP_S
     return [pose for poses, _ in found for pose in poses], ok
 
 
-def _follow_joined(scans: list[Scan], known: _Known, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
-    """As `_follow`, in one map: of a long path two that share some scans are made at once, and joined by these."""
+def _track_in_single_map(scans: list[Scan], known: _KnownSteps, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
+    """Poses and their validity, in one map. The halves of a long recording run on two threads, and are joined by the
+    scans that both contain."""
     middle = len(scans) // 2
-    if len(scans) >= MANY:
-        parts = [slice(0, middle + SHARED), slice(middle, len(scans))]
-        (before, fits), (after, fit_after) = _follow_at_once(scans, known, edge_m, parts, True)
-        both = np.flatnonzero(fits[middle:] & fit_after[:SHARED])
-        if len(both) >= FEWEST_SHARED:
-            joined = _in_map_of([before[middle + k] for k in both], [after[k] for k in both], after[SHARED:])
-            return [*before, *joined], np.concatenate([fits, fit_after[SHARED:]])
-    return _follow(scans, known, edge_m, True)
+    if len(scans) >= MIN_SCANS_FOR_TWO_MAPS:
+        parts = [slice(0, middle + OVERLAP_SCANS), slice(middle, len(scans))]
+        (before, fits), (after, fits_after) = _track_parts(scans, known, edge_m, parts, True)
+        both = np.flatnonzero(fits[middle:] & fits_after[:OVERLAP_SCANS])
+        if len(both) >= MIN_OVERLAP_SCANS:
+            joined = _joined([before[middle + k] for k in both], [after[k] for k in both], after[OVERLAP_SCANS:])
+            return [*before, *joined], np.concatenate([fits, fits_after[OVERLAP_SCANS:]])
+    return _MapTracker(scans, known, edge_m, True).track()
 
 
-def _follow_at_once(
-    scans: list[Scan], known: _Known, edge_m: float, parts: list[slice], whole: bool
+def _track_parts(
+    scans: list[Scan], known: _KnownSteps, edge_m: float, parts: list[slice], single_map: bool
 ) -> list[tuple[list[ScanPose], np.ndarray]]:
-    """`_follow` of each of the parts, on a thread of its own."""
+    """Poses and their validity of each part, each on a thread."""
+
+    def track(own: slice) -> tuple[list[ScanPose], np.ndarray]:
+        return _MapTracker(scans[own], known.part(own), edge_m, single_map).track()
+
     with ThreadPoolExecutor(len(parts)) as pool:
-        return list(pool.map(lambda own: _follow(scans[own], known.some(own), edge_m, whole), parts))
+        return list(pool.map(track, parts))
 
 
-def _in_map_of(here: list[ScanPose], there: list[ScanPose], others: list[ScanPose]) -> list[ScanPose]:
-    """The poses `others` of the map of `there` in that of `here`, which are of the same scans."""
+def _joined(here: list[ScanPose], there: list[ScanPose], others: list[ScanPose]) -> list[ScanPose]:
+    """Poses `others` of a second map, transformed to the first. here, there: poses of the same scans in both maps."""
     u, _, vt = np.linalg.svd(
         sum((a.rotation @ b.rotation.T for a, b in zip(here, there, strict=True)), np.zeros((3, 3)))
     )
-    R = u @ vt  # the mean: all are near one another
+    R = u @ vt  # chordal mean; its determinant is 1, as the rotations are near one another
     p = np.mean([a.position - R @ b.position for a, b in zip(here, there, strict=True)], axis=0)
     return [ScanPose(R @ x.rotation, p + R @ x.position, x.rate, R @ x.velocity) for x in others]
 
 
-def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tuple[list[ScanPose], np.ndarray]:
-    """Poses, and whether each fits its map; see `lidar_path`."""
-    fits = np.ones(len(scans), dtype=bool)
+class _MapTracker:
+    """Registers scans one after another to a map that grows with them; see `lidar_trajectory`."""
 
-    def place(k: int, before: ScanPose, scale: float) -> ScanPose:
-        step = scans[k].middle - scans[k - 1].middle
-        turned, way = (None if x is None else x[k] for x in (known.turned, known.way))
-        expected = Expected.of(before, min(step, LONGEST_STEP_S), turned, way)
-        pose, fits[k] = _register(voxels, scans[k], expected, scale)
-        return pose
+    def __init__(self, scans: list[Scan], known: _KnownSteps, edge_m: float, single_map: bool) -> None:
+        self._scans, self._known, self._single_map = scans, known, single_map
+        self._voxels = VoxelMap.empty(edge_m, MAX_VOXELS)
+        self._fits = np.ones(len(scans), dtype=bool)  # each its map
+        self._excluded = np.zeros(len(scans), dtype=bool)  # from the trajectory, although they may fit
+        self._excluded_until = -np.inf  # instant [s]
 
-    def begin(k: int) -> ScanPose:
-        """Starts a new map from scan k, with rate and velocity estimated by registering scan k + 1."""
+    def track(self) -> tuple[list[ScanPose], np.ndarray]:
+        """Poses of the scans, and whether each is valid (n,)."""
+        gyro = self._known.rotation is not None
+        scale, decay = (FINAL_SCALE_WITH_GYRO, SCAN_DECAY_WITH_GYRO) if gyro else (FINAL_SCALE, SCAN_DECAY)
+        poses, lost = [self._start_map(0)], 0
+        for k in range(1, len(self._scans)):
+            pose = self._place(k, poses[-1], scale)
+            lost = 0 if self._fits[k] else lost + 1
+            if lost == MAX_LOST_SCANS and self._may_restart(k):
+                self._exclude_before(k, lost)
+                pose, lost = self._start_map(k), 0
+            self._excluded[k] = self._scans[k].middle < self._excluded_until
+            poses.append(pose)
+            if self._fits[k]:
+                self._insert(k, pose, decay)
+        return poses, self._fits & ~self._excluded
+
+    def _place(self, k: int, before: ScanPose, scale: float) -> ScanPose:
+        """Pose of scan k, given that of the scan before. A scan that does not fit gets the predicted pose."""
+        scan, known = self._scans[k], self._known
+        step = scan.middle - self._scans[k - 1].middle
+        rotation, translation = (None if x is None else x[k] for x in (known.rotation, known.translation))
+        prediction = PosePrediction.of(before, min(step, MAX_SCAN_STEP_S), rotation, translation)
+        xyz, tau = scan.xyz[:MAX_MATCHED_POINTS], scan.tau[:MAX_MATCHED_POINTS]
+        pose, near = register(self._voxels, xyz, tau, MAX_NEIGHBOUR_POINTS, prediction, scale)
+        self._fits[k] = near > MIN_SHARE_NEAR_MAP * len(tau)
+        return pose if self._fits[k] else predicted_pose(prediction)
+
+    def _start_map(self, k: int) -> ScanPose:
+        """Starts a new map from scan k. Its rate and velocity are estimated by registering scan k + 1 to it."""
+        still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         pose = still
-        for _ in range(FIRST_ROUNDS):
-            voxels.clear()
-            insert(voxels, pose, scans[k].xyz, scans[k].tau, k, 1.0)
-            after = place(k + 1, pose, LAST_SCALE)
+        for _ in range(FIRST_TWIST_ROUNDS):
+            self._voxels.clear()
+            self._insert(k, pose, 1.0)
+            after = self._place(k + 1, pose, FINAL_SCALE)
             pose = still._replace(rate=after.rate, velocity=after.velocity)
         return pose
 
-    last, keep = (LAST_SCALE, KEEP) if known.turned is None else (LAST_SCALE_TURNED, KEEP_TURNED)
-    still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    voxels = VoxelMap.empty(edge_m, CAPACITY)
-    poses, lost = [begin(0)], 0
-    apart, again = np.zeros(len(scans), dtype=bool), -np.inf
-    for k in range(1, len(scans)):
-        pose = place(k, poses[-1], last)
-        lost = 0 if fits[k] else lost + 1
-        if lost == MOST_LOST and k + 1 < len(scans) and not (whole and np.count_nonzero((fits & ~apart)[:k]) > FEW):
-            if whole:
-                apart[:k] = True
-            else:
-                again = scans[k - lost].middle + LONGEST_STEP_S
-            pose, lost = begin(k), 0
-        apart[k] = scans[k].middle < again
-        poses.append(pose)
-        if fits[k]:
-            insert(voxels, pose, scans[k].xyz, scans[k].tau, k, keep)
-    return poses, fits & ~apart
+    def _insert(self, k: int, pose: ScanPose, decay: float) -> None:
+        """Adds scan k to the map."""
+        insert(self._voxels, pose, self._scans[k].xyz, self._scans[k].tau, k, decay)
 
+    def _may_restart(self, k: int) -> bool:
+        """Whether a new map may start at scan k: there is a scan after it, and a single map has few scans yet."""
+        n_valid = np.count_nonzero((self._fits & ~self._excluded)[:k])
+        return k + 1 < len(self._scans) and not (self._single_map and n_valid > MIN_MAP_SCANS)
 
-def _register(voxels: VoxelMap, scan: Scan, expected: Expected, last: float) -> tuple[ScanPose, bool]:
-    """The scan's pose, and whether it fits the map."""
-    xyz, tau = scan.xyz[:MOST_MATCHED], scan.tau[:MOST_MATCHED]
-    pose, near = register(voxels, xyz, tau, MOST_WIDE, expected, last)
-    return (pose, True) if near > LEAST_NEAR * len(tau) else (expected_pose(expected), False)
+    def _exclude_before(self, k: int, lost: int) -> None:
+        """Excludes the scans of a map that is given up, or those too soon after its last good one."""
+        if self._single_map:
+            self._excluded[:k] = True
+        else:
+            self._excluded_until = self._scans[k - lost].middle + MAX_SCAN_STEP_S

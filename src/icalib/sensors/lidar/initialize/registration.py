@@ -1,4 +1,4 @@
-"""Compiled registration of a scan to a map of flat voxels, near where the scan before expects it."""
+"""Compiled registration of a scan to a map of planar voxels, near the pose predicted from the scan before."""
 
 from __future__ import annotations
 
@@ -9,121 +9,134 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, solve_definite, tmul3
-from icalib.sensors.lidar.initialize.voxel_map import UNKNOWNS, ScanPose, moved, sums
+from icalib.sensors.lidar.initialize.voxel_map import N_SCAN_UNKNOWNS, ScanPose, accumulate_scan, corrected_pose
 
-ROUNDS = 14
-WIDE_ROUNDS = 4  # that look into voxels around
-SCALE = 0.5  # of an edge: of the weights in the first round
-SMALL = 1e-4  # rad, m: a step that ends the search
-POINT_SIGMA_M = 0.1  # of a point against what is expected of the motion: points of one plane err together
-# What a motion may do between scans: change its rates (rad/s^2, m/s^2), and depart from their means (rad, m).
-ANGULAR_ACCELERATION, ACCELERATION = 6.0, 5.0
-TURN_SIGMA, MOVE_SIGMA = 0.02, 0.02
-# Where the gyroscope turns the points: its bias and the alignment may err by this much (rad/s, rad).
-RATE_SIGMA, GYRO_SIGMA = 0.01, 0.004
-KNOWN_SIGMA = 0.03  # m, of a known way between scans: what a lever arm that is not known makes of it
+MAX_REGISTRATION_ROUNDS = 14  # Gauss-Newton steps of a scan
+NEIGHBOUR_ROUNDS = 4  # first steps, which also search the neighbours of a voxel
+FIRST_SCALE = 0.5  # scale of the robust weights in the first step, in edges of a voxel
+CONVERGED_STEP = 1e-4  # rad, m: a smaller step ends the registration
+POINT_SIGMA_M = 0.1  # of a point, as against the prediction: larger than its noise, as points of a plane err together
+# Without the gyroscope: how much a motion changes between scans (rad/s^2, m/s^2), and by how much a step departs from
+# the mean of the rates around it (rad, m), as of a LiDAR carried by hand.
+ANGULAR_ACCELERATION_SIGMA, ACCELERATION_SIGMA = 6.0, 5.0
+STEP_ROTATION_SIGMA, STEP_POSITION_SIGMA = 0.02, 0.02
+# With the gyroscope: errors of its bias (rad/s), and of its rotation between scans (rad).
+GYRO_RATE_SIGMA, GYRO_ROTATION_SIGMA = 0.01, 0.004
+KNOWN_TRANSLATION_SIGMA = 0.03  # m between scans: a lever arm that is still unknown, times the rotation
 
 
-class Expected(NamedTuple):
-    """What the scan before says of a pose: `before` it by `step` s; `turned` (3, 3) and `way` (3,) since, in the axes
-    of the one before, where they are known."""
+class PosePrediction(NamedTuple):
+    """Prediction of a pose from that `before`, `step` seconds earlier. rotation R_before_scan (3, 3), if known;
+    translation (3,): from the scan before to this one, in axes of the one before [m], if known."""
 
     before: ScanPose
     step: float
-    knows_turn: bool
-    turned: np.ndarray
-    knows_way: bool
-    way: np.ndarray
+    knows_rotation: bool
+    rotation: np.ndarray
+    knows_translation: bool
+    translation: np.ndarray
 
     @classmethod
-    def of(cls, before: ScanPose, step: float, turned: np.ndarray | None, way: np.ndarray | None) -> Expected:
-        """None: not known."""
+    def of(
+        cls, before: ScanPose, step: float, rotation: np.ndarray | None, translation: np.ndarray | None
+    ) -> PosePrediction:
+        """Prediction with rotation and translation, each None if unknown."""
         return cls(
             before,
             step,
-            turned is not None,
-            np.eye(3) if turned is None else np.ascontiguousarray(turned),
-            way is not None,
-            np.zeros(3) if way is None else np.ascontiguousarray(way),
+            rotation is not None,
+            np.eye(3) if rotation is None else np.ascontiguousarray(rotation),
+            translation is not None,
+            np.zeros(3) if translation is None else np.ascontiguousarray(translation),
         )
 
 
 @njit(cache=True, nogil=True)
-def _way(e):
-    """(3,) m since the scan before, in the map."""
-    way = np.empty(3)
+def _displacement(prediction):
+    """(3,) predicted translation since the scan before, in axes of the map [m]."""
+    before, translation = prediction.before, prediction.translation
+    out = np.empty(3)
     for i in range(3):
-        R = e.before.rotation[i]
-        known = R[0] * e.way[0] + R[1] * e.way[1] + R[2] * e.way[2]
-        way[i] = known if e.knows_way else e.before.velocity[i] * e.step
-    return way
+        R = before.rotation[i]
+        known = R[0] * translation[0] + R[1] * translation[1] + R[2] * translation[2]
+        out[i] = known if prediction.knows_translation else before.velocity[i] * prediction.step
+    return out
 
 
 @njit(cache=True, nogil=True)
-def expected_pose(e):
-    """Where the scan is looked for."""
-    b, way = e.before, _way(e)
+def predicted_pose(prediction):
+    """The predicted pose and twist, by constant rates as far as nothing else is known."""
+    b, h, d = prediction.before, prediction.step, _displacement(prediction)
     turn, position, rate, velocity = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):  # in loops: array expressions take seconds to compile
-        turn[i], rate[i] = b.rate[i] * e.step, b.rate[i]
-        position[i], velocity[i] = b.position[i] + way[i], way[i] / e.step
-    return ScanPose(mul3(b.rotation, e.turned if e.knows_turn else so3.exp(turn)), position, rate, velocity)
+        turn[i], rate[i] = b.rate[i] * h, b.rate[i]
+        position[i], velocity[i] = b.position[i] + d[i], d[i] / h
+    R = prediction.rotation if prediction.knows_rotation else so3.exp(turn)
+    return ScanPose(mul3(b.rotation, R), position, rate, velocity)
 
 
 @njit(cache=True, nogil=True)
-def _add_row(i, r, sigma, mean, H, g):
-    """Row i of what is expected: unknown i, less `mean` of its rate, departs by r."""
+def _add_row(i, r, sigma, J_rate, H, g):
+    """Adds a prediction of unknown i to the normal equations: residual r with standard deviation sigma, derivative 1 by
+    the unknown and -J_rate by its rate, unknown i + 6."""
     w, j = (POINT_SIGMA_M / sigma) ** 2, i + 6
     H[i, i] += w
     g[i] += w * r
-    if mean != 0.0:
-        H[i, j] -= w * mean
-        H[j, i] -= w * mean
-        H[j, j] += w * mean * mean
-        g[j] -= w * mean * r
+    if J_rate != 0.0:
+        H[i, j] -= w * J_rate
+        H[j, i] -= w * J_rate
+        H[j, j] += w * J_rate * J_rate
+        g[j] -= w * J_rate * r
 
 
 @njit(cache=True, nogil=True, inline="always")
-def add_expected(e, pose, H, g):
-    """Adds to the normal equations (12, 12), (12,) that rates change little, and poses by the mean of the rates around
-    them, in units of POINT_SIGMA_M."""
-    b, h, way = e.before, e.step, _way(e)
-    turned = so3.log(tmul3(mul3(b.rotation, e.turned) if e.knows_turn else b.rotation, pose.rotation))
+def add_prediction(prediction, pose, H, g):
+    """Adds the prediction of `pose` to the normal equations H (12, 12), g (12,), in units of POINT_SIGMA_M.
+
+    Known rotations and translations are predicted directly. Unknown ones follow the mean of the rates before and after,
+    and these rates change little.
+    """
+    b, h, d = prediction.before, prediction.step, _displacement(prediction)
+    R = mul3(b.rotation, prediction.rotation) if prediction.knows_rotation else b.rotation
+    turn = so3.log(tmul3(R, pose.rotation))
     for i in range(3):
-        if e.knows_turn:
-            _add_row(i, turned[i], GYRO_SIGMA, 0.0, H, g)
-            _add_row(6 + i, pose.rate[i], RATE_SIGMA, 0.0, H, g)
+        if prediction.knows_rotation:
+            _add_row(i, turn[i], GYRO_ROTATION_SIGMA, 0.0, H, g)
+            _add_row(6 + i, pose.rate[i], GYRO_RATE_SIGMA, 0.0, H, g)
         else:
-            _add_row(i, turned[i] - 0.5 * h * (b.rate[i] + pose.rate[i]), TURN_SIGMA, 0.5 * h, H, g)
-            _add_row(6 + i, pose.rate[i] - b.rate[i], ANGULAR_ACCELERATION * h, 0.0, H, g)
+            _add_row(i, turn[i] - 0.5 * h * (b.rate[i] + pose.rate[i]), STEP_ROTATION_SIGMA, 0.5 * h, H, g)
+            _add_row(6 + i, pose.rate[i] - b.rate[i], ANGULAR_ACCELERATION_SIGMA * h, 0.0, H, g)
         moved = pose.position[i] - b.position[i]
-        if e.knows_way:
-            _add_row(3 + i, moved - way[i], KNOWN_SIGMA, 0.0, H, g)
-            _add_row(9 + i, pose.velocity[i] - way[i] / h, ACCELERATION * h, 0.0, H, g)
+        if prediction.knows_translation:
+            _add_row(3 + i, moved - d[i], KNOWN_TRANSLATION_SIGMA, 0.0, H, g)
+            _add_row(9 + i, pose.velocity[i] - d[i] / h, ACCELERATION_SIGMA * h, 0.0, H, g)
         else:
-            _add_row(3 + i, moved - 0.5 * h * (b.velocity[i] + pose.velocity[i]), MOVE_SIGMA, 0.5 * h, H, g)
-            _add_row(9 + i, pose.velocity[i] - b.velocity[i], ACCELERATION * h, 0.0, H, g)
+            _add_row(3 + i, moved - 0.5 * h * (b.velocity[i] + pose.velocity[i]), STEP_POSITION_SIGMA, 0.5 * h, H, g)
+            _add_row(9 + i, pose.velocity[i] - b.velocity[i], ACCELERATION_SIGMA * h, 0.0, H, g)
 
 
 @njit(cache=True, nogil=True)
-def register(voxels, xyz, tau, n_wide, e, last):
-    """Pose of the scan of points xyz (n, 3) m at tau (n,) s from its middle, as `Expected` e, of which the first n_wide
-    are looked for in voxels around, too; weights end at a scale of `last` edges. And how many points lie on the map's
-    planes."""
-    pose, H, g, near = expected_pose(e), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), 0
-    for k in range(ROUNDS):
-        share, wide = min(k / (WIDE_ROUNDS + 1.0), 1.0), k < WIDE_ROUNDS
-        n = min(n_wide, len(xyz)) if wide else len(xyz)
-        scale = voxels.edge_m * SCALE ** (1.0 - share) * last**share
-        _, near = sums(voxels, pose, xyz[:n], tau[:n], int(wide), scale, H, g)
-        add_expected(e, pose, H, g)
+def register(voxels, xyz, tau, n_neighbour, prediction, final_scale):
+    """Pose of a scan in the map (Gauss-Newton, point to plane), and its number of points near planes of the map.
+
+    xyz (n, 3) [m] at tau (n,) [s] from the middle of the scan; the first n_neighbour of them are used in the steps that
+    search neighbours. Scales of the robust weights fall from FIRST_SCALE to final_scale, in edges of a voxel.
+    """
+    pose, near = predicted_pose(prediction), 0
+    H, g = np.empty((N_SCAN_UNKNOWNS, N_SCAN_UNKNOWNS)), np.empty(N_SCAN_UNKNOWNS)
+    for k in range(MAX_REGISTRATION_ROUNDS):
+        share, wide = min(k / (NEIGHBOUR_ROUNDS + 1.0), 1.0), k < NEIGHBOUR_ROUNDS
+        n = min(n_neighbour, len(xyz)) if wide else len(xyz)
+        scale = voxels.edge_m * FIRST_SCALE ** (1.0 - share) * final_scale**share
+        _, near = accumulate_scan(voxels, pose, xyz[:n], tau[:n], int(wide), scale, H, g)
+        add_prediction(prediction, pose, H, g)
         if not solve_definite(H, g):
             break
         small = share == 1.0
-        for i in range(UNKNOWNS):
+        for i in range(N_SCAN_UNKNOWNS):
             g[i] = -g[i]
-            small = small and (i >= 6 or abs(g[i]) < SMALL)
-        pose = moved(pose, g)
+            small = small and (i >= 6 or abs(g[i]) < CONVERGED_STEP)
+        pose = corrected_pose(pose, g)
         if small:
             break
     return pose, near

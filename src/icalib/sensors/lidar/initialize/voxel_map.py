@@ -1,12 +1,12 @@
-"""Compiled parts of LiDAR odometry: a map of flat voxels, and a scan's distances from it.
+"""Compiled parts of LiDAR odometry: a map of planar voxels, and distances of a scan from it.
 
-A point x at tau seconds from its scan's middle is seen at y = R Exp(w tau) x + p + v tau in the map: the scan's pose
-(R, p) and its twist, w in its own axes and v in the map's. Its distance from the plane of the voxel that y falls into
-moves by
+A point x, taken tau seconds after the middle of its scan, is at y = R Exp(w tau) x + p + v tau in the map. The pose
+(R, p) is that of the middle, w is the angular rate in axes of the LiDAR, and v the velocity in axes of the map. The
+distance r from the plane of the voxel at y has the differential
 
     dr = n . (-R [z]x dtheta + dp - R [z]x tau dw + tau dv)     z = Exp(w tau) x
 
-where Exp((w + dw) tau) = Exp(w tau) Exp(tau dw) is good enough within a scan.
+with the approximation Exp((w + dw) tau) = Exp(w tau) Exp(tau dw).
 """
 
 from __future__ import annotations
@@ -19,39 +19,41 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import eigen3, mul3
 
-UNKNOWNS = 12  # of a scan: turn, position, rate, velocity
-PRODUCTS = 27  # of a point: upper triangle of its derivatives by the pose with one another, and with its distance
-MOMENTS = 9  # x; y; z; xx; yx, yy; zx, zy, zz about the voxel's middle
-FEWEST = 6  # points of a voxel
-ACROSS = 0.06  # of a voxel's edge: what spreads less in its own plane is a line
-FLATTEST = 0.15  # of a voxel's edge: what spreads more across is no plane
-NEAR = 0.2  # of a voxel's edge
-REACH = 1 << 20  # voxels from the origin to either side
+N_SCAN_UNKNOWNS = 12  # rotation, position, angular rate, velocity
+N_PRODUCTS = 27  # of a point: upper triangle of products of its 6 derivatives by the pose and its distance, without r^2
+N_VOXEL_MOMENTS = 9  # x; y; z; xx; yx, yy; zx, zy, zz about the centre of the cube
+MIN_VOXEL_POINTS = 6  # weight of a planar voxel: a plane has 3 unknowns
+# Standard deviations of the points of a planar voxel, as shares of its edge (a uniformly filled one has 0.29):
+MIN_PLANE_WIDTH = 0.06  # along the narrower direction in the plane; narrower points are a line
+MAX_PLANE_THICKNESS = 0.15  # along the normal
+NEAR_PLANE = 0.2  # of the edge: a point nearer to a plane of the map counts as matching
+MAX_VOXEL_INDEX = 1 << 20  # voxels from the origin along an axis: three indices fit 64 bits
 
 
 class VoxelMap(NamedTuple):
-    """An open hash table of cubic voxels with edge `edge_m`. key (H,): -1 where empty; place (H,): row of the voxel.
-    size (1,): number of voxels in use.
+    """A hash table of cubic voxels with edge `edge_m`, by linear probing. key (H,): of each voxel, -1 if empty; row
+    (H,): of each voxel in the arrays below; size (1,): number of voxels in use.
 
-    Per voxel: middle (V, 3) of the cube [m]; weight (V,): decayed number of points; moments (V, 9) about middle, see
-    MOMENTS; touched (V,): last scan that added a point; centre, normal (V, 3) of the points; flat (V,): they are a
-    plane."""
+    Of each voxel: middle (V, 3) of the cube [m]; weight (V,): decayed number of points; moments (V, 9) about middle,
+    see N_VOXEL_MOMENTS; last_scan (V,): number of the last scan that added a point; centre, normal (V, 3) of the
+    points; flat (V,): whether the points are planar.
+    """
 
     edge_m: float
     key: np.ndarray
-    place: np.ndarray
+    row: np.ndarray
     size: np.ndarray
     middle: np.ndarray
     weight: np.ndarray
     moments: np.ndarray
-    touched: np.ndarray
+    last_scan: np.ndarray
     centre: np.ndarray
     normal: np.ndarray
     flat: np.ndarray
 
     @classmethod
     def empty(cls, edge_m: float, capacity: int) -> VoxelMap:
-        """Room for `capacity` voxels, a power of two; points of further ones are not kept."""
+        """A map of at most `capacity` voxels, a power of two. Points in further voxels are ignored."""
         n = capacity
         return cls(
             edge_m,
@@ -60,7 +62,7 @@ class VoxelMap(NamedTuple):
             np.zeros(1, np.int64),
             np.zeros((n, 3)),
             np.zeros(n),
-            np.zeros((n, MOMENTS)),
+            np.zeros((n, N_VOXEL_MOMENTS)),
             np.zeros(n, np.int64),
             np.zeros((n, 3)),
             np.zeros((n, 3)),
@@ -68,12 +70,13 @@ class VoxelMap(NamedTuple):
         )
 
     def clear(self) -> None:
-        """As if nothing had been put in."""
+        """Removes all points."""
         self.key[:], self.size[:], self.weight[:], self.moments[:], self.flat[:] = -1, 0, 0.0, 0.0, False
 
 
 class ScanPose(NamedTuple):
-    """Of a scan's middle, in the map: R (3, 3), p (3,) m; rate (3,) rad/s in its own axes, velocity (3,) m/s."""
+    """Pose and twist of the LiDAR at the middle of a scan: R_map_lidar (3, 3), p_map_lidar (3,) [m], angular rate (3,)
+    [rad/s] in axes of the LiDAR, velocity (3,) [m/s] in axes of the map."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -83,15 +86,16 @@ class ScanPose(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _index(x, voxels):
+    """Index of the voxel along one axis at coordinate x [m]."""
     return int(np.floor(x / voxels.edge_m))
 
 
 @njit(cache=True, nogil=True)
 def _slot(key, i, j, k):
-    """Where voxel (i, j, k) is in the hash table, or would be; and its key. Voxels above one another are neighbours
-    there, too: searches look at these together."""
-    column = ((i + REACH) << 21) + (j + REACH)
-    own, mask = (column << 21) + (k + REACH), len(key) - 1
+    """Slot of voxel (i, j, k) in the hash table, or the empty slot where it belongs; and its key. Voxels above one
+    another are neighbours in the table, as searches visit them together."""
+    column = ((i + MAX_VOXEL_INDEX) << 21) + (j + MAX_VOXEL_INDEX)
+    own, mask = (column << 21) + (k + MAX_VOXEL_INDEX), len(key) - 1
     s = (((column * 0x9E3779B97F4A7C1) >> 20) + k) & mask
     while key[s] != own and key[s] != -1:
         s = (s + 1) & mask
@@ -100,10 +104,10 @@ def _slot(key, i, j, k):
 
 @njit(cache=True, nogil=True)
 def place_point(pose, x, y, z, tau, out):
-    """out (6,): the point in the map, then z = Exp(w tau) x."""
+    """out (6,): the point (x, y, z) in the map, then Exp(w tau) (x, y, z)."""
     w = pose.rate
     a, b, c = w[0] * tau, w[1] * tau, w[2] * tau
-    # Exp to second order: a scan turns by less than half a radian to either side.
+    # Exp to second order: a scan turns by less than 0.5 rad to either side of its middle.
     ux, uy, uz = b * z - c * y, c * x - a * z, a * y - b * x
     out[3] = x + ux + 0.5 * (b * uz - c * uy)
     out[4] = y + uy + 0.5 * (c * ux - a * uz)
@@ -114,45 +118,46 @@ def place_point(pose, x, y, z, tau, out):
 
 
 @njit(cache=True, nogil=True)
-def insert(voxels, pose, xyz, tau, scan, keep):
-    """Adds points xyz (n, 3) of scan number `scan`; older content decays by the factor `keep` per scan."""
+def insert(voxels, pose, xyz, tau, scan, decay):
+    """Adds points xyz (n, 3) [m] at tau (n,) [s] of scan number `scan`, seen from `pose`. Older points of a voxel decay
+    by the factor `decay` per scan."""
     y, touched, n_touched = np.empty(6), np.empty(len(xyz), np.int64), 0
     for n in range(len(xyz)):
         place_point(pose, xyz[n, 0], xyz[n, 1], xyz[n, 2], tau[n], y)
         i, j, k = _index(y[0], voxels), _index(y[1], voxels), _index(y[2], voxels)
-        if max(abs(i), abs(j), abs(k)) >= REACH - 1:
+        if max(abs(i), abs(j), abs(k)) >= MAX_VOXEL_INDEX - 1:
             continue
         s, own = _slot(voxels.key, i, j, k)
         if voxels.key[s] == -1:
             if voxels.size[0] == len(voxels.weight):
                 continue
-            voxels.key[s], voxels.place[s] = own, voxels.size[0]
+            voxels.key[s], voxels.row[s] = own, voxels.size[0]
             v = voxels.size[0]
             voxels.size[0] += 1
             for a, index in enumerate((i, j, k)):
                 voxels.middle[v, a] = (index + 0.5) * voxels.edge_m
-            voxels.touched[v] = -1
-        v = voxels.place[s]
-        if voxels.touched[v] != scan:
-            f = keep ** (scan - voxels.touched[v])
+            voxels.last_scan[v] = -1
+        v = voxels.row[s]
+        if voxels.last_scan[v] != scan:
+            f = decay ** (scan - voxels.last_scan[v])
             voxels.weight[v] *= f
-            for a in range(MOMENTS):
+            for a in range(N_VOXEL_MOMENTS):
                 voxels.moments[v, a] *= f
-            voxels.touched[v] = scan
+            voxels.last_scan[v] = scan
             touched[n_touched] = v
             n_touched += 1
         voxels.weight[v] += 1.0
         a, b, c = y[0] - voxels.middle[v, 0], y[1] - voxels.middle[v, 1], y[2] - voxels.middle[v, 2]
         row = (a, b, c, a * a, b * a, b * b, c * a, c * b, c * c)
-        for m in range(MOMENTS):
+        for m in range(N_VOXEL_MOMENTS):
             voxels.moments[v, m] += row[m]
     for i in range(n_touched):
-        _fit(voxels, touched[i])
+        _fit_plane(voxels, touched[i])
 
 
 @njit(cache=True, nogil=True)
-def _fit(voxels, v):
-    """Centre, normal and flatness of a voxel from its moments."""
+def _fit_plane(voxels, v):
+    """Updates centre, normal and flatness of voxel v from its moments (principal axes)."""
     m, w = voxels.moments[v], voxels.weight[v]
     a, b, c = m[0] / w, m[1] / w, m[2] / w
     S, spread, axes = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
@@ -161,25 +166,26 @@ def _fit(voxels, v):
     S[0, 1], S[0, 2], S[1, 2] = S[1, 0], S[2, 0], S[2, 1]
     eigen3(S, spread, axes)
     edge2 = voxels.edge_m * voxels.edge_m
-    thin = spread[0] < FLATTEST * FLATTEST * edge2 and spread[0] < 0.25 * spread[1]
-    voxels.flat[v] = w >= FEWEST and thin and spread[1] > ACROSS * ACROSS * edge2
+    thin = spread[0] < MAX_PLANE_THICKNESS * MAX_PLANE_THICKNESS * edge2 and spread[0] < 0.25 * spread[1]
+    voxels.flat[v] = w >= MIN_VOXEL_POINTS and thin and spread[1] > MIN_PLANE_WIDTH * MIN_PLANE_WIDTH * edge2
     for i, x in enumerate((a, b, c)):
         voxels.centre[v, i] = voxels.middle[v, i] + x
         voxels.normal[v, i] = axes[i, 0]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _voxel_at(voxels, y, around):
-    """The flat voxel that y falls into, or with `around` of the 27 there the one with the nearest centre; -1: none."""
+def _planar_voxel_at(voxels, y, around):
+    """Row of the planar voxel that contains y. With around = 1: of the planar voxel with the nearest centre among this
+    voxel and its 26 neighbours. -1: none."""
     i0, j0, k0 = _index(y[0], voxels), _index(y[1], voxels), _index(y[2], voxels)
-    if max(abs(i0), abs(j0), abs(k0)) >= REACH - 2:
+    if max(abs(i0), abs(j0), abs(k0)) >= MAX_VOXEL_INDEX - 2:
         return -1
     found, least = -1, np.inf
     for i in range(i0 - around, i0 + around + 1):
         for j in range(j0 - around, j0 + around + 1):
             for k in range(k0 - around, k0 + around + 1):
                 s, _ = _slot(voxels.key, i, j, k)
-                v = voxels.place[s]
+                v = voxels.row[s]
                 if voxels.key[s] == -1 or not voxels.flat[v]:
                     continue
                 d = 0.0
@@ -191,8 +197,9 @@ def _voxel_at(voxels, y, around):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _derivatives(R, normal, y, J):
-    """J (6,) of a distance by turn and position; n . (-R [z]x d) = d . (z x R^T n)."""
+def _fill_jacobian(R, normal, y, J):
+    """First 6 entries of J, out: derivatives of a distance by rotation and position. n . (-R [z]x d) = d . (z x R^T n)
+    with z = y[3:]."""
     b0 = R[0, 0] * normal[0] + R[1, 0] * normal[1] + R[2, 0] * normal[2]
     b1 = R[0, 1] * normal[0] + R[1, 1] * normal[1] + R[2, 1] * normal[2]
     b2 = R[0, 2] * normal[0] + R[1, 2] * normal[1] + R[2, 2] * normal[2]
@@ -203,32 +210,33 @@ def _derivatives(R, normal, y, J):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_products(product, tau, by_0, by_1, by_2):
-    """A loop that the compiler makes a few instructions of."""
-    for k in range(PRODUCTS):
+    """Adds the products of a point to the sums by 1, tau and tau^2. A loop of its own, so that it is vectorised."""
+    for k in range(N_PRODUCTS):
         by_0[k] += product[k]
         by_1[k] += tau * product[k]
         by_2[k] += tau * tau * product[k]
 
 
 @njit(cache=True, nogil=True)
-def sums(voxels, pose, xyz, tau, around, scale, H, g):
-    """Fills the normal equations H (12, 12), g (12,) of the scan's distances [m] from the map, Geman and McClure's
-    weights of `scale` m. Returns how many points met a plane, and how many of these are near it."""
-    y, J, met, near = np.empty(6), np.empty(7), 0, 0
-    # Derivatives by rates are tau times those by the pose: sums of (J, r) J by 1, tau and tau^2, upper triangles.
-    product, by_0, by_1, by_2 = np.empty(PRODUCTS), np.zeros(PRODUCTS), np.zeros(PRODUCTS), np.zeros(PRODUCTS)
+def accumulate_scan(voxels, pose, xyz, tau, around, scale, H, g):
+    """Fills the normal equations H (12, 12), g (12,) of the distances [m] of points xyz (n, 3) from the map, with Geman
+    and McClure's weights of `scale` [m]. around: see `_planar_voxel_at`. Returns the number of points with a plane, and
+    of those near it."""
+    y, J, matched, near = np.empty(6), np.empty(7), 0, 0
+    # Derivatives by rates are tau times those by the pose, so that sums of products by 1, tau and tau^2 are enough.
+    product, by_0, by_1, by_2 = np.empty(N_PRODUCTS), np.zeros(N_PRODUCTS), np.zeros(N_PRODUCTS), np.zeros(N_PRODUCTS)
     for n in range(len(xyz)):
         place_point(pose, xyz[n, 0], xyz[n, 1], xyz[n, 2], tau[n], y)
-        v = _voxel_at(voxels, y, around)
+        v = _planar_voxel_at(voxels, y, around)
         if v < 0:
             continue
         normal, r = voxels.normal[v], 0.0
         for a in range(3):
             r += normal[a] * (y[a] - voxels.centre[v, a])
-        met += 1
-        near += abs(r) < NEAR * voxels.edge_m
+        matched += 1
+        near += abs(r) < NEAR_PLANE * voxels.edge_m
         root = 1.0 + (r / scale) ** 2
-        _derivatives(pose.rotation, normal, y, J)
+        _fill_jacobian(pose.rotation, normal, y, J)
         J[6] = r
         k = 0
         for a in range(6):
@@ -245,13 +253,13 @@ def sums(voxels, pose, xyz, tau, around, scale, H, g):
             k += 1
         g[a], g[6 + a] = by_0[k], by_1[k]
         k += 1
-    return met, near
+    return matched, near
 
 
 @njit(cache=True, nogil=True)
-def pick(xyz, offset, chosen, middle, nearest, points, tau):
-    """Fills points (n, 3) and tau (n,), offsets from `middle`, with those of `chosen` (n,) that are somewhere, and
-    further than `nearest`; returns how many."""
+def pick_points(xyz, offset, chosen, middle, nearest, points, tau):
+    """Fills points (n, 3) [m] and tau (n,), seconds from `middle`, with those of the points `chosen` (n,) that are
+    finite and further than `nearest` [m]. Returns their number."""
     count = 0
     for i in chosen:
         x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
@@ -264,17 +272,17 @@ def pick(xyz, offset, chosen, middle, nearest, points, tau):
 
 
 @njit(cache=True, nogil=True)
-def turn_back(xyz, which, turns):
-    """Points xyz (n, 3) turned by turns[which] each, in place."""
+def rotate_points(xyz, which, rotations):
+    """Rotates points xyz (n, 3) in place, each by rotations[which[n]]."""
     for n in range(len(xyz)):
-        R, x, y, z = turns[which[n]], xyz[n, 0], xyz[n, 1], xyz[n, 2]
+        R, x, y, z = rotations[which[n]], xyz[n, 0], xyz[n, 1], xyz[n, 2]
         for a in range(3):
             xyz[n, a] = R[a, 0] * x + R[a, 1] * y + R[a, 2] * z
 
 
 @njit(cache=True, nogil=True)
-def moved(pose, d):
-    """The pose corrected by d (12,)."""
+def corrected_pose(pose, d):
+    """The pose corrected by d (12,): rotation, position, angular rate, velocity."""
     position, rate, velocity = np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         position[i], rate[i] = pose.position[i] + d[3 + i], pose.rate[i] + d[6 + i]
