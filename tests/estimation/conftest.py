@@ -31,7 +31,7 @@ from icalib.rig import ImuSensor, Lidar, Scheme, Settings
 from icalib.rig.scene import SHAPE_LABELS
 from icalib.sensors.camera.connected_bodies import restrict
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.features.surfaces import OnPlanes, Surfaces
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor

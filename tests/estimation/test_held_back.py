@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.sensors.camera.features.feature_kernels import held_back
+from icalib.sensors.camera.features.kernels import held_back
 
 
 def test_it_is_that_of_a_newton_step_and_nothing_where_there_is_no_inverse():

@@ -8,7 +8,7 @@ import pytest
 
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for
 from icalib.estimate.problem.inputs import inputs_for
-from icalib.sensors.camera.images import image_times
+from icalib.sensors.camera.image_times import image_times
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 

@@ -26,7 +26,7 @@ from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.error_clusters import _tag_corners
 from icalib.sensors.camera.features.error_clusters import image_cells as cells_of
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.model import MODEL
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from icalib.optim.arrowhead import make_pieces
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
-from icalib.sensors.camera.features.feature_kernels import FARTHEST_M
-from icalib.sensors.camera.features.feature_statistics import FeatureOutput
+from icalib.sensors.camera.features.kernels import FARTHEST_M
+from icalib.sensors.camera.features.residual import FeatureFactor
+from icalib.sensors.camera.features.statistics import FeatureOutput
 from icalib.tools.simulation import handheld, simulate
 
 

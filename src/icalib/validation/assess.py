@@ -44,8 +44,8 @@ from icalib.result.verdict import by_size
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.sensors import SENSOR_KINDS, ask, facet
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
-from icalib.sensors.camera.images import image_times
+from icalib.sensors.camera.features.residual import FeatureFactor
+from icalib.sensors.camera.image_times import image_times
 from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.cross_validation import cross_validation
 from icalib.validation.guesses import guess_notes

@@ -18,7 +18,7 @@ from icalib.geometry.cameras.convert import fit_rays
 from icalib.motion.factor import of_type
 from icalib.result import SensorFit
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.residual import FeatureFactor
 
 MOST_POINTS = 400  # that lenses are compared at
 OTHER_FOCAL = 0.02  # of the focal length: sets that differ by less are one

@@ -21,7 +21,7 @@ from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, m
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
 from icalib.rig.scene import TILT
 from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
-from icalib.sensors.camera.images import on_common_images
+from icalib.sensors.camera.image_times import on_common_images
 
 
 @dataclass(frozen=True)

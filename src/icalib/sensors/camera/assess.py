@@ -19,7 +19,7 @@ from icalib.sensors.camera.circle_centres import centre_shifts
 from icalib.sensors.camera.connected_bodies import words_on_left_out
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.corner_noise import NoiseModel
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.sensors.camera.model import CameraNoise
 

@@ -44,7 +44,7 @@ from icalib.sensors.camera.corner_kernels import (
     camera_points,
 )
 from icalib.sensors.camera.corner_statistics import CORNERS, corner_squares, image_rows, rms_px, spent_by_corners
-from icalib.sensors.camera.views import Views
+from icalib.sensors.camera.corner_views import Views
 
 BLOCK = 256  # images at a time, where nothing is summed
 POSES = 1024  # views at a time, whose poses and how these move are made together

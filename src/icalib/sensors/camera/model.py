@@ -31,12 +31,12 @@ from icalib.sensors.camera.corner_outliers import inliers
 from icalib.sensors.camera.corner_statistics import CORNERS
 from icalib.sensors.camera.edge_curvature import with_bent_edges
 from icalib.sensors.camera.features.error_clusters import error_clusters
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
-from icalib.sensors.camera.features.feature_noise import TrackSelection, next_selections, observed_at_keyframes
 from icalib.sensors.camera.features.patch_curvature import with_curved_patches
+from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.features.surfaces import Surfaces
+from icalib.sensors.camera.features.track_selection import TrackSelection, next_selections, observed_at_keyframes
 from icalib.sensors.camera.image_pairs import not_simultaneous
-from icalib.sensors.camera.images import are_used, keyframes_of
+from icalib.sensors.camera.image_times import are_used, keyframes_of
 from icalib.sensors.camera.spec import BLOOM
 from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 

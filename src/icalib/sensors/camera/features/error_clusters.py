@@ -14,7 +14,7 @@ import numpy as np
 from icalib.model.sensor_model import Clusters
 from icalib.motion.factor import FactorKey
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.residual import FeatureFactor
 
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_REGIONS = 3  # along each side of a body

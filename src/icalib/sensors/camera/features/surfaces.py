@@ -24,7 +24,7 @@ from icalib.optim.front_plan import FeatureSums
 from icalib.optim.planes import Planes
 from icalib.optim.robust_weights import Loss, weight
 from icalib.optim.state import Key
-from icalib.sensors.camera.features.feature_kernels import Points
+from icalib.sensors.camera.features.kernels import Points
 
 ON_PLANES = "points on planes"  # the kind of these rows
 CELL_M = 0.25  # a plane ends where no LiDAR saw it, to a cell

@@ -13,7 +13,7 @@ from icalib.sensors.camera.corner_statistics import image_rows, rms_px
 from icalib.sensors.camera.features.surfaces import ON_PLANES, Distances
 
 if TYPE_CHECKING:
-    from icalib.sensors.camera.features.feature_factor import FeatureFactor
+    from icalib.sensors.camera.features.residual import FeatureFactor
 
 FEATURES = "features"  # the kind of a track's rows
 

@@ -7,7 +7,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.motion.sensor_pose import chain_width, fill_chain
 from icalib.optim.rows import add_gradients
-from icalib.sensors.camera.features.feature_kernels import weighted_rows
+from icalib.sensors.camera.features.kernels import weighted_rows
 
 
 @njit(cache=True, nogil=True)

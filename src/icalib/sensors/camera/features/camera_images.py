@@ -10,7 +10,7 @@ import numpy as np
 from icalib.motion.sensor_pose import SensorPose
 from icalib.optim.robust_weights import Loss
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.feature_kernels import (
+from icalib.sensors.camera.features.kernels import (
     Points,
     Seeing,
     Seen,

@@ -15,10 +15,10 @@ from icalib.optim.medians import grouped_quantiles, largest_normal, median_varia
 from icalib.optim.state import State
 from icalib.rig import Camera, Settings
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.feature_factor import FeatureFactor
-from icalib.sensors.camera.features.feature_statistics import FeatureOutput
+from icalib.sensors.camera.features.residual import FeatureFactor
+from icalib.sensors.camera.features.statistics import FeatureOutput
 from icalib.sensors.camera.features.tracks import TrackNoise
-from icalib.sensors.camera.images import are_used
+from icalib.sensors.camera.image_times import are_used
 
 FIRST_GUESS_PX = 1.0
 SMALLEST_PX = 0.005

@@ -26,8 +26,9 @@ from icalib.optim.planes import Planes
 from icalib.optim.robust_weights import LOSSES, Loss
 from icalib.optim.state import Layout, State
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.feature_clusters import accumulate_clusters
-from icalib.sensors.camera.features.feature_kernels import (
+from icalib.sensors.camera.features.camera_images import View
+from icalib.sensors.camera.features.cluster_kernels import accumulate_clusters
+from icalib.sensors.camera.features.kernels import (
     Points,
     Range,
     Seen,
@@ -36,14 +37,13 @@ from icalib.sensors.camera.features.feature_kernels import (
     held_back,
     take_trials,
 )
-from icalib.sensors.camera.features.feature_statistics import (
+from icalib.sensors.camera.features.statistics import (
     FeatureOutput,
     feature_rows,
     feature_sizes,
     feature_squares,
     spent_by_features,
 )
-from icalib.sensors.camera.features.feature_views import View
 from icalib.sensors.camera.features.surfaces import (
     NOWHERE,
     Distances,
