@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.estimate.estimate import ENOUGH_TRACKED, estimate
+from icalib.estimate.estimate import estimate
 from icalib.geometry import so3
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.motion.factor import of_type
 from icalib.sensors.camera.features.residual import FeatureFactor
+from icalib.sensors.camera.model import ENOUGH_USED
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
@@ -66,6 +67,6 @@ def test_where_enough_take_part_there_is_one_pass(settled):
     inputs, found = settled
     again, begun = passes(inputs, found, 0.5)
     assert len(begun) == 1
-    assert features_of(again.problem).followed > ENOUGH_TRACKED * sum(
+    assert features_of(again.problem).followed > ENOUGH_USED * sum(
         int(k.sum()) for k in features_of(again.problem).keep
     )
