@@ -11,7 +11,9 @@ from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Ground, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, Wheels, by_name
 from icalib.rig.complete import check_complete, lack_of
 from icalib.rig.file import rig_from_dict, rig_to_dict
+from icalib.sensors.position.spec import PositionSensor
 
+GNSS = PositionSensor("gnss0", "")
 IMU = ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
 LIDAR, WHEELS = Lidar("lidar0", ""), Wheels("wheel0", "", "differential")
 MOCAP, ODOMETRY = PoseSensor("mocap0", ""), PoseSensor("odom0", "", "relative")
@@ -31,6 +33,10 @@ EMPTY = Measurements.of_streams()
         (Rig(by_name(LIDAR, MOCAP)), "lidar0 needs an IMU"),
         (Rig(by_name(LIDAR, WHEELS)), "lidar0 needs an IMU"),
         (Rig(by_name(MOCAP)), "mocap0 is the only sensor"),
+        (Rig(by_name(GNSS)), "gnss0 positions do not determine rotations; add an IMU, a camera that sees a target"),
+        (Rig(by_name(GNSS, WHEELS)), "gnss0 positions do not determine rotations"),
+        (Rig(by_name(GNSS, LIDAR)), "lidar0 needs an IMU"),
+        (Rig(by_name(GNSS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
         (Rig(by_name(WHEELS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
     ],
     ids=lambda value: "" if isinstance(value, Rig) else value,
@@ -66,7 +72,7 @@ def test_rigs_made_in_python_are_checked_as_rig_files_are(rig: Rig, words: str):
 
 @pytest.mark.parametrize(
     "rig",
-    [Rig(by_name(IMU, LIDAR)), Rig(by_name(IMU, ODOMETRY)), Rig(by_name(WHEELS, MOCAP))],
+    [Rig(by_name(IMU, LIDAR)), Rig(by_name(IMU, ODOMETRY)), Rig(by_name(WHEELS, MOCAP)), Rig(by_name(GNSS, MOCAP))],
 )
 def test_what_can_be_calibrated(rig: Rig):
     assert lack_of(rig) is None

@@ -111,10 +111,3 @@ def test_a_target_of_two_bodies_has_no_frame(tmp_path):
     )
     with pytest.raises(RigError, match="a target of 2 bodies has no frame"):
         load_rig(path)
-
-
-def test_it_needs_an_imu(tmp_path):
-    path = tmp_path / "rig.yaml"
-    path.write_text("sensors:\n  gnss0: {type: position}\n")
-    with pytest.raises(RigError, match="gnss0"):
-        load_rig(path)

@@ -10,7 +10,7 @@ import numpy as np
 from icalib.model.frames import frame_entries
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.model.statistics import ResidualStatistics
-from icalib.optim.state import Entry
+from icalib.optim.state import Entry, Key
 from icalib.rig import Rig, Settings
 from icalib.rig.scene import FRAME, LEVEL_FRAME
 from icalib.sensors.position.frame import frame_owner
@@ -36,6 +36,12 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
             return []
         levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == LEVELLED
         return frame_entries(sensor.name, n_recordings, specs=LEVEL_FRAME if levelled else FRAME)
+
+    def keyframe_times(
+        self, sensor: PositionSensor, stream: PositionStream, values: dict[Key, np.ndarray], rig: Rig
+    ) -> np.ndarray:
+        """None where the motion is assumed to be smooth: other sensors show it, and place keyframes densely enough."""
+        return np.zeros(0) if rig.assumes_motion else super().keyframe_times(sensor, stream, values, rig)
 
     def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
         """In metres if the rig file states a number, else 1: times the standard deviations of `weighted`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -19,7 +20,16 @@ from icalib.sensors.fields import (
 )
 from icalib.sensors.parameter import Parameter
 from icalib.sensors.parameter_spec import ParameterSpec
-from icalib.sensors.sensor import PLAIN_TABLE, TIME_OFFSET, TRANSLATION, ClockedSensor, TableLayout
+from icalib.sensors.sensor import (
+    PLAIN_TABLE,
+    TIME_OFFSET,
+    TRANSLATION,
+    ClockedSensor,
+    Lack,
+    Sensor,
+    TableLayout,
+    has_imu,
+)
 
 LEVELLED, TILTED = "levelled", "tilted"
 Coordinates = Literal["metric", "geodetic"]
@@ -45,7 +55,6 @@ class PositionSensor(ClockedSensor):
     noun: ClassVar[str] = "position sensor"
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (TRANSLATION, TIME_OFFSET)
     gives_motion: ClassVar[bool] = True
-    needs_imu: ClassVar[bool] = True
 
     path: str
     coordinates: Coordinates | None = None
@@ -65,6 +74,14 @@ class PositionSensor(ClockedSensor):
     def shared_frame(self) -> str:
         """See `Sensor`."""
         return "" if self.has_frame else self.frame
+
+    def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
+        yield from super().lacks(sensors, has_target)
+        if not has_imu(sensors) and not any(s.gives_motion_without_imu(has_target) for s in sensors.values()):
+            yield Lack(
+                ("sensors", self.name),
+                "positions do not determine rotations; add an IMU, a camera that sees a target, or a pose sensor.",
+            )
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> PositionSensor:
