@@ -26,8 +26,8 @@ STEERED = np.stack([SPEED / RADIUS, np.cos(ANGLE), np.sin(ANGLE), np.ones_like(T
 
 
 def check_mount(found):
-    assert np.abs(Rotation.from_matrix(R_IMU_WHEEL.T @ found.rotation).as_rotvec()).max() < 1e-9
-    assert np.abs((R_IMU_WHEEL.T @ found.position - LEVER)[:2]).max() < 1e-9
+    assert np.abs(Rotation.from_matrix(R_IMU_WHEEL.T @ found.extrinsics.R).as_rotvec()).max() < 1e-9
+    assert np.abs((R_IMU_WHEEL.T @ found.extrinsics.p - LEVER)[:2]).max() < 1e-9
 
 
 def test_scales_are_exact_without_noise():

@@ -68,8 +68,8 @@ def guess(p, velocity_noise=0.0, wheel_noise=0.0, seed=0):
 
 def differences(found):
     """Yaw, x, y in the wheels' axes, relative radii and baseline."""
-    turn = Rotation.from_matrix(R_IMU_WHEEL.T @ found.rotation).as_rotvec()
-    p = R_IMU_WHEEL.T @ found.position - LEVER
+    turn = Rotation.from_matrix(R_IMU_WHEEL.T @ found.extrinsics.R).as_rotvec()
+    p = R_IMU_WHEEL.T @ found.extrinsics.p - LEVER
     return turn, p, found.values["radii"] / RADII - 1.0, found.values["baseline"][0] / BASELINE - 1.0
 
 
@@ -78,9 +78,9 @@ def test_without_noise_the_drive_is_exact():
     turn, p, radii, baseline = differences(found)
     assert np.abs(turn).max() < 1e-6 and np.abs(p[:2]).max() < 1e-6
     assert np.abs(radii).max() < 1e-6 and abs(baseline) < 1e-6
-    assert UP @ found.position == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), rtol=0, atol=1e-12)
-    assert np.linalg.det(found.rotation) > 0.0
+    assert UP @ found.extrinsics.p == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(found.extrinsics.R @ found.extrinsics.R.T, np.eye(3), rtol=0, atol=1e-12)
+    assert np.linalg.det(found.extrinsics.R) > 0.0
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -160,7 +160,7 @@ def test_readings_do_not_depend_on_how_many_are_made_at_a_time(robot, reports, m
     scenario = replace(scenario, robot_noise_enabled=False)
     assert scenario.of(SimWheels)[0].reports == reports
     whole = simulate(scenario, 9).measurements.wheels[0]
-    monkeypatch.setattr("icalib.sensors.wheels.simulate._AT_A_TIME", 177)
+    monkeypatch.setattr("icalib.sensors.wheels.simulate._CHUNK", 177)
     parts = simulate(scenario, 9).measurements.wheels[0]
     same = "rate" if reports == "rates" else "pose"
     np.testing.assert_array_equal(getattr(parts, same), getattr(whole, same))

@@ -1,4 +1,4 @@
-"""What a result keeps and says of wheels: residuals, the ground they stand on, and sizes that no vehicle has."""
+"""Assessment of wheels in a result: residuals, warnings on the ground, and implausible sizes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from icalib.result.row_records import row_record
 from icalib.result.timeline import Timeline
 from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
-from icalib.sensors.wheels.initialize.drive_guess import OPPOSITE
+from icalib.sensors.wheels.initialize.drive_guess import REVERSED_YAW
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor
 
 LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical slip": ("vertical",)} | {
@@ -27,7 +27,7 @@ LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical s
     "wheel": ("wheel",),
     "steering": ("steering",),
 }
-# Of rows of wheels: what they are, the field of the rig file that says how far off they may be, and its unit.
+# By kind of residual: its name in sentences, the field of the rig file with its noise, and the unit of that.
 _ROWS = {
     "wheels": ("wheel angles", "wheel_noise", "rad/sqrt(s)"),
     "wheel": ("wheel angles", "wheel_noise", "rad/sqrt(s)"),
@@ -37,15 +37,15 @@ _ROWS = {
     "lateral slip": ("lateral slip", "lateral_slip", "m/sqrt(s)"),
     "vertical slip": ("vertical slip", "vertical_slip", "m/sqrt(s)"),
 }
-UPRIGHT = 0.5  # cosine of the angle between the downward axis of the image and that of the vehicle: 60 degrees
-# Radii over baseline: from 1/15 of a floor robot to 1 of a toy; rates in rpm make 1/3 a 1/30.
-SMALLEST_SHARE, LARGEST_SHARE = 1.0 / 25.0, 4.0
-RATES = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
-NEARLY = 0.1  # of a number in another unit
+UPRIGHT_COSINE = 0.5  # of 60 deg, the largest angle between the axis of an upright camera and the vertical
+# Radius over baseline: 1/15 of a floor robot to 1 of a toy. Rates in rpm instead of rad/s turn 1/3 into 1/30.
+MIN_RADIUS_RATIO, MAX_RADIUS_RATIO = 1.0 / 25.0, 4.0
+RATE_UNIT_FACTORS = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
+UNIT_TOLERANCE = 0.1  # relative difference between a size and that in another unit
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
-    """Of each set of wheels; slip is measured to be 0. A row is an interval between keyframes."""
+    """A record of each set of wheels with one row per interval between keyframes; the measured slip is 0."""
     for key, factor in found.problem.factors.items():
         if isinstance(factor, IncrementFactor | RelativePoseFactor):
             rows = factor.rows(found.outcome.residuals[key], found.outcome.state)
@@ -53,23 +53,23 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[R
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """Where a camera that stands upright is all that speaks for the wheels as they are."""
-    for wheels, up in _open(inputs, found):
-        if not inputs.rig.moves_by_poses and _stance(up) is None:
+    """A note if only the assumption of an upright camera decides whether wheels are upside down."""
+    for wheels, up in _without_vertical(inputs, found):
+        if not inputs.rig.moves_by_poses and _posture(up) is None:
             yield (
                 f"{wheels}: nothing but {_body(inputs)}, which then stands upright, shows which way is up; if it is "
-                f"upside down, {_opposite(inputs, wheels)}."
+                f"upside down, {_other_vertical(inputs, wheels)}."
             )
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where no LiDAR sees the ground of wheels, or nothing shows which way is up."""
+    """Warnings if no LiDAR sees the ground of wheels, or if nothing shows the vertical."""
     yield from ground_warnings(found)
     yield from _upwards_warnings(inputs, found)
 
 
 def ground_warnings(found: Estimate) -> Iterator[str]:
-    """Warnings on ground constraints whose floor no LiDAR sees."""
+    """A warning for each ground factor whose floor no LiDAR sees."""
     for factor in of_type(found.problem.factors, GroundFactor):
         if not len(factor.keyframes):
             yield (
@@ -79,25 +79,25 @@ def ground_warnings(found: Estimate) -> Iterator[str]:
 
 
 def _upwards_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Both readings of wheels that stand on the ground only if the first camera does not stand upright, or with a pose
-    sensor whose frame is not level."""
-    for wheels, up in _open(inputs, found):
+    """A warning with both possible verticals: with a pose sensor whose frame is not level, or if the first camera is
+    not upright for the vertical of the result."""
+    for wheels, up in _without_vertical(inputs, found):
         if inputs.rig.moves_by_poses:
             x, y, z = up
             yield (
                 f"{wheels}: nothing shows which way is up: no frame of a pose sensor is level. Here up is ({x:.2f}, "
-                f"{y:.2f}, {z:.2f}) in the axes of {_body(inputs)}; if that is down, {_opposite(inputs, wheels)}."
+                f"{y:.2f}, {z:.2f}) in the axes of {_body(inputs)}; if that is down, {_other_vertical(inputs, wheels)}."
             )
-        elif stance := _stance(up):
+        elif posture := _posture(up):
             yield (
-                f"{wheels}: nothing shows which way is up. Either {_body(inputs)} {stance}, or "
-                f"{_opposite(inputs, wheels)}."
+                f"{wheels}: nothing shows which way is up. Either {_body(inputs)} {posture}, or "
+                f"{_other_vertical(inputs, wheels)}."
             )
 
 
-def _open(inputs: Inputs, found: Estimate) -> Iterator[tuple[str, np.ndarray]]:
-    """Names of wheels of which the motion does not show what is up, nor the rig file, and z of their frame in the axes
-    of the body."""
+def _without_vertical(inputs: Inputs, found: Estimate) -> Iterator[tuple[str, np.ndarray]]:
+    """Names of wheels whose vertical neither the data nor the rig file determine up to its sign, with the z axis (3,)
+    of their frame in the axes of the body."""
     values = found.outcome.state.values
     if not inputs.rig.assumes_motion or level_sensor(inputs, found.outcome.state) is not None:
         return
@@ -106,27 +106,30 @@ def _open(inputs: Inputs, found: Estimate) -> Iterator[tuple[str, np.ndarray]]:
             yield wheels.name, values[wheels.name, "rotation"][:, 2]
 
 
-def _stance(up: np.ndarray) -> str | None:
-    """How a camera stands in whose axes (x to the right, y down, z ahead) up is `up` (3,); None: upright."""
+def _posture(up: np.ndarray) -> str | None:
+    """The posture of a camera in words, None if it is upright; up (3,): the vertical in its axes, x right, y down, z
+    ahead."""
     _, down, ahead = up
-    if down < -UPRIGHT:
+    if down < -UPRIGHT_COSINE:
         return None
-    if down > UPRIGHT:
+    if down > UPRIGHT_COSINE:
         return "stands upside down"
-    return "looks up" if ahead > UPRIGHT else "looks down" if ahead < -UPRIGHT else "lies on its side"
+    return "looks up" if ahead > UPRIGHT_COSINE else "looks down" if ahead < -UPRIGHT_COSINE else "lies on its side"
 
 
 def _body(inputs: Inputs) -> str:
+    """Name of the body's sensor."""
     return inputs.rig.reference_without_imu
 
 
-def _opposite(inputs: Inputs, name: str) -> str:
+def _other_vertical(inputs: Inputs, name: str) -> str:
+    """What is wrong with the wheels `name` if the vertical has the other sign."""
     wheels = next(w for w in inputs.rig.wheels if w.name == name)
-    return OPPOSITE[wheels.kind]
+    return REVERSED_YAW[wheels.kind]
 
 
 def misfit(wheels: Wheels, f: SensorFit, is_noise: bool) -> str | None:
-    """A sentence where wheels slip or turn by more than the rig file states."""
+    """A sentence if residuals are larger than the rig file states, with the field to change; else None."""
     if excess(f) == 1.0:
         return None
     if f.kind in (TILT, HEIGHT):
@@ -136,7 +139,7 @@ def misfit(wheels: Wheels, f: SensorFit, is_noise: bool) -> str | None:
             f"{wheels.name} {what} its ground {times(f)} more than {field} predicts, as on ramps or where the ground "
             "is another plane; take ground out, or that part of the recording."
         )
-    relative = f.kind == "yaw" and wheels.kind == "pair"  # the paper's relative poses have a yaw, too
+    relative = f.kind == "yaw" and wheels.kind == "pair"  # relative poses of a pair have a yaw, too
     what, field, unit = _ROWS.get("" if relative else f.kind, (f.kind, "", ""))
     words = f"{what} residuals of {wheels.name} are {times(f)} larger than {field or 'its noise'} predicts"
     if not is_noise:
@@ -147,25 +150,25 @@ def misfit(wheels: Wheels, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def length(wheels: Wheels, rig: Rig) -> str | None:
-    """What shows how long a metre is: wheels that report metres, or turns of wheels of a known size."""
+    """What determines the scale, in words: wheels that report metres, or whose sizes are stated; else None."""
     known = wheels.measures == "poses" or getattr(wheels, wheels.drive_specs[0].name).mode != "free"
     return f"the stated sizes of {wheels.name}" if known else None
 
 
 def sizes(wheels: Wheels) -> tuple[str, ...]:
-    """The parameters that say how long a metre is."""
+    """Names of the parameters that determine the scale if they are stated."""
     return (wheels.drive_specs[0].name,)
 
 
 def absurd(wheels: Wheels, found: dict[tuple[str, str], ParameterGroup]) -> Iterator[str]:
-    """Wheels that are tiny or huge beside what is between them: readings in another unit."""
+    """A sentence if radii and baseline are out of proportion, as for readings in another unit."""
     if wheels.kind != "pair":
         return
     radii, baseline = found.get((wheels.name, "radii")), found.get((wheels.name, "baseline"))
     if radii is None or baseline is None:
         return
-    share = float(radii.value.mean() / baseline.value[0])
-    if SMALLEST_SHARE < share < LARGEST_SHARE:
+    ratio = float(radii.value.mean() / baseline.value[0])
+    if MIN_RADIUS_RATIO < ratio < MAX_RADIUS_RATIO:
         return
     cause = {"ticks": "its counts_per_turn", "rates": "its rate_unit"}.get(
         wheels.measures, "whether its angles are in radians"
@@ -177,14 +180,15 @@ def absurd(wheels: Wheels, found: dict[tuple[str, str], ParameterGroup]) -> Iter
 
 
 def looks_like(wheels: Wheels, name: str, value: np.ndarray, found: np.ndarray) -> str:
-    """What the stated size of wheels looks like, as a sentence that begins with a space; or nothing."""
+    """A sentence on the likely mistake in a stated size, with a leading space; empty without one. value, found: the
+    stated and the estimated size."""
     if name not in ("radii", "radius"):
         return ""
-    if is_near(found, 0.5 * value, NEARLY):
+    if is_near(found, 0.5 * value, UNIT_TOLERANCE):
         return " It looks like a diameter: write the radius."
     if wheels.measures == "ticks" and wheels.counts_per_turn is not None:
         return f" With it counts_per_turn would be {wheels.counts_per_turn * float(np.median(value / found)):.0f}."
-    for size, unit in RATES.items() if wheels.measures == "rates" else ():
-        if is_near(found, size * value, NEARLY):
+    for factor, unit in RATE_UNIT_FACTORS.items() if wheels.measures == "rates" else ():
+        if is_near(found, factor * value, UNIT_TOLERANCE):
             return f" Its readings look like {unit}: write rate_unit: {unit}."
     return ""

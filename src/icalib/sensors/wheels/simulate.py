@@ -1,5 +1,4 @@
-"""Simulated wheels report turning rates of encoders, speed and yaw rate, a steering angle, or relative poses of their
-frame as the paper's (27) has them."""
+"""Simulated wheels: rates of encoders, speed and yaw rate, a steering angle, or the paper's relative poses (27)."""
 
 from __future__ import annotations
 
@@ -23,12 +22,12 @@ from icalib.tools.simulation.scenario.room import Room
 from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
-_GAUSS = np.polynomial.legendre.leggauss(3)
-_STEEPEST_RAD = 1.3  # of front wheels: a car's turn by 0.7
-_SUBSTEPS = 12  # of an interval of (27), for its noise
-_AT_A_TIME = 100_000  # instants: motion and its derivatives take 2 kB each
+_GAUSS = np.polynomial.legendre.leggauss(3)  # nodes and weights on [-1, 1]
+_MAX_STEERING_RAD = 1.3  # of front wheels; those of a car reach 0.7
+_SUBSTEPS = 12  # of an interval of (27), over which its noise is integrated
+_CHUNK = 100_000  # instants at a time: motion and its derivatives take 2 kB each
 _KINDS: dict[str, WheelKind] = {"rates": "pair", "steering": "steered", "twist": "twist", "poses": "pair"}
-# Fields of a scenario file by what wheels report: those that they must have, and the noise that they may have.
+# Fields of a scenario file by what wheels report: required ones, then optional ones.
 _FIELDS = {
     "rates": (("radii", "baseline"), ("noise", "slip", "allowed_slip", "poses_every")),
     "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
@@ -47,8 +46,8 @@ _JOINTS = {"pair": ["left_wheel", "right_wheel"], "steered": ["wheel", "steering
 
 @dataclass(frozen=True, eq=False)
 class WheelTruth:
-    """seconds (N,) on the IMU's clock of each stamp; value: (N, 2) as in `WheelStream`, or (N - 1, 3) relative poses,
-    both without noise."""
+    """Readings without noise: seconds (N,) of the stamps on the IMU's clock; value (N, 2) as in `WheelStream`, or
+    relative poses (N - 1, 3)."""
 
     seconds: np.ndarray
     value: np.ndarray
@@ -56,17 +55,17 @@ class WheelTruth:
 
 @dataclass(frozen=True, eq=False)
 class SimWheels(SimSensor):
-    """True wheels; their frame is the middle of the axle that is not steered, on the floor, x forwards, z up.
+    """Simulated wheels. The origin of their frame is midway between the wheels of the axle that is not steered, on the
+    floor; x forward, z up.
 
-    radii (left, right) [m], baseline [m]. noise: density of each wheel's rate [rad/s/sqrt(Hz)]; slip: density of a
-    lateral random path [m/sqrt(s)], in poses only. allowed_slip: density of slip [m/sqrt(s)] that the rig is told;
-    encoders simulated here know none, while a rig that is told nothing allows for what real wheels may have.
+    radii (left, right) [m], baseline [m]. noise: density of each wheel's rate [rad/s/sqrt(Hz)]. slip: density of
+    lateral slip [m/sqrt(s)], of poses only. allowed_slip: density of slip [m/sqrt(s)] that the rig file states;
+    simulated encoders have none, and the default of the rig file is that of real wheels.
 
-    rates: what encoders report, by `sampling` as in `WheelStream`: (v_x -+ baseline/2 w_z) / radius. twist: forward
-    speed and yaw rate, v_x and w_z over their scales, by `sampling`, too. steering: the rate v_x / radius of a driven
-    wheel, and the angle by which front wheels a wheelbase ahead point to where they move, less steering_offset [rad].
-    poses: relative poses as the paper's (27) predicts them from the truth, one for every `poses_every` readings, with
-    the noise that integrating the readings would have.
+    reports, with v_x and w_z the velocity of the frame, sampled by `sampling` as in `WheelStream`:
+    rates: (v_x -+ baseline/2 w_z) / radius. twist: v_x and w_z over their scales. steering: v_x / radius of the driven
+    wheel, and the direction in which a point a wheelbase ahead moves, less steering_offset [rad]. poses: relative poses
+    of the paper's (27), one for every `poses_every` readings, with the noise of integrated readings.
     """
 
     sensor_type: ClassVar[str] = "wheels"
@@ -142,7 +141,7 @@ class SimWheels(SimSensor):
         return Report(stream, WheelTruth(seconds[1:], true))
 
     def _densities(self) -> np.ndarray:
-        """(2,) of the noise of the two columns."""
+        """(2,) noise densities of the two columns of readings."""
         densities = {"twist": [self.speed_noise, self.yaw_noise], "steering": [self.noise, self.steering_noise]}
         return np.array(densities.get(self.reports, [self.noise, self.noise]))
 
@@ -174,7 +173,7 @@ class SimWheels(SimSensor):
         write_table(folder / "poses.csv", header, stamps[:-1], stamps[1:], stream.pose, upper)
 
     def bag_topic(self, stream: WheelStream | WheelPoses, offset_ns: int) -> BagTopic | str:
-        """JointState or TwistStamped."""
+        """Messages JointState or TwistStamped; a sentence for relative poses, which have none."""
         if isinstance(stream, WheelPoses):
             return f"{self.name} reports relative poses, which no driver sends; they are not written."
         if stream.kind == "twist":
@@ -201,8 +200,8 @@ def _number(key: str, value: YamlValue) -> Any:
 
 
 def _joint_states(wheels: WheelStream, offset_ns: int) -> Iterator[BagEvent]:
-    """Positions are the angles turned since the first stamp, where the readings are means; else there are none, but
-    steering angles, which have no velocity."""
+    """Messages of joints. Positions are angles since the first stamp if readings are means over intervals; else there
+    are none. A steering joint has a position and no velocity."""
     angles, rates = np.full(wheels.rate.shape, np.nan), wheels.rate.copy()
     if wheels.sampling == "interval-mean":
         turned = wheels.rate[1:] * np.diff(wheels.stamps_ns)[:, None] * 1e-9
@@ -232,7 +231,7 @@ def _twists(wheels: WheelStream, offset_ns: int) -> Iterator[BagEvent]:
 
 
 def _twist(bag: BagWriter, stamp_ns: int, frame: str, speed: float, yaw_rate: float) -> Any:
-    """Forward speed [m/s] and yaw rate [rad/s]."""
+    """A message TwistStamped of forward speed [m/s] and yaw rate [rad/s]."""
     linear, angular = (bag.make("geometry_msgs/msg/Vector3", *v) for v in ((speed, 0.0, 0.0), (0.0, 0.0, yaw_rate)))
     return bag.make(_TWIST, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Twist", linear, angular))
 
@@ -248,8 +247,8 @@ def _true_readings(wheels: SimWheels, scene: SimScene, seconds: np.ndarray) -> n
 
 
 def reported(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> np.ndarray:
-    """(N, 2) at each instant, without noise, as in `WheelStream`. Of rates (v_x -+ baseline/2 w_z) / radius."""
-    some = np.split(seconds, range(_AT_A_TIME, len(seconds), _AT_A_TIME))
+    """(N, 2) instantaneous readings without noise, as in `WheelStream`, at seconds (N,) on the clock of the truth."""
+    some = np.split(seconds, range(_CHUNK, len(seconds), _CHUNK))
     return np.concatenate([_reported(wheels, trajectory, s) for s in some])
 
 
@@ -267,10 +266,10 @@ def _reported(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray
 
 
 def _steering(wheels: SimWheels, ahead: np.ndarray, turning: np.ndarray) -> np.ndarray:
-    """(N,) rad: a point a wheelbase ahead moves at v_x forwards, or backwards, and at wheelbase w_z to the left. Raises
-    RigError where no front wheels can be steered so."""
+    """(N,) steering angle [rad]: the direction in which a point a wheelbase ahead moves, with the speed v_x along x and
+    wheelbase * w_z along y. Raises RigError beyond the range of front wheels."""
     angle = np.arctan2(np.copysign(wheels.wheelbase, ahead) * turning, np.abs(ahead))
-    if np.abs(angle).max() > _STEEPEST_RAD:
+    if np.abs(angle).max() > _MAX_STEERING_RAD:
         raise RigError(
             f"{wheels.name} would have to steer by {np.rad2deg(np.abs(angle).max()):.0f} deg; choose a motion with "
             "wider curves that never drives backwards, or a shorter wheelbase."
@@ -289,7 +288,8 @@ def wheel_velocity(
 
 
 def _means(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray, imu_seconds: np.ndarray) -> np.ndarray:
-    """(N - 1, 2) means between the instants, by Gauss's rule between all these and the IMU's, where rates may jump."""
+    """(N - 1, 2) mean readings between seconds (N,), by Gauss quadrature between these and imu_seconds, where rates may
+    jump."""
     within = imu_seconds[(imu_seconds > seconds[0]) & (imu_seconds < seconds[-1])]
     cuts = np.union1d(seconds, within)
     width = np.diff(cuts)
@@ -304,7 +304,7 @@ def relative_poses(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.nd
     """(K, 3) yaw, x, y between consecutive instants (K + 1,) by the paper's (27), without noise, and (K, 3, 3) the
     covariance that integrating noisy readings would give them: yaw = e3 . Log(R_W(k)_W(k+1)), x and y of p_W(k)_W(k+1).
     """
-    each = _AT_A_TIME // (2 * _SUBSTEPS + 1)
+    each = _CHUNK // (2 * _SUBSTEPS + 1)
     some = [seconds[k : k + each + 1] for k in range(0, len(seconds) - 1, each)]
     poses, covariances = zip(*(_relative_poses(wheels, trajectory, s) for s in some), strict=True)
     return np.concatenate(poses), np.concatenate(covariances)
@@ -342,19 +342,19 @@ def _rotation_vectors(rotation: np.ndarray) -> np.ndarray:
 
 
 def _covariance(wheels: SimWheels, yaw: np.ndarray, xy: np.ndarray, duration: np.ndarray) -> np.ndarray:
-    """(K, 3, 3) of yaw, x, y: the noise of rates at each part, carried to the end of its interval.
+    """(K, 3, 3) covariance of yaw, x, y: the noise of rates at each instant, propagated to the end of its interval.
 
-    yaw (K, M), xy (K, M, 2) along each interval, M odd: Simpson's rule. An error of the turning rate at one instant
-    turns the rest of the way about where the frame then was; one of the speed is along where it then points.
+    yaw (K, M), xy (K, M, 2) along each interval, M odd, for Simpson's rule; duration (K,) s. An error of the yaw rate
+    rotates the rest of the path about the frame's position at that instant; one of the speed moves it along its x axis.
     """
     r_l, r_r = wheels.radii
     speeds = np.array([[-r_l, r_r], [0.5 * r_l * wheels.baseline, 0.5 * r_r * wheels.baseline]]) / wheels.baseline
     to_end = xy[:, -1:] - xy
     c, s, none, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
-    by_turn = np.stack([one, -to_end[..., 1], to_end[..., 0]], axis=-1)
-    by_speed, by_slip = np.stack([none, c, s], axis=-1), np.stack([none, -s, c], axis=-1)
-    by_wheels = np.stack([by_turn, by_speed], axis=-1) @ speeds * wheels.noise
-    effect = np.concatenate([by_wheels, by_slip[..., None] * wheels.slip], axis=-1)
+    J_turn = np.stack([one, -to_end[..., 1], to_end[..., 0]], axis=-1)
+    J_speed, J_slip = np.stack([none, c, s], axis=-1), np.stack([none, -s, c], axis=-1)
+    J_wheels = np.stack([J_turn, J_speed], axis=-1) @ speeds * wheels.noise
+    effect = np.concatenate([J_wheels, J_slip[..., None] * wheels.slip], axis=-1)
     weight = np.where(np.arange(yaw.shape[1]) % 2, 4.0, 2.0)
     weight[[0, -1]] = 1.0
     weight = weight / weight.sum() * duration[:, None]

@@ -1,4 +1,4 @@
-"""Initial guess of wheels on a known trajectory."""
+"""Initial guess of wheels on a known trajectory, and a trajectory by wheels for rigs without an IMU."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from icalib.sensors.wheels.initialize.planar_path import wheel_path
 
 
 class WheelInitializer(Initializer[Wheels]):
-    """Wheels are placed on the motion of others. Without any and without an IMU, they give it on a flat floor."""
+    """Guesses wheels from the trajectory of other sensors. Without an IMU and other sensors, dead reckoning on a flat
+    floor gives the trajectory."""
 
     asks_for_vertical = True
 

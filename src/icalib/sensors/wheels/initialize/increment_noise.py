@@ -1,4 +1,4 @@
-"""The noise of wheels as densities of path and yaw."""
+"""Noise of wheels as densities of distance and yaw, before their sizes are known."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from icalib.rig import Wheels
 
 
 def wheel_noise(wheels: Wheels, streams: Sequence[object], paths: Sequence[SmoothTrajectory]) -> tuple[float, float]:
-    """Densities of path [m/sqrt(s)] and yaw [rad/sqrt(s)]; zeros if they are unknown. Radius and baseline of a pair are
-    the ratios of RMS speeds and RMS rates of `paths` to those of the wheels, which no time offset changes."""
+    """Densities of distance [m/sqrt(s)] and yaw [rad/sqrt(s)]; zeros if unknown.
+
+    Radius and baseline of a pair are approximated by ratios of RMS speed and RMS rate of `paths` to those of the
+    wheels, which a time offset does not change.
+    """
     if wheels.kind == "twist":
         return wheels.speed_noise, wheels.yaw_noise
     rates = [s.rate for s in streams if isinstance(s, WheelStream) and s.kind == "pair"]
@@ -29,5 +32,5 @@ def wheel_noise(wheels: Wheels, streams: Sequence[object], paths: Sequence[Smoot
 
 
 def _rms(x: np.ndarray) -> float:
-    """Of numbers (n,), or of the lengths of vectors (n, 3)."""
+    """Root mean square of numbers (n,) or of the lengths of vectors (n, 3)."""
     return float(np.sqrt((x.reshape(len(x), -1) ** 2).sum(axis=1).mean()))

@@ -1,4 +1,4 @@
-"""Wheels placed on a known motion: time offset, direction of travel, sizes."""
+"""Initial guess of wheels on a known trajectory: time offset, extrinsics, sizes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from icalib.optim.state import Key, State
 from icalib.rig import Wheels
 from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION, mounted
 from icalib.sensors.wheels.initialize.drive_guess import (
-    OPPOSITE,
+    REVERSED_YAW,
     WheelRates,
     drive_guess,
     wheel_offset,
@@ -37,13 +37,13 @@ from icalib.sensors.wheels.initialize.drive_guess import (
 from icalib.sensors.wheels.initialize.relative_pose_guess import extrinsics_guess, poses_offset
 from icalib.sensors.wheels.integrals import integrals_of
 
-SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0  # weights of start, middle and end of a span
+SIMPSON_WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0  # of start, middle and end of an interval
 
 
 def wheel_values(inputs: Inputs, state: State, sensors: Sequence[Wheels]) -> dict[Key, np.ndarray]:
-    """Parameters of `sensors`, as the rig file gives them or as the motion in `state` shows them.
+    """Parameters of `sensors`, from the rig file or else from the trajectory in `state`.
 
-    Raises EstimationError where neither does.
+    Raises EstimationError if the rig file lacks some and the trajectory does not determine them.
     """
     out: dict[Key, np.ndarray] = {}
     for wheels in sensors:
@@ -54,6 +54,7 @@ def wheel_values(inputs: Inputs, state: State, sensors: Sequence[Wheels]) -> dic
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
+    """As `wheel_values`, of one set of wheels. Values of the rig file stay unless the trajectory contradicts them."""
     names = [spec.name for spec in wheels.specs()]
     known = stated_values(inputs, wheels, names)
     if isinstance(stream, WheelPoses):
@@ -64,74 +65,79 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     clock = wheels.name, "time_offset"
     offset = known.get(clock)
     try:
-        found = _found(inputs, state, wheels, stream, None if wheels.time_offset.mode == "free" else offset)
+        found = _from_trajectory(inputs, state, wheels, stream, None if wheels.time_offset.mode == "free" else offset)
         if not complete and offset is not None and not is_contradicted(TIME_OFFSET, offset, found[clock]):
-            found = _found(inputs, state, wheels, stream, offset)
+            found = _from_trajectory(inputs, state, wheels, stream, offset)
     except EstimationError:
         if complete:
             return known
         if offset is None:
             raise
-        found = _found(inputs, state, wheels, stream, offset)
-    mount = wheels.name, "translation"
-    arm = known.get(mount)
-    level = found[mount] if arm is None else _as_high(inputs, state, arm, found[mount])
-    refuse_far_off(wheels, found | {mount: level})
-    if arm is not None and not is_contradicted(TRANSLATION, arm, level):
-        found[mount] = arm
+        found = _from_trajectory(inputs, state, wheels, stream, offset)
+    translation = wheels.name, "translation"
+    stated = known.get(translation)
+    level = found[translation] if stated is None else _at_height_of(inputs, state, stated, found[translation])
+    refuse_far_off(wheels, found | {translation: level})
+    if stated is not None and not is_contradicted(TRANSLATION, stated, level):
+        found[translation] = stated
     return merged_values(wheels, known, found)
 
 
-def _as_high(inputs: Inputs, state: State, arm: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """The lever arm that was `found`, as high as `arm`: on a floor wheels do not show their height."""
+def _at_height_of(inputs: Inputs, state: State, stated: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """The lever arm `found` (3,), moved along the vertical to the height of `stated` (3,): the motion on a floor does
+    not determine heights."""
     up = possible_verticals(inputs, state).candidates[0]
     up = up / np.linalg.norm(up)
-    return found + up * (up @ (arm - found))
+    return found + up * (up @ (stated - found))
 
 
-def _found(
+def _from_trajectory(
     inputs: Inputs,
     state: State,
     wheels: Wheels,
     stream: WheelStream | WheelPoses,
     offset: np.ndarray | None,
 ) -> dict[Key, np.ndarray]:
-    """What the motion shows of wheels, at a time `offset` where it is known."""
+    """Parameters of wheels from the trajectory; offset (1,) s: the known time offset.
+
+    Both directions of the vertical are tried if nothing shows which is up. Raises EstimationError if neither fits.
+    """
     assert inputs.imu is not None
     if isinstance(stream, WheelPoses):
-        return _posing(inputs, state, stream, offset)
+        return _from_relative_poses(inputs, state, stream, offset)
     rates = wheel_rates(wheels.name, stream.seconds, integrals_of(stream), stream.kind)
     up = possible_verticals(inputs, state)
     failed: list[EstimationError] = []
-    for way in up.candidates:
-        found = _try(inputs, state, stream, rates, way, offset)
+    for candidate in up.candidates:
+        found = _attempt(inputs, state, stream, rates, candidate, offset)
         if not isinstance(found, EstimationError):
             return found
         failed.append(found)
-    other = _try(inputs, state, stream, rates, -up.candidates[0], offset) if up.level_sensor else failed[0]
+    other = _attempt(inputs, state, stream, rates, -up.candidates[0], offset) if up.level_sensor else failed[0]
     if not isinstance(other, EstimationError):
         raise EstimationError(
-            f"{wheels.name}: {OPPOSITE[rates.kind]}. If z of the frame of {up.level_sensor} points down, write level: "
-            f"false for {up.level_sensor} instead."
+            f"{wheels.name}: {REVERSED_YAW[rates.kind]}. If z of the frame of {up.level_sensor} points down, write "
+            f"level: false for {up.level_sensor} instead."
         )
-    # Of a motion that is no vehicle's one way up shows the slip, the other but that it turns the wrong way.
+    # The motion of no vehicle: lateral slip in one direction is the cause, a reversed yaw in the other only follows.
     raise next((error for error in (*failed, other) if isinstance(error, MotionContradictedError)), failed[0])
 
 
-def _try(
+def _attempt(
     inputs: Inputs, state: State, stream: WheelStream, rates: WheelRates, up: np.ndarray, offset: np.ndarray | None
 ) -> dict[Key, np.ndarray] | EstimationError:
-    """As `_turning`, or why not."""
+    """As `_from_rates`; the error instead of raising it."""
     try:
-        return _turning(inputs, state, stream, rates, up, offset)
+        return _from_rates(inputs, state, stream, rates, up, offset)
     except EstimationError as error:
         return error
 
 
-def _turning(
+def _from_rates(
     inputs: Inputs, state: State, stream: WheelStream, rates: WheelRates, up: np.ndarray, offset: np.ndarray | None
 ) -> dict[Key, np.ndarray]:
-    """Of wheels that turn, or report what a vehicle does. Raises EstimationError where the motion does not show it."""
+    """Parameters of wheels that report rates; up (3,): the vertical in IMU axes. Raises EstimationError, see
+    `drive_guess`."""
     assert inputs.imu is not None
     name = stream.name
     if offset is None and inputs.sensor(name).clock_restarts:
@@ -142,24 +148,26 @@ def _turning(
     start, end = instants(stream, clock, rates.start), instants(stream, clock, rates.end)
     inside, rate, velocity = _means(inputs, state, start, end)
     drive = drive_guess(name, rates.rate[inside], rate, velocity, up, rates.kind)
-    found = mounted(drive.rotation, drive.position, offset) | drive.values
+    found = mounted(drive.extrinsics.R, drive.extrinsics.p, offset) | drive.values
     return {(name, group): value for group, value in found.items()}
 
 
 def _offset_alone(inputs: Inputs, name: str, up: np.ndarray, recording: int) -> float:
-    """Of wheels in one recording, between its own first stamps; `up` (3,) in the IMU's axes."""
+    """Time offset [s] in one recording, between its own first stamps; up (3,): the vertical in IMU axes."""
     own = single_recording(inputs, recording)
     stream = own.stream(name)
     assert own.imu is not None and isinstance(stream, WheelStream)
     return wheel_offset(own.imu, up, name, wheel_rates(name, stream.seconds, integrals_of(stream), stream.kind))
 
 
-def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray | None) -> dict[Key, np.ndarray]:
-    """Of wheels that report relative poses."""
+def _from_relative_poses(
+    inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray | None
+) -> dict[Key, np.ndarray]:
+    """Extrinsics and time offset of wheels that report relative poses."""
     assert inputs.imu is not None
     if offset is None:
         offset = np.array([poses_offset(inputs.imu, stream)])
-    times = stream.seconds + offset[0]  # there is but one recording of relative poses
+    times = stream.seconds + offset[0]  # relative poses are of one recording
     inside, rate, velocity = _means(inputs, state, times[:-1], times[1:])
     found = extrinsics_guess(stream, inside, rate, velocity)
     values = mounted(found.R, found.p, offset)
@@ -169,15 +177,15 @@ def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray
 def _means(
     inputs: Inputs, state: State, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which spans from start to end (m,), on the IMU's clock, fall within the motion and no gap of the IMU, and over
-    these n the means (n, 3) of the IMU's rate, without bias, and velocity, in its axes.
+    """Mean motion of the IMU over intervals from start to end (m,) s on its clock, by Simpson's rule.
 
-    Raises EstimationError where the wheels turned while nothing else was recorded.
+    Returns a mask (m,) of the n intervals within the trajectory and outside gaps of the IMU, and over these the means
+    (n, 3) of rate [rad/s], without bias, and velocity [m/s], in IMU axes. Raises EstimationError if there are none.
     """
     assert inputs.imu is not None
     motion = motion_of(inputs, state)
     inside = is_known(state.seconds, start) & is_known(state.seconds, end)
-    inside &= clear_of(inputs.imu.gaps, start, end)  # across which the keyframes are extrapolated
+    inside &= clear_of(inputs.imu.gaps, start, end)  # in which poses are extrapolated
     if not inside.any():
         raise EstimationError(
             "no reading of the wheels falls within the recording of the other sensors; check the clocks, or "
@@ -187,5 +195,5 @@ def _means(
     times = np.stack([start, 0.5 * (start + end), end], axis=1).ravel()
     poses = imu_poses(motion, times)
     velocity = np.einsum("nji,nj->ni", poses.rotation, poses.velocity)
-    rate, speed = (np.einsum("k,nki->ni", SIMPSON, x.reshape(-1, 3, 3)) for x in (poses.rate, velocity))
+    rate, speed = (np.einsum("k,nki->ni", SIMPSON_WEIGHTS, x.reshape(-1, 3, 3)) for x in (poses.rate, velocity))
     return inside, rate, speed

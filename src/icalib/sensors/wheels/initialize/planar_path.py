@@ -1,4 +1,4 @@
-"""Dead reckoning by wheels on a flat floor."""
+"""Trajectory of a rig without an IMU: dead reckoning by wheels on a flat floor."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from icalib.sensors.wheels.integrals import integrals_of
 
 
 def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:
-    """Poses of the wheels' frame at their stamps, in the plane that they start in, z up.
+    """Poses of the wheels' frame at their stamps, relative to the first, in the plane z = 0.
 
-    Raises EstimationError where the rig file does not say how large the wheels are.
+    Raises EstimationError if the rig file does not state the sizes of the wheels.
     """
     if isinstance(stream, WheelPoses):
         turn, along = stream.pose[:, 0], stream.pose[:, 1:]
@@ -30,7 +30,7 @@ def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:
 
 
 def _increments(wheels: Wheels, stream: WheelStream) -> tuple[np.ndarray, np.ndarray]:
-    """Yaw (n,) rad and way (n, 2) m in the frame at the beginning, from each reading to the next."""
+    """From each reading to the next: yaw (n,) rad, and displacement (n, 2) m in the frame at the former."""
     turned = np.diff(integrals_of(stream), axis=0)
     if stream.kind == "pair":
         path = turned * _size(wheels, "radii")
@@ -43,11 +43,12 @@ def _increments(wheels: Wheels, stream: WheelStream) -> tuple[np.ndarray, np.nda
         ahead = turned[:, 0] * _size(wheels, "radius")[0]
         steer = np.arctan2(turned[:, 2], turned[:, 1]) + offset
         yaw = ahead * np.tan(steer) / _size(wheels, "wheelbase")[0]
-    half = 0.5 * yaw  # the chord of an arc
+    half = 0.5 * yaw  # the displacement is the chord of an arc
     return yaw, (ahead * np.sinc(half / np.pi))[:, None] * np.stack([np.cos(half), np.sin(half)], axis=1)
 
 
 def _size(wheels: Wheels, name: str) -> np.ndarray:
+    """The stated value of a parameter, or EstimationError."""
     value = getattr(wheels, name).value
     if value is None:
         raise EstimationError(
