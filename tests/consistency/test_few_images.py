@@ -13,7 +13,8 @@ from icalib.data.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.tools.simulation import handheld, rig_for, simulate
-from icalib.validation.assess import few_factor, few_parts_notes
+from icalib.validation.assess import few_parts_notes
+from icalib.validation.variance_parts import few_factor
 
 LENS = {"intrinsics": (458.7, 457.3, 367.2, 248.4), "distortion": (-0.28, 0.07, 2e-4, 2e-5)}
 

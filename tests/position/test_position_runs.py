@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from icalib.errors import EstimationError
 from icalib.pipeline import calibrate, calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig.file import load_rig
@@ -151,6 +152,21 @@ def test_a_leap_second_offset_is_named():
     result = calibrated(sim, moved)
     assert float(result.value("gnss0", "time_offset")[0]) == pytest.approx(-18.0, abs=0.01)
     assert any("18 s between GPS time and UTC" in note for note in result.notes)
+
+
+@pytest.mark.parametrize(("hours", "told"), [(30.0, "30.0 hours after imu0"), (72.0, "3.0 days after imu0")])
+def test_fixes_of_another_day(hours, told):
+    """Unix stamps on both sides: the same rig, the next day, along another path."""
+    sim, other = (recorded("free", antenna(), seed=seed, duration_s=25.0) for seed in (1, 2))
+    (fixes,), imu = other.measurements.of(PositionStream), sim.measurements.imu
+    assert imu is not None
+    unix = 1_700_000_000_000_000_000
+    imu = replace(imu, stamps_ns=imu.stamps_ns - imu.stamps_ns[0] + unix)
+    stamps = fixes.stamps_ns - fixes.stamps_ns[0] + imu.stamps_ns[-1] + round(3600e9 * hours)
+    with pytest.raises(EstimationError, match=rf"^gnss0 was recorded {told}, by the stamps of both, and does not"):
+        calibrated(sim, imu, replace(fixes, stamps_ns=stamps))
+    with pytest.raises(EstimationError, match="of its acceleration at any time offset"):
+        calibrated(sim, imu, replace(fixes, stamps_ns=stamps - round(3600e9 * hours)))
 
 
 def test_a_walk_with_an_antenna_in_the_hand(gnss_imu, tmp_path):

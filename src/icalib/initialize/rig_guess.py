@@ -11,6 +11,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, resample, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.initialize.assumed_motion import guess_with_assumed_motion
+from icalib.initialize.recording_times import naming_recording_times
 from icalib.initialize.steps.initializer import (
     Initializer,
     Values,
@@ -39,11 +40,12 @@ def guess_of_rig(
     the recordings do not carry it.
     """
     recordings = resolve_symmetry(rig, recordings)
-    while True:
-        try:
-            return _guess(rig, recordings, lap)
-        except UnconnectedBodiesError as untied:
-            recordings = [without_bodies(rig.target, untied.names, m) for m in recordings]
+    with naming_recording_times(recordings):
+        while True:
+            try:
+                return _guess(rig, recordings, lap)
+            except UnconnectedBodiesError as untied:
+                recordings = [without_bodies(rig.target, untied.names, m) for m in recordings]
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None]) -> InitialGuess:

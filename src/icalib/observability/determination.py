@@ -24,7 +24,7 @@ from scipy.linalg import LinAlgError, eigh
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
 from icalib.estimate.evidence.debias import Spurious, spurious_information
-from icalib.estimate.evidence.inflation import LEAST, inflation, with_priors_weighed
+from icalib.estimate.evidence.inflation import LEAST, inflation, nuisance_priors, with_priors_weighed
 from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome, Step
@@ -32,7 +32,7 @@ from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.observability.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.optim.calib_block import HELD_BELOW, essential_information, restricted_root
-from icalib.optim.prior_factor import without_priors
+from icalib.optim.prior_factor import variance_of_priors, without_priors
 from icalib.optim.state import Key, State
 
 # A direction with a larger share of noise in its information counts as unobservable: all of it may be noise.
@@ -66,6 +66,15 @@ class Determined:
         t = self.estimate.problem.tolerance
         known = t[:, None] * self.estimate.outcome.information * t - self.noise
         return t[:, None] * scatter(known, self.noise, self.held) * t + self.shifts.T @ self.shifts
+
+    @property
+    def prior_variance(self) -> np.ndarray:
+        """(B,) what errors of nuisance parameters contribute to the diagonal of the covariance. Noise in the Jacobian
+        is no knowledge: errors lead back by the inverse of what is known, as in `scatter`."""
+        problem, outcome = self.estimate.problem, self.estimate.outcome
+        t = problem.tolerance
+        root = t[:, None] * restricted_root(t[:, None] * outcome.information * t - self.noise, self.held)
+        return variance_of_priors(root @ root.T, nuisance_priors(problem), outcome.state)
 
     @property
     def spread(self) -> np.ndarray:

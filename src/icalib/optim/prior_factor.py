@@ -54,12 +54,12 @@ def without_priors(information: np.ndarray, priors: Sequence[Prior], state: Stat
     return information - sums_of_priors(priors, state, len(information))[2]
 
 
-def variance_of_priors(covariance: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
-    """(B,) what errors of the means of `priors` contribute to the diagonal of `covariance` (B, B), of an estimate in
-    which they count: C W C with their information W. The rest is what noise of the measurements contributes."""
-    information = sums_of_priors(priors, state, len(covariance))[2]
-    own = np.einsum("ij,jk,ki->i", covariance, information, covariance, optimize=True)
-    return np.clip(own, 0.0, np.diag(covariance))
+def variance_of_priors(known: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
+    """(B,) variances that errors of the means of `priors` contribute to an estimate in which the priors count: the
+    diagonal of K W K, with W the information of the priors and K = `known` (B, B) what leads from the normal equations
+    to the estimate: the inverse of its information."""
+    information = sums_of_priors(priors, state, len(known))[2]
+    return np.einsum("ij,jk,ki->i", known, information, known, optimize=True)
 
 
 def accumulate_bias_prior(

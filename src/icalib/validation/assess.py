@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr, stdtrit
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.evidence.evidence import fits, raw_sizes
-from icalib.estimate.evidence.inflation import calibration_columns, spread_variance, white_variance
+from icalib.estimate.evidence.inflation import calibration_columns
 from icalib.estimate.evidence.parts import Parts
-from icalib.estimate.evidence.places import cluster_covariances
 from icalib.estimate.problem.gauge import IN_THE_WORLD
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.outcome import Visit
 from icalib.estimate.problem.problem import Problem
 from icalib.model.statistics import Fit
 from icalib.motion.axes import hardly_turned
-from icalib.motion.factor import of_type
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined
 from icalib.observability.words import Observability, observe
@@ -44,7 +40,6 @@ from icalib.result.verdict import by_size
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.sensors import SENSOR_KINDS, ask, facet
-from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.image_times import image_times
 from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.cross_validation import cross_validation
@@ -52,8 +47,8 @@ from icalib.validation.guesses import guess_notes
 from icalib.validation.misfit import scatter_warnings
 from icalib.validation.notes import notes
 from icalib.validation.twin_lenses import twin_lens_notes
+from icalib.validation.variance_parts import ENOUGH_PARTS, VarianceParts, few_factor
 
-ENOUGH_PARTS = 8  # segments; with more, t differs from the normal distribution by 8 % at most
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of it
 
 
@@ -61,28 +56,22 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     """The result, with standard deviations, verdicts and warnings. against: statements of the rig file that the data
     contradict so strongly that other faults of the estimate may follow from them."""
     found = determined.estimate
-    problem, outcome = found.problem, found.outcome
-    names = _column_names(inputs)
-    tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
-    state = outcome.state
-    axes = hardly_turned(state.seconds, state.rotation, inputs.rig.reference)
-    on_wheels = any(s.drives for s in inputs.rig.mounted)
-    seen = observe(determined, names, _column_specs(inputs), on_wheels, tracking, axes)
-    parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
-    noise = _NoiseShare.of(determined, seen.covariance, parts)
-    groups = _groups(inputs, determined, seen, noise)
-    judged = _sensor_fits([f for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
-    held = cross_validation(parts, [s for s in (inputs.rig.reference,) if _is_assumed(inputs, s)])
+    outcome, state = found.outcome, found.outcome.state
+    seen, names = _observed(inputs, determined), _column_names(inputs)
+    parts = Parts.of(found.problem, outcome, inputs.rig.settings.segments)
+    groups = _groups(inputs, determined, seen, VarianceParts.of(determined, parts))
+    judged = _sensor_fits([f for f in fits(found.problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
+    validation = cross_validation(parts, [s for s in (inputs.rig.reference,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs.measurements, state.values), inputs.rig.reference)
     factors = _factors(inputs, groups)
-    factor = factors.max(initial=1.0)
-    causes, size_notes = all_causes(AssessedEstimate(inputs, found, groups, judged, factor, parts, timeline), against)
+    assessed = AssessedEstimate(inputs, found, groups, judged, factors.max(initial=1.0), parts, timeline)
+    causes, size_notes = all_causes(assessed, against)
     wrong = tuple(c.sentence for c in causes if c.grave)
     warnings = (
         *wrong,
         *(c.sentence for c in causes if not c.grave),
         *_warnings(inputs, found, groups),
-        *scatter_warnings(factors, parts is not None, held),
+        *scatter_warnings(factors, parts is not None, validation),
     )
     return Calibration(
         groups=groups,
@@ -97,22 +86,32 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         converged=outcome.converged,
         status=outcome.status,
         warnings=tuple(dict.fromkeys(warnings)),
-        notes=(
-            *notes(inputs, found, timeline),
-            *twin_lens_notes(inputs, found, judged),
-            *guess_notes(inputs, groups),
-            *size_notes,
-            *few_parts_notes(inputs, parts),
-        ),
+        notes=(*_notes(assessed), *size_notes, *few_parts_notes(inputs, parts)),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
         versions=versions(),
         recordings=timeline.spans,
         planes=tuple(ask("assess", "planes", inputs, state)),
-        cross_validation=held,
+        cross_validation=validation,
         wrong=wrong,
     )
+
+
+def _observed(inputs: Inputs, determined: Determined) -> Observability:
+    """Covariance and verdicts by observability, with sentences on what is undetermined."""
+    state = determined.estimate.outcome.state
+    tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
+    axes = hardly_turned(state.seconds, state.rotation, inputs.rig.reference)
+    on_wheels = any(s.drives for s in inputs.rig.mounted)
+    return observe(determined, _column_names(inputs), _column_specs(inputs), on_wheels, tracking, axes)
+
+
+def _notes(assessed: AssessedEstimate) -> Iterator[str]:
+    inputs, found = assessed.inputs, assessed.found
+    yield from notes(inputs, found, assessed.timeline)
+    yield from twin_lens_notes(inputs, found, assessed.fits)
+    yield from guess_notes(inputs, assessed.groups)
 
 
 def _rates(inputs: Inputs) -> dict[str, float]:
@@ -164,36 +163,11 @@ def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
     return value
 
 
-class _NoiseShare(NamedTuple):
-    """share (B,): part of the formal variances that noise of the measurements contributes; errors of nuisance
-    parameters contribute the rest, which is common to all segments. ratio (B,): empirical over formal standard
-    deviation of the first part. weight: square root of how many times priors on nuisance parameters count."""
-
-    share: np.ndarray
-    ratio: np.ndarray
-    weight: float
-
-    @classmethod
-    def of(cls, determined: Determined, covariance: np.ndarray, parts: Parts | None) -> _NoiseShare:
-        """covariance (B, B): formal."""
-        found = determined.estimate
-        white = white_variance(found.problem, found.outcome, covariance)
-        ratio = np.sqrt(_empirical_variance(found, parts, white) / white)
-        return cls(white / np.diag(covariance), ratio, determined.inflation)
-
-    def factor(self, columns: np.ndarray, overall: float) -> np.ndarray:
-        """(n,) of the standard deviations of a group: by its own ratio or the `overall` one."""
-        own = max(1.0, float(np.sqrt(np.mean(self.ratio[columns] ** 2))), overall)
-        share = self.share[columns]
-        return np.sqrt(own**2 * share + self.weight**2 * (1.0 - share))
-
-
 def _groups(
-    inputs: Inputs, determined: Determined, seen: Observability, noise: _NoiseShare
+    inputs: Inputs, determined: Determined, seen: Observability, variances: VarianceParts
 ) -> tuple[ParameterGroup, ...]:
     formal, found = np.sqrt(np.diag(seen.covariance)), determined.estimate
-    own = calibration_columns(inputs)
-    overall = float(np.sqrt(np.mean(noise.ratio[own] ** 2))) if len(own) else 1.0
+    overall = variances.pooled(calibration_columns(inputs))
     groups = []
     for block in inputs.layout.blocks:
         if block.name in IN_THE_WORLD or _is_assumed(inputs, block.sensor):
@@ -207,7 +181,7 @@ def _groups(
             verdict: tuple[Verdict, ...] = ("fixed",) * block.size
         else:
             k = block.columns
-            std, factor = formal[k], noise.factor(k, overall)
+            std, factor = formal[k], variances.factor(k, overall)
             sizes = factor * np.maximum(seen.spread[k], std / found.problem.tolerance[k])
             verdict = tuple(_final_verdict(seen.verdicts[i], size) for i, size in zip(k, sizes.tolist(), strict=True))
         groups.append(
@@ -243,19 +217,6 @@ def _final_verdict(formal: Verdict, size: float) -> Verdict:
     return formal if formal == "undetermined" else by_size(size)
 
 
-def _empirical_variance(found: Estimate, parts: Parts | None, white: np.ndarray) -> np.ndarray:
-    """Variance (B,): the larger of the scatter over segments and over feature tracks, plus the excess of clustered over
-    `white` variance (B,) for image and target regions. Without segments and tracks: `white`."""
-    if parts is None and not of_type(found.problem.factors, FeatureFactor):
-        return white
-    clusters = cluster_covariances(found.problem, found.outcome)
-    spread = white if clusters.tracks is None else np.diag(clusters.tracks)
-    if parts is not None:
-        over_parts = few_factor(parts.count) ** 2 * spread_variance(found.outcome, parts, white)
-        spread = over_parts if clusters.tracks is None else np.maximum(spread, over_parts)
-    return spread + sum(np.maximum(np.diag(V) - white, 0.0) for V in clusters.places)
-
-
 def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:
     """A note if standard deviations rest on few segments, with advice to get more."""
     if inputs.imu is not None:
@@ -267,12 +228,6 @@ def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:
             f"standard deviations rest on the spread of {parts.count} parts of the recording, by Student's t "
             f"distribution {few_factor(parts.count):.2f} times as large as those of many; {more}."
         )
-
-
-def few_factor(parts: int) -> float:
-    """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within: Student's t
-    distribution with parts - 1 degrees of freedom."""
-    return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0
 
 
 def _sensor_fits(judged: Sequence[Fit], found: Estimate) -> list[SensorFit]:

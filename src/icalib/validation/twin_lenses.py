@@ -6,7 +6,7 @@ Standard deviations describe the surroundings of one set, and say nothing of the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -25,7 +25,7 @@ OTHER_FOCAL = 0.02  # of the focal length: sets that differ by less are one
 MOST_CHI2 = 16.0  # between two lenses, four standard deviations: noise causes less
 
 
-def twin_lens_notes(inputs: Inputs, found: Estimate, fits: list[SensorFit]) -> Iterator[str]:
+def twin_lens_notes(inputs: Inputs, found: Estimate, fits: Sequence[SensorFit]) -> Iterator[str]:
     """One sentence for each camera whose observations fit another set of parameters as well."""
     for camera, factor in zip(inputs.rig.cameras, of_type(found.problem.factors, CornerFactor), strict=True):
         fit = next((f for f in fits if f.sensor == camera.name and f.unit == "px" and f.rms), None)

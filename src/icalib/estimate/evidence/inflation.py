@@ -20,19 +20,25 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.optim.calib_block import restricted_inverse
-from icalib.optim.prior_factor import variance_of_priors
+from icalib.optim.prior_factor import Prior, variance_of_priors
 
 LEAST = 1.5  # below it, another weight of the priors would gain less than a tenth of a standard deviation
-LEAST_WHITE = 1e-9  # of a variance: rounding, where a prior contributes all of it
+ROUNDING = 1e-9  # of a variance: rounding, where a prior contributes all of it
 MOST_LEVERAGE = 4.0  # of the variance: one part knows nearly all beyond, and the spread of the others nothing
 
 
-def white_variance(problem: Problem, outcome: Outcome, covariance: np.ndarray) -> np.ndarray:
-    """(B,) the part of the diagonal of a formal `covariance` (B, B) that noise of the measurements contributes, and not
-    errors of nuisance parameters."""
-    nuisance = [p for p in problem.priors if p.block.is_nuisance]
-    whole = np.diag(covariance)
-    return np.maximum(whole - variance_of_priors(covariance, nuisance, outcome.state), LEAST_WHITE * whole)
+def noise_variance(problem: Problem, outcome: Outcome) -> np.ndarray:
+    """(B,) the part of the formal variances of S^-1, the inverse of the information, that noise of the measurements
+    contributes, and not errors of nuisance parameters."""
+    t = problem.tolerance
+    inverse = t[:, None] * restricted_inverse(t[:, None] * outcome.information * t, problem.held) * t
+    whole = np.diag(inverse)
+    return np.maximum(whole - variance_of_priors(inverse, nuisance_priors(problem), outcome.state), ROUNDING * whole)
+
+
+def nuisance_priors(problem: Problem) -> list[Prior]:
+    """The priors on nuisance parameters."""
+    return [p for p in problem.priors if p.block.is_nuisance]
 
 
 def spread_variance(outcome: Outcome, parts: Parts, white: np.ndarray) -> np.ndarray:
@@ -51,15 +57,12 @@ def inflation(inputs: Inputs, outcome: Outcome) -> float:
     """F, the root mean square over the calibration parameters; 1 where no prior bounds a nuisance parameter, or the
     recording cannot be split."""
     problem, columns = outcome.problem, calibration_columns(inputs)
-    if not any(p.block.is_nuisance for p in problem.priors) or not len(columns):
+    if not nuisance_priors(problem) or not len(columns):
         return 1.0
     parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
     if parts is None:
         return 1.0
-    t = problem.tolerance
-    scaled = t[:, None] * outcome.information * t
-    covariance = t[:, None] * restricted_inverse(scaled, problem.held) * t
-    white = white_variance(problem, outcome, covariance)
+    white = noise_variance(problem, outcome)
     ratio = spread_variance(outcome, parts, white) / white
     return float(np.sqrt(np.mean(ratio[columns])))
 

@@ -1,0 +1,73 @@
+"""What the formal variances of a result consist of, and empirical factors on each part."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtr, stdtrit
+
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.inflation import noise_variance, spread_variance
+from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.evidence.places import cluster_covariances
+from icalib.motion.factor import of_type
+from icalib.observability.determination import Determined
+from icalib.sensors.camera.features.residual import FeatureFactor
+
+ENOUGH_PARTS = 8  # segments; with more, t differs from the normal distribution by 8 % at most
+
+
+class VarianceParts(NamedTuple):
+    """What contributes to the formal variances, and how much larger it is than the formal covariance says.
+
+    noise, prior (B,): shares that noise of the measurements and errors of nuisance parameters contribute; errors of the
+    initial guess along undetermined directions contribute the rest. ratio (B,): empirical over formal standard
+    deviation of the noise's part. weight: square root of how many times priors on nuisance parameters count.
+    """
+
+    noise: np.ndarray
+    prior: np.ndarray
+    ratio: np.ndarray
+    weight: float
+
+    @classmethod
+    def of(cls, determined: Determined, parts: Parts | None) -> VarianceParts:
+        found = determined.estimate
+        whole, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
+        prior = np.clip(determined.prior_variance, 0.0, whole - guess)
+        formal = noise_variance(found.problem, found.outcome)
+        empirical = _empirical_variance(found, parts, formal)
+        ratio = np.sqrt(np.divide(empirical, formal, out=np.ones_like(formal), where=formal > 0.0))  # 0: fixed
+        return cls(np.maximum(1.0 - (guess + prior) / whole, 0.0), prior / whole, ratio, determined.inflation)
+
+    def pooled(self, columns: np.ndarray) -> float:
+        """Root mean square of the ratio over the columns, weighted by how much the noise contributes to them."""
+        weights = self.noise[columns]
+        total = float(weights.sum())
+        return float(np.sqrt(weights @ self.ratio[columns] ** 2 / total)) if total > 0.0 else 1.0
+
+    def factor(self, columns: np.ndarray, overall: float) -> np.ndarray:
+        """(n,) of the standard deviations of a group: by its own ratio or the `overall` one."""
+        own = max(1.0, self.pooled(columns), overall)
+        noise, prior = self.noise[columns], self.prior[columns]
+        return np.sqrt(own**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))
+
+
+def _empirical_variance(found: Estimate, parts: Parts | None, white: np.ndarray) -> np.ndarray:
+    """Variance (B,): the larger of the scatter over segments and over feature tracks, plus the excess of clustered over
+    `white` variance (B,) for image and target regions. Without segments and tracks: `white`."""
+    if parts is None and not of_type(found.problem.factors, FeatureFactor):
+        return white
+    clusters = cluster_covariances(found.problem, found.outcome)
+    spread = white if clusters.tracks is None else np.diag(clusters.tracks)
+    if parts is not None:
+        over_parts = few_factor(parts.count) ** 2 * spread_variance(found.outcome, parts, white)
+        spread = over_parts if clusters.tracks is None else np.maximum(spread, over_parts)
+    return spread + sum(np.maximum(np.diag(V) - white, 0.0) for V in clusters.places)
+
+
+def few_factor(parts: int) -> float:
+    """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within: Student's t
+    distribution with parts - 1 degrees of freedom."""
+    return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0
