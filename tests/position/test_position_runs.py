@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from scipy.stats import chi2
 
 from icalib.errors import EstimationError
+from icalib.export.formats import export
 from icalib.pipeline import calibrate, calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig.file import load_rig
@@ -60,10 +62,25 @@ def errors(result: Calibration, sim: Simulation, name="gnss0", arm=ARM):
     return error, np.append(result.std(name, "translation"), np.ravel(result.std(name, "time_offset")))
 
 
+def check_mins(result: Calibration, sim: Simulation):
+    """What MINS predicts of each fix by its formula, p_IinE + R_EtoI^T pGinI at time + timeoffset, against the
+    truth."""
+    file = export(result, "mins").files["config_gps.yaml"]
+    entry = yaml.safe_load(file.removeprefix("%YAML:1.0"))["gps0"]
+    (stream,), reported = sim.measurements.of(PositionStream), sim.truth.reported["gnss0"]
+    time = stream.stamps_ns * 1e-9 + entry["timeoffset"] - 1e-9 * sim.truth.imu_clock_origin_ns
+    R, p, _ = sim.truth.pose_at(time)
+    frame = pose([3.0, -1.0, 0.5], 2.1)
+    expected = (p + R @ entry["pGinI"] - frame[:3, 3]) @ frame[:3, :3]
+    assert np.median(np.linalg.norm(expected - reported.position, axis=1)) < 0.02
+
+
 @pytest.mark.parametrize("motion", ["free", "ramps"])
 def test_lever_arm_and_clock_from_nothing(motion):
     sim = recorded(motion, antenna())
-    error, std = errors(calibrated(sim), sim)
+    result = calibrated(sim)
+    check_mins(result, sim)
+    error, std = errors(result, sim)
     assert (np.abs(error) < 3.0 * std).all()
     assert std[:3].max() < 0.02
     assert std[3] < 4e-3

@@ -69,6 +69,8 @@ def _placed(c: Calibration, name: str, kind: str) -> dict[str, Any]:
 
 
 def _antenna(c: Calibration, name: str) -> dict[str, Any]:
+    """MINS compares a fix at `time` with p_IinE + R_EtoI^T pGinI of the IMU at time + timeoffset, on the IMU's clock
+    (mins/src/update/gps/UpdaterGPS.cpp, `UpdaterGPS::update`): the lever arm and time offset of icalib."""
     arm = c.group(name, "translation").value.tolist()
     return {"timeoffset": time_offset(c, name), "pGinI": arm, "topic": topic(c, name, f"/{name}/fix")}
 
