@@ -140,6 +140,7 @@ REVISED = (
     "estimate",
     "export",
     "geometry",
+    "initialize",
     "model",
     "observability",
     "report",

@@ -178,7 +178,7 @@ def _calibrate(
         raise EstimationError(" Besides, ".join(stated_words(made.inputs, c) for c in made.against)) from made.error
     clock.lap("solving")
     progress("assessing the result", 0.9)
-    result = assess(made.inputs, made.found, made.against)
+    result = assess(made.inputs, made.solution, made.against)
     _refuse_no_numbers(result)
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps)

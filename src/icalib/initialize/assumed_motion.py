@@ -1,12 +1,12 @@
 """Without an IMU, but with wheels or a pose sensor: smooth motion is assumed in its place.
 
-The estimate keeps an IMU that reads zero and knows no gravity. The biases of a keyframe are then minus its angular rate
-and minus its acceleration, in the axes of the body. Their random walk is white noise on angular acceleration and on
-jerk: a motion prior, which ties keyframes and propagates poses from keyframes to the instants of sensors. Its densities
-are those of the motion itself, as the poses of the body show it. Nothing else is taken from these twice.
+The estimate gets an IMU that reads zero, without gravity. The biases at a keyframe are then minus the body's angular
+rate and minus its acceleration, in body axes. Their random walk is white noise on angular acceleration and on jerk: a
+motion prior that connects keyframes, and propagates poses to the instants of measurements. Its densities are estimated
+from the poses of the body. Nothing else is used twice.
 
 The body is the first camera, whose target is the world, or the first pose sensor, whose frame is. Cameras with feature
-tracks are placed on the motion of the pose sensor.
+tracks are aligned to the trajectory of the pose sensor.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from icalib.initialize.cameras_on_odometry import (
 )
 from icalib.initialize.steps.contradicted_guesses import MotionContradictedError
 from icalib.initialize.steps.initializer import (
+    InitialGuess,
     Initializer,
     Values,
     initializer_of,
@@ -48,22 +49,19 @@ from icalib.rig import ImuNoise, ImuSensor, Rig, Sensor
 from icalib.sensors.parameter import Parameter, fixed
 from icalib.sensors.sensor import mounted
 
-ASSUMED_IMU = "assumed motion"  # the name of the IMU; no sensor is called so
-ASSUMED_IMU_STEP_S = 0.01  # between its readings
-REGULARISING_STEP_S = 5e-3  # its white noise is what the walks make of so long a step: keeps covariances regular
-DENSITY_LAG_S = 0.1  # over which changes of rate and acceleration tell their densities
-MIN_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): of a body that stood still
-MIN_KEYFRAME_SPACING_S = 0.02  # of keyframes: the same as with an IMU
-
-
-InitialGuess = tuple[Inputs, State, Values]
+ASSUMED_IMU = "assumed motion"  # name of the assumed IMU; it has a space, so no sensor has this name
+ASSUMED_IMU_STEP_S = 0.01  # s between its readings
+REGULARISING_STEP_S = 5e-3  # s: its white noise equals its random walk over this time, which keeps covariances regular
+DENSITY_LAG_S = 0.1  # s: changes of rate and acceleration over this lag show their densities
+MIN_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): floor for a body at rest
+MIN_KEYFRAME_SPACING_S = 0.02  # s between keyframes, as with an IMU
 
 
 def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
-    """As `start.start`. Where all was measured at rest, no motion is assumed.
+    """As `rig_guess.guess_of_rig`, for a rig without IMU. If all was measured at rest, no motion is assumed.
 
-    Raises EstimationError where the poses of the body do not show its motion, or are in another convention, or where
-    other sensors are not aligned with it.
+    Raises EstimationError if the body's poses do not show its motion, are in another convention, or if other sensors do
+    not align to it.
     """
     try:
         return _guess(rig, recordings)
@@ -78,46 +76,46 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
-    """As `start_without_imu`, with poses as they are written."""
-    shown = _BodyMotion.by(motion_kinds(rig)[0], rig, recordings)
+    """As `guess_with_assumed_motion`, with poses in the convention in which they are recorded."""
+    motion = _BodyMotion.by(motion_kinds(rig)[0], rig, recordings)
     for kind in kinds_of(rig):
-        if (still := kind.start_at_rest(rig, recordings, shown.body, shown.values)) is not None:
+        if (still := kind.start_at_rest(rig, recordings, motion.body, motion.values)) is not None:
             return still
     for m in recordings:
         for kind in kinds_of(rig):
             kind.check_moving(m)
-    for own, m in zip(shown.body, recordings, strict=True):
+    for own, m in zip(motion.body, recordings, strict=True):
         if len(own.seconds) < MIN_PARABOLA_POSES:
             where = f"{m.name}: " if len(recordings) > 1 else ""
             raise EstimationError(
                 f"{where}{rig.reference} has a pose at only {len(own.seconds)} instants; record more."
             )
-    paths = _smoothed(shown.body)
+    paths = _smoothed(motion.body)
     # Densities come out too large rather than too small: a wide window would take motion from them.
-    body = _with_assumption(rig, recordings, _smoothed(shown.body, narrow=True))
+    body = _with_assumption(rig, recordings, _smoothed(motion.body, narrow=True))
     inputs = replace(inputs_for(body, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
-    felt = _with_ideal_readings(body, recordings, paths, inputs)
-    found = shown.values if shown.reckoned is None else with_stated_values(inputs, shown.reckoned, shown.values)
+    ideal = _with_ideal_readings(body, recordings, paths, inputs)
+    found = motion.values if motion.odometry is None else with_stated_values(inputs, motion.odometry, motion.values)
     if _keyframe_hosts(body) and not found:
-        found = _place_hosts(body, recordings, shown.body, paths)
-    moving, turned = _keyframe_motion(inputs, shown.body, found)
+        found = _place_hosts(body, recordings, motion.body, paths)
+    moving, turned = _keyframe_motion(inputs, motion.body, found)
     others = [s for s in body.mounted if (s.name, "rotation") not in moving.values]
-    values = place_sensors(felt, moving, others) | moving.values
+    values = place_sensors(ideal, moving, others) | moving.values
     return inputs, replace(moving, bias=-turned, values=values), values
 
 
 @dataclass(frozen=True)
 class _BodyMotion:
-    """Poses of the body in each recording; values found on the way; reckoned: the sensor whose dead reckoning showed
-    them."""
+    """body: poses of the body in each recording; values: parameters estimated with them; odometry: the sensor whose
+    dead reckoning gave the poses, if one did."""
 
     body: list[BodyPoses]
     values: Values
-    reckoned: str | None = None
+    odometry: str | None = None
 
     @classmethod
     def by(cls, source: Initializer[Any], rig: Rig, recordings: Sequence[Measurements]) -> _BodyMotion:
-        """The poses of the body by the sensors of `source`, which may not be the body."""
+        """Poses of the body by the sensors of `source`, which may not be the body itself."""
         paths, found = source.body_poses(rig, recordings)
         if initializer_of(rig.sensors[rig.reference]) is source:
             return cls(paths, found)
@@ -129,29 +127,31 @@ class _BodyMotion:
 
 
 def _smoothed(body: Sequence[BodyPoses], narrow: bool = False) -> list[SmoothTrajectory]:
-    """The path of the body in each recording, every STEP_S from its first stamp on."""
+    """The trajectory of the body in each recording, every ASSUMED_IMU_STEP_S from its first stamp. narrow: see
+    `smooth_trajectory`."""
     return [own.at(np.arange(0.0, own.seconds[-1], ASSUMED_IMU_STEP_S), narrow=narrow) for own in body]
 
 
 def _keyframe_hosts(rig: Rig) -> list[Sensor]:
-    """The sensors at whose measurements keyframes lie, but for the body."""
+    """The sensors at whose measurements keyframes are set, without the body."""
     return [s for s in rig.mounted if initializer_of(s).hosts_keyframes and s.name != rig.reference_without_imu]
 
 
 def _place_hosts(
     body: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], paths: Sequence[SmoothTrajectory]
 ) -> Values:
-    """The sensors that host keyframes, placed on the motion that the first pose sensor of `body` shows."""
+    """Values of the sensors that host keyframes, aligned to the motion of the first pose sensor of `body`."""
     hosts = _keyframe_hosts(body)
     blind = body.without(*(s.name for s in hosts))
     unseen = [m.only(*blind.sensors) for m in recordings]
     alone = _with_ideal_readings(blind, unseen, paths, inputs_for(blind, _with_assumed_readings(unseen, paths)))
-    felt = _with_ideal_readings(body, recordings, paths, inputs_for(body, _with_assumed_readings(recordings, paths)))
-    return place_sensors(felt, _keyframe_motion(alone, shown, {})[0], hosts)
+    ideal = _with_ideal_readings(body, recordings, paths, inputs_for(body, _with_assumed_readings(recordings, paths)))
+    return place_sensors(ideal, _keyframe_motion(alone, shown, {})[0], hosts)
 
 
 def _place_cameras(rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses]) -> Values:
-    """Cameras with feature tracks, placed on the planar `paths` of `sensor`, on which nothing else is known."""
+    """Values of cameras with feature tracks, aligned to the planar trajectories `paths` of `sensor`. Raises
+    EstimationError if the motion does not determine them."""
     blank = with_pose_sensor(rig, sensor)
     streams = pose_streams(recordings, sensor, paths)
     posed = [m.only(*(c.name for c in rig.cameras)).with_streams(s) for m, s in zip(recordings, streams, strict=True)]
@@ -168,15 +168,15 @@ def _place_cameras(rig: Rig, recordings: Sequence[Measurements], sensor: str, pa
 def _with_ideal_readings(
     rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory], like: Inputs
 ) -> Inputs:
-    """The inputs with the readings that an IMU in the body would have."""
-    felt = inputs_for(rig, _with_assumed_readings(recordings, paths), like)
-    assert felt.imu is not None
-    return replace(felt, imu=replace(felt.imu, forwards=False))
+    """Inputs with the readings that an ideal IMU in the body would have. like: inputs whose time base is kept."""
+    ideal = inputs_for(rig, _with_assumed_readings(recordings, paths), like)
+    assert ideal.imu is not None
+    return replace(ideal, imu=replace(ideal.imu, forwards=False))
 
 
 def _keyframe_motion(inputs: Inputs, shown: Sequence[BodyPoses], found: Values) -> tuple[State, np.ndarray]:
-    """The motion of the body without biases, and its angular rate and acceleration (K, 6) at keyframes; `found`: what
-    is known of sensors."""
+    """The trajectory of the body at keyframes, without biases, and its angular rate and acceleration (K, 6) there.
+    found: known values of sensors."""
     values = start_values(inputs, found | _body_identities(inputs))
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     starts = first_keyframes(inputs.imu, keyframes)
@@ -191,7 +191,7 @@ def _keyframe_motion(inputs: Inputs, shown: Sequence[BodyPoses], found: Values) 
 
 
 def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory]) -> Rig:
-    """The rig with the assumption as its IMU, which is where the body is."""
+    """The rig with the assumed IMU, which coincides with the body. Its noise densities are those of the motion."""
     turning, jerking = (
         np.sqrt(np.mean(np.concatenate([_changes_over_lag(p, what) for p in paths]) ** 2) / DENSITY_LAG_S) + MIN_DENSITY
         for what in ("rate", "acceleration")
@@ -206,13 +206,14 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
 
 
 def keyframe_spacing(rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
-    """Seconds, from LEAST_SPACING_S to the rig's `keyframe_spacing_s`: the largest that all kinds of sensors allow."""
+    """The largest spacing [s] that all kinds of sensors allow, within MIN_KEYFRAME_SPACING_S and the rig's
+    `keyframe_spacing_s`."""
     longest = min(kind.longest_spacing(rig, recordings, motion) for kind in kinds_of(rig))
     return float(np.clip(longest, MIN_KEYFRAME_SPACING_S, max(rig.settings.keyframe_spacing_s, MIN_KEYFRAME_SPACING_S)))
 
 
 def _changes_over_lag(path: SmoothTrajectory, what: str) -> np.ndarray:
-    """(n, 3) over LAG_S, where poses show both ends."""
+    """Changes (n, 3) of the attribute `what` over DENSITY_LAG_S, between instants with poses nearby."""
     n = round(DENSITY_LAG_S / ASSUMED_IMU_STEP_S)
     x = getattr(path, what)
     return (x[n:] - x[:-n])[path.near[n:] & path.near[:-n]]
@@ -221,8 +222,8 @@ def _changes_over_lag(path: SmoothTrajectory, what: str) -> np.ndarray:
 def _with_assumed_readings(
     recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory], max_gap_s: float | None = None
 ) -> list[Measurements]:
-    """The recordings with readings of the assumed IMU: zero, but in gaps of poses that are longer than `max_gap_s`; or
-    without it those that an IMU in the body would have, where poses show them."""
+    """The recordings with readings of the assumed IMU. With `max_gap_s`: zeros, except in gaps between poses that are
+    longer [s]. Without: ideal readings at the instants with poses nearby."""
     out = []
     for m, path in zip(recordings, paths, strict=True):
         stamps = m.origin_ns + np.round(path.seconds * 1e9).astype(np.int64)
@@ -234,8 +235,8 @@ def _with_assumed_readings(
 
 
 def _within_short_gaps(path: SmoothTrajectory, max_gap_s: float) -> np.ndarray:
-    """(m,) whether poses show the path, or it is unseen for a short while only: for longer an assumption says nothing
-    of where the body is."""
+    """(m,) whether poses are nearby, or the gap between poses is at most `max_gap_s`. Over longer gaps the assumption
+    does not constrain the motion."""
     seen = path.seconds[path.near]
     if not len(seen):
         return np.zeros(len(path.seconds), dtype=bool)
@@ -245,7 +246,7 @@ def _within_short_gaps(path: SmoothTrajectory, max_gap_s: float) -> np.ndarray:
 
 
 def _body_identities(inputs: Inputs) -> Values:
-    """The body is where the assumed IMU is, and its target or its frame is the world."""
+    """Identity values: the body coincides with the assumed IMU, and its target or frame with the world."""
     sensor = inputs.rig.sensors[inputs.rig.reference_without_imu]
     out, own = stated_values(inputs, sensor), {block.key for block in inputs.layout.blocks}
     for k in range(len(inputs.parts)):

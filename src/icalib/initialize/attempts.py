@@ -1,7 +1,8 @@
-"""The estimate, and where it fails or hardly fits, the one without guesses, and without what the rig file states.
+"""The estimate. If it fails or fits poorly, others are tried: without guesses, and without the values that the rig file
+states.
 
-Guesses have no weight: an estimate that they spoil is made from nothing. What is fixed or has a prior has weight: where
-it spoils the estimate, the one without says which of it contradicts the data.
+Guesses have no weight, so an estimate without them replaces one that they spoil. Fixed values and priors have weight.
+If they spoil the estimate, one without them shows which values contradict the data.
 """
 
 from __future__ import annotations
@@ -29,29 +30,31 @@ from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.pages import give_back
 from icalib.rig import LENS, Parameter, Rig, Sensor
 
-POOR_FIT_RATIO = 4.0  # times as large as their noise are the residuals of some sensor
-CLEARLY_BETTER_RATIO = 0.5  # times the misfit of another estimate
+POOR_FIT_RATIO = 4.0  # RMS residual over stated noise of some kind of residuals
+CLEARLY_BETTER_RATIO = 0.5  # misfit of another estimate over that of the first, to replace it
 OnVisit = Callable[[Inputs, str, Problem, Visit], None]
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """An estimate. against: what the rig file states, and another estimate without contradicts; error: why there is no
-    estimate with it, where there is none."""
+    """An estimate. against: values of the rig file that an estimate without them contradicts; error: why the estimate
+    with them failed, if it did."""
 
     inputs: Inputs
-    found: Determined
+    solution: Determined
     against: tuple[Contradiction, ...] = ()
     error: EstimationError | None = None
 
     @property
     def converged(self) -> bool:
-        return self.found.estimate.outcome.converged
+        """Whether the solver converged."""
+        return self.solution.estimate.outcome.converged
 
     @property
     def misfit(self) -> float:
-        """Times as large as their noise the residuals of some sensor are at least; infinite without an end."""
-        outcome = self.found.estimate.outcome
+        """The largest ratio, over all kinds of residuals, of their RMS to the stated noise; infinite if not
+        converged."""
+        outcome = self.solution.estimate.outcome
         shown = chi2_by_kind(outcome.problem, outcome.residuals).values()
         return max((np.sqrt(chi2 / max(n, 1)) for n, chi2 in shown), default=0.0) if outcome.converged else np.inf
 
@@ -63,8 +66,9 @@ def attempt(
     on_step: Callable[[str, Step], None],
     on_visit: OnVisit,
 ) -> Attempt:
-    """The estimate of `rig`, or where it fails or hardly fits one without guesses that fits better; or else the first,
-    with what contradicts it. Raises EstimationError where the data do not carry an estimate."""
+    """The estimate of `rig`. If it fails or fits poorly, an estimate without guesses that fits clearly better; else the
+    first one, with the values that contradict it. lap, on_step, on_visit: progress of stages and solver. Raises
+    EstimationError if the data do not determine an estimate."""
     make = partial(_make_attempt, recordings=recordings, lap=lap, on_step=on_step, on_visit=on_visit)
     try:
         with refusing_far_off():
@@ -89,7 +93,7 @@ def attempt(
 
 
 def _attempt_or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] | tuple[None, EstimationError]:
-    """The estimate, or why there is none. Raises FarOffError."""
+    """The attempt, or the error why it failed. Raises FarOffError."""
     try:
         return make(rig), None
     except FarOffError:
@@ -101,7 +105,7 @@ def _attempt_or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt
 def explained_failure(
     rig: Rig, recordings: Sequence[Measurements], make: Callable[[Rig], Attempt], failed: EstimationError
 ) -> EstimationError:
-    """Why an estimate `failed`, as the kind of sensor that gave the motion explains a breakdown; else `failed`."""
+    """The error with the cause of a breakdown, if the kind of sensor that gave the motion knows one; else `failed`."""
     if not isinstance(failed, NotDefiniteError):
         return failed
     source = motion_kinds(rig)[0]
@@ -115,6 +119,7 @@ def _make_attempt(
     on_step: Callable[[str, Step], None],
     on_visit: OnVisit,
 ) -> Attempt:
+    """Initial guess and estimate of one rig. Raises EstimationError."""
     inputs, state, guess = guess_of_rig(rig, recordings, lap)
     give_back()
     with ExitStack() as explaining:
@@ -125,12 +130,12 @@ def _make_attempt(
 
 
 def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
-    """The estimate without guesses, or with those that it does not contradict where it needs them; None where there are
-    none, or it fails as well."""
+    """The estimate without guesses. If parameters stay unobservable, one with the guesses that it does not contradict.
+    None if the rig has no guesses, or the estimate fails."""
     found = _without_values(rig, make, lambda p: p.mode == "free") if _has_values(rig, "free") else None
     if found is None:
         return None
-    values = found.found.estimate.outcome.state.values
+    values = found.solution.estimate.outcome.state.values
 
     def agreeing(sensor: Sensor, name: str, p: Parameter) -> Parameter:
         if p.mode != "free" or p.value is None or name == "time_offset":
@@ -139,14 +144,14 @@ def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None
         return Parameter() if is_contradicted(sensor.spec(name), p.value, other) else p
 
     kept = with_groups(rig, agreeing)
-    if found.found.held.size and _has_values(kept, "free") and (other := _converged_attempt(kept, make)) is not None:
+    if found.solution.held.size and _has_values(kept, "free") and (other := _converged_attempt(kept, make)) is not None:
         found = other
     return replace(found, inputs=replace(found.inputs, asked=rig))
 
 
 def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[[Parameter], bool]) -> Attempt | None:
-    """The estimate without the values that are `dropped`; of cameras that follow points, where it fails, with those of
-    lenses as mere guesses: not every motion shows a lens from nothing."""
+    """The estimate without the values that `dropped` selects. If it fails for cameras with feature tracks, their
+    intrinsics are kept as guesses, as not every motion shows them without one."""
 
     def bare(lens: bool) -> Rig:
         return with_groups(
@@ -161,23 +166,24 @@ def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[
 
 
 def _contradicting_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
-    """The estimate of all that the rig file states, from nothing, with what it contradicts; None where it fails as well
-    or contradicts nothing."""
+    """The estimate without any value of the rig file, with the fixed values and priors that it contradicts. None if
+    there are no such values, it fails, or it contradicts none."""
     if not (_has_values(rig, "fixed") or _has_values(rig, "prior")):
         return None
     found = _without_values(rig, make, lambda p: True)
     if found is None:
         return None
-    against = contradicted_by(replace(found.inputs, asked=rig), found.found)
+    against = contradicted_by(replace(found.inputs, asked=rig), found.solution)
     return replace(found, against=against) if against else None
 
 
 def _has_values(rig: Rig, mode: str) -> bool:
-    """Whether the rig file gives some value in this way."""
+    """Whether the rig file gives a value with this mode."""
     return any(p.mode == mode and p.value is not None for _, _, p in groups_of(rig))
 
 
 def _converged_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
+    """The attempt if it converges, else None."""
     try:
         found = make(rig)
     except EstimationError:

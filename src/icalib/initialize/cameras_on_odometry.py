@@ -1,6 +1,7 @@
-"""Cameras with feature tracks placed on the path of a sensor by dead reckoning, which stands in for a pose sensor.
+"""Cameras with feature tracks, aligned to a trajectory by odometry, which takes the place of a pose sensor.
 
-The first camera is the body: its poses and the extrinsics of all others follow from those on the path.
+The first camera is the body. Its poses, and the extrinsics of all other sensors, follow from those relative to the
+odometry.
 """
 
 from __future__ import annotations
@@ -21,14 +22,15 @@ from icalib.sensors.sensor import MOUNTED_NAMES
 
 
 def with_pose_sensor(rig: Rig, sensor: str) -> Rig:
-    """The cameras of `rig` and a pose sensor in place of `sensor`; the extrinsics of the cameras are unknown."""
+    """A rig of the cameras of `rig` and a pose sensor named `sensor` in place of the odometry. Extrinsics of the
+    cameras are unknown."""
     free = dict.fromkeys(MOUNTED_NAMES, Parameter())
     cameras = tuple(replace(c, clock_restarts=False, **free) for c in rig.cameras)
     return rig.only().with_sensors(*cameras, PoseSensor(sensor, "", "absolute"))
 
 
 def pose_streams(recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses]) -> list[PoseStream]:
-    """`paths` of `sensor`, one for each recording, as measurements of a pose sensor."""
+    """The trajectories `paths` of `sensor`, one for each recording, as measurements of a pose sensor."""
     stamps = [m.streams[sensor].stamps_ns for m in recordings]
     return [PoseStream(sensor, t, p.rotation, p.position) for t, p in zip(stamps, paths, strict=True)]
 
@@ -36,7 +38,8 @@ def pose_streams(recordings: Sequence[Measurements], sensor: str, paths: Sequenc
 def camera_poses(
     rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses], values: Values
 ) -> list[BodyPoses]:
-    """Poses of the first camera, on its own clock, from `paths` of `sensor`; values: extrinsics of cameras on these."""
+    """Poses of the first camera, on its own clock, from trajectories `paths` of `sensor`. values: extrinsics of the
+    cameras relative to `sensor`."""
     first = rig.cameras[0].name
     R, p, offset = (values[first, name] for name in MOUNTED_NAMES)
     between = [(m.tracks[0].origin_ns - m.streams[sensor].origin_ns) * 1e-9 for m in recordings]
@@ -47,8 +50,8 @@ def camera_poses(
 
 
 def relative_to_first_camera(rig: Rig, sensor: str, values: Values) -> Values:
-    """Extrinsics of cameras and `sensor` relative to the first camera, from `values` relative to `sensor`; lenses; and
-    the other parameters of `sensor` as the rig file gives them."""
+    """Converts `values`, extrinsics of cameras relative to `sensor`, to extrinsics of all relative to the first camera.
+    Also returns the camera models, and the other parameters of `sensor` as the rig file gives them."""
     first, *others = rig.cameras
     R, p, offset = (values[first.name, name] for name in MOUNTED_NAMES)
     out = {key: value for key, value in values.items() if key[1] in ("intrinsics", "distortion")}
@@ -65,8 +68,8 @@ def relative_to_first_camera(rig: Rig, sensor: str, values: Values) -> Values:
 
 
 def with_stated_values(inputs: Inputs, sensor: str, found: Values) -> Values:
-    """`found`, but what the rig file gives of cameras and `sensor` unless that contradicts it. The height of `sensor`
-    is as given: on a floor nothing shows it."""
+    """`found`, completed by values of the rig file for cameras and `sensor` that it does not contradict. The height of
+    `sensor` is the stated one, as planar motion does not show it."""
     out, rig = dict(found), inputs.rig
     for other in (*rig.cameras[1:], rig.sensors[sensor]):
         names = MOUNTED_NAMES if other.name != sensor else [spec.name for spec in other.specs()]

@@ -1,4 +1,4 @@
-"""What the estimate is made from, and the state that its first pass starts from."""
+"""The initial guess: inputs of the estimate, and the state at which its first pass starts."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.initialize.assumed_motion import guess_with_assumed_motion
 from icalib.initialize.recording_times import naming_recording_times
 from icalib.initialize.steps.initializer import (
+    InitialGuess,
     Initializer,
     Values,
     initializer_of,
@@ -27,17 +28,15 @@ from icalib.sensors.camera.connected_bodies import without_bodies
 from icalib.sensors.camera.initialize.boards.incremental_scene import UnconnectedBodiesError
 from icalib.sensors.camera.initialize.boards.symmetry import resolve_symmetry
 
-InitialGuess = tuple[Inputs, State, Values]
-
 
 def guess_of_rig(
     rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None] = lambda stage: None
-) -> tuple[Inputs, State, Values]:
-    """What the estimate is made from, where it starts, and the guess at which stays what the data do not determine.
+) -> InitialGuess:
+    """Inputs of the estimate, its start state, and the guess to which unobservable parameters are reset.
 
-    The motion comes from the first kind of sensor that shows it, in the order of `motion_kinds`; all other sensors are
-    placed on it. Bodies of the target that images do not tie to the others are left out. Raises EstimationError where
-    the recordings do not carry it.
+    The trajectory comes from the first kind in `motion_kinds` that shows it. All other sensors are aligned to it.
+    Bodies of the target that no image connects to the others are left out. lap: called at the end of each stage with
+    its name. Raises EstimationError if the recordings do not determine a guess.
     """
     recordings = resolve_symmetry(rig, recordings)
     with naming_recording_times(recordings):
@@ -49,6 +48,7 @@ def guess_of_rig(
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None]) -> InitialGuess:
+    """As `guess_of_rig`, for recordings whose target bodies are all connected."""
     if rig.imu is None and not rig.cameras_alone:
         found = guess_with_assumed_motion(rig, recordings)
         lap("first guess")
@@ -68,8 +68,9 @@ def _guess(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], No
 def _trajectory(
     whole: Inputs, recordings: Sequence[Measurements], kinds: Sequence[Initializer[Any]]
 ) -> tuple[Initializer[Any], Inputs, State]:
-    """The first of `kinds` whose sensors show the motion, their own inputs, and the motion. Cameras that see a target
-    are not placed on the motion of others. Raises EstimationError where no kind shows the motion."""
+    """The first of `kinds` whose sensors show the motion, their inputs, and a state with the trajectory. There is no
+    fallback for cameras that see a target: their error is raised. Raises EstimationError if no kind shows the motion.
+    """
     if not kinds:
         raise EstimationError("no sensor of the rig shows its motion; add a camera, a LiDAR or a pose sensor.")
     kind, *others = kinds
@@ -87,7 +88,7 @@ def _trajectory(
 
 
 def _place_others(whole: Inputs, source: Initializer[Any], own: Inputs, state: State, guess: Values) -> InitialGuess:
-    """All of `start`, where the sensors of `own` have shown the motion: the others are placed on it."""
+    """The whole initial guess, from the trajectory in `state` by the sensors of `own`: all others are aligned to it."""
     inputs = source.adopted(whole, own)
     known = {s.name for s in own.rig.mounted}
     others = [s for s in whole.rig.mounted if s.name not in known]

@@ -1,4 +1,9 @@
-"""How a camera turned from image to image, from the points that it followed: epipolar geometry, no guess needed."""
+"""Rotation of a camera between two images, from tracked points: epipolar geometry, without an initial guess.
+
+Unit rays f and h of one point satisfy t . (R f x h) = 0, where R rotates from the first camera to the second and t is
+the unit direction of motion. R and t minimise the errors over their standard deviation (Sampson's weighting) with
+Cauchy's loss.
+"""
 
 from __future__ import annotations
 
@@ -14,21 +19,21 @@ from icalib.geometry.small import solve_definite
 from icalib.initialize.steps.rate_correlation import SensorRates
 from icalib.sensors.camera.stream import TrackStream, shared_rows
 
-MIN_SHARED_POINTS = 12  # points in two images
-MIN_TRACK_RATES = 20
-SAMPLED_PAIRS = 30  # that tell how long points are followed
-MIN_TRACK_RATE_CORRELATION = 0.5  # with the IMU's rates; these here are noisy
-EPIPOLAR_ITERATIONS = 10
-DIRECTION_ITERATIONS = 4
-TRACK_RATE_STEP_S = 0.4  # between images: over less, turning and moving sideways look alike
-THINNED_STEP_SHARE = 0.3  # of an interval that the next one begins later, at most: those between say little more
-NOISE_EVERY = 5  # so many rates, the noise of one
-EPIPOLAR_DAMPING = 1e-9  # of the mean diagonal: a camera that does not move has no direction of motion
+MIN_SHARED_POINTS = 12  # points that two images share: a relative pose has five unknowns, the rest gives redundancy
+MIN_TRACK_RATES = 20  # rates: fewer do not show a time offset
+SAMPLED_PAIRS = 30  # pairs of images that show how long tracks are
+MIN_TRACK_RATE_CORRELATION = 0.5  # with the IMU's rates; smaller than for poses, as rates from tracks are noisy
+EPIPOLAR_ITERATIONS = 10  # of rotation and direction, from a start without translation
+DIRECTION_ITERATIONS = 4  # of the direction alone, at a fixed rotation
+TRACK_RATE_STEP_S = 0.4  # s between two images: over less, rotation and sideways translation look alike
+THINNED_STEP_SHARE = 0.3  # start of the next interval, as a share of `step`: those between add little information
+NOISE_EVERY = 5  # the noise of every fifth rate is computed
+EPIPOLAR_DAMPING = 1e-9  # of the mean diagonal: without translation the direction is unobservable
 
 
 @njit(cache=True, nogil=True)
 def _tangent_basis(t, a, b):
-    """Two unit vectors at right angles to t."""
+    """Fills a, b (3,): unit vectors orthogonal to the unit vector t (3,) and to each other."""
     k = 0
     for i in range(3):
         if abs(t[i]) < abs(t[k]):
@@ -45,13 +50,10 @@ def _tangent_basis(t, a, b):
 
 
 @njit(cache=True, nogil=True)
-def _epipolar_sums(f, h, f_by, h_by, R, t, a, b, A, x):
-    """A (5 + L, 5 + L) and x (5 + L,): normal equations of a left turn of R, of t along a and b, and of the lens along
-    its L slopes f_by and h_by (n, L, 3) of the rays, for e = t . (R f x h) by its own standard deviation, Cauchy's
-    weights of the median error. Returns the sum of the weighted squares of the errors [rad^2]."""
-    n, m = len(f), f_by.shape[1]
-    g, c, e, spread, row = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(5 + m)
-    for i in range(n):
+def _epipolar_errors(f, h, R, t, g, c, e, sigma):
+    """Fills g (n, 3) = R f, c (n, 3) = R f x h, the errors e (n,) = t . c / sigma, and sigma (n,): the standard
+    deviation of t . c by unit noise of both rays."""
+    for i in range(len(f)):
         for r in range(3):
             g[i, r] = R[r, 0] * f[i, 0] + R[r, 1] * f[i, 1] + R[r, 2] * f[i, 2]
         c[i, 0] = g[i, 1] * h[i, 2] - g[i, 2] * h[i, 1]
@@ -59,43 +61,60 @@ def _epipolar_sums(f, h, f_by, h_by, R, t, a, b, A, x):
         c[i, 2] = g[i, 0] * h[i, 1] - g[i, 1] * h[i, 0]
         tg = t[0] * g[i, 0] + t[1] * g[i, 1] + t[2] * g[i, 2]
         th = t[0] * h[i, 0] + t[1] * h[i, 1] + t[2] * h[i, 2]
-        spread[i] = np.sqrt(max(2.0 - tg * tg - th * th, 1e-4))
-        e[i] = (t[0] * c[i, 0] + t[1] * c[i, 1] + t[2] * c[i, 2]) / spread[i]
-    scale, left = 3.0 * np.median(np.abs(e)) + 1e-12, 0.0
+        sigma[i] = np.sqrt(max(2.0 - tg * tg - th * th, 1e-4))
+        e[i] = (t[0] * c[i, 0] + t[1] * c[i, 1] + t[2] * c[i, 2]) / sigma[i]
+
+
+@njit(cache=True, nogil=True)
+def _epipolar_row(g, h, c, J_f_lens, J_h_lens, R, t, a, b, J):
+    """Fills J (5 + L,): derivative of t . (R f x h) for one point by a left rotation of R, by t along a and b, and by
+    the lens. g = R f, c = g x h; J_f_lens, J_h_lens (L, 3): derivatives of the rays f and h by the lens."""
+    m0, m1 = h[1] * t[2] - h[2] * t[1], h[2] * t[0] - h[0] * t[2]
+    m2 = h[0] * t[1] - h[1] * t[0]
+    J[0], J[1] = g[1] * m2 - g[2] * m1, g[2] * m0 - g[0] * m2
+    J[2] = g[0] * m1 - g[1] * m0
+    J[3] = a[0] * c[0] + a[1] * c[1] + a[2] * c[2]
+    J[4] = b[0] * c[0] + b[1] * c[1] + b[2] * c[2]
+    for j in range(len(J_f_lens)):
+        # t . (R J_f x h + R f x J_h), with m = h x t and t x R f.
+        J[5 + j] = 0.0
+        for r in range(3):
+            turned = R[r, 0] * J_f_lens[j, 0] + R[r, 1] * J_f_lens[j, 1] + R[r, 2] * J_f_lens[j, 2]
+            J[5 + j] += turned * (m0 if r == 0 else m1 if r == 1 else m2)
+            p, q = (r + 1) % 3, (r + 2) % 3
+            J[5 + j] += J_h_lens[j, r] * (t[p] * g[q] - t[q] * g[p])
+
+
+@njit(cache=True, nogil=True)
+def _epipolar_sums(f, h, J_f_lens, J_h_lens, R, t, a, b, A, x):
+    """Normal equations A (5 + L, 5 + L), x (5 + L,) of the errors e = t . (R f x h) over their standard deviation, with
+    Cauchy's weights. Unknowns: a left rotation of R, t along a and b (which are filled), and L lens parameters.
+    J_f_lens, J_h_lens (n, L, 3): derivatives of the rays f, h (n, 3). Returns the weighted sum of squares [rad^2]."""
+    n, m = len(f), J_f_lens.shape[1]
+    g, c, e, sigma, J = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(5 + m)
+    _epipolar_errors(f, h, R, t, g, c, e, sigma)
+    scale, cost = 3.0 * np.median(np.abs(e)) + 1e-12, 0.0
     _tangent_basis(t, a, b)
     A[:] = 0.0
     x[:] = 0.0
     for i in range(n):
-        m0, m1 = h[i, 1] * t[2] - h[i, 2] * t[1], h[i, 2] * t[0] - h[i, 0] * t[2]
-        m2 = h[i, 0] * t[1] - h[i, 1] * t[0]
-        row[0], row[1] = g[i, 1] * m2 - g[i, 2] * m1, g[i, 2] * m0 - g[i, 0] * m2
-        row[2] = g[i, 0] * m1 - g[i, 1] * m0
-        row[3] = a[0] * c[i, 0] + a[1] * c[i, 1] + a[2] * c[i, 2]
-        row[4] = b[0] * c[i, 0] + b[1] * c[i, 1] + b[2] * c[i, 2]
-        for j in range(m):
-            # t . (R f_by x h + R f x h_by), with m = h x t and t x R f.
-            row[5 + j] = 0.0
-            for r in range(3):
-                by = R[r, 0] * f_by[i, j, 0] + R[r, 1] * f_by[i, j, 1] + R[r, 2] * f_by[i, j, 2]
-                row[5 + j] += by * (m0 if r == 0 else m1 if r == 1 else m2)
-                p, q = (r + 1) % 3, (r + 2) % 3
-                row[5 + j] += h_by[i, j, r] * (t[p] * g[i, q] - t[q] * g[i, p])
+        _epipolar_row(g[i], h[i], c[i], J_f_lens[i], J_h_lens[i], R, t, a, b, J)
         w = 1.0 / (1.0 + (e[i] / scale) ** 2)
-        left += w * e[i] ** 2
+        cost += w * e[i] ** 2
         for r in range(5 + m):
-            row[r] /= spread[i]
-            x[r] -= w * row[r] * e[i]
+            J[r] /= sigma[i]
+            x[r] -= w * J[r] * e[i]
             for k in range(r + 1):
-                A[r, k] += w * row[r] * row[k]
+                A[r, k] += w * J[r] * J[k]
     for r in range(5 + m):
         for k in range(r):
             A[k, r] = A[r, k]
-    return left
+    return cost
 
 
 @njit(cache=True, nogil=True)
 def _move_direction(t, a, b, da, db):
-    """t turned by da along a and db along b, half a radian at most."""
+    """Moves the unit vector t by da along a and db along b, at most by 0.5 rad."""
     size = np.sqrt(da * da + db * db)
     shorter = 0.5 / size if size > 0.5 else 1.0
     for r in range(3):
@@ -107,13 +126,12 @@ def _move_direction(t, a, b, da, db):
 
 @njit(cache=True, nogil=True)
 def refine_relative_pose(f, h, R, t):
-    """R and t (unit), improved: rays f (n, 3) and h (n, 3) of the same points in two images lie in planes with t,
-    h ~ R f + s t. Returns the sum of the weighted squares of the errors [rad^2] before the last step, infinite where
-    that is singular."""
-    a, b, A, x, stiff = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5), np.empty((len(f), 0, 3))
-    left = np.inf
+    """Refines R (3, 3) and the unit direction t (3,) of the relative pose with h ~ R f + s t, for rays f, h (n, 3).
+    Returns the weighted sum of squares [rad^2] before the last step; infinite if singular."""
+    a, b, A, x, J_no_lens = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5), np.empty((len(f), 0, 3))
+    cost = np.inf
     for _ in range(EPIPOLAR_ITERATIONS):
-        left = _epipolar_sums(f, h, stiff, stiff, R, t, a, b, A, x)
+        cost = _epipolar_sums(f, h, J_no_lens, J_no_lens, R, t, a, b, A, x)
         mean = EPIPOLAR_DAMPING * (A[0, 0] + A[1, 1] + A[2, 2])
         for r in range(5):
             A[r, r] += mean
@@ -121,12 +139,12 @@ def refine_relative_pose(f, h, R, t):
             return np.inf
         R[:] = so3.exp(x[:3].copy()) @ R
         _move_direction(t, a, b, x[3], x[4])
-    return left
+    return cost
 
 
 @njit(cache=True, nogil=True)
 def _direction_step(A, x, y):
-    """Solves the part of A (5, 5) that belongs to the direction for (x, y)."""
+    """Solves the 2 x 2 block of A (5, 5) that belongs to the direction, for the right side (x, y)."""
     mean = EPIPOLAR_DAMPING * (A[0, 0] + A[1, 1] + A[2, 2])
     p, q, r = A[3, 3] + mean, A[3, 4], A[4, 4] + mean
     inverse = 1.0 / (p * r - q * q)
@@ -134,18 +152,18 @@ def _direction_step(A, x, y):
 
 
 @njit(cache=True, nogil=True)
-def rotation_information(f, h, f_by, h_by, R, t, H, g):
-    """H (3 + L, 3 + L) and g (3 + L,): what two images say of a left turn of R and of the lens, and what step they ask
-    for, H step = g; the direction of motion t is found on the way. Returns the sum of the weighted squares of the
-    errors [rad^2]."""
-    a, b, A, x, stiff = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5), np.empty((len(f), 0, 3))
+def rotation_information(f, h, J_f_lens, J_h_lens, R, t, H, g):
+    """Fills H (3 + L, 3 + L) and g (3 + L,), the normal equations H step = g of a left rotation of R and of L lens
+    parameters, after elimination of the direction of motion t, which is refined. Arguments as for `_epipolar_sums`.
+    Returns the weighted sum of squares [rad^2]."""
+    a, b, A, x, J_no_lens = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5), np.empty((len(f), 0, 3))
     for _ in range(DIRECTION_ITERATIONS):
-        _epipolar_sums(f, h, stiff, stiff, R, t, a, b, A, x)
+        _epipolar_sums(f, h, J_no_lens, J_no_lens, R, t, a, b, A, x)
         u, v = _direction_step(A, x[3], x[4])
         _move_direction(t, a, b, u, v)
-    n = 5 + f_by.shape[1]
+    n = 5 + J_f_lens.shape[1]
     A, x = np.empty((n, n)), np.empty(n)
-    left = _epipolar_sums(f, h, f_by, h_by, R, t, a, b, A, x)
+    cost = _epipolar_sums(f, h, J_f_lens, J_h_lens, R, t, a, b, A, x)
     for i in range(n - 2):
         r = i if i < 3 else i + 2
         u, v = _direction_step(A, A[3, r], A[4, r])
@@ -153,12 +171,13 @@ def rotation_information(f, h, f_by, h_by, R, t, H, g):
         for k in range(n - 2):
             c = k if k < 3 else k + 2
             H[i, k] = A[r, c] - u * A[3, c] - v * A[4, c]
-    return left
+    return cost
 
 
 @njit(cache=True, nogil=True)
 def direction_for_rotation(f, h, R):
-    """(3,) the direction of motion that rays f and h leave once turned by R."""
+    """The direction of motion (3,) that fits rays f, h (n, 3) best for the rotation R: eigenvector of the smallest
+    eigenvalue of sum (R f x h)(R f x h)^T."""
     N, g, c = np.zeros((3, 3)), np.empty(3), np.empty(3)
     for i in range(len(f)):
         for r in range(3):
@@ -173,17 +192,18 @@ def direction_for_rotation(f, h, R):
 
 
 @njit(cache=True, nogil=True)
-def rotation_information_of_pairs(f, h, f_by, h_by, begin, R, H, g, left):
-    """H (M, 3 + L, 3 + L), g (M, 3 + L) and left (M,) of `turn_information` for pairs of images with turns
-    R (M, 3, 3); rays of pair i are begin[i]..begin[i + 1] of f and h (n, 3), and of their slopes (n, L, 3)."""
+def rotation_information_of_pairs(f, h, J_f_lens, J_h_lens, begin, R, H, g, cost):
+    """Fills H (M, 3 + L, 3 + L), g (M, 3 + L) and cost (M,) of `rotation_information`, for pairs of images with
+    rotations R (M, 3, 3). Pair i has the rows begin[i]..begin[i + 1] of the rays f, h (n, 3) and of their derivatives
+    (n, L, 3)."""
     for i in range(len(R)):
-        own = slice(begin[i], begin[i + 1])
-        t = direction_for_rotation(f[own], h[own], R[i])
-        left[i] = rotation_information(f[own], h[own], f_by[own], h_by[own], R[i], t, H[i], g[i])
+        rows = slice(begin[i], begin[i + 1])
+        t = direction_for_rotation(f[rows], h[rows], R[i])
+        cost[i] = rotation_information(f[rows], h[rows], J_f_lens[rows], J_h_lens[rows], R[i], t, H[i], g[i])
 
 
 def rotation_without_translation(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The turn that brings rays f nearest to h, and the direction of motion that is left."""
+    """R (3, 3) that best rotates rays f to h (n, 3), and the best direction of motion (3,) for it."""
     U, _, Vt = np.linalg.svd(h.T @ f)
     R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     return np.ascontiguousarray(R), direction_for_rotation(f, h, R)
@@ -197,9 +217,11 @@ def track_rates(
     thinned: bool = False,
     chained: bool = False,
 ) -> SensorRates:
-    """Mean angular rates from images to the ones about `step` s later, with their noise, from how far rays miss their
-    epipolar planes; `thinned`: not from every image, where intervals overlap much; `chained`: sought from the turn of
-    the interval before, too. Raises EstimationError where hardly any images share enough points."""
+    """Mean angular rates between each image and the one about `step` s later, with their noise by the epipolar errors.
+
+    thinned: skips images whose intervals overlap much. chained: also starts from the relative pose of the previous
+    interval. Raises EstimationError if fewer than MIN_TRACK_RATES pairs share enough points.
+    """
     rays, valid = model.unproject(params, stream.uv)
     t, found, noise, before = stream.seconds, [], [], None
     every = max(1, int(THINNED_STEP_SHARE * step / float(np.median(np.diff(t))))) if thinned else 1
@@ -208,8 +230,8 @@ def track_rates(
         if len(p) < MIN_SHARED_POINTS:
             continue
         f, h = rays[p], rays[q]
-        left, R, direction = _best_relative_pose(f, h, before)
-        if np.isfinite(left):
+        cost, R, direction = _best_relative_pose(f, h, before)
+        if np.isfinite(cost):
             before = (R, direction) if chained else None
             found.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
             if len(found) % NOISE_EVERY == 0:
@@ -227,8 +249,8 @@ def track_rates(
 def _best_relative_pose(
     f: np.ndarray, h: np.ndarray, before: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """What is left, and turn and direction of two images, from the turn that fits best without any motion, or where
-    there are some from those of the two images `before`, whichever leaves less."""
+    """Cost, rotation and direction of the better of two refinements: from a pure rotation, and from the relative pose
+    `before` if there is one."""
     found = []
     for start in (rotation_without_translation(f, h), before):
         if start is not None:
@@ -238,15 +260,16 @@ def _best_relative_pose(
 
 
 def rotation_error(f: np.ndarray, h: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[float, float]:
-    """Standard deviation [rad] of a turn about each axis, RMS over the axes, and of a ray across its epipolar plane."""
-    H, g, stiff = np.empty((3, 3)), np.empty(3), np.empty((len(f), 0, 3))
-    left = rotation_information(f, h, stiff, stiff, R, t.copy(), H, g)
+    """Standard deviation [rad] of a rotation about each axis (RMS over axes), and of a ray across its epipolar plane
+    [rad]."""
+    H, g, J_no_lens = np.empty((3, 3)), np.empty(3), np.empty((len(f), 0, 3))
+    cost = rotation_information(f, h, J_no_lens, J_no_lens, R, t.copy(), H, g)
     H[range(3), range(3)] += EPIPOLAR_DAMPING * np.trace(H)
-    return float(np.sqrt(left / len(f) * np.trace(np.linalg.inv(H)) / 3.0)), float(np.sqrt(left / len(f)))
+    return float(np.sqrt(cost / len(f) * np.trace(np.linalg.inv(H)) / 3.0)), float(np.sqrt(cost / len(f)))
 
 
 def image_pairs(stream: TrackStream, step: float) -> list[tuple[int, int]]:
-    """Each image and the one about `step` seconds later."""
+    """Indices of each image and of the one about `step` s later."""
     t = stream.seconds
     after = np.searchsorted(t, t + step - 0.5 * float(np.median(np.diff(t))))
     return [(i, int(j)) for i, j in enumerate(after) if i < j < len(t)]
@@ -255,8 +278,9 @@ def image_pairs(stream: TrackStream, step: float) -> list[tuple[int, int]]:
 def pairs_with_shared_points(
     stream: TrackStream, valid: np.ndarray, steps: Sequence[float], most: int
 ) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
-    """About `most` pairs of images for each of the `steps` between them that share points enough, and their rows, as
-    `common` has them. Where points are lost before the first of the steps, all are halved until they are not."""
+    """About `most` pairs of images for each of the `steps` [s] between them, with MIN_SHARED_POINTS shared points or
+    more: indices of both images, and rows as `shared_points` returns them. If tracks are shorter than the first step,
+    all steps are halved until half of the pairs share enough points."""
     for step in _shortened_steps(stream, valid, steps):
         every = image_pairs(stream, step)
         for i, j in every[:: max(1, len(every) // most)]:
@@ -266,8 +290,7 @@ def pairs_with_shared_points(
 
 
 def _shortened_steps(stream: TrackStream, valid: np.ndarray, steps: Sequence[float]) -> Sequence[float]:
-    """The steps, or a half, a quarter or an eighth of them: the longest of which half of the pairs share points enough
-    at the first."""
+    """The steps times 1, 1/2, 1/4 or 1/8: the largest at which more than half of the pairs share enough points."""
     for shorter in (1.0, 0.5, 0.25, 0.125):
         every = image_pairs(stream, shorter * steps[0])
         some = every[:: max(1, len(every) // SAMPLED_PAIRS)]
@@ -278,7 +301,7 @@ def _shortened_steps(stream: TrackStream, valid: np.ndarray, steps: Sequence[flo
 
 
 def shared_points(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the points that images i and j share, as i and as j saw them."""
+    """Rows of the points that images i and j share, in i and in j; only those with a valid ray."""
     p, q = shared_rows(stream.start, stream.feature, i, j)
     seen = valid[p] & valid[q]
     return p[seen], q[seen]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.geometry.integrals import once_integrated
 from icalib.initialize.steps.rate_correlation import interpolated
 from icalib.motion.imu_data import ImuData
 
@@ -20,9 +21,7 @@ class MeanRates:
     @classmethod
     def of(cls, imu: ImuData) -> MeanRates:
         """Integrates the readings of `imu` by the trapezoidal rule."""
-        angle = np.zeros((len(imu.seconds), 3))
-        angle[1:] = np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0)
-        return cls(imu, angle)
+        return cls(imu, once_integrated(imu.gyro, np.diff(imu.seconds)))
 
     def over(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Mean rates (n, 3) rad/s over intervals from start to end (n,), in s on the IMU's clock."""

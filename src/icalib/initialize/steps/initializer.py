@@ -26,6 +26,7 @@ from icalib.sensors import SENSOR_KINDS, facet
 S = TypeVar("S", bound=Sensor)
 Values = dict[Key, np.ndarray]
 InputsWithMotion = tuple[Inputs, State]  # inputs, and a state whose poses are the trajectory
+InitialGuess = tuple[Inputs, State, Values]  # inputs, start state, values to which unobservable parameters are reset
 
 # Ranks of the kinds that show the motion, the preferred one first: see `Initializer.motion_rank`.
 BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = range(6)
@@ -102,7 +103,7 @@ class Initializer(Generic[S]):
 
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], found: Values
-    ) -> tuple[Inputs, State, Values] | None:
+    ) -> InitialGuess | None:
         """The whole initial guess if all measurements were taken at rest, so that no motion is assumed; else None.
         body, found: results of `body_poses`."""
         del rig, recordings, body, found

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.geometry.integrals import once_integrated, twice_integrated
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.rate_correlation import MAX_USUAL_STEPS
 from icalib.initialize.steps.target_poses import TargetPoses
@@ -186,11 +187,10 @@ def _double_integrals(
 def _double_integral(s: np.ndarray, x: np.ndarray, t: np.ndarray, j: np.ndarray) -> np.ndarray:
     """(n,) at times t, in intervals j, of x (N,), linear between times s (N,)."""
     dt = np.diff(s)
-    first, second = np.zeros_like(x), np.zeros_like(x)
-    first[1:] = np.cumsum(0.5 * (x[1:] + x[:-1]) * dt)
-    second[1:] = np.cumsum(first[:-1] * dt + (2.0 * x[:-1] + x[1:]) * dt**2 / 6.0)
+    once = once_integrated(x, dt)
+    twice = twice_integrated(x, once, dt)
     tau = t - s[j]
-    return second[j] + first[j] * tau + 0.5 * x[j] * tau**2
+    return twice[j] + once[j] * tau + 0.5 * x[j] * tau**2
 
 
 def check_target_size(arm: LeverArm, camera: str, guessed: bool) -> None:

@@ -1,4 +1,7 @@
-"""Time offset and rotation between a camera and the IMU, from angular rates alone."""
+"""Time offset, rotation and gyroscope bias between a sensor and the IMU, from angular rates alone.
+
+The time offset comes from correlation or regression, the rotation from Kabsch's method, both refined together.
+"""
 
 from __future__ import annotations
 
@@ -28,27 +31,28 @@ from icalib.initialize.steps.turned_angles import ChainedRates
 from icalib.motion.axes import other_axes
 from icalib.motion.imu_data import ImuData
 
-MIN_IMAGE_PAIRS = 20  # of neighbouring images
-MAX_UNEXPLAINED_RATE = 0.35  # of the angular rate
-LONG_RATE_MEAN_S = 0.5  # over which noisy rates are compared where over AVERAGED_S they are not alike
-OFFSET_AGREEMENT_S = 0.01  # of the time offsets that two recordings show
-MAX_UNEXPLAINED_RATIO_OF_OTHER = 0.5  # of what another offset leaves unexplained
-MIN_COMMON_RATE_SHARE = 0.3  # share of the camera's rate that goes with the IMU's, below which their ratio says nothing
-STILL_RATE_RAD_S = 0.03
-MAX_NOISE_RATIO_AT_REST = 1.5  # times what noise makes of the rate
+MIN_IMAGE_PAIRS = 20  # pairs of consecutive images: below, the median of differences is unreliable
+MAX_UNEXPLAINED_RATE = 0.35  # share of the angular rate; two independent motions leave about 1
+LONG_RATE_MEAN_S = 0.5  # s: duration of means that are compared if those over RATE_MEAN_S do not match
+OFFSET_AGREEMENT_S = 0.01  # s: time offsets that differ by less agree
+MAX_UNEXPLAINED_RATIO_OF_OTHER = 0.5  # unexplained rate at another offset over that at the present one, to replace it
+MIN_COMMON_RATE_SHARE = 0.3  # projection over norm of the sensor's rate: below, a ratio of rates says nothing
+STILL_RATE_RAD_S = 0.03  # rad/s: slower rotation is not distinguished from rest
+MAX_NOISE_RATIO_AT_REST = 1.5  # RMS of the rate over the noise of a gyroscope at rest
 _SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
-MIN_SECOND_AXIS_RATIO = 0.05  # of the spread of rates about the first
-MAX_ALIGNMENT_ITERATIONS = 12
+MIN_SECOND_AXIS_RATIO = 0.05  # spread of rates along the second axis over that along the first
+MAX_ALIGNMENT_ITERATIONS = 12  # of the alternation, which usually needs three
 DEG_PER_RAD = 180.0 / np.pi
 
 
 class OneAxisError(EstimationError):
-    """A camera turned about one axis only, and the turn about it is open."""
+    """A sensor turned about one axis only, so its rotation about this axis is unobservable."""
 
 
 @dataclass(frozen=True)
 class RateAlignment:
-    """offset: t_imu - t_camera, both since their clock's first stamp [s]; R_imu_cam; gyro_bias (3,) rad/s."""
+    """offset: t_imu - t_sensor [s], both since their clocks' first stamps; rotation: R_imu_sensor (3, 3); gyro_bias
+    (3,) rad/s."""
 
     offset: float
     rotation: np.ndarray
@@ -57,7 +61,8 @@ class RateAlignment:
 
 
 def camera_rates(stream: CornerStream, poses: TargetPoses) -> SensorRates:
-    """Angular rates from consecutive good poses. Raises EstimationError where there are hardly any."""
+    """Angular rates from consecutive good poses of a camera. Raises EstimationError if fewer than MIN_IMAGE_PAIRS pairs
+    are close enough in time."""
     t = stream.seconds
     index = np.flatnonzero(poses.ok)
     if len(index) < 2:
@@ -79,7 +84,8 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> SensorRates:
 
 
 def align_rates(imu: ImuData, name: str, rates: SensorRates, given_offset: float | None) -> RateAlignment:
-    """Offset, rotation and gyro bias. Raises EstimationError where the rates do not match at any shift."""
+    """Estimates the alignment of the sensor `name`; with `given_offset` [s], at this offset. Raises EstimationError if
+    the rates do not match at any offset, or units are wrong."""
     _check_motion(imu, name, rates)
     keep = given_offset is not None
     if rates.offsets == () and not keep:
@@ -97,9 +103,12 @@ def align_rates(imu: ImuData, name: str, rates: SensorRates, given_offset: float
 def _first_match(
     imu: ImuData, tried: Sequence[tuple[SensorRates, RateAlignment]]
 ) -> tuple[tuple[SensorRates, RateAlignment], float]:
-    """The first at which the two turn alike, but a later one where they turn far more alike, and over how long; or if
-    they do nowhere the very first. Over LONGER_S what is noise shrinks with the root of that at least, another motion
-    does not."""
+    """The first of the alignments `tried` whose unexplained rate is small enough, or the best one if it is clearly
+    better; and the duration [s] of the means that were compared.
+
+    If none matches over RATE_MEAN_S, means over LONG_RATE_MEAN_S are compared: noise shrinks at least with the root of
+    the duration, a different motion does not. If none matches then, returns the first.
+    """
     left = [_unexplained(imu, *one) for one in tried]
     alike = [k for k, share in enumerate(left) if share <= MAX_UNEXPLAINED_RATE]
     if alike:
@@ -115,8 +124,8 @@ def _first_match(
 def _align_near(
     imu: ImuData, name: str, rates: SensorRates, offset: float, keep_offset: bool
 ) -> tuple[SensorRates, RateAlignment]:
-    """From one offset: the rates, as large as the gyroscope's where a guessed lens makes them too large or too small,
-    and how they go together."""
+    """The alignment near one offset, and the rates. These are scaled to the gyroscope's if a wrong focal length made
+    them too large or too small."""
     if not covered(imu, rates, offset).any():
         raise no_overlap(imu, name)
     pair = _side_by_side(imu, rates, offset)
@@ -130,8 +139,8 @@ def _align_near(
 def rough_alignments(
     imu: ImuData, name: str, rates: SensorRates, offsets: Sequence[float] | None, guess: float
 ) -> list[RateAlignment]:
-    """Where to search from, whether the rates match or not: at the `offsets`, or if there are none where the angular
-    rates go together best, and at the `guess`."""
+    """Alignments to search from, whether or not rates match: at the `offsets` [s]. None: at the best matches and at
+    `guess`."""
     _check_motion(imu, name, rates)
     if offsets is None:
         offsets = [*best_offsets(imu, rates), guess]
@@ -140,12 +149,12 @@ def rough_alignments(
 
 
 def covered(imu: ImuData, rates: SensorRates, offset: float) -> np.ndarray:
-    """(n,) bool: image intervals within the IMU's recording and none of its gaps."""
+    """(n,) bool: intervals of the rates that lie within the IMU's recording and in none of its gaps."""
     return imu.covers(rates.start + offset, rates.end + offset)
 
 
 def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> None:
-    """An offset at which the two do not turn alike is wrong, or the recordings do not belong together."""
+    """Raises EstimationError if too much of the rate is unexplained. given: whether the rig file gives the offset."""
     if unexplained > MAX_UNEXPLAINED_RATE:
         where = "with the time_offset in the rig file" if given else "at any time offset"
         advice = "correct it, or remove it so that it is estimated" if given else _SAME_RECORDING
@@ -156,8 +165,8 @@ def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> N
 
 
 def _unexplained(imu: ImuData, rates: SensorRates, found: RateAlignment, averaged: float = RATE_MEAN_S) -> float:
-    """Share of the angular rate that the camera did not see, of means over `averaged` seconds, beyond the noise of the
-    camera's rates, where it is known."""
+    """Median difference between the rates of IMU and sensor, over the median rate, of means over `averaged` s. The
+    known noise of the sensor's rates is subtracted."""
     gyro, seen = _side_by_side(imu, rates, found.offset, averaged)
     gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
     left = float(np.median(np.linalg.norm(gyro - seen, axis=1)))
@@ -166,7 +175,7 @@ def _unexplained(imu: ImuData, rates: SensorRates, found: RateAlignment, average
 
 
 def _unexplained_at(imu: ImuData, rates: SensorRates, found: RateAlignment, offset: float) -> float:
-    """What is unexplained of some of the rates at another offset; infinite where the IMU was not running."""
+    """The unexplained share of `rates` at another offset; infinite if the IMU was not running."""
     there = replace(found, offset=offset)
     return _unexplained(imu, rates, there) if covered(imu, rates, offset).any() else np.inf
 
@@ -174,8 +183,8 @@ def _unexplained_at(imu: ImuData, rates: SensorRates, found: RateAlignment, offs
 def _side_by_side(
     imu: ImuData, rates: SensorRates, offset: float, averaged: float = RATE_MEAN_S
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) each, rad/s in own axes: what the gyroscope and the camera have, both as means over some images: a rate
-    between neighbours has little but noise where the target is far or the motion slow."""
+    """Rates of gyroscope and sensor (n, 3) rad/s over the same intervals, each in its own axes, as means over about
+    `averaged` s. A single rate is mostly noise if the target is far or the motion slow."""
     inside = covered(imu, rates, offset)
     start, end = rates.start[inside], rates.end[inside]
     gyro = _interval_rates(imu, rates).over(start + offset, end + offset)
@@ -186,7 +195,7 @@ def _side_by_side(
 
 
 def contradicting_offset(imu: ImuData, name: str, rates: SensorRates, expected: float) -> float | None:
-    """The offset at which the two turn alike, where it is clearly another than the `expected` one; else None."""
+    """The offset [s] at which the rates match, if it is clearly better than `expected`; else None."""
     try:
         own = align_rates(imu, name, rates, None)
     except EstimationError:
@@ -200,8 +209,8 @@ def contradicting_offset(imu: ImuData, name: str, rates: SensorRates, expected: 
 
 
 def rms_rates(imu: ImuData, rates: SensorRates) -> tuple[float, float]:
-    """How the IMU turned and how the camera, rad/s: RMS about the median, of means over AVERAGED_S where it is no more
-    than noise explains; and the median."""
+    """How fast IMU and sensor turn [rad/s]: RMS of the IMU's rate about its median, and median of the sensor's rate. If
+    the IMU's rate is hardly more than its noise, means over RATE_MEAN_S are used."""
     dt = float(np.median(np.diff(imu.seconds)))
     rate = imu.gyro - np.median(imu.gyro, axis=0)
     noise = np.sqrt(3.0 * np.median(imu.variance[:, 0]) / dt)
@@ -211,11 +220,12 @@ def rms_rates(imu: ImuData, rates: SensorRates) -> tuple[float, float]:
 
 
 def is_still(turned: float, seen: float) -> bool:
-    """Whether neither turned to speak of; see `turning`."""
+    """Whether neither sensor turned significantly. turned, seen: results of `rms_rates`."""
     return turned < STILL_RATE_RAD_S and seen < 3.0 * STILL_RATE_RAD_S
 
 
 def _check_motion(imu: ImuData, name: str, rates: SensorRates) -> None:
+    """Raises EstimationError if neither sensor turned significantly."""
     turned, seen = rms_rates(imu, rates)
     if is_still(turned, seen):
         raise EstimationError(
@@ -225,7 +235,8 @@ def _check_motion(imu: ImuData, name: str, rates: SensorRates) -> None:
 
 
 def kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R and bias with w_imu = R w_cam + bias: means removed, then an SVD."""
+    """R (3, 3) and bias (3,) with w_imu = R w_cam + bias (n, 3), weighted least squares: means are removed, then the
+    SVD of the covariance (Kabsch 1976)."""
     total = weight.sum()
     mi, mc = weight @ w_imu / total, weight @ w_cam / total
     U, _, Vt = np.linalg.svd(((w_imu - mi) * weight[:, None]).T @ (w_cam - mc))
@@ -235,17 +246,19 @@ def kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np
 
 
 def _alignment_at_offset(offset: float, gyro: np.ndarray, seen: np.ndarray) -> RateAlignment:
-    """At this offset, from means over some images: a pose that flips to its mirror image and back cancels in them."""
+    """Rotation and bias at this offset from rates side by side. Means over several images suppress poses that flip to
+    their mirrored solution and back."""
     return RateAlignment(offset, *kabsch(gyro, seen, np.ones(len(gyro))))
 
 
 def _interval_rates(imu: ImuData, rates: SensorRates) -> MeanRates | ChainedRates:
-    """What compares with rates over such intervals."""
+    """The gyroscope's rates over intervals as long as those of `rates`."""
     return ChainedRates.of(imu) if rates.are_slow else MeanRates.of(imu)
 
 
 def _refine(imu: ImuData, rates: SensorRates, rough: RateAlignment, keep_offset: bool) -> RateAlignment:
-    """Gauss-Newton on the offset, Kabsch on rotation and bias in turn; rates are means over each image interval."""
+    """Alternates Gauss-Newton on the offset with Kabsch on rotation and bias, without outliers. keep_offset: estimates
+    rotation and bias only."""
     measured = _interval_rates(imu, rates)
     offset, R, bias, residual = rough.offset, rough.rotation, rough.gyro_bias, np.zeros_like(rates.rate)
     for _ in range(MAX_ALIGNMENT_ITERATIONS):
@@ -268,40 +281,40 @@ def _refine(imu: ImuData, rates: SensorRates, rough: RateAlignment, keep_offset:
 
 
 def turns_about_two_axes(imu: ImuData, rates: SensorRates, found: RateAlignment) -> bool:
-    """Whether the camera turned about more than one axis, and the IMU with it: of a target far away a camera alone
-    sees turns that are noise. Else its rotation about that axis stays open."""
+    """Whether sensor and IMU both turned about more than one axis. Both are checked, as a camera far from the target
+    measures rotations that are noise. If not, the rotation about this axis is unobservable."""
     middle = (0.5 * (rates.start + rates.end) + found.offset)[covered(imu, rates, found.offset)]
     gyro = interpolated(imu.seconds, imu.gyro, middle)
     return all(_second_axis(w) >= MIN_SECOND_AXIS_RATIO for w in (rates.rate, gyro))
 
 
 def _second_axis(rate: np.ndarray) -> float:
-    """The spread of rates (n, 3) about their second axis over that about the first."""
+    """Spread of rates (n, 3) along their second principal axis over that along the first."""
     spread, _ = _spread_axes(rate)
     return float(spread[1] / spread[0])
 
 
 def only_axis(rate: np.ndarray, least: float) -> np.ndarray | None:
-    """(3,) the axis of rates (n, 3), or turns, where there is no other: of those about the second there are less than
-    `least` of those about the first, and how much is turned about the axis itself they do not show."""
+    """Unit vector (3,) of the single axis of rates or rotation vectors (n, 3); None if the spread along the second
+    principal axis is at least `least` times that along the first. About a single axis the rotation is unobservable."""
     spread, axes = _spread_axes(rate)
     return axes[0] if spread[1] < least * spread[0] else None
 
 
 def _spread_axes(rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How rates (n, 3) spread about their axes (3, 3), by rows, the widest first."""
+    """Singular values of rates (n, 3) about their mean, and principal axes (3, 3) as rows, the widest first."""
     _, spread, axes = np.linalg.svd(rate - rate.mean(axis=0), full_matrices=False)
     return spread, axes
 
 
 def main_axis(rate: np.ndarray) -> np.ndarray:
-    """(3,) the axis that rates (n, 3) spread about most."""
+    """Unit vector (3,) of the first principal axis of rates (n, 3)."""
     return _spread_axes(rate)[1][0]
 
 
 def check_two_axes(imu: ImuData, rates: SensorRates, found: RateAlignment, name: str, on_wheels: bool) -> None:
-    """Raises OneAxisError where the camera turned about one axis only. on_wheels: a vehicle, which turns about others
-    on slopes only."""
+    """Raises OneAxisError if the sensor turned about one axis only. on_wheels: whether it is on a vehicle, which turns
+    about other axes on slopes only."""
     if not turns_about_two_axes(imu, rates, found):
         axes = other_axes(imu.name, main_axis(imu.gyro))
         motion = "drive over ramps" if on_wheels else f"turn the rig about {axes} as well"
@@ -312,15 +325,15 @@ def check_two_axes(imu: ImuData, rates: SensorRates, found: RateAlignment, name:
 
 
 def better_at_offset(imu: ImuData, name: str, rates: SensorRates, found: RateAlignment, offset: float) -> RateAlignment:
-    """`found`, or what a guess of the `offset` makes of it where the two turn alike there far better: rates about one
-    axis fit the other way round, too."""
+    """`found`, or the alignment at a guessed `offset` [s] if rates match clearly better there. Rates about one axis
+    also match a rotation that is reversed."""
     if not covered(imu, rates, offset).any():
         return found
     return better_alignment(imu, rates, found, alignment_as_stated(imu, name, rates, offset, found.rotation))
 
 
 def better_alignment(imu: ImuData, rates: SensorRates, found: RateAlignment, other: RateAlignment) -> RateAlignment:
-    """`found`, or the other where the two turn far more alike there."""
+    """`found`, or `other` if its unexplained rate is clearly smaller."""
     return (
         other
         if _unexplained(imu, rates, other) < MAX_UNEXPLAINED_RATIO_OF_OTHER * _unexplained(imu, rates, found)
@@ -331,8 +344,8 @@ def better_alignment(imu: ImuData, rates: SensorRates, found: RateAlignment, oth
 def alignment_as_stated(
     imu: ImuData, name: str, rates: SensorRates, offset: float, rotation: np.ndarray
 ) -> RateAlignment:
-    """An alignment with this offset and rotation, whatever the motion: only the gyro bias is found. Raises
-    EstimationError where clocks do not overlap."""
+    """An alignment with the given offset [s] and rotation R_imu_sensor; only the gyroscope's bias is estimated. Raises
+    EstimationError if the recordings do not overlap."""
     inside = covered(imu, rates, offset)
     if not inside.any():
         raise no_overlap(imu, name)
@@ -344,12 +357,13 @@ def alignment_as_stated(
 
 
 def rates_contradict(imu: ImuData, rates: SensorRates, given: RateAlignment) -> bool:
-    """Whether the two turn, but not alike, even allowing for what a guess is off."""
+    """Whether the sensors turned, but not as the alignment `given` predicts."""
     (_, found), averaged = _first_match(imu, [(rates, given)])
     return not is_still(*rms_rates(imu, rates)) and _unexplained(imu, rates, found, averaged) > MAX_UNEXPLAINED_RATE
 
 
 def no_overlap(imu: ImuData, name: str) -> EstimationError:
+    """The error of recordings that do not overlap in time."""
     return EstimationError(
         f"no data of {name} fall within the recording of {imu.name}. Check that both come from the same "
         "recording, and that a time_offset in the rig file is in seconds, or remove it so that it is "
@@ -358,7 +372,8 @@ def no_overlap(imu: ImuData, name: str) -> EstimationError:
 
 
 def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, seen: np.ndarray) -> None:
-    """By size alone: readings in degrees match no camera's motion, and must not be blamed for that."""
+    """Raises EstimationError if the gyroscope is in deg/s, by the norms of the rates (n, 3). It comes before the checks
+    of the motion, which such rates would fail."""
     size = [np.linalg.norm(w - np.median(w, axis=0), axis=1) for w in (gyro, seen)]
     ratio = float(np.median(size[0]) / max(np.median(size[1]), 1e-9))
     if 0.8 < ratio / DEG_PER_RAD < 1.25:
@@ -369,7 +384,7 @@ def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, seen: np.ndarray) 
 
 
 def _check_scale(imu: ImuData, name: str, rates: SensorRates, found: RateAlignment, averaged: float) -> None:
-    """The two must turn equally fast."""
+    """Raises EstimationError if the norms of the rates differ by more than a quarter."""
     ratio = _rate_ratio(found, *_side_by_side(imu, rates, found.offset, averaged))
     if not 0.8 < ratio < 1.25:
         raise EstimationError(
@@ -379,9 +394,8 @@ def _check_scale(imu: ImuData, name: str, rates: SensorRates, found: RateAlignme
 
 
 def _rate_ratio(found: RateAlignment, gyro: np.ndarray, camera: np.ndarray) -> float:
-    """How much faster the gyroscope turns than the camera, side by side: both about their medians, as a bias has no
-    say, and along the gyroscope's axis, where noise of the camera, which would make it seem slower, has none. Where
-    it does not turn alike at all, none is faster."""
+    """Rate of the gyroscope over that of the sensor, both (n, 3) about their medians, which hold the bias. The sensor's
+    rate is projected on the gyroscope's, so that its noise averages out. 1 if the rates do not correlate."""
     gyro, camera = gyro - np.median(gyro, axis=0), (camera - np.median(camera, axis=0)) @ found.rotation.T
     size = np.linalg.norm(gyro, axis=1)
     fast = size > np.median(size)

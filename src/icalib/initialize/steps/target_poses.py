@@ -1,4 +1,5 @@
-"""Where each camera stood when it took each image: the target's pose from its corners, no guess needed."""
+"""Poses of cameras relative to a flat target, from the corners of each image, without an initial guess: homography,
+then Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -13,18 +14,19 @@ from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
 
-MAX_POSE_CORNERS = 48  # of an image; more do not make a first guess better
-MIN_POSE_CORNERS = 6  # of a board; fewer lie on a line too easily
-MIN_RAY_COSINE = 0.15  # rays closer to the image plane than this have no place in a homography
-MAX_POSE_RMS_PX = 3.0
-POSE_HUBER_PX = 2.0
-POSE_ITERATIONS = 5
-POSES_PER_BLOCK = 512  # poses at a time: what all corners need at once fills the memory
+MAX_POSE_CORNERS = 48  # corners of an image that are used; more do not improve an initial guess
+MIN_POSE_CORNERS = 6  # corners of a board: fewer are too often nearly collinear
+MIN_RAY_COSINE = 0.15  # cosine of a ray to the optical axis: homographies need rays away from the image plane
+MAX_POSE_RMS_PX = 3.0  # px: poses with a larger RMS error are rejected
+POSE_HUBER_PX = 2.0  # px: width of Huber's loss
+POSE_ITERATIONS = 5  # of Gauss-Newton, which starts near the solution
+POSES_PER_BLOCK = 512  # poses computed at once: bounds the memory of rays and Jacobians
 
 
 @dataclass(frozen=True)
 class TargetPoses:
-    """Camera poses in the board frame: R_board_cam (M, 3, 3), p_board_cam (M, 3); ok (M,) bool; rms_px (M,)."""
+    """Camera poses in the board frame: R_board_cam (M, 3, 3), p_board_cam (M, 3) m; ok (M,) bool; rms_px (M,): RMS
+    reprojection error."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -34,7 +36,8 @@ class TargetPoses:
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _homography(points, seen, centre, h):
-    """H (9,) with seen ~ H (point - centre, 1), h33 = 1, by linear least squares. False where it is singular."""
+    """Fills h (9,) = H with seen ~ H (point - centre, 1) and h33 = 1, by linear least squares (DLT). points (n, 3),
+    seen (n, 3). Returns False if singular."""
     A, b, row = np.zeros((8, 8)), np.zeros(8), np.empty(8)
     for n in range(len(points)):
         x, y = points[n, 0] - centre[0], points[n, 1] - centre[1]
@@ -59,7 +62,8 @@ def _homography(points, seen, centre, h):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _pose_from_homography(h, R, t):
-    """R_cam_board and the position of the homography's centre in the camera, from columns of equal length."""
+    """Fills R_cam_board and t, the position in the camera of the homography's centre, from its columns scaled to equal
+    length (Zhang 2000)."""
     n1 = np.sqrt(h[0] ** 2 + h[3] ** 2 + h[6] ** 2)
     n2 = np.sqrt(h[1] ** 2 + h[4] ** 2 + h[7] ** 2)
     s = 2.0 / (n1 + n2)
@@ -83,6 +87,7 @@ def _pose_from_homography(h, R, t):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _normalise(v):
+    """Scales v (3,) to unit length."""
     n = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     for i in range(3):
         v[i] /= n
@@ -99,11 +104,30 @@ def _apply_step(turn, g, R, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refine_pose(points, seen, R, t, rounds):
-    """Gauss-Newton on x / z, y / z in pixels, Huber weights beyond `HUBER_PX`; returns the last RMS error [px], errors
-    capped at 4 times that. Points behind the camera count as so far off; 1e9 where as few as 3 are in front of it.
+def _add_corner(X, iz, density, r0, r1, w, J, H, g):
+    """Adds the residuals r0, r1 [px] of a corner, with weight w, to the normal equations H (6, 6), lower triangle, and
+    g (6,) of a left increment of the pose. X (3,): the corner in the camera, iz = 1 / X[2]. J (2, 6) is filled."""
+    for k in range(2):
+        a = density * iz if k == 0 else 0.0
+        b = density * iz if k == 1 else 0.0
+        c = -density * X[k] * iz * iz
+        J[k, 0] = -b * X[2] + c * X[1]
+        J[k, 1] = a * X[2] - c * X[0]
+        J[k, 2] = -a * X[1] + b * X[0]
+        J[k, 3], J[k, 4], J[k, 5] = a, b, c
+    for i in range(6):
+        g[i] += w * (J[0, i] * r0 + J[1, i] * r1)
+        for j in range(i + 1):  # `solve_definite` takes the lower triangle
+            H[i, j] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
 
-    seen (n, 3): x / z, y / z, and pixels per unit of these, which on a fisheye fall to a tenth towards the border.
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def refine_pose(points, seen, R, t, rounds):
+    """Gauss-Newton on R_cam_board and t with Huber weights. points (n, 3) m: corners on the board; seen (n, 3): x / z,
+    y / z, and pixels per unit of these, which fall to a tenth towards the border of a fisheye.
+
+    Returns the RMS error [px] before the last step, with errors capped at 4 POSE_HUBER_PX; points behind the camera
+    count as this much. Returns 1e9 if singular, or if fewer than 4 points are in front of the camera.
     """
     rms, X, J, H, g = 1e9, np.empty(3), np.empty((2, 6)), np.empty((6, 6)), np.empty(6)
     for _ in range(rounds):
@@ -120,19 +144,7 @@ def refine_pose(points, seen, R, t, rounds):
             r0, r1 = density * (X[0] * iz - seen[n, 0]), density * (X[1] * iz - seen[n, 1])
             e = np.sqrt(r0 * r0 + r1 * r1)
             total += min(e, 4.0 * POSE_HUBER_PX) ** 2
-            w = 1.0 if e <= POSE_HUBER_PX else POSE_HUBER_PX / e
-            for k in range(2):
-                a = density * iz if k == 0 else 0.0
-                b = density * iz if k == 1 else 0.0
-                c = -density * X[k] * iz * iz
-                J[k, 0] = -b * X[2] + c * X[1]
-                J[k, 1] = a * X[2] - c * X[0]
-                J[k, 2] = -a * X[1] + b * X[0]
-                J[k, 3], J[k, 4], J[k, 5] = a, b, c
-            for i in range(6):
-                g[i] += w * (J[0, i] * r0 + J[1, i] * r1)
-                for j in range(i + 1):  # `solve_definite` takes the lower triangle
-                    H[i, j] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
+            _add_corner(X, iz, density, r0, r1, 1.0 if e <= POSE_HUBER_PX else POSE_HUBER_PX / e, J, H, g)
         rms = np.sqrt(total / (2 * len(points)))
         if len(points) - behind < 4:
             return 1e9
@@ -144,8 +156,8 @@ def refine_pose(points, seen, R, t, rounds):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def select_corners(a, b, point, rays, density, good, target, points, seen):
-    """Fills points (n, 3) and seen (n, 3), as `refine` wants them, with corners a..b that are good, as many as have
-    room, spread; returns their number."""
+    """Fills points (n, 3) and seen (n, 3), as `refine_pose` needs them, with good corners among a..b, evenly spread if
+    there are more than n. Returns their number."""
     most, total = len(points), 0
     for n in range(a, b):
         total += good[n]
@@ -164,7 +176,7 @@ def select_corners(a, b, point, rays, density, good, target, points, seen):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def camera_in_target(R, t, rotation, position):
-    """From R_cam_target, p_cam_target to R_target_cam, p_target_cam."""
+    """Inverts R_cam_target, p_cam_target to R_target_cam, p_target_cam."""
     for a in range(3):
         position[a] = -(R[0, a] * t[0] + R[1, a] * t[1] + R[2, a] * t[2])
         for b in range(3):
@@ -173,8 +185,8 @@ def camera_in_target(R, t, rotation, position):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _mirrored_pose(centre, R, t):
-    """The other pose from which a flat target looks nearly alike: its depths mirrored about its middle (Schweighofer
-    and Pinz 2006)."""
+    """The second pose from which a flat target looks nearly alike: depths mirrored about the target's centre
+    (Schweighofer and Pinz 2006)."""
     c, d = np.empty(3), np.empty(3)
     for i in range(3):
         c[i] = t[i] + R[i, 0] * centre[0] + R[i, 1] * centre[1]
@@ -192,7 +204,7 @@ def _mirrored_pose(centre, R, t):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, rotation, position, rms):
-    """Poses (n, 1 or 2, ...): with two, the mirrored one second."""
+    """Fills poses (n, 1 or 2, ...) of the images; with two, the mirrored solution is second."""
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
     points, seen = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     for i in range(len(start) - 1):
@@ -221,22 +233,23 @@ def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, 
 
 @dataclass(frozen=True)
 class FlatPoints:
-    """Points (n, 3) of flat bodies, each in its body's frame, and how many make a pose."""
+    """Points (n, 3) m of flat bodies, each in its body's frame, and the fewest corners that give a pose."""
 
     points: np.ndarray
     fewest: int = MIN_POSE_CORNERS
 
 
 def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, target: FlatPoints) -> TargetPoses:
-    """Poses of the camera in the frame of the one body that each image shows, from up to 48 corners each."""
+    """Poses of the camera in the frame of the one body that each image shows, from up to MAX_POSE_CORNERS
+    corners each."""
     fewest = np.full(len(stream.stamps_ns), target.fewest)
     found = flat_poses(stream, stream.start, fewest, model, params, target.points, 1)
     return TargetPoses(found.rotation[:, 0], found.position[:, 0], found.ok[:, 0], found.rms_px[:, 0])
 
 
 def check_front_side(camera: str, poses: TargetPoses) -> None:
-    """Raises EstimationError where most `poses` of the camera in the frame of a flat body are behind its sheet: a
-    mirrored image looks as the sheet would through its back."""
+    """Raises EstimationError if most `poses` of the camera are behind the sheet of a flat body: a mirrored image looks
+    like the sheet seen through its back."""
     behind = poses.position[poses.ok, 2] < 0.0
     if 2 * behind.sum() > len(behind):
         raise EstimationError(
@@ -255,9 +268,9 @@ def flat_poses(
     target: np.ndarray,
     sides: int,
 ) -> TargetPoses:
-    """Poses (n, sides, ...) of the camera in the frames of flat bodies: the corners start[i]:start[i + 1] are of one,
-    and make a pose where there are `fewest` (n,) of them. With two sides, the pose with mirrored depths comes second:
-    a small body far away looks alike from both."""
+    """Poses (n, sides, ...) of the camera in the frames of flat bodies. The corners start[i]:start[i + 1] belong to one
+    body, and give a pose if there are at least `fewest` (n,). With sides = 2 the mirrored solution comes second: a
+    small body far away looks alike from both poses."""
     n = len(start) - 1
     rotation, position = np.tile(np.eye(3), (n, sides, 1, 1)), np.zeros((n, sides, 3))
     rms = np.empty((n, sides))
@@ -282,8 +295,8 @@ def flat_poses(
 
 
 def usable_rays(uv: np.ndarray, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N, 3) unit rays of corners at uv (N, 2), (N,) pixels per unit of x / z and y / z there, the geometric mean over
-    directions, and (N,) whether the ray is far enough from the image plane."""
+    """Unit rays (N, 3) of corners at uv (N, 2); pixels per unit of x / z and y / z there (N,), the geometric mean over
+    directions; and whether the ray is far enough from the image plane (N,)."""
     rays, valid = model.unproject(params, uv)
     good = valid & (rays[:, 2] > MIN_RAY_COSINE)
     J = model.project_with_jacobians(params, rays)[2]

@@ -1,1 +1,1 @@
-"""A sensor's own trajectory against the IMU or a known motion: what sensors of several kinds share."""
+"""A sensor's own trajectory, aligned to the IMU's readings or to a known trajectory."""

@@ -1,6 +1,7 @@
-"""An IMU whose readings are recorded another way than its axes are: inverted, permuted, or of left-handed axes.
+"""An IMU whose axes in the recording are not the true ones: inverted, permuted or left-handed.
 
-Each way is tried where the readings as they are do not fit what a camera saw, and named where it fits far better.
+Each convention is tried if the readings do not fit the motion that cameras measured. It is named in an error if it fits
+far better.
 """
 
 from __future__ import annotations
@@ -15,24 +16,26 @@ from icalib.motion.imu_data import ImuData
 from icalib.rig import Axes, ImuSensor
 
 UNCHANGED_AXES: Axes = ("x", "y", "z")
-MAX_GOOD_UNEXPLAINED = 0.4  # of the acceleration that was seen is left: readings that fit so are as they should be
-MAX_UNEXPLAINED_RATIO = 0.5  # times what is left of the readings as they are
-_UNIQUE_BEST_RATIO = 0.8  # times what the next best way leaves; two that fit alike are both named
+MAX_GOOD_UNEXPLAINED = 0.4  # unexplained share of the acceleration: a convention that leaves less fits
+MAX_UNEXPLAINED_RATIO = 0.5  # over the share that the present convention leaves
+_UNIQUE_BEST_RATIO = 0.8  # best over second best share: above, both conventions fit alike and are named
 
 
 @dataclass(frozen=True)
 class AxisConvention:
-    """The columns that become x, y, z of each sensor, and words for it."""
+    """gyro, accel: the recorded columns that are the true x, y, z axes, with sign; words: the convention as a
+    clause."""
 
     gyro: Axes
     accel: Axes
     words: str
 
     def of(self, imu: ImuData) -> ImuData:
+        """The readings of `imu` in the true axes, if this convention holds."""
         return replace(imu, gyro=_in_axes(imu.gyro, self.gyro), accel=_in_axes(imu.accel, self.accel))
 
     def fields(self, sensor: ImuSensor) -> str:
-        """What to write in the rig file, on top of what it says."""
+        """The fields to set in the rig file, combined with those of `sensor` that it has already."""
         found = []
         for name, given, own in (
             ("gyro_axes", sensor.gyro_axes, self.gyro),
@@ -44,7 +47,8 @@ class AxisConvention:
 
 
 def axis_conventions() -> Iterator[AxisConvention]:
-    """The commonest first. A turn of one sensor's axes against the other's stands as one of the gyroscope's."""
+    """All conventions that are tried, the most common first. A rotation between both triads is assigned to the
+    gyroscope."""
     yield AxisConvention(UNCHANGED_AXES, ("-x", "-y", "-z"), "has an inverted accelerometer, which reads -g at rest")
     for k, axis in enumerate("xyz"):
         yield AxisConvention(_flipped(k), UNCHANGED_AXES, f"has a left-handed gyroscope, axis {axis} reversed")
@@ -62,15 +66,16 @@ def axis_conventions() -> Iterator[AxisConvention]:
 
 
 def refuse_other_axes(
-    sensor: ImuSensor, imu: ImuData, left: Callable[[ImuData], float], failed: EstimationError | None
+    sensor: ImuSensor, imu: ImuData, unexplained: Callable[[ImuData], float], failed: EstimationError | None
 ) -> None:
-    """Raises EstimationError where readings recorded another way would fit far better. left: what readings leave of the
-    acceleration that was seen, or raises EstimationError; failed: where those as they are did."""
+    """Raises EstimationError if readings in another convention fit far better. unexplained(imu): share of the measured
+    acceleration that the readings do not explain; it may raise EstimationError. failed: the error that the present
+    readings raised, if any."""
     if sensor.assumed:
         return
-    now = _unexplained_or_inf(left, imu)
+    now = _unexplained_or_inf(unexplained, imu)
     found = sorted(
-        ((_unexplained_or_inf(left, way.of(imu)), k, way) for k, way in enumerate(axis_conventions())),
+        ((_unexplained_or_inf(unexplained, way.of(imu)), k, way) for k, way in enumerate(axis_conventions())),
         key=lambda x: x[:2],
     )
     best, _, way = found[0]
@@ -84,30 +89,34 @@ def refuse_other_axes(
         ) from failed
 
 
-def _unexplained_or_inf(left: Callable[[ImuData], float], imu: ImuData) -> float:
+def _unexplained_or_inf(unexplained: Callable[[ImuData], float], imu: ImuData) -> float:
+    """The unexplained share, infinite if it raises EstimationError."""
     try:
-        return left(imu)
+        return unexplained(imu)
     except EstimationError:
         return np.inf
 
 
 def _in_axes(values: np.ndarray, axes: Axes) -> np.ndarray:
+    """Columns of `values` (N, 3), permuted and signed as in `axes`."""
     sign = [-1.0 if entry.startswith("-") else 1.0 for entry in axes]
     return np.ascontiguousarray(values[:, ["xyz".index(entry[-1]) for entry in axes]] * sign)
 
 
 def _composed(given: Axes, own: Axes) -> list[str]:
-    """The columns of what is recorded, of `own` axes of the `given` ones."""
+    """The recorded columns that result from `own` axes of the columns in `given`."""
     columns = [(given["xyz".index(entry[-1])], entry.startswith("-")) for entry in own]
     return [f"{'-' if name.startswith('-') != turned else ''}{name[-1]}" for name, turned in columns]
 
 
 def _flipped(*which: int) -> Axes:
+    """Axes with the columns in `which` negated."""
     x, y, z = (f"-{axis}" if k in which else axis for k, axis in enumerate("xyz"))
     return x, y, z
 
 
 def _swapped(i: int, j: int) -> Axes:
+    """Axes with columns i and j exchanged."""
     axes = list("xyz")
     axes[i], axes[j] = axes[j], axes[i]
     return axes[0], axes[1], axes[2]

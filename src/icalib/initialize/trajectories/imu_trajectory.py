@@ -1,9 +1,9 @@
-"""How the IMU moved while a LiDAR looked around: the LiDAR's positions, with the IMU's readings in between.
+"""Trajectory of the IMU, from the poses of a sensor on it and from the IMU's readings in between.
 
-Rotations come from the LiDAR, carried by the gyroscope. With gravity and the accelerometer's bias known, positions and
-velocities at the scans are linear least squares, each axis on its own:
+Rotations come from the sensor, interpolated by the gyroscope. With known gravity and accelerometer bias, positions and
+velocities at the instants of the poses are linear least squares, each axis on its own:
 
-    p_k+1 = p_k + v_k h + g h^2 / 2 + dp_k        v_k+1 = v_k + g h + dv_k        p_k as the LiDAR shows it
+    p_k+1 = p_k + v_k h + g h^2 / 2 + dp_k        v_k+1 = v_k + g h + dv_k        p_k as the sensor measures it
 """
 
 from __future__ import annotations
@@ -12,22 +12,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.geometry.integrals import once_integrated
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.motion.imu_data import ImuData, clear_of
 
-SENSOR_POSITION_SIGMA_M, IMU_DISPLACEMENT_SIGMA_M, IMU_VELOCITY_SIGMA_M_S = (
-    0.02,
-    2e-3,
-    0.02,
-)  # m, m, m/s: of what the LiDAR shows, of what the IMU feels
-IMU_GAP_SIGMA_FACTOR = 1e4  # times as much where the IMU did not run
-MAX_PROPAGATION_S = 1.0
+SENSOR_POSITION_SIGMA_M = 0.02  # m: standard deviation of the sensor's positions
+IMU_DISPLACEMENT_SIGMA_M = 2e-3  # m: of a displacement by the IMU between two poses, without gap
+IMU_VELOCITY_SIGMA_M_S = 0.02  # m/s: of a change of velocity by the IMU between two poses, without gap
+IMU_GAP_SIGMA_FACTOR = 1e4  # on both of the IMU over a gap: practically no constraint
+MAX_PROPAGATION_S = 1.0  # s: longer intervals between poses count as gaps
 
 
 @dataclass(frozen=True)
 class SignalIntegrals:
-    """First and second integrals over time of a signal x (N, m) that is linear between the IMU's stamps, from the first
-    stamp on."""
+    """First and second integrals over time, from the first stamp, of a signal x (N, m) that is linear between the IMU's
+    stamps. once, twice (N, m): at these stamps."""
 
     imu: ImuData
     x: np.ndarray
@@ -36,14 +35,15 @@ class SignalIntegrals:
 
     @classmethod
     def of(cls, imu: ImuData, x: np.ndarray) -> SignalIntegrals:
+        """Integrates the signal x (N, m), given at the stamps of `imu`."""
         h = np.diff(imu.seconds)[:, None]
-        once, twice = np.zeros_like(x), np.zeros_like(x)
-        once[1:] = np.cumsum(0.5 * h * (x[1:] + x[:-1]), axis=0)
+        once, twice = once_integrated(x, h[:, 0]), np.zeros_like(x)
         twice[1:] = np.cumsum(h * once[:-1] + h**2 * (x[:-1] / 3.0 + x[1:] / 6.0), axis=0)
         return cls(imu, x, once, twice)
 
     def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Both (n, m) at times t; beyond the recording the last signal is continued."""
+        """First and second integral (n, m) at times t (n,) s. Outside the recording the signal is extrapolated
+        linearly."""
         j = self.imu.interval(t)
         s, h = (t - self.imu.seconds[j])[:, None], np.diff(self.imu.seconds)[j][:, None]
         slope = (self.x[j + 1] - self.x[j]) / h
@@ -53,8 +53,8 @@ class SignalIntegrals:
 
 @dataclass(frozen=True)
 class ImuTrajectory:
-    """The IMU in a world with z up. At instants seconds (n,), in order: R_world_imu, position and velocity; gyro_bias,
-    accel_bias (3,); gravity: how long it is [m/s^2]."""
+    """The IMU in a world with z up, at increasing seconds (n,): R_world_imu (n, 3, 3), position (n, 3) m, velocity (n,
+    3) m/s. gyro_bias (3,) rad/s, accel_bias (3,) m/s^2; gravity: magnitude [m/s^2]."""
 
     gyro: GyroRotation
     seconds: np.ndarray
@@ -67,37 +67,38 @@ class ImuTrajectory:
 
     @property
     def bias(self) -> np.ndarray:
-        """(6,) gyroscope, accelerometer."""
+        """(6,) biases of gyroscope [rad/s] and accelerometer [m/s^2]."""
         return np.concatenate([self.gyro_bias, self.accel_bias])
 
     def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """R_world_imu (n, 3, 3), position and velocity (n, 3) at times t on the imu clock, from the instant before."""
+        """R_world_imu (n, 3, 3), position (n, 3) m and velocity (n, 3) m/s at times t (n,) s on the IMU's clock,
+        propagated by its readings from the last instant before."""
         down = np.array([0.0, 0.0, -self.gravity])
-        felt = self._felt()
+        force = self._force_integrals()
         k = np.clip(np.searchsorted(self.seconds, t, side="right") - 1, 0, len(self.seconds) - 1)
-        once, twice = felt.at(t)
-        once_k, twice_k = (x[k] for x in felt.at(self.seconds))
+        once, twice = force.at(t)
+        once_k, twice_k = (x[k] for x in force.at(self.seconds))
         h = (t - self.seconds[k])[:, None]
         velocity = self.velocity[k] + h * down + once - once_k
         position = self.position[k] + h * self.velocity[k] + 0.5 * h**2 * down + twice - twice_k - h * once_k
         return self.gyro.carry(self.seconds, self.rotation, t), position, velocity
 
-    def _felt(self) -> SignalIntegrals:
-        """Integrals of the accelerometer's readings in world axes."""
+    def _force_integrals(self) -> SignalIntegrals:
+        """Integrals of the specific force in world axes, without bias."""
         imu = self.gyro.imu
         R = self.gyro.carry(self.seconds, self.rotation, imu.seconds)
         return SignalIntegrals.of(imu, np.einsum("nij,nj->ni", R, imu.accel - self.accel_bias))
 
     def smoothed(self) -> ImuTrajectory:
-        """Positions made better and velocities found by what the IMU feels between them."""
+        """The trajectory with positions smoothed, and velocities estimated, by the IMU's readings between the poses."""
         down, t = np.array([0.0, 0.0, -self.gravity]), self.seconds
-        once, twice = self._felt().at(t)
+        once, twice = self._force_integrals().at(t)
         h = np.diff(t)[:, None]
-        speed = np.diff(once, axis=0) + h * down
-        way = np.diff(twice, axis=0) - h * once[:-1] + 0.5 * h**2 * down
-        unfelt = (h[:, 0] > MAX_PROPAGATION_S) | ~clear_of(self.gyro.imu.gaps, t[:-1], t[1:])
+        velocity_change = np.diff(once, axis=0) + h * down
+        displacement = np.diff(twice, axis=0) - h * once[:-1] + 0.5 * h**2 * down
+        has_gap = (h[:, 0] > MAX_PROPAGATION_S) | ~clear_of(self.gyro.imu.gaps, t[:-1], t[1:])
         position, velocity = _least_squares(
-            h[:, 0], self.position, way, speed, np.where(unfelt, IMU_GAP_SIGMA_FACTOR, 1.0)
+            h[:, 0], self.position, displacement, velocity_change, np.where(has_gap, IMU_GAP_SIGMA_FACTOR, 1.0)
         )
         return ImuTrajectory(
             self.gyro, t, self.rotation, position, velocity, self.gyro_bias, self.accel_bias, self.gravity
@@ -105,19 +106,29 @@ class ImuTrajectory:
 
 
 def _least_squares(
-    h: np.ndarray, seen: np.ndarray, way: np.ndarray, speed: np.ndarray, rough: np.ndarray
+    h: np.ndarray,
+    positions: np.ndarray,
+    displacement: np.ndarray,
+    velocity_change: np.ndarray,
+    sigma_factor: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities (n, 3) from seen (n, 3) positions, and steps (n - 1, 3) way and speed over h (n - 1,),
-    whose sigma is `rough` times as much; block tridiagonal."""
-    n = len(seen)
+    """Positions and velocities (n, 3) from measured positions (n, 3), and increments of position and velocity (n - 1,
+    3) over intervals h (n - 1,) s, whose standard deviations are scaled by sigma_factor (n - 1,). Solves a
+    block-tridiagonal system by elimination."""
+    n = len(positions)
     D, U, r = np.zeros((n, 2, 2)), np.zeros((n - 1, 2, 2)), np.zeros((n, 2, 3))
     D[:, 0, 0] = SENSOR_POSITION_SIGMA_M**-2
-    r[:, 0] = seen * SENSOR_POSITION_SIGMA_M**-2
-    A, B = np.zeros((n - 1, 2, 2)), np.tile(np.eye(2), (n - 1, 1, 1))  # rows B x_k+1 + A x_k = (way, speed)
+    r[:, 0] = positions * SENSOR_POSITION_SIGMA_M**-2
+    A, B = (
+        np.zeros((n - 1, 2, 2)),
+        np.tile(np.eye(2), (n - 1, 1, 1)),
+    )  # rows B x_k+1 + A x_k = (displacement, velocity_change)
     A[:, 0, 0] = A[:, 1, 1] = -1.0
     A[:, 0, 1] = -h
-    w = np.stack([(IMU_DISPLACEMENT_SIGMA_M * rough) ** -2, (IMU_VELOCITY_SIGMA_M_S * rough) ** -2], axis=1)
-    b = np.stack([way, speed], axis=1)
+    w = np.stack(
+        [(IMU_DISPLACEMENT_SIGMA_M * sigma_factor) ** -2, (IMU_VELOCITY_SIGMA_M_S * sigma_factor) ** -2], axis=1
+    )
+    b = np.stack([displacement, velocity_change], axis=1)
     At, Bt = A.transpose(0, 2, 1) * w[:, None, :], B.transpose(0, 2, 1) * w[:, None, :]
     D[:-1] += At @ A
     D[1:] += Bt @ B

@@ -1,4 +1,4 @@
-"""A sensor whose poses are measured, placed on a motion of the IMU that other sensors showed."""
+"""Extrinsics of a sensor with its own trajectory, by a known trajectory of the IMU."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess, Se
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 
-MIN_RATE_WINDOW_S = 0.1  # of a mean rate, at least
-MIN_RATE_WINDOWS = 20
+MIN_RATE_WINDOW_S = 0.1  # s: shortest window of a mean rate
+MIN_RATE_WINDOWS = 20  # mean rates: fewer do not show a time offset
 
 
 def trajectory_rates(name: str, path: SensorTrajectory) -> SensorRates:
-    """Mean angular rates of the sensor `name` over windows of WINDOW_S or more, as the noise of its poses asks for, one
-    from each pose. Raises EstimationError where there are hardly any."""
+    """Mean angular rates of the sensor `name`, over windows as long as the noise of its poses demands, at least
+    MIN_RATE_WINDOW_S. Raises EstimationError if there are too few, or the rotation is constant."""
     t, R = path.seconds, path.rotation
     longest = max_rate_step(name, t, "poses")
     a, b, rate = window_rates(t, R, rate_window(t, R, MIN_RATE_WINDOW_S, longest), longest)
@@ -46,19 +46,19 @@ def trajectory_rates(name: str, path: SensorTrajectory) -> SensorRates:
 
 
 def extrinsics_on_trajectory(
-    imu: ImuData, name: str, path: SensorTrajectory, known: State, held: KnownExtrinsics
+    imu: ImuData, name: str, path: SensorTrajectory, state: State, known: KnownExtrinsics
 ) -> tuple[ExtrinsicsGuess, float]:
-    """The guess of the sensor `name` from the motion of the IMU in `known`, and the share of its displacements that is
-    left, see `left_over`. Raises EstimationError where they do not show it."""
+    """The extrinsics of the sensor `name` that align its trajectory `path` to the IMU's in `state`, and
+    `unexplained_displacement`. Raises EstimationError if too few poses overlap."""
     rates = trajectory_rates(name, path)
-    aligned = align_trajectory(imu, name, rates, held)
+    aligned = align_trajectory(imu, name, rates, known)
     t = path.seconds + aligned.offset
-    path = path.only((t >= known.seconds[0]) & (t <= known.seconds[-1]))
+    path = path.only((t >= state.seconds[0]) & (t <= state.seconds[-1]))
     if not len(path.seconds):
         raise too_few_poses(name)
     t = path.seconds + aligned.offset
-    R, p = imu_poses_at(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t)
-    prior = lever_arm_prior(np.zeros(0), rates.rate, DISPLACEMENT_SIGMA_M, held.rotation is not None, held.position)
+    R, p = imu_poses_at(state, GyroRotation.integrate(imu, state.bias[:, :3].mean(axis=0)), t)
+    prior = lever_arm_prior(np.zeros(0), rates.rate, DISPLACEMENT_SIGMA_M, known.rotation is not None, known.position)
     system = system_from_trajectory(R, p, t, path.rotation, path.position)
     found = solve_lever_arm(system, prior, aligned.rotation, rates.rate)
     if found is None:
@@ -66,18 +66,18 @@ def extrinsics_on_trajectory(
     return ExtrinsicsGuess(found[0], found[1][3:6], aligned.offset), unexplained_displacement(system, *found)
 
 
-def imu_poses_at(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R_world_imu (n, 3, 3), p_world_imu (n, 3) at times t (n,): positions are cubic between keyframes, by their
-    velocities."""
-    k = np.clip(np.searchsorted(known.seconds, t, side="right") - 1, 0, len(known.seconds) - 2)
-    h = np.diff(known.seconds)[k][:, None]
-    s = (t - known.seconds[k])[:, None] / h
-    way = hermite(s, known.position[k + 1] - known.position[k], known.velocity[k] * h, known.velocity[k + 1] * h)
-    return gyro.carry(known.seconds, known.rotation, t), known.position[k] + way
+def imu_poses_at(state: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R_world_imu (n, 3, 3), p_world_imu (n, 3) m at times t (n,) s: rotations by the gyroscope from the nearest
+    keyframe, positions by cubic Hermite interpolation."""
+    k = np.clip(np.searchsorted(state.seconds, t, side="right") - 1, 0, len(state.seconds) - 2)
+    h = np.diff(state.seconds)[k][:, None]
+    s = (t - state.seconds[k])[:, None] / h
+    way = hermite(s, state.position[k + 1] - state.position[k], state.velocity[k] * h, state.velocity[k + 1] * h)
+    return gyro.carry(state.seconds, state.rotation, t), state.position[k] + way
 
 
 def too_few_poses(name: str) -> EstimationError:
-    """The error of a sensor whose poses hardly overlap with the motion."""
+    """The error of a sensor whose poses hardly overlap in time with the trajectory."""
     return EstimationError(
         f"{name}: too few of its poses fall within the recording of the other sensors to estimate its "
         "lever arm; check that the clocks overlap, or record for longer."

@@ -1,16 +1,17 @@
-"""A LiDAR's lever arm, and what rates leave open of its rotation: linear in its positions.
+"""Lever arm of a sensor with its own trajectory, and the part of its rotation that angular rates do not determine.
 
-Against a known motion of the IMU, with u the LiDAR's own way from instant i to j in its axes at i (hand and eye):
+`map` is the world frame of the sensor's trajectory. With a known trajectory of the IMU, and the sensor's displacement u
+from instant i to j in its axes at i (hand-eye equation, R and p of the IMU):
 
-    (R_j - R_i) p_imu_lidar - R_i R_imu_lidar u = p_i - p_j                                     R, p: of the IMU
+    (R_j - R_i) p_imu_sensor - R_i R_imu_sensor u = p_i - p_j
 
-Against the IMU's readings alone, with A[x] = (x_2 - x_1) / h_2 - (x_1 - x_0) / h_1 over three scans, in which
-velocities have dropped out (as of a camera in `lever_arm`, whose board is the LiDAR's map here):
+With the IMU's readings alone, and A[x] = (x_2 - x_1) / h_2 - (x_1 - x_0) / h_1 over three poses, which removes
+velocities (as in `lever_arm`, whose board frame is the map here):
 
-    A[p_map_lidar] = A[R_map_imu] p_imu_lidar + A[D_f] - A[D_R] b_a + g (h_1 + h_2) / 2
+    A[p_map_sensor] = A[R_map_imu] p_imu_sensor + A[D_f] - A[D_R] b_a + g (h_1 + h_2) / 2
 
-Both are linear in a turn R_imu_lidar Exp(d), too. Where a LiDAR turned about one axis, d about it is left to these rows
-alone; then the turn that fits them best among all is where to start.
+Both are also linear in a small rotation d of R_imu_sensor Exp(d). If the sensor turned about one axis, rates do not
+show d about it. These equations then start from the candidate rotation about this axis that fits best.
 """
 
 from __future__ import annotations
@@ -27,40 +28,42 @@ from icalib.initialize.steps.rate_alignment import only_axis
 from icalib.initialize.trajectories.imu_trajectory import SignalIntegrals
 from icalib.motion.imu_data import ImuData, clear_of
 
-LEVER_ARM_PRIOR_M = 0.5  # m: what the motion leaves open stays small
-ACCEL_BIAS_PRIOR = 0.3  # m/s^2
-UNKNOWN_SIGMA = 1e3
-FIXED_SIGMA = 1e-6
-DISPLACEMENT_SIGMA_M, VELOCITY_CHANGE_SIGMA_M_S = 0.1, 0.05  # m, m/s: of a row
-SENSOR_RATE_SIGMA_RAD_S = 0.02  # rad/s, of a rate of the LiDAR
-DISPLACEMENT_SPANS_S = (0.5, 2.0)  # of ways
-MIN_TRIPLE_STEP_S = 0.1  # between the scans of a triple, at least
-MIN_LEVER_ARM_ROWS = 10
+LEVER_ARM_PRIOR_M = 0.5  # m: prior standard deviation; keeps unobservable components small
+ACCEL_BIAS_PRIOR = 0.3  # m/s^2: prior standard deviation
+UNKNOWN_SIGMA = 1e3  # prior standard deviation of unknowns without a prior, in their units
+FIXED_SIGMA = 1e-6  # prior standard deviation of known values, in their units
+DISPLACEMENT_SIGMA_M = 0.1  # m: standard deviation of a row of displacements
+VELOCITY_CHANGE_SIGMA_M_S = 0.05  # m/s: standard deviation of a row of readings
+SENSOR_RATE_SIGMA_RAD_S = 0.02  # rad/s: standard deviation of a rate of the sensor
+DISPLACEMENT_SPANS_S = (0.5, 2.0)  # s between the two poses of a displacement
+MIN_TRIPLE_STEP_S = 0.1  # s between the poses of a triple
+MIN_LEVER_ARM_ROWS = 10  # equations of three components each
+# spread of rates along the second axis over that along the first: below, it is noise
 SINGLE_AXIS_RATE_RATIO = (
     0.1  # of the spread of rates about the first axis: below, turns about the second are lost in noise
 )
-AXIS_TURN_CANDIDATES = 24  # turns about that axis
-LEVER_ARM_ITERATIONS = 5
-MIN_MIRRORED_SHARE = 1.4  # times what was seen is left: 2 without noise, and 1 or less where axes are right-handed
+AXIS_TURN_CANDIDATES = 24  # start rotations about a single axis, 15 degrees apart
+LEVER_ARM_ITERATIONS = 5  # of Gauss-Newton on the rotation
+MIN_MIRRORED_SHARE = 1.4  # unexplained share: 2 in left-handed axes without noise, at most 1 in right-handed ones
 
 
 class LeverArmRows(NamedTuple):
-    """A x = b with A (n, 3, m), b (n, 3); the first six of x are d and p_imu_lidar. seen (n, 3): what the LiDAR's path
-    has part in b."""
+    """Linear system A x = b: A (n, 3, m), b (n, 3). The first six of x are d [rad] and p_imu_sensor [m]. motion (n, 3):
+    the part of b that the sensor's trajectory contributes."""
 
     A: np.ndarray
     b: np.ndarray
-    seen: np.ndarray
+    motion: np.ndarray
 
 
-LeverArmSystem = Callable[
-    [np.ndarray, np.ndarray], LeverArmRows
-]  # of R_imu_lidar, and p_imu_lidar for the derivative by d
+# function of R_imu_sensor and of p_imu_sensor, which the derivative by d needs
+LeverArmSystem = Callable[[np.ndarray, np.ndarray], LeverArmRows]
 
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """Of x (m,): mean and sigma, in the units of a row's sigma; information (3, 3) of d from rates, likewise."""
+    """Prior of x (m,): mean and standard deviation, over the standard deviation of a row. information (3, 3): of d by
+    angular rates, in the same units."""
 
     mean: np.ndarray
     sigma: np.ndarray
@@ -68,13 +71,14 @@ class GaussianPrior:
 
 
 def lever_arm_prior(
-    others: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_held: bool, held: np.ndarray | None
-):
-    """Of a system with unknowns of sigma `others` (k,) beside d and p, and rates (n, 3) of the LiDAR; held (3,): the
-    lever arm where it is known."""
-    d = FIXED_SIGMA if rotation_held else UNKNOWN_SIGMA
-    arm = LEVER_ARM_PRIOR_M if held is None else FIXED_SIGMA
-    mean = np.concatenate([np.zeros(3), np.zeros(3) if held is None else held, np.zeros(len(others))])
+    others: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_known: bool, known: np.ndarray | None
+) -> GaussianPrior:
+    """The prior of a system with unknowns of standard deviation `others` (k,) after d and p. rates (n, 3) rad/s: of the
+    sensor; row_sigma: of a row; rotation_known: whether d is fixed at zero; known (3,) m: the lever arm if it is known.
+    """
+    d = FIXED_SIGMA if rotation_known else UNKNOWN_SIGMA
+    arm = LEVER_ARM_PRIOR_M if known is None else FIXED_SIGMA
+    mean = np.concatenate([np.zeros(3), np.zeros(3) if known is None else known, np.zeros(len(others))])
     w = rates - rates.mean(axis=0)
     information = (w**2).sum() * np.eye(3) - w.T @ w
     return GaussianPrior(
@@ -87,17 +91,18 @@ def lever_arm_prior(
 def system_from_trajectory(
     R_imu: np.ndarray, p_imu: np.ndarray, seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
 ) -> LeverArmSystem:
-    """Of a LiDAR at seconds (n,), R_map_lidar and p_map_lidar, while the IMU was at R_imu, p_imu in any world."""
+    """The system of a sensor with poses R_map_sensor, p_map_sensor at seconds (n,), at which the IMU has the poses
+    R_imu (n, 3, 3), p_imu (n, 3) in any world."""
     i, j = _displacement_pairs(seconds)
     u = np.einsum("nji,nj->ni", rotation[i], position[j] - position[i])
     hat_u = so3.hat_many(u)
 
-    def rows(R_il: np.ndarray, p_il: np.ndarray) -> LeverArmRows:
-        del p_il
-        R = R_imu[i] @ R_il
+    def rows(R_is: np.ndarray, p_is: np.ndarray) -> LeverArmRows:
+        del p_is
+        R = R_imu[i] @ R_is
         A = np.concatenate([R @ hat_u, R_imu[j] - R_imu[i]], axis=2)
-        way = np.einsum("nij,nj->ni", R, u)
-        return LeverArmRows(A, way - (p_imu[j] - p_imu[i]), way)
+        displacement = np.einsum("nij,nj->ni", R, u)
+        return LeverArmRows(A, displacement - (p_imu[j] - p_imu[i]), displacement)
 
     return rows
 
@@ -109,71 +114,74 @@ def system_from_readings(
     rotation: np.ndarray,
     position: np.ndarray,
 ) -> LeverArmSystem:
-    """Of a LiDAR at seconds (n,) on the imu clock; carry: R_map_imu (N, 3, 3) at the IMU's stamps from that (n, 3, 3)
-    at the scans. The unknowns after p are gravity in the map and the accelerometer's bias."""
+    """The system of a sensor with poses R_map_sensor, p_map_sensor at seconds (n,) on the IMU's clock. carry: maps
+    R_map_imu (n, 3, 3) at the poses to those at the IMU's stamps (N, 3, 3). The unknowns after p are gravity [m/s^2] in
+    the map and the accelerometer's bias [m/s^2]."""
     triples = _pose_triples(seconds, imu.gaps)
     n, second = len(triples.i), triples.second
-    bend = second(position)
+    velocity_changes = second(position)
 
-    def rows(R_il: np.ndarray, p_il: np.ndarray) -> LeverArmRows:
-        at_scans = rotation @ R_il.T
-        R = carry(at_scans)
-        felt = np.einsum("nij,nj->ni", R, imu.accel)
-        # R_map_lidar is what is known: with R_imu_lidar Exp(d) what is felt turns by -d in the LiDAR's axes.
-        by_turn = so3.hat_many(felt) @ R @ R_il
-        x = np.concatenate([felt, R.reshape(-1, 9), by_turn.reshape(-1, 9)], axis=1)
+    def rows(R_is: np.ndarray, p_is: np.ndarray) -> LeverArmRows:
+        R_at_poses = rotation @ R_is.T
+        R = carry(R_at_poses)
+        force = np.einsum("nij,nj->ni", R, imu.accel)
+        # R_map_sensor is measured, so R_imu_sensor Exp(d) rotates the force by -d in the sensor's axes.
+        J_force_d = so3.hat_many(force) @ R @ R_is
+        x = np.concatenate([force, R.reshape(-1, 9), J_force_d.reshape(-1, 9)], axis=1)
         D = SignalIntegrals.of(imu, x).at(seconds)[1]
         A = np.zeros((n, 3, 12))
-        A[:, :, :3] = second(rotation @ so3.hat_many((R_il.T @ p_il)[None])[0] + D[:, 12:].reshape(-1, 3, 3))
-        A[:, :, 3:6] = second(at_scans)
+        A[:, :, :3] = second(rotation @ so3.hat_many((R_is.T @ p_is)[None])[0] + D[:, 12:].reshape(-1, 3, 3))
+        A[:, :, 3:6] = second(R_at_poses)
         A[:, :, 6:9] = triples.half[:, None, None] * np.eye(3)
         A[:, :, 9:] = -second(D[:, 3:12].reshape(-1, 3, 3))
-        return LeverArmRows(A, bend - second(D[:, :3]), bend)
+        return LeverArmRows(A, velocity_changes - second(D[:, :3]), velocity_changes)
 
     return rows
 
 
 def solve_lever_arm(
-    rows: LeverArmSystem, prior: GaussianPrior, R_il: np.ndarray, rates: np.ndarray
+    rows: LeverArmSystem, prior: GaussianPrior, R_is: np.ndarray, rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """R_imu_lidar and x (m,) that fit the rows best, from a rotation that fits rates (n, 3) of the LiDAR; None where
-    rows are too few."""
+    """R_imu_sensor and x (m,) that fit the system best, starting at the rotation R_is that fits the sensor's rates (n,
+    3). None if the system has too few rows."""
     start = prior.mean[3:6]
-    if len(rows(R_il, start).b) < MIN_LEVER_ARM_ROWS:
+    if len(rows(R_is, start).b) < MIN_LEVER_ARM_ROWS:
         return None
-    held = prior.sigma[0] < 1.0
+    rotation_known = prior.sigma[0] < 1.0
     axis = only_axis(rates, SINGLE_AXIS_RATE_RATIO)
-    if not held and axis is not None:
+    if not rotation_known and axis is not None:
         angles = 2.0 * np.pi * np.arange(AXIS_TURN_CANDIDATES) / AXIS_TURN_CANDIDATES
         turns = so3.exp_many(angles[:, None] * axis)
-        R_il = min((R_il @ turn for turn in turns), key=lambda R: _misfit_of_rotation(rows(R, start), prior))
+        R_is = min((R_is @ turn for turn in turns), key=lambda R: _misfit_of_rotation(rows(R, start), prior))
     x = prior.mean
     for _ in range(LEVER_ARM_ITERATIONS):
-        x = _robust_least_squares(rows(R_il, x[3:6]), prior, 0)[0]
-        R_il = R_il @ so3.exp(x[:3].copy())
-    return R_il, x
+        x = _robust_least_squares(rows(R_is, x[3:6]), prior, 0)[0]
+        R_is = R_is @ so3.exp(x[:3].copy())
+    return R_is, x
 
 
-def unexplained_displacement(rows: LeverArmSystem, R_il: np.ndarray, x: np.ndarray) -> float:
-    """How much of what the path has part in the solution x (m,) and `R_il` leave: the ratio of the medians."""
-    A, b, seen = rows(R_il, x[3:6])
+def unexplained_displacement(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> float:
+    """Median residual of the solution R_is, x (m,) over the median part of the sensor's trajectory in the equations."""
+    A, b, motion = rows(R_is, x[3:6])
     left = b - A[:, :, 3:] @ x[3:]
-    return float(np.median(np.linalg.norm(left, axis=1)) / max(np.median(np.linalg.norm(seen, axis=1)), 1e-30))
+    return float(np.median(np.linalg.norm(left, axis=1)) / max(np.median(np.linalg.norm(motion, axis=1)), 1e-30))
 
 
-def is_mirrored(rows: LeverArmSystem, R_il: np.ndarray, x: np.ndarray) -> bool:
-    """Whether the LiDAR moved the other way than the solution x (m,) and `R_il` say. Rates of mirrored axes are those
-    of axes turned by half a turn, and fit; of ways twice their length is left then."""
-    return unexplained_displacement(rows, R_il, x) > MIN_MIRRORED_SHARE
+def is_mirrored(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> bool:
+    """Whether the sensor moved opposite to the solution R_is, x (m,). Rates in left-handed axes equal those of axes
+    rotated by 180 deg, so they fit. Displacements then have the wrong sign, and the residual is about twice as large as
+    they are."""
+    return unexplained_displacement(rows, R_is, x) > MIN_MIRRORED_SHARE
 
 
 def _misfit_of_rotation(rows: LeverArmRows, prior: GaussianPrior) -> float:
-    """RMS of what rows lack with d = 0."""
+    """RMS residual of the best fit with d = 0."""
     return _robust_least_squares(rows, prior, 3)[1]
 
 
 def _robust_least_squares(rows: LeverArmRows, prior: GaussianPrior, without: int) -> tuple[np.ndarray, float]:
-    """Least squares for x without its first `without`, twice more without rows that stand far off; RMS of the rest."""
+    """Least squares for x, without its first `without` components, with the prior. Repeated twice without outliers.
+    Returns x (m,) and the RMS residual of the inliers."""
     A, free = rows.A[:, :, without:], slice(without, None)
     N0, mean = np.diag(prior.sigma[free] ** -2), prior.mean[free]
     weight, x, size = np.ones(len(A)), mean, np.zeros(len(A))
@@ -189,7 +197,7 @@ def _robust_least_squares(rows: LeverArmRows, prior: GaussianPrior, without: int
 
 
 def _displacement_pairs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Instants (i, j) about SPANS_S apart."""
+    """Pairs of instants (i, j) about DISPLACEMENT_SPANS_S apart."""
     i = np.tile(np.arange(len(t)), len(DISPLACEMENT_SPANS_S))
     span = np.repeat(DISPLACEMENT_SPANS_S, len(t))
     j = np.searchsorted(t, t[i] + span - 1e-3)
@@ -198,7 +206,8 @@ def _displacement_pairs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pose_triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> Triples:
-    """Scans (i, j, k) about STEP_S apart, or next to each other, and no part of them in a gap of the IMU."""
+    """Triples of poses about MIN_TRIPLE_STEP_S apart, or of neighbours if these are further apart. None spans a gap of
+    the IMU."""
     i = np.arange(len(t))
     step = max(MIN_TRIPLE_STEP_S, float(np.median(np.diff(t))))
     j = np.searchsorted(t, t + 0.99 * step - 1e-3)

@@ -1,4 +1,4 @@
-"""Time offset, rotation and gyroscope bias that make a path turn as the IMU does."""
+"""Time offset, rotation and gyroscope bias that align a sensor's trajectory to the IMU, by angular rates."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
 
 
-def align_trajectory(imu: ImuData, name: str, rates: SensorRates, held: KnownExtrinsics) -> RateAlignment:
-    """From the angular rates of the sensor `name`; what is `held` stays. Raises EstimationError where the rates do not
-    show the alignment."""
-    if held.rotation is not None and held.offset is not None:
-        found = alignment_as_stated(imu, name, rates, held.offset, held.rotation)
+def align_trajectory(imu: ImuData, name: str, rates: SensorRates, known: KnownExtrinsics) -> RateAlignment:
+    """Alignment from the angular rates of the sensor `name`; `known` values are kept. Raises EstimationError if the
+    rates do not determine it, or contradict the known values."""
+    if known.rotation is not None and known.offset is not None:
+        found = alignment_as_stated(imu, name, rates, known.offset, known.rotation)
         if rates_contradict(imu, rates, found):
             raise EstimationError(
                 f"{name} does not turn as {imu.name} does with the rotation and time_offset in the rig file; "
@@ -28,12 +28,12 @@ def align_trajectory(imu: ImuData, name: str, rates: SensorRates, held: KnownExt
             )
         return found
     _check_turning(imu, name, rates)
-    found = align_rates(imu, name, rates, held.offset)
-    return found if held.rotation is None else alignment_as_stated(imu, name, rates, found.offset, held.rotation)
+    found = align_rates(imu, name, rates, known.offset)
+    return found if known.rotation is None else alignment_as_stated(imu, name, rates, found.offset, known.rotation)
 
 
 def _check_turning(imu: ImuData, name: str, rates: SensorRates) -> None:
-    """Raises EstimationError where neither turns."""
+    """Raises EstimationError if neither sensor turned significantly."""
     turned, seen = rms_rates(imu, rates)
     if is_still(turned, seen):
         raise EstimationError(

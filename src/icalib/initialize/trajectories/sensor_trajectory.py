@@ -20,14 +20,15 @@ class SensorTrajectory:
     ok: np.ndarray
 
     def only(self, chosen: np.ndarray) -> SensorTrajectory:
-        """The poses that are `chosen` (n,)."""
+        """The poses selected by `chosen` (n,)."""
         return SensorTrajectory(self.seconds[chosen], self.rotation[chosen], self.position[chosen], self.ok[chosen])
 
 
 @dataclass(frozen=True)
 class ExtrinsicsGuess:
-    """R_imu_sensor (3, 3), p_imu_sensor (3,) m; offset: t_imu - t_sensor, both since their clocks' first stamps [s];
-    turned: whether the sensor turned about more than one axis, which shows all of its rotation."""
+    """rotation: R_imu_sensor (3, 3); position: p_imu_sensor (3,) m; offset: t_imu - t_sensor [s], both since their
+    clocks' first stamps; turned: whether the sensor turned about more than one axis, which makes its rotation
+    observable."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -35,7 +36,7 @@ class ExtrinsicsGuess:
     turned: bool = False
 
     def values(self, name: str) -> dict[Key, np.ndarray]:
-        """As calibration parameters of the sensor `name`."""
+        """The guess as calibration parameters of the sensor `name`."""
         return {
             (name, "rotation"): self.rotation,
             (name, "translation"): self.position,

@@ -1,4 +1,4 @@
-"""The motion of the IMU, and a sensor's lever arm, from the sensor's path and the readings of the IMU alone."""
+"""The trajectory of the IMU and a sensor's extrinsics, from the sensor's trajectory and the IMU's readings alone."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ from icalib.initialize.trajectories.lever_arm_rows import (
 from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess, SensorTrajectory
 from icalib.motion.imu_data import ImuData
 
-TRAJECTORY_GRAVITY_TOLERANCE = 0.1  # of gravity: further off, units are wrong or the path is
+TRAJECTORY_GRAVITY_TOLERANCE = 0.1  # relative error of gravity: more means wrong units or a wrong trajectory
 
 
 @dataclass(frozen=True)
 class TrajectoryFit:
-    """What a path shows with the IMU: the sensor's guess, the motion of the IMU, the size of gravity [m/s^2], and
-    R_world_map, which makes the map level; the origin of the world is the map's. left: see `left_over`."""
+    """guess: extrinsics of the sensor; motion: trajectory of the IMU; gravity: its estimated magnitude [m/s^2];
+    R_world_map (3, 3): levels the map, whose origin is that of the world; unexplained: see `unexplained_displacement`.
+    """
 
     guess: ExtrinsicsGuess
     motion: ImuTrajectory
@@ -46,9 +47,11 @@ def fit_imu_trajectory(
     rates: SensorRates,
     aligned: RateAlignment,
     gravity: float,
-    held: KnownExtrinsics,
+    known: KnownExtrinsics,
 ) -> TrajectoryFit | None:
-    """From the path of one sensor, all of it while the IMU was running; gravity [m/s^2]. None where it is too short."""
+    """Fits the trajectory `path` of one sensor, which must lie within the IMU's recording. rates, aligned: of this
+    sensor; gravity: expected magnitude [m/s^2]; known: values that are kept. Returns None if the trajectory is too
+    short."""
     gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
 
     def carry(at_poses: np.ndarray) -> np.ndarray:
@@ -58,8 +61,8 @@ def fit_imu_trajectory(
         np.array([UNKNOWN_SIGMA] * 3 + [ACCEL_BIAS_PRIOR] * 3),
         rates.rate,
         VELOCITY_CHANGE_SIGMA_M_S,
-        held.rotation is not None,
-        held.position,
+        known.rotation is not None,
+        known.position,
     )
     system = system_from_readings(imu, carry, t, path.rotation, path.position)
     found = solve_lever_arm(system, prior, aligned.rotation, rates.rate)
@@ -80,7 +83,7 @@ def fit_imu_trajectory(
 
 
 def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:
-    """R_world_map: the smallest rotation that brings gravity (3,) down."""
+    """R_world_map: the smallest rotation that turns gravity (3,) to -z."""
     d = -gravity / np.linalg.norm(gravity)
     axis = np.array([d[1], -d[0], 0.0])  # d x z
     sine = np.linalg.norm(axis)

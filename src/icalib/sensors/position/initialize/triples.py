@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.geometry import so3
+from icalib.geometry.integrals import once_integrated, twice_integrated
 from icalib.initialize.steps.lever_arm import Triples
 from icalib.motion.imu_data import ImuData, clear_of
 
@@ -75,17 +76,15 @@ class Carried:
         so3.chain(so3.exp_many(rate * dt[:, None]), R)
         at = int(np.clip(np.searchsorted(s, reference), 0, len(s) - 1))
         R = np.ascontiguousarray(R[at].T @ R)
-        turned = _integral(R.reshape(len(s), 9), dt).reshape(-1, 3, 3)
+        turned = once_integrated(R.reshape(len(s), 9), dt).reshape(-1, 3, 3)
         turned -= turned[at]
         force = np.einsum("nij,nj->ni", R, accel)
         columns = force
         if not alone:
             J_bias = so3.hat_many(force) @ turned
             columns = np.concatenate([force, R.reshape(-1, 9), J_bias.reshape(-1, 9)], axis=1)
-        first = _integral(columns, dt)
-        step = dt[:, None]
-        second = np.zeros_like(columns)
-        second[1:] = np.cumsum(first[:-1] * step + (2.0 * columns[:-1] + columns[1:]) * step**2 / 6.0, axis=0)
+        first = once_integrated(columns, dt)
+        second = twice_integrated(columns, first, dt)
         return cls(s, R, rate, turned, columns, first, second)
 
     def _interval(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,10 +106,3 @@ class Carried:
         j, tau = self._interval(t)
         tau = tau[:, None]
         return self.second[j] + self.first[j] * tau + 0.5 * self.columns[j] * tau**2
-
-
-def _integral(x: np.ndarray, dt: np.ndarray) -> np.ndarray:
-    """(N, c) of x (N, c), linear between stamps dt (N - 1,) s apart, from the first."""
-    out = np.zeros_like(x)
-    out[1:] = np.cumsum(0.5 * (x[1:] + x[:-1]) * dt[:, None], axis=0)
-    return out
