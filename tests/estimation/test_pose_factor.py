@@ -16,7 +16,7 @@ from icalib.motion.pose_rows import Frame, absolute_residuals, relative_residual
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import State
 from icalib.rig import PoseSensor
-from icalib.sensors.pose.model import MODEL, scaled_noise
+from icalib.sensors.pose.model import MODEL, estimated_noise
 from icalib.sensors.pose.residual import FRAME, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate
@@ -168,7 +168,7 @@ def test_residuals_are_those_of_matrices():
 def test_noise_that_is_given_stays():
     noise = PoseNoise(0.01, 0.02)
     ratios = {"rotation": 4.0, "position": 9.0}
-    assert scaled_noise(PoseSensor("a", "a"), noise, ratios) == PoseNoise(0.02, 0.06)
-    assert scaled_noise(PoseSensor("a", "a"), noise, {"rotation": 4.0}) == PoseNoise(0.02, 0.02)
-    assert scaled_noise(PoseSensor("a", "a", rotation_noise=0.01), noise, ratios) == PoseNoise(0.01, 0.06)
-    assert scaled_noise(PoseSensor("a", "a", position_noise=0.02), noise, ratios) == PoseNoise(0.02, 0.02)
+    assert estimated_noise(PoseSensor("a", "a"), noise, ratios) == PoseNoise(0.02, 0.06)
+    assert estimated_noise(PoseSensor("a", "a"), noise, {"rotation": 4.0}) == PoseNoise(0.02, 0.02)
+    assert estimated_noise(PoseSensor("a", "a", rotation_noise=0.01), noise, ratios) == PoseNoise(0.01, 0.06)
+    assert estimated_noise(PoseSensor("a", "a", position_noise=0.02), noise, ratios) == PoseNoise(0.02, 0.02)

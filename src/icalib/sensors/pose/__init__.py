@@ -1,1 +1,1 @@
-"""The factor of a sensor that gives its own pose."""
+"""Pose sensors: motion capture, or the odometry of another program."""

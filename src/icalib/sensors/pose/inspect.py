@@ -1,4 +1,4 @@
-"""Poses in a recording: topics and tables of poses, odometry, and frames of transforms."""
+"""Pose sensors in a recording: topics and tables of poses or odometry, frames of transforms, and their draft lines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icalib.tools.inspection.kinds import KindInspector
 
 
 class PoseInspector(KindInspector):
-    """Poses may be computed from the very sensors that were recorded."""
+    """Finds pose sensors. The draft comments them out, as poses may be computed from sensors of the same recording."""
 
     sensor: ClassVar[type[Sensor]] = PoseSensor
     topic_kinds: ClassVar[tuple[str, ...]] = ("pose", "odometry")
@@ -27,12 +27,12 @@ class PoseInspector(KindInspector):
     moves_alone: ClassVar[bool] = True
 
     def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
-        """Without an IMU the first pose sensor gives the motion, which must not drift."""
+        """Line of the kind. Without an IMU the first pose sensor gives the motion, so it must be absolute."""
         drifts = topic.kind == "odometry" or "odom" in topic.name
         yield f"kind: {'relative' if drifts and found.sources.imus else 'absolute'}"
 
     def more_lines(self, found: Inspection, shown: bool) -> Iterator[str]:
-        """A pose sensor of the two frames with most motion between them, where there is motion."""
+        """Lines of a pose sensor from transforms: the two frames with most moving edges between them, if any moves."""
         shown = shown and not found.sources.of(PoseSensor.sensor_type)
         chain = _most_motion(found.frames)
         if not chain:
@@ -51,7 +51,8 @@ INSPECTOR = PoseInspector()
 
 
 def _most_motion(pairs: Sequence[FramePair]) -> list[FramePair]:
-    """From parent to child the pairs with most moving ones in a row of one topic, which begins and ends with such."""
+    """Chain of frame pairs of one topic, from parent to child, with most moving pairs. It begins and ends with a moving
+    pair."""
     above = {(p.topic, p.child): p for p in pairs}
     best: list[FramePair] = []
     for last in pairs:

@@ -1,4 +1,4 @@
-"""How a pose sensor enters the problem: by its poses, and by the frame in which it reports absolute ones."""
+"""How a pose sensor enters the problem: by a factor of its poses, and by the frame of absolute poses."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from icalib.optim.state import Entry, Key
 from icalib.rig import ImuSensor, PoseSensor, Rig, Settings
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor
 
-# Where the noise is not stated: rad, m; of relative poses rad/sqrt(s), m/sqrt(s).
+# In the first pass, if the rig file states none: rad, m; of relative poses rad/sqrt(s), m/sqrt(s). Then estimated.
 FIRST_ROTATION_NOISE, FIRST_POSITION_NOISE = 0.01, 0.02
-LEAST_NOISE = 1e-6  # rad, m: keeps the weights of poses without any noise finite
+MIN_POSE_NOISE = 1e-6  # same units: keeps weights of simulated poses without noise finite
 
 
 class PoseModel(SensorModel[PoseSensor, PoseNoise]):
-    """Noise that is not stated is estimated by degrees of freedom: where nothing else shows the motion, it absorbs most
-    of the residuals. The first such estimate is a rough one, so there are two."""
+    """Noise that the rig file does not state is estimated with post-fit degrees of freedom: if no other sensor gives
+    the motion, the trajectory absorbs most of the residuals. The first estimate is rough, so there are two."""
 
     keyframes = "poses"
     only_first_places_keyframes = True
 
     def scene_entries(self, sensor: PoseSensor, rig: Rig, n_recordings: int) -> list[Entry]:
-        """The frame of absolute poses; that of the sensor which alone shows the motion is the world's."""
+        """The frame of absolute poses. It is the world frame if this sensor alone gives the motion."""
         if sensor.kind != "absolute":
             return []
         is_reference = rig.moves_by_poses and sensor is rig.poses[0]
@@ -38,10 +38,10 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
     def keyframe_times(
         self, sensor: PoseSensor, stream: PoseStream, values: dict[Key, np.ndarray], rig: Rig
     ) -> np.ndarray:
-        """Those of poses, as many as are needed."""
+        """Instants of poses, at the keyframe spacing, seconds on the IMU's clock."""
         del sensor
         imu = rig.imu or ImuSensor  # its default
-        return instants(stream, values, thinned(stream.seconds, imu.pose_keyframes_s))
+        return instants(stream, values, spaced(stream.seconds, imu.pose_keyframes_s))
 
     def first_noise(self, sensor: PoseSensor, settings: Settings) -> PoseNoise:
         """See `SensorModel`."""
@@ -53,14 +53,14 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
         """See `SensorModel`."""
         if not self.noise_is_estimated(sensor):
             return noise
-        return scaled_noise(sensor, noise, found.variance_factors())
+        return estimated_noise(sensor, noise, found.variance_factors())
 
     def noise_passes(self, sensor: PoseSensor) -> int:
         """See `SensorModel`."""
         return 2 if sensor.rotation_noise is None or sensor.position_noise is None else 0
 
     def factors(self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass) -> Iterator[PoseFactor]:
-        """One, of absolute or of relative poses."""
+        """One factor, of absolute or of relative poses."""
         assert at.motion is not None
         kind = AbsolutePoseFactor if sensor.kind == "absolute" else RelativePosesFactor
         yield kind.build(stream, at.motion, noise, at.layout)
@@ -68,15 +68,15 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
     def still_factors(
         self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass
     ) -> Iterator[AbsolutePoseFactor]:
-        """One, of the poses at keyframes."""
+        """One factor, of the poses at keyframes."""
         yield AbsolutePoseFactor.at_keyframes(stream, at.state, at.starts, noise, at.layout)
 
 
-def scaled_noise(sensor: PoseSensor, noise: PoseNoise, variance_factors: dict[str, float]) -> PoseNoise:
-    """The noise times the roots of `variance_factors`, by kind of residual, where it is not stated. A kind that they
-    lack stays as it is."""
+def estimated_noise(sensor: PoseSensor, noise: PoseNoise, variance_factors: dict[str, float]) -> PoseNoise:
+    """The noise, scaled by the square roots of variance_factors (by kind of residual) if it is not stated. A kind
+    without a factor keeps its noise."""
     rotation, position = (
-        max(sigma * float(np.sqrt(variance_factors.get(kind, 1.0))), LEAST_NOISE)
+        max(sigma * float(np.sqrt(variance_factors.get(kind, 1.0))), MIN_POSE_NOISE)
         for kind, sigma in (("rotation", noise.rotation), ("position", noise.position))
     )
     rotation = rotation if sensor.rotation_noise is None else noise.rotation
@@ -84,8 +84,8 @@ def scaled_noise(sensor: PoseSensor, noise: PoseNoise, variance_factors: dict[st
     return PoseNoise(rotation, position, noise.loss, noise.loss_scale)
 
 
-def thinned(seconds: np.ndarray, spacing: float) -> np.ndarray:
-    """The first of `seconds` (n,), in order, in each stretch of `spacing`, and the last of all."""
+def spaced(seconds: np.ndarray, spacing: float) -> np.ndarray:
+    """The first of `seconds` (n,), increasing, in each interval of `spacing` [s], and the last of all."""
     k = np.flatnonzero(np.diff(np.floor(seconds / spacing + 1e-6), prepend=-1.0))
     return seconds[np.append(k, len(seconds) - 1)] if k[-1] < len(seconds) - 1 else seconds[k]
 

@@ -1,12 +1,12 @@
-"""Poses that a sensor reports, motion capture or another program's odometry, against the motion of the IMU.
+"""Factors of reported poses, from motion capture or the odometry of another program.
 
-`AbsolutePoseFactor`: each pose at its own instant, in a frame that stands still in the world of each recording.
-`RelativePosesFactor`: the way from one pose to another, about from keyframe to keyframe; their frame may drift.
+`AbsolutePoseFactor`: each pose at its own instant, in a static frame of each recording.
+`RelativePosesFactor`: motion between two poses, about from keyframe to keyframe; the frame may drift.
 
-The sensor's parameters are the blocks rotation, translation (R_imu_sensor, p_imu_sensor), time_offset, and scale (1,),
-true lengths over reported ones. A position is predicted / scale - reported: the noise is that of what is reported, and
-a scale on it would be drawn to where it makes the noise less. The frame has the blocks frame_rotation and
-frame_translation (R_world_frame, p_world_frame), in each recording its own.
+Parameters of the sensor are rotation, translation (R_imu_sensor, p_imu_sensor), time_offset, and scale (1,), true
+lengths over reported ones. The frame of each recording has frame_rotation and frame_translation (R_world_frame,
+p_world_frame). Residuals of positions are predicted / scale - reported. With scale * reported instead, the scale would
+multiply the noise, and the estimate would shrink it.
 """
 
 from __future__ import annotations
@@ -32,15 +32,17 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 
-NEAR_KEYFRAME_S = 0.05  # a pose further from all keyframes is left out: the IMU alone would carry it there
+# From the nearest keyframe to a pose; a pose farther off is left out, as the noise of propagation is not modelled.
+MAX_POSE_PROPAGATION_S = 0.05
 KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
 UNITS = {"rotation": "rad", "position": "m"}
 
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Standard deviations of each axis, rad and m; of relative poses densities, rad/sqrt(s) and m/sqrt(s). The robust
-    loss of each whitened row, and where it bends, in standard deviations."""
+    """Noise of reported poses, for each axis: standard deviations of absolute poses [rad, m], or random-walk densities
+    of relative ones [rad/sqrt(s), m/sqrt(s)]. Robust loss of each whitened row, and its scale in standard
+    deviations."""
 
     rotation: float
     position: float
@@ -49,7 +51,8 @@ class PoseNoise:
 
 
 class _PoseFactor(RowFactor):
-    """What both factors of poses share: three rows of rotation and three of position each. name: of the sensor."""
+    """Common part of both factors: n measurements with three rows of rotation and three of position. name: of the
+    sensor."""
 
     units: ClassVar[Mapping[str, str]] = UNITS
 
@@ -58,7 +61,7 @@ class _PoseFactor(RowFactor):
 
     @property
     def sigma(self) -> np.ndarray:
-        """(n, 6) of each row."""
+        """(n, 6) standard deviation of each row [rad, m]."""
         raise NotImplementedError
 
     @property
@@ -76,12 +79,12 @@ class _PoseFactor(RowFactor):
 
     @property
     def instants(self) -> np.ndarray:
-        """(n,) that the rows are at, on the sensor's clock since its first stamp."""
+        """(n,) instants of the measurements, seconds on the sensor's clock since its first stamp."""
         raise NotImplementedError
 
     @property
     def keyframes(self) -> np.ndarray:
-        """(n,) that the rows hang on, the first of two."""
+        """(n,) keyframe of each measurement, the first if there are two."""
         raise NotImplementedError
 
     def times(self, state: State) -> np.ndarray:
@@ -89,18 +92,18 @@ class _PoseFactor(RowFactor):
         return self.instants + offset_at(state, self.name, self.keyframes)
 
     def raw(self, out: Whitened) -> np.ndarray:
-        """(n, 6) rad and m."""
+        """(n, 6) residuals [rad, m]."""
         return out.residual * self.sigma
 
     def raw_sigma(self) -> np.ndarray:
-        """(n, 6) rad and m."""
+        """(n, 6) standard deviations [rad, m]."""
         return self.sigma
 
 
 @dataclass(frozen=True)
 class AbsolutePoseFactor(_PoseFactor):
-    """n poses of one sensor in its frame, see `absolute_residuals`. `keyframe` (n,), in order: of each; sigma: of its
-    rotation [rad] and position [m]. imu: None where poses were taken at keyframes, which nothing ties to each other."""
+    """n poses of one sensor in its frame, see `absolute_residuals`. keyframe (n,), increasing: from which each is
+    propagated. imu: None if all poses were taken at keyframes that no IMU connects. gravity [m/s^2]."""
 
     name: str
     seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
@@ -116,8 +119,8 @@ class AbsolutePoseFactor(_PoseFactor):
 
     @classmethod
     def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
-        """Of the poses that lie near keyframes; those in gaps of the IMU that are not bridged are left out."""
-        state, (k, keyframe) = motion.state, motion.near_keyframes(stream, NEAR_KEYFRAME_S)
+        """The factor of the poses near keyframes, without those in IMU gaps that are not bridged."""
+        state, (k, keyframe) = motion.state, motion.near_keyframes(stream, MAX_POSE_PROPAGATION_S)
         return cls(
             stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], keyframe, state.starts,
             len(state.seconds), motion.imu, motion.gravity, noise, layout,
@@ -127,7 +130,7 @@ class AbsolutePoseFactor(_PoseFactor):
     def at_keyframes(
         cls, stream: PoseStream, state: State, starts: tuple[int, ...], noise: PoseNoise, layout: Layout
     ) -> AbsolutePoseFactor:
-        """Of the poses that were taken at a keyframe, without an IMU; starts: the first keyframe of each recording."""
+        """The factor of the poses taken at keyframes, without an IMU. starts: the first keyframe of each recording."""
         times = instants(stream, state.values)
         keyframe = np.searchsorted(0.5 * (state.seconds[1:] + state.seconds[:-1]), times)
         k = np.flatnonzero(np.abs(times - state.seconds[keyframe]) <= MERGED_WITHIN_S)
@@ -148,16 +151,16 @@ class AbsolutePoseFactor(_PoseFactor):
 
     @property
     def sigma(self) -> np.ndarray:
-        """(n, 6) of each row."""
+        """See `_PoseFactor`."""
         return np.tile(np.repeat([self.noise.rotation, self.noise.position], 3), (len(self.seconds), 1))
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
         into, parts = Into(piece, out, sums, curved), of_recordings(self.keyframe, self.starts, self.n_keyframes, piece)
-        return sum(self._of_recording(k, own, state, into) for k, own in parts)
+        return sum(self._add_recording(k, own, state, into) for k, own in parts)
 
-    def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
-        """Adds the poses `own`, of one recording."""
+    def _add_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
+        """Adds the poses `own` of one recording. Returns their cost."""
         frame = frame_of(self.name, recording)
         v, keyframe, kinematics = state.values, self.keyframe[own], Kinematics.of(self)
         at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
@@ -178,8 +181,8 @@ class AbsolutePoseFactor(_PoseFactor):
 
 @dataclass(frozen=True)
 class RelativePosesFactor(_PoseFactor):
-    """n ways of one sensor, see `relative_residuals`, each between two of its stamps about from keyframe to keyframe;
-    duration (n,) s. Their noise is that of a random walk, and independent."""
+    """n relative poses of one sensor, see `relative_residuals`, each between two stamps, about from keyframe to
+    keyframe. Their noise is a random walk: independent, with a variance that is proportional to the duration."""
 
     name: str
     seconds: np.ndarray  # (N,) stamps since the first on the sensor's clock
@@ -193,19 +196,19 @@ class RelativePosesFactor(_PoseFactor):
 
     @classmethod
     def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> RelativePosesFactor:
-        """Chooses the stretches at the time offset and the keyframes of the motion."""
+        """The factor with intervals between stamps, chosen by the time offset and the keyframes of `motion`."""
         state, seconds = motion.state, stream.seconds
         times = instants(stream, state.values)
         found = choose_intervals(motion.imu, state.seconds, state.starts, times)
         R0, R1 = stream.rotation[found.first], stream.rotation[found.last]
-        way = stream.position[found.last] - stream.position[found.first]
-        position = np.einsum("nji,nj->ni", R0, way)
+        displacement = stream.position[found.last] - stream.position[found.first]
+        position = np.einsum("nji,nj->ni", R0, displacement)
         rotation = np.ascontiguousarray(R0.transpose(0, 2, 1) @ R1)
         return cls(stream.name, seconds, found, rotation, position, motion.imu, motion.gravity, noise, layout)
 
     @property
     def instants(self) -> np.ndarray:
-        """(n,) at which the stretches begin, on the sensor's clock."""
+        """(n,) starts of the intervals, on the sensor's clock [s]."""
         return self.seconds[self.intervals.first]
 
     @property
@@ -215,7 +218,7 @@ class RelativePosesFactor(_PoseFactor):
 
     @property
     def sigma(self) -> np.ndarray:
-        """(n, 6) of each row."""
+        """See `_PoseFactor`."""
         duration = self.seconds[self.intervals.last] - self.seconds[self.intervals.first]
         return np.sqrt(duration)[:, None] * np.repeat([self.noise.rotation, self.noise.position], 3)
 
@@ -225,11 +228,11 @@ class RelativePosesFactor(_PoseFactor):
         into, cost = Into(piece, out, sums, curved), 0.0
         for clock, part in by_clock(state, self.name, self.intervals.keyframe[low:high]):
             for some in in_chunks(slice(low + part.start, low + part.stop)):
-                cost += self._of_clock(clock, some, state, into)
+                cost += self._add_interval_rows(clock, some, state, into)
         return cost
 
-    def _of_clock(self, clock: int, own: slice, state: State, into: Into) -> float:
-        """Adds the ways `own`, which go by one time offset."""
+    def _add_interval_rows(self, clock: int, own: slice, state: State, into: Into) -> float:
+        """Adds the relative poses `own`, which share the time offset number `clock`. Returns their cost."""
         first, last, keyframe = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.keyframe))
         kinematics = Kinematics.of(self)
         a = SensorPose.at(kinematics, self.seconds[first], keyframe, state, into.sums)
@@ -249,20 +252,21 @@ PoseFactor = AbsolutePoseFactor | RelativePosesFactor
 
 
 def _rows(found: PoseResiduals, ends: tuple[SensorPose, ...], factor: PoseFactor, state: State, own: slice) -> Rows:
-    """Rows of reported positions from residuals `found` of those times their scale; by calibration parameters of the
-    pose, then frame and scale."""
+    """Rows of predicted / scale - reported, from residuals `found` of predicted - scale * reported. Their calibration
+    parameters are those of the poses at both ends, then frame and scale."""
     scale, reported = float(state.values[factor.name, "scale"][0]), factor.position[own]
     found.residual[:, 3:] /= scale
     n = len(found.J_frame)
-    J_own = np.zeros((n, 6, found.J_frame.shape[2] + 1))
-    J_own[:, :, :-1] = found.J_frame
-    for J in (J_own, *found.J_pose):
+    J_frame_scale = np.zeros((n, 6, found.J_frame.shape[2] + 1))
+    J_frame_scale[:, :, :-1] = found.J_frame
+    for J in (J_frame_scale, *found.J_pose):
         J[:, 3:] /= scale
     if n:
-        J_own[:, 3:, -1] = -(found.residual[:, 3:] + reported) / scale
-    return rows_at(found.residual, found.J_pose, ends, J_own)
+        J_frame_scale[:, 3:, -1] = -(found.residual[:, 3:] + reported) / scale
+    return rows_at(found.residual, found.J_pose, ends, J_frame_scale)
 
 
 def _noise(factor: PoseFactor, own: slice) -> RobustNoise:
+    """Noise of the measurements `own`."""
     whitening = np.eye(6) / factor.sigma[own][:, :, None]
     return RobustNoise(whitening, factor.noise.loss, factor.noise.loss_scale)

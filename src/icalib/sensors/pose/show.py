@@ -1,4 +1,4 @@
-"""What the report shows of pose sensors: residuals over time."""
+"""Pose sensors in the report: residuals over time."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from icalib.report.sections import Section, row_sections
 from icalib.result import Calibration
 
 _WORDS = (
-    "Rotation about the sensor's own axes, position along those in which it was measured. They should look like "
-    "noise; slow waves are poses that drift or are filtered."
+    "Rotation about the axes of the sensor, position along the axes of its frame. They should look like white noise; "
+    "slow waves come from poses that drift or are filtered."
 )
 
 
 def sections(c: Calibration) -> Iterator[Section]:
-    """Residuals of each pose sensor."""
+    """One section with the residuals of each pose sensor."""
     yield from row_sections(c, "pose", "poses", "Residuals of pose sensors", _WORDS)

@@ -1,4 +1,4 @@
-"""A simulated pose sensor reports its pose in a frame of its own, as motion capture or an odometry does."""
+"""Simulated pose sensors: poses in a frame of the sensor, as of motion capture or an odometry."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _POSE = "geometry_msgs/msg/PoseStamped"
 
 @dataclass(frozen=True, eq=False)
 class PoseTruth:
-    """seconds (N,) on the IMU's clock of each stamp; rotation (N, 3, 3), position (N, 3) m: what is reported, without
-    noise."""
+    """Reported poses without noise. seconds (N,): on the IMU's clock; rotation (N, 3, 3) R_frame_sensor, position (N,
+    3) p_frame_sensor [m]."""
 
     seconds: np.ndarray
     rotation: np.ndarray
@@ -34,11 +34,11 @@ class PoseTruth:
 
 @dataclass(frozen=True, eq=False)
 class SimPoses(SimSensor):
-    """One true sensor that reports its pose T_frame_sensor in a frame that stands at T_world_frame.
+    """True parameters of one sensor that reports T_frame_sensor, in a frame at T_world_frame.
 
-    absolute: each pose has noise of its own, rotation_noise [rad] and position_noise [m] on each axis. relative: each
-    step from pose to pose has, which adds up to a drift: rad/sqrt(s) and m/sqrt(s). scale: true lengths over reported
-    ones.
+    absolute: poses have independent noise, rotation_noise [rad] and position_noise [m] on each axis. relative: steps
+    from pose to pose have independent noise, [rad/sqrt(s)] and [m/sqrt(s)], which adds up to a drift. scale: true
+    lengths over reported ones.
     """
 
     sensor_type: ClassVar[str] = "pose"
@@ -70,7 +70,7 @@ class SimPoses(SimSensor):
         return {"kind": self.kind, "T_world_frame": self.T_world_frame.tolist(), "scale": self.scale}
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
-        """Its poses within the readings of the IMU."""
+        """Poses while the IMU is running, and their truth."""
         stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
         R, p, _ = scene.trajectory.pose_at(seconds)
         T = np.tile(np.eye(4), (len(seconds), 1, 1))
@@ -80,7 +80,8 @@ class SimPoses(SimSensor):
         truth = PoseTruth(seconds, seen[:, :3, :3].copy(), seen[:, :3, 3].copy())
         if scene.noisy:
             rng = np.random.default_rng(seed)
-            seen = _scattered(self, seen, rng) if self.kind == "absolute" else _drifting(self, seen, seconds, rng)
+            is_absolute = self.kind == "absolute"
+            seen = _with_white_noise(self, seen, rng) if is_absolute else _with_drift(self, seen, seconds, rng)
         return Report(PoseStream(self.name, stamps, seen[:, :3, :3].copy(), seen[:, :3, 3].copy()), truth)
 
     def rig_entry(self) -> PoseSensor:
@@ -93,7 +94,7 @@ class SimPoses(SimSensor):
         write_table(folder / "poses.csv", header, stream.stamps_ns, stream.position, xyzw)
 
     def bag_topic(self, stream: PoseStream, offset_ns: int) -> BagTopic:
-        """PoseStamped."""
+        """Messages PoseStamped."""
         return BagTopic(f"/{self.name}/pose", _POSE, _messages(stream, offset_ns))
 
 
@@ -101,6 +102,7 @@ SIMULATED = SimPoses
 
 
 def _messages(poses: PoseStream, offset_ns: int) -> Iterator[BagEvent]:
+    """A message for each pose, at its stamp."""
     frame = f"{poses.name}_frame"
     for stamp_ns, R, position in zip(poses.stamps_ns.tolist(), poses.rotation, poses.position, strict=True):
         yield (
@@ -110,14 +112,14 @@ def _messages(poses: PoseStream, offset_ns: int) -> Iterator[BagEvent]:
 
 
 def _message(bag: BagWriter, stamp_ns: int, frame: str, position: np.ndarray, R: np.ndarray) -> Any:
-    """position (3,) [m] and rotation (3, 3) of a sensor in `frame`."""
+    """PoseStamped with position (3,) [m] and rotation R (3, 3) of a sensor in `frame`."""
     point = bag.make("geometry_msgs/msg/Point", *position.tolist())
     turn = bag.make("geometry_msgs/msg/Quaternion", *quaternion(R).tolist())
     return bag.make(_POSE, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Pose", point, turn))
 
 
-def _scattered(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Each pose (N, 4, 4) with an error of its own: its rotation in the sensor's axes, its position in the frame's."""
+def _with_white_noise(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Poses (N, 4, 4) with independent noise: of rotations in axes of the sensor, of positions in axes of the frame."""
     out = seen.copy()
     for T in out:
         T[:3, :3] = T[:3, :3] @ rotation_from_vector(sensor.rotation_noise * rng.standard_normal(3))
@@ -125,8 +127,8 @@ def _scattered(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generator) -> 
     return out
 
 
-def _drifting(sensor: SimPoses, seen: np.ndarray, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poses (N, 4, 4) whose steps have an error each, that adds up."""
+def _with_drift(sensor: SimPoses, seen: np.ndarray, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Poses (N, 4, 4) whose steps have independent noise, so that they drift."""
     out = seen.copy()
     for k in range(1, len(seen)):
         step, root = np.linalg.inv(seen[k - 1]) @ seen[k], np.sqrt(seconds[k] - seconds[k - 1])
@@ -137,7 +139,8 @@ def _drifting(sensor: SimPoses, seen: np.ndarray, seconds: np.ndarray, rng: np.r
 
 
 def quaternion(R: np.ndarray) -> np.ndarray:
-    """(4,) x, y, z, w of a rotation (3, 3): the eigenvector of Bar-Itzhack's matrix, which has no bad angles."""
+    """(4,) quaternion x, y, z, w of a rotation (3, 3): eigenvector of a symmetric matrix, without singular angles
+    (Bar-Itzhack, 2000)."""
     (a, b, c), (d, e, f), (g, h, i) = R
     K = [[a - e - i, b + d, c + g, h - f], [b + d, e - a - i, f + h, c - g], [c + g, f + h, i - a - e, d - b]]
     return np.linalg.eigh(np.array([*K, [h - f, c - g, d - b, a + e + i]]) / 3.0)[1][:, -1]

@@ -1,4 +1,4 @@
-"""A pose sensor (motion capture, or another program's odometry), and its fields in the rig file."""
+"""A pose sensor of the rig (motion capture, or the odometry of another program), and its fields in the rig file."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class PoseSensor(MountedSensor):
 
     path: str
     kind: PoseKind = "absolute"
-    rotation_noise: float | None = None  # per axis; None: estimated from the residuals
+    rotation_noise: float | None = None  # of each axis; None: estimated from the residuals
     position_noise: float | None = None
     level: bool = True
     position_axes: Axes | None = None  # recorded columns that are x, y, z in the axes of the rotations
-    topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
+    topic: str | None = None  # of its poses; None: the topic with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
     inverted: bool = False  # T_sensor_frame is recorded
     frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: another topic
@@ -116,13 +116,14 @@ class PoseSensor(MountedSensor):
 
 
 def _scale_sigma(value: YamlValue) -> float:
+    """A share of all lengths. Raises RigError if it is not in [0, 1)."""
     if not 0.0 <= (sigma := value.number()) < 1.0:
         value.fail(f"is a share of all lengths between 0 (exact) and 1, but is {sigma:g}; write 0.001 for 0.1 %.")
     return sigma
 
 
 def _frames(value: YamlValue) -> tuple[str, str]:
-    """Parent and child."""
+    """Names of parent and child. Raises RigError if there are not two different ones."""
     names = [entry.text() for entry in value.items()]
     if len(names) != 2 or names[0].lstrip("/") == names[1].lstrip("/"):
         value.fail("must name two frames, the parent and the child, as in [base_link, tool0]; correct it.")

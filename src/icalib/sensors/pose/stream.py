@@ -1,4 +1,4 @@
-"""What a pose sensor measured."""
+"""Measurements of a pose sensor."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from icalib.sensors.stream import Stream, check, far_origin
 
 @dataclass(frozen=True)
 class PoseStream(Stream):
-    """Where a sensor said that it was: its poses in a frame that stands still, or nearly so.
+    """Reported poses of a sensor, in a frame that is static or drifts slowly.
 
-    stamps_ns (N,) int64, strictly increasing; rotation (N, 3, 3) R_frame_sensor; position (N, 3) p_frame_sensor [m].
+    stamps_ns (N,) int64: strictly increasing; rotation (N, 3, 3): R_frame_sensor; position (N, 3): p_frame_sensor [m].
     """
 
     sensor_type: ClassVar[str] = "pose"
@@ -30,6 +30,7 @@ class PoseStream(Stream):
         check(shape == (n, 3), f"{self.name}: position must have shape ({n}, 3), not {shape}.")
 
     def near_origin(self) -> tuple[Self, tuple[str, ...]]:
+        """The stream with positions near the origin, and a note; as it is if they are near already."""
         origin = far_origin(self.position)
         if origin is None:
             return self, ()
