@@ -153,7 +153,7 @@ REVISED = (
     "sensors/imu/read",
     "sensors/lidar",
     "sensors/parameter*",
-    "sensors/pose/read",
+    "sensors/pose",
     "sensors/sensor",
     "sensors/wheels/read",
     "tools",

@@ -17,14 +17,14 @@ from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.model.frames import FRAME, frame_of
 from icalib.optim.state import State
 from icalib.rig import PoseSensor, Rig
-from icalib.sensors.pose.initialize.conventions import TURNED, WAYS
+from icalib.sensors.pose.initialize.conventions import CONVENTIONS, POSITION_AXES
 from icalib.sensors.pose.initialize.extrinsics import check_rate, pose_values, state_from_poses
 from icalib.sensors.pose.initialize.initial_noise import pose_noise
-from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, start_from_pairs
+from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, state_from_pairs
 
 
 class PoseInitializer(Initializer[PoseSensor]):
-    """The first pose sensor gives the motion where neither cameras nor LiDARs do; all others are placed on it."""
+    """The first pose sensor gives the trajectory if neither cameras nor LiDARs do. All others are aligned to it."""
 
     def motion_rank(self, rig: Rig) -> int | None:
         return BY_POSES if rig.poses else None
@@ -37,7 +37,7 @@ class PoseInitializer(Initializer[PoseSensor]):
         return state_from_poses(inputs)
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        """After a pass of the estimate, the sensor is placed anew on the better motion."""
+        """State after one pass of the estimate, with extrinsics aligned to the better trajectory."""
         sensors = inputs.rig.poses
         state = first_pass(inputs, replace(state, values=state.values | self.place(inputs, state, sensors)))
         state = replace(state, values=state.values | self.place(inputs, state, sensors))
@@ -61,25 +61,25 @@ class PoseInitializer(Initializer[PoseSensor]):
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], found: Values
     ) -> tuple[Inputs, State, Values] | None:
-        """Hand-eye calibration of pairs of poses."""
+        """Hand-eye calibration from pairs of poses, if the robot stood still at each; else None."""
         if not is_stop_and_go(rig, recordings, body):
             return None
-        return start_from_pairs(rig, recordings, body, found)
+        return state_from_pairs(rig, recordings, body, found)
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         return motion.spacing_for_poses(*pose_noise([m.poses[0] for m in recordings]))
 
     def rewritten(self, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
-        for words, way in (*WAYS, *TURNED):
+        for words, convert in (*CONVENTIONS, *POSITION_AXES):
             yield (
                 f"the poses of {recordings[0].poses[0].name} {words}.",
-                [m.with_streams(way(m.poses[0])) for m in recordings],
+                [m.with_streams(convert(m.poses[0])) for m in recordings],
             )
 
     def explained(
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
     ) -> EstimationError | None:
-        """Of relative poses: whether the same poses would do as absolute ones."""
+        """An error that advises kind: absolute, if relative poses fail and the same poses converge as absolute ones."""
         del recordings
         first = rig.poses[0]
         if first.kind != "relative" or not converges(rig.with_sensors(replace(first, kind="absolute"))):

@@ -1,7 +1,9 @@
-"""Poses that are written another way than `PoseStream` has them: the inverse, inverse rotations, left-handed axes,
-quaternions with w first, positions and rotations in different frames.
+"""Conventions of poses other than that of `PoseStream`.
 
-Each way is tried where the poses as they are do not fit the motion, and named where it fits far better.
+These are inverted poses or rotations, left-handed axes, quaternions with w first, and positions and rotations in
+different frames.
+
+Each convention is tried if the poses do not fit the motion, and named in an error if the poses fit far better with it.
 """
 
 from __future__ import annotations
@@ -17,46 +19,53 @@ from icalib.data.measurements import PoseStream
 from icalib.data.tables.axes import in_axes
 from icalib.errors import EstimationError
 from icalib.rig import Axes
-from icalib.sensors.pose.initialize.position_frame import words_for
+from icalib.sensors.pose.initialize.position_frame import axes_text
 
-Way = Callable[[PoseStream], PoseStream]
+Conversion = Callable[[PoseStream], PoseStream]  # from a convention to that of `PoseStream`
 T = TypeVar("T")
-WELL = 0.1  # of what was seen is left: poses that fit so are written as they should be
-BETTER = 0.5  # times what is left of the poses as they are
+MAX_UNEXPLAINED = 0.1  # share of the motion: poses with less have the right convention
+MAX_UNEXPLAINED_RATIO = 0.5  # to that of the unconverted poses, of a convention that fits far better
 
 
 def _inverse(x: PoseStream) -> PoseStream:
+    """Inverted poses."""
     back = np.ascontiguousarray(x.rotation.transpose(0, 2, 1))
     return replace(x, rotation=back, position=-np.einsum("nij,nj->ni", back, x.position))
 
 
-def _turned_back(x: PoseStream) -> PoseStream:
+def _with_inverse_rotations(x: PoseStream) -> PoseStream:
+    """Poses with inverted rotations."""
     return replace(x, rotation=np.ascontiguousarray(x.rotation.transpose(0, 2, 1)))
 
 
-def _other_handed(x: PoseStream) -> PoseStream:
+def _with_y_reversed(x: PoseStream) -> PoseStream:
+    """Poses with reversed y axes of frame and sensor."""
     flip = np.array([1.0, -1.0, 1.0])
     return replace(x, rotation=flip[:, None] * x.rotation * flip, position=flip * x.position)
 
 
-def _with_axis_reversed(axis: int) -> Way:
+def _with_axis_reversed(axis: int) -> Conversion:
+    """Reverses one axis of the positions."""
     return lambda x: replace(x, position=x.position * np.where(np.arange(3) == axis, -1.0, 1.0))
 
 
 def _w_first(x: PoseStream) -> PoseStream:
-    """A product with a permutation: each quaternion may have either sign."""
-    w_x_y_z = Rotation.from_matrix(x.rotation).as_quat()  # as written, taken for x, y, z, w
+    """Poses whose quaternions w, x, y, z were read as x, y, z, w."""
+    w_x_y_z = Rotation.from_matrix(x.rotation).as_quat()  # as written; of either sign
     return replace(x, rotation=Rotation.from_quat(w_x_y_z[:, [1, 2, 3, 0]]).as_matrix())
 
 
-WAYS: tuple[tuple[str, Way], ...] = (
+CONVENTIONS: tuple[tuple[str, Conversion], ...] = (
     (
         "are inverted: they give the pose of the reference frame in the sensor's frame; write inverted: true for "
         "it in the rig file",
         _inverse,
     ),
-    ("have inverted rotations; write R_frame_sensor, or change the signs of x, y, z of the quaternions", _turned_back),
-    ("are in left-handed axes; write them in right-handed axes", _other_handed),
+    (
+        "have inverted rotations; write R_frame_sensor, or change the signs of x, y, z of the quaternions",
+        _with_inverse_rotations,
+    ),
+    ("are in left-handed axes; write them in right-handed axes", _with_y_reversed),
     *(
         (f"have the {'xyz'[k]} axis of the position reversed; set its position_axes to {axes}", _with_axis_reversed(k))
         for k, axes in enumerate(("[-x, y, z]", "[x, -y, z]", "[x, y, -z]"))
@@ -69,12 +78,13 @@ WAYS: tuple[tuple[str, Way], ...] = (
 )
 
 
-def _with_axes(axes: Axes) -> Way:
+def _with_axes(axes: Axes) -> Conversion:
+    """Exchanges axes of the positions."""
     return lambda x: replace(x, position=in_axes(x.position, axes))
 
 
-# Which of those that agree in which way is up it is does not matter to a vehicle on a floor.
-TURNED: tuple[tuple[str, Way], ...] = tuple(
+# One convention for each direction of the vertical: a vehicle on a floor does not distinguish the others.
+POSITION_AXES: tuple[tuple[str, Conversion], ...] = tuple(
     (
         "have positions and rotations in different frames, for example one with z up and the other with y up; "
         f"set its position_axes to [{', '.join(axes)}]",
@@ -84,27 +94,28 @@ TURNED: tuple[tuple[str, Way], ...] = tuple(
 )
 
 
-def placed(
+def with_checked_convention(
     stream: PoseStream,
     place: Callable[[PoseStream], tuple[T, float]],
-    turn: Callable[[PoseStream], np.ndarray | None] = lambda stream: None,
+    rotation_of: Callable[[PoseStream], np.ndarray | None] = lambda stream: None,
 ) -> T:
-    """What `place` makes of the poses; it gives, too, what is left of what they showed of the motion. `turn` proposes a
-    turn (3, 3) of their positions into the frame of their rotations.
+    """Result of `place` for the poses. place: returns its result, and the share of the motion that poses do not
+    explain. rotation_of: a candidate rotation (3, 3) of positions to the frame of rotations, or None.
 
-    Raises EstimationError as `place` does, or where poses written another way would fit far better.
+    Raises EstimationError as `place` does, or if the poses fit far better with another convention.
     """
     found: T | None = None
     failed: EstimationError | None = None
-    left = 1.0
+    unexplained = 1.0
     try:
-        found, left = place(stream)
+        found, unexplained = place(stream)
     except EstimationError as error:
         failed = error
-    if left > WELL:
-        _refuse_two_frames(stream, place, turn, BETTER * left)
-        for words, way in WAYS:
-            if _left(place, way(stream)) < BETTER * left:
+    if unexplained > MAX_UNEXPLAINED:
+        most = MAX_UNEXPLAINED_RATIO * unexplained
+        _refuse_two_frames(stream, place, rotation_of, most)
+        for words, convert in CONVENTIONS:
+            if _unexplained(place, convert(stream)) < most:
                 raise EstimationError(f"the poses of {stream.name} {words}.") from failed
     if found is None:
         assert failed is not None
@@ -115,17 +126,17 @@ def placed(
 def _refuse_two_frames(
     stream: PoseStream,
     place: Callable[[PoseStream], tuple[T, float]],
-    turn: Callable[[PoseStream], np.ndarray | None],
-    left: float,
+    rotation_of: Callable[[PoseStream], np.ndarray | None],
+    most: float,
 ) -> None:
-    """Raises EstimationError where less is `left` of poses whose positions are turned."""
+    """Raises EstimationError if poses with rotated positions leave less than `most` of the motion unexplained."""
     try:
-        C = turn(stream)
+        C = rotation_of(stream)
     except EstimationError:
         return
-    if C is None or not _left(place, replace(stream, position=stream.position @ C.T)) < left:
+    if C is None or not _unexplained(place, replace(stream, position=stream.position @ C.T)) < most:
         return
-    axes = words_for(C)
+    axes = axes_text(C)
     degrees = ", ".join(f"{angle:.0f}" for angle in Rotation.from_matrix(C).as_euler("xyz", degrees=True))
     raise EstimationError(
         f"the positions and rotations of {stream.name} are in different frames, for example one with z up and "
@@ -138,7 +149,8 @@ def _refuse_two_frames(
     )
 
 
-def _left(place: Callable[[PoseStream], tuple[T, float]], stream: PoseStream) -> float:
+def _unexplained(place: Callable[[PoseStream], tuple[T, float]], stream: PoseStream) -> float:
+    """Share of the motion that the poses do not explain; infinite if `place` fails."""
     try:
         return place(stream)[1]
     except EstimationError:

@@ -1,7 +1,7 @@
-"""A pose sensor from nothing: offset and rotation from angular rates, lever arm linearly, and where its frame stands.
+"""Initial extrinsics, time offset and frame of a pose sensor, and the IMU trajectory if no other sensor gives it.
 
-It is placed on a motion that other sensors showed, or gives the motion itself, with the IMU, as a LiDAR does whose path
-is known.
+Time offset and rotation come from angular rates; the lever arm from linear least squares: against a known trajectory,
+or against the readings of the IMU.
 """
 
 from __future__ import annotations
@@ -52,19 +52,21 @@ from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import Key, State
 from icalib.rig import PoseSensor
-from icalib.sensors.pose.initialize.conventions import placed
-from icalib.sensors.pose.initialize.position_frame import turn_of_positions
+from icalib.sensors.pose.initialize.conventions import with_checked_convention
+from icalib.sensors.pose.initialize.position_frame import rotation_of_positions
 from icalib.sensors.sensor import MOUNTED_NAMES
 
-LEAST_RATE_HZ = 2.0  # of poses of something that moves
-APART_S = 0.4  # of poses that show whether they fit: next to each other they differ by little but noise
-G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
+MIN_POSE_RATE_HZ = 2.0  # of a moving sensor: angular rates are means between poses
+FIT_STEP_S = 0.4  # between the poses that test the fit: noise dominates the motion between successive poses
+MAX_GRAVITY_ERROR = (
+    0.5  # relative error of gravity by a wrong scale of positions; a larger one is a unit of the accelerometer
+)
 
 
 def pose_values(inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> dict[Key, np.ndarray]:
-    """Parameters of `sensors` and of their frames, as the rig file gives them or as the motion in `state` shows them.
+    """Initial parameters of `sensors` and of their frames, from the rig file, or given the trajectory in `state`.
 
-    Raises EstimationError where neither does.
+    Raises EstimationError if a recording does not determine them.
     """
     assert inputs.imu is not None
     out: dict[Key, np.ndarray] = {}
@@ -73,29 +75,31 @@ def pose_values(inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> 
         assert isinstance(stream, PoseStream)
         known = stated_values(inputs, sensor)
         if len(known) < len(MOUNTED_NAMES):
-            known = merged_values(sensor, known, _placed(inputs, state, sensor, stream))
+            known = merged_values(sensor, known, _aligned_values(inputs, state, sensor, stream))
         elif has_guesses(sensor, known):
             with suppress(EstimationError):
-                known = merged_values(sensor, known, _placed(inputs, state, sensor, stream))
+                known = merged_values(sensor, known, _aligned_values(inputs, state, sensor, stream))
         out |= known | _frames(inputs.imu, sensor, stream, state, known) | {(sensor.name, "scale"): np.ones(1)}
     return out
 
 
-def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream) -> dict[Key, np.ndarray]:
-    """Extrinsics and time offsets of a sensor, given the motion in `state`. If its clock restarts between recordings,
-    the extrinsics are those of the recording with most poses."""
+def _aligned_values(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream) -> dict[Key, np.ndarray]:
+    """Extrinsics and time offsets of a sensor, given the trajectory in `state`. If its clock restarts between
+    recordings, the extrinsics are those of the recording with most poses."""
     assert inputs.imu is not None
     held = known_extrinsics(inputs, sensor)
     if not sensor.clock_restarts:
         known = {"known": state, "held": held}
-        turn = partial(_turn_on_motion, inputs.imu, **known)
-        return placed(stream, partial(_on_motion, inputs.imu, **known), turn).values(sensor.name)
-    streams = [_alone(inputs, k, sensor.name) for k in range(len(inputs.parts))]
+        rotation_of = partial(_position_rotation_on_trajectory, inputs.imu, **known)
+        place = partial(_fit_to_trajectory, inputs.imu, **known)
+        return with_checked_convention(stream, place, rotation_of).values(sensor.name)
+    streams = [_imu_and_poses(inputs, k, sensor.name) for k in range(len(inputs.parts))]
     k = fullest_recording(inputs, sensor.name)
     imu, own = streams[k]
     with naming_recording(inputs, k):
         known = {"known": state_of_recording(inputs, k, state), "held": held}
-        found = placed(own, partial(_on_motion, imu, **known), partial(_turn_on_motion, imu, **known))
+        rotation_of = partial(_position_rotation_on_trajectory, imu, **known)
+        found = with_checked_convention(own, partial(_fit_to_trajectory, imu, **known), rotation_of)
 
     def offset(recording: int) -> float:
         return _aligned(*streams[recording], KnownExtrinsics(found.rotation))[0].offset
@@ -104,7 +108,8 @@ def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream
     return found.values(sensor.name) | {(sensor.name, "time_offset"): offsets}
 
 
-def _alone(inputs: Inputs, recording: int, sensor: str) -> tuple[ImuData, PoseStream]:
+def _imu_and_poses(inputs: Inputs, recording: int, sensor: str) -> tuple[ImuData, PoseStream]:
+    """Readings of the IMU, and poses of a sensor, in one recording."""
     own = single_recording(inputs, recording)
     stream = own.stream(sensor)
     assert own.imu is not None and isinstance(stream, PoseStream)
@@ -112,21 +117,22 @@ def _alone(inputs: Inputs, recording: int, sensor: str) -> tuple[ImuData, PoseSt
 
 
 def state_from_poses(inputs: Inputs) -> State:
-    """Where the solver starts where neither camera nor LiDAR shows the motion: the first pose sensor and the IMU do. Of
-    several recordings the one with most poses says how the sensor stands.
+    """The initial state from the first pose sensor and the IMU. The recording with most poses gives the extrinsics.
 
-    Raises EstimationError where they do not.
+    Raises EstimationError if a recording does not determine the trajectory.
     """
     sensor = inputs.rig.poses[0]
-    return states_from_best(inputs, sensor, fullest_recording(inputs, sensor.name), _state_of_one)
+    return states_from_best(inputs, sensor, fullest_recording(inputs, sensor.name), _single_state)
 
 
-def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None) -> State:
-    """Of one recording; `held`: how the sensor stands, where another has shown it."""
+def _single_state(inputs: Inputs, held: KnownExtrinsics | None) -> State:
+    """The initial state of one recording. held: extrinsics of the sensor from another recording."""
     assert inputs.imu is not None
     sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
     known = held or known_extrinsics(inputs, sensor)
-    found = placed(stream, lambda x: _with_motion(imu, x, gravity, known), lambda x: _turn_alone(imu, x, known))
+    found = with_checked_convention(
+        stream, lambda x: _fit_to_imu(imu, x, gravity, known), lambda x: _position_rotation_by_imu(imu, x, known)
+    )
     own = merged_values(sensor, stated_values(inputs, sensor), found.guess.values(sensor.name))
     values = start_values(inputs, own)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
@@ -136,109 +142,126 @@ def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None) -> State:
 
 
 def pose_rates(stream: PoseStream) -> SensorRates:
-    """See `path_rates`."""
-    return trajectory_rates(stream.name, _path(stream))
+    """Angular rates from pose to pose; see `trajectory_rates`."""
+    return trajectory_rates(stream.name, _trajectory(stream))
 
 
 def check_rate(stream: PoseStream) -> None:
-    """Raises EstimationError where poses are too far apart to show how it moves."""
+    """Raises EstimationError if poses are too rare for angular rates."""
     rate = 1.0 / float(np.median(np.diff(stream.seconds)))
-    if rate < LEAST_RATE_HZ:
-        often = f"{rate:.2g} pose{'' if round(rate, 1) == 1.0 else 's'} per second, but {LEAST_RATE_HZ:g} are needed"
+    if rate < MIN_POSE_RATE_HZ:
+        often = f"{rate:.2g} pose{'' if round(rate, 1) == 1.0 else 's'} per second, but {MIN_POSE_RATE_HZ:g} are needed"
         raise EstimationError(
             f"{stream.name}: {often} during motion; record at a higher rate, or without an IMU stand still at "
             "each pose, with an image or another pose of the same stamp."
         )
 
 
-def _path(stream: PoseStream) -> SensorTrajectory:
+def _trajectory(stream: PoseStream) -> SensorTrajectory:
+    """The poses as a trajectory."""
     return SensorTrajectory(
         stream.seconds, stream.rotation, stream.position, np.ones(len(stream.stamps_ns), dtype=bool)
     )
 
 
 def _aligned(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> tuple[RateAlignment, SensorRates]:
+    """Alignment of angular rates with the gyroscope, and the rates."""
     rates = pose_rates(stream)
     return align_trajectory(imu, stream.name, rates, held), rates
 
 
-def _with_motion(
-    imu: ImuData, stream: PoseStream, gravity: float, held: KnownExtrinsics
-) -> tuple[TrajectoryFit, float]:
-    """What the poses show with the IMU alone, and what is left of them. Raises EstimationError where they do not."""
+def _fit_to_imu(imu: ImuData, stream: PoseStream, gravity: float, held: KnownExtrinsics) -> tuple[TrajectoryFit, float]:
+    """Extrinsics and IMU trajectory from poses and IMU, and the unexplained share of the motion. Raises EstimationError
+    if they contradict, or the poses are too few."""
     aligned, rates = _aligned(imu, stream, held)
-    path, t = _path(stream), stream.seconds + aligned.offset
-    path = path.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
+    trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
+    trajectory = trajectory.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
     gyro, R_is = GyroRotation.integrate(imu, aligned.gyro_bias), aligned.rotation
-    path = replace(path, rotation=gyro.smoothed(path.seconds + aligned.offset, path.rotation @ R_is.T) @ R_is)
-    found = fit_imu_trajectory(imu, path, rates, aligned, gravity, held)
+    trajectory = replace(
+        trajectory, rotation=gyro.smoothed(trajectory.seconds + aligned.offset, trajectory.rotation @ R_is.T) @ R_is
+    )
+    found = fit_imu_trajectory(imu, trajectory, rates, aligned, gravity, held)
     if found is None:
         raise too_few_poses(stream.name)
     off = abs(found.gravity / gravity - 1.0)
-    if off <= G_OTHER_UNITS:
-        _check_size(imu, stream.name, path, aligned, found)
+    if off <= MAX_GRAVITY_ERROR:
+        _check_scale(imu, stream.name, trajectory, aligned, found)
     if off > TRAJECTORY_GRAVITY_TOLERANCE:
         raise EstimationError(
             f"{imu.name} and {stream.name} together give a gravity of {found.gravity:.3g} m/s^2 instead of "
             f"{gravity:.3g}; check that the accelerometer is in m/s^2, not in g (accel_unit), and the "
             f"positions of {stream.name} in metres."
         )
-    step = max(1, round(APART_S / float(np.median(np.diff(path.seconds)))))
-    apart = fit_imu_trajectory(imu, path.only(np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
+    step = max(1, round(FIT_STEP_S / float(np.median(np.diff(trajectory.seconds)))))
+    apart = fit_imu_trajectory(
+        imu, trajectory.only(np.arange(len(trajectory.seconds)) % step == 0), rates, aligned, gravity, held
+    )
     return found, 0.0 if apart is None else apart.unexplained
 
 
-def _turn_alone(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> np.ndarray | None:
-    """See `turn_of_positions`: by the IMU's readings."""
+def _position_rotation_by_imu(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> np.ndarray | None:
+    """See `rotation_of_positions`, from the readings of the IMU."""
     aligned, _ = _aligned(imu, stream, held)
-    path, t = _path(stream), stream.seconds + aligned.offset
-    path = path.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
-    carry = partial(GyroRotation.integrate(imu, aligned.gyro_bias).carry, path.seconds + aligned.offset, to=imu.seconds)
-    system = system_from_readings(imu, carry, path.seconds + aligned.offset, path.rotation, path.position)
-    return turn_of_positions(system(aligned.rotation, np.zeros(3)))
+    trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
+    trajectory = trajectory.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
+    carry = partial(
+        GyroRotation.integrate(imu, aligned.gyro_bias).carry, trajectory.seconds + aligned.offset, to=imu.seconds
+    )
+    system = system_from_readings(
+        imu, carry, trajectory.seconds + aligned.offset, trajectory.rotation, trajectory.position
+    )
+    return rotation_of_positions(system(aligned.rotation, np.zeros(3)))
 
 
-def _turn_on_motion(imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics) -> np.ndarray | None:
-    """See `turn_of_positions`: by a motion that others showed."""
+def _position_rotation_on_trajectory(
+    imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics
+) -> np.ndarray | None:
+    """See `rotation_of_positions`, from the trajectory `known`."""
     aligned, _ = _aligned(imu, stream, held)
-    path, t = _path(stream), stream.seconds + aligned.offset
-    path = path.only((t >= known.seconds[0]) & (t <= known.seconds[-1]))
-    t = path.seconds + aligned.offset
+    trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
+    trajectory = trajectory.only((t >= known.seconds[0]) & (t <= known.seconds[-1]))
+    t = trajectory.seconds + aligned.offset
     if not len(t):
         return None
     R, p = imu_poses_at(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t)
-    U, _, Vt = np.linalg.svd((R @ aligned.rotation @ path.rotation.transpose(0, 2, 1)).sum(axis=0))
-    rows = system_from_trajectory(R, p, t, path.rotation, path.position)(aligned.rotation, np.zeros(3))
-    return turn_of_positions(rows, U @ Vt)
+    U, _, Vt = np.linalg.svd((R @ aligned.rotation @ trajectory.rotation.transpose(0, 2, 1)).sum(axis=0))
+    rows = system_from_trajectory(R, p, t, trajectory.rotation, trajectory.position)(aligned.rotation, np.zeros(3))
+    return rotation_of_positions(rows, U @ Vt)
 
 
-def _check_size(imu: ImuData, name: str, path: SensorTrajectory, aligned: RateAlignment, found: TrajectoryFit) -> None:
-    """Raises EstimationError where the accelerometer contradicts the size of the motion: the rows of `against_readings`
-    with what it felt as one more column, as of a target in `lever_arm`."""
-    gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
+def _check_scale(
+    imu: ImuData, name: str, trajectory: SensorTrajectory, aligned: RateAlignment, found: TrajectoryFit
+) -> None:
+    """Raises EstimationError if the accelerometer contradicts the scale of positions, which is estimated with the lever
+    arm; see `scale_by_accelerometer`."""
+    gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), trajectory.seconds + aligned.offset
 
     def rows_at(position: np.ndarray) -> LeverArmRows:
         carry = partial(gyro.carry, t, to=imu.seconds)
-        return system_from_readings(imu, carry, t, path.rotation, position)(found.guess.rotation, found.guess.position)
+        return system_from_readings(imu, carry, t, trajectory.rotation, position)(
+            found.guess.rotation, found.guess.position
+        )
 
-    rows, felt = rows_at(path.position), -rows_at(np.zeros_like(path.position)).b
-    size, std = scale_by_accelerometer(rows.A[:, :, 3:], rows.b, felt)
-    if abs(size - 1.0) > max(TARGET_SIZE_TOLERANCE, 5.0 * std):
+    rows, from_imu = rows_at(trajectory.position), -rows_at(np.zeros_like(trajectory.position)).b
+    scale, std = scale_by_accelerometer(rows.A[:, :, 3:], rows.b, from_imu)
+    if abs(scale - 1.0) > max(TARGET_SIZE_TOLERANCE, 5.0 * std):
         raise EstimationError(
-            f"{name}: the accelerometer shows its motion to be {size:.2f} +- {std:.2f} times as large as its "
+            f"{name}: the accelerometer shows its motion to be {scale:.2f} +- {std:.2f} times as large as its "
             "positions; these must be in metres (an odometry from one camera has no scale)."
         )
 
 
-def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics) -> tuple[ExtrinsicsGuess, float]:
-    """See `path_on_motion`."""
-    return extrinsics_on_trajectory(imu, stream.name, _path(stream), known, held)
+def _fit_to_trajectory(
+    imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics
+) -> tuple[ExtrinsicsGuess, float]:
+    """See `extrinsics_on_trajectory`."""
+    return extrinsics_on_trajectory(imu, stream.name, _trajectory(stream), known, held)
 
 
 def _frames(
     imu: ImuData, sensor: PoseSensor, stream: PoseStream, known: State, values: dict[Key, np.ndarray]
 ) -> dict[Key, np.ndarray]:
-    """Where the frame of absolute poses stands in each recording's world: the mean of what the poses say."""
+    """Frame of absolute poses in the world of each recording: mean rotation (chordal), median origin over all poses."""
     out: dict[Key, np.ndarray] = {}
     R_is, p_is, _ = (values[sensor.name, name] for name in MOUNTED_NAMES)
     t = instants(stream, values)
@@ -256,5 +279,6 @@ def _frames(
 
 
 def _keyframes(state: State, own: slice) -> State:
+    """The state with the keyframes `own` alone."""
     columns = {name: getattr(state, name)[own] for name in ("seconds", "rotation", "position", "velocity", "bias")}
     return replace(state, **columns, starts=(0,))

@@ -1,11 +1,11 @@
-"""Poses whose positions and rotations are in different frames, as of motion capture with z up here and y up there.
+"""Poses whose positions and rotations are in different frames, for example with z up and with y up.
 
-With C from the frame of positions to that of rotations the rows of `lidar_arm` are linear in M = C^T:
+With C from the frame of positions to that of rotations, the lever arm rows are linear in M = C^T:
 
-    seen = M felt + M S p + g    seen: what positions have part in, felt: the IMU, S: of the lever arm p, g: gravity
+    y = M a + M S p + g    y: from positions, a: from the IMU, S: factor of the lever arm p, g: gravity
 
-M is found by regression on felt, S and gravity, M and the products with p and g each for itself; its polar part is the
-turn. It is a proposal only: the caller turns the positions by it and looks whether they fit.
+M is estimated by linear regression of y on a, S and g, with M, M p and g as independent unknowns. C is the orthogonal
+factor of its polar decomposition. It is a candidate: the caller rotates the positions by it and tests the fit.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ import numpy as np
 
 from icalib.initialize.trajectories.lever_arm_rows import LeverArmRows
 
-SQUARE = 0.35  # cosine with the next axes: turns within 20 degrees of these are meant to be about right angles
-EVEN = 0.5  # the least over the largest stretch of M: a turn has 1
-FEWEST = 40  # rows
-UNTURNED = np.eye(3)
+MAX_AXES_ERROR = 0.35  # largest difference of an entry: rotations within 20 deg of exchanged axes are taken for these
+MIN_SINGULAR_RATIO = 0.5  # smallest over largest singular value of M: 1 for a rotation
+MIN_FRAME_ROWS = 40  # three times the 13 regressors
+IDENTITY = np.eye(3)
 
 
-def turn_of_positions(rows: LeverArmRows, R_world_frame: np.ndarray = UNTURNED) -> np.ndarray | None:
+def rotation_of_positions(rows: LeverArmRows, R_world_frame: np.ndarray = IDENTITY) -> np.ndarray | None:
     """Estimated rotation C (3, 3) from the frame of positions to that of rotations; None if it is the identity, not a
     rotation, or rows are few. R_world_frame (3, 3): rotation from the frame of rotations to the axes of the rows."""
-    felt, n = rows.seen - rows.b, len(rows.b)
-    X = np.concatenate([felt, rows.A[:, :, 3:6].reshape(n, 9), rows.A[:, 0, 6:7]], axis=1)
-    if n < FEWEST:
+    from_imu, n = rows.seen - rows.b, len(rows.b)
+    X = np.concatenate([from_imu, rows.A[:, :, 3:6].reshape(n, 9), rows.A[:, 0, 6:7]], axis=1)
+    if n < MIN_FRAME_ROWS:
         return None
     weight, M = np.ones(n), np.eye(3)
     for _ in range(3):
         x = np.linalg.lstsq(X * weight[:, None], rows.seen * weight[:, None], rcond=None)[0]
         size = np.linalg.norm(rows.seen - X @ x, axis=1)
         weight, M = (size < 4.0 * np.median(size) + 1e-9).astype(float), x[:3].T
-    U, stretch, Vt = np.linalg.svd(M)
-    if stretch[2] < EVEN * stretch[0] or np.linalg.det(U @ Vt) < 0.0:
+    U, singular, Vt = np.linalg.svd(M)
+    if singular[2] < MIN_SINGULAR_RATIO * singular[0] or np.linalg.det(U @ Vt) < 0.0:
         return None
     C = nearest_axes(R_world_frame.T @ (U @ Vt).T @ R_world_frame)
     return None if np.allclose(C, np.eye(3)) else C
 
 
 def nearest_axes(C: np.ndarray) -> np.ndarray:
-    """The turn by right angles that a turn is nearly; else the turn as it is."""
+    """The nearest of the 24 rotations that exchange axes, if C (3, 3) is near one; else C."""
     cube = [
         np.diag(signs)[list(order)]
         for order in permutations(range(3))
@@ -50,11 +50,11 @@ def nearest_axes(C: np.ndarray) -> np.ndarray:
         if np.linalg.det(np.diag(signs)[list(order)]) > 0.0
     ]
     best = max(cube, key=lambda P: float(np.sum(P * C)))
-    return best if np.abs(C - best).max() < SQUARE else C
+    return best if np.abs(C - best).max() < MAX_AXES_ERROR else C
 
 
-def words_for(C: np.ndarray) -> str | None:
-    """C as `position_axes` of the rig file has it, None where it is not one of right angles."""
+def axes_text(C: np.ndarray) -> str | None:
+    """C (3, 3) as `position_axes` in the rig file; None if it does not exchange axes."""
     if not np.allclose(np.abs(C).max(axis=1), 1.0):
         return None
     entries = [("-" if row.min() < -0.5 else "") + "xyz"[int(np.argmax(np.abs(row)))] for row in C]
