@@ -44,7 +44,7 @@ ORDER = (
     ("sensors.camera.features",),
     ("sensors.*.model",),
     ("estimate.problem",),
-    ("estimate.evidence",),
+    ("estimate.residual_statistics",),
     ("estimate",),
     ("result",),
     ("observability", "initialize.steps"),

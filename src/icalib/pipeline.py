@@ -23,7 +23,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Visit
 from icalib.estimate.problem.problem import Problem
 from icalib.initialize.attempts import attempt
-from icalib.optim.pages import give_back, keep_apart
+from icalib.optim.memory import set_mmap_threshold, trim_heap
 from icalib.result import Calibration, Visited
 from icalib.result.provenance import provenance
 from icalib.rig import Camera, Rig
@@ -53,7 +53,7 @@ def calibrate(
     """
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
     check_complete(rig)
-    keep_apart()
+    set_mmap_threshold()
     opened = open_all(recording, start_s, end_s)
     started = time.perf_counter()
     share = _reading_share(rig, opened)
@@ -165,8 +165,8 @@ def _calibrate(
 ) -> Calibration:
     clock = _Clock()
     progress("estimating the initial guess", 0.0)
-    keep_apart()
-    give_back()
+    set_mmap_threshold()
+    trim_heap()
     steps = _StepProgress(progress)
 
     def tell(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> None:

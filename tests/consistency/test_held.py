@@ -17,7 +17,7 @@ def test_of_an_estimate_that_failed_no_answers_are_looked_for(robot, monkeypatch
 
     def failing(*given, **named):
         found = estimate(*given, **named)
-        return replace(found, outcome=replace(found.outcome, converged=False, half_way=False))
+        return replace(found, outcome=replace(found.outcome, converged=False, stopped_early=False))
 
     monkeypatch.setattr(determination, "estimate", failing)
     monkeypatch.setattr(determination, "owed_to_guess", None)

@@ -24,7 +24,7 @@ from icalib.motion.factor import keyed
 from icalib.motion.imu_data import ImuData
 from icalib.motion.keyframe_placement import place_keyframes
 from icalib.motion.poses import assign_keyframes
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.state import KEYFRAME_DIM, Entry, Kind, Layout, State, make_layout
 from icalib.rig import ImuSensor, Lidar, Scheme, Settings
@@ -298,8 +298,8 @@ class RoomSetup:
         calib = rng.normal(size=self.layout.size) * self.columns_scale()
         return self.state.retract(self.layout, size * chain, size * calib)
 
-    def motion(self, state: State) -> Motion:
-        return Motion(state, self.imu, 9.81, 0.5)
+    def motion(self, state: State) -> EstimatedMotion:
+        return EstimatedMotion(state, self.imu, 9.81, 0.5)
 
     def factor(self, start: State | None = None, noise: LidarNoise | None = None, **options) -> LidarFactor:
         """The LiDAR's, its moments taken at `start` or the truth."""

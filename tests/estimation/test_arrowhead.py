@@ -5,7 +5,7 @@ import pytest
 
 from icalib.optim import arrowhead
 from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, marginalise_in_segments, solve
-from icalib.optim.calib_block import HELD_BELOW, calib_step
+from icalib.optim.calib_block import UNOBSERVABLE_BELOW, calib_step
 from icalib.optim.state import KEYFRAME_DIM
 
 
@@ -128,7 +128,7 @@ def whole_and_segments(n_keyframes, n_calib, seed):
 @pytest.mark.parametrize("segment", [1, 2, 3, 100])
 @pytest.mark.parametrize("n_keyframes", [1, 2, 3, 4, 6, 7, 8])
 def test_marginalising_in_segments_is_the_schur_complement(monkeypatch, dense, n_keyframes, segment):
-    monkeypatch.setattr(arrowhead, "SEGMENT", segment)
+    monkeypatch.setattr(arrowhead, "SEGMENT_KEYFRAMES", segment)
     whole, part = whole_and_segments(n_keyframes, 5, seed=4)
     H, g = dense((whole,), n_keyframes)
     information, gradient = schur(H, g, n_keyframes)
@@ -139,7 +139,7 @@ def test_marginalising_in_segments_is_the_schur_complement(monkeypatch, dense, n
 
 @pytest.mark.parametrize("keyframe", [0, 2, 3, 6])
 def test_marginalising_in_segments_raises_where_a_keyframe_is_not_determined(monkeypatch, keyframe):
-    monkeypatch.setattr(arrowhead, "SEGMENT", 3)
+    monkeypatch.setattr(arrowhead, "SEGMENT_KEYFRAMES", 3)
     _, part = whole_and_segments(7, 2, seed=4)
 
     def spoilt(first, last):
@@ -160,7 +160,7 @@ def test_undetermined_directions_stay_and_the_rest_is_solved(dense, n_keyframes)
     H, g = dense(pieces, n_keyframes)
     information, gradient = schur(H, g, n_keyframes)
     values, vectors = np.linalg.eigh(information * np.outer(tolerance, tolerance))
-    assert values[1] < 1e-8 < HELD_BELOW < values[2]
+    assert values[1] < 1e-8 < UNOBSERVABLE_BELOW < values[2]
     solution = solve(pieces, n_keyframes, tolerance)
     np.testing.assert_allclose(vectors[:, :2].T @ (solution.calib / tolerance), 0.0, atol=1e-12)
     free = tolerance[:, None] * vectors[:, 2:]
@@ -173,8 +173,8 @@ def test_undetermined_directions_stay_and_the_rest_is_solved(dense, n_keyframes)
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
 def test_calibration_parameters_between_held_and_moved(factor):
-    """One parameter with a tolerance of 0.1: information HELD_BELOW / 0.1^2 is where it begins to move."""
-    information, gradient = np.array([[factor * HELD_BELOW / 0.1**2]]), np.array([3.0])
+    """One parameter with a tolerance of 0.1: information UNOBSERVABLE_BELOW / 0.1^2 is where it begins to move."""
+    information, gradient = np.array([[factor * UNOBSERVABLE_BELOW / 0.1**2]]), np.array([3.0])
     step, decrease = calib_step(information, gradient, np.array([0.1]))
     expected = 0.0 if factor < 1.0 else -3.0 / information[0, 0]
     assert step[0] == pytest.approx(expected, rel=1e-12)

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from icalib.estimate.problem.outcome import Step
-from icalib.estimate.problem.solver import SLOW, _Care, _Descent
+from icalib.estimate.problem.solver import CAREFUL_DAMPING, _DampingControl, _Descent
 
 
 @pytest.mark.parametrize(
@@ -24,18 +24,18 @@ def test_steps_that_fail_do_not_creep(promised: tuple[float, ...], accepted: tup
 
 def test_damping_stays_near_what_the_last_failure_asked_for():
     """It grows by 2, 4, 8 and shrinks by a third at most, until one good step follows another."""
-    care = _Care(SLOW)
+    care = _DampingControl(CAREFUL_DAMPING)
     grown = []
     for _ in range(5):
         care.more()
-        grown.append(care.damping / SLOW.first)
+        grown.append(care.damping / CAREFUL_DAMPING.first)
     assert grown == pytest.approx([1.0, 4.0, 32.0, 512.0, 16384.0])
     care.less(near=False, gain=1.0)
-    assert care.damping == pytest.approx(grown[-1] * SLOW.first / 3.0)
+    assert care.damping == pytest.approx(grown[-1] * CAREFUL_DAMPING.first / 3.0)
     before = care.damping
     care.less(near=False, gain=1.0)
-    assert care.damping == pytest.approx(SLOW.less * before)
+    assert care.damping == pytest.approx(CAREFUL_DAMPING.less * before)
     care.less(near=False, gain=0.1)
-    assert care.damping == pytest.approx(SLOW.less * before)
+    assert care.damping == pytest.approx(CAREFUL_DAMPING.less * before)
     care.less(near=True, gain=0.5)
-    assert care.curved and care.damping == pytest.approx(SLOW.less * before)
+    assert care.curved and care.damping == pytest.approx(CAREFUL_DAMPING.less * before)

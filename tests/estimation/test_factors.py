@@ -24,13 +24,13 @@ import icalib.sensors
 from icalib.data.measurements import PoseStream
 from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
-from icalib.motion.clocks import offset_at
-from icalib.motion.factor import look
+from icalib.motion.factor import output_at
 from icalib.motion.poses import poses_at
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.time_offsets import offset_at
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
-from icalib.optim.robust_weights import LEAST_CURVATURE
+from icalib.optim.robust_weights import MIN_CURVATURE_RATIO
 from icalib.optim.state import KEYFRAME_DIM, State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import CornerNoise
@@ -95,7 +95,7 @@ def slope_along(loss, t):
 
     if loss == "none":
         return np.ones_like(t)
-    return np.maximum((psi(t + 1e-6) - psi(t - 1e-6)) / 2e-6 / (psi(t) / t), LEAST_CURVATURE)
+    return np.maximum((psi(t + 1e-6) - psi(t - 1e-6)) / 2e-6 / (psi(t) / t), MIN_CURVATURE_RATIO)
 
 
 def row_sample(setup, state, made, bend, curved):
@@ -522,7 +522,7 @@ def pose_sample(
     stamps = np.round(1e9 * seconds).astype(np.int64)
     joins = (int(stamps[len(stamps) // 2]),) if restarts else ()
     stream = PoseStream("mocap0", stamps, rotation, position, joins_ns=joins)
-    motion = Motion(setup.state, setup.imu, 9.81, 0.5)
+    motion = EstimatedMotion(setup.state, setup.imu, 9.81, 0.5)
     made = factor.build(stream, motion, PoseNoise(0.5, 0.3, loss, LOSS_SCALE), setup.layout)
     state = setup.perturbed(rng, 0.3)
 
@@ -555,8 +555,8 @@ def position_sample(
     joins = (int(stamps[len(stamps) // 2]),) if restarts else ()
     stream = PositionStream("mocap0", stamps, position, root @ root.transpose(0, 2, 1), joins_ns=joins)
     made = PositionFactor.build(
-        stream, Motion(setup.state, setup.imu, 9.81, 0.5), PositionNoise(0.3, 0.5, loss, LOSS_SCALE), setup.layout,
-        "target" if frame == "tilt" else "mocap0",
+        stream, EstimatedMotion(setup.state, setup.imu, 9.81, 0.5), PositionNoise(0.3, 0.5, loss, LOSS_SCALE),
+        setup.layout, "target" if frame == "tilt" else "mocap0",
     )  # fmt: skip
     state = setup.perturbed(rng, 0.3)
 
@@ -802,7 +802,7 @@ def test_rows_are_the_residuals_by_kind(sample):
         assert sample.factor in ("Prior", "accumulate_bias_prior")
         return
     made, state = sample.made, sample.state
-    out = look(made, state)
+    out = output_at(made, state)
     rows, squares, sizes = made.rows(out, state), made.squares(out), made.sizes(out)
     common = {kind for _, kind in squares if kind.startswith("common")}
     assert {(r.sensor, r.kind) for r in rows} >= {key for key in squares if key[1] not in {*common, ON_PLANES}}

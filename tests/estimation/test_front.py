@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, solve
-from icalib.optim.front import Features
-from icalib.optim.front_plan import SIZES, FeatureSums, plan
+from icalib.optim.front import PieceFeatures
+from icalib.optim.front_plan import GROUP_SIZES, FeatureSums, plan
 from icalib.optim.state import KEYFRAME_DIM
 
 
@@ -73,7 +73,7 @@ def build(n_keyframes, n_tracks, n_calib, seed=0, pieces=None, per_keyframe=1, b
         sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], n_calib, by_next)
         sums.pose[:], sums.next_pose[:] = images[1:]
         add(piece, sums, rows)
-        piece.features = Features.of(sums, plan(sums, n, piece.first == 0 or not keep, keep, sizes=sizes))
+        piece.features = PieceFeatures.of(sums, plan(sums, n, piece.first == 0 or not keep, keep, sizes=sizes))
         for column, A, f, _, F, _, C, r in rows:
             row = np.zeros((len(r), width))
             row[:, column : column + A.shape[1]], row[:, o : o + n_calib], row[:, o + n_calib] = A, C, r
@@ -102,7 +102,7 @@ def test_solution_is_the_dense_one(n_keyframes, n_tracks):
     check(*build(n_keyframes, n_tracks, 3), n_keyframes)
 
 
-@pytest.mark.parametrize("sizes", [(1,), (3,), SIZES])
+@pytest.mark.parametrize("sizes", [(1,), (3,), GROUP_SIZES])
 @pytest.mark.parametrize(("per_keyframe", "by_next"), [(1, False), (2, False), (3, False), (1, True), (2, True)])
 def test_solution_is_the_dense_one_however_images_hang_on_keyframes(per_keyframe, by_next, sizes):
     check(*build(13, 30, 2, per_keyframe=per_keyframe, by_next=by_next, sizes=sizes), 13)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from icalib.estimate import estimate as estimates
-from icalib.estimate.estimate import Estimate, Judged, estimate
+from icalib.estimate.estimate import Estimate, MeasurementModel, estimate
 from icalib.estimate.problem import solver
 from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.guess_priors import guess_priors, guess_sigma
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.solver import _Descent
-from icalib.estimate.problem.tolerances import FROM_NOTHING_M
+from icalib.estimate.problem.tolerances import UNGUESSED_TRANSLATION_SIGMA_M
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.optim.arrowhead import solve
 from icalib.optim.state import State
@@ -45,7 +45,7 @@ def test_they_are_as_wide_as_a_guess_is_off_and_never_beside_a_given_one(begun):
     assert (camera, "time_offset") not in found
     np.testing.assert_array_equal(found[other, "time_offset"].sigma, 2.0 * TIME_OFFSET.prior_sigma)
     np.testing.assert_array_equal(found[other, "rotation"].sigma, 2.0 * ROTATION.prior_sigma)
-    np.testing.assert_array_equal(found[other, "translation"].sigma, 2.0 * FROM_NOTHING_M)
+    np.testing.assert_array_equal(found[other, "translation"].sigma, 2.0 * UNGUESSED_TRANSLATION_SIGMA_M)
     assert all(inputs.is_sensor(sensor) for sensor, _ in found)
     for key, prior in found.items():
         residual, _ = prior.residual(state)
@@ -105,14 +105,14 @@ def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them
     assert not left & guessed
     assert asked[0] == len(found.problem.priors) + len(guessed)  # in the first pass they count
     assert (asked[-1] == asked[0]) == doubtful
-    assert found.outcome.half_way == doubtful
+    assert found.outcome.stopped_early == doubtful
     same_information(found)
 
 
 def test_priors_that_are_let_go_leave_the_step_of_the_problem_without_them(begun):
     """What is taken off the calibration parameters' sums is what a solve without the priors does not have."""
     inputs, state = begun
-    problem = Judged.first(inputs).problem(inputs, state)
+    problem = MeasurementModel.first(inputs).problem(inputs, state)
     more = guess_priors(inputs, replace(state, values=state.values | TURNED))
     led = replace(problem, priors=(*problem.priors, *more))
     assert led.without(more).priors == problem.priors
@@ -159,8 +159,8 @@ def test_while_something_is_held_they_count_and_the_estimate_is_half_way(begun, 
     key = inputs.rig.cameras[1].name, "time_offset"
     elsewhere = replace(state, values=state.values | {key: free.outcome.state.values[key] + 5e-3})
     led = estimate(inputs, state, held=held, guess=elsewhere)
-    assert led.outcome.half_way
-    assert not free.outcome.half_way
+    assert led.outcome.stopped_early
+    assert not free.outcome.stopped_early
     assert len(led.problem.priors) == len(free.problem.priors) == len(given_priors(inputs))
     same_information(led)
     assert led.outcome.state.values[key] - free.outcome.state.values[key] > 0.2 * 5e-3

@@ -147,5 +147,5 @@ def test_what_nobody_guessed_moves_no_further_than_the_data_leave_open(given):
     given.problem.held = np.eye(8)[:, [0, 1]]  # of a, which is no sensor now
     shifts = owed_to_guess(given.inputs, given.outcome, data)
     width = np.sqrt((shifts**2).sum(axis=0)) / given.problem.tolerance
-    assert width[0] == pytest.approx(guess_worth.UNGUESSED / 5e-3)
-    assert width[1] == pytest.approx(min(guess_worth.UNGUESSED / 5e-3, 1.0 / np.sqrt(5e-3)))
+    assert width[0] == pytest.approx(guess_worth.UNGUESSED_SIGMA / 5e-3)
+    assert width[1] == pytest.approx(min(guess_worth.UNGUESSED_SIGMA / 5e-3, 1.0 / np.sqrt(5e-3)))

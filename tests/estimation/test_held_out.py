@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tests.estimation.test_arrowhead import random_pieces
 
-from icalib.estimate.evidence.evidence import chi2_by_kind
-from icalib.estimate.evidence.held_out import Half, excess, halves_of, predict, shifts
-from icalib.estimate.evidence.parts import MIN_PART_KEYFRAMES, Parts
 from icalib.estimate.problem.solver import minimise
-from icalib.optim.arrowhead import KEYFRAME_DIM, given_calib
+from icalib.estimate.residual_statistics.cross_validation import Half, excess, halves_of, predict, shifts
+from icalib.estimate.residual_statistics.fit_statistics import chi2_by_kind
+from icalib.estimate.residual_statistics.segments import MIN_SEGMENT_KEYFRAMES, Segments
+from icalib.optim.arrowhead import KEYFRAME_DIM, chain_step_given_calib
 from icalib.optim.prior_factor import Prior
 from icalib.tools.simulation import handheld, simulate
 
@@ -31,7 +31,7 @@ def test_keyframes_follow_the_calibration_from_the_first_keyframe_and_from_anoth
     calib = np.random.default_rng(1).normal(size=(3, 2))
     o = KEYFRAME_DIM * n
     expected = -np.linalg.solve(H[:o, :o], g[:o, None] + H[:o, o:] @ calib)
-    np.testing.assert_allclose(given_calib(piece, calib).reshape(o, 2), expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(chain_step_given_calib(piece, calib).reshape(o, 2), expected, rtol=1e-8, atol=1e-10)
 
 
 def rows_of(rng, n, columns):
@@ -127,7 +127,7 @@ def solved(setup_of, problem_of):
     prior = Prior(block, setup.state.values[block.key] + 0.2, np.full(4, 0.3))
     problem = replace(problem_of(setup), priors=(prior,))
     outcome = minimise(problem, setup.state)
-    parts = Parts.of(problem, outcome, 5)
+    parts = Segments.of(problem, outcome, 5)
     assert parts is not None
     return problem, outcome, parts
 
@@ -176,12 +176,12 @@ def solution(sums):
 
 def test_parts_are_as_many_as_asked_for_and_long_enough(solved):
     problem, outcome, _ = solved
-    assert Parts.of(problem, outcome, 0) is None
-    assert Parts.of(problem, outcome, 1) is None
-    two, many = Parts.of(problem, outcome, 2), Parts.of(problem, outcome, problem.n_keyframes // 2)
+    assert Segments.of(problem, outcome, 0) is None
+    assert Segments.of(problem, outcome, 1) is None
+    two, many = Segments.of(problem, outcome, 2), Segments.of(problem, outcome, problem.n_keyframes // 2)
     assert two is not None and two.count == 2
-    assert many is not None and many.count == (problem.n_keyframes - 1) // MIN_PART_KEYFRAMES
-    assert np.diff(many.ends).min() >= MIN_PART_KEYFRAMES
+    assert many is not None and many.count == (problem.n_keyframes - 1) // MIN_SEGMENT_KEYFRAMES
+    assert np.diff(many.ends).min() >= MIN_SEGMENT_KEYFRAMES
 
 
 @pytest.mark.parametrize(("duration", "keyframes", "parts"), [(0.35, 5, None), (0.45, 8, 2)])
@@ -189,6 +189,6 @@ def test_a_recording_too_short_for_two_parts_has_none(duration, keyframes, parts
     """Three keyframes a part and one at the end: two parts need seven."""
     setup = setup_of(simulate(handheld(duration), seed=5))
     problem = problem_of(setup)
-    found = Parts.of(problem, minimise(problem, setup.state), 8)
+    found = Segments.of(problem, minimise(problem, setup.state), 8)
     assert problem.n_keyframes == keyframes
     assert (None if found is None else found.count) == parts

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import ImuStream
-from icalib.motion.imu_data import GAP, ImuData
+from icalib.motion.imu_data import MIN_GAP_PERIODS, ImuData
 from icalib.rig import ImuNoise
 
 DENSITY = 1e-3  # rad/s/sqrt(Hz)
@@ -44,7 +44,7 @@ def test_in_a_gap_it_is_the_unseen_motion_that_turns():
     moving = stream(stamps[(stamps < 4 * 10**8) | (stamps > 5 * 10**8)])
     moving = replace(moving, gyro=np.random.default_rng(1).normal(size=moving.gyro.shape))
     imu = ImuData.build(moving, NOISE)
-    assert np.diff(imu.seconds).max() > GAP * 5e-3
+    assert np.diff(imu.seconds).max() > MIN_GAP_PERIODS * 5e-3
     across, beside = imu.turned_by_noise(np.array([0.39, 0.29]), np.array([0.45, 0.35]))
     assert beside == pytest.approx(DENSITY * np.sqrt(0.06), rel=1e-9)
     assert across > 30.0 * beside

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.motion.imu_model import correction_matrices
-from icalib.motion.integration_step import SIZE, STRIDE, E, correction, fill_intrinsics
+from icalib.motion.integration_step import AT_INTRINSICS, J_STRIDE, RUN_SIZE, correction, fill_intrinsics
 from icalib.sensors.imu.spec import INTRINSICS_LABELS as LABELS
 from icalib.sensors.imu.spec import N_INTRINSICS
 
@@ -44,9 +44,9 @@ def test_derivatives_by_central_differences(size):
     intrinsics = random_intrinsics(2, size)
     gyro, accel = np.array([0.5, 1.0, -0.8]), np.array([-1.0, 4.0, 8.0])
     rate, force = corrected(intrinsics, gyro, accel)
-    run = np.zeros(SIZE)
+    run = np.zeros(RUN_SIZE)
     fill_intrinsics(tuple(rate), tuple(force), correction(intrinsics), run)
-    d_rate, d_force = run[E : E + 6 * STRIDE].reshape(2, 3, STRIDE)[:, :, :N_INTRINSICS]
+    d_rate, d_force = run[AT_INTRINSICS : AT_INTRINSICS + 6 * J_STRIDE].reshape(2, 3, J_STRIDE)[:, :, :N_INTRINSICS]
     h = 1e-5
     for n in range(N_INTRINSICS):
         step = h * np.eye(N_INTRINSICS)[n]

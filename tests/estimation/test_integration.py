@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from icalib.geometry import so3
 from icalib.motion.integration import Increment, Readings, finish, integrate, integration_room
-from icalib.motion.integration_step import COVARIANCE, SIZE, correction
-from icalib.motion.propagation import in_order_of_keyframes, integrate_from_keyframe, nothing_carried
+from icalib.motion.integration_step import COVARIANCE_SIZE, RUN_SIZE, correction
+from icalib.motion.propagation import empty_prefix, in_order_of_keyframes, integrate_from_keyframe
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
 INTRINSICS = np.random.default_rng(5).normal(size=24) * np.repeat([0.01, 0.01, 0.02, 2e-3], [6, 6, 3, 9])
@@ -40,7 +40,7 @@ def run(r, t0, t1, bias=BIAS, intrinsics=None, first=None, width=6, covariance=F
     first = r.interval(t0) if first is None else first
     x = np.zeros(24) if intrinsics is None else intrinsics
     readings = Readings(r.t, r.gyro, r.accel, r.variance, r.walk, linear)
-    room = integration_room(COVARIANCE if covariance else 0)
+    room = integration_room(COVARIANCE_SIZE if covariance else 0)
     end = integrate(t0, t1, first, tuple(bias), readings, correction(x), room, Increment(R, v, p, J, P))
     return R, v, p, J, P, end
 
@@ -182,7 +182,7 @@ def test_what_is_carried_on_is_what_starts_anew(order, width):
         "any": rng.permutation(68),
     }
     readings = Readings(R0.t, R0.gyro, R0.accel, R0.variance, R0.walk, True)
-    by, carried, x, none = correction(INTRINSICS), nothing_carried(), np.empty(SIZE), np.empty(0)
+    by, carried, x, none = correction(INTRINSICS), empty_prefix(), np.empty(RUN_SIZE), np.empty(0)
     for i in ways[order]:
         k = keyframe[i]
         out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))

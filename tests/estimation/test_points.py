@@ -74,7 +74,7 @@ def test_coarse_noise_is_as_large_as_most_errors_and_no_less_than_stated(factor,
     streams = list(factor.streams)
     streams[noisy] = replace(stream, uv=stream.uv + errors)
     _, out = outcome(factor, setup.state)
-    found = replace(factor.settled(out), streams=tuple(streams)).coarse(setup.state).noise
+    found = replace(factor.warm_started(out), streams=tuple(streams)).coarse(setup.state).noise
     n = int((factor.tracks.track[noisy] >= 0).sum())
     assert found[noisy].sigma == pytest.approx(sigma, rel=3.0 / np.sqrt(n))
     assert [s for i, s in enumerate(found) if i != noisy] == [s for i, s in enumerate(factor.noise) if i != noisy]
@@ -90,6 +90,6 @@ def test_none_is_followed_where_every_other_image_looks_away(factor, setup):
 
 def test_settled_features_are_where_they_were(factor, setup):
     cost, out = outcome(looked_for(factor, 3.0 * factor.tracks.start), setup.state)
-    again, there = outcome(factor.settled(out), setup.state)
+    again, there = outcome(factor.warm_started(out), setup.state)
     assert again == pytest.approx(cost, rel=1e-12)
     np.testing.assert_allclose(there.points, out.points, atol=1e-9)

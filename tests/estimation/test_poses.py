@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from icalib.geometry import so3
-from icalib.motion.poses import assign_keyframes, motion_at, poses_at
+from icalib.motion.poses import assign_keyframes, poses_and_velocity_derivatives, poses_at
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
 from icalib.optim.state import KEYFRAME_DIM
 
@@ -107,7 +107,7 @@ def test_the_chain_rule_of_a_sensor_pose_by_central_differences(setup, scheme):
 
 def motion(setup, state=None, times=TIMES, imu_free=True):
     keyframe = assign_keyframes("inertial", setup.state.seconds, TIMES)
-    return *motion_at(times, keyframe, state or setup.state, setup.imu, 9.81, imu_free), keyframe
+    return *poses_and_velocity_derivatives(times, keyframe, state or setup.state, setup.imu, 9.81, imu_free), keyframe
 
 
 def test_motion_has_the_inertial_poses(setup):

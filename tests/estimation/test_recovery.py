@@ -11,7 +11,7 @@ from icalib.estimate.problem import solver
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry import so3
 from icalib.motion.factor import of_type
-from icalib.optim.arrowhead import THREADS, solve
+from icalib.optim.arrowhead import N_THREADS, solve
 from icalib.pipeline import calibrate_measurements
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.tools.simulation import handheld, rig_for, simulate
@@ -115,7 +115,7 @@ def test_information_is_that_of_the_end_and_without_damping(noisy_problem):
 
 
 def test_the_answer_is_the_same_to_the_last_bit(noisy_problem):
-    assert THREADS == 2
+    assert N_THREADS == 2
     problem, start = noisy_problem
     first, second = minimise(problem, start), minimise(problem, start)
     assert first.cost == second.cost

@@ -12,9 +12,9 @@ from icalib.data.joining import PAUSE_NS, join
 from icalib.data.measurements import Measurements
 from icalib.data.recordings.several import naming, open_all
 from icalib.errors import RecordingError
-from icalib.estimate.evidence.parts import segment_ends
 from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
+from icalib.estimate.residual_statistics.segments import segment_ends
 from icalib.geometry import so3
 from icalib.motion.factor import of_type
 from icalib.motion.keyframe_placement import first_keyframes, place_keyframes, usable

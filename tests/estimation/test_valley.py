@@ -13,7 +13,7 @@ from tests.typed import StandIn
 from icalib.estimate.problem.solver import minimise
 from icalib.optim.anderson import Accelerator
 from icalib.optim.arrowhead import make_pieces
-from icalib.optim.calib_block import NOTHING
+from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.state import State, make_layout
 
 KEY = ("sensor", "value")
@@ -24,7 +24,7 @@ class OneNumber(StandIn):
     """A problem in one number y, with one keyframe that is left alone."""
 
     layout = make_layout([(*KEY, "vector", 1, True)])
-    n_keyframes, tolerance, held = 1, np.array([1e3]), NOTHING
+    n_keyframes, tolerance, held = 1, np.array([1e3]), NO_DIRECTIONS
 
     def pieces(self):
         return make_pieces(1, 1)
@@ -32,7 +32,7 @@ class OneNumber(StandIn):
     def residuals(self):
         return SimpleNamespace()
 
-    def settled(self, residuals):
+    def warm_started(self, residuals):
         return self
 
     def rows(self, y: float) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +88,7 @@ class Saddle(OneNumber):
     """Residuals x - 1, y - 2 and LARGE + c x y / LARGE: curvatures 1 + c and 1 - c, where the squared slopes are 1."""
 
     layout = make_layout([(*KEY, "vector", 2, True)])
-    tolerance, held = np.array([1.0, 1.0]), NOTHING
+    tolerance, held = np.array([1.0, 1.0]), NO_DIRECTIONS
 
     def __init__(self, c: float):
         self.c = c

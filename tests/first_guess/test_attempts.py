@@ -8,11 +8,11 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.initialize.attempts import explained_failure
-from icalib.optim.arrowhead import BROKEN_DOWN, NotDefiniteError
+from icalib.optim.arrowhead import NOT_DEFINITE, NotDefiniteError
 from icalib.rig import Camera, ImuNoise, ImuSensor, PoseSensor, Rig, by_name
 
 RELATIVE = Rig(by_name(ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)), PoseSensor("odom", "", "relative")))
-BROKEN = NotDefiniteError(BROKEN_DOWN)
+BROKEN = NotDefiniteError(NOT_DEFINITE)
 
 
 def converging(rig: Rig):

@@ -15,7 +15,7 @@ from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess
 from icalib.motion.factor import keyed
 from icalib.motion.keyframe_placement import place_keyframes
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
 from icalib.optim.state import State, make_layout
 from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
@@ -53,7 +53,7 @@ def solved(r, state, found):
     layout = make_layout(entries + found.clouds.entries)
     kept = {k: v for k, v in state.values.items() if k[1] != "plane"}
     state = replace(state, values=kept | found.values)
-    motion = Motion(state, r.imu, 9.81, 0.5)
+    motion = EstimatedMotion(state, r.imu, 9.81, 0.5)
     lidars = tuple(
         LidarFactor.build(s, plane, found.clouds.keys, motion, NOISE, layout)
         for s, plane in zip(r.streams, found.clouds.plane, strict=True)
@@ -70,7 +70,7 @@ def calibrated(r, rounds=ASSOCIATION_ROUNDS):
     """The state after the rounds, and the associations of all of them."""
     state, found = guessed(r), []
     for k in range(rounds):
-        motion = Motion(state, r.imu, 9.81, 0.5)
+        motion = EstimatedMotion(state, r.imu, 9.81, 0.5)
         found.append(associate(r.streams, motion, round_search(k, NOISE.sigma), found[-1] if found else None))
         state = solved(r, state, found[-1])
     return state, found
@@ -143,7 +143,9 @@ def test_no_plane_is_refused(free_robot):
     state = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], 0.05))
     with pytest.raises(EstimationError, match="^lidar0 saw no flat surface of .* check the point times.$"):
         associate(
-            [replace(stream, xyz=anywhere)], Motion(state, free_robot.imu, 9.81, 0.5), round_search(3, NOISE.sigma)
+            [replace(stream, xyz=anywhere)],
+            EstimatedMotion(state, free_robot.imu, 9.81, 0.5),
+            round_search(3, NOISE.sigma),
         )
 
 
@@ -154,7 +156,7 @@ def test_one_wall_is_one_plane(free_robot):
     start = np.searchsorted(scan, np.arange(len(stream.stamps_ns) + 1))
     alone = replace(stream, start=start, offset_s=stream.offset_s[wall], xyz=stream.xyz[wall], plane=stream.plane[wall])
     state = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], 0.05))
-    found = associate([alone], Motion(state, free_robot.imu, 9.81, 0.5), round_search(3, NOISE.sigma))
+    found = associate([alone], EstimatedMotion(state, free_robot.imu, 9.81, 0.5), round_search(3, NOISE.sigma))
     assert found.clouds.names == ("plane 0",)
     assert found.clouds.points[0] > 0.8 * len(alone.xyz)
 

@@ -14,7 +14,7 @@ from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
 from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
 from icalib.optim.state import State
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.position.frame import PositionFrame
@@ -87,7 +87,7 @@ def test_placed_on_a_known_motion(world, levelled):
     values = {("imu0", "intrinsics"): sim.truth.imu_intrinsics}
     R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
     state = State(keyframes, R, p, v, bias, values)
-    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, KnownPlace(levelled))
+    found = place(EstimatedMotion(state, imu, GRAVITY, 0.5), "gnss0", fix, KnownPlace(levelled))
     assert found.offset == pytest.approx(offset, abs=0.01)
     planar = 0.1 if sim.scenario.motion.kind == "ramps" else 0.04
     np.testing.assert_allclose(found.arm, ARM, atol=planar)
@@ -120,7 +120,7 @@ def test_placed_on_a_rig_that_turns_in_place(frame):
     state = State(keyframes, R[100:-100:20], still, still, np.zeros((len(keyframes), 6)), values)
     k = np.arange(200, 5800, 40)
     position = (R[k] @ ARM - ORIGIN) @ yaw(FRAME_YAW) + 0.005 * np.random.default_rng(1).normal(size=(len(k), 3))
-    found = place(Motion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), known)
+    found = place(EstimatedMotion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), known)
     assert found.offset == pytest.approx(seconds[k[0]], abs=5e-3)
     np.testing.assert_allclose(found.arm, ARM, atol=0.01)
     np.testing.assert_allclose(found.R_wf, yaw(FRAME_YAW), atol=0.02)
@@ -153,7 +153,7 @@ def test_fixes_in_another_frame_than_they_are_said_to_share(world):
     state = State(keyframes, R, p, v, np.zeros((len(keyframes), 6)), {("imu0", "intrinsics"): sim.truth.imu_intrinsics})
     known = KnownPlace(False, frame=PositionFrame(yaw(FRAME_YAW + 1.0), ORIGIN, ()))
     with pytest.raises(EstimationError, match="of their spread; .*in the frame that the rig file names"):
-        place(Motion(state, imu, GRAVITY, 0.5), "gnss0", fix, known)
+        place(EstimatedMotion(state, imu, GRAVITY, 0.5), "gnss0", fix, known)
     upright = replace(fix, position=fix.position[:, [0, 2, 1]] * [1.0, -1.0, 1.0])
     with pytest.raises(EstimationError, match="write frame: tilted if z of its frame does not point up"):
-        place(Motion(state, imu, GRAVITY, 0.5), "gnss0", upright, KnownPlace(True))
+        place(EstimatedMotion(state, imu, GRAVITY, 0.5), "gnss0", upright, KnownPlace(True))

@@ -9,34 +9,36 @@ from typing import Any
 
 import numpy as np
 
-from icalib.estimate.evidence.evidence import chi2_by_kind, fits
 from icalib.estimate.problem.assembly import assemble, keyframe_times, keyframes_for, resample
 from icalib.estimate.problem.guess_priors import guess_priors
 from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.outcome import Outcome, Step, Visit, way_come
+from icalib.estimate.problem.outcome import Outcome, Step, Visit, relative_decrease
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.residual_statistics.fit_statistics import chi2_by_kind, fits
 from icalib.model.sensor_model import by_kind
 from icalib.model.statistics import PassEnd
-from icalib.optim import pages
-from icalib.optim.calib_block import NOTHING
+from icalib.optim import memory
+from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior, without_priors
 from icalib.optim.state import State
 
 FIRST_PASS_PRIOR_WIDTH = 3.0  # times the prior uncertainty of the initial guess
 # An early pass stops where the next step would lower half the chi^2 by less, or by less than that share of it.
-EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6
-FIRST_SHARE = 1e-3  # the same of the first pass: noise and inliers that it freezes are farther off
-MOST_REPEATS = 4  # of the final pass
-FAR = 1.1  # ratio of the chi^2 at the start of a pass to that at its end, above which frozen weights are out of date
-NEARER = 0.5  # relative cost decrease over that of the pass before: above it passes alternate between two states
+EARLY_DECREASE, EARLY_DECREASE_SHARE = 0.5, 1e-6
+FIRST_DECREASE_SHARE = 1e-3  # the same of the first pass: noise and inliers that it freezes are farther off
+MAX_FINAL_REPEATS = 4  # of the final pass
+# ratio of the chi^2 at the start of a pass to that at its end, above which frozen weights are out of date
+STALE_CHI2_RATIO = 1.1
+# relative cost decrease over that of the pass before: above it passes alternate between two states
+ALTERNATING_RATIO = 0.5
 
 
 OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its problem, and where the solver stood
 
 
 @dataclass(frozen=True)
-class Judged:
+class MeasurementModel:
     """Noise and inliers of a pass. noise: by sensor, of the class that its kind has. coarse: nothing is known yet, so
     the pass costs little, see `Pass`."""
 
@@ -44,18 +46,18 @@ class Judged:
     coarse: bool = False
 
     @classmethod
-    def first(cls, inputs: Inputs) -> Judged:
+    def first(cls, inputs: Inputs) -> MeasurementModel:
         """Before any pass: what the rig file says, or what is usual, of all there is."""
         noise = {}
         for model, sensors in by_kind(inputs.rig.mounted):
             noise |= model.first_noises(sensors, inputs.rig, inputs.measurements)
         return cls(noise, True)
 
-    def problem(self, inputs: Inputs, state: State, held: np.ndarray = NOTHING) -> Problem:
+    def problem(self, inputs: Inputs, state: State, held: np.ndarray = NO_DIRECTIONS) -> Problem:
         """See `assemble`."""
         return assemble(inputs, state, self.noise, held, self.coarse)
 
-    def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> Judged:
+    def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> MeasurementModel:
         """As what a pass left behind, the `first` or another, shows it."""
         problem, residuals = outcome.problem, outcome.residuals
         end = PassEnd(
@@ -65,7 +67,7 @@ class Judged:
         noise = {}
         for model, sensors in by_kind(inputs.rig.mounted):
             noise |= model.next_noises(sensors, self.noise, end)
-        return Judged(noise)
+        return MeasurementModel(noise)
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Estimate:
     """The last pass: where the solver ended, and what it was told of the noise."""
 
     outcome: Outcome
-    judged: Judged
+    judged: MeasurementModel
     steps: tuple[tuple[str, Step], ...]  # of all passes, with the pass's name
 
     @property
@@ -85,9 +87,9 @@ def estimate(
     inputs: Inputs,
     state: State,
     on_step: Callable[[str, Step], None] = lambda *_: None,
-    held: np.ndarray = NOTHING,
+    held: np.ndarray = NO_DIRECTIONS,
     on_visit: OnVisit = lambda *_: None,
-    judged: Judged | None = None,
+    judged: MeasurementModel | None = None,
     maybe_rank_deficient: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
     guess: State | None = None,
 ) -> Estimate:
@@ -103,23 +105,23 @@ def estimate(
     *early, final = pass_names(inputs)
     about = () if guess is None else guess_priors(inputs, guess)
     passes = _Passes(
-        inputs, held, on_step, on_visit, maybe_rank_deficient, state, judged or Judged.first(inputs), about
+        inputs, held, on_step, on_visit, maybe_rank_deficient, state, judged or MeasurementModel.first(inputs), about
     )
     if judged is None:
         for name in early:
             passes.early(name)
-            pages.give_back()  # before the next one takes as much memory
+            memory.trim_heap()  # before the next one takes as much memory
     else:
         passes.begin_at(state)
     way = np.inf
-    for left in reversed(range(1 + MOST_REPEATS)):
+    for left in reversed(range(1 + MAX_FINAL_REPEATS)):
         way_before = way if left else 0.0  # nearer than that is not to be had any more
         outcome, way = passes.final(final, way_before)
         if not left or not _again(inputs, outcome, passes.judged, way, way_before):
             return Estimate(_without_priors(outcome, passes.about), passes.judged, tuple(passes.history))
         passes.begin_at(outcome.state)
         del outcome
-        pages.give_back()
+        memory.trim_heap()
     raise AssertionError("the loop ends where nothing is left")
 
 
@@ -134,7 +136,7 @@ class _Passes:
     on_visit: OnVisit
     maybe_rank_deficient: Callable[[Problem, np.ndarray], bool]
     state: State
-    judged: Judged
+    judged: MeasurementModel
     about: tuple[Prior, ...]
     history: list[tuple[str, Step]] = field(default_factory=list)
 
@@ -146,7 +148,7 @@ class _Passes:
         """One that leads near, and shows what is judged before the next."""
         first = name == "first"
         problem, told = self._next(name)
-        share = FIRST_SHARE if first else EARLY_SHARE
+        share = FIRST_DECREASE_SHARE if first else EARLY_DECREASE_SHARE
 
         def leaves(_: float, information: np.ndarray) -> bool:
             return self.maybe_rank_deficient(problem, information)
@@ -164,18 +166,20 @@ class _Passes:
         def leaves(way: float, information: np.ndarray) -> bool:
             return bool(self.about) or self.maybe_rank_deficient(problem, information) or _is_far(way, way_before)
 
-        def lets_go(way: float, information: np.ndarray) -> tuple[Prior, ...]:
+        def priors_to_drop(way: float, information: np.ndarray) -> tuple[Prior, ...]:
             return () if _is_far(way, way_before) else self._let_go(self.maybe_rank_deficient(problem, information))
 
-        outcome = minimise(problem, self.state, told.step, on_visit=told.visit, leaves=leaves, lets_go=lets_go)
+        outcome = minimise(
+            problem, self.state, told.step, on_visit=told.visit, leaves=leaves, priors_to_drop=priors_to_drop
+        )
         is_open = self.maybe_rank_deficient(problem, told.information)
-        way, gone = way_come(outcome.steps, outcome.cost), self._let_go(is_open)
+        way, gone = relative_decrease(outcome.steps, outcome.cost), self._let_go(is_open)
         if gone and not _is_far(way, way_before):
             without, room = outcome.problem.without(gone), outcome.room
             rest = minimise(without, outcome.state, told.step, on_visit=told.visit, room=room)
             outcome = replace(rest, steps=(*outcome.steps, *rest.steps))
-            way = way_come(outcome.steps, outcome.cost)
-        return outcome, np.inf if is_open and outcome.half_way else way
+            way = relative_decrease(outcome.steps, outcome.cost)
+        return outcome, np.inf if is_open and outcome.stopped_early else way
 
     def _next(self, name: str) -> tuple[Problem, _Told]:
         problem = _with_priors(self.judged.problem(self.inputs, self.state, self.held), self.about)
@@ -199,7 +203,7 @@ class _Told:
     on_step: Callable[[str, Step], None]
     on_visit: OnVisit
     history: list[tuple[str, Step]]
-    information: np.ndarray = field(default_factory=lambda: NOTHING)
+    information: np.ndarray = field(default_factory=lambda: NO_DIRECTIONS)
 
     def step(self, step: Step) -> None:
         self.history.append((self.name, step))
@@ -223,11 +227,11 @@ def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
         outcome,
         problem=outcome.problem.without(more),
         information=without_priors(outcome.information, more, outcome.state),
-        half_way=outcome.half_way or outcome.converged,
+        stopped_early=outcome.stopped_early or outcome.converged,
     )
 
 
-def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way: float, way_before: float) -> bool:
+def _again(inputs: Inputs, outcome: Outcome, judged: MeasurementModel, way: float, way_before: float) -> bool:
     """Whether the last pass is to be made anew: what it froze, such as the weights of points on planes, is of a state
     far from its end, but nearer than in the last pass before, or many measurements fit again that it rejected. way:
     relative cost decrease, infinite if the pass stopped early because the problem is rank deficient."""
@@ -237,7 +241,7 @@ def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way: float, way_bef
 
 
 def _is_far(way: float, way_before: float) -> bool:
-    return FAR - 1.0 < way < NEARER * way_before
+    return STALE_CHI2_RATIO - 1.0 < way < ALTERNATING_RATIO * way_before
 
 
 def _on_own_keyframes(inputs: Inputs, state: State) -> State:
@@ -251,9 +255,9 @@ def first_pass(inputs: Inputs, state: State) -> State:
 
     Raises EstimationError where the data do not carry an estimate.
     """
-    problem = Judged.first(inputs).problem(inputs, state)
+    problem = MeasurementModel.first(inputs).problem(inputs, state)
     problem = _with_priors(problem, guess_priors(inputs, state, FIRST_PASS_PRIOR_WIDTH))
-    return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_SHARE, comes_back=False).state
+    return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_DECREASE_SHARE, second_order=False).state
 
 
 def pass_names(inputs: Inputs) -> tuple[str, ...]:

@@ -15,28 +15,28 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.evidence import DRAW_STEP
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.residual_statistics.fit_statistics import DRAW_STEP
 from icalib.model.sensor_model import model_of
-from icalib.motion.factor import look
+from icalib.motion.factor import output_at
 from icalib.motion.imu_data import joined_imu_data
 from icalib.rig import ImuNoise
 from icalib.sensors.imu.residual import ImuFactor
 
-ROUNDS = 12  # the scales converge linearly
-SETTLED = 0.05  # of a scale, in logarithms
-LEAST_DOF = 3.0  # times the root of the number of residuals, which is how far off sampled ones may be
-LAGS = 3  # intervals
-WHITE = 0.25  # correlation
-CHANCE = 3.0  # standard deviations
-SEGMENTS = 8
-VARIES = 3.0  # times the mean square of the whole recording
-AS_STATED = 1.25  # times the stated density, or one over that: nobody states noise any better
-LARGEST_STEP = 10.0  # of a scale in one round
-SMALLEST = 0.02  # of the stated noise: a sensor with less has none, as in a simulation without noise
-KINDS = ("gyroscope", "accelerometer")
+MAX_NOISE_ROUNDS = 12  # the scales converge linearly
+MAX_LOG_SCALE_CHANGE = 0.05  # of a scale, in logarithms
+MIN_DOF_RATIO = 3.0  # times the root of the number of residuals, which is how far off sampled ones may be
+N_LAGS = 3  # intervals
+MAX_CORRELATION = 0.25  # correlation
+CHANCE_SIGMAS = 3.0  # standard deviations
+N_NOISE_SEGMENTS = 8
+MAX_VARIATION = 3.0  # times the mean square of the whole recording
+MAX_STATED_RATIO = 1.25  # times the stated density, or one over that: nobody states noise any better
+MAX_SCALE_STEP = 10.0  # of a scale in one round
+MIN_NOISE_SCALE = 0.02  # of the stated noise: a sensor with less has none, as in a simulation without noise
+IMU_KINDS = ("gyroscope", "accelerometer")
 
 
 @dataclass(frozen=True)
@@ -66,38 +66,38 @@ class NoiseFit:
     @property
     def is_as_stated(self) -> bool:
         """Whether the IMU's noise fits as it is, once that of the cameras does."""
-        return self.settled and all(abs(np.log(s)) < np.log(AS_STATED) for s in self.scales.values())
+        return self.settled and all(abs(np.log(s)) < np.log(MAX_STATED_RATIO) for s in self.scales.values())
 
 
 def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
     """None without an IMU, where an estimate with other noise fails, or where a sensor has next to no noise."""
     if inputs.rig.imu is None or inputs.rig.assumes_motion or not isinstance(found.problem.chain, ImuFactor):
         return None
-    scales: dict[str, float] = dict.fromkeys([*KINDS, *_refitted_sizes(inputs, found.outcome)], 1.0)
+    scales: dict[str, float] = dict.fromkeys([*IMU_KINDS, *_refitted_sizes(inputs, found.outcome)], 1.0)
     outcome, settled = found.outcome, False
-    for _ in range(ROUNDS):
+    for _ in range(MAX_NOISE_ROUNDS):
         shown = _ImuDraws.of(outcome)
-        sizes = {kind: shown.size(kind) for kind in KINDS} | _refitted_sizes(inputs, outcome)
-        steps = {key: float(np.clip(size, 1.0 / LARGEST_STEP, LARGEST_STEP)) for key, size in sizes.items()}
-        settled = all(abs(np.log(step)) < SETTLED for step in steps.values())
+        sizes = {kind: shown.size(kind) for kind in IMU_KINDS} | _refitted_sizes(inputs, outcome)
+        steps = {key: float(np.clip(size, 1.0 / MAX_SCALE_STEP, MAX_SCALE_STEP)) for key, size in sizes.items()}
+        settled = all(abs(np.log(step)) < MAX_LOG_SCALE_CHANGE for step in steps.values())
         if settled:
             break
         scales = {key: scales[key] * steps[key] for key in scales}
-        if min(scales.values()) < SMALLEST:
+        if min(scales.values()) < MIN_NOISE_SCALE:
             return None
         try:
             outcome = _solved(inputs, found, scales)
         except EstimationError:
             return None
     shown = _ImuDraws.of(outcome)
-    correlation = max(shown.correlation(kind) for kind in KINDS)
-    own = {kind: scales[kind] for kind in KINDS}
-    return NoiseFit(_scaled(inputs, scales), own, settled, correlation, max(map(shown.variation, KINDS)))
+    correlation = max(shown.correlation(kind) for kind in IMU_KINDS)
+    own = {kind: scales[kind] for kind in IMU_KINDS}
+    return NoiseFit(_scaled(inputs, scales), own, settled, correlation, max(map(shown.variation, IMU_KINDS)))
 
 
 def _scaled(inputs: Inputs, scales: dict[str, float]) -> ImuNoise:
     assert inputs.rig.imu is not None
-    n, (gyro, accel) = inputs.rig.imu.noise, (scales[kind] for kind in KINDS)
+    n, (gyro, accel) = inputs.rig.imu.noise, (scales[kind] for kind in IMU_KINDS)
     return replace(
         n, gyro=gyro * n.gyro, gyro_walk=gyro * n.gyro_walk, accel=accel * n.accel, accel_walk=accel * n.accel_walk
     )
@@ -141,8 +141,8 @@ class _ImuDraws:
         along = []
         for x in outcome.draws.free[:4]:
             there = state.retract(problem.layout, DRAW_STEP * x.chain, DRAW_STEP * x.calib)
-            along.append((look(problem.chain, there).residual - base) / DRAW_STEP)
-        kinds = {k: r for k, r in problem.chain.kinds.items() if k in KINDS}
+            along.append((output_at(problem.chain, there).residual - base) / DRAW_STEP)
+        kinds = {k: r for k, r in problem.chain.kinds.items() if k in IMU_KINDS}
         return cls(kinds, base, tuple(along))
 
     def _left(self, kind: str, rows: slice = slice(None)) -> tuple[int, float, float]:
@@ -154,29 +154,29 @@ class _ImuDraws:
     def size(self, kind: str) -> float:
         """The root of chi^2 over the degrees of freedom, or a lower bound; 1 where these are too few to show more."""
         count, dof, chi2 = self._left(kind)
-        least = LEAST_DOF * np.sqrt(count)
+        least = MIN_DOF_RATIO * np.sqrt(count)
         size = float(np.sqrt(chi2 / max(dof, least)))
         return size if dof > least else max(size, 1.0)
 
     def correlation(self, kind: str) -> float:
-        """Mean over LAGS, over what is allowed."""
+        """Mean over N_LAGS, over what is allowed."""
         columns, (count, dof, chi2) = self.rows[kind], self._left(kind)
         total = 0.0
-        for lag in range(1, LAGS + 1):
+        for lag in range(1, N_LAGS + 1):
             r, made = self.residual[:, columns], [a[:, columns] for a in self.along]
             total += float((r[lag:] * r[:-lag]).sum()) * dof / max(chi2, 1e-300)
             total += float(np.mean([(a[lag:] * a[:-lag]).sum() for a in made]))
         dof = max(dof, 1.0)
-        return abs(total) / LAGS / dof / max(WHITE, CHANCE * np.sqrt(count / LAGS) / dof)
+        return abs(total) / N_LAGS / dof / max(MAX_CORRELATION, CHANCE_SIGMAS * np.sqrt(count / N_LAGS) / dof)
 
     def variation(self, kind: str) -> float:
         """The segment that departs most from the whole, in logarithms, over what is allowed."""
         _, dof, chi2 = self._left(kind)
         worst, whole = 0.0, chi2 / max(dof, 1.0)
-        for own in np.array_split(np.arange(len(self.residual)), SEGMENTS):
+        for own in np.array_split(np.arange(len(self.residual)), N_NOISE_SEGMENTS):
             n, left, size = self._left(kind, slice(int(own[0]), int(own[-1]) + 1) if len(own) else slice(0))
-            if left > LEAST_DOF * np.sqrt(max(n, 1)):
-                allowed = np.log(VARIES) + CHANCE * np.sqrt(2.0 / left)
+            if left > MIN_DOF_RATIO * np.sqrt(max(n, 1)):
+                allowed = np.log(MAX_VARIATION) + CHANCE_SIGMAS * np.sqrt(2.0 / left)
                 worst = max(worst, abs(np.log(max(size / left / whole, 1e-12))) / allowed)
         return float(worst)
 
@@ -184,10 +184,10 @@ class _ImuDraws:
 def are_noise(rows: np.ndarray) -> bool:
     """Whether rows (n, m) of residuals, most of whose degrees of freedom the fit left, are white and constant."""
     n, square = len(rows), float((rows**2).sum())
-    if n < 2 * SEGMENTS or square == 0.0:
+    if n < 2 * N_NOISE_SEGMENTS or square == 0.0:
         return False
-    lags = [float((rows[lag:] * rows[:-lag]).sum()) / square for lag in range(1, LAGS + 1)]
-    white = abs(np.mean(lags)) < max(WHITE, CHANCE / np.sqrt(LAGS * rows.size))
-    sizes = [float(np.mean(own**2)) / (square / rows.size) for own in np.array_split(rows, SEGMENTS)]
-    allowed = np.log(VARIES) + CHANCE * np.sqrt(2.0 * SEGMENTS / rows.size)
+    lags = [float((rows[lag:] * rows[:-lag]).sum()) / square for lag in range(1, N_LAGS + 1)]
+    white = abs(np.mean(lags)) < max(MAX_CORRELATION, CHANCE_SIGMAS / np.sqrt(N_LAGS * rows.size))
+    sizes = [float(np.mean(own**2)) / (square / rows.size) for own in np.array_split(rows, N_NOISE_SEGMENTS)]
+    allowed = np.log(MAX_VARIATION) + CHANCE_SIGMAS * np.sqrt(2.0 * N_NOISE_SEGMENTS / rows.size)
     return bool(white and max(abs(np.log(max(s, 1e-12))) for s in sizes) < allowed)

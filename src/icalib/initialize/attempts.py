@@ -16,18 +16,18 @@ import numpy as np
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimate.evidence.evidence import chi2_by_kind
 from icalib.estimate.problem.groups import groups_of, with_groups
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Step, Visit
 from icalib.estimate.problem.problem import Problem
+from icalib.estimate.residual_statistics.fit_statistics import chi2_by_kind
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.initialize.steps.contradicted_guesses import FarOffError, is_contradicted, refusing_far_off
 from icalib.initialize.steps.initializer import kinds_of, motion_kinds
 from icalib.observability.contradictions import Contradiction, contradicted_by
 from icalib.observability.determination import Determined, determine
 from icalib.optim.arrowhead import NotDefiniteError
-from icalib.optim.pages import give_back
+from icalib.optim.memory import trim_heap
 from icalib.rig import LENS, Parameter, Rig, Sensor
 
 POOR_FIT_RATIO = 4.0  # RMS residual over stated noise of some kind of residuals
@@ -121,7 +121,7 @@ def _make_attempt(
 ) -> Attempt:
     """Initial guess and estimate of one rig. Raises EstimationError."""
     inputs, state, guess = guess_of_rig(rig, recordings, lap)
-    give_back()
+    trim_heap()
     with ExitStack() as explaining:
         for kind in kinds_of(rig):
             explaining.enter_context(kind.explaining(inputs))

@@ -13,11 +13,11 @@ from icalib.data.joining import Part
 from icalib.data.measurements import Measurements
 from icalib.model.bodies import Bodies
 from icalib.model.statistics import PassEnd, ResidualStatistics
-from icalib.motion.clocks import instants
 from icalib.motion.clouds import Clouds
 from icalib.motion.factor import Factor, FactorKey
 from icalib.motion.imu_data import ImuData
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import Entry, Key, Layout, State
 from icalib.rig import ParameterSpec, Rig, Sensor, Settings
 from icalib.sensors import SENSOR_KINDS, facet
@@ -39,7 +39,7 @@ class Pass:
     clouds: Clouds
     layout: Layout
     state: State
-    motion: Motion | None
+    motion: EstimatedMotion | None
     starts: tuple[int, ...]
     measurements: Measurements
     parts: tuple[Part, ...]

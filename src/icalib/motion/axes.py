@@ -6,9 +6,10 @@ import numpy as np
 
 from icalib.geometry import so3
 
-HARDLY = 0.1  # of the RMS rate about the strongest axis: the data say little of what rotation about the axis shows
-ALONG = 0.9  # component of a unit vector: above it, the direction is called by the axis' name
-_FEWEST = 2  # keyframes
+# of the RMS rate about the strongest axis: the data say little of what rotation about the axis shows
+WEAK_AXIS_RATIO = 0.1
+NAMED_AXIS_COSINE = 0.9  # component of a unit vector: above it, the direction is called by the axis' name
+MIN_KEYFRAMES_FOR_AXES = 2  # keyframes
 
 
 def hardly_turned(seconds: np.ndarray, rotation: np.ndarray, body: str) -> str:
@@ -16,13 +17,13 @@ def hardly_turned(seconds: np.ndarray, rotation: np.ndarray, body: str) -> str:
 
     seconds (K,), rotation (K, 3, 3) R_world_body: its keyframes. Steps back in time, between recordings, do not count.
     """
-    if len(seconds) < _FEWEST:
+    if len(seconds) < MIN_KEYFRAMES_FOR_AXES:
         return ""
     step = np.diff(seconds)
     turn = so3.log_many(np.ascontiguousarray(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]))
     rate = turn[step > 0.0] / np.sqrt(step[step > 0.0])[:, None]
     squares, axes = np.linalg.eigh(rate.T @ rate)
-    weak = np.sqrt(np.maximum(squares, 0.0)) < HARDLY * np.sqrt(max(squares[-1], 0.0))
+    weak = np.sqrt(np.maximum(squares, 0.0)) < WEAK_AXIS_RATIO * np.sqrt(max(squares[-1], 0.0))
     if not weak.any():
         return ""
     return axis_words(body, axes[:, 0]) if weak.sum() == 1 else other_axes(body, axes[:, -1])
@@ -31,7 +32,7 @@ def hardly_turned(seconds: np.ndarray, rotation: np.ndarray, body: str) -> str:
 def axis_words(body: str, direction: np.ndarray | tuple[float, float, float]) -> str:
     """A unit vector (3,) in the axes of `body`, as "the z axis of imu0" where it is near one."""
     k = int(np.argmax(np.abs(direction)))
-    if abs(direction[k]) > ALONG:
+    if abs(direction[k]) > NAMED_AXIS_COSINE:
         return f"the {'xyz'[k]} axis of {body}"
     return f"the direction {_numbers(direction)} in the axes of {body}"
 
@@ -39,7 +40,7 @@ def axis_words(body: str, direction: np.ndarray | tuple[float, float, float]) ->
 def other_axes(body: str, direction: np.ndarray | tuple[float, float, float]) -> str:
     """The two axes perpendicular to a unit vector (3,) in the axes of `body`, as "the x and y axes of imu0"."""
     k = int(np.argmax(np.abs(direction)))
-    if abs(direction[k]) > ALONG:
+    if abs(direction[k]) > NAMED_AXIS_COSINE:
         return f"the {' and '.join(c for c in 'xyz' if c != 'xyz'[k])} axes of {body}"
     return f"two axes perpendicular to the direction {_numbers(direction)} in the axes of {body}"
 

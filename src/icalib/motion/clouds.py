@@ -12,7 +12,7 @@ from icalib.motion.point_planes import count_points
 from icalib.optim.state import Entry, Key
 from icalib.rig.scene import PLANE
 
-FEWEST_POINTS = 100  # of a plane
+MIN_PLANE_POINTS = 100  # of a plane
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def known_planes(streams: Sequence[LidarStream]) -> Clouds:
     """The association that streams come with, planes with few points left out."""
     most = max((int(s.plane.max(initial=-1)) for s in streams), default=-1) + 1
     count = sum((count_points(s.plane, most) for s in streams), np.zeros(most, dtype=np.int64))
-    used = np.flatnonzero(count >= FEWEST_POINTS)
+    used = np.flatnonzero(count >= MIN_PLANE_POINTS)
     own = np.full(most + 1, -1, dtype=np.int32)
     own[used] = np.arange(len(used))
     return Clouds(tuple(f"plane {k}" for k in used), tuple(own[s.plane] for s in streams))

@@ -59,7 +59,7 @@ class ResidualRows:
         return np.where(self.root > 0.0, self.whitened * self.root, 0.0)
 
 
-class Along(NamedTuple):
+class StateDifference(NamedTuple):
     """A step from `start`, scaled by `share`, that ends at `end`; for difference quotients of residuals. The share is
     small enough for residuals to be linear."""
 
@@ -111,7 +111,7 @@ class Factor(Protocol):
         """The residuals of each kind, `out` at `state`."""
         ...
 
-    def spent(self, out: Any, along: Along) -> dict[FitKey, float]:
+    def dof_used(self, out: Any, along: StateDifference) -> dict[FitKey, float]:
         """|J x|^2 of each kind of residual for the step x, `out` at its start: of a draw x from the posterior, the mean
         is the number of parameters that these residuals pay for."""
         ...
@@ -120,11 +120,11 @@ class Factor(Protocol):
         """The same measurements, at the motion that other readings give."""
         ...
 
-    def throwaway(self) -> Any:
+    def discarded_output(self) -> Any:
         """Output for one piece that nobody will read."""
         ...
 
-    def scratch(self, out: Any) -> Any:
+    def reusable_output(self, out: Any) -> Any:
         """`out`, of this factor or of the one that it was cut from, to be filled once more."""
         ...
 
@@ -136,7 +136,7 @@ class Factor(Protocol):
         """The same measurements, of which none ties keyframes on both sides of one of `keyframes`."""
         ...
 
-    def settled(self, out: Any) -> Self:
+    def warm_started(self, out: Any) -> Self:
         """The same factor, which first looks for what it eliminates where `out` found it."""
         ...
 
@@ -152,12 +152,12 @@ class FactorDefaults:
         factor: Any = self
         return replace(factor, imu=imu)
 
-    def throwaway(self) -> Any:
+    def discarded_output(self) -> Any:
         """See `Factor`."""
         factor: Any = self
         return factor.output()
 
-    def scratch(self, out: Any) -> Any:
+    def reusable_output(self, out: Any) -> Any:
         """See `Factor`."""
         return out
 
@@ -171,7 +171,7 @@ class FactorDefaults:
         del state, keyframes
         return self
 
-    def settled(self, out: Any) -> Self:
+    def warm_started(self, out: Any) -> Self:
         """See `Factor`."""
         del out
         return self
@@ -274,13 +274,13 @@ class RowFactor(FactorDefaults):
         """See `Factor`."""
         return {(self.name, kind): RawSize(*self.rms(out, kind)) for kind in self.kinds}
 
-    def spent(self: _HasRows, out: Whitened, along: Along) -> dict[FitKey, float]:
+    def dof_used(self: _HasRows, out: Whitened, along: StateDifference) -> dict[FitKey, float]:
         """See `Factor`."""
-        slope = (look(self, along.end).residual - out.residual) / along.share * out.root
+        slope = (output_at(self, along.end).residual - out.residual) / along.share * out.root
         return {(self.name, kind): float((slope[:, r] ** 2).sum()) for kind, r in self.kinds.items()}
 
 
-def look(factor: Any, state: State) -> Any:
+def output_at(factor: Any, state: State) -> Any:
     """A factor's output at `state`, the chain cut where `make_pieces` cuts it."""
     out = factor.output()
     pieces = make_pieces(len(state.seconds), None)

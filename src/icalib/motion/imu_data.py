@@ -12,12 +12,13 @@ from icalib.data.measurements import ImuStream, Measurements
 from icalib.data.stamps.clocks import usual_step
 from icalib.rig import ImuNoise, Rig
 
-GAP_S, GAP = 0.01, 3.0  # an interval longer than both this and so many periods is a gap
+MIN_GAP_S, MIN_GAP_PERIODS = 0.01, 3.0  # an interval longer than both this and so many periods is a gap
 # Within a gap the motion goes on unseen: what is not known of rate and force, their spread over the recording,
 # is taken to stay correlated for this long.
 MOTION_CORRELATION_S = 0.1
-DENSE_S = 0.025  # with 20 Hz, jumping rates moved a time offset by a whole step; with 100 Hz, steady ones by 0.6 ms
-WITHIN = 1e-4  # keeps the covariance of a stretch without a stamp in it definite; nothing else
+# with 20 Hz, jumping rates moved a time offset by a whole step; with 100 Hz, steady ones by 0.6 ms
+MAX_DENSE_PERIOD_S = 0.025
+WITHIN_INTERVAL_SHARE = 1e-4  # keeps the covariance of a stretch without a stamp in it definite; nothing else
 
 
 def clear_of(gaps: Iterable[tuple[float, float]], start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -58,8 +59,8 @@ class ImuData:
     def build(cls, stream: ImuStream, noise: ImuNoise, forwards: bool = False) -> ImuData:
         t = stream.seconds
         dt = np.diff(t)
-        variance = np.tile([noise.gyro**2, noise.accel**2, WITHIN * noise.accel**2], (len(dt), 1))
-        gap = dt > max(GAP_S, GAP * _period(t))
+        variance = np.tile([noise.gyro**2, noise.accel**2, WITHIN_INTERVAL_SHARE * noise.accel**2], (len(dt), 1))
+        gap = dt > max(MIN_GAP_S, MIN_GAP_PERIODS * _period(t))
         gyro, accel = stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0
         variance[gap] += 2.0 * MOTION_CORRELATION_S * np.array([gyro, accel, accel])
         # A step of integration holds biases still; what their walk makes of so long a one is white noise here.
@@ -104,7 +105,7 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
 
 def _is_dense(measurements: Measurements) -> bool:
     """Whether the body's poses, where there is no IMU, come so fast that rates may jump at keyframes."""
-    return float(np.median(np.diff(measurements.body.seconds))) <= DENSE_S
+    return float(np.median(np.diff(measurements.body.seconds))) <= MAX_DENSE_PERIOD_S
 
 
 def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> ImuData | None:

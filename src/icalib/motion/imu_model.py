@@ -15,8 +15,8 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, tmul3
 
-_ROW = np.array([0, 1, 1, 2, 2, 2])
-_COL = np.array([0, 0, 1, 0, 1, 2])
+_LOWER_ROW = np.array([0, 1, 1, 2, 2, 2])
+_LOWER_COLUMN = np.array([0, 0, 1, 0, 1, 2])
 
 
 @njit(cache=True, nogil=True)
@@ -46,8 +46,8 @@ def correction_matrices(intrinsics):
     """Matrices that undo the model: f = F (accel - b_a), w = G (gyro - b_g) + H (accel - b_a); returns F, G, H."""
     ma, mg = np.eye(3), np.eye(3)
     for n in range(6):
-        ma[_ROW[n], _COL[n]] += intrinsics[n]
-        mg[_ROW[n], _COL[n]] += intrinsics[6 + n]
+        ma[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[n]
+        mg[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[6 + n]
     F = _lower_inverse(ma)
     C = so3.exp(intrinsics[12:15])
     G = tmul3(C, _lower_inverse(mg))

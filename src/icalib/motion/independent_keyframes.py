@@ -9,12 +9,10 @@ import numpy as np
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece
-from icalib.optim.state import KEYFRAME_DIM, State
+from icalib.optim.state import KEYFRAME_DIM, POSE_DIM, State
 
-POSE = 6
-WEAK = (
-    1e-9  # information [1/rad^2, 1/m^2]: keeps a keyframe defined whose corners were all rejected; steers nothing else
-)
+# information [1/rad^2, 1/m^2]: keeps a keyframe defined whose corners were all rejected; steers nothing else
+WEAK_POSE_INFORMATION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class IndependentKeyframes(RowFactor):
         """Defines what corners leave open in the keyframes of `piece`. Returns half a chi^2 of nothing."""
         del state, out, curved
         if sums:
-            own = np.concatenate([np.full(POSE, WEAK), np.ones(KEYFRAME_DIM - POSE)])
+            own = np.concatenate([np.full(POSE_DIM, WEAK_POSE_INFORMATION), np.ones(KEYFRAME_DIM - POSE_DIM)])
             piece.diagonal[:, range(KEYFRAME_DIM), range(KEYFRAME_DIM)] += own
         return 0.0
 

@@ -15,7 +15,21 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.motion.imu_data import ImuData
-from icalib.motion.integration_step import SIZE, STRIDE, F, G, H, J, P, V, add_covariance, matrix, start, step, times
+from icalib.motion.integration_step import (
+    AT_J,
+    AT_P,
+    AT_V,
+    J_STRIDE,
+    ROW_F,
+    ROW_G,
+    ROW_H,
+    RUN_SIZE,
+    add_covariance,
+    matrix,
+    start,
+    step,
+    times,
+)
 
 
 class Readings(NamedTuple):
@@ -58,13 +72,13 @@ def _corrected(gyro, accel, j, share, bias, by):
         accel[j, 1] + share * (accel[j + 1, 1] - accel[j, 1]) - bias[4],
         accel[j, 2] + share * (accel[j + 1, 2] - accel[j, 2]) - bias[5],
     )
-    A, B = matrix(by, G), matrix(by, H)
+    A, B = matrix(by, ROW_G), matrix(by, ROW_H)
     rate = (
         A[0] * w[0] + B[0] * f[0] + (A[1] * w[1] + B[1] * f[1]) + (A[2] * w[2] + B[2] * f[2]),
         A[3] * w[0] + B[3] * f[0] + (A[4] * w[1] + B[4] * f[1]) + (A[5] * w[2] + B[5] * f[2]),
         A[6] * w[0] + B[6] * f[0] + (A[7] * w[1] + B[7] * f[1]) + (A[8] * w[2] + B[8] * f[2]),
     )
-    return rate, times(matrix(by, F), f)
+    return rate, times(matrix(by, ROW_F), f)
 
 
 @njit(cache=True, nogil=True)
@@ -109,15 +123,15 @@ def _share(t, j, at):
 def finish(run, cov, out):
     """Fills `out`, an `Increment`, with what `run` and `cov` have."""
     for i in range(3):
-        out.v[i], out.p[i] = run[V + i], run[P + i]
+        out.v[i], out.p[i] = run[AT_V + i], run[AT_P + i]
         for k in range(3):
             out.R[i, k] = run[3 * i + k]
     for i in range(9):
         for c in range(out.J.shape[1]):
-            out.J[i, c] = run[J + STRIDE * i + c]
+            out.J[i, c] = run[AT_J + J_STRIDE * i + c]
     for i in range(len(out.P)):
         for c in range(15):
-            out.P[i, c] = cov[J + STRIDE * i + c]
+            out.P[i, c] = cov[AT_J + J_STRIDE * i + c]
 
 
 @njit(cache=True, nogil=True)
@@ -140,8 +154,8 @@ def integrate(t0, t1, first, bias, readings, by, room, out):
 
 @njit(cache=True, nogil=True)
 def integration_room(n):
-    """What `integrate` needs on its way; n: COVARIANCE where a covariance is wanted, or else 0."""
-    return np.empty(SIZE), np.empty(n), np.empty(n)
+    """What `integrate` needs on its way; n: COVARIANCE_SIZE where a covariance is wanted, or else 0."""
+    return np.empty(RUN_SIZE), np.empty(n), np.empty(n)
 
 
 def readings_of(imu: ImuData, linear: bool) -> Readings:

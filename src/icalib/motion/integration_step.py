@@ -20,28 +20,29 @@ from icalib.motion.imu_model import correction_matrices, sensitivity
 
 _1_12, _1_48, _1_60, _1_99, _1_180, _1_360 = (1.0 / n for n in (12.0, 48.0, 60.0, 99.0, 180.0, 360.0))
 _1_1260, _1_10080, _3_112, _2_135, _2_165 = 1.0 / 1260.0, 1.0 / 10080.0, 3.0 / 112.0, 2.0 / 135.0, 2.0 / 165.0
-F, G, H, AXES, AXES_JACOBIAN, SENSITIVITY = range(6)  # rows of a `correction`
-# What is on its way is one array, `run`: R row by row, v, p; derivatives of a step, STEP numbers a row, by rate, force
-# and both biases, at D; of rate and force by the IMU intrinsics, STRIDE numbers a row, at E; J, STRIDE numbers a row,
-# of which `width` count: 6 biases, 24 IMU intrinsics. As the compiler knows the distance from row to row, it takes
-# several columns at a time.
-V, P, D, E, J, STEP, STRIDE = 9, 12, 15, 128, 320, 12, 32
-SIZE = J + 9 * STRIDE
-# The covariance of rotation, velocity, position and biases has its rows at the same places as J.
-COVARIANCE = J + 15 * STRIDE
+ROW_F, ROW_G, ROW_H, ROW_C, ROW_JR, ROW_GA = range(6)  # rows of a `correction`
+# What is on its way is one array, `run`: R row by row, v, p; derivatives of a step, STEP_STRIDE numbers a row, by rate,
+# force and both biases, at AT_STEP; of rate and force by the IMU intrinsics, J_STRIDE numbers a row, at AT_INTRINSICS;
+# AT_J, J_STRIDE numbers a row, of which `width` count: 6 biases, 24 IMU intrinsics. As the compiler knows the distance
+# from row to row, it takes several columns at a time.
+AT_V, AT_P, AT_STEP, AT_INTRINSICS, AT_J, STEP_STRIDE, J_STRIDE = 9, 12, 15, 128, 320, 12, 32
+RUN_SIZE = AT_J + 9 * J_STRIDE
+# The covariance of rotation, velocity, position and biases has its rows at the same places as AT_J.
+COVARIANCE_SIZE = AT_J + 15 * J_STRIDE
 
 
 @njit(cache=True, nogil=True)
 def start(run):
     """No motion yet."""
-    for i in range(SIZE):
+    for i in range(RUN_SIZE):
         run[i] = 0.0
     run[0] = run[4] = run[8] = 1.0
 
 
 @njit(cache=True, nogil=True)
 def correction(intrinsics):
-    """(6, 9) matrices row by row: F, G, H, see `correction_matrices`; C = Exp(r), J_r(r) and G A_g, see `imu_model`."""
+    """(6, 9) matrices row by row: ROW_F, ROW_G, ROW_H, see `correction_matrices`; C = Exp(r), J_r(r) and ROW_G A_g, see
+    `imu_model`."""
     r, by = intrinsics[12:15], np.empty((6, 9))
     F_, G_, H_ = correction_matrices(intrinsics)
     matrices = F_, G_, H_, so3.exp(r), so3.right_jacobian(r), mul3(G_, sensitivity(intrinsics))
@@ -153,8 +154,8 @@ def _series_slope(phi, f, products, c1, c2, d1, d2):
 def step(rate, force, dt, by, run, width):
     """Advances `run` by dt (either sign) of constant body `rate` and specific `force`; returns what `carry` needs.
 
-    run: the increments and their derivatives, laid out as at V, P, ... above. by: see `correction`; read only if
-    derivatives are wanted. width, columns of J that are advanced: 0 none, 6 biases, more: IMU intrinsics too."""
+    run: the increments and their derivatives, laid out as at AT_V, AT_P, ... above. by: see `correction`; read only if
+    derivatives are wanted. width, columns of AT_J that are advanced: 0 none, 6 biases, more: IMU intrinsics too."""
     phi = rate[0] * dt, rate[1] * dt, rate[2] * dt
     x = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s0, s1, s2, s3 = so3.jacobian_coefficients(x)
@@ -177,8 +178,8 @@ def step(rate, force, dt, by, run, width):
         row = run[3 * i], run[3 * i + 1], run[3 * i + 2]
         run[3 * i], run[3 * i + 1], run[3 * i + 2] = row_times(row, turn)
     for i in range(3):
-        run[P + i] += run[V + i] * dt + dt * dt * p[i]
-        run[V + i] += dt * v[i]
+        run[AT_P + i] += run[AT_V + i] * dt + dt * dt * p[i]
+        run[AT_V + i] += dt * v[i]
     return turn, by_turn
 
 
@@ -201,15 +202,15 @@ def _scaled(s, m):
 @njit(cache=True, nogil=True)
 def _fill_step(dt, G1, G2, slope1, slope2, by, run):
     """Fills the derivatives of a step by rate, force and biases; slope1, slope2: of G1 f and G2 f by phi."""
-    C_f, C_w, C_wf = matrix(by, F), matrix(by, G), matrix(by, H)
+    C_f, C_w, C_wf = matrix(by, ROW_F), matrix(by, ROW_G), matrix(by, ROW_H)
     for i in range(3):
         R = run[3 * i], run[3 * i + 1], run[3 * i + 2]
         # The right Jacobian is the transpose of the left one, G1.
         turn = (G1[0], G1[3], G1[6]) if i == 0 else ((G1[1], G1[4], G1[7]) if i == 1 else (G1[2], G1[5], G1[8]))
         v, p, v_force, p_force = row_times(R, slope1), row_times(R, slope2), row_times(R, G1), row_times(R, G2)
-        _fill_row(D + STEP * i, dt, turn, 0.0, turn, C_f, C_w, C_wf, run)
-        _fill_row(D + STEP * (3 + i), dt * dt, v, dt, v_force, C_f, C_w, C_wf, run)
-        _fill_row(D + STEP * (6 + i), dt * dt * dt, p, dt * dt, p_force, C_f, C_w, C_wf, run)
+        _fill_row(AT_STEP + STEP_STRIDE * i, dt, turn, 0.0, turn, C_f, C_w, C_wf, run)
+        _fill_row(AT_STEP + STEP_STRIDE * (3 + i), dt * dt, v, dt, v_force, C_f, C_w, C_wf, run)
+        _fill_row(AT_STEP + STEP_STRIDE * (6 + i), dt * dt * dt, p, dt * dt, p_force, C_f, C_w, C_wf, run)
 
 
 @njit(cache=True, nogil=True)
@@ -227,101 +228,107 @@ def _fill_row(o, s, by_rate, t, by_force, C_f, C_w, C_wf, run):
 
 @njit(cache=True, nogil=True)
 def carry(turn, by_turn, dt, width, x):
-    """Rows of J in x: errors after a step from those before it, what the step itself adds aside."""
+    """Rows of AT_J in x: errors after a step from those before it, what the step itself adds aside."""
     E0, E1, E2, E3, E4, E5, E6, E7, E8 = turn
     A0, A1, A2, A3, A4, A5, A6, A7, A8 = by_turn[0]
     B0, B1, B2, B3, B4, B5, B6, B7, B8 = by_turn[1]
     for j in range(width):
-        a, b, c = x[J + j], x[J + STRIDE + j], x[J + 2 * STRIDE + j]
-        v0, v1, v2 = x[J + 3 * STRIDE + j], x[J + 4 * STRIDE + j], x[J + 5 * STRIDE + j]
-        x[J + 6 * STRIDE + j] += dt * v0 + B0 * a + B1 * b + B2 * c
-        x[J + 7 * STRIDE + j] += dt * v1 + B3 * a + B4 * b + B5 * c
-        x[J + 8 * STRIDE + j] += dt * v2 + B6 * a + B7 * b + B8 * c
-        x[J + 3 * STRIDE + j] = v0 + (A0 * a + A1 * b + A2 * c)
-        x[J + 4 * STRIDE + j] = v1 + (A3 * a + A4 * b + A5 * c)
-        x[J + 5 * STRIDE + j] = v2 + (A6 * a + A7 * b + A8 * c)
-        x[J + j] = E0 * a + E3 * b + E6 * c
-        x[J + STRIDE + j] = E1 * a + E4 * b + E7 * c
-        x[J + 2 * STRIDE + j] = E2 * a + E5 * b + E8 * c
+        a, b, c = x[AT_J + j], x[AT_J + J_STRIDE + j], x[AT_J + 2 * J_STRIDE + j]
+        v0, v1, v2 = x[AT_J + 3 * J_STRIDE + j], x[AT_J + 4 * J_STRIDE + j], x[AT_J + 5 * J_STRIDE + j]
+        x[AT_J + 6 * J_STRIDE + j] += dt * v0 + B0 * a + B1 * b + B2 * c
+        x[AT_J + 7 * J_STRIDE + j] += dt * v1 + B3 * a + B4 * b + B5 * c
+        x[AT_J + 8 * J_STRIDE + j] += dt * v2 + B6 * a + B7 * b + B8 * c
+        x[AT_J + 3 * J_STRIDE + j] = v0 + (A0 * a + A1 * b + A2 * c)
+        x[AT_J + 4 * J_STRIDE + j] = v1 + (A3 * a + A4 * b + A5 * c)
+        x[AT_J + 5 * J_STRIDE + j] = v2 + (A6 * a + A7 * b + A8 * c)
+        x[AT_J + j] = E0 * a + E3 * b + E6 * c
+        x[AT_J + J_STRIDE + j] = E1 * a + E4 * b + E7 * c
+        x[AT_J + 2 * J_STRIDE + j] = E2 * a + E5 * b + E8 * c
 
 
 @njit(cache=True, nogil=True)
 def _add_biases(run):
     for i in range(9):
         for j in range(6):
-            run[J + STRIDE * i + j] += run[D + STEP * i + 6 + j]
+            run[AT_J + J_STRIDE * i + j] += run[AT_STEP + STEP_STRIDE * i + 6 + j]
 
 
 @njit(cache=True, nogil=True)
 def fill_intrinsics(rate, force, by, run):
-    """Fills the derivatives of corrected rate (three rows) and force (three rows), from number E on, by the 24 IMU
-    intrinsics, see `imu_model`; what does not depend on one is zero already."""
-    u, turn = times(matrix(by, AXES), rate), _cross_product(rate, matrix(by, AXES_JACOBIAN))
+    """Fills the derivatives of corrected rate (three rows) and force (three rows), from number AT_INTRINSICS on, by the
+    24 IMU intrinsics, see `imu_model`; what does not depend on one is zero already."""
+    u, turn = times(matrix(by, ROW_C), rate), _cross_product(rate, matrix(by, ROW_JR))
     f, lower = force, (force[0], force[0], force[1], force[0], force[1], force[2])
     for i in range(3):
-        F0, F1, F2 = by[F, 3 * i], by[F, 3 * i + 1], by[F, 3 * i + 2]
-        o = E + STRIDE * (3 + i)
+        F0, F1, F2 = by[ROW_F, 3 * i], by[ROW_F, 3 * i + 1], by[ROW_F, 3 * i + 2]
+        o = AT_INTRINSICS + J_STRIDE * (3 + i)
         run[o], run[o + 1], run[o + 2] = -F0 * lower[0], -F1 * lower[1], -F1 * lower[2]
         run[o + 3], run[o + 4], run[o + 5] = -F2 * lower[3], -F2 * lower[4], -F2 * lower[5]
     for i in range(3):
-        S0, S1, S2 = by[SENSITIVITY, 3 * i], by[SENSITIVITY, 3 * i + 1], by[SENSITIVITY, 3 * i + 2]
-        G0, G1, G2 = by[G, 3 * i], by[G, 3 * i + 1], by[G, 3 * i + 2]
-        o, q = E + STRIDE * i, E + STRIDE * 3
+        S0, S1, S2 = by[ROW_GA, 3 * i], by[ROW_GA, 3 * i + 1], by[ROW_GA, 3 * i + 2]
+        G0, G1, G2 = by[ROW_G, 3 * i], by[ROW_G, 3 * i + 1], by[ROW_G, 3 * i + 2]
+        o, q = AT_INTRINSICS + J_STRIDE * i, AT_INTRINSICS + J_STRIDE * 3
         for n in range(6):
-            run[o + n] = -(S0 * run[q + n] + S1 * run[q + STRIDE + n] + S2 * run[q + 2 * STRIDE + n])
+            run[o + n] = -(S0 * run[q + n] + S1 * run[q + J_STRIDE + n] + S2 * run[q + 2 * J_STRIDE + n])
         run[o + 6], run[o + 7], run[o + 8] = -G0 * u[0], -G1 * u[0], -G1 * u[1]
         run[o + 9], run[o + 10], run[o + 11] = -G2 * u[0], -G2 * u[1], -G2 * u[2]
         run[o + 15], run[o + 16], run[o + 17] = -G0 * f[0], -G0 * f[1], -G0 * f[2]
         run[o + 18], run[o + 19], run[o + 20] = -G1 * f[0], -G1 * f[1], -G1 * f[2]
         run[o + 21], run[o + 22], run[o + 23] = -G2 * f[0], -G2 * f[1], -G2 * f[2]
     for k in range(3):
-        run[E + 12 + k], run[E + STRIDE + 12 + k], run[E + 2 * STRIDE + 12 + k] = turn[k], turn[3 + k], turn[6 + k]
+        (
+            run[AT_INTRINSICS + 12 + k],
+            run[AT_INTRINSICS + J_STRIDE + 12 + k],
+            run[AT_INTRINSICS + 2 * J_STRIDE + 12 + k],
+        ) = turn[k], turn[3 + k], turn[6 + k]
 
 
 @njit(cache=True, nogil=True)
 def _add_intrinsics(run):
-    """J += what the step adds by the IMU intrinsics."""
+    """AT_J += what the step adds by the IMU intrinsics."""
     for i in range(9):
-        o, d = STRIDE * i + 6, D + STEP * i
+        o, d = J_STRIDE * i + 6, AT_STEP + STEP_STRIDE * i
         a, b, c = run[d], run[d + 1], run[d + 2]
         for j in range(24):
-            x = run[J + o + j] + a * run[E + j]
-            run[J + o + j] = x + b * run[E + STRIDE + j] + c * run[E + 2 * STRIDE + j]
+            x = run[AT_J + o + j] + a * run[AT_INTRINSICS + j]
+            run[AT_J + o + j] = x + b * run[AT_INTRINSICS + J_STRIDE + j] + c * run[AT_INTRINSICS + 2 * J_STRIDE + j]
     for i in range(3, 9):
-        o, d = STRIDE * i + 6, D + STEP * i + 3
+        o, d = J_STRIDE * i + 6, AT_STEP + STEP_STRIDE * i + 3
         a, b, c = run[d], run[d + 1], run[d + 2]
         for j in range(6):  # those of the accelerometer
-            x = run[J + o + j] + a * run[E + 3 * STRIDE + j]
-            run[J + o + j] = x + b * run[E + 4 * STRIDE + j] + c * run[E + 5 * STRIDE + j]
+            x = run[AT_J + o + j] + a * run[AT_INTRINSICS + 3 * J_STRIDE + j]
+            run[AT_J + o + j] = (
+                x + b * run[AT_INTRINSICS + 4 * J_STRIDE + j] + c * run[AT_INTRINSICS + 5 * J_STRIDE + j]
+            )
 
 
 @njit(cache=True, nogil=True)
 def add_covariance(turn, by_turn, dt, variance, walk, run, cov, cov_t):
-    """cov, see COVARIANCE, after the step of `run` that gave turn and by_turn; cov_t: room.
+    """cov, see COVARIANCE_SIZE, after the step of `run` that gave turn and by_turn; cov_t: room.
 
-    F cov F^T, both halves by the same row operation, and noise. variance (3,): squared densities, see `ImuData`, walk
-    (2,): of the biases' random walks.
+    ROW_F cov ROW_F^T, both halves by the same row operation, and noise. variance (3,): squared densities, see
+    `ImuData`, walk (2,): of the biases' random walks.
     """
     for half in range(2):
         source, target = (cov, cov_t) if half == 0 else (cov_t, cov)
         carry(turn, by_turn, dt, 15, source)
         for i in range(9):
             for k in range(6):
-                d = run[D + STEP * i + 6 + k]
+                d = run[AT_STEP + STEP_STRIDE * i + 6 + k]
                 for j in range(15):
-                    source[J + STRIDE * i + j] += d * source[J + STRIDE * (9 + k) + j]
+                    source[AT_J + J_STRIDE * i + j] += d * source[AT_J + J_STRIDE * (9 + k) + j]
         for i in range(15):
             for j in range(15):
-                target[J + STRIDE * i + j] = source[J + STRIDE * j + i]
+                target[AT_J + J_STRIDE * i + j] = source[AT_J + J_STRIDE * j + i]
     for i in range(9):
         for j in range(9):
             s = 0.0
             for k in range(6):
-                s += run[D + STEP * i + 6 + k] * run[D + STEP * j + 6 + k] * variance[k // 3]
-            cov[J + STRIDE * i + j] += s / dt
+                s += run[AT_STEP + STEP_STRIDE * i + 6 + k] * run[AT_STEP + STEP_STRIDE * j + 6 + k] * variance[k // 3]
+            cov[AT_J + J_STRIDE * i + j] += s / dt
     for i in range(6, 9):
         # A force that is not constant within the stretch: white, it moves the position by dt^3 / 3, its mean by
         # dt^3 / 4. Without it position follows velocity exactly where a stretch holds no other stamp (a bridged gap).
-        cov[J + STRIDE * i + i] += variance[2] * dt * dt * dt / 12.0
+        cov[AT_J + J_STRIDE * i + i] += variance[2] * dt * dt * dt / 12.0
     for k in range(6):
-        cov[J + (STRIDE + 1) * (9 + k)] += walk[k // 3] * dt
+        cov[AT_J + (J_STRIDE + 1) * (9 + k)] += walk[k // 3] * dt

@@ -7,7 +7,7 @@ import numpy as np
 from icalib.motion.imu_data import ImuData, clear_of
 
 MERGED_WITHIN_S = 2e-3  # images closer than this share a keyframe
-SLACK = 0.1  # of the spacing: a camera of 20 Hz whose stamps jitter needs no keyframe in between
+SPACING_SLACK = 0.1  # of the spacing: a camera of 20 Hz whose stamps jitter needs no keyframe in between
 
 
 def place_keyframes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max_gap: float) -> np.ndarray:
@@ -25,7 +25,7 @@ def place_keyframes(imu: ImuData, image_times: list[np.ndarray], spacing: float,
 def _filled(times: np.ndarray, spacing: float) -> np.ndarray:
     """Sorted `times` (n,), and instants evenly in between where they are further apart than 1.1 `spacing`."""
     apart = np.diff(times)
-    steps = np.maximum(np.ceil(apart / spacing - SLACK), 1.0).astype(np.int64)
+    steps = np.maximum(np.ceil(apart / spacing - SPACING_SLACK), 1.0).astype(np.int64)
     last = np.cumsum(steps)
     k = np.arange(1, steps.sum() + 1) - np.repeat(last - steps, steps)
     filled = np.append(times[:1], np.repeat(times[:-1], steps) + k * np.repeat(apart / steps, steps))

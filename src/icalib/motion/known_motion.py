@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.motion.poses import Poses, assign_keyframes, poses_at
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
 
-NEAR_KEYFRAME_S = 0.15  # a scan of a LiDAR alone goes on so long after its keyframe
+MAX_KEYFRAME_DISTANCE_S = 0.15  # a scan of a LiDAR alone goes on so long after its keyframe
 
 
 def are_near_keyframes(keyframes: np.ndarray, times: np.ndarray) -> np.ndarray:
     """(n,) whether there is a keyframe near each of the times (n,)."""
     k = np.clip(np.searchsorted(keyframes, times), 1, len(keyframes) - 1)
-    return np.minimum(np.abs(times - keyframes[k - 1]), np.abs(times - keyframes[k])) < NEAR_KEYFRAME_S
+    return np.minimum(np.abs(times - keyframes[k - 1]), np.abs(times - keyframes[k])) < MAX_KEYFRAME_DISTANCE_S
 
 
 def is_known(keyframes: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -21,7 +21,7 @@ def is_known(keyframes: np.ndarray, times: np.ndarray) -> np.ndarray:
     return are_near_keyframes(keyframes, times) & (times >= keyframes[0]) & (times <= keyframes[-1])
 
 
-def imu_poses(motion: Motion, times: np.ndarray) -> Poses:
+def imu_poses(motion: EstimatedMotion, times: np.ndarray) -> Poses:
     """The IMU's poses at times (n,) on its clock, by its readings from the keyframes next to them."""
     keyframe = assign_keyframes("inertial", motion.state.seconds, times)
     return poses_at("inertial", times, keyframe, motion.state, motion.imu, motion.gravity, False)

@@ -6,8 +6,8 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-COARSE_POINTS = 3_000_000  # of a LiDAR, where some of its points will do
-FEW = 20_000  # points of a plane that are all looked at
+MAX_COARSE_POINTS = 3_000_000  # of a LiDAR, where some of its points will do
+MAX_PLANE_POINTS_KEPT_WHOLE = 20_000  # points of a plane that are all looked at
 
 
 @njit(cache=True, nogil=True)
@@ -35,14 +35,14 @@ def _some(plane, step, count, out):
     due = 0
     for i in range(len(plane)):
         q = plane[i]
-        out[i] = q if i == due or (q >= 0 and count[q] < FEW) else -1
+        out[i] = q if i == due or (q >= 0 and count[q] < MAX_PLANE_POINTS_KEPT_WHOLE) else -1
         if i == due:
             due += step
 
 
 def thinned(plane: np.ndarray) -> np.ndarray:
     """(N,) plane of each point, -1 for all but some of very many; by an odd step, or some lasers would be left out."""
-    step = len(plane) // COARSE_POINTS | 1
+    step = len(plane) // MAX_COARSE_POINTS | 1
     if step == 1:
         return plane
     out = np.empty_like(plane)

@@ -19,15 +19,24 @@ from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 from icalib.motion.imu_model import correction_matrices
 from icalib.motion.integration import bias_of, readings_of
-from icalib.motion.integration_step import SIZE, STRIDE, E, J, P, V, correction, fill_intrinsics
+from icalib.motion.integration_step import (
+    AT_INTRINSICS,
+    AT_J,
+    AT_P,
+    AT_V,
+    J_STRIDE,
+    RUN_SIZE,
+    correction,
+    fill_intrinsics,
+)
 from icalib.motion.propagation import (
     Moving,
+    empty_prefix,
     integrate_from_keyframe,
     keyframes_of,
-    nothing_carried,
     place,
+    propagation_query,
     rotation_of,
-    ways_from,
 )
 from icalib.optim.state import KEYFRAME_DIM, State
 from icalib.rig import Scheme
@@ -52,7 +61,7 @@ class Poses:
     J_imu: np.ndarray
 
 
-class Velocities(NamedTuple):
+class VelocityDerivatives(NamedTuple):
     """How the velocity in `Poses` (world, m/s) moves in the `inertial` scheme.
 
     acceleration (n, 3) world m/s^2, its time derivative; J_keyframe (n, 3, 15), J_imu (n, 3, 24 or 0): with respect to
@@ -64,7 +73,7 @@ class Velocities(NamedTuple):
     J_imu: np.ndarray
 
     @classmethod
-    def empty(cls, n: int, n_imu: int) -> Velocities:
+    def empty(cls, n: int, n_imu: int) -> VelocityDerivatives:
         return cls(np.empty((n, 3)), np.zeros((n, 3, KEYFRAME_DIM)), np.zeros((n, 3, n_imu)))
 
 
@@ -82,8 +91,8 @@ def _velocity(i, R, run, force, g, at, moving):
     """Fills entry i of `moving`: increments `run` (see `integration_step`) from a keyframe at R, and `force` at the
     instant."""
     first = 0 * i
-    _fill_start(i, first, R, run, J + 3 * STRIDE, moving.J_keyframe, moving.J_imu)
-    _fill_turn(i, first, R, run, V, moving.J_keyframe)
+    _fill_start(i, first, R, run, AT_J + 3 * J_STRIDE, moving.J_keyframe, moving.J_imu)
+    _fill_turn(i, first, R, run, AT_V, moving.J_keyframe)
     for a in range(3):
         row = at.rotation[i, a, 0], at.rotation[i, a, 1], at.rotation[i, a, 2]
         moving.acceleration[i, a] = row[0] * force[0] + row[1] * force[1] + row[2] * force[2]
@@ -96,17 +105,17 @@ def _fill_pose(i, dt, R, run, Jn, Jx):
     """Fills entry i of the Jacobians of a pose: dt and increments `run` (see `integration_step`) from a keyframe at
     R."""
     first = 0 * i  # an integer and no literal, for which all is compiled once more
-    _fill_start(i, first + 3, R, run, J + 6 * STRIDE, Jn, Jx)
-    _fill_turn(i, first + 3, R, run, P, Jn)
+    _fill_start(i, first + 3, R, run, AT_J + 6 * J_STRIDE, Jn, Jx)
+    _fill_turn(i, first + 3, R, run, AT_P, Jn)
     for a in range(3):
         Jn[i, 3 + a, 3 + a] = 1.0
         Jn[i, 3 + a, 6 + a] = dt
         for c in range(3):
             Jn[i, a, c] = run[3 * c + a]
         for c in range(6):
-            Jn[i, a, 9 + c] = run[J + STRIDE * a + c]
+            Jn[i, a, 9 + c] = run[AT_J + J_STRIDE * a + c]
         for c in range(Jx.shape[2]):
-            Jx[i, a, c] = run[J + STRIDE * a + 6 + c]
+            Jx[i, a, c] = run[AT_J + J_STRIDE * a + 6 + c]
 
 
 @njit(cache=True, nogil=True)
@@ -122,20 +131,20 @@ def _fill_turn(i, r, R, run, o, Jn):
 
 @njit(cache=True, nogil=True)
 def _fill_start(i, r, R, x, o, Jn, Jx):
-    """Rows r.. of Jn[i] and Jx[i] by biases and intrinsics: R times three rows of J in x, from number o on."""
+    """Rows r.. of Jn[i] and Jx[i] by biases and intrinsics: R times three rows of AT_J in x, from number o on."""
     for a in range(3):
         R0, R1, R2 = R[3 * a], R[3 * a + 1], R[3 * a + 2]
         for c in range(6):
-            Jn[i, r + a, 9 + c] = R0 * x[o + c] + R1 * x[o + STRIDE + c] + R2 * x[o + 2 * STRIDE + c]
+            Jn[i, r + a, 9 + c] = R0 * x[o + c] + R1 * x[o + J_STRIDE + c] + R2 * x[o + 2 * J_STRIDE + c]
         for c in range(Jx.shape[2]):
-            Jx[i, r + a, c] = R0 * x[o + 6 + c] + R1 * x[o + STRIDE + 6 + c] + R2 * x[o + 2 * STRIDE + 6 + c]
+            Jx[i, r + a, c] = R0 * x[o + 6 + c] + R1 * x[o + J_STRIDE + 6 + c] + R2 * x[o + 2 * J_STRIDE + 6 + c]
 
 
 @njit(cache=True, nogil=True)
 def _inertial(ways, keyframes, readings, intrinsics, at, Jn, Jx, moving):
     """Fills `at`, a `Moving`, and where they are not empty the Jacobians and `moving`."""
     width = 6 + Jx.shape[2] if len(Jn) else 0
-    by, carried, run = correction(intrinsics), nothing_carried(), np.empty(SIZE)
+    by, carried, run = correction(intrinsics), empty_prefix(), np.empty(RUN_SIZE)
     for i in ways.order:
         k, t = ways.keyframe[i], ways.times[i]
         t0, bias = keyframes.seconds[k], bias_of(keyframes.bias, k)
@@ -153,7 +162,7 @@ def _kinematic(
 ):
     F, G, H = correction_matrices(intrinsics)
     n_x = Jx.shape[2]
-    by, run = correction(intrinsics), np.zeros(SIZE)
+    by, run = correction(intrinsics), np.zeros(RUN_SIZE)
     w, f = np.empty(3), np.empty(3)
     for i in range(len(times)):
         k, j = keyframe[i], first[i]
@@ -183,7 +192,7 @@ def _kinematic(
                     Jn[i, a, 9 + c] -= dt * Jr[a, d] * G[d, c]
                     Jn[i, a, 12 + c] -= dt * Jr[a, d] * H[d, c]
             for c in range(n_x):
-                by_w = run[E + c], run[E + STRIDE + c], run[E + 2 * STRIDE + c]
+                by_w = run[AT_INTRINSICS + c], run[AT_INTRINSICS + J_STRIDE + c], run[AT_INTRINSICS + 2 * J_STRIDE + c]
                 Jx[i, a, c] = dt * (Jr[a, 0] * by_w[0] + Jr[a, 1] * by_w[1] + Jr[a, 2] * by_w[2])
 
 
@@ -228,7 +237,7 @@ def poses_at(
     """IMU poses at `times` (n,) seconds on the imu clock, each from its `keyframe` (see `assign_keyframes`)."""
     n = len(times)
     if scheme == "inertial":
-        return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, Velocities.empty(0, 0))
+        return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
     out, J_keyframe, J_imu = (
         Moving.empty(n),
         np.zeros((n, 6, KEYFRAME_DIM)),
@@ -246,17 +255,19 @@ def poses_at(
     return Poses(*out, J_keyframe, J_next, J_imu)
 
 
-def poses_alone(times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float) -> Poses:
+def poses_without_jacobians(
+    times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float
+) -> Poses:
     """The `inertial` poses of `poses_at` with Jacobians of length 0."""
-    return _carried(_empty(len(times), 0, False), times, keyframe, state, imu, gravity, Velocities.empty(0, 0))
+    return _carried(_empty(len(times), 0, False), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
 
 
-def motion_at(
+def poses_and_velocity_derivatives(
     times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
-) -> tuple[Poses, Velocities]:
+) -> tuple[Poses, VelocityDerivatives]:
     """The `inertial` poses of `poses_at`, and how their velocities move."""
     n = len(times)
-    moving = Velocities.empty(n, N_INTRINSICS if imu_free else 0)
+    moving = VelocityDerivatives.empty(n, N_INTRINSICS if imu_free else 0)
     return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, moving), moving
 
 
@@ -267,10 +278,16 @@ def _empty(n: int, n_jacobians: int, imu_free: bool) -> Poses:
 
 
 def _carried(
-    out: Poses, times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, moving: Velocities
+    out: Poses,
+    times: np.ndarray,
+    keyframe: np.ndarray,
+    state: State,
+    imu: ImuData,
+    gravity: float,
+    moving: VelocityDerivatives,
 ) -> Poses:
     """Fills `out` with the `inertial` poses, and `moving` where it is not empty; returns `out`."""
-    ways, keyframes = ways_from(state, times, keyframe, imu), keyframes_of(state, gravity)
+    ways, keyframes = propagation_query(state, times, keyframe, imu), keyframes_of(state, gravity)
     at = Moving(out.rotation, out.position, out.rate, out.velocity)
     intrinsics = state.values[imu.name, "intrinsics"]
     _inertial(ways, keyframes, readings_of(imu, True), intrinsics, at, out.J_keyframe, out.J_imu, moving)

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.motion.imu_data import ImuData
 from icalib.motion.integration import advance
-from icalib.motion.integration_step import SIZE, D, start
+from icalib.motion.integration_step import AT_STEP, RUN_SIZE, start
 from icalib.optim.state import State
 
 
@@ -28,7 +28,7 @@ def keyframes_of(state: State, gravity: float) -> Keyframes:
     return Keyframes(state.seconds, state.rotation, state.position, state.velocity, state.bias, gravity)
 
 
-class Ways(NamedTuple):
+class PropagationQuery(NamedTuple):
     """How n instants are reached: times (n,) seconds on the IMU's clock, keyframe (n,) of each, first (n,) the interval
     of the readings in which its way begins, order (n,) in which to go."""
 
@@ -54,30 +54,37 @@ class Moving(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def integrate_from_keyframe(keyframe, t0, t1, first, bias, readings, by, carried, run, width):
-    """As `integrate`, without a covariance and into `run` (SIZE,). What was `carried` from the same keyframe in the
+    """As `integrate`, without a covariance and into `run` (RUN_SIZE,). What was `carried` from the same keyframe in the
     same direction, and not as far as t1, is carried on, so that many instants (`in_order_of_keyframes`) cost little
-    more than the last one. carried (SIZE + 3,): a run through whole intervals; its way, its interval, its instant."""
+    more than the last one. carried (RUN_SIZE + 3,): a run through whole intervals; its way, its interval, its
+    instant."""
     backwards = t1 < t0
     way = 2 * keyframe + backwards
-    if carried[SIZE] != way or (t1 >= carried[SIZE + 2] if backwards else t1 <= carried[SIZE + 2]):
+    if carried[RUN_SIZE] != way or (t1 >= carried[RUN_SIZE + 2] if backwards else t1 <= carried[RUN_SIZE + 2]):
         start(carried)
-        carried[SIZE], carried[SIZE + 1], carried[SIZE + 2] = way, first, t0
-    none, j, now, rate, force = carried[:0], int(carried[SIZE + 1]), carried[SIZE + 2], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        carried[RUN_SIZE], carried[RUN_SIZE + 1], carried[RUN_SIZE + 2] = way, first, t0
+    none, j, now, rate, force = (
+        carried[:0],
+        int(carried[RUN_SIZE + 1]),
+        carried[RUN_SIZE + 2],
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+    )
     for part in range(2):  # whole intervals, and then the rest
         x = run if part else carried
         j, now, rate, force = advance(t1, part == 0, j, now, bias, readings, by, x, width, none, none)
         if part == 0:
-            carried[SIZE + 1], carried[SIZE + 2] = j, now
-            for i in range(SIZE if width else D):
+            carried[RUN_SIZE + 1], carried[RUN_SIZE + 2] = j, now
+            for i in range(RUN_SIZE if width else AT_STEP):
                 run[i] = carried[i]
     return rate, force
 
 
 @njit(cache=True, nogil=True)
-def nothing_carried():
+def empty_prefix():
     """See `integrate_from_keyframe`."""
-    carried = np.zeros(SIZE + 3)
-    carried[SIZE] = -1.0
+    carried = np.zeros(RUN_SIZE + 3)
+    carried[RUN_SIZE] = -1.0
     return carried
 
 
@@ -113,10 +120,10 @@ def in_order_of_keyframes(times: np.ndarray, keyframe: np.ndarray, seconds: np.n
     return np.concatenate([np.flatnonzero(~before), np.flatnonzero(before)[::-1]])
 
 
-def ways_from(state: State, times: np.ndarray, keyframe: np.ndarray, imu: ImuData) -> Ways:
+def propagation_query(state: State, times: np.ndarray, keyframe: np.ndarray, imu: ImuData) -> PropagationQuery:
     """To `times` (n,), in order, from their `keyframe` (n,)."""
     begin = state.seconds[keyframe]
     first = imu.interval(begin)
     # Integration backwards starts in the interval that ends at the keyframe, if the keyframe lies on a stamp.
     on_stamp = (times < begin) & (imu.seconds[first] == begin) & (first > 0)
-    return Ways(times, keyframe, first - on_stamp, in_order_of_keyframes(times, keyframe, state.seconds))
+    return PropagationQuery(times, keyframe, first - on_stamp, in_order_of_keyframes(times, keyframe, state.seconds))

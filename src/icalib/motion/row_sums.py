@@ -14,7 +14,7 @@ from icalib.optim.robust_weights import LOSSES, Loss
 from icalib.optim.rows import Rows, accumulate_rows
 
 # Rows of a factor that are made at once: their Jacobians stay in the processor's cache.
-CHUNK = 256
+ROWS_PER_CHUNK = 256
 
 
 class Into(NamedTuple):
@@ -35,16 +35,16 @@ class RobustNoise(NamedTuple):
 
 
 def in_chunks(own: slice) -> Iterator[slice]:
-    """The rows `own`, CHUNK at a time."""
-    for start in range(own.start, own.stop, CHUNK):
-        yield slice(start, min(start + CHUNK, own.stop))
+    """The rows `own`, ROWS_PER_CHUNK at a time."""
+    for start in range(own.start, own.stop, ROWS_PER_CHUNK):
+        yield slice(start, min(start + ROWS_PER_CHUNK, own.stop))
 
 
-def of_recordings(
+def rows_by_recording(
     keyframe: np.ndarray, starts: tuple[int, ...], n_keyframes: int, piece: Piece
 ) -> Iterator[tuple[int, slice]]:
-    """The rows in `piece` of measurements at keyframes `keyframe` (n,), in order, CHUNK at a time: number of the
-    recording, and its rows. Rows belong to intervals: those at the last keyframe, number n_keyframes - 1, go to the
+    """The rows in `piece` of measurements at keyframes `keyframe` (n,), in order, ROWS_PER_CHUNK at a time: number of
+    the recording, and its rows. Rows belong to intervals: those at the last keyframe, number n_keyframes - 1, go to the
     last interval. starts: the first keyframe of each recording."""
     edges = np.searchsorted(keyframe, (*starts, n_keyframes))
     low, high = np.searchsorted(np.minimum(keyframe, n_keyframes - 2), [piece.first, piece.last])

@@ -20,16 +20,16 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.motion.clocks import mounted_columns, offset_at
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import Poses, poses_alone, poses_at, poses_of_keyframes
-from icalib.optim.rows import KEYFRAME_PAIR_DIM, Rows, U
+from icalib.motion.poses import Poses, poses_at, poses_of_keyframes, poses_without_jacobians
+from icalib.motion.time_offsets import offset_at, pose_columns
+from icalib.optim.rows import KEYFRAME_PAIR_DIM, Rows, UInt
 from icalib.optim.state import KEYFRAME_DIM, Layout, State
 from icalib.rig import Scheme
 
-OFFSET = 6  # number of the time offset among the calibration parameters of a pose
-N_MOUNTED = 7  # extrinsics and time offset; the IMU intrinsics follow
-ITSELF = np.eye(6)  # a pose by itself
+OFFSET_COLUMN = 6  # number of the time offset among the calibration parameters of a pose
+N_POSE_PARAMETERS = 7  # extrinsics and time offset; the IMU intrinsics follow
+IDENTITY_6 = np.eye(6)  # a pose by itself
 
 
 class _Moving(Protocol):
@@ -67,7 +67,7 @@ class Kinematics:
     def columns(self, clock: int = 0) -> np.ndarray:
         """(7 + 24 or 0,) calibration columns of the sensor's pose, -1 where fixed; `clock`: number of its time
         offset."""
-        own = mounted_columns(self.layout, self.sensor, clock)
+        own = pose_columns(self.layout, self.sensor, clock)
         return np.concatenate([own, self.layout.columns(self._imu, "intrinsics")]) if self._imu else own
 
     @property
@@ -81,7 +81,7 @@ class Kinematics:
             return poses_of_keyframes(keyframe, state)
         times = seconds + offset_at(state, self.sensor, keyframe)
         if self.scheme == "inertial" and not jacobians:
-            return poses_alone(times, keyframe, state, self.imu, self.gravity)
+            return poses_without_jacobians(times, keyframe, state, self.imu, self.gravity)
         return poses_at(self.scheme, times, keyframe, state, self.imu, self.gravity, bool(self._imu))
 
 
@@ -130,7 +130,7 @@ class SensorPose(NamedTuple):
     @property
     def n_calib(self) -> int:
         """How many calibration parameters the poses depend on."""
-        return N_MOUNTED + self.J_imu.shape[2]
+        return N_POSE_PARAMETERS + self.J_imu.shape[2]
 
 
 def rows_at(residual: np.ndarray, J_pose: Sequence[np.ndarray], ends: Sequence[SensorPose], J_own: np.ndarray) -> Rows:
@@ -173,26 +173,26 @@ def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
         at.J_next,
         at.J_imu,
     )
-    n_imu, has_next, own, mounted, x = U(J_imu.shape[2]), len(J_next) > 0, U(first), U(calib), U(i)
-    imu, offset = mounted + U(N_MOUNTED), mounted + U(OFFSET)
-    for r in range(U(T.shape[0])):
-        for k in range(U(6)):
+    n_imu, has_next, own, mounted, x = UInt(J_imu.shape[2]), len(J_next) > 0, UInt(first), UInt(calib), UInt(i)
+    imu, offset = mounted + UInt(N_POSE_PARAMETERS), mounted + UInt(OFFSET_COLUMN)
+    for r in range(UInt(T.shape[0])):
+        for k in range(UInt(6)):
             f = J_imu_pose[r, k]
             if f == 0.0:
                 continue
-            for j in range(U(KEYFRAME_DIM)):
+            for j in range(UInt(KEYFRAME_DIM)):
                 T[r, own + j] += f * J_keyframe[x, k, j]
             if has_next:
-                for j in range(U(KEYFRAME_DIM)):
-                    T[r, own + U(KEYFRAME_DIM) + j] += f * J_next[x, k, j]
+                for j in range(UInt(KEYFRAME_DIM)):
+                    T[r, own + UInt(KEYFRAME_DIM) + j] += f * J_next[x, k, j]
             for j in range(n_imu):
                 T[r, imu + j] += f * J_imu[x, k, j]
-        for k in range(U(3)):
-            T[r, offset] += J_imu_pose[r, k] * rate[x, k] + J_imu_pose[r, U(3) + k] * velocity[x, k]
-        for j in range(U(3)):
+        for k in range(UInt(3)):
+            T[r, offset] += J_imu_pose[r, k] * rate[x, k] + J_imu_pose[r, UInt(3) + k] * velocity[x, k]
+        for j in range(UInt(3)):
             T[r, mounted + j] += J_pose[r, j]
-            for k in range(U(3)):
-                T[r, mounted + U(3) + j] += J_pose[r, U(3) + k] * R[j, k]
+            for k in range(UInt(3)):
+                T[r, mounted + UInt(3) + j] += J_pose[r, UInt(3) + k] * R[j, k]
 
 
 @njit(cache=True, nogil=True)
@@ -203,7 +203,7 @@ def fill_chain(i, at, A, T):
     for r in range(6):
         for j in range(T.shape[1]):
             T[r, j] = 0.0
-    add_chain(i, at, ITSELF, A, 0, chain_width(at), T)
+    add_chain(i, at, IDENTITY_6, A, 0, chain_width(at), T)
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.motion.imu_data import ImuData, clear_of
 
-LONGEST_S = 0.5  # intervals longer than this are no longer consistent
+MAX_INTERVAL_S = 0.5  # intervals longer than this are no longer consistent
 
 
 @dataclass(frozen=True)
@@ -54,4 +54,4 @@ def pose_intervals(imu: ImuData, keyframes: np.ndarray, starts: tuple[int, ...],
 
 def _usable(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """(n,) whether each span is short, and lies within the IMU's recordings and none of their gaps."""
-    return (end - start <= LONGEST_S) & imu.covers(start, end) & clear_of(imu.seams, start, end)
+    return (end - start <= MAX_INTERVAL_S) & imu.covers(start, end) & clear_of(imu.seams, start, end)

@@ -10,15 +10,15 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.data.measurements import Stream
 from icalib.geometry.small import mul3
-from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
 from icalib.motion.keyframe_placement import usable
-from icalib.motion.poses import assign_keyframes, poses_alone
+from icalib.motion.poses import assign_keyframes, poses_without_jacobians
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import State
 
 
 @dataclass(frozen=True)
-class Motion:
+class EstimatedMotion:
     """The IMU's motion as a state has it. gravity [m/s^2]; IMU gaps up to max_gap_s are bridged."""
 
     state: State
@@ -67,12 +67,12 @@ def _to_lidar(R_il, p_il, R, p, rate, velocity):
                 R[i, a, c] = turned[a, c]
 
 
-def sweep(drive: Motion, name: str, times: np.ndarray, near: np.ndarray | None = None) -> Sweep:
+def sweep(drive: EstimatedMotion, name: str, times: np.ndarray, near: np.ndarray | None = None) -> Sweep:
     """Where LiDAR `name` is and how it moves at `times` (n,) on the IMU's clock, by the IMU's readings from the
     keyframes next to them, or next to `near` (n,)."""
     state, imu = drive.state, drive.imu
     keyframe = assign_keyframes("inertial", state.seconds, times if near is None else near)
-    imu_at = poses_alone(times, keyframe, state, imu, drive.gravity)
+    imu_at = poses_without_jacobians(times, keyframe, state, imu, drive.gravity)
     R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
     found = Sweep(imu_at.rotation, imu_at.position, imu_at.rate, imu_at.velocity)
     _to_lidar(np.ascontiguousarray(R_il), p_il, *found)

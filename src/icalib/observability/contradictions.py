@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimate.evidence.evidence import fits
 from icalib.estimate.problem.inputs import Inputs, origin_difference
+from icalib.estimate.residual_statistics.fit_statistics import fits
 from icalib.geometry import so3
 from icalib.observability.determination import Determined, determine, judge, scatter
 from icalib.observability.relaxed import Relaxed, freed_inputs, stated_keys

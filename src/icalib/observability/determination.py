@@ -22,16 +22,16 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
 from icalib.errors import EstimationError
-from icalib.estimate.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
-from icalib.estimate.evidence.debias import Spurious, spurious_information
-from icalib.estimate.evidence.inflation import LEAST, inflation, nuisance_priors, with_priors_weighed
+from icalib.estimate.estimate import EARLY_DECREASE, EARLY_DECREASE_SHARE, Estimate, OnVisit, estimate
 from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome, Step
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.residual_statistics.inflation import MIN_INFLATION, inflation, nuisance_priors, with_priors_weighed
+from icalib.estimate.residual_statistics.jacobian_noise import Spurious, spurious_information
 from icalib.observability.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
-from icalib.optim.calib_block import HELD_BELOW, essential_information, restricted_root
+from icalib.optim.calib_block import UNOBSERVABLE_BELOW, essential_information, restricted_root
 from icalib.optim.prior_factor import variance_of_priors, without_priors
 from icalib.optim.state import Key, State
 
@@ -150,7 +150,7 @@ class _Search:
         for k in range(MOST_ROUNDS):
             found, seen = self.found, self.seen
             settled = _is_settled(seen.undetermined, found.problem.held, k >= LATE)
-            if settled and not found.outcome.half_way:
+            if settled and not found.outcome.stopped_early:
                 return
             held = found.problem.held if settled and found.problem.held.size else seen.undetermined
             # A failed estimate is no start for the next one.
@@ -177,7 +177,7 @@ class _Search:
     def balance(self) -> None:
         """Weighs priors on nuisance parameters by how large errors of the measurements are."""
         outcome = self.found.outcome
-        if not outcome.converged or (factor := inflation(self.inputs, outcome)) < LEAST:
+        if not outcome.converged or (factor := inflation(self.inputs, outcome)) < MIN_INFLATION:
             return
         problem = with_priors_weighed(outcome.problem, factor)
         again = minimise(problem, outcome.state, partial(self.on_step, "last"), room=outcome.room)
@@ -203,13 +203,13 @@ def _followed(found: Estimate, moved: State, held: np.ndarray) -> State:
         return moved
     problem, room = replace(found.problem, held=held), found.outcome.room
     try:
-        return minimise(problem, moved, tolerance=EARLY_DECREASE, share=EARLY_SHARE, room=room).state
+        return minimise(problem, moved, tolerance=EARLY_DECREASE, share=EARLY_DECREASE_SHARE, room=room).state
     except EstimationError:
         return moved
 
 
 def _is_worth_keeping(outcome: Outcome) -> bool:
-    return outcome.converged or outcome.half_way
+    return outcome.converged or outcome.stopped_early
 
 
 def _maybe_rank_deficient(problem: Problem, information: np.ndarray) -> bool:
@@ -270,7 +270,7 @@ def judge(
 
 def _are_alike(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two informations (B, B) in tolerance units are about the same in every direction that they know."""
-    nothing = HELD_BELOW * np.eye(len(a))
+    nothing = UNOBSERVABLE_BELOW * np.eye(len(a))
     try:
         ratios = eigh(b + nothing, a + nothing, eigvals_only=True)
     except LinAlgError:  # not definite: of a state far from its end
@@ -294,6 +294,6 @@ def _shown(asked: np.ndarray, tolerance: np.ndarray, is_essential: np.ndarray, s
     vectors = np.zeros((len(asked), len(own)))
     values, vectors[own] = np.linalg.eigh(known[np.ix_(own, own)])
     all_of_it = np.einsum("ik,ij,jk->k", vectors, asked, vectors)
-    nothing = values < HELD_BELOW
+    nothing = values < UNOBSERVABLE_BELOW
     maybe = values < spurious.chance(tolerance[:, None] * vectors)
     return _ShownDirections(vectors, nothing, ~nothing & maybe & (values < SPURIOUS_SHARE * all_of_it))

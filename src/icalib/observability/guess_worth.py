@@ -18,9 +18,9 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
-from icalib.estimate.problem.tolerances import UNGUESSED
+from icalib.estimate.problem.tolerances import UNGUESSED_SIGMA
 from icalib.geometry import planes, so3
-from icalib.optim.calib_block import HELD_BELOW
+from icalib.optim.calib_block import UNOBSERVABLE_BELOW
 from icalib.optim.state import Block, State
 from icalib.sensors.sensor import ROTATION
 
@@ -114,7 +114,7 @@ def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     width = np.sqrt(np.clip(values, 0.0, None))
     own = np.concatenate([np.arange(0), *(b.columns for b in problem.layout.free if inputs.is_sensor(b.sensor))])
     for k, way in enumerate(ways.T):
-        left = float(np.clip(way @ data @ way, 0.0, HELD_BELOW))
+        left = float(np.clip(way @ data @ way, 0.0, UNOBSERVABLE_BELOW))
         if float((way[own] ** 2).sum()) < MOSTLY and width[k] ** 2 * left > 1.0:
             width[k] = 1.0 / np.sqrt(left)
     return ways * width
@@ -128,7 +128,7 @@ def _guess_covariance(inputs: Inputs, problem: Problem, state: State, held: np.n
         return np.linalg.inv(scaled.T @ scaled)
     sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
-        sigma[block.columns] = np.minimum(sigma[block.columns], UNGUESSED)
+        sigma[block.columns] = np.minimum(sigma[block.columns], UNGUESSED_SIGMA)
     scaled = held * (sigma / problem.tolerance)[:, None]
     return scaled.T @ scaled
 
@@ -136,7 +136,9 @@ def _guess_covariance(inputs: Inputs, problem: Problem, state: State, held: np.n
 def _leave_nothing(inputs: Inputs, problem: Problem, ways: np.ndarray) -> bool:
     """Whether the guess alone leaves every parameter of every sensor open."""
     owed = (ways**2).sum(axis=1)
-    return all((owed[b.columns] > 1.0 / HELD_BELOW).all() for b in problem.layout.free if inputs.is_sensor(b.sensor))
+    return all(
+        (owed[b.columns] > 1.0 / UNOBSERVABLE_BELOW).all() for b in problem.layout.free if inputs.is_sensor(b.sensor)
+    )
 
 
 def _answer(outcome: Outcome, way: np.ndarray) -> np.ndarray:

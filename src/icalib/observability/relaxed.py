@@ -20,7 +20,7 @@ from icalib.estimate.problem.outcome import Outcome, outcome_of
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Solution, solve
-from icalib.optim.calib_block import NOTHING, restricted_root
+from icalib.optim.calib_block import NO_DIRECTIONS, restricted_root
 from icalib.optim.prior_factor import sums_of_priors
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Parameter, Sensor
@@ -123,7 +123,7 @@ def _is_stated(parameter: Parameter) -> bool:
 def _held_in(layout: Layout, before: Layout, held: np.ndarray) -> np.ndarray:
     """Directions of the calibration parameters of `before` in those of `layout`, which has more columns."""
     if not held.size:
-        return NOTHING
+        return NO_DIRECTIONS
     out = np.zeros((layout.size, held.shape[1]))
     for block in before.free:
         out[layout.block(*block.key).columns] = held[block.columns]

@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-DEPTH = 3  # earlier steps in use; the modes seen so far come in pairs of a parameter and the motion that follows it
-SLOW = 0.1  # of the predicted decrease before: steps that shrink faster converge well by themselves
-LEAST_RANK = 1e-6  # relative singular value, below which earlier steps are the same
-PROMISED = 0.5  # of what the plain step promises: an accelerated one must gain more
+# earlier steps in use; the modes seen so far come in pairs of a parameter and the motion that follows it
+MAX_EARLIER_STEPS = 3
+SLOW_DECREASE_RATIO = 0.1  # of the predicted decrease before: steps that shrink faster converge well by themselves
+MIN_SINGULAR_RATIO = 1e-6  # relative singular value, below which earlier steps are the same
+MIN_ACCELERATED_GAIN = 0.5  # of what the plain step promises: an accelerated one must gain more
 
 
 @dataclass
@@ -28,7 +29,7 @@ class Accelerator:
 
     def slow(self, decrease: float) -> bool:
         """Whether plain steps, of which the next promises `decrease`, converge slowly."""
-        return bool(self.moves) and decrease > SLOW * self.decrease
+        return bool(self.moves) and decrease > SLOW_DECREASE_RATIO * self.decrease
 
     def step(self, chain: np.ndarray, calib: np.ndarray, decrease: float) -> tuple[np.ndarray, np.ndarray] | None:
         """The accelerated step, chain (K, 15) and calib (B,), for a plain one that promises `decrease`; None where
@@ -38,7 +39,7 @@ class Accelerator:
         now = np.concatenate([chain.ravel(), calib])
         scale = self._scale(chain, calib)
         changes = np.diff(np.array([*self.steps, now]), axis=0)
-        share = np.linalg.lstsq((changes / scale).T, now / scale, rcond=LEAST_RANK)[0]
+        share = np.linalg.lstsq((changes / scale).T, now / scale, rcond=MIN_SINGULAR_RATIO)[0]
         best = now - share @ (np.array(self.moves) + changes)
         return best[: chain.size].reshape(chain.shape), best[chain.size :]
 
@@ -46,7 +47,11 @@ class Accelerator:
         """Remembers that in place of a `plain` step, which promised `decrease`, another or the same was `taken`."""
         self.steps.append(np.concatenate([x.ravel() for x in plain]))
         self.moves.append(np.concatenate([x.ravel() for x in taken]))
-        self.steps, self.moves, self.decrease = self.steps[-DEPTH:], self.moves[-DEPTH:], decrease
+        self.steps, self.moves, self.decrease = (
+            self.steps[-MAX_EARLIER_STEPS:],
+            self.moves[-MAX_EARLIER_STEPS:],
+            decrease,
+        )
 
     def forget(self) -> None:
         """After a step that was damped, shortened or not taken."""

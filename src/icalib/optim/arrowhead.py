@@ -22,21 +22,21 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.geometry.small import cholesky
-from icalib.optim import pages
-from icalib.optim.calib_block import NOTHING, calib_draws, calib_step
+from icalib.optim import memory
+from icalib.optim.calib_block import NO_DIRECTIONS, calib_draws, calib_step
 from icalib.optim.chain_kernels import damp, eliminate_chain, forward_solve, substitute_chain
-from icalib.optim.front import Eliminated, Features, eliminate
+from icalib.optim.front import Eliminated, PieceFeatures, eliminate
 from icalib.optim.front_plan import plan
 from icalib.optim.state import KEYFRAME_DIM
 
 T = TypeVar("T")
-THREADS = 2  # pieces of the chain; more would need separators of their own
-SEGMENT = 512  # keyframes at a time, where nothing is asked of the chain itself
+N_THREADS = 2  # pieces of the chain; more would need separators of their own
+SEGMENT_KEYFRAMES = 512  # keyframes at a time, where nothing is asked of the chain itself
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(THREADS, thread_name_prefix="icalib")
+    return ThreadPoolExecutor(N_THREADS, thread_name_prefix="icalib")
 
 
 if hasattr(os, "register_at_fork"):  # its threads do not live on in a process that is forked
@@ -73,7 +73,7 @@ class Piece:
     upper: np.ndarray
     side: np.ndarray
     calib: np.ndarray
-    features: Features | None = None
+    features: PieceFeatures | None = None
 
     @classmethod
     def zeros(cls, first: int, last: int, n_calib: int) -> Piece:
@@ -81,9 +81,9 @@ class Piece:
         return cls(
             first,
             last,
-            pages.zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)),
-            pages.zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)),
-            pages.zeros((n, KEYFRAME_DIM, n_calib + 1)),
+            memory.mmap_zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)),
+            memory.mmap_zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)),
+            memory.mmap_zeros((n, KEYFRAME_DIM, n_calib + 1)),
             np.zeros((n_calib + 1, n_calib + 1)),
         )
 
@@ -103,7 +103,7 @@ class Piece:
         """The same sums without keyframe `last`, of which they must say nothing."""
         features = self.features
         if features is not None:
-            features = Features.of(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
+            features = PieceFeatures.of(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
         own = self.diagonal[:-1], self.upper[:-1], self.side[:-1]
         return Piece(self.first, self.last - 1, *own, self.calib, features)
 
@@ -124,7 +124,7 @@ def make_pieces(n_keyframes: int, n_calib: int | None) -> tuple[Piece, ...]:
     bare ones."""
     ends = (0, *chain_cuts(n_keyframes), n_keyframes - 1)
     if n_calib is not None:
-        pages.give_back()  # there is no moment at which more is needed
+        memory.trim_heap()  # there is no moment at which more is needed
     return tuple(Piece.bare(a, b) if n_calib is None else Piece.zeros(a, b, n_calib) for a, b in pairwise(ends))
 
 
@@ -216,7 +216,7 @@ class Solution:
         return Solution.of(factors, self.gradient - np.append(gradient, 0.0))
 
 
-BROKEN_DOWN = (
+NOT_DEFINITE = (
     "the estimate failed, because from its initial guess the measurements do not determine the motion; give "
     "rough extrinsics, time offsets and intrinsics in the rig file."
 )
@@ -265,7 +265,7 @@ def _reduce_all(piece: Piece) -> Eliminated | bool:
     """Eliminates a piece in place. Raises NotDefiniteError."""
     done = _reduce(piece, False)
     if not done:
-        raise NotDefiniteError(BROKEN_DOWN)
+        raise NotDefiniteError(NOT_DEFINITE)
     return done
 
 
@@ -280,7 +280,7 @@ def marginalise(piece: Piece) -> np.ndarray:
     return piece.calib
 
 
-def given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
+def chain_step_given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
     """(n, 15, m) the best steps of the keyframes of `piece` where the calibration parameters make steps (B, m);
     overwrites the piece. Raises NotDefiniteError."""
     done, m = _reduce_all(piece), calib.shape[1]
@@ -292,10 +292,10 @@ def given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
 def marginalise_in_segments(piece: Callable[[int, int], Piece], n_keyframes: int) -> np.ndarray:
     """As `marginalise`, of a whole chain whose `piece` from one keyframe to another is made when it is its turn, so
     that the chain never lies in memory as a whole."""
-    ends = [*range(0, n_keyframes - 1, SEGMENT), n_keyframes - 1]
+    ends = [*range(0, n_keyframes - 1, SEGMENT_KEYFRAMES), n_keyframes - 1]
     spans, rest = list(pairwise(ends)), None
-    for k in range(0, len(spans), THREADS):
-        for own in in_parallel(lambda span: piece(*span), spans[k : k + THREADS]):
+    for k in range(0, len(spans), N_THREADS):
+        for own in in_parallel(lambda span: piece(*span), spans[k : k + N_THREADS]):
             if rest is not None:
                 own.diagonal[0] += rest.diagonal[0]
                 own.side[0] += rest.side[0]
@@ -307,7 +307,7 @@ def marginalise_in_segments(piece: Callable[[int, int], Piece], n_keyframes: int
 def _onto_last(piece: Piece) -> Piece:
     """The last keyframe and the calibration parameters, all other keyframes eliminated. Raises NotDefiniteError."""
     if not eliminate_chain(piece.diagonal, piece.upper, piece.side, True, True):
-        raise NotDefiniteError(BROKEN_DOWN)
+        raise NotDefiniteError(NOT_DEFINITE)
     last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1)
     last.diagonal[0], last.side[0] = piece.diagonal[-1], piece.side[-1]
     flat = piece.side[:-1].reshape(-1, piece.side.shape[2])
@@ -334,7 +334,11 @@ def _back(
 
 
 def solve(
-    pieces: tuple[Piece, ...], n_keyframes: int, tolerance: np.ndarray, damping: float = 0.0, held: np.ndarray = NOTHING
+    pieces: tuple[Piece, ...],
+    n_keyframes: int,
+    tolerance: np.ndarray,
+    damping: float = 0.0,
+    held: np.ndarray = NO_DIRECTIONS,
 ) -> Solution:
     """Solves (H + damping diag(H)) step = -gradient, directions of the calibration parameters in `held` left alone (see
     calib_step); overwrites the pieces. Raises NotDefiniteError."""
@@ -347,14 +351,14 @@ def solve(
             damp(piece.diagonal, damping)
     done = in_parallel(lambda p: _reduce(p, keep), pieces)
     if not all(done):
-        raise NotDefiniteError(BROKEN_DOWN)
+        raise NotDefiniteError(NOT_DEFINITE)
     rest = sum((p.calib for p in pieces), extra)
     shared, shared_side = np.zeros((0, 0)), np.zeros((0, n_calib + 1))
     if keep:
         shared = pieces[0].diagonal[-1] + pieces[1].diagonal[0]
         shared_side = pieces[0].side[-1] + pieces[1].side[0]
         if not cholesky(shared):
-            raise NotDefiniteError(BROKEN_DOWN)
+            raise NotDefiniteError(NOT_DEFINITE)
         forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side
     information = rest[:n_calib, :n_calib]

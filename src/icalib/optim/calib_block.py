@@ -7,14 +7,15 @@ import numpy as np
 
 from icalib.optim.state import Layout
 
-HELD_BELOW = 1e-2  # information in tolerance units: a direction known to less than ten tolerances stays where it is
-DETERMINED = 1.0  # in the same units: known to one tolerance
-LEAST = 1e-4  # of information in tolerance units; keeps variances finite
-NOTHING = np.zeros((0, 0))
+# information in tolerance units: a direction known to less than ten tolerances stays where it is
+UNOBSERVABLE_BELOW = 1e-2
+DETERMINED_ABOVE = 1.0  # in the same units: known to one tolerance
+MIN_INFORMATION = 1e-4  # of information in tolerance units; keeps variances finite
+NO_DIRECTIONS = np.zeros((0, 0))
 
 
 def calib_step(
-    information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray, held: np.ndarray = NOTHING
+    information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray, held: np.ndarray = NO_DIRECTIONS
 ) -> tuple[np.ndarray, float]:
     """Step (B,) of the calibration parameters and the decrease of half the chi^2 it promises; undetermined directions
     are held, and those in the columns of `held` (B, m), orthonormal.
@@ -23,7 +24,7 @@ def calib_step(
     """
     free, values, vectors = _directions(information, tolerance, held)
     projected = vectors.T @ (free.T @ (tolerance * gradient))
-    step = np.where(values > HELD_BELOW, -projected / np.maximum(values, HELD_BELOW), 0.0)
+    step = np.where(values > UNOBSERVABLE_BELOW, -projected / np.maximum(values, UNOBSERVABLE_BELOW), 0.0)
     return tolerance * (free @ (vectors @ step)), float(-0.5 * projected @ step)
 
 
@@ -61,7 +62,7 @@ def restricted_root(information: np.ndarray, held: np.ndarray) -> np.ndarray:
     """(B, n) whose product with its transpose is the `restricted_inverse`."""
     free = complement(held, len(information))
     values, vectors = np.linalg.eigh(free.T @ information @ free)
-    return free @ vectors / np.sqrt(np.maximum(values, LEAST))
+    return free @ vectors / np.sqrt(np.maximum(values, MIN_INFORMATION))
 
 
 def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -74,5 +75,5 @@ def calib_draws(information: np.ndarray, tolerance: np.ndarray, held: np.ndarray
     """(B, m) from white noise (B, m): what has the inverse of the information for its covariance, what `calib_step`
     holds held."""
     free, values, vectors = _directions(information, tolerance, held)
-    scaled = np.where(values > HELD_BELOW, 1.0 / np.sqrt(np.maximum(values, HELD_BELOW)), 0.0)
+    scaled = np.where(values > UNOBSERVABLE_BELOW, 1.0 / np.sqrt(np.maximum(values, UNOBSERVABLE_BELOW)), 0.0)
     return tolerance[:, None] * (free @ (vectors @ (scaled[:, None] * white[: len(values)])))

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.optim.front_kernels import Chain, Sizes, eliminate_all, rotate_keyframes, substitute_all
+from icalib.optim.front_kernels import FrontChain, Sizes, eliminate_all, rotate_keyframes, substitute_all
 from icalib.optim.front_plan import FeatureSums, Plan
 from icalib.optim.state import KEYFRAME_DIM
 
 
 @dataclass(frozen=True)
-class Features:
+class PieceFeatures:
     """Those of a `Piece`: their sums, the steps in which keyframes and features are eliminated, and room for the
     factors: each elimination overwrites that of the one before, because memory that is new costs more than what it is
     for."""
@@ -27,15 +27,15 @@ class Features:
     room: np.ndarray
 
     @classmethod
-    def of(cls, sums: FeatureSums, plan: Plan) -> Features:
+    def of(cls, sums: FeatureSums, plan: Plan) -> PieceFeatures:
         return cls(sums, plan, np.empty(_sizes(plan, sums.side.shape[2]).start[-1]))
 
-    def widened(self, n_calib: int) -> Features:
+    def widened(self, n_calib: int) -> PieceFeatures:
         """The same with further calibration columns, between those there are and the gradient; zero, this too."""
         side = self.sums.side
         wide = np.zeros((*side.shape[:2], n_calib + 1))
         wide[:, :, : side.shape[2] - 1] = side[:, :, :-1]
-        return Features.of(self.sums._replace(side=wide), self.plan)
+        return PieceFeatures.of(self.sums._replace(side=wide), self.plan)
 
 
 @dataclass(frozen=True)
@@ -71,14 +71,14 @@ def _sizes(plan: Plan, n_calib: int) -> Sizes:
 
 
 def eliminate(
-    features: Features, diagonal: np.ndarray, upper: np.ndarray, side: np.ndarray, forwards: bool, keep: bool
+    features: PieceFeatures, diagonal: np.ndarray, upper: np.ndarray, side: np.ndarray, forwards: bool, keep: bool
 ) -> Eliminated | None:
     """All steps; None where the sums are not positive definite. The factors are in the room of `features`."""
     plan, sums, n_calib = features.plan, features.sums, side.shape[2]
     sizes = _sizes(plan, n_calib)
     widest = int(sizes.wide.max())
     turn, room = np.empty_like(diagonal), features.room
-    chain = Chain(diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose))
+    chain = FrontChain(diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose))
     rotate_keyframes(plan, sums, turn, chain.pose, chain.next_pose)
     front, carry = np.zeros((widest, widest)), np.zeros((KEYFRAME_DIM, KEYFRAME_DIM + widest))
     if not eliminate_all(plan, sizes, sums, chain, room, front, carry):

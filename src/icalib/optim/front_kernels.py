@@ -13,11 +13,10 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry.blas import factorise, solve_transposed, solve_upper, subtract_gram, subtract_product
+from icalib.optim.state import KEYFRAME_DIM, POSE_DIM
 
-KEYFRAME_DIM, POSE = 15, 6
 
-
-class Chain(NamedTuple):
+class FrontChain(NamedTuple):
     """Keyframes of the piece: diagonal, upper (n, 15, 15), side (n, 15, B + 1), the direction, and how each is turned:
     turn (n, 15, 15), its columns the new dimensions; pose and next_pose by these (I, 6, 15)."""
 
@@ -96,8 +95,8 @@ def rotate_keyframes(plan, sums, turn, pose, next_pose):
     for i in range(len(sums.keyframe)):
         k = sums.keyframe[i]
         if seeing[i] and plan.coupled[k] < KEYFRAME_DIM:
-            rows[k, filled[k] : filled[k] + POSE] = sums.pose[i]
-            filled[k] += POSE
+            rows[k, filled[k] : filled[k] + POSE_DIM] = sums.pose[i]
+            filled[k] += POSE_DIM
     for k in range(n):
         turn[k] = np.eye(KEYFRAME_DIM)
         if filled[k]:
@@ -201,7 +200,7 @@ def _fill_carry(g, plan, row, carry, U, Wc, rest):
 @njit(cache=True, nogil=True)
 def _add_pose(T, n, block, rows, column, into):
     """into[rows:rows + n, column:column + 3] += (block T)^T, T (6, 15) its first n columns."""
-    for j in range(POSE):
+    for j in range(POSE_DIM):
         for k in range(n):
             f = T[j, k]
             for i in range(3):
@@ -241,7 +240,7 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
             k = sums.keyframe[i]
             begin = row[k, 0] - rest
             for a in range(3):
-                for j in range(POSE):
+                for j in range(POSE_DIM):
                     w = sums.block[e, a, j]
                     for b in range(plan.coupled[k]):
                         rows[a, begin + b] += w * chain.pose[i, j, b]

@@ -12,16 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.optim.state import KEYFRAME_DIM
+from icalib.optim.state import KEYFRAME_DIM, POSE_DIM
 
-POSE = 6  # of a camera
-SIZES = (4, 8, 12, 16, 24, 32)  # keyframes of a group
+GROUP_SIZES = (4, 8, 12, 16, 24, 32)  # keyframes of a group
 # What costs beside the products of the front, in their multiplications (measured on one machine; groups of half or
 # twice the size that this finds best cost 10 % more):
-SMALL = 3.0  # one of a small factorisation or triangular solve
-CACHED, STORED = 2.0, 32.0  # moving a number of the front, and of the factors
-STEP = 3e5  # a step's many small calls
-NO_ENDS = np.zeros(0, dtype=np.int64)
+SMALL_PRODUCT_COST = 3.0  # one of a small factorisation or triangular solve
+FRONT_MOVE_COST, FACTOR_MOVE_COST = 2.0, 32.0  # moving a number of the front, and of the factors
+STEP_COST = 3e5  # a step's many small calls
+NO_TRACK_ENDS = np.zeros(0, dtype=np.int64)
 
 
 class FeatureSums(NamedTuple):
@@ -51,11 +50,11 @@ class FeatureSums(NamedTuple):
         n_calib: int,
         by_next: bool = False,
     ) -> FeatureSums:
-        pose = np.zeros((len(keyframe), POSE, KEYFRAME_DIM))
+        pose = np.zeros((len(keyframe), POSE_DIM, KEYFRAME_DIM))
         return cls(
             np.zeros((n_tracks, 3, 3)),
             np.zeros((n_tracks, 3, n_calib + 1)),
-            np.zeros((len(track), 3, POSE)),
+            np.zeros((len(track), 3, POSE_DIM)),
             pose,
             pose.copy() if by_next else pose[:0],
             track,
@@ -157,8 +156,8 @@ class _Lives:
         meets = np.array([coupled[g].sum() + (KEYFRAME_DIM - coupled[g[:1]]).sum() for g in self.groups])
         rank = meets + 3.0 * died
         small = keyframes**3 / 6.0 + keyframes**2 * n_calib / 2.0 + wide * rank**2 / 2.0
-        moved = CACHED * wide**2 + STORED * (rank * wide + keyframes**2)
-        return float((rank * wide**2 / 2.0 + SMALL * small + moved + STEP).sum())
+        moved = FRONT_MOVE_COST * wide**2 + FACTOR_MOVE_COST * (rank * wide + keyframes**2)
+        return float((rank * wide**2 / 2.0 + SMALL_PRODUCT_COST * small + moved + STEP_COST).sum())
 
 
 def plan(
@@ -166,13 +165,13 @@ def plan(
     n_keyframes: int,
     forwards: bool,
     keep: bool,
-    ends: np.ndarray = NO_ENDS,
-    sizes: tuple[int, ...] = SIZES,
+    ends: np.ndarray = NO_TRACK_ENDS,
+    sizes: tuple[int, ...] = GROUP_SIZES,
 ) -> Plan:
     """Steps that eliminate `n_keyframes` keyframes and all features; with `keep`, all but the last keyframe in this
     direction. ends: keyframes before which all features end; sizes: of groups, tried for the cheapest."""
     met = np.zeros(n_keyframes, dtype=np.int64)
-    np.add.at(met, sums.keyframe[np.unique(sums.image)], POSE)
+    np.add.at(met, sums.keyframe[np.unique(sums.image)], POSE_DIM)
     coupled = np.minimum(met, KEYFRAME_DIM) if not len(sums.next_pose) else np.full(n_keyframes, KEYFRAME_DIM)
     tried = [_Lives.of(sums, n_keyframes, forwards, keep, s, ends) for s in sizes]
     lives = min(tried, key=lambda x: x.cost(coupled, sums.side.shape[2]))

@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-LEAST_CURVATURE = 1e-3
+MIN_CURVATURE_RATIO = 1e-3
 LOSSES = {"none": 0, "huber": 1, "cauchy": 2}  # names of the settings; numbers in kernels
 
 
@@ -30,9 +30,9 @@ def weight(loss, scale, s):
         r = np.sqrt(s)
         if r <= scale:
             return 1.0, 0.5 * s, 1.0
-        return scale / r, scale * r - 0.5 * scale * scale, LEAST_CURVATURE
+        return scale / r, scale * r - 0.5 * scale * scale, MIN_CURVATURE_RATIO
     k = scale * scale
-    return 1.0 / (1.0 + s / k), 0.5 * k * np.log1p(s / k), max((k - s) / (k + s), LEAST_CURVATURE)
+    return 1.0 / (1.0 + s / k), 0.5 * k * np.log1p(s / k), max((k - s) / (k + s), MIN_CURVATURE_RATIO)
 
 
 @njit(cache=True, nogil=True)
@@ -123,7 +123,7 @@ def whole_error(res, f, shared, error):
 
 
 @njit(cache=True, nogil=True)
-def bend(A, D, i, n, r, factor):
+def correct_curvature(A, D, i, n, r, factor):
     """Scales the Jacobian rows of corner i along its residual r by `factor`, and the residual by its inverse."""
     size = np.sqrt(r[0] * r[0] + r[1] * r[1])
     u, v = r[0] / size, r[1] / size

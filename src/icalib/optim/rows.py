@@ -11,7 +11,7 @@ from icalib.optim.robust_weights import weight
 from icalib.optim.state import KEYFRAME_DIM
 
 KEYFRAME_PAIR_DIM = 2 * KEYFRAME_DIM  # columns of a row by its keyframe and the next one
-U = np.uint64
+UInt = np.uint64
 
 
 class Rows(NamedTuple):
@@ -63,20 +63,20 @@ def add_product(k, n_chain, width, A, B, columns, sums):
     Numbers are unsigned: an index that may be negative is wrapped, and the compiler then takes one column at a time.
     """
     diagonal, upper, side = sums.diagonal, sums.upper, sums.side
-    n, end, n_b, block = U(n_chain), U(len(columns)), U(sums.calib.shape[0] - 1), U(KEYFRAME_DIM)
+    n, end, n_b, block = UInt(n_chain), UInt(len(columns)), UInt(sums.calib.shape[0] - 1), UInt(KEYFRAME_DIM)
     row, rest = np.empty(KEYFRAME_PAIR_DIM), np.empty(len(columns) + 1)
     for i in range(n):
         is_next = i >= block
-        keyframe, r, own = (U(k + 1), i - block, block) if is_next else (U(k), i, U(0))
+        keyframe, r, own = (UInt(k + 1), i - block, block) if is_next else (UInt(k), i, UInt(0))
         has_next = n > block and not is_next
         for j in range(block):
             row[j] = diagonal[keyframe, r, j]
             if has_next:
                 row[block + j] = upper[keyframe, r, j]
         for j in range(end):
-            rest[j] = side[keyframe, r, U(columns[j])] if columns[j] >= 0 else 0.0
+            rest[j] = side[keyframe, r, UInt(columns[j])] if columns[j] >= 0 else 0.0
         rest[end] = side[keyframe, r, n_b]
-        for q in range(U(len(A))):
+        for q in range(UInt(len(A))):
             f = A[q, i]
             if f == 0.0:
                 continue
@@ -85,7 +85,7 @@ def add_product(k, n_chain, width, A, B, columns, sums):
             if has_next:
                 for j in range(block):
                     row[block + j] += f * B[q, block + j]
-            for j in range(end + U(1)):
+            for j in range(end + UInt(1)):
                 rest[j] += f * B[q, n + j]
         for j in range(block):
             diagonal[keyframe, r, j] = row[j]
@@ -93,30 +93,30 @@ def add_product(k, n_chain, width, A, B, columns, sums):
                 upper[keyframe, r, j] = row[block + j]
         for j in range(end):
             if columns[j] >= 0:
-                side[keyframe, r, U(columns[j])] = rest[j]
+                side[keyframe, r, UInt(columns[j])] = rest[j]
         side[keyframe, r, n_b] = rest[end]
-    for i in range(n, U(width)):
+    for i in range(n, UInt(width)):
         if columns[i - n] >= 0:
-            _add_calib(i, n, U(width), A, B, columns, sums.calib, rest)
+            _add_calib(i, n, UInt(width), A, B, columns, sums.calib, rest)
 
 
 @njit(cache=True, nogil=True)
 def _add_calib(i, n, width, A, B, columns, calib, rest):
     """Adds row i of A^T B, by a calibration parameter; columns that A lacks also across the diagonal."""
-    a, end, n_b = U(columns[i - n]), U(len(columns)), U(calib.shape[0] - 1)
+    a, end, n_b = UInt(columns[i - n]), UInt(len(columns)), UInt(calib.shape[0] - 1)
     for j in range(end):
-        rest[j] = calib[a, U(columns[j])] if columns[j] >= 0 else 0.0
+        rest[j] = calib[a, UInt(columns[j])] if columns[j] >= 0 else 0.0
     rest[end] = calib[a, n_b]
-    for q in range(U(len(A))):
+    for q in range(UInt(len(A))):
         f = A[q, i]
         if f != 0.0:
-            for j in range(end + U(1)):
+            for j in range(end + UInt(1)):
                 rest[j] += f * B[q, n + j]
     for j in range(end):
         if columns[j] >= 0:
-            calib[a, U(columns[j])] = rest[j]
+            calib[a, UInt(columns[j])] = rest[j]
             if n + j >= width:
-                calib[U(columns[j]), a] = rest[j]
+                calib[UInt(columns[j]), a] = rest[j]
     calib[a, n_b] = calib[n_b, a] = rest[end]
 
 

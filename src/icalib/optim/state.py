@@ -13,7 +13,8 @@ import numpy as np
 
 from icalib.geometry import planes, so3
 
-KEYFRAME_DIM = 15
+KEYFRAME_DIM = 15  # tangent dimensions of a keyframe
+POSE_DIM = 6  # of these, rotation and position
 Key = tuple[str, str]  # sensor, parameter
 Kind = Literal["vector", "nuisance", "rotation", "tilt", "plane"]
 Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it is estimated

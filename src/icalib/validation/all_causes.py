@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
 from icalib.observability.fixed_lens import lens_steps
 from icalib.observability.relaxed import Relaxed, relaxed
@@ -40,7 +40,7 @@ class AssessedEstimate:
     groups: tuple[ParameterGroup, ...]
     fits: Sequence[SensorFit]
     factor: float
-    parts: Parts | None
+    parts: Segments | None
     timeline: Timeline
 
     @property

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.evidence import fits, raw_sizes
-from icalib.estimate.evidence.inflation import calibration_columns
-from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.gauge import IN_THE_WORLD
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.outcome import Visit
 from icalib.estimate.problem.problem import Problem
+from icalib.estimate.residual_statistics.fit_statistics import fits, raw_sizes
+from icalib.estimate.residual_statistics.inflation import calibration_columns
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.model.statistics import Fit
 from icalib.motion.axes import hardly_turned
 from icalib.observability.contradictions import Contradiction
@@ -58,7 +58,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     found = determined.estimate
     outcome, state = found.outcome, found.outcome.state
     seen, names = _observed(inputs, determined), _column_names(inputs)
-    parts = Parts.of(found.problem, outcome, inputs.rig.settings.segments)
+    parts = Segments.of(found.problem, outcome, inputs.rig.settings.segments)
     groups = _groups(inputs, determined, seen, VarianceParts.of(determined, parts))
     judged = _sensor_fits([f for f in fits(found.problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
     validation = cross_validation(parts, [s for s in (inputs.rig.reference,) if _is_assumed(inputs, s)])
@@ -217,7 +217,7 @@ def _final_verdict(formal: Verdict, size: float) -> Verdict:
     return formal if formal == "undetermined" else by_size(size)
 
 
-def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:
+def few_parts_notes(inputs: Inputs, parts: Segments | None) -> Iterator[str]:
     """A note if standard deviations rest on few segments, with advice to get more."""
     if inputs.imu is not None:
         more = "record longer, and leave `segments` at 8 or more"

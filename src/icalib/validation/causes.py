@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.changes import Change, changes, heterogeneity
-from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.noise_size import NoiseFit
 from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.residual_statistics.parameter_changes import Change, changes, heterogeneity
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.result import SensorFit
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.timeline import Timeline
@@ -81,7 +81,7 @@ def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
 
 
 def changing(
-    inputs: Inputs, found: Estimate, parts: Parts | None, misfit: Misfit, scattering: bool, timeline: Timeline
+    inputs: Inputs, found: Estimate, parts: Segments | None, misfit: Misfit, scattering: bool, timeline: Timeline
 ) -> Iterator[Cause]:
     """Causes that change over the recording, act at one time, or follow the image speed. scattering: segments scatter
     more than noise predicts."""
@@ -148,7 +148,7 @@ def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
     )
 
 
-def _change_words(alike: list[Change], parts: Parts, timeline: Timeline) -> str:
+def _change_words(alike: list[Change], parts: Segments, timeline: Timeline) -> str:
     """Of the changes of one sensor that explain as much, the best first."""
     best, sensor = alike[0], alike[0].key[0]
     when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
@@ -163,7 +163,7 @@ def _change_words(alike: list[Change], parts: Parts, timeline: Timeline) -> str:
     )
 
 
-def _changed(c: Change, parts: Parts) -> str:
+def _changed(c: Change, parts: Segments) -> str:
     over = float(np.ptp(parts.state.seconds[parts.ends])) if c.pattern == "drift" else 1.0
     if c.key[1] == "intrinsics":
         return f"its lens by up to {over * np.abs(c.value).max():.2g} px"
@@ -171,7 +171,7 @@ def _changed(c: Change, parts: Parts) -> str:
     return f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
 
 
-def _clock_words(c: Change, parts: Parts, when: str, timeline: Timeline) -> str:
+def _clock_words(c: Change, parts: Segments, when: str, timeline: Timeline) -> str:
     if c.pattern == "drift":
         span = float(np.ptp(parts.state.seconds[parts.ends]))
         return (
@@ -192,7 +192,7 @@ def _apart(c: Change, timeline: Timeline, words: str) -> str:
     return f"{words} (--to or --from; stay clear of the change near {c.second:.1f} s)"
 
 
-def _sizes(parts: Parts, c: Change, over: float) -> tuple[float, float]:
+def _sizes(parts: Segments, c: Change, over: float) -> tuple[float, float]:
     """Angle [rad] and distance [m] of a change of rotation, translation, or both."""
     layout, n = parts.problem.layout, 0
     sizes = {"rotation": 0.0, "translation": 0.0}

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from icalib.estimate.evidence.evidence import chi2_by_kind, raw_sizes
-from icalib.estimate.evidence.held_out import Prediction, predict, shifts
-from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.problem import Problem
+from icalib.estimate.residual_statistics.cross_validation import Prediction, predict, shifts
+from icalib.estimate.residual_statistics.fit_statistics import chi2_by_kind, raw_sizes
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.result import CrossValidation, PredictedFit
 
 
-def cross_validation(parts: Parts | None, assumed: Collection[str]) -> CrossValidation | None:
+def cross_validation(parts: Segments | None, assumed: Collection[str]) -> CrossValidation | None:
     """None if the recording cannot be split, or if no parameter is known to both halves. `assumed` sensors have no
     fits; no sensor has if the solutions of the halves are too far apart to be linearised."""
     found = None if parts is None else predict(parts)

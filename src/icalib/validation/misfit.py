@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.evidence import rows_of
 from icalib.estimate.noise_size import are_noise, fitting_noise
 from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.residual_statistics.fit_statistics import rows_of
 from icalib.result import CrossValidation, SensorFit
 from icalib.result.excess import FAR_BEYOND, dof_known, excess, times
 from icalib.rig import Rig

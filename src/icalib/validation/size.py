@@ -8,8 +8,8 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.target_size import TargetSize, target_size
 from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.residual_statistics.target_size import TargetSize, target_size
 from icalib.model.bodies import SIZE
 from icalib.result import ParameterGroup
 from icalib.sensors import answer

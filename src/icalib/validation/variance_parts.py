@@ -8,9 +8,9 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.evidence.inflation import noise_variance, spread_variance
-from icalib.estimate.evidence.parts import Parts
-from icalib.estimate.evidence.places import cluster_covariances
+from icalib.estimate.residual_statistics.image_regions import cluster_covariances
+from icalib.estimate.residual_statistics.inflation import noise_variance, spread_variance
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.motion.factor import of_type
 from icalib.observability.determination import Determined
 from icalib.sensors.camera.features.residual import FeatureFactor
@@ -32,7 +32,7 @@ class VarianceParts(NamedTuple):
     weight: float
 
     @classmethod
-    def of(cls, determined: Determined, parts: Parts | None) -> VarianceParts:
+    def of(cls, determined: Determined, parts: Segments | None) -> VarianceParts:
         found = determined.estimate
         whole, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
         prior = np.clip(determined.prior_variance, 0.0, whole - guess)
@@ -54,7 +54,7 @@ class VarianceParts(NamedTuple):
         return np.sqrt(own**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))
 
 
-def _empirical_variance(found: Estimate, parts: Parts | None, white: np.ndarray) -> np.ndarray:
+def _empirical_variance(found: Estimate, parts: Segments | None, white: np.ndarray) -> np.ndarray:
     """Variance (B,): the larger of the scatter over segments and over feature tracks, plus the excess of clustered over
     `white` variance (B,) for image and target regions. Without segments and tracks: `white`."""
     if parts is None and not of_type(found.problem.factors, FeatureFactor):

@@ -18,7 +18,7 @@ from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
-from icalib.optim.calib_block import NOTHING
+from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Layout, State, make_layout
 from icalib.rig import ImuNoise
@@ -248,7 +248,7 @@ class DriveProblem:
     poses: PoseFactor
     wheels: Any
     priors: tuple[Prior, ...] = ()
-    held: np.ndarray = field(default_factory=lambda: NOTHING)
+    held: np.ndarray = field(default_factory=lambda: NO_DIRECTIONS)
 
     @property
     def n_keyframes(self):
@@ -267,7 +267,7 @@ class DriveProblem:
     def residuals(self):
         return self.imu.output(), self.wheels.output()
 
-    def settled(self, _at):
+    def warm_started(self, _at):
         return self  # no points of the scene
 
     def linearise(self, state, pieces, out, sums=True, curved=False):

@@ -7,7 +7,7 @@ import pytest
 
 from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
-from icalib.motion.stamp_intervals import LONGEST_S, StampIntervals, choose_intervals
+from icalib.motion.stamp_intervals import MAX_INTERVAL_S, StampIntervals, choose_intervals
 from icalib.rig import ImuNoise
 from icalib.sensors.wheels.integrals import integrated
 from icalib.sensors.wheels.quadrature import PANEL_S, quadrature
@@ -68,7 +68,7 @@ def test_a_seam_within_the_readings_is_not_crossed(imu):
 
 
 def test_a_pause_of_the_wheels_is_no_interval(imu):
-    times = np.concatenate([np.arange(0.0, 0.5, 0.01), np.arange(0.5 + LONGEST_S + 0.02, 1.9, 0.01)])
+    times = np.concatenate([np.arange(0.0, 0.5, 0.01), np.arange(0.5 + MAX_INTERVAL_S + 0.02, 1.9, 0.01)])
     found = choose_intervals(imu, np.arange(0.0, 1.9, 0.05), (0,), times)
     assert (times[found.last] - times[found.first]).max() < 0.1
 

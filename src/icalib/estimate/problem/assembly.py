@@ -13,13 +13,13 @@ from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.problem import ChainFactor, Problem
 from icalib.model.bodies import SHAPE_SIGMA_M, SIZE
 from icalib.model.sensor_model import Pass, SensorModel, by_kind, model_of
-from icalib.motion.clocks import EARLY_S
 from icalib.motion.factor import Factor, keyed
 from icalib.motion.independent_keyframes import IndependentKeyframes
 from icalib.motion.keyframe_placement import distinct, first_keyframes, place_keyframes
 from icalib.motion.poses import assign_keyframes, poses_at
-from icalib.motion.sweep import Motion
-from icalib.optim.calib_block import NOTHING
+from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.time_offsets import RECORDING_MARGIN_S
+from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Block, Key, State
 from icalib.rig import Parameter, Rig, Sensor
@@ -136,7 +136,7 @@ def _hosts(rig: Rig) -> str:
 
 
 def assemble(
-    inputs: Inputs, state: State, noise: Mapping[str, Any], held: np.ndarray = NOTHING, coarse: bool = False
+    inputs: Inputs, state: State, noise: Mapping[str, Any], held: np.ndarray = NO_DIRECTIONS, coarse: bool = False
 ) -> Problem:
     """The problem at the keyframes of `state`, everything frozen that a pass freezes: assignment, preintegration,
     corrections of measurements that depend on the state.
@@ -151,10 +151,10 @@ def assemble(
     )  # fmt: skip
 
 
-def motion_of(inputs: Inputs, state: State) -> Motion:
+def motion_of(inputs: Inputs, state: State) -> EstimatedMotion:
     """The IMU's motion as `state` has it."""
     assert inputs.imu is not None
-    return Motion(state, inputs.imu, inputs.rig.gravity, inputs.rig.settings.max_gap_s)
+    return EstimatedMotion(state, inputs.imu, inputs.rig.gravity, inputs.rig.settings.max_gap_s)
 
 
 def _measured(inputs: Inputs, noise: Mapping[str, Any], at: Pass) -> list[Factor]:
@@ -176,7 +176,7 @@ def pass_at(inputs: Inputs, state: State, coarse: bool = False) -> Pass:
     if inputs.imu is not None:
         motion, starts = motion_of(inputs, state), state.starts
     else:
-        begins = [part.begin - EARLY_S for part in inputs.parts[1:]]
+        begins = [part.begin - RECORDING_MARGIN_S for part in inputs.parts[1:]]
         motion, starts = None, (0, *(int(k) for k in np.searchsorted(state.seconds, begins)))
     return Pass(
         inputs.rig, inputs.clouds, inputs.layout, state, motion, starts, inputs.measurements, inputs.motions,

@@ -19,10 +19,12 @@ IN_THE_WORLD = (PLANE.name, *(spec.name for spec in (*SENSOR_FRAME, *LEVEL_FRAME
 # Information [1/m^2, 1/rad^2] along what nothing sees. Any number does if everything else is observable. But a
 # step could move along a fixed direction of planes and sensors all the same, and compensate by a rotation of the world
 # as far as this information allows. With a small one the solver then drifts.
-FRAME = 1e10
+FRAME_INFORMATION = 1e10
 
 
-def hold_frame(state: State, piece: Piece, keyframe: int, levelled: bool, information: float = FRAME) -> None:
+def hold_frame(
+    state: State, piece: Piece, keyframe: int, levelled: bool, information: float = FRAME_INFORMATION
+) -> None:
     """Fixes the position of a keyframe, and its turn about gravity, or where this is not known (`levelled`) its
     rotation, where they are: without a target nothing in the world says where its origin is. Adds to the sums of
     `piece`; there is no gradient, and what is seen does not depend on it."""

@@ -9,14 +9,14 @@ import numpy as np
 
 from icalib.estimate.problem.assembly import stated_priors
 from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.tolerances import FROM_NOTHING_M
+from icalib.estimate.problem.tolerances import UNGUESSED_TRANSLATION_SIGMA_M
 from icalib.geometry.cameras import camera_model
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import State
 from icalib.rig import Camera
 from icalib.sensors.sensor import TRANSLATION
 
-RATIO_STEP = 1e-4  # of a coefficient, for a difference quotient
+COEFFICIENT_STEP = 1e-4  # of a coefficient, for a difference quotient
 
 
 def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
@@ -25,7 +25,7 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
     for b in inputs.layout.free:
         stated = inputs.stated(b)
         is_guessed = b.name != TRANSLATION.name or stated is None or stated.value is not None
-        sigma[b.columns] = inputs.specs[b.key].prior_sigma if is_guessed else FROM_NOTHING_M
+        sigma[b.columns] = inputs.specs[b.key].prior_sigma if is_guessed else UNGUESSED_TRANSLATION_SIGMA_M
     for camera in inputs.rig.cameras:
         columns = inputs.layout.columns(camera.name, "intrinsics", "distortion")
         if (columns >= 0).all():
@@ -52,6 +52,6 @@ def _focal_sigma(camera: Camera, state: State, sigma: np.ndarray) -> float:
     """
     model, fx = camera_model(camera.model), state.values[camera.name, "intrinsics"][0]
     lens = np.concatenate([state.values[camera.name, name] for name in ("intrinsics", "distortion")])
-    steps = lens + RATIO_STEP * np.eye(len(lens))[4:]
-    slope = (np.array([model.central_scale(p) for p in steps]) / model.central_scale(lens) - 1.0) / RATIO_STEP
+    steps = lens + COEFFICIENT_STEP * np.eye(len(lens))[4:]
+    slope = (np.array([model.central_scale(p) for p in steps]) / model.central_scale(lens) - 1.0) / COEFFICIENT_STEP
     return float(fx * np.sqrt(((slope * sigma) ** 2).sum()))

@@ -10,16 +10,16 @@ import numpy as np
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Draw, Piece, Solution, solve
-from icalib.optim.calib_block import NOTHING
+from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.state import State
 
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
-FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
+N_JOINT_DRAWS, N_CHAIN_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
 # Of few keyframes more free ones: the degrees of freedom that they show are off by sqrt(2 spent / draws), of few
 # residuals too much. So many keyframes times draws at most; doubled, they cost twice as much, and are off by 0.7 times
 # as much.
-DRAWN_KEYFRAMES, MOST_FREE = 640, 64
-MORE_STILL = 5  # for where these leave doubt; drawn later, so that the first stay what they are
+DRAWS_TIMES_KEYFRAMES, MAX_JOINT_DRAWS = 640, 64
+N_MORE_CHAIN_DRAWS = 5  # for where these leave doubt; drawn later, so that the first stay what they are
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Visit:
 class Outcome:
     """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
     looked for where they were; information (B, B): of the calibration parameters at `state`, the chain marginalised, no
-    damping; empty, and no draws, where another pass follows. half_way: left before its end, because more seemed of no
-    use. room: the pieces that it was solved in, to be filled anew; None without features, of which alone the fronts
+    damping; empty, and no draws, where another pass follows. stopped_early: left before its end, because more seemed of
+    no use. room: the pieces that it was solved in, to be filled anew; None without features, of which alone the fronts
     are kept."""
 
     problem: Problem
@@ -58,7 +58,7 @@ class Outcome:
     converged: bool
     status: str
     draws: Draws | None = None
-    half_way: bool = False
+    stopped_early: bool = False
     room: tuple[Piece, ...] | None = None
 
 
@@ -74,13 +74,13 @@ class Draws:
     def of(cls, solution: Solution) -> Draws:
         """From what was solved last, the pieces as the solve left them."""
         rng, factors = np.random.default_rng(0), solution.factors
-        drawn = factors.draws(rng, FREE_DRAWS, STILL_DRAWS) + factors.draws(rng, 0, MORE_STILL)
-        more = min(DRAWN_KEYFRAMES // len(solution.chain), MOST_FREE) - FREE_DRAWS
-        free = drawn[:FREE_DRAWS] + (factors.draws(rng, more, 0) if more > 0 else ())
-        return cls(free, drawn[FREE_DRAWS:])
+        drawn = factors.draws(rng, N_JOINT_DRAWS, N_CHAIN_DRAWS) + factors.draws(rng, 0, N_MORE_CHAIN_DRAWS)
+        more = min(DRAWS_TIMES_KEYFRAMES // len(solution.chain), MAX_JOINT_DRAWS) - N_JOINT_DRAWS
+        free = drawn[:N_JOINT_DRAWS] + (factors.draws(rng, more, 0) if more > 0 else ())
+        return cls(free, drawn[N_JOINT_DRAWS:])
 
 
-def way_come(steps: Sequence[Step], cost: float) -> float:
+def relative_decrease(steps: Sequence[Step], cost: float) -> float:
     """From where the first of `steps` began to half a chi^2 of `cost`, as a share of that; nothing where that is
     nothing, or there is no step."""
     return steps[0].cost / cost - 1.0 if steps and cost > 0.0 else 0.0
@@ -108,7 +108,7 @@ def outcome_of(
             f"{left:.3g}; give a better initial guess, or check the noise in the rig file."
         )
     )
-    begun = Outcome(problem, state, cost, residuals, NOTHING, tuple(steps), converged, status)
+    begun = Outcome(problem, state, cost, residuals, NO_DIRECTIONS, tuple(steps), converged, status)
     if end is None:
         return begun
     pieces = end.factors.pieces

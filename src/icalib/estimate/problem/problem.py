@@ -12,7 +12,7 @@ import numpy as np
 from icalib.estimate.problem.gauge import hold_frame
 from icalib.motion.factor import Factor, FactorKey, Residuals, Whitened, keyed
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces, marginalise, marginalise_in_segments
-from icalib.optim.calib_block import NOTHING
+from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Layout, State
 
@@ -51,7 +51,7 @@ class Problem:
     priors: tuple[Prior, ...]
     tolerance: np.ndarray  # (B,) what a user would call the same number; scales the calibration parameters
     held: np.ndarray = field(
-        default_factory=lambda: NOTHING
+        default_factory=lambda: NO_DIRECTIONS
     )  # (B, m) orthonormal directions of the calibration parameters, in tolerance units, that stay
     framed: bool = True  # a target says where the world's origin is; else nothing does, and it stays where it is
     levelled: bool = True  # gravity says which way is up
@@ -106,7 +106,7 @@ class Problem:
         """The sums between two keyframes alone, with the true curvature of robust losses; residuals are not kept."""
         piece = self.attach(Piece.zeros(first, last, self.layout.size))
         for factor in self.factors.values():
-            factor.accumulate(state, piece, factor.throwaway(), curved=True)
+            factor.accumulate(state, piece, factor.discarded_output(), curved=True)
         self.add_bias_prior(state, piece)
         for prior in self.priors if first == 0 else ():
             prior.accumulate(state, piece)
@@ -117,13 +117,13 @@ class Problem:
         """Empty arrays for `linearise` to fill."""
         return {key: factor.output() for key, factor in self.factors.items()}
 
-    def scratch(self, at: Residuals) -> Residuals:
+    def reusable_output(self, at: Residuals) -> Residuals:
         """`at`, to be filled once more, with new arrays where this problem's own are of another size."""
-        return {key: factor.scratch(at[key]) for key, factor in self.factors.items()}
+        return {key: factor.reusable_output(at[key]) for key, factor in self.factors.items()}
 
-    def settled(self, at: Residuals) -> Problem:
+    def warm_started(self, at: Residuals) -> Problem:
         """The same problem, points of the scene first looked for where they were at `at`."""
-        return self.replacing([factor.settled(at[key]) for key, factor in self.factors.items()])
+        return self.replacing([factor.warm_started(at[key]) for key, factor in self.factors.items()])
 
     def linearise(
         self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True, curved: bool = False

@@ -9,34 +9,38 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimate.problem.outcome import STALLED_DECREASE, Outcome, Step, Visit, outcome_of, way_come
+from icalib.estimate.problem.outcome import STALLED_DECREASE, Outcome, Step, Visit, outcome_of, relative_decrease
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
-from icalib.optim.anderson import PROMISED, Accelerator
+from icalib.optim.anderson import MIN_ACCELERATED_GAIN, Accelerator
 from icalib.optim.arrowhead import NotDefiniteError, Piece, Solution, solve
-from icalib.optim.calib_block import DETERMINED, essential_information
+from icalib.optim.calib_block import DETERMINED_ABOVE, essential_information
 from icalib.optim.prior_factor import Prior, sums_of_priors
 from icalib.optim.state import State
 
 MAX_ITERATIONS = 50
 # Half a chi^2 of 5e-4 is a step of 0.03 standard deviations at most, in any direction.
 CONVERGED_DECREASE = 5e-4
-ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
-CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
-HALF_WAY = 0.5  # of half the chi^2: where little more is gained, unobservable directions show
-MOST_STALLED = 4  # steps this small that fail before the solver rests
-COMES_BACK = 0.25  # of what a step costs too much, where its error is of second order: this much at most is left next
-STRAIGHT, AS_SAID = 1e3, 0.1  # of half the chi^2; of an early pass's tolerance: how well a larger step may be foretold
-OVERSHOT = 0.5  # of what a step promises: one that gains or costs less than this is too long
-ACROSS = 1e-6  # damping of a step that comes back: across a valley, not along it
-CREEPING = 2  # steps, of the least of which the next one must promise less than half; with one, any bend would do
-RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
-FIRST_DAMPING = 1e-8
+ROUNDING_SHARE = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
+CURVED_BELOW_SHARE = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
+EARLY_STOP_DECREASE = 0.5  # of half the chi^2: where little more is gained, unobservable directions show
+MAX_STALLED_STEPS = 4  # steps this small that fail before the solver rests
+# of what a step costs too much, where its error is of second order: this much at most is left next
+MAX_CORRECTION_RATIO = 0.25
+MAX_LINEAR_DECREASE, MAX_LINEAR_MISMATCH = (
+    1e3,
+    0.1,
+)  # of half the chi^2; of an early pass's tolerance: how well a larger step may be foretold
+OVERSHOOT_GAIN = 0.5  # of what a step promises: one that gains or costs less than this is too long
+CORRECTION_DAMPING = 1e-6  # damping of a step that comes back: across a valley, not along it
+CREEPING_STEPS = 2  # steps, of the least of which the next one must promise less than half; with one, any bend would do
+RESTING_RATIO = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
+MIN_DAMPING = 1e-8
 SMALL_DECREASE = 0.5  # of half the chi^2: a step of one standard deviation, all parameters together
-LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations: too small to linearise again
+NEGLIGIBLE_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations: too small to linearise again
 
 
-class _Pace(NamedTuple):
+class _DampingSchedule(NamedTuple):
     """Of damping: what it is at first; by what it grows with a failure, by its square with the next, ...; by what it
     shrinks where one good step follows another; and below what there is none: the weak information of a planar drive
     must not be swamped."""
@@ -47,29 +51,30 @@ class _Pace(NamedTuple):
     none: float
 
 
-SLOW = _Pace(1e-6, 2.0, 0.1, 1e-10)
-QUICK = _Pace(1e-4, 8.0, 0.01, 2e-6)  # where a pass is only to lead near
-LEAST_LESS = 1.0 / 3.0  # Nielsen 1999, "Damping parameter in Marquardt's method": by what it shrinks after a failure
-GOOD_GAIN = 0.25  # of what a step promises: with less, damping does not shrink
+CAREFUL_DAMPING = _DampingSchedule(1e-6, 2.0, 0.1, 1e-10)
+EARLY_DAMPING = _DampingSchedule(1e-4, 8.0, 0.01, 2e-6)  # where a pass is only to lead near
+# Nielsen 1999, "Damping parameter in Marquardt's method": by what it shrinks after a failure
+MIN_FACTOR_AFTER_FAILURE = 1.0 / 3.0
+MIN_GAIN_RATIO = 0.25  # of what a step promises: with less, damping does not shrink
 
 
 @dataclass
-class _Care:
+class _DampingControl:
     """How steps are shortened: by damping, at its `pace`, and by weights alone in place of the true curvature of the
     loss, which the sums have (`curved`) where a step promises less than `curved_below` of the cost."""
 
-    pace: _Pace
+    pace: _DampingSchedule
     damping: float = 0.0
     curved: bool = False
-    curved_below: float = CURVED_BELOW
+    curved_below: float = CURVED_BELOW_SHARE
     failures: int = 0  # since the last step that was taken
 
     def less(self, near: bool, gain: float) -> None:
         """After a step that was taken, with its gain over the predicted one, to sums that have the true curvature where
         `near`. Damping that a failed step asked for shrinks slowly: with much less the next step would fail, too."""
         self.curved = near
-        if gain > GOOD_GAIN:
-            least = LEAST_LESS if self.failures else self.pace.less
+        if gain > MIN_GAIN_RATIO:
+            least = MIN_FACTOR_AFTER_FAILURE if self.failures else self.pace.less
             self.damping *= max(least, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
         self.failures = 0
         self.damping = 0.0 if self.damping < self.pace.none else self.damping
@@ -98,12 +103,12 @@ class _Descent:
     residuals: Residuals
     cost: float
     steps: list[Step] = field(default_factory=list)
-    care: _Care = field(init=False)
+    care: _DampingControl = field(init=False)
     stalled: int = 0
     accelerator: Accelerator = field(default_factory=Accelerator)
 
     def __post_init__(self) -> None:
-        self.care = _Care(QUICK if self.early else SLOW)
+        self.care = _DampingControl(EARLY_DAMPING if self.early else CAREFUL_DAMPING)
 
     @classmethod
     def begin(
@@ -145,22 +150,24 @@ class _Descent:
             try:
                 return self._solve(self.care.damping)
             except NotDefiniteError:
-                self.care.damping = max(10.0 * self.care.damping, FIRST_DAMPING)
+                self.care.damping = max(10.0 * self.care.damping, MIN_DAMPING)
                 if self.care.damping > 1e3:
                     raise
                 self._linearise(self.state, curved=self.care.curved)
 
     def has_ended(self, solution: Solution) -> bool:
         """Whether nothing that counts would change: the sums are those of the end already."""
-        counts = min(ROUNDING * self.cost, LEAST_DECREASE)
+        counts = min(ROUNDING_SHARE * self.cost, NEGLIGIBLE_DECREASE)
         return not self.early and self.care.curved and self.free and solution.decrease < counts
 
     def creeps(self, solution: Solution) -> bool:
         """Whether steps have ceased to promise less and less: Gauss and Newton's do where the measurements determine
         all, and wander where noise leads. One that failed is no step: the next promises about as much as it did. Nor is
         a damped one: with less damping the next promises more."""
-        before = [step.predicted_decrease for step in self.steps[-CREEPING:] if step.accepted and step.damping == 0.0]
-        return len(before) == CREEPING and solution.decrease > 0.5 * min(before)
+        before = [
+            step.predicted_decrease for step in self.steps[-CREEPING_STEPS:] if step.accepted and step.damping == 0.0
+        ]
+        return len(before) == CREEPING_STEPS and solution.decrease > 0.5 * min(before)
 
     def let_go(self, priors: Sequence[Prior], solution: Solution) -> Solution:
         """The solution where `priors` count no more: what they add to the calibration parameters is known, so nothing
@@ -178,18 +185,19 @@ class _Descent:
         before, now = self.steps[-1], solution.decrease
         left = now * now / before.predicted_decrease if before.accepted else np.inf
         if not (
-            left < LEAST_DECREASE
+            left < NEGLIGIBLE_DECREASE
             and now < SMALL_DECREASE
-            and essential_information(solution.information, self.problem.tolerance, self.problem.layout) > DETERMINED
+            and essential_information(solution.information, self.problem.tolerance, self.problem.layout)
+            > DETERMINED_ABOVE
         ):
             return None
         there = self.state.retract(self.problem.layout, solution.chain, solution.calib)
         cost = self._linearise(there, sums=False, curved=True)
-        if not cost - self.cost < ROUNDING * self.cost:
+        if not cost - self.cost < ROUNDING_SHARE * self.cost:
             self.cost = self._linearise(self.state, curved=True)
             return None
         self.note(solution, True)
-        self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
+        self.state, self.cost, self.problem = there, cost, self.problem.warm_started(self.residuals)
         return left
 
     def note(self, solution: Solution, taken: bool) -> None:
@@ -197,7 +205,7 @@ class _Descent:
         self.steps.append(Step(self.cost, solution.decrease, self.care.damping, taken))
         self.on_step(self.steps[-1])
 
-    def step(self, solution: Solution, comes_back: bool) -> tuple[bool, bool]:
+    def step(self, solution: Solution, second_order: bool) -> tuple[bool, bool]:
         """Whether the step is taken, and whether it is the last one."""
         near = solution.decrease < self.care.curved_below * self.cost
         if self._accelerated(solution, near):
@@ -209,7 +217,7 @@ class _Descent:
         cost = self._linearise(there, sums, near) if straight is None else straight
         if not (self.early or converged):
             there, cost = self._shortened(solution, there, cost, near)
-        if comes_back and sums and not (cost < self.cost or converged):
+        if second_order and sums and not (cost < self.cost or converged):
             there, cost = self._corrected(there, cost, near)
         # At the bottom rounding decides whether the cost falls; a step that promises this little is taken anyway, but
         # not where it goes far along what the data hardly tell, and the cost rises.
@@ -222,7 +230,7 @@ class _Descent:
             self.accelerator.forget()
         if taken:
             self.care.less(near, (self.cost - cost) / max(solution.decrease, 1e-300))
-            self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
+            self.state, self.cost, self.problem = there, cost, self.problem.warm_started(self.residuals)
         return taken, converged
 
     def _accelerated(self, solution: Solution, curved: bool) -> bool:
@@ -234,18 +242,18 @@ class _Descent:
             return False
         there = self.state.retract(self.problem.layout, *best)
         cost = self._linearise(there, True, curved)
-        if not cost < self.cost - PROMISED * solution.decrease:
+        if not cost < self.cost - MIN_ACCELERATED_GAIN * solution.decrease:
             self.accelerator.forget()
             return False
         self.note(solution, True)
         self.accelerator.note((solution.chain, solution.calib), best, solution.decrease)
-        self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
+        self.state, self.cost, self.problem = there, cost, self.problem.warm_started(self.residuals)
         return True
 
     def tries_again(self, solution: Solution) -> bool:
         """After a step that failed: with more care, unless nothing comes of it."""
         self.stalled += solution.decrease < STALLED_DECREASE
-        if self.stalled > MOST_STALLED or (self.early and solution.decrease < RESTING * self.enough):
+        if self.stalled > MAX_STALLED_STEPS or (self.early and solution.decrease < RESTING_RATIO * self.enough):
             return False
         self.care.more()
         if self.care.damping > 1e6:
@@ -274,12 +282,12 @@ class _Descent:
     def _straight(self, solution: Solution, state: State, curved: bool) -> float | None:
         """What a step to `state` costs, where an early pass may end with it although it is not small: it gains just
         what the sums say, so that nothing bends on its way, and next to nothing is left behind it. Else None."""
-        if not (self.early and self.free and self.enough < solution.decrease < STRAIGHT):
+        if not (self.early and self.free and self.enough < solution.decrease < MAX_LINEAR_DECREASE):
             return None
         if self.accelerator.slow(solution.decrease):  # something bends
             return None
         cost = self._linearise(state, sums=False, curved=curved)
-        return cost if abs(self.cost - cost - solution.decrease) < AS_SAID * self.tolerance else None
+        return cost if abs(self.cost - cost - solution.decrease) < MAX_LINEAR_MISMATCH * self.tolerance else None
 
     def _shortened(self, solution: Solution, state: State, cost: float, curved: bool) -> tuple[State, float]:
         """Of a step to `state`, at `cost`, that overshoots, about half, to where a parabola has its least; and what
@@ -289,7 +297,7 @@ class _Descent:
         curvature: then steps jump from one side of the least to the other.
         """
         gain = (self.cost - cost) / solution.decrease if solution.decrease > 0.0 else 1.0
-        if not -OVERSHOT < gain < OVERSHOT:
+        if not -OVERSHOOT_GAIN < gain < OVERSHOOT_GAIN:
             return state, cost
         share = 1.0 / (2.0 - gain)
         short = self.state.retract(self.problem.layout, share * solution.chain, share * solution.calib)
@@ -300,21 +308,21 @@ class _Descent:
 
     def _corrected(self, state: State, cost: float, curved: bool) -> tuple[State, float]:
         """Second-order correction: if a candidate step, linearised at `state`, raises the cost, takes further steps
-        from it while each removes most of the excess (share < COMES_BACK). Returns state and cost.
+        from it while each removes most of the excess (share < MAX_CORRECTION_RATIO). Returns state and cost.
 
         A weakly observable direction, such as gravity's on a straight drive, moves far in one step. A step along the
         tangent of a curved valley leaves it by the square of its length; the next ones return. More damping would make
         the solver creep. An excess within rounding counts as none: it would never be less.
         """
         share, least = 0.0, self.cost
-        while cost - least >= ROUNDING * least and share < COMES_BACK:
+        while cost - least >= ROUNDING_SHARE * least and share < MAX_CORRECTION_RATIO:
             try:
-                solution = self._solve(max(self.care.damping, ACROSS))
+                solution = self._solve(max(self.care.damping, CORRECTION_DAMPING))
             except NotDefiniteError:
                 break
             state = state.retract(self.problem.layout, solution.chain, solution.calib)
             before, cost = cost, self._linearise(state, True, curved)
-            share = (cost - least) / max(before - least, ROUNDING * least) if np.isfinite(cost) else np.inf
+            share = (cost - least) / max(before - least, ROUNDING_SHARE * least) if np.isfinite(cost) else np.inf
         return state, cost
 
     def _linearise(self, state: State, sums: bool = True, curved: bool = False) -> float:
@@ -330,21 +338,22 @@ def minimise(
     on_step: Callable[[Step], None] = lambda _: None,
     tolerance: float = CONVERGED_DECREASE,
     on_visit: Callable[[Visit], None] = lambda _: None,
-    share: float = ROUNDING,
-    comes_back: bool = True,
+    share: float = ROUNDING_SHARE,
+    second_order: bool = True,
     leaves: Callable[[float, np.ndarray], bool] | None = None,
-    lets_go: Callable[[float, np.ndarray], Sequence[Prior]] = lambda *_: (),
+    priors_to_drop: Callable[[float, np.ndarray], Sequence[Prior]] = lambda *_: (),
     room: tuple[Piece, ...] | None = None,
 ) -> Outcome:
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
 
     `on_visit` is told of each state that a step was looked for from, and of the last. Where the tolerance is wide
     another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
-    `comes_back`: steps may go as far as the next ones can make good, see `_Descent`. `leaves`: asked with
+    `second_order`: steps may go as far as the next ones can make good, see `_Descent`. `leaves`: asked with
     how far it has come, as a share of half the chi^2, and the calibration parameters' information (B, B), whether to
-    end when half the chi^2 can fall by less than HALF_WAY, or a step not far from there fails, or steps creep.
-    `lets_go`: asked before it, with the same, which priors are to count no more from where half the chi^2 can fall by
-    less than HALF_WAY. `room`: of an outcome of a problem with the same features, to be used again.
+    end when half the chi^2 can fall by less than EARLY_STOP_DECREASE, or a step not far from there fails, or steps
+    creep. `priors_to_drop`: asked before it, with the same, which priors are to count no more from where half the chi^2
+    can fall by less than EARLY_STOP_DECREASE. `room`: of an outcome of a problem with the same features, to be used
+    again.
 
     Raises EstimationError if no step can be computed at all.
     """
@@ -352,27 +361,27 @@ def minimise(
     for _ in range(MAX_ITERATIONS):
         solution = at.solution()
         on_visit(Visit(at.state, solution.information))
-        if at.free and solution.decrease < HALF_WAY:
-            gone = lets_go(way_come(at.steps, at.cost), solution.information)
+        if at.free and solution.decrease < EARLY_STOP_DECREASE:
+            gone = priors_to_drop(relative_decrease(at.steps, at.cost), solution.information)
             solution = at.let_go(gone, solution) if gone else solution
         creeps = at.creeps(solution)
-        low = creeps or (at.free and solution.decrease < RESTING * HALF_WAY)
-        asked = low and leaves is not None and leaves(way_come(at.steps, at.cost), solution.information)
-        if asked and (creeps or solution.decrease < HALF_WAY) and (at.free or at.early):
-            return replace(at.outcome(solution) if at.free else at.end(on_visit), half_way=True)
+        low = creeps or (at.free and solution.decrease < RESTING_RATIO * EARLY_STOP_DECREASE)
+        asked = low and leaves is not None and leaves(relative_decrease(at.steps, at.cost), solution.information)
+        if asked and (creeps or solution.decrease < EARLY_STOP_DECREASE) and (at.free or at.early):
+            return replace(at.outcome(solution) if at.free else at.end(on_visit), stopped_early=True)
         if at.has_ended(solution):
             at.note(solution, True)
             return at.outcome(solution)
         if (left := at.last_step(solution)) is not None:
             on_visit(Visit(at.state, solution.information))
             return at.outcome(solution, left)
-        taken, converged = at.step(solution, comes_back)
+        taken, converged = at.step(solution, second_order)
         if converged:
             break
         if taken:
             continue
         if asked:
-            return replace(at.end(on_visit), half_way=True)
+            return replace(at.end(on_visit), stopped_early=True)
         if not at.tries_again(solution):
             break
     return at.end(on_visit)

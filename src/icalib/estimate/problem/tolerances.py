@@ -11,8 +11,9 @@ from icalib.rig import ParameterSpec, Sensor, Settings
 from icalib.rig.scene import SCENE
 from icalib.sensors.sensor import TIME_OFFSET
 
-UNGUESSED = 0.03  # rad or m: how well the start knows what nobody guessed, such as which way is up
-FROM_NOTHING_M = 0.5  # prior uncertainty of a translation that nobody guessed: where the program took it to be
+UNGUESSED_SIGMA = 0.03  # rad or m: how well the start knows what nobody guessed, such as which way is up
+# prior uncertainty of a translation that nobody guessed: where the program took it to be
+UNGUESSED_TRANSLATION_SIGMA_M = 0.5
 
 
 def specs_of(layout: Layout, sensors: Iterable[Sensor]) -> dict[Key, ParameterSpec]:

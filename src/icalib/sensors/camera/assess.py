@@ -8,9 +8,9 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
-from icalib.motion.clocks import instants
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
 from icalib.motion.keyframe_placement import usable
+from icalib.motion.time_offsets import instants
 from icalib.result import CornerResiduals, SensorFit, TrackResiduals
 from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.geometry.cameras.base import CameraModel
-from icalib.optim import pages
+from icalib.optim import memory
 from icalib.optim.state import State
 from icalib.sensors.camera.corner_factor import CornerFactor
 
@@ -16,7 +16,7 @@ def with_bloom(factor: CornerFactor, state: State) -> CornerFactor:
     target = factor.bodies.target
     inwards = target.tag_centers - target.points
     params = factor.lens(state)
-    direction = pages.zeros(factor.stream.uv.shape, np.float32)
+    direction = memory.mmap_zeros(factor.stream.uv.shape, np.float32)
     for own, X, R_cam_body in factor.in_camera(state):
         towards = np.einsum("nij,nj->ni", R_cam_body, inwards[factor.stream.point[own]])
         direction[own] = bloom_direction(factor.model, params, X, towards)

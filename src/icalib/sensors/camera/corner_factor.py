@@ -22,12 +22,12 @@ from icalib.data.measurements import CornerStream
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import BOARD
 from icalib.model.bodies import Bodies
-from icalib.motion.clocks import offset_at
-from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares
+from icalib.motion.factor import FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares, StateDifference
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import Poses
 from icalib.motion.sensor_pose import Kinematics, SensorPose
-from icalib.optim import pages
+from icalib.motion.time_offsets import offset_at
+from icalib.optim import memory
 from icalib.optim.arrowhead import Piece
 from icalib.optim.robust_weights import LOSSES
 from icalib.optim.state import Layout, State, in_recording
@@ -76,7 +76,7 @@ class CornerOutput:
     @classmethod
     def empty(cls, n: int, n_views: int, m: int, dtype: type = np.float32) -> CornerOutput:
         """For n corners in `n_views` views with m sizes of a common error."""
-        return cls(pages.zeros((n, 2), dtype), pages.zeros((n,), dtype), np.zeros((n_views, 2, m)))
+        return cls(memory.mmap_zeros((n, 2), dtype), memory.mmap_zeros((n,), dtype), np.zeros((n_views, 2, m)))
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class CornerFactor(FactorDefaults):
         used = out.root > 0.0
         return float(((self.errors(out)[used] * out.root[used, None]) ** 2).sum(dtype=np.float64))
 
-    def throwaway(self) -> None:
+    def discarded_output(self) -> None:
         """None: arrays for all corners would be large beside those of a piece."""
 
     def squares(self, out: CornerOutput) -> dict[FitKey, Squares]:
@@ -230,7 +230,7 @@ class CornerFactor(FactorDefaults):
         rows = image_rows(self.name, CORNERS, seconds, out.residual, self.noise.sigma, out.root)
         return [rows] if len(seconds) else []
 
-    def spent(self, out: CornerOutput, along: Along) -> dict[FitKey, float]:
+    def dof_used(self, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
         """See `Factor`. A few images at a time: residuals of all at another state would fill the memory."""
         return spent_by_corners(self, out, along)
 

@@ -12,7 +12,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.sensor_pose import SensorPose, chain_width, fill_chain
-from icalib.optim.robust_weights import bend, marginalise_shared, robust_weights, weight, whole_error
+from icalib.optim.robust_weights import correct_curvature, marginalise_shared, robust_weights, weight, whole_error
 from icalib.optim.rows import add_gradients, add_gram
 
 
@@ -188,7 +188,7 @@ def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
             square = (error[k, 0] ** 2 + error[k, 1] ** 2) / (sigma * sigma)
             _, _, curvature = weight(noise.loss, noise.scale, square)
             if curvature < 1.0:
-                bend(A, D, k, n, error[k], np.sqrt(curvature))
+                correct_curvature(A, D, k, n, error[k], np.sqrt(curvature))
 
 
 class _Work(NamedTuple):

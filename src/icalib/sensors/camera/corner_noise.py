@@ -31,7 +31,7 @@ FIRST_GUESS_PX = 0.5
 SMALLEST_PX, LARGEST_PX = 1e-3, 5.0
 FIRST_TAU_PX = 0.1
 COMMON_ERRORS = 1
-SMALLEST_BASE_PX = 0.005  # no detector does better; keeps weights finite where corners are exact
+MIN_CORNER_NOISE_PX = 0.005  # no detector does better; keeps weights finite where corners are exact
 BINS = 12  # of image speed
 LARGE_MISFIT = 0.5  # times the noise: a fifth of the variance
 # Times the `loss_scale`. On stereo stills whose lenses leave 8 px near the border it takes the error of images that
@@ -128,7 +128,7 @@ def residual_noise(factor: CornerFactor, out: CornerOutput, settings: Settings, 
     base, exposure = float(np.sqrt(median_variance(square))), 0.0
     if settings.blur_noise:
         base, exposure = _fit_blur(square, speed[stream.image][used] / relative)
-    return ResidualNoise(max(base, SMALLEST_BASE_PX), exposure, lens)
+    return ResidualNoise(max(base, MIN_CORNER_NOISE_PX), exposure, lens)
 
 
 def estimate_noise(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icalib.motion.factor import Along, FitKey, ResidualRows, Squares
+from icalib.motion.factor import FitKey, ResidualRows, Squares, StateDifference
 from icalib.optim.arrowhead import in_parallel
 
 if TYPE_CHECKING:
@@ -40,13 +40,15 @@ def rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
     return float(np.sqrt(np.mean(used**2, dtype=np.float64))) if len(used) else None
 
 
-def spent_by_corners(camera: CornerFactor, out: CornerOutput, along: Along) -> dict[FitKey, float]:
+def spent_by_corners(camera: CornerFactor, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
     """See `Factor.spent`."""
     found = in_parallel(partial(_spent_by_views, camera, out, along), camera.blocks())
     return {(camera.name, kind): sum(one[kind] for one in found) for kind in (found[0] if found else ())}
 
 
-def _spent_by_views(camera: CornerFactor, at: CornerOutput, step: Along, views: tuple[int, int]) -> dict[str, float]:
+def _spent_by_views(
+    camera: CornerFactor, at: CornerOutput, step: StateDifference, views: tuple[int, int]
+) -> dict[str, float]:
     """|J x|^2 of some views, its mean over their images' common errors, which follow x."""
     own, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
     up, down = (camera.residual(state, *views) for state in (step.end, step.start))

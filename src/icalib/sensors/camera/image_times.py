@@ -8,10 +8,10 @@ import numpy as np
 
 from icalib.data.measurements import CornerStream, Measurements, TrackStream
 from icalib.errors import EstimationError
-from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
 from icalib.motion.keyframe_placement import MERGED_WITHIN_S, usable
 from icalib.motion.poses import assign_keyframes
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import Key, State
 from icalib.rig import Rig, Scheme
 

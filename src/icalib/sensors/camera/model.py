@@ -11,8 +11,8 @@ from icalib.data.measurements import CornerStream, Measurements
 from icalib.geometry.cameras import camera_model
 from icalib.model.sensor_model import Clusters, Pass, SensorModel, model_of
 from icalib.model.statistics import PassEnd
-from icalib.motion.clocks import instants
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
+from icalib.motion.time_offsets import instants
 from icalib.optim.arrowhead import chain_cuts
 from icalib.rig import Camera, ParameterSpec, Rig, Settings
 from icalib.sensors.camera.bloom import with_bloom

@@ -13,8 +13,8 @@ from icalib.geometry.small import inverse_cholesky, mul3, tmul3
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.integration import Increment, bias_of, integrate, integration_room, readings_of
-from icalib.motion.integration_step import COVARIANCE, correction
-from icalib.optim import pages
+from icalib.motion.integration_step import COVARIANCE_SIZE, correction
+from icalib.optim import memory
 from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.prior_factor import accumulate_bias_prior
 from icalib.optim.rows import KEYFRAME_PAIR_DIM, add_product, whiten
@@ -27,7 +27,7 @@ KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": sl
 @njit(cache=True, nogil=True)
 def _preintegrate(k0, k1, keyframes, first, readings, bias, intrinsics, dR, dv, dp, J, W):
     """Increments, bias (and intrinsics) Jacobians and inverse Cholesky factor W of the covariance, intervals k0..k1."""
-    P, by, room = np.empty((ROWS, ROWS)), correction(intrinsics), integration_room(COVARIANCE)
+    P, by, room = np.empty((ROWS, ROWS)), correction(intrinsics), integration_room(COVARIANCE_SIZE)
     for k in range(k0, k1):
         out = Increment(dR[k], dv[k], dp[k], J[k], P)
         integrate(keyframes[k], keyframes[k + 1], first[k], bias_of(bias, k), readings, by, room, out)
@@ -213,8 +213,8 @@ class ImuFactor(RowFactor):
             np.empty((n, 3, 3)),
             np.empty((n, 3)),
             np.empty((n, 3)),
-            pages.zeros((n, 9, width)),
-            pages.zeros((n, ROWS, ROWS)),
+            memory.mmap_zeros((n, 9, width)),
+            memory.mmap_zeros((n, ROWS, ROWS)),
         )
         bias0 = state.bias.copy()
         intrinsics = state.values[imu.name, "intrinsics"].copy()

@@ -12,9 +12,9 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.geometry.planes import plane_of
-from icalib.motion.clocks import instants
 from icalib.motion.factor import of_type
 from icalib.motion.keyframe_placement import usable
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import State
 from icalib.result import Plane, SensorFit
 from icalib.result.excess import excess, times

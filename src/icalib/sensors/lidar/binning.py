@@ -21,9 +21,9 @@ import numpy as np
 
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.motion.clocks import instants
 from icalib.motion.keyframe_placement import usable
-from icalib.motion.sweep import Motion, sweep
+from icalib.motion.sweep import EstimatedMotion, sweep
+from icalib.motion.time_offsets import instants
 from icalib.optim.arrowhead import in_parallel
 from icalib.optim.robust_weights import LOSSES
 from icalib.rig import Loss
@@ -85,7 +85,7 @@ class Moments:
     incidence: np.ndarray
 
 
-def take_moments(cloud: AssociatedPoints, motion: Motion, noise: LidarNoise, bin_s: float = BIN_S) -> Moments:
+def take_moments(cloud: AssociatedPoints, motion: EstimatedMotion, noise: LidarNoise, bin_s: float = BIN_S) -> Moments:
     """Moments of all points that lie on a plane, with poses, planes and residuals at the state of `motion`.
 
     Points in IMU gaps that are not bridged are left out. Groups of scans are summed one after another, on two threads,
@@ -134,7 +134,7 @@ def _scans_with_steps(
 
 
 def _moments_of(
-    cloud: AssociatedPoints, motion: Motion, noise: LidarNoise, bin_s: float, group: slice
+    cloud: AssociatedPoints, motion: EstimatedMotion, noise: LidarNoise, bin_s: float, group: slice
 ) -> tuple[np.ndarray, ...]:
     """Centres [s] of the bins of a group of scans; and bin, plane, count, root and incidence of each entry."""
     per_bin = steps_of(bin_s)
@@ -167,7 +167,7 @@ def steps_of(bin_s: float) -> int:
     return max(2 * (int(bin_s / STEP_S + 0.5) // 2) + 1, 1) if bin_s > STEP_S else 1
 
 
-def in_world(motion: Motion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray]:
+def in_world(motion: EstimatedMotion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) of a LiDAR in the world frame, and positions (N, 3) of the LiDAR at their instants, float32 [m].
 
     Within a step the LiDAR moves with its twist. In gaps of the IMU its motion follows the nearest reading.
@@ -183,7 +183,7 @@ def in_world(motion: Motion, stream: LidarStream) -> tuple[np.ndarray, np.ndarra
     return points, seen_from
 
 
-def points_on_planes(motion: Motion, stream: LidarStream, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def points_on_planes(motion: EstimatedMotion, stream: LidarStream, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) on planes in the world frame [m], about MAX_OUTLINE_POINTS at most, and the plane of each (n,).
     plane (N,): of each point of the stream, -1: none."""
     some = (plane >= 0) & (np.arange(len(plane)) % (len(plane) // MAX_OUTLINE_POINTS | 1) == 0)

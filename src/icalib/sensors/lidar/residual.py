@@ -17,12 +17,12 @@ from itertools import pairwise
 import numpy as np
 
 from icalib.data.measurements import LidarStream
-from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import assign_keyframes
 from icalib.motion.sensor_pose import Kinematics, SensorPose
-from icalib.motion.sweep import Motion as ImuMotion
+from icalib.motion.sweep import EstimatedMotion as ImuMotion
+from icalib.motion.time_offsets import instants, offset_at, slices_by_clock
 from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.planes import Planes
 from icalib.optim.state import Key, Layout, State
@@ -152,7 +152,7 @@ class LidarFactor(RowFactor):
         self, state: State, kinematics: Kinematics, b0: int, b1: int
     ) -> Iterator[tuple[np.ndarray, int, int]]:
         """Bins b0:b1 in chunks: calibration columns (c,) of their poses, first bin, and the one after the last."""
-        for clock, own in by_clock(state, self.name, self.keyframe[b0:b1]):
+        for clock, own in slices_by_clock(state, self.name, self.keyframe[b0:b1]):
             columns = kinematics.columns(clock)
             first, last = b0 + own.start, b0 + own.stop
             # Bins on one side of a keyframe share an unknown rotation, so that they must not be separated.

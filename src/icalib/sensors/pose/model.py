@@ -10,7 +10,7 @@ from icalib.data.measurements import PoseStream
 from icalib.model.frames import frame_entries
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.model.statistics import ResidualStatistics
-from icalib.motion.clocks import instants
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import Entry, Key
 from icalib.rig import ImuSensor, PoseSensor, Rig, Settings
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor

@@ -19,15 +19,15 @@ import numpy as np
 
 from icalib.data.measurements import PoseStream
 from icalib.model.frames import FRAME, frame_of
-from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.keyframe_placement import MERGED_WITHIN_S
 from icalib.motion.pose_rows import Frame, PoseResiduals, absolute_residuals, relative_residuals
-from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks, of_recordings
+from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks, rows_by_recording
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
 from icalib.motion.stamp_intervals import StampIntervals, choose_intervals
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.time_offsets import instants, offset_at, slices_by_clock
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
@@ -118,7 +118,7 @@ class AbsolutePoseFactor(_PoseFactor):
     layout: Layout
 
     @classmethod
-    def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
+    def build(cls, stream: PoseStream, motion: EstimatedMotion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
         """The factor of the poses near keyframes, without those in IMU gaps that are not bridged."""
         state, (k, keyframe) = motion.state, motion.near_keyframes(stream, MAX_POSE_PROPAGATION_S)
         return cls(
@@ -156,7 +156,10 @@ class AbsolutePoseFactor(_PoseFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        into, parts = Into(piece, out, sums, curved), of_recordings(self.keyframe, self.starts, self.n_keyframes, piece)
+        into, parts = (
+            Into(piece, out, sums, curved),
+            rows_by_recording(self.keyframe, self.starts, self.n_keyframes, piece),
+        )
         return sum(self._add_recording(k, own, state, into) for k, own in parts)
 
     def _add_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
@@ -195,7 +198,9 @@ class RelativePosesFactor(_PoseFactor):
     layout: Layout
 
     @classmethod
-    def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> RelativePosesFactor:
+    def build(
+        cls, stream: PoseStream, motion: EstimatedMotion, noise: PoseNoise, layout: Layout
+    ) -> RelativePosesFactor:
         """The factor with intervals between stamps, chosen by the time offset and the keyframes of `motion`."""
         state, seconds = motion.state, stream.seconds
         times = instants(stream, state.values)
@@ -226,7 +231,7 @@ class RelativePosesFactor(_PoseFactor):
         """See `Factor`."""
         low, high = (int(k) for k in np.searchsorted(self.intervals.keyframe, [piece.first, piece.last]))
         into, cost = Into(piece, out, sums, curved), 0.0
-        for clock, part in by_clock(state, self.name, self.intervals.keyframe[low:high]):
+        for clock, part in slices_by_clock(state, self.name, self.intervals.keyframe[low:high]):
             for some in in_chunks(slice(low + part.start, low + part.stop)):
                 cost += self._add_interval_rows(clock, some, state, into)
         return cost

@@ -15,12 +15,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from icalib.motion.clocks import offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.row_sums import Into, RobustNoise, add_rows, of_recordings
+from icalib.motion.row_sums import Into, RobustNoise, add_rows, rows_by_recording
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.time_offsets import offset_at
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
@@ -74,7 +74,7 @@ class PositionFactor(RowFactor):
 
     @classmethod
     def build(
-        cls, stream: PositionStream, motion: Motion, noise: PositionNoise, layout: Layout, frame: str
+        cls, stream: PositionStream, motion: EstimatedMotion, noise: PositionNoise, layout: Layout, frame: str
     ) -> PositionFactor:
         """The fixes near keyframes and outside gaps of the IMU; their keyframes stay while the solver runs. The
         covariances of `stream` are the weights: see `model.weighted`."""
@@ -111,7 +111,10 @@ class PositionFactor(RowFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
-        into, parts = Into(piece, out, sums, curved), of_recordings(self.keyframe, self.starts, self.n_keyframes, piece)
+        into, parts = (
+            Into(piece, out, sums, curved),
+            rows_by_recording(self.keyframe, self.starts, self.n_keyframes, piece),
+        )
         return sum(self._of_recording(k, own, state, into) for k, own in parts)
 
     def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
-from icalib.motion.sensor_pose import N_MOUNTED, OFFSET
+from icalib.motion.sensor_pose import N_POSE_PARAMETERS, OFFSET_COLUMN
 from icalib.optim.rows import KEYFRAME_PAIR_DIM
 from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.wheels.drive_rows import N_DRIVE
@@ -117,9 +117,9 @@ def _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows):
         for c in range(KEYFRAME_DIM):
             rows.J[i, q, c] += aY[k] * J_first[k, c] + aT[k] * J_first[3 + k, c]
             rows.J[i, q, KEYFRAME_DIM + c] += aY[k] * J_second[k, c] + aT[k] * J_second[3 + k, c]
-        rows.J[i, q, KEYFRAME_PAIR_DIM + OFFSET] += aY[k] * J_calib[k, 0] + aT[k] * J_calib[3 + k, 0]
+        rows.J[i, q, KEYFRAME_PAIR_DIM + OFFSET_COLUMN] += aY[k] * J_calib[k, 0] + aT[k] * J_calib[3 + k, 0]
         for c in range(J_calib.shape[1] - 1):
-            rows.J[i, q, KEYFRAME_PAIR_DIM + N_MOUNTED + c] += (
+            rows.J[i, q, KEYFRAME_PAIR_DIM + N_POSE_PARAMETERS + c] += (
                 aY[k] * J_calib[k, 1 + c] + aT[k] * J_calib[3 + k, 1 + c]
             )  # fmt: skip
 

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.model.sensor_model import Pass, SensorModel
-from icalib.motion.clocks import instants
 from icalib.motion.factor import Factor
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import Key, Layout
 from icalib.rig import Settings, Wheels
 from icalib.sensors.wheels.ground_factor import GroundFactor, floors
@@ -40,7 +40,7 @@ class WheelModel(SensorModel[Wheels, WheelNoise]):
 
 
 def wheel_factor(
-    wheels: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, motion: Motion, layout: Layout
+    wheels: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, motion: EstimatedMotion, layout: Layout
 ) -> IncrementFactor | RelativePoseFactor:
     """The factor of the readings, as the fields `measures` and `factor` of the rig file choose it."""
     if isinstance(stream, WheelPoses):

@@ -21,14 +21,20 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.data.measurements import WheelPoses
-from icalib.motion.clocks import by_clock, instants, offset_at
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.pose_rows import Extrinsics, relative_residuals
-from icalib.motion.poses import Poses, Velocities, motion_at, poses_alone, poses_at
+from icalib.motion.poses import (
+    Poses,
+    VelocityDerivatives,
+    poses_and_velocity_derivatives,
+    poses_at,
+    poses_without_jacobians,
+)
 from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
-from icalib.motion.sensor_pose import N_MOUNTED, Kinematics, SensorPose, rows_at
+from icalib.motion.sensor_pose import N_POSE_PARAMETERS, Kinematics, SensorPose, rows_at
 from icalib.motion.stamp_intervals import StampIntervals, choose_intervals, pose_intervals
+from icalib.motion.time_offsets import instants, offset_at, slices_by_clock
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
@@ -157,7 +163,7 @@ class IncrementFactor(RowFactor):
         keyframe = self.instants.keyframe[used]
         times = self.instants.times[used] + offset_at(state, self.name, keyframe)
         poses, velocities = _motion(self, times, keyframe, state, into.sums)
-        rows = Rows.empty(len(start) - 1, 4, N_MOUNTED + poses.J_imu.shape[2] + N_DRIVE, into.sums)
+        rows = Rows.empty(len(start) - 1, 4, N_POSE_PARAMETERS + poses.J_imu.shape[2] + N_DRIVE, into.sums)
         wheels = _wheel_parameters(self.name, state, self.kind)
         c = coefficients(self.kind, wheels.drive, self.mean[own])
         increment_rows(
@@ -321,13 +327,15 @@ def _wheel_parameters(name: str, state: State, kind: WheelKind) -> WheelParamete
 
 def _motion(
     factor: IncrementFactor, times: np.ndarray, keyframe: np.ndarray, state: State, jacobians: bool
-) -> tuple[Poses, Velocities]:
+) -> tuple[Poses, VelocityDerivatives]:
     """Poses and velocities of the IMU at times (m,) on its clock, propagated from keyframe (m,); without `jacobians`
     the velocities are empty, as nothing needs their derivatives."""
     if not jacobians:
-        return poses_alone(times, keyframe, state, factor.imu, factor.gravity), Velocities.empty(0, 0)
+        return poses_without_jacobians(times, keyframe, state, factor.imu, factor.gravity), VelocityDerivatives.empty(
+            0, 0
+        )
     free = factor.layout.is_free(factor.imu.name, "intrinsics")
-    return motion_at(times, keyframe, state, factor.imu, factor.gravity, free)
+    return poses_and_velocity_derivatives(times, keyframe, state, factor.imu, factor.gravity, free)
 
 
 def _samples(keyframe: np.ndarray, p: Poses) -> MotionSamples:
@@ -357,7 +365,7 @@ def _add(factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, s
     drive = layout.columns(factor.name, *drive_names(factor.kind))
     drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])
     kinematics = Kinematics.of(factor)
-    for clock, part in by_clock(state, factor.name, keyframe):
+    for clock, part in slices_by_clock(state, factor.name, keyframe):
         columns = np.concatenate([kinematics.columns(clock), drive])
         mine = slice(own.start + part.start, own.start + part.stop)
         noise = RobustNoise(factor.whitening[mine], factor.noise.loss, factor.noise.loss_scale)

@@ -15,7 +15,7 @@ from icalib.geometry.blas import subtract_gram
 from icalib.geometry.planes import tangents
 from icalib.geometry.small import eigen3, solve_definite
 from icalib.motion.sensor_pose import chain_width, fill_chain
-from icalib.optim.robust_weights import bend, weight
+from icalib.optim.robust_weights import correct_curvature, weight
 from icalib.optim.rows import add_gram
 from icalib.optim.state import KEYFRAME_DIM
 
@@ -306,7 +306,7 @@ def weighted_rows(i, n, X, seen, seeing, loss, R_cw, error, A):
             A[D - 3 + k, r] = a0 * R_cw[i, 0, k] + a1 * R_cw[i, 1, k] + a2 * R_cw[i, 2, k]
         A[D, r] = root * error[r]
     if loss.curved and curvature < 1.0:
-        bend(A, D, 0, 1, error, np.sqrt(curvature))
+        correct_curvature(A, D, 0, 1, error, np.sqrt(curvature))
     return root, cost
 
 

@@ -15,11 +15,11 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.data.measurements import TrackStream
-from icalib.motion.clocks import clock_of
-from icalib.motion.factor import Along, FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares
+from icalib.motion.factor import FactorDefaults, FactorKey, FitKey, RawSize, ResidualRows, Squares, StateDifference
 from icalib.motion.imu_data import ImuData
+from icalib.motion.time_offsets import clock_numbers
 from icalib.optim.arrowhead import Piece
-from icalib.optim.front import Features
+from icalib.optim.front import PieceFeatures
 from icalib.optim.front_plan import FeatureSums, plan
 from icalib.optim.medians import median_variance
 from icalib.optim.planes import Planes
@@ -197,12 +197,12 @@ class FeatureFactor(FactorDefaults):
         """See `Factor`."""
         return replace(self, cameras=tuple(c.with_imu(imu) for c in self.cameras))
 
-    def scratch(self, out: FeatureOutput) -> FeatureOutput:
+    def reusable_output(self, out: FeatureOutput) -> FeatureOutput:
         """See `Factor`: a cut has other tracks."""
         del out
         return self.output()
 
-    def settled(self, out: FeatureOutput) -> FeatureFactor:
+    def warm_started(self, out: FeatureOutput) -> FeatureFactor:
         """See `Factor`: from far off a point may stop short, or end elsewhere, and the cost would jump from one step to
         the next."""
         return replace(self, tracks=replace(self.tracks, start=out.points.copy()))
@@ -219,7 +219,7 @@ class FeatureFactor(FactorDefaults):
         """See `Factor`: of each camera's features."""
         return feature_rows(self, out, state)
 
-    def spent(self, out: FeatureOutput, along: Along) -> dict[FitKey, float]:
+    def dof_used(self, out: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
         """See `Factor`."""
         return spent_by_features(self, out, along)
 
@@ -237,7 +237,7 @@ class FeatureFactor(FactorDefaults):
         )  # fmt: skip
         ends = self.tracks.edges - piece.first
         steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep, ends)
-        return replace(piece, features=Features.of(sums, steps))
+        return replace(piece, features=PieceFeatures.of(sums, steps))
 
     def accumulate(
         self, state: State, piece: Piece, out: FeatureOutput, sums: bool = True, curved: bool = False
@@ -341,7 +341,7 @@ class FeatureFactor(FactorDefaults):
         pars = np.flatnonzero(lens >= 0)
         clocks = range(len(state.values[camera.name, "time_offset"]))
         own = np.array([np.concatenate([camera.kinematics.columns(k), lens[pars]]) for k in clocks])
-        columns = own[clock_of(state, camera.name, camera.keyframe[i0:i1])]
+        columns = own[clock_numbers(state, camera.name, camera.keyframe[i0:i1])]
         return View(camera, index, i0, camera.lens(state), seen, camera.poses(state, i0, i1), columns, pars)
 
     def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> Points:

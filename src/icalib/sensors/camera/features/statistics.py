@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icalib.motion.factor import Along, FitKey, RawSize, ResidualRows, Squares, look
+from icalib.motion.factor import FitKey, RawSize, ResidualRows, Squares, StateDifference, output_at
 from icalib.optim.state import State
 from icalib.sensors.camera.corner_statistics import image_rows, rms_px
 from icalib.sensors.camera.features.surfaces import ON_PLANES, Distances
@@ -64,10 +64,10 @@ def feature_rows(factor: FeatureFactor, out: FeatureOutput, state: State) -> lis
     return found
 
 
-def spent_by_features(factor: FeatureFactor, at: FeatureOutput, along: Along) -> dict[FitKey, float]:
+def spent_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
     """|J x|^2 of each camera's features. Their points follow x, and three degrees of freedom a point are its own: the
     plane that it lies on pays for its share, and the cameras by the number of observations."""
-    there, count = look(factor, along.end), np.zeros(factor.tracks.count)
+    there, count = output_at(factor, along.end), np.zeros(factor.tracks.count)
     used = [root > 0.0 for root in at.root]
     for track, u in zip(factor.tracks.track, used, strict=True):
         count += np.bincount(track[u], minlength=len(count))

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.data.measurements import TrackStream
-from icalib.motion.clocks import instants
-from icalib.motion.factor import look
+from icalib.motion.factor import output_at
+from icalib.motion.time_offsets import instants
 from icalib.optim.arrowhead import chain_cuts
 from icalib.optim.medians import grouped_quantiles, largest_normal, median_variance
 from icalib.optim.state import State
@@ -62,7 +62,7 @@ def next_selections(
     # what a lens that was not found yet made an outlier may be none.
     shown = observed_at_keyframes(factor.cameras, factor.streams, state, settings.max_gap_s)
     anew = replace(factor, noise=noise, keep=shown).cut(state, chain_cuts(factor.n_keyframes))
-    left, share = look(anew, state), GOOD_AT_FIRST if is_first else GOOD
+    left, share = output_at(anew, state), GOOD_AT_FIRST if is_first else GOOD
     # The next pass uses no observation that was not judged, as those of tracks that the poses do not find.
     return [TrackSelection(n, *_judged(anew, left, i, settings, share)) for i, n in enumerate(noise)]
 

@@ -15,7 +15,7 @@ from icalib.data.measurements import LidarStream
 from icalib.detection.planes.planes import MOST_POINTS, FoundPlanes, PlaneSearch, find_planes
 from icalib.errors import EstimationError
 from icalib.motion.clouds import Clouds
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
 from icalib.optim.arrowhead import in_parallel
 from icalib.optim.state import Key
 from icalib.sensors.lidar.binning import in_world
@@ -47,7 +47,7 @@ def round_search(k: int, noise_m: float) -> PlaneSearch:
 
 
 def associate(
-    streams: Sequence[LidarStream], motion: Motion, search: PlaneSearch, before: Association | None = None
+    streams: Sequence[LidarStream], motion: EstimatedMotion, search: PlaneSearch, before: Association | None = None
 ) -> Association:
     """Planes, and their points, at the state of `motion`. Planes get the names of those in `before` with which they
     share most points. Raises EstimationError if there is no plane."""

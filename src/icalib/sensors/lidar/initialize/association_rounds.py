@@ -30,11 +30,11 @@ from icalib.initialize.steps.single_recording import (
     state_of_recording,
     states_from_best,
 )
-from icalib.motion.clocks import instants
 from icalib.motion.clouds import Clouds, joined_clouds, known_planes
 from icalib.motion.known_motion import are_near_keyframes
 from icalib.motion.point_planes import are_somewhere, thinned
-from icalib.motion.sweep import Motion, sweep
+from icalib.motion.sweep import EstimatedMotion, sweep
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import Key, State
 from icalib.sensors.lidar.binning import COARSE_BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.initialize.association import (
@@ -263,7 +263,7 @@ def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.
     return out
 
 
-def _add_in_world(moments: Moments, motion: Motion, stream: LidarStream, sums: np.ndarray) -> None:
+def _add_in_world(moments: Moments, motion: EstimatedMotion, stream: LidarStream, sums: np.ndarray) -> None:
     """Adds the sums of (1, x) (1, x)^T over the points x of each plane, in the world, to sums (P, 4, 4)."""
     at = sweep(motion, stream.name, instants(stream, motion.state.values, moments.seconds))
     bin_of = np.repeat(np.arange(len(moments.seconds)), np.diff(moments.start))

@@ -16,7 +16,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.initialize.trajectories.sensor_trajectory import SensorTrajectory
-from icalib.optim.arrowhead import THREADS
+from icalib.optim.arrowhead import N_THREADS
 from icalib.sensors.lidar.initialize.registration import PosePrediction, predicted_pose, register
 from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert, pick_points, rotate_points
 
@@ -67,7 +67,7 @@ class Scan:
 def sampled_scans(stream: LidarStream) -> list[Scan]:
     """At most MAX_MAPPED_POINTS of each scan, without scans of few points. Raises EstimationError if scans are too
     few."""
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(N_THREADS) as pool:
         scans = list(pool.map(lambda i: _sampled_scan(stream, i), range(len(stream.stamps_ns))))
     scans = [s for s in scans if len(s.tau) >= MIN_SCAN_POINTS]
     if len(scans) < MIN_SCANS:

@@ -48,8 +48,8 @@ from icalib.initialize.trajectories.trajectory_fit import (
     fit_imu_trajectory,
 )
 from icalib.model.frames import FRAME, frame_of
-from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import Key, State
 from icalib.rig import PoseSensor
 from icalib.sensors.pose.initialize.conventions import with_checked_convention

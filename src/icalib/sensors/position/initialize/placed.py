@@ -12,7 +12,7 @@ from icalib.geometry import so3
 from icalib.initialize.steps.cross_correlation import best_shifts
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
 from icalib.sensors.position.frame import PositionFrame
 from icalib.sensors.position.initialize.attitude import Fix
 from icalib.sensors.position.initialize.clock import likely_offsets, varies
@@ -61,7 +61,7 @@ class KnownPlace:
         return 1 if self.levelled else 3
 
 
-def place(motion: Motion, name: str, fix: Fix, known: KnownPlace) -> PlacedSensor:
+def place(motion: EstimatedMotion, name: str, fix: Fix, known: KnownPlace) -> PlacedSensor:
     """From the fixes of one recording, whose keyframes `motion` has. Raises EstimationError where they do not show
     it."""
     found = [x for offset in _offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
@@ -86,7 +86,7 @@ def place(motion: Motion, name: str, fix: Fix, known: KnownPlace) -> PlacedSenso
     return best
 
 
-def _offsets(motion: Motion, fix: Fix, known: KnownPlace) -> list[float]:
+def _offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> list[float]:
     """Candidate time offsets [s]: peaks of the correlation of mean speeds, then of third differences with the IMU's
     readings. The latter are needed where the rig turns and hardly moves: a long lever arm makes speeds differ."""
     if known.offset is not None:
@@ -101,7 +101,7 @@ def _offsets(motion: Motion, fix: Fix, known: KnownPlace) -> list[float]:
     return [*(peak.samples / GRID_HZ for peak in peaks), *felt]
 
 
-def _scanned(motion: Motion, fix: Fix, known: KnownPlace) -> list[float]:
+def _scanned(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> list[float]:
     """The offsets of a grid at which frame and lever arm fit best, however the rig moves: where it turns in place,
     neither its speed nor its acceleration is like those of the antenna. Half of the fixes must be used."""
     some = np.linspace(0, len(fix.t) - 1, min(len(fix.t), SCANNED_FIXES)).astype(int)
@@ -146,7 +146,7 @@ class _Unknowns:
         )
 
 
-def _placed(motion: Motion, fix: Fix, offset: float, known: KnownPlace) -> PlacedSensor | None:
+def _placed(motion: EstimatedMotion, fix: Fix, offset: float, known: KnownPlace) -> PlacedSensor | None:
     """By Gauss-Newton from a linear solution, at an offset that is refined."""
     t = fix.t + offset
     ok = is_known(motion.state.seconds, t - OFFSET_SIGMA) & is_known(motion.state.seconds, t + OFFSET_SIGMA)
@@ -220,7 +220,9 @@ def _linear_arm(at: Poses, p: np.ndarray, frame: PositionFrame, arm: np.ndarray 
     return _Unknowns(arm, frame.rotation, frame.position, offset)
 
 
-def _rows(motion: Motion, t: np.ndarray, p: np.ndarray, x: _Unknowns, levelled: bool) -> tuple[np.ndarray, np.ndarray]:
+def _rows(
+    motion: EstimatedMotion, t: np.ndarray, p: np.ndarray, x: _Unknowns, levelled: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (n, 3) m in the world, and their derivatives (n, 3, 8 or 10): arm, turn, origin, offset."""
     at, turned = imu_poses(motion, t + x.offset), p @ x.R_wf.T
     r = at.position + at.rotation @ x.arm - turned - x.p_wf

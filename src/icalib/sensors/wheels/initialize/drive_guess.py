@@ -22,7 +22,7 @@ from icalib.initialize.steps.cross_correlation import best_shift
 from icalib.initialize.steps.rate_correlation import MAX_RATE_STEP_S, correlation_in_words, max_rate_step
 from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.pose_rows import Extrinsics
-from icalib.motion.stamp_intervals import LONGEST_S
+from icalib.motion.stamp_intervals import MAX_INTERVAL_S
 from icalib.rig import WheelKind, drive_names
 
 CORRELATION_HZ = 100.0  # grid of the correlation; Gauss-Newton refines its peak
@@ -106,7 +106,7 @@ def wheel_rates(name: str, seconds: np.ndarray, integrals: np.ndarray, kind: Whe
     b = np.searchsorted(seconds, seconds + RATE_WINDOW_S - 1e-9)
     good = (b < len(seconds)) & (b > a)
     a, b = a[good], b[good]
-    longest = max_rate_step(name, seconds, "readings", LONGEST_S)
+    longest = max_rate_step(name, seconds, "readings", MAX_INTERVAL_S)
     near = seconds[b] - seconds[a] <= longest
     a, b = a[near], b[near]
     if len(a) < MIN_WINDOWS:

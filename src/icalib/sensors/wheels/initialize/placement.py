@@ -21,9 +21,9 @@ from icalib.initialize.steps.contradicted_guesses import (
 from icalib.initialize.steps.rig_file_values import stated_values
 from icalib.initialize.steps.single_recording import offset_of_each_clock, single_recording
 from icalib.initialize.steps.vertical import possible_verticals
-from icalib.motion.clocks import instants
 from icalib.motion.imu_data import clear_of
 from icalib.motion.known_motion import imu_poses, is_known
+from icalib.motion.time_offsets import instants
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
 from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION, mounted

@@ -11,7 +11,7 @@ from icalib.data.stamps.clocks import usual_step
 from icalib.data.stamps.ordered import kept_readings, longest_run
 from icalib.errors import RecordingError
 from icalib.rig import RATE_UNITS, Wheels
-from icalib.sensors.wheels.read.outliers import apart, comes_back, counter_of, range_of, set_back, without_wraps
+from icalib.sensors.wheels.read.outliers import apart, counter_of, range_of, second_order, set_back, without_wraps
 from icalib.sensors.wheels.read.raw_readings import RATE_HZ, WheelReadings
 
 _LEAST_HZ = 2.0  # the motion over longer periods is not followed by the estimate
@@ -106,7 +106,7 @@ def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelRe
     size, notes = _range(read, wheels, what)
     off, own = apart(_steps(read, wheels, size), read.seconds[1:])
     dt = np.diff(read.seconds)[:, None]
-    wrong = comes_back(off * dt, own)
+    wrong = second_order(off * dt, own)
     if wrong.any():
         at = read.stamps_ns[np.argmax(wrong)]
         notes += (f"{what}: {int(wrong.sum())} single readings are outliers and were removed, the first at {at} ns.",)

@@ -59,7 +59,7 @@ def _fastest(rate: np.ndarray) -> np.ndarray:
     return _FASTEST_TIMES * np.percentile(np.abs(rate), _BRISK, axis=0)
 
 
-def comes_back(off: np.ndarray, own: np.ndarray) -> np.ndarray:
+def second_order(off: np.ndarray, own: np.ndarray) -> np.ndarray:
     """(N + 1,) the wrong ones of N + 1 angles whose steps (N, m) are `off` from those nearby, `own` (N, m) of them far:
     steps away from the others' path and back."""
     wrong = np.zeros(len(off) + 1, dtype=bool)

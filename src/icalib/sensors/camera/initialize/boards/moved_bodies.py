@@ -16,7 +16,7 @@ from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.rig import Rig
 from icalib.sensors.camera.connected_bodies import restrict
-from icalib.sensors.camera.corner_noise import SMALLEST_BASE_PX
+from icalib.sensors.camera.corner_noise import MIN_CORNER_NOISE_PX
 from icalib.sensors.camera.initialize.boards.incremental_scene import fixed_lens, reconstruct_scene
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, multi_body_poses
 
@@ -44,7 +44,7 @@ def scene_error_ratios(rig: Rig, scene: TargetScene, recordings: Sequence[Measur
     The largest, because few images alike in a scene of their own hide the errors of a wrong lens.
     """
     common, own = np.array([_median_errors(rig, scene, r) for r in recordings]).T
-    return common / max(float(own.max()), SMALLEST_BASE_PX)
+    return common / max(float(own.max()), MIN_CORNER_NOISE_PX)
 
 
 def _median_errors(rig: Rig, scene: TargetScene, recording: Measurements) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.initialize.steps.epipolar_rotation import pairs_with_shared_points
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
-from icalib.motion.sweep import Motion
+from icalib.motion.sweep import EstimatedMotion
 
 STEPS_S = (0.5, 1.0)  # between two images
 MOST_PAIRS = 300  # of images a step
@@ -175,7 +175,7 @@ class _PairResiduals:
     h_by: np.ndarray
 
     @classmethod
-    def of(cls, followed: ImagePairs, motion: Motion, at: CameraExtrinsics) -> _PairResiduals:
+    def of(cls, followed: ImagePairs, motion: EstimatedMotion, at: CameraExtrinsics) -> _PairResiduals:
         t = followed.times + at.offset
         followed = followed.some(is_known(motion.state.seconds, t[:, 0]) & is_known(motion.state.seconds, t[:, 1]))
         t1, t2 = (followed.times + at.offset).T
@@ -240,7 +240,11 @@ def _after(poses: Poses, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def extrinsics_on_motion(
-    followed: ImagePairs, motion: Motion, starts: Sequence[CameraExtrinsics], axis: np.ndarray | None, held: np.ndarray
+    followed: ImagePairs,
+    motion: EstimatedMotion,
+    starts: Sequence[CameraExtrinsics],
+    axis: np.ndarray | None,
+    held: np.ndarray,
 ) -> CameraExtrinsics:
     """The camera that fits best what it `followed`, sought from each of the `starts`, turned all round about `axis`
     (3,) of the IMU where there is one. held (7,): what is not sought, as in `CameraExtrinsics.moved`.
@@ -266,7 +270,7 @@ def extrinsics_on_motion(
     return mount
 
 
-def _in_common(followed: ImagePairs, motion: Motion) -> float:
+def _in_common(followed: ImagePairs, motion: EstimatedMotion) -> float:
     """The share of its pairs of images that a camera can have made while the motion is known, wherever its clock is."""
     span, known = np.ptp(followed.times), np.ptp(motion.state.seconds)
     return min(1.0, float(known / span)) if span > 0.0 else 1.0

@@ -21,7 +21,7 @@ from icalib.initialize.steps.single_recording import (
     single_recording,
     state_of_recording,
 )
-from icalib.optim.arrowhead import THREADS
+from icalib.optim.arrowhead import N_THREADS
 from icalib.optim.state import Key, State
 from icalib.rig import Camera
 from icalib.sensors.camera.initialize.guess import relative_offset
@@ -48,7 +48,7 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
         guessed = {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]}
         return guessed | (_placed(inputs, state, number, lens) if len(known) < len(MOUNTED_NAMES) else {}) | known
 
-    with ThreadPoolExecutor(THREADS) as pool:  # its own: what it does may use the solver's
+    with ThreadPoolExecutor(N_THREADS) as pool:  # its own: what it does may use the solver's
         return {k: v for own in pool.map(values, range(len(inputs.rig.cameras))) for k, v in own.items()}
 
 

@@ -10,10 +10,10 @@ from tests.estimation.test_arrowhead import random_pieces
 from tests.estimation.test_front import build
 from tests.typed import not_none
 
-from icalib.estimate.evidence.debias import spurious_information
-from icalib.estimate.evidence.evidence import fits
 from icalib.estimate.problem.outcome import Draws, Outcome, posterior
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.residual_statistics.fit_statistics import fits
+from icalib.estimate.residual_statistics.jacobian_noise import spurious_information
 from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import Piece, solve
 from icalib.sensors.camera.corner_factor import CornerFactor

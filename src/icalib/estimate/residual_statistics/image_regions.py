@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from icalib.estimate.evidence.evidence import spread_covariance
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
+from icalib.estimate.residual_statistics.fit_statistics import spread_covariance
 from icalib.model.sensor_model import all_models
 from icalib.motion.factor import FactorKey
 from icalib.optim.arrowhead import Piece
@@ -55,7 +55,7 @@ def _cluster_gradients(
 ) -> list[np.ndarray]:
     """Of each of `kinds` of clusters (clusters, B), the gradient of each cluster; chain and points are marginalised."""
     counts = [_count(kind) for kind in kinds]
-    B, state, at = problem.layout.size, outcome.state, problem.scratch(outcome.residuals)
+    B, state, at = problem.layout.size, outcome.state, problem.reusable_output(outcome.residuals)
     starts = B + np.cumsum([0, *counts])
 
     def segment(first: int, last: int) -> Piece:

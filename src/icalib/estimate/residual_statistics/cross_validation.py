@@ -19,13 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.motion.factor import Residuals
-from icalib.optim.arrowhead import Piece, given_calib, in_parallel
-from icalib.optim.calib_block import HELD_BELOW, complement, restricted_inverse
+from icalib.optim.arrowhead import Piece, chain_step_given_calib, in_parallel
+from icalib.optim.calib_block import UNOBSERVABLE_BELOW, complement, restricted_inverse
 
-LEAST_PART = 1e-6  # of a direction: shorter ones are rounding
-LINEAR = 0.1  # of the excess: what it may be off by where the step of the other half is short enough
+MIN_SINGULAR_VALUE = 1e-6  # of a direction: shorter ones are rounding
+MAX_NONLINEAR_SHARE = 0.1  # of the excess: what it may be off by where the step of the other half is short enough
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Excess(NamedTuple):
     steps: np.ndarray
 
 
-def predict(parts: Parts) -> Prediction | None:
+def predict(parts: Segments) -> Prediction | None:
     """Predicts each half of the recording from the other. None if no direction of the calibration parameters is
     determined by both."""
     t, B = parts.problem.tolerance, parts.problem.layout.size
@@ -88,7 +88,7 @@ def predict(parts: Parts) -> Prediction | None:
         steps.append(free @ (shared @ known + own @ rest))
     costs, inside, outside = _evaluate(parts, steps)
     bent = abs(2.0 * float(costs[1] - costs[0]) - found.value)
-    linear = bent < max(found.std, LINEAR * abs(found.value))
+    linear = bent < max(found.std, MAX_NONLINEAR_SHARE * abs(found.value))
     return Prediction(shared.shape[1], found.value, found.mean, found.std, inside, outside, linear)
 
 
@@ -106,7 +106,7 @@ def _within(sums: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return basis.T @ sums[:-1, :-1] @ basis, basis.T @ sums[:-1, -1]
 
 
-def _priors(parts: Parts) -> np.ndarray:
+def _priors(parts: Segments) -> np.ndarray:
     piece = Piece.zeros(0, 0, parts.problem.layout.size)
     for prior in parts.problem.priors:
         prior.accumulate(parts.state, piece)
@@ -118,15 +118,15 @@ def _unknown(information: list[np.ndarray]) -> np.ndarray:
     found = []
     for own in information:
         values, vectors = np.linalg.eigh(own)
-        found.append(vectors[:, values < HELD_BELOW])
+        found.append(vectors[:, values < UNOBSERVABLE_BELOW])
     vectors, sizes, _ = np.linalg.svd(np.concatenate(found, axis=1), full_matrices=False)
-    return vectors[:, sizes > LEAST_PART]
+    return vectors[:, sizes > MIN_SINGULAR_VALUE]
 
 
 def _half(information: np.ndarray, gradient: np.ndarray, shared: np.ndarray, own: np.ndarray) -> Half:
     """What the directions `own` leave of the `shared` ones. They stay within some ten tolerances: of what a half does
     not see it says nothing."""
-    S = information + HELD_BELOW * own @ own.T
+    S = information + UNOBSERVABLE_BELOW * own @ own.T
     both = np.concatenate([own.T @ S @ shared, (own.T @ gradient)[:, None]], axis=1)
     rest = -np.linalg.solve(own.T @ S @ own, both)
     left = shared.T @ S @ own @ rest
@@ -157,7 +157,7 @@ def excess(first: Half, second: Half, prior: tuple[np.ndarray, np.ndarray]) -> E
     return Excess(value, float(np.trace(spread)), float(np.sqrt(variance)), np.array([s @ gradients for s in steps]))
 
 
-def _evaluate(parts: Parts, steps: list[np.ndarray]) -> tuple[np.ndarray, Residuals, Residuals]:
+def _evaluate(parts: Segments, steps: list[np.ndarray]) -> tuple[np.ndarray, Residuals, Residuals]:
     """Half the chi^2 (2,) and the residuals at two steps of the calibration parameters of either half, steps (B, 2) of
     both and of the other: the keyframes of each part follow, and nothing is linear but their step."""
     problem, state = parts.problem, parts.state
@@ -165,7 +165,7 @@ def _evaluate(parts: Parts, steps: list[np.ndarray]) -> tuple[np.ndarray, Residu
 
     def costs(g: int) -> list[float]:
         step = steps[g % 2]
-        own = given_calib(parts.piece(g, scratch), step)
+        own = chain_step_given_calib(parts.piece(g, scratch), step)
         out = []
         for k in range(2):
             chain = np.zeros((problem.n_keyframes, own.shape[1]))
@@ -185,7 +185,7 @@ class Shifts:
     expected: np.ndarray
 
 
-def shifts(parts: Parts) -> Shifts:
+def shifts(parts: Segments) -> Shifts:
     """The solution without each part, against that of all parts."""
     t, held = parts.problem.tolerance, parts.problem.held
     scale = np.append(t, 1.0)

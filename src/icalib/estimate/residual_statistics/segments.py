@@ -1,4 +1,5 @@
-"""Parts of a recording that stand alone: what each says of the calibration parameters, its own keyframes eliminated."""
+"""Segments of a recording that stand alone: what each says of the calibration parameters, its own keyframes
+eliminated."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimate.problem.gauge import FRAME, IN_THE_WORLD, hold_frame
+from icalib.estimate.problem.gauge import FRAME_INFORMATION, IN_THE_WORLD, hold_frame
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
@@ -15,16 +16,16 @@ from icalib.motion.independent_keyframes import IndependentKeyframes
 from icalib.optim.arrowhead import Piece, in_parallel, marginalise
 from icalib.optim.state import State
 
-MIN_PART_KEYFRAMES = 3  # between the ends of a part
-FEWEST_PARTS = 4  # of poses at rest: the spread of fewer says little
+MIN_SEGMENT_KEYFRAMES = 3  # between the ends of a part
+MIN_SEGMENTS_AT_REST = 4  # of poses at rest: the spread of fewer says little
 # Information [1/m^2, 1/rad^2] that holds the frame of each part in a world that nobody sees, where parts share planes
 # or the frame of a pose sensor: held firmly, each would seem to say where these are. Where they share nothing of the
 # world so little would be lost in rounding.
-LOOSE_FRAME = 1e-3
+LOOSE_FRAME_INFORMATION = 1e-3
 
 
 @dataclass(frozen=True)
-class Parts:
+class Segments:
     """Of `problem`, in which tracks end where parts do, at `state`; ends (G + 1,): keyframes between which parts lie.
 
     sums (G, B + 1, B + 1): each part's information of the calibration parameters, its gradient in the last column.
@@ -36,7 +37,7 @@ class Parts:
     sums: np.ndarray
 
     @classmethod
-    def of(cls, problem: Problem, outcome: Outcome, count: int) -> Parts | None:
+    def of(cls, problem: Problem, outcome: Outcome, count: int) -> Segments | None:
         """About `count` parts of about one length, which several recordings share, at least one each. None where they
         would be too short, or one does not stand alone."""
         count, fewest = _as_many_as_stand_alone(problem, count)
@@ -46,7 +47,7 @@ class Parts:
         if len(ends) < 3 or np.diff(ends).min() < fewest:
             return None
         parts = cls(problem.cut(outcome.state, ends[:-1]), outcome.state, ends, np.zeros(0))
-        scratch = parts.problem.scratch(outcome.residuals)
+        scratch = parts.problem.reusable_output(outcome.residuals)
         try:
             sums = in_parallel(lambda g: marginalise(parts.piece(g, scratch)), range(len(ends) - 1))
         except EstimationError:
@@ -66,7 +67,7 @@ class Parts:
         problem.add_bias_prior(state, piece)
         if not problem.framed:
             shared = any(b.name in IN_THE_WORLD for b in problem.layout.blocks)
-            hold_frame(state, piece, first, problem.levelled, LOOSE_FRAME if shared else FRAME)
+            hold_frame(state, piece, first, problem.levelled, LOOSE_FRAME_INFORMATION if shared else FRAME_INFORMATION)
         # A seam says nothing of the keyframe behind it, and that keyframe's own images are in the next part.
         return piece.without_last() if last in problem.chain.starts else piece
 
@@ -84,12 +85,12 @@ def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
     Images that nothing ties to each other stand alone: where there are few, each but the last is a part.
     """
     if not isinstance(problem.chain, IndependentKeyframes):
-        return min(count, (problem.n_keyframes - 1) // MIN_PART_KEYFRAMES), MIN_PART_KEYFRAMES
+        return min(count, (problem.n_keyframes - 1) // MIN_SEGMENT_KEYFRAMES), MIN_SEGMENT_KEYFRAMES
     others = [f for f in problem.factors.values() if f is not problem.chain]
     if any(f.is_sparse for f in others):  # poses at rest, of which there may be few
-        fewer = min(count, problem.n_keyframes // MIN_PART_KEYFRAMES)
-        return fewer if fewer >= FEWEST_PARTS else 0, MIN_PART_KEYFRAMES
-    few = count > 0 and problem.n_keyframes <= MIN_PART_KEYFRAMES * count
+        fewer = min(count, problem.n_keyframes // MIN_SEGMENT_KEYFRAMES)
+        return fewer if fewer >= MIN_SEGMENTS_AT_REST else 0, MIN_SEGMENT_KEYFRAMES
+    few = count > 0 and problem.n_keyframes <= MIN_SEGMENT_KEYFRAMES * count
     return problem.n_keyframes - 1 if few else count, 1
 
 

@@ -14,17 +14,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimate.evidence.evidence import split_covariance, split_expectation
-from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
+from icalib.estimate.residual_statistics.fit_statistics import split_covariance, split_expectation
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.optim.calib_block import restricted_inverse
 from icalib.optim.prior_factor import Prior, variance_of_priors
 
-LEAST = 1.5  # below it, another weight of the priors would gain less than a tenth of a standard deviation
+MIN_INFLATION = 1.5  # below it, another weight of the priors would gain less than a tenth of a standard deviation
 ROUNDING = 1e-9  # of a variance: rounding, where a prior contributes all of it
-MOST_LEVERAGE = 4.0  # of the variance: one part knows nearly all beyond, and the spread of the others nothing
+MAX_LEVERAGE = 4.0  # of the variance: one part knows nearly all beyond, and the spread of the others nothing
 
 
 def noise_variance(problem: Problem, outcome: Outcome) -> np.ndarray:
@@ -41,10 +41,10 @@ def nuisance_priors(problem: Problem) -> list[Prior]:
     return [p for p in problem.priors if p.block.is_nuisance]
 
 
-def spread_variance(outcome: Outcome, parts: Parts, white: np.ndarray) -> np.ndarray:
+def spread_variance(outcome: Outcome, parts: Segments, white: np.ndarray) -> np.ndarray:
     """(B,) variances by the spread over `parts`, where white noise contributes `white` (B,) to the formal ones."""
     spread, expected = np.diag(split_covariance(outcome, parts)), split_expectation(outcome, parts)
-    return np.clip(white / np.maximum(expected, 1e-300), 1.0, MOST_LEVERAGE) * spread
+    return np.clip(white / np.maximum(expected, 1e-300), 1.0, MAX_LEVERAGE) * spread
 
 
 def calibration_columns(inputs: Inputs) -> np.ndarray:
@@ -59,7 +59,7 @@ def inflation(inputs: Inputs, outcome: Outcome) -> float:
     problem, columns = outcome.problem, calibration_columns(inputs)
     if not nuisance_priors(problem) or not len(columns):
         return 1.0
-    parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
+    parts = Segments.of(problem, outcome, inputs.rig.settings.segments)
     if parts is None:
         return 1.0
     white = noise_variance(problem, outcome)

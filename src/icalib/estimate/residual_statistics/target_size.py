@@ -18,11 +18,11 @@ from icalib.optim.arrowhead import Piece, solve
 from icalib.optim.state import State
 from icalib.sensors.imu.residual import ImuFactor
 
-STEP = 1e-3  # of the size: small against what bends p, large against rounding
-OPEN = 0.05  # a size that is known no better is not known
-NEAR = 5e-3  # what one step about the state is good for
-ROUNDS = 3
-TOLERANCE = 0.5  # of half the chi^2, of the states in between
+SIZE_STEP = 1e-3  # of the size: small against what bends p, large against rounding
+MAX_SIZE_SIGMA = 0.05  # a size that is known no better is not known
+MAX_SIZE_CHANGE = 5e-3  # what one step about the state is good for
+MAX_SIZE_ROUNDS = 3
+INNER_TOLERANCE = 0.5  # of half the chi^2, of the states in between
 
 
 @dataclass(frozen=True)
@@ -41,17 +41,22 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
         return None
     ratio = std = 1.0
     room = problem.pieces(), problem.residuals()
-    for _ in range(ROUNDS):
-        costs = [_least_cost(*_grown(problem, state, ratio, ratio + step), *room) for step in (-STEP, 0.0, STEP)]
-        slope, curvature = (costs[2] - costs[0]) / (2.0 * STEP), (costs[2] - 2.0 * costs[1] + costs[0]) / STEP**2
-        if curvature * OPEN**2 < 1.0:
+    for _ in range(MAX_SIZE_ROUNDS):
+        costs = [
+            _least_cost(*_grown(problem, state, ratio, ratio + step), *room) for step in (-SIZE_STEP, 0.0, SIZE_STEP)
+        ]
+        slope, curvature = (
+            (costs[2] - costs[0]) / (2.0 * SIZE_STEP),
+            (costs[2] - 2.0 * costs[1] + costs[0]) / SIZE_STEP**2,
+        )
+        if curvature * MAX_SIZE_SIGMA**2 < 1.0:
             return None
         change, std = -slope / curvature, curvature**-0.5
         grown, begin = _grown(problem, state, ratio, ratio + change)
         ratio += change
-        if abs(change) < NEAR:
+        if abs(change) < MAX_SIZE_CHANGE:
             break
-        state = minimise(grown, begin, tolerance=TOLERANCE).state
+        state = minimise(grown, begin, tolerance=INNER_TOLERANCE).state
     return TargetSize(float(ratio), float(std))
 
 

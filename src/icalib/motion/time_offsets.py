@@ -13,7 +13,7 @@ import numpy as np
 from icalib.data.measurements import Stream
 from icalib.optim.state import Key, Layout, State
 
-EARLY_S = 5.0  # by which what a stamp stands for may come before it; recordings are further apart
+RECORDING_MARGIN_S = 5.0  # by which what a stamp stands for may come before it; recordings are further apart
 
 
 def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
@@ -21,12 +21,12 @@ def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray 
     own, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
     if len(offset) == 1:
         return own + offset[0]
-    joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in stream.joins_ns]) - EARLY_S
+    joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in stream.joins_ns]) - RECORDING_MARGIN_S
     assert len(joins) == len(offset) - 1
     return own + offset[np.searchsorted(joins, own, side="right")]
 
 
-def clock_of(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
+def clock_numbers(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
     """(n,) number of the time offset that a sensor's measurements which hang on `keyframe` (n,) go by."""
     if len(state.values[name, "time_offset"]) == 1:
         return np.zeros(len(keyframe), dtype=np.int64)
@@ -35,10 +35,10 @@ def clock_of(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
 
 def offset_at(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
     """(n,) time offset of a sensor's measurements that hang on `keyframe` (n,)."""
-    return state.values[name, "time_offset"][clock_of(state, name, keyframe)]
+    return state.values[name, "time_offset"][clock_numbers(state, name, keyframe)]
 
 
-def by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[tuple[int, slice]]:
+def slices_by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[tuple[int, slice]]:
     """Stretches of measurements that hang on `keyframe` (n,), in order, and go by one time offset: its number, and
     which they are."""
     if len(state.values[name, "time_offset"]) == 1:
@@ -50,7 +50,7 @@ def by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[tuple[in
             yield k, slice(int(a), int(b))
 
 
-def mounted_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
+def pose_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
     """(7,) calibration columns of a sensor's rotation, -1 where it has none, translation and the time offset number
     `clock`, or its only one."""
     offset = layout.columns(name, "time_offset")

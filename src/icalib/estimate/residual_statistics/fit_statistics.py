@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimate.evidence.parts import Parts
 from icalib.estimate.problem.outcome import Outcome, posterior
 from icalib.estimate.problem.problem import Problem
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.model.statistics import Fit
-from icalib.motion.factor import Along, FitKey, RawSize, ResidualRows, Residuals, Squares
+from icalib.motion.factor import FitKey, RawSize, ResidualRows, Residuals, Squares, StateDifference
 from icalib.optim.arrowhead import Draw
 from icalib.optim.calib_block import restricted_inverse
 
@@ -51,11 +51,11 @@ def rows_of(outcome: Outcome, sensor: str, kind: str) -> ResidualRows | None:
 def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[FitKey, float]:
     """|J_s x|^2 of each sensor for one draw x."""
     start, end = (outcome.state.retract(problem.layout, s * draw.chain, s * draw.calib) for s in (0.0, DRAW_STEP))
-    along, at = Along(start, end, DRAW_STEP), outcome.residuals
-    return {kind: own for key, f in problem.factors.items() for kind, own in f.spent(at[key], along).items()}
+    along, at = StateDifference(start, end, DRAW_STEP), outcome.residuals
+    return {kind: own for key, f in problem.factors.items() for kind, own in f.dof_used(at[key], along).items()}
 
 
-def split_covariance(outcome: Outcome, parts: Parts) -> np.ndarray:
+def split_covariance(outcome: Outcome, parts: Segments) -> np.ndarray:
     """(B, B) covariance of the calibration parameters as the spread over `parts` of the recording shows it.
 
     Each part's own gradient b_g at the joint optimum (its chain marginalised) would be zero but for noise; their
@@ -66,7 +66,7 @@ def split_covariance(outcome: Outcome, parts: Parts) -> np.ndarray:
     return n / (n - 1.0) * spread_covariance(parts.problem, outcome, b - b.mean(axis=0))
 
 
-def split_expectation(outcome: Outcome, parts: Parts) -> np.ndarray:
+def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
     """(B,) variances that `split_covariance` has on average where noise is white.
 
     At the joint optimum the gradient of part g has the covariance S_g - S_g S^-1 S_g: a part that knows much pulls the

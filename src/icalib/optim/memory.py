@@ -12,34 +12,35 @@ import sys
 
 import numpy as np
 
-LEAST = 1 << 20  # bytes, below which the allocator does better
-LARGE = 1 << 24  # bytes of what comes and goes: smaller arrays are made often, and new pages cost more than they do
+MIN_MMAP_BYTES = 1 << 20  # bytes, below which the allocator does better
+# bytes of what comes and goes: smaller arrays are made often, and new pages cost more than they do
+MMAP_THRESHOLD_BYTES = 1 << 24
 # Bytes of freed memory at the end of the heap that stay there. By default 128 kB do: arrays of a few megabytes that are
 # made again and again would get new pages each time. More holds more memory than is in use.
-KEPT = 1 << 22
+TRIM_THRESHOLD_BYTES = 1 << 22
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt, in malloc.h
 
 
-def zeros(shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
+def mmap_zeros(shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
     """As np.zeros, with pages of its own where it is large."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size < LEAST or sys.platform == "win32":
+    if size < MIN_MMAP_BYTES or sys.platform == "win32":
         return np.zeros(shape, dtype)
     return np.ndarray(shape, dtype, buffer=mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
 
 
-def give_back() -> None:
+def trim_heap() -> None:
     """What nobody uses any more goes back to the system, where the C library knows how to (glibc). Takes about 1 ms."""
     _in_glibc("malloc_trim", 0)
 
 
-def keep_apart() -> None:
+def set_mmap_threshold() -> None:
     """From now on large arrays have pages of their own, in the whole process, where the C library can do that (glibc).
 
     It does so at first, but once such an array has been freed, the next ones as large lie between the small ones.
     """
-    _in_glibc("mallopt", _M_MMAP_THRESHOLD, LARGE)
-    _in_glibc("mallopt", _M_TRIM_THRESHOLD, KEPT)
+    _in_glibc("mallopt", _M_MMAP_THRESHOLD, MMAP_THRESHOLD_BYTES)
+    _in_glibc("mallopt", _M_TRIM_THRESHOLD, TRIM_THRESHOLD_BYTES)
 
 
 def _in_glibc(name: str, *arguments: int) -> None:

@@ -11,15 +11,15 @@ import pytest
 
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.estimate import estimate
-from icalib.estimate.evidence.places import _cluster_gradients, _count, cluster_covariances
 from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.residual_statistics.image_regions import _cluster_gradients, _count, cluster_covariances
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.model.bodies import Bodies
-from icalib.motion.factor import FactorKey, look, of_type
+from icalib.motion.factor import FactorKey, of_type, output_at
 from icalib.optim.calib_block import restricted_inverse
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
@@ -77,7 +77,7 @@ def test_the_gradient_of_a_cell_is_what_its_residuals_change(solved: tuple[Probl
     problem = moved(exact, [LITTLE_PX * rng.normal(size=(len(own), 2)) for own in tracks])
     (found,) = _cluster_gradients(problem, outcome, [cells])
     assert found.shape == (_count(cells), problem.layout.size) and _count(cells) == 36
-    residual = look(of_type(problem.factors, FeatureFactor)[0], outcome.state).residual
+    residual = output_at(of_type(problem.factors, FeatureFactor)[0], outcome.state).residual
     before, size = gradient(problem, outcome), np.abs(found).max(axis=0)
     for cell in (1, 14, 30):
         twice = moved(problem, [-r * (own == cell)[:, None] for r, own in zip(residual, tracks, strict=True)])

@@ -24,15 +24,17 @@ from icalib.estimate.problem.outcome import Outcome, posterior
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, solve
-from icalib.optim.calib_block import DETERMINED, HELD_BELOW, least_information
+from icalib.optim.calib_block import DETERMINED_ABOVE, UNOBSERVABLE_BELOW, least_information
 from icalib.optim.state import State
 from icalib.sensors.imu.residual import ImuFactor
 
-CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
-NEGLIGIBLE = 0.01  # of the information: where all is determined and one side shows less, odd parts included, it will do
-SLIGHT = 0.05  # of the information: where one pair finds less noise than this, it will do, too
-FEW = 3  # draws at first
-SURE = 0.999  # probability that noise adds no more than is allowed for
+# information in tolerance units: where all is known to a third of a tolerance, one pair will do
+CLEARLY_DETERMINED = 10.0
+# of the information: where all is determined and one side shows less, odd parts included, it will do
+NEGLIGIBLE_SHARE = 0.01
+SMALL_SHARE = 0.05  # of the information: where one pair finds less noise than this, it will do, too
+N_FIRST_DRAWS = 3  # draws at first
+CONFIDENCE = 0.999  # probability that noise adds no more than is allowed for
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Spurious:
         if n == 1:
             return np.zeros(directions.shape[1])
         along = np.einsum("ik,nij,jk->nk", directions, self.each, directions)
-        return float(stdtrit(n - 1, SURE)) * np.sqrt(1.0 + 1.0 / n) * along.std(axis=0, ddof=1)
+        return float(stdtrit(n - 1, CONFIDENCE)) * np.sqrt(1.0 + 1.0 / n) * along.std(axis=0, ddof=1)
 
 
 def spurious_information(
@@ -80,13 +82,13 @@ def spurious_information(
     samples = (outcome.draws or posterior(problem, outcome.state)).still
     noise, first = _Noise(problem, outcome, among), _reading_noise(problem.chain.imu, rng)
     one_side = noise.there(1.0, samples[0].chain, first)
-    if least > DETERMINED and _largest_share(t[:, None] * one_side * t, scaled) < NEGLIGIBLE:
+    if least > DETERMINED_ABOVE and _largest_share(t[:, None] * one_side * t, scaled) < NEGLIGIBLE_SHARE:
         return Spurious(one_side[None])
     found = 0.5 * (one_side + noise.there(-1.0, samples[0].chain, first))
-    if least > CLEAR or _largest_share(t[:, None] * found * t, scaled) < SLIGHT:
+    if least > CLEARLY_DETERMINED or _largest_share(t[:, None] * found * t, scaled) < SMALL_SHARE:
         return Spurious(found[None])
     each: list[np.ndarray] = []
-    for some in (samples[1 : 1 + FEW], samples[1 + FEW :]):
+    for some in (samples[1 : 1 + N_FIRST_DRAWS], samples[1 + N_FIRST_DRAWS :]):
         each += [noise.followed(d.chain, _reading_noise(problem.chain.imu, rng)) for d in some]
         if enough(Spurious(np.array(each))):
             break
@@ -132,7 +134,7 @@ class _Noise:
 def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:
     """Of what is noise, in absolute value, in any direction that the solver moves along; both in tolerance units."""
     values, vectors = np.linalg.eigh(information)
-    known = values > HELD_BELOW
+    known = values > UNOBSERVABLE_BELOW
     half = vectors[:, known] / np.sqrt(values[known])
     return float(np.abs(np.linalg.eigvalsh(half.T @ noise @ half)).max(initial=0.0))
 

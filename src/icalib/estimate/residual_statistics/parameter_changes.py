@@ -15,15 +15,16 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.residual_statistics.segments import Segments
 from icalib.optim.calib_block import complement
 from icalib.optim.state import Key
 from icalib.sensors.camera.spec import INTRINSICS
 from icalib.sensors.sensor import ROTATION, TIME_OFFSET, TRANSLATION
 
 # The groups that change together. Board, planes and IMU are what the others are measured by.
-CHANGING = ((TIME_OFFSET.name,), (ROTATION.name, TRANSLATION.name), (INTRINSICS.name,))
-RIDGE = 1e-6  # information in tolerance units: 1000 tolerances; keeps the form definite where nothing is known
+CHANGING_GROUPS = ((TIME_OFFSET.name,), (ROTATION.name, TRANSLATION.name), (INTRINSICS.name,))
+# information in tolerance units: 1000 tolerances; keeps the form definite where nothing is known
+RIDGE_INFORMATION = 1e-6
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Change:
         return len(self.value)
 
 
-def changes(parts: Parts, sensors: tuple[str, ...]) -> tuple[Change, ...]:
+def changes(parts: Segments, sensors: tuple[str, ...]) -> tuple[Change, ...]:
     """The best pattern of each group of the `sensors`, the largest gain first."""
     found: dict[Key, Change] = {}
     form = _Form.of(parts)
@@ -55,14 +56,14 @@ def changes(parts: Parts, sensors: tuple[str, ...]) -> tuple[Change, ...]:
     return tuple(sorted(found.values(), key=lambda c: -c.gain))
 
 
-def _tested(parts: Parts, form: _Form, sensors: tuple[str, ...]) -> Iterator[Change]:
+def _tested(parts: Segments, form: _Form, sensors: tuple[str, ...]) -> Iterator[Change]:
     ends = parts.state.seconds[parts.ends]
     middle = 0.5 * (ends[:-1] + ends[1:])
     centre = 0.5 * (ends[0] + ends[-1])
     layout = parts.problem.layout
     free = {b.key for b in layout.free}
     for sensor in sensors:
-        for names in CHANGING:
+        for names in CHANGING_GROUPS:
             own = [name for name in names if (sensor, name) in free]
             if not own:
                 continue
@@ -85,20 +86,22 @@ class _Form:
     root: np.ndarray
 
     @classmethod
-    def of(cls, parts: Parts) -> _Form:
+    def of(cls, parts: Segments) -> _Form:
         t, B = parts.problem.tolerance, parts.problem.layout.size
         information = t[:, None] * parts.sums[:, :-1, :-1] * t
         free = complement(parts.problem.held, B)
         whole = free.T @ information.sum(axis=0) @ free
         values, vectors = np.linalg.eigh(whole)
-        return cls(t, information, t * parts.sums[:, :-1, -1], free @ vectors / np.sqrt(np.maximum(values, RIDGE)))
+        return cls(
+            t, information, t * parts.sums[:, :-1, -1], free @ vectors / np.sqrt(np.maximum(values, RIDGE_INFORMATION))
+        )
 
     def change(
         self, key: Key, columns: np.ndarray, pattern: np.ndarray, kind: Literal["drift", "step"], second: float
     ) -> Change:
         """The change of `columns` by `pattern` (G,), all others and a common step free."""
         own = self.information[:, columns]
-        A = np.einsum("g,gij->ij", pattern**2, own[:, :, columns]) + RIDGE * np.eye(len(columns))
+        A = np.einsum("g,gij->ij", pattern**2, own[:, :, columns]) + RIDGE_INFORMATION * np.eye(len(columns))
         cross = np.einsum("g,gij->ij", pattern, own) @ self.root
         common = self.root.T @ self.gradient.sum(axis=0)
         g = np.einsum("g,gi->i", pattern, self.gradient[:, columns]) - cross @ common
@@ -107,12 +110,12 @@ class _Form:
         return Change(key, kind, second, t * step, t * np.sqrt(np.diag(covariance)), float(-g @ step))
 
 
-def heterogeneity(parts: Parts) -> float:
+def heterogeneity(parts: Segments) -> float:
     """By how much chi^2 falls where each segment has calibration parameters of its own."""
     t = parts.problem.tolerance
     free = complement(parts.problem.held, len(t))
     total = 0.0
     for sums in parts.sums:
         S, b = free.T @ (t[:, None] * sums[:-1, :-1] * t) @ free, free.T @ (t * sums[:-1, -1])
-        total += float(b @ np.linalg.solve(S + RIDGE * np.eye(len(S)), b))
+        total += float(b @ np.linalg.solve(S + RIDGE_INFORMATION * np.eye(len(S)), b))
     return total
