@@ -46,17 +46,16 @@ def read(recording: Recording, sensors: Sequence[Lidar], reading: Reading) -> li
     found = []
     for sensor in sensors:
         where = recording.where(sensor)
-        # Checked before it is cut: a single wrong stamp is no jump of the clock.
+        # Checked before it is cut, as a single wrong stamp is no jump of the clock.
         stream, notes = checked_lidar(scans(recording, sensor), where)
         found.append((reading.cut(stream, f"{where} ({sensor.name})"), notes))
     return found
 
 
 def scans(recording: Recording, sensor: Lidar) -> LidarStream:
-    """All scans, without points that cannot be used, which the recording's notes say; a scan may have none.
+    """All scans without unusable points, which the recording notes; a scan may have no point.
 
-    Raises RecordingError naming file or topic where the data are missing or cannot be read, and where the times of
-    points are not known.
+    Raises RecordingError naming file or topic if the data are missing or cannot be read, or point times are unknown.
     """
     if recording.has_messages:
         topic = _topic(recording, sensor)
@@ -74,7 +73,7 @@ def scans(recording: Recording, sensor: Lidar) -> LidarStream:
 
 
 def where(recording: Recording, sensor: Lidar) -> str:
-    """How a sentence names the place of the scans."""
+    """File or topic of the scans, for sentences."""
     if recording.has_messages:
         return recording.place(_topic(recording, sensor))
     return str(recording.table(sensor, sensor.path))

@@ -1,4 +1,4 @@
-"""When points of a LiDAR that turns were measured, from where they lie: for clouds that do not say it."""
+"""Instants of points from their azimuths, for clouds of spinning LiDARs without point times."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ from dataclasses import dataclass
 import numpy as np
 
 _TURN = 2.0 * np.pi
-_LEAST_TURNED = 0.5  # turns of a scan; what does not turn goes to and fro
-_ROWS = 1.5  # turns of a scan, above which its rings follow one another
-_EDGE = 0.25  # of a turn
+_MIN_TURNS = 0.5  # turns of a scan; a LiDAR with fewer oscillates, or has no order of azimuth
+_MIN_TURNS_BY_ROWS = 1.5  # turns of the points of a scan; with more, whole rings follow one another
+_SEAM_TURNS = 0.25  # of a turn: points so near the first column may belong to either end of the scan
 
 
 @dataclass(frozen=True)
 class SweepOrder:
-    """direction: 1 against the clock seen from above, -1 with it. by_rows: rings follow one another in the message,
-    each a whole turn; else columns do."""
+    """Order of points in a scan. direction: 1 counterclockwise seen from above, -1 clockwise. by_rows: whole rings
+    follow one another in the message; else columns."""
 
     direction: int
     by_rows: bool
 
 
 def find_sweep(scans: Sequence[np.ndarray]) -> SweepOrder | None:
-    """How the LiDAR turns, from the points (N, 3) of some scans in the order of the message; None if it does not."""
+    """Order of the points (N, 3) of some scans in messages; None if the LiDAR does not spin."""
     turned = np.array([_turned(xyz) for xyz in scans])
     middle = float(np.median(turned))
-    if abs(middle) < _LEAST_TURNED:
+    if abs(middle) < _MIN_TURNS:
         return None
-    return SweepOrder(1 if middle > 0 else -1, abs(middle) > _ROWS)
+    return SweepOrder(1 if middle > 0 else -1, abs(middle) > _MIN_TURNS_BY_ROWS)
 
 
 def sweep_share(sweep: SweepOrder, xyz: np.ndarray, height: int) -> np.ndarray:
-    """(N,) share of the turn that had passed when each point (N, 3) was measured, from the scan's first column on; NaN
-    of points at zero or without numbers. height: rows of an organised message.
+    """(N,) instant of each point (N, 3), as a share of the turn since the first column; NaN for points that are zero or
+    not finite. height: rows of an organised message.
 
-    Lasers of a column look to slightly different sides, so a point close to where the scan begins may belong to its
-    beginning or its end; its place in the message tells.
+    Lasers of a column have slightly different azimuths. A point near the first column may thus belong to the beginning
+    or the end of the scan; its position in the message decides.
     """
     n = len(xyz)
     usable = _usable(xyz)
@@ -50,18 +50,19 @@ def sweep_share(sweep: SweepOrder, xyz: np.ndarray, height: int) -> np.ndarray:
     first = np.flatnonzero(usable)[np.argmin(place[usable])]
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0], dtype=np.float64)
     passed = np.mod(sweep.direction * (azimuth - azimuth[first]) / _TURN, 1.0)
-    passed -= (passed > 1.0 - _EDGE) & (place < _EDGE)
-    passed += (passed < _EDGE) & (place > 1.0 - _EDGE)
+    passed -= (passed > 1.0 - _SEAM_TURNS) & (place < _SEAM_TURNS)
+    passed += (passed < _SEAM_TURNS) & (place > 1.0 - _SEAM_TURNS)
     share[usable] = passed[usable] + (place[first] if organised else 0.0)
     return share
 
 
 def _usable(xyz: np.ndarray) -> np.ndarray:
+    """(N,) whether points (N, 3) are finite and have an azimuth."""
     return np.isfinite(xyz).all(axis=1) & (xyz[:, :2] != 0).any(axis=1)
 
 
 def _turned(xyz: np.ndarray) -> float:
-    """How many turns the points make, one after the other; positive against the clock."""
+    """Number of turns of successive points (N, 3), positive counterclockwise."""
     used = xyz[_usable(xyz)]
     step = np.diff(np.arctan2(used[:, 1], used[:, 0], dtype=np.float64))
     return float((np.mod(step + np.pi, _TURN) - np.pi).sum() / _TURN)

@@ -1,4 +1,4 @@
-"""Which points of a LiDAR can be used, and whether its scans are timed as they should be."""
+"""Checks of points and scans: usable points, and stamps that fit the point times."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from icalib.data.stamps.clocks import rate_sentence
 from icalib.errors import RecordingError
 from icalib.sensors.lidar.read.scan_order import at_even_steps, in_order, selected, without_repeats
 
-_RATE_HZ = (0.1, 1000.0)
-_FARTHEST_PERIODS = 2.0  # of a point from its scan's stamp
-_MOST_FAR = 0.1  # share of scans whose points are farther; more of them are wrong throughout
-_BATCH = 1_000_000  # points at a time
+_SCAN_RATE_HZ = (0.1, 1000.0)  # lowest and highest plausible rate
+_MAX_POINT_PERIODS = 2.0  # from the stamp of a scan to its points, in scan periods
+_MAX_FAR_SHARE = 0.1  # of the scans; if more have points farther off, the unit or origin of point times is wrong
+_POINTS_PER_BATCH = 1_000_000  # bounds the memory
 
 
 class Sieve:
-    """Keeps the points from min_range_m to max_range_m, and counts the others."""
+    """Selects points from min_range_m to max_range_m, and counts the others by reason."""
 
     def __init__(self, min_range_m: float, max_range_m: float) -> None:
         self._near_m, self._far_m = min_range_m, max_range_m
@@ -24,7 +24,7 @@ class Sieve:
         self._dropped = np.zeros(5, np.int64)
 
     def keep(self, xyz: np.ndarray, offset_s: np.ndarray) -> np.ndarray:
-        """(N,) bool: which of the points (N, 3) [m], at offset_s (N,), NaN where they have no time, can be used."""
+        """(N,) bool, whether each point xyz (N, 3) [m] can be used. offset_s (N,): its time, NaN if it has none."""
         with np.errstate(over="ignore", invalid="ignore"):  # 1e28 m is as far as infinity
             r2 = np.einsum("ij,ij->i", xyz, xyz)
         near, far = r2 < np.float32(self._near_m) ** 2, r2 > np.float32(self._far_m) ** 2
@@ -38,7 +38,7 @@ class Sieve:
         return kept
 
     def note(self, what: str) -> str | None:
-        """A sentence on what was left out of `what`; None where all points were kept."""
+        """A sentence on the points left out of `what`, by reason; None if all were kept."""
         if not self._dropped.any():
             return None
         words = (
@@ -53,14 +53,14 @@ class Sieve:
 
 
 def sifted(stream: LidarStream, sieve: Sieve) -> LidarStream:
-    """`stream` with those of its points that the sieve keeps; a scan may lose all. What is kept moves up in the arrays
-    of `stream` itself, which are no longer of use: a second cloud would not fit in memory."""
+    """The stream with the points that the sieve keeps; a scan may lose all. Reuses the arrays of `stream`, which are
+    invalid afterwards: a second cloud may not fit in memory."""
     n = len(stream.xyz)
     columns = (stream.offset_s, stream.xyz, stream.plane)
     keep = np.empty(n, bool)
     kept = 0
-    for begin in range(0, n, _BATCH):
-        part = slice(begin, min(begin + _BATCH, n))
+    for begin in range(0, n, _POINTS_PER_BATCH):
+        part = slice(begin, min(begin + _POINTS_PER_BATCH, n))
         keep[part] = sieve.keep(stream.xyz[part], stream.offset_s[part])
         count = int(np.count_nonzero(keep[part]))
         for column in columns:
@@ -95,7 +95,7 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
         raise RecordingError(
             f"{what}: all scans are the same; the LiDAR or its driver froze; restart it, and record again."
         )
-    sentence = rate_sentence(what, stream.stamps_ns, *_RATE_HZ)
+    sentence = rate_sentence(what, stream.stamps_ns, *_SCAN_RATE_HZ)
     if sentence:
         raise RecordingError(sentence)
     stream, found = _near_their_stamps(stream, what)
@@ -103,14 +103,14 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
 
 
 def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """`stream` without the few scans whose points are far from their stamp, and a note. Raises RecordingError where
-    these are many."""
+    """The stream without scans whose points are far from their stamp, and a note. Raises RecordingError if these are
+    many."""
     period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
     low, high = (extreme.reduceat(stream.offset_s, stream.start[:-1]) for extreme in (np.minimum, np.maximum))
-    far = np.maximum(-low, high) > _FARTHEST_PERIODS * period_s
+    far = np.maximum(-low, high) > _MAX_POINT_PERIODS * period_s
     if not far.any():
         return stream, ()
-    if far.mean() > _MOST_FAR:
+    if far.mean() > _MAX_FAR_SHARE:
         raise RecordingError(
             f"{what}: points are {low[far].min():.4g} to {high[far].max():.4g} s from the stamp of their scan, "
             f"but scans are {period_s:.4g} s apart; write point times relative to the stamp of the scan."

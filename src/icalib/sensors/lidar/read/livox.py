@@ -15,7 +15,7 @@ import numpy as np
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg", "livox_interfaces/msg/CustomMsg")
 _FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
-_POINT = 19  # bytes; in CDR the next one begins after a multiple of 4
+_POINT_BYTES = 19  # in CDR padded to a multiple of 4
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Stamp:
 
 @dataclass(frozen=True)
 class Header:
-    """Named as ROS names them."""
+    """Header of a message, with the field names of ROS."""
 
     stamp: Stamp
     frame_id: str
@@ -36,34 +36,34 @@ class Header:
 
 @dataclass(frozen=True)
 class LivoxCloud:
-    """points (N,): structured, with the message's fields."""
+    """A CustomMsg. points (N,): structured, with the fields of the message."""
 
     header: Header
     points: np.ndarray
 
 
 def parse_ros1(content: bytes) -> LivoxCloud:
-    """Raises ValueError or struct.error where the bytes are not such a message."""
+    """The message in ROS 1 serialisation. Raises ValueError or struct.error where the bytes are not such a message."""
     _, sec, nanosec, length = struct.unpack_from("<4I", content)
     at = 16 + length
     header = Header(Stamp(sec, nanosec), content[16:at].decode("utf-8", "replace"))
-    return LivoxCloud(header, _points(content, at + 16, "<", _POINT))
+    return LivoxCloud(header, _points(content, at + 16, "<", _POINT_BYTES))
 
 
 def parse_cdr(content: bytes) -> LivoxCloud:
-    """Raises ValueError or struct.error where the bytes are not such a message."""
+    """The message in CDR (ROS 2). Raises ValueError or struct.error where the bytes are not such a message."""
     body = content[4:]  # alignment counts from here
     order = "<" if content[1:2] == b"\x01" else ">"
     sec, nanosec, length = struct.unpack_from(order + "iII", body)
     name = body[12 : 12 + length].rstrip(b"\0").decode("utf-8", "replace")
     timebase = -(-(12 + length) // 8) * 8
-    return LivoxCloud(Header(Stamp(sec, nanosec), name), _points(body, timebase + 16, order, -(-_POINT // 4) * 4))
+    return LivoxCloud(Header(Stamp(sec, nanosec), name), _points(body, timebase + 16, order, -(-_POINT_BYTES // 4) * 4))
 
 
 def _points(content: bytes, at: int, order: str, step: int) -> np.ndarray:
-    """Those whose number stands at `at`, each `step` bytes after the one before."""
+    """The points, whose number is at byte `at`, each `step` bytes after the one before."""
     (count,) = struct.unpack_from(order + "I", content, at)
-    size = step * count - (step - _POINT) * (count > 0)
+    size = step * count - (step - _POINT_BYTES) * (count > 0)
     data = content[at + 4 : at + 4 + size]
     if len(data) < size:
         raise ValueError(f"{count} points do not fit {len(content)} bytes")

@@ -20,13 +20,13 @@ from icalib.sensors.lidar.read.checks import Sieve
 from icalib.sensors.lidar.read.livox import LivoxCloud
 from icalib.sensors.lidar.read.point_times import PointTimes, clock_note, find_point_times, likely_fields
 
-_AHEAD = 8  # clouds with points that tell how points are timed
+_N_TIMING_CLOUDS = 8  # first clouds with points, which show the times of points
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """One message of points: (N,) with the message's fields (x, y, z [m], ...), in the order in which they came; height
-    rows of them, one after the other."""
+    """A message of points (N,), structured, with the fields of the message (x, y, z [m], ...) in its order. height:
+    rows of the message, one after another."""
 
     stamp_ns: int
     frame: str
@@ -35,7 +35,7 @@ class PointCloud:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Those of a single number for each point."""
+        """Names of fields with a single number for each point."""
         kind = self.points.dtype
         return tuple(name for name in kind.names or () if not kind[name].shape)
 
@@ -104,13 +104,13 @@ def timing_fields(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tupl
 
 
 def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:
-    """Up to the eighth that has points. Raises RecordingError where there are fewer than two such."""
+    """Clouds up to the eighth with points. Raises RecordingError if fewer than two have points."""
     found: list[PointCloud] = []
     filled = 0
     for cloud in clouds:
         found.append(cloud)
         filled += len(cloud.points) > 0
-        if filled == _AHEAD:
+        if filled == _N_TIMING_CLOUDS:
             return found
     if filled < 2:
         raise RecordingError(
@@ -120,7 +120,7 @@ def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:
 
 
 def _with_usual_fields(clouds: Sequence[PointCloud]) -> tuple[list[PointCloud], frozenset[str]]:
-    """Those of `clouds` that have points, with the fields that most of these have; and these fields."""
+    """Clouds with points and with the most common fields; and these fields."""
     filled = [cloud for cloud in clouds if len(cloud.points)]
     usual = frozenset(Counter(cloud.fields for cloud in filled).most_common(1)[0][0])
     return [cloud for cloud in filled if usual.issubset(cloud.fields)], usual
@@ -141,7 +141,7 @@ def coordinates(cloud: PointCloud, what: str) -> np.ndarray:
 
 
 def _stamps(clouds: Sequence[PointCloud], what: str) -> np.ndarray:
-    """(S,) ns. Raises RecordingError where they do not go on."""
+    """(S,) stamps [ns]. Raises RecordingError if they do not increase."""
     stamps_ns = np.array([cloud.stamp_ns for cloud in clouds], np.int64)
     if len(stamps_ns) < 2 or np.median(np.diff(stamps_ns)) <= 0:
         raise RecordingError(
@@ -152,7 +152,8 @@ def _stamps(clouds: Sequence[PointCloud], what: str) -> np.ndarray:
 
 
 def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timing, tuple[str, ...]]:
-    """How points are timed, told from the first clouds."""
+    """The function that times points, from the first clouds; and notes. Raises RecordingError if times are not
+    known."""
     stamps_ns = _stamps(clouds, what)
     if lidar.point_time == "snapshot":
         note = f"{what}: all points of a cloud are taken at its stamp, as point_time says; motion within it is ignored."
@@ -175,21 +176,24 @@ def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timi
 
 
 def _at_the_stamp(cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
+    """Stamp, and times of 0."""
     return cloud.stamp_ns, np.zeros(len(xyz), np.float32)
 
 
 def _by_azimuth(sweep: SweepOrder, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
-    """Times in turns."""
+    """Stamp, and times as shares of a turn."""
     return cloud.stamp_ns, sweep_share(sweep, xyz, cloud.height).astype(np.float32)
 
 
 def _by_field(times: PointTimes, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
+    """Stamp, and times [s] from the field."""
     del xyz
     return times.of(cloud.stamp_ns, cloud.points[times.field])
 
 
 def _joined(lidar: Lidar, stamps_ns: np.ndarray, parts: list[tuple[np.ndarray, np.ndarray]]) -> LidarStream:
-    """Column by column, so that no more than one column is in memory twice. Empties `parts`."""
+    """The stream of all clouds, joined column by column, so that one column at most is in memory twice. Empties
+    `parts`."""
     start = np.concatenate([[0], np.cumsum([len(offset) for _, offset in parts], dtype=np.int64)])
     offsets = [offset for _, offset in parts]
     points = [xyz for xyz, _ in parts]
@@ -223,7 +227,7 @@ _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 
 
 def _point_type(message: Any) -> np.dtype:
-    """Raises ValueError where the fields do not fit a point."""
+    """Structured type of a point of a message. Raises ValueError if its fields cannot be read."""
     order = ">" if message.is_bigendian else "<"
     unknown = [f.name for f in message.fields if f.datatype not in _FIELD_TYPES]
     if unknown or message.point_step < 1:

@@ -1,11 +1,11 @@
-"""When the points of a cloud were measured, from what drivers write beside their coordinates.
+"""Instants of the points of a cloud, from a field that drivers write beside the coordinates.
 
 The field is one of FIELDS, or `point_time_field` of the rig file. Its values are
 
 - relative: seconds where it is a floating-point number, nanoseconds where it is a whole one or its name ends in _ns,
   from the stamp of the message on (Velodyne's `time`, below zero where the last point is stamped; Ouster's `t`,
   Livox's `offset_time`, Aeva's `time_offset_ns`, Blickfeld's `point_time_offset`);
-- or absolute, going on from scan to scan: s, ms, us or ns of a clock (`timestamp` of Hesai and RoboSense in s, of
+- or absolute, increasing from scan to scan: s, ms, us or ns of a clock (`timestamp` of Hesai and RoboSense in s, of
   Livox in ns). Then this clock, not that of the messages' stamps, is the LiDAR's.
 
 How long scans take tells the unit, for a scan takes 0.02 to 1.7 times what scans are apart: no two units fit.
@@ -40,11 +40,11 @@ FIELDS = (
     "stamps",
 )
 UNIT_NS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
-LONGEST_PERIODS = 1.7  # how long a scan may take: up to scans that overlap
-_SHORTEST_PERIODS = 0.02  # a narrow sector of a turn; shorter ones are in another unit, or a flash
-_UNIT_FIT = 1.5  # how far the unit of absolute times may be off what the stamps say
-_MOST = 1e25  # ns since 1970 are some 1e18
-_BULK = (5.0, 95.0)  # per cent: the times of a scan without the few that may be wrong
+MAX_SCAN_PERIODS = 1.7  # longest scan, in scan periods: scans may overlap
+_MIN_SCAN_PERIODS = 0.02  # shortest scan, a narrow sector of a turn; a shorter one has another unit, or is a flash
+_MAX_PERIOD_RATIO = 1.5  # of scan periods by point times and by stamps
+_MAX_TIME = 1e25  # larger values are no times: ns since 1970 are some 1e18
+_BULK_PERCENT = (5.0, 95.0)  # percentiles: the times of a scan without single wrong ones
 _LIKE_A_TIME = re.compile(r"time|stamp|offset|curvature|(^|_)(t|ts|dt|s|ms|us|ns|[mun]?secs?)\d*(_|$)", re.IGNORECASE)
 _NO_TIMES = {"x", "y", "z", "intensity", "reflectivity", "ring", "line", "tag", "range", "rgb", "rgba"}
 _CHOICES = "set point_time to azimuth (it turns) or snapshot (all points at the stamp) in the rig file"
@@ -72,7 +72,7 @@ class PointTimes:
             return stamp_ns, np.full(len(times), np.nan, np.float32)
         first, last = float(times[timed].min()), float(times[timed].max())
         times[~timed] = np.nan
-        # Differences first: float64 nanoseconds since 1970 step by 256.
+        # Differences first: the resolution of float64 nanoseconds since 1970 is 256 ns.
         since_first = (times - first) * (unit_ns * 1e-9)
         if self.point_time == "end":
             since_first -= (last - first) * (unit_ns * 1e-9)
@@ -88,7 +88,7 @@ def within_scan(times: np.ndarray, longest: float) -> np.ndarray:
     if not len(times) or times.max() - times.min() <= longest:
         return np.ones(len(times), bool)
     near = times[np.abs(times - np.median(times)) <= longest]
-    low, high = np.percentile(near, _BULK) if len(near) else (np.inf, -np.inf)
+    low, high = np.percentile(near, _BULK_PERCENT) if len(near) else (np.inf, -np.inf)
     return (times >= high - longest) & (times <= low + longest)
 
 
@@ -104,12 +104,12 @@ def find_point_times(
     times = [_decimal(scan[field]) for scan in scans]
     used = [t[_timed(t, True)] for t in times if _timed(t, True).any()]
     period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
-    if (ends := _of_a_clock(used, period_s)) is not None:
+    if (ends := _clock_instants(used, period_s)) is not None:
         unit = _unit_of_clock(what, field, ends, period_s, lidar)
-        return PointTimes(field, unit, True, lidar.point_time, LONGEST_PERIODS * period_s), ()
+        return PointTimes(field, unit, True, lidar.point_time, MAX_SCAN_PERIODS * period_s), ()
     usual = _usual_unit(field, scans[0].dtype[field].kind in "iu")
     unit, notes = unit_of_offsets(f"{what}: the times `{field}`", used, period_s, lidar, usual)
-    return PointTimes(field, unit, False, lidar.point_time, LONGEST_PERIODS * period_s), notes
+    return PointTimes(field, unit, False, lidar.point_time, MAX_SCAN_PERIODS * period_s), notes
 
 
 def unit_of_offsets(
@@ -120,11 +120,11 @@ def unit_of_offsets(
 
     Raises RecordingError where there is none.
     """
-    bulk = _median([np.ptp(np.percentile(t, _BULK)) for t in used])
+    bulk = _median([np.ptp(np.percentile(t, _BULK_PERCENT)) for t in used])
     spans = (bulk, _median([np.ptp(t) for t in used]))
     first = lidar.point_time_unit or usual
     fitting: list[TimeUnit] = [unit for span in spans for unit in UNIT_NS if _fits(span, unit, period_s)]
-    given = lidar.point_time_unit is not None and bulk * UNIT_NS[first] * 1e-9 <= LONGEST_PERIODS * period_s
+    given = lidar.point_time_unit is not None and bulk * UNIT_NS[first] * 1e-9 <= MAX_SCAN_PERIODS * period_s
     if given or first in fitting:
         return first, ()
     spread = f"{times}, read as {first}, spread over {bulk * UNIT_NS[first] * 1e-9:.4g} s, though scans are "
@@ -192,7 +192,7 @@ def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
 
 
 def _usual_unit(field: str, whole: bool) -> TimeUnit:
-    """That in its name, else ns of whole numbers and s of others."""
+    """The unit in the name of the field, else ns for whole numbers and s for others."""
     for unit in UNIT_NS:
         if field.endswith(f"_{unit}"):
             return unit
@@ -206,19 +206,20 @@ def _differing(scans: Sequence[np.ndarray]) -> list[str]:
 
 
 def _decimal(values: np.ndarray) -> np.ndarray:
-    """float64, NaN where there is no number or one beyond all clocks."""
+    """(N,) float64, NaN for values that are not finite or too large for a time."""
     with np.errstate(invalid="ignore"):  # some bytes are NaN that signal
         times = values.astype(np.float64)
-        return np.where(np.abs(times) < _MOST, times, np.nan)
+        return np.where(np.abs(times) < _MAX_TIME, times, np.nan)
 
 
 def _differ(values: np.ndarray) -> bool:
+    """Whether the times (N,) of points differ."""
     timed = values[_timed(values, True)]
     return bool(len(timed) and timed.max() > timed.min())
 
 
 def _timed(times: np.ndarray, absolute: bool) -> np.ndarray:
-    """(N,) bool: which points have a time; drivers write 0 where no light came back."""
+    """(N,) bool, whether each point has a time. Drivers write an absolute time of 0 for beams without return."""
     return np.isfinite(times) & ((times != 0) | (not absolute))
 
 
@@ -227,28 +228,30 @@ def _median(values: Sequence[float]) -> float:
 
 
 def _fits(span: float, unit: TimeUnit, period_s: float) -> bool:
-    return _SHORTEST_PERIODS <= span * UNIT_NS[unit] * 1e-9 / period_s <= LONGEST_PERIODS
+    """Whether a scan of duration `span` in `unit` has a plausible length."""
+    return _MIN_SCAN_PERIODS <= span * UNIT_NS[unit] * 1e-9 / period_s <= MAX_SCAN_PERIODS
 
 
-def _of_a_clock(used: Sequence[np.ndarray], period_s: float) -> np.ndarray | None:
-    """(S,) an instant of each scan where its times go on from scan to scan, else None. The last, or where single times
-    are wrong the middle."""
+def _clock_instants(used: Sequence[np.ndarray], period_s: float) -> np.ndarray | None:
+    """(S,) an instant of each scan if times increase from scan to scan, else None: the last time, or the median if
+    single times are wrong."""
     if len(used) < 2:
         return None
     lasts, middles = np.array([t.max() for t in used]), np.array([np.median(t) for t in used])
     if np.median(np.diff(lasts)) > 0.5 * np.median(lasts - [t.min() for t in used]):
         return lasts
-    step, bulk = np.median(np.diff(middles)), _median([np.ptp(np.percentile(t, _BULK)) for t in used])
+    step, bulk = np.median(np.diff(middles)), _median([np.ptp(np.percentile(t, _BULK_PERCENT)) for t in used])
     return middles if step > 0.5 * bulk and _clock_units(float(step), period_s) else None
 
 
 def _clock_units(step: float, period_s: float) -> list[TimeUnit]:
-    """Units in which times that go on by `step` from scan to scan fit scans period_s apart: one, or none."""
-    return [u for u, ns in UNIT_NS.items() if 1.0 / _UNIT_FIT < step * ns * 1e-9 / period_s < _UNIT_FIT]
+    """Units in which times that increase by `step` from scan to scan fit the scan period: one, or none."""
+    return [u for u, ns in UNIT_NS.items() if 1.0 / _MAX_PERIOD_RATIO < step * ns * 1e-9 / period_s < _MAX_PERIOD_RATIO]
 
 
 def _unit_of_clock(what: str, field: str, ends: np.ndarray, period_s: float, lidar: Lidar) -> TimeUnit:
-    """That of absolute times, from how far scans are apart."""
+    """Unit of absolute times, from the scan period. Raises RecordingError if none fits, or not the one of the rig
+    file."""
     step, given = float(np.median(np.diff(ends))), lidar.point_time_unit
     fitting = _clock_units(step, period_s)
     if given in fitting or (fitting and given is None):

@@ -1,4 +1,4 @@
-"""Scans that are there twice, and scans whose stamps are out of order."""
+"""Repeated scans, scans out of order, and scans with wrong stamps."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.errors import RecordingError
 
-_RECENT = 4  # scans among which a copy is looked for: messages overtake each other by few
-_SWAPPED_S = 1.0  # messages overtake each other on the network by less
-_ROOM = 0.5  # of a period, that a scan has to both sides where it belongs
-_FEWEST_EVEN = 10  # scans that show how even stamps are
-_LATE, _SURE = 0.05, 8.0  # of a period, and scatters of the stamps, by which a single one is too early or too late
-_ENDS = (1.0, 99.0)  # per cent: the first and the last points of a scan, but for single wrong times
-_LONELY_S = 10.0  # from all other scans
-_MOST_BAD = 0.1  # share of scans with bad stamps; more of them is a clock that was set back
+_N_RECENT_SCANS = 4  # among which a copy is searched: messages overtake few others
+_MAX_DELAY_S = 1.0  # of a message that others overtake on the network
+_MIN_NEIGHBOUR_PERIODS = 0.5  # from a late scan, sorted by its stamp, to its neighbours
+_MIN_EVEN_SCANS = 10  # for a robust scatter of stamps
+# A stamp is wrong if it is off by both: share of a period, and standard deviations of all stamps.
+_MAX_STAMP_ERROR, _SIGNIFICANT_STAMP_ERROR = 0.05, 8.0
+_SCAN_ENDS_PERCENT = (1.0, 99.0)  # percentiles: first and last points of a scan without single wrong times
+_ISOLATED_S = 10.0  # a first or last scan so far from all others has a wrong stamp
+_MAX_BAD_STAMPS = 0.1  # of all scans; with more, the clock was set back
 
 
 def without_repeats(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """`stream` without scans whose points are those of one shortly before, whatever their stamp, and a note."""
-    recent: deque[np.ndarray] = deque(maxlen=_RECENT)
+    """The stream without scans that repeat the points of a recent one, whatever their stamp, and a note."""
+    recent: deque[np.ndarray] = deque(maxlen=_N_RECENT_SCANS)
     fresh = np.ones(len(stream.stamps_ns), bool)
     for i in range(len(fresh)):
         xyz = stream.xyz[stream.start[i] : stream.start[i + 1]]
@@ -38,17 +39,17 @@ def without_repeats(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[
 
 
 def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """`stream` with strictly increasing stamps, and notes on what was done for it: scans that came late are sorted,
-    single ones whose stamp fits nowhere are left out.
+    """The stream with strictly increasing stamps, and notes: late scans are sorted, and single scans with a wrong stamp
+    are left out.
 
-    Raises RecordingError naming the instant where these are too many to be errors of single stamps.
+    Raises RecordingError naming the instant if wrong stamps are too many.
     """
     stamps_ns = stream.stamps_ns
-    kept = _without_lonely_ends(stamps_ns, _longest_increasing(stamps_ns))
+    kept = _without_isolated_ends(stamps_ns, _longest_increasing(stamps_ns))
     if len(kept) == len(stamps_ns):
         return stream, ()
-    order, late, bad = _sorted_in(stamps_ns, kept)
-    if len(bad) > max(1.0, _MOST_BAD * len(stamps_ns)):
+    order, late, bad = _sorted_by_stamp(stamps_ns, kept)
+    if len(bad) > max(1.0, _MAX_BAD_STAMPS * len(stamps_ns)):
         i = int(np.argmax(np.diff(stamps_ns) <= 0))
         raise RecordingError(
             f"{what}: the scan at {stamps_ns[i + 1]} ns comes after the one at {stamps_ns[i]} ns; record again if the "
@@ -69,30 +70,30 @@ def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ..
 
 
 def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """`stream` without single scans that are early or late between two that are a double period apart, and a note. All
-    stay where these are many, and where only the first or only the last points of a scan are missing."""
+    """The stream without single scans that are early or late between neighbours two periods apart, and a note. All stay
+    if such scans are many, or if only one end of a scan is missing."""
     stamps_ns = stream.stamps_ns
-    if len(stamps_ns) < _FEWEST_EVEN:
+    if len(stamps_ns) < _MIN_EVEN_SCANS:
         return stream, ()
     period_ns = float(np.median(np.diff(stamps_ns)))
     off = stamps_ns[1:-1] - (stamps_ns[:-2] + (stamps_ns[2:] - stamps_ns[:-2]) // 2)
-    late_ns = max(_LATE * period_ns, _SURE * 1.4826 * float(np.median(np.abs(off))))
-    between = np.abs(stamps_ns[2:] - stamps_ns[:-2] - 2.0 * period_ns) < 2.0 * _LATE * period_ns
+    late_ns = max(_MAX_STAMP_ERROR * period_ns, _SIGNIFICANT_STAMP_ERROR * 1.4826 * float(np.median(np.abs(off))))
+    between = np.abs(stamps_ns[2:] - stamps_ns[:-2] - 2.0 * period_ns) < 2.0 * _MAX_STAMP_ERROR * period_ns
     odd = 1 + np.flatnonzero((np.abs(off) > late_ns) & between)
     odd = odd[[_is_off(stream, i, late_ns) for i in odd.tolist()]] if len(odd) else odd
-    if not len(odd) or len(odd) > _MOST_BAD * len(stamps_ns):
+    if not len(odd) or len(odd) > _MAX_BAD_STAMPS * len(stamps_ns):
         return stream, ()
     note = (
-        f"{what}: {len(odd)} of {len(stamps_ns)} scans are stamped more than {_LATE:.0%} of a period too early "
-        f"or too late relative to their neighbours and were removed, the first at {stamps_ns[odd[0]]} ns."
+        f"{what}: {len(odd)} of {len(stamps_ns)} scans are stamped more than {_MAX_STAMP_ERROR:.0%} of a period too "
+        f"early or too late relative to their neighbours and were removed, the first at {stamps_ns[odd[0]]} ns."
     )
     return selected(stream, np.setdiff1d(np.arange(len(stamps_ns)), odd)), (note,)
 
 
 def _is_off(stream: LidarStream, i: int, late_ns: float) -> bool:
-    """Whether both the first and the last points of scan i are as far off the middle of its neighbours' ones."""
+    """Whether both first and last points of scan i are off the mean of its neighbours' by more than late_ns."""
     around = range(i - 1, i + 2)
-    ends = [np.percentile(stream.offset_s[stream.start[k] : stream.start[k + 1]], _ENDS) for k in around]
+    ends = [np.percentile(stream.offset_s[stream.start[k] : stream.start[k + 1]], _SCAN_ENDS_PERCENT) for k in around]
     stamps = stream.stamps_ns[i - 1 : i + 2] - stream.stamps_ns[i]
     before, own, after = (stamp + 1e9 * end for stamp, end in zip(stamps, ends, strict=True))
     off = own - 0.5 * (before + after)
@@ -109,22 +110,21 @@ def selected(stream: LidarStream, scans: np.ndarray) -> LidarStream:
 
 
 def _same(points: np.ndarray, others: np.ndarray) -> bool:
-    """Their first points tell nearly all scans apart."""
+    """Whether two scans have equal points. The first 8 are compared first, as they differ in nearly all scans."""
     return len(points) == len(others) and (points[:8] == others[:8]).all() and np.array_equal(points, others)
 
 
-def _without_lonely_ends(stamps_ns: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """The scans `kept` (K,) but a first or last one that is far from all others: its stamp may be wrong, and alone it
-    shows nothing."""
-    if len(kept) < _FEWEST_EVEN:
+def _without_isolated_ends(stamps_ns: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """The scans `kept` (K,) without a first or last one that is far from all others, as its stamp may be wrong."""
+    if len(kept) < _MIN_EVEN_SCANS:
         return kept
-    first, last = (abs(int(stamps_ns[kept[a]] - stamps_ns[kept[b]])) > _LONELY_S * 1e9 for a, b in ((0, 1), (-1, -2)))
+    first, last = (abs(int(stamps_ns[kept[a]] - stamps_ns[kept[b]])) > _ISOLATED_S * 1e9 for a, b in ((0, 1), (-1, -2)))
     return kept[int(first) : len(kept) - int(last)]
 
 
-def _sorted_in(stamps_ns: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, list[int], list[int]]:
-    """Numbers (K,) of scans by stamp: those `kept` and of the others those that came late; these; and those whose stamp
-    is wrong: where it would put them there is a scan, or no neighbour."""
+def _sorted_by_stamp(stamps_ns: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, list[int], list[int]]:
+    """Numbers (K,) of `kept` and late scans by stamp; those of late scans; and those of scans with wrong stamps, which
+    would collide with another scan or have no neighbour."""
     period_ns = float(np.median(np.diff(stamps_ns[kept]))) if len(kept) > 1 else np.inf
     placed, order = stamps_ns[kept].tolist(), kept.tolist()
     late: list[int] = []
@@ -134,7 +134,11 @@ def _sorted_in(stamps_ns: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, lis
         came_with = int(stamps_ns[kept[max(np.searchsorted(kept, i) - 1, 0)]])
         at = bisect_left(placed, stamp)
         gaps = [abs(stamp - placed[k]) / period_ns for k in (at - 1, at) if 0 <= k < len(placed)]
-        if abs(stamp - came_with) < _SWAPPED_S * 1e9 and min(gaps) > _ROOM and min(gaps) < 1.0 + _ROOM:
+        if (
+            abs(stamp - came_with) < _MAX_DELAY_S * 1e9
+            and min(gaps) > _MIN_NEIGHBOUR_PERIODS
+            and min(gaps) < 1.0 + _MIN_NEIGHBOUR_PERIODS
+        ):
             late.append(i)
             placed.insert(at, stamp)
             order.insert(at, i)

@@ -13,11 +13,11 @@ from icalib.data.images.unreadable import HEAD_BYTES, not_data
 from icalib.data.measurements import LidarStream
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
-from icalib.sensors.lidar.read.point_times import LONGEST_PERIODS, UNIT_NS, unit_of_offsets, within_scan
+from icalib.sensors.lidar.read.point_times import MAX_SCAN_PERIODS, UNIT_NS, unit_of_offsets, within_scan
 
 _REQUIRED = {"stamps_ns": np.int64, "start": np.int64, "offset_s": np.float32, "xyz": np.float32}
 _OPTIONAL = {"plane": np.int32}
-_AHEAD = 8  # scans that tell in what unit points are timed
+_N_UNIT_SCANS = 8  # first scans, which show the unit of point times
 
 
 def read_scans(name: str, path: Path) -> LidarStream:
@@ -42,7 +42,7 @@ def read_scans(name: str, path: Path) -> LidarStream:
 
 
 def _are_planes(ids: np.ndarray) -> bool:
-    """No more planes than points: their number sizes arrays."""
+    """Whether plane numbers are valid: -1, or below the number of points, as the largest one sizes arrays."""
     return not ids.size or bool(ids.min() >= -1 and ids.max() < ids.size)
 
 
@@ -58,9 +58,9 @@ def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStrea
     """`stream` with times of points in seconds, NaN where they cannot be their scan's, and a note on the unit; in the
     arrays of `stream` itself. Raises RecordingError where they fit in no unit."""
     scans = [stream.offset_s[a:b] for a, b in pairwise(stream.start.tolist()) if b > a]
-    first = [scan[np.isfinite(scan)].astype(np.float64) for scan in scans[:_AHEAD]]
+    first = [scan[np.isfinite(scan)].astype(np.float64) for scan in scans[:_N_UNIT_SCANS]]
     first = [times for times in first if len(times) and np.ptp(times) > 0]
-    if not first or len(scans) < 2:  # all points at the stamp
+    if not first or len(scans) < 2:  # all points are taken at the stamp
         return stream, ()
     period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
     if not period_s > 0:
@@ -70,7 +70,7 @@ def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStrea
         np.multiply(stream.offset_s, np.float32(1e-9 * UNIT_NS[unit]), out=stream.offset_s)
     for scan in scans:
         timed = np.isfinite(scan)
-        timed[timed] = within_scan(scan[timed], LONGEST_PERIODS * period_s)
+        timed[timed] = within_scan(scan[timed], MAX_SCAN_PERIODS * period_s)
         scan[~timed] = np.nan
     return stream, notes
 

@@ -52,7 +52,7 @@ def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
 
 
 def _is_one(path: Path) -> bool:
-    """Whether a `poses.csv` has poses in a frame: other sensors have tables of that name."""
+    """Whether a `poses.csv` is a table of poses: other sensors have tables of that name."""
     return is_tum_text(path) or holds(path, POSES)
 
 
@@ -74,11 +74,11 @@ def read(recording: Recording, sensors: Sequence[PoseSensor], reading: Reading) 
 
 
 def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
-    """All poses as they were written: stamps may still repeat or run backwards. They come from a chain of transforms, a
-    table, which may lie beside a bag, or a topic.
+    """All poses as recorded, from a chain of transforms, a table (which may be beside a bag), or a topic. Stamps may
+    repeat or run backwards.
 
-    Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read, and the instant
-    of a rotation that is none.
+    Raises RecordingError naming file and line, or topic, if the data are missing or cannot be read, and the instant of
+    an invalid rotation.
     """
     if sensor.frames is not None:
         if not recording.has_messages:
@@ -97,20 +97,21 @@ def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
 
 
 def where(recording: Recording, sensor: PoseSensor) -> str:
-    """How a sentence names the place of the poses."""
+    """File or topic of the poses, for sentences."""
     if _is_table(recording, sensor):
         return str(recording.table(sensor, sensor.path))
     return recording.place(_topic(recording, sensor).name)
 
 
 def _is_table(recording: Recording, sensor: PoseSensor) -> bool:
+    """Whether the poses come from a table."""
     if not recording.has_messages:
         return True
     return sensor.topic is None and sensor.frames is None and recording.find(sensor.path) is not None
 
 
 def _topic(recording: Recording, sensor: PoseSensor) -> TopicInfo:
-    """An odometry's will do, too."""
+    """Topic of poses, odometry, or transforms."""
     if sensor.frames is not None:
         return recording.topic(sensor.name, sensor.topic or DEFAULT_TOPIC, TRANSFORMS)
     refuse_without_frames(recording.root, recording.topics(), sensor)

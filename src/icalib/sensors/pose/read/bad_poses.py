@@ -1,7 +1,7 @@
-"""Wrong poses among good ones: no poses at all, copies of earlier poses, and poses off the path of the others.
+"""Bad poses: invalid ones, copies of earlier ones, and poses off the trajectory of the others.
 
-Poses are cut into pieces at jumps. The path is the heaviest chain of pieces that go on from each other (dynamic
-programming): a chain may leave pieces out, or pay for a jump that stays.
+Poses are cut into pieces at jumps. The trajectory is the chain of continuous pieces with most poses (dynamic
+programming). A chain may omit pieces, or keep a jump at a price.
 """
 
 from __future__ import annotations
@@ -13,21 +13,22 @@ import numpy as np
 
 from icalib.geometry import so3
 
-FARTHEST_M = 1e9  # from the origin of any frame: the Earth's radius is 6e6
-_JUMP_M, _JUMP_RAD = 0.05, 0.05  # beyond the steps before and after, and
-_BRISK = 10.0  # m/s^2, rad/s^2: a motion may change so fast from pose to pose, or
-_JUMP_TIMES = 20.0  # the median of all steps beyond theirs
-_LASTING_SHARE = 0.1  # of all poses: more are not left out for one jump less
-_MOST_PIECES_BACK = 200
-_COPIED_WITHIN_S = 1.0
-_MOVING_SHARE = 0.2  # of the usual speed: slower, a pose that is repeated is one of a thing that stands still
-_GAP_STEPS = 2.0  # a longer step is a gap, over which the motion may have changed
+MAX_COORDINATE_M = 1e9  # larger ones are no positions on Earth, whose radius is 6e6 m
+# A step is a jump if it differs from its neighbours by more than each of these:
+_MIN_JUMP_M, _MIN_JUMP_RAD = 0.05, 0.05
+_MAX_ACCELERATION = 10.0  # m/s^2, rad/s^2, times the square of the step
+_JUMP_MEDIANS = 20.0  # medians of this difference over all steps
+_MIN_KEPT_SHARE = 0.1  # of all poses, as the price of a jump: so many poses are not omitted to avoid it
+_MAX_OMITTED_PIECES = 200  # in a row: bounds the time
+_MAX_COPY_AGE_S = 1.0  # between a pose and its copy
+_MIN_MOVING_SPEED = 0.2  # of the median speed; a slower sensor may stand still and repeat its pose
+_MIN_GAP_STEPS = 2.0  # median steps; over a longer step the motion may have changed
 
 
 @dataclass(frozen=True)
 class ContinuousPoses:
-    """on (N,): the poses of the path; jumps (M,) first pose after each; size_m, size_rad: of the largest; lasting_m:
-    how far the jumps that stay in the path add up; longest_s: between poses of the path, of time left out."""
+    """The trajectory among N poses. on (N,): its poses; jumps (M,): first pose after each jump; size_m, size_rad: of
+    the largest; lasting_m: sum of the jumps that stay in the trajectory; longest_s: longest gap by omitted poses."""
 
     on: np.ndarray
     jumps: np.ndarray
@@ -38,16 +39,17 @@ class ContinuousPoses:
 
 
 def are_poses(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(N,) whether rotations (N, 3, 3) and positions (N, 3) are finite and somewhere on Earth."""
+    """(N,) whether rotations (N, 3, 3) and positions (N, 3) [m] are finite and plausible."""
     values = np.hstack([position, rotation.reshape(-1, 9)])
-    return np.logical_and.reduce(np.abs(values) < FARTHEST_M, axis=1)
+    return np.logical_and.reduce(np.abs(values) < MAX_COORDINATE_M, axis=1)
 
 
 def stale_copies(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(N,) whether a pose repeats an earlier one in every digit while the sensor moves: a tracker that is lost, or a
-    driver that sends its last pose again. Without noise a thing that stands still repeats itself, too: slowly left."""
+    """(N,) whether a pose equals an earlier one in every digit while the sensor moves, as of a lost tracker, or a
+    driver that repeats its last pose. A sensor at rest without noise repeats its pose as well; the speed afterwards
+    decides."""
     before = _same_before(np.hstack([position, rotation.reshape(-1, 9)]))
-    copy = (before >= 0) & (seconds - seconds[before] <= _COPIED_WITHIN_S)
+    copy = (before >= 0) & (seconds - seconds[before] <= _MAX_COPY_AGE_S)
     own = np.flatnonzero(~copy)
     if len(own) == len(seconds) or len(own) < 3:
         return np.zeros(len(seconds), dtype=bool)
@@ -55,7 +57,7 @@ def stale_copies(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
     for i in np.flatnonzero(copy).tolist():
         first[i] = first[before[i]]
     after = np.searchsorted(own, np.arange(len(seconds)), side="right")
-    # At the end no pose follows: the step to the pose that is repeated tells whether it stopped there.
+    # At the end no pose follows, so the step to the repeated pose decides.
     ends = after == len(own)
     a = np.where(ends, np.maximum(first - 1, 0), first)
     b = np.where(ends, first, own[np.minimum(after, len(own) - 1)])
@@ -63,12 +65,12 @@ def stale_copies(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
     stale = np.zeros(len(seconds), dtype=bool)
     for way in (np.linalg.norm(position[b] - position[a], axis=1), _angles(rotation, a, b)):
         usual = float(np.median((way / step)[own[:-1]]))
-        stale |= (usual > 0.0) & (way / step > _MOVING_SHARE * usual)
+        stale |= (usual > 0.0) & (way / step > _MIN_MOVING_SPEED * usual)
     return stale & copy
 
 
 def _same_before(rows: np.ndarray) -> np.ndarray:
-    """(N,) the last earlier row that is the same in every digit, -1 if there is none."""
+    """(N,) number of the last earlier row that equals each row (N, k) in every digit, -1 if there is none."""
     words = np.ascontiguousarray(rows).view(np.uint64)
     odd = np.random.default_rng(0).integers(1, 2**63, words.shape[1], dtype=np.uint64) * np.uint64(2) + np.uint64(1)
     key = (words * odd).sum(axis=1, dtype=np.uint64)
@@ -79,10 +81,13 @@ def _same_before(rows: np.ndarray) -> np.ndarray:
     return before
 
 
-def path_of(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> ContinuousPoses:
-    """The path of poses (N,), and where they jump."""
+def continuous_poses(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> ContinuousPoses:
+    """The trajectory of N poses at seconds (N,), and its jumps."""
     step, n = np.diff(seconds), len(seconds)
-    way, turn = _Steps.of(np.diff(position, axis=0), step, _JUMP_M), _Steps.of(_turns(rotation), step, _JUMP_RAD)
+    way, turn = (
+        _Steps.of(np.diff(position, axis=0), step, _MIN_JUMP_M),
+        _Steps.of(_rotation_steps(rotation), step, _MIN_JUMP_RAD),
+    )
     jump = way.jump | turn.jump
     if not jump.any():
         return ContinuousPoses(np.ones(n, dtype=bool), np.empty(0, np.int64), 0.0, 0.0, 0.0, 0.0)
@@ -95,7 +100,7 @@ def path_of(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> 
         return moved(i, j)[1] | turn.left(seconds[j] - seconds[i], turned, i, j)[1]
 
     cuts = np.concatenate([[0], np.flatnonzero(jump) + 1, [n]])
-    chain = _heaviest(cuts, _LASTING_SHARE * n, apart)
+    chain = _longest_chain(cuts, _MIN_KEPT_SHARE * n, apart)
     on = np.zeros(n, dtype=bool)
     for k in chain.tolist():
         on[cuts[k] : cuts[k + 1]] = True
@@ -115,8 +120,9 @@ def path_of(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> 
 
 @dataclass(frozen=True)
 class _Steps:
-    """Steps from pose to pose, of positions or rotations: size (N - 1,) beyond the neighbouring steps, and which are
-    jumps; limit of what is none; rate (N, 3) about each pose, and the fastest without jumps; usual_s: of a step."""
+    """Steps from pose to pose, of positions [m] or rotations [rad]. size (N - 1,): difference from the median of the
+    neighbouring steps; jump (N - 1,); limit: largest size without a jump; rate (N, 3): around each pose [1/s]; fastest:
+    largest rate without jumps; usual_s: median step."""
 
     size: np.ndarray
     jump: np.ndarray
@@ -129,8 +135,8 @@ class _Steps:
     def of(cls, change: np.ndarray, step: np.ndarray, least: float) -> _Steps:
         usual = float(np.median(step))
         size = np.linalg.norm(change - _medians(change), axis=1)
-        limit = max(least, _BRISK * usual**2, _JUMP_TIMES * float(np.median(size)))
-        gap = step >= _GAP_STEPS * usual
+        limit = max(least, _MAX_ACCELERATION * usual**2, _JUMP_MEDIANS * float(np.median(size)))
+        gap = step >= _MIN_GAP_STEPS * usual
         jump, rate = (size > limit) & ~gap, change / step[:, None]
         steady = np.flatnonzero(~jump & ~gap)
         fastest = float(np.linalg.norm(rate[steady], axis=1).max(initial=0.0))
@@ -141,24 +147,24 @@ class _Steps:
         return cls(size, jump, limit, rate, fastest, usual)
 
     def left(self, dt: np.ndarray, change: np.ndarray, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What steady motion leaves (n, 3) of the change (n, 3) from poses i to j over dt (n,) s, and whether it is a
-        jump (n,)."""
+        """Change (n, 3) from poses i to j over dt (n,) [s] less that at constant rate (n, 3), and whether it is a jump
+        (n,)."""
         left = change - 0.5 * (self.rate[i] + self.rate[j]) * dt[:, None]
         allowed = self.limit + self.fastest * np.maximum(dt - 1.5 * self.usual_s, 0.0)
         return left, np.linalg.norm(left, axis=1) > allowed
 
 
-def _heaviest(cuts: np.ndarray, price: float, apart: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-    """Numbers, in order, of the pieces (M,) of the chain with most poses, less the `price` of each jump in it; piece k
-    has the poses from cuts[k] to cuts[k + 1]."""
+def _longest_chain(cuts: np.ndarray, price: float, apart: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """Numbers (k,), increasing, of the pieces of the chain with most poses, less the `price` of each jump in it. Piece
+    k has the poses cuts[k]:cuts[k + 1]; apart: whether a jump lies between poses (n,) and (n,)."""
     m = len(cuts) - 1
     best, before = np.diff(cuts).astype(float), np.full(m, -1)
     for k in range(1, m):
-        earlier = np.arange(max(0, k - _MOST_PIECES_BACK), k)
-        worth = best[earlier] - price * apart(cuts[earlier + 1] - 1, np.full(len(earlier), cuts[k]))
-        top = int(np.argmax(worth))
-        if worth[top] > 0.0:
-            best[k] += worth[top]
+        earlier = np.arange(max(0, k - _MAX_OMITTED_PIECES), k)
+        length = best[earlier] - price * apart(cuts[earlier + 1] - 1, np.full(len(earlier), cuts[k]))
+        top = int(np.argmax(length))
+        if length[top] > 0.0:
+            best[k] += length[top]
             before[k] = earlier[top]
     chain = [int(np.argmax(best))]
     while before[chain[-1]] >= 0:
@@ -167,17 +173,17 @@ def _heaviest(cuts: np.ndarray, price: float, apart: Callable[[np.ndarray, np.nd
 
 
 def _medians(steps: np.ndarray) -> np.ndarray:
-    """Of each of steps (n, 3), the median of it and its neighbours, two on each side."""
+    """(n, 3) running medians of steps (n, 3) over 5 steps."""
     padded = np.pad(steps, ((2, 2), (0, 0)), mode="reflect")
     return np.median(np.stack([padded[k : k + len(steps)] for k in range(5)]), axis=0)
 
 
-def _turns(rotation: np.ndarray) -> np.ndarray:
-    """(N - 1, 3) what each pose turned from the one before, about axes of the sensor, rad."""
+def _rotation_steps(rotation: np.ndarray) -> np.ndarray:
+    """(N - 1, 3) rotation vectors from pose to pose, in axes of the sensor [rad]."""
     return so3.log_many(np.ascontiguousarray(rotation[:-1].transpose(0, 2, 1) @ rotation[1:]))
 
 
 def _angles(rotation: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n,) rad from rotations a to rotations b."""
+    """(n,) angles [rad] between rotations number a (n,) and b (n,)."""
     turns = so3.log_many(np.ascontiguousarray(rotation[a].transpose(0, 2, 1) @ rotation[b]))
     return np.linalg.norm(turns, axis=1)

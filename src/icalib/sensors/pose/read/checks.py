@@ -1,4 +1,4 @@
-"""Are these poses those of one thing that moves, in metres, in one frame that stands still?"""
+"""Checks of poses: one moving sensor, in metres, in one static frame."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from icalib.data.stamps.ordered import kept_readings
 from icalib.errors import RecordingError
 from icalib.geometry import so3
 from icalib.rig import PoseSensor
-from icalib.sensors.pose.read.bad_poses import are_poses, path_of, stale_copies
-from icalib.sensors.pose.read.outliers import single_wrong
-from icalib.sensors.pose.read.pose_tables import RATE_HZ, PoseReadings
+from icalib.sensors.pose.read.bad_poses import are_poses, continuous_poses, stale_copies
+from icalib.sensors.pose.read.outliers import single_outliers
+from icalib.sensors.pose.read.pose_tables import POSE_RATE_HZ, PoseReadings
 
-_FASTEST_M_S = 100.0
-_BROKEN_SHARE = 0.5  # of all poses: more are no single bad readings
-_LASTING_M, _RETURNS = 0.05, 0.5  # of a jump's length: jumps that add up to less come back
-_STILL_M, _STILL_RAD = 0.02, 0.02  # from pose to pose, farthest from the first
+_MAX_SPEED = 100.0  # m/s, median: a higher one is a wrong unit of length or time
+_MAX_INVALID_SHARE = 0.5  # of all poses; with more, the writer is wrong
+# Jumps return if they add up to less than the larger of: metres, share of the largest jump.
+_MAX_LASTING_M, _MAX_LASTING_SHARE = 0.05, 0.5
+_MIN_TRAVEL_M, _MIN_TRAVEL_RAD = 0.02, 0.02  # largest displacement and rotation; less is a sensor at rest
 
 
 def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[PoseStream, tuple[str, ...]]:
@@ -29,32 +30,32 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     what = f"{where} ({read.name})"
     if len(read.stamps_ns) < 3:
         raise RecordingError(f"{what}: only {len(read.stamps_ns)} poses; a calibration needs the whole recording.")
-    read, broken = _without_broken(read, what)
+    read, broken = _without_invalid(read, what)
     values = np.hstack([read.position, read.rotation.reshape(-1, 9)])
     own = "write the sensor's own stamps"
-    kept, notes = kept_readings(read.stamps_ns, values, what, RATE_HZ, "pose", own)
+    kept, notes = kept_readings(read.stamps_ns, values, what, POSE_RATE_HZ, "pose", own)
     read = read.some(kept)
     copied, single, jumped = (), (), ()
     if not stands_still_between(read.seconds, read.rotation, read.position):
-        # Of a robot that stands still the controller repeats its pose in every digit.
+        # The controller of a robot at rest repeats its pose in every digit.
         read, copied = _without_copies(read, what)
     if not stands_still_between(read.seconds, read.rotation, read.position):
-        # Where it stands still what moved while it was not seen did not jump.
-        read, single = _without_singles(read, what)
-        read, jumped = _on_path(read, sensor, what)
+        # Steps between the stops of a robot are no jumps.
+        read, single = _without_outliers(read, what)
+        read, jumped = _on_trajectory(read, sensor, what)
     _refuse_stillness(read, what)
     _refuse_units(read, what)
     stream = PoseStream(read.name, read.stamps_ns, np.ascontiguousarray(read.rotation), read.position)
     return stream, broken + notes + copied + single + jumped
 
 
-def _without_broken(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    """Without the few that are no poses."""
+def _without_invalid(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+    """Valid poses, and a note on the others. Raises RecordingError if most are invalid."""
     good = are_poses(read.rotation, read.position)
     if good.all():
         return read, ()
     first, count = read.stamps_ns[np.argmin(good)], int((~good).sum())
-    if count > _BROKEN_SHARE * len(good) or len(good) - count < 3:
+    if count > _MAX_INVALID_SHARE * len(good) or len(good) - count < 3:
         raise RecordingError(
             f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion, the first at "
             f"{first} ns; correct the program that writes them."
@@ -66,6 +67,7 @@ def _without_broken(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
 
 
 def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+    """Poses without stale copies, and a note."""
     stale = stale_copies(read.seconds, read.rotation, read.position)
     if not stale.any():
         return read, ()
@@ -76,8 +78,9 @@ def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
     )
 
 
-def _without_singles(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    wrong = single_wrong(read.seconds, read.rotation, read.position)
+def _without_outliers(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+    """Poses without single outliers, and a note."""
+    wrong = single_outliers(read.seconds, read.rotation, read.position)
     if not wrong.any():
         return read, ()
     return read.some(~wrong), (
@@ -86,16 +89,15 @@ def _without_singles(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple
     )
 
 
-def _on_path(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    """Without poses off the path of the others, and a note where poses jump; raises RecordingError where jumps of a
-    frame that stands still do not come back."""
-    path = path_of(read.seconds, read.rotation, read.position)
+def _on_trajectory(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+    """Poses on the trajectory, and a note on jumps. Raises RecordingError if jumps of absolute poses do not return."""
+    path = continuous_poses(read.seconds, read.rotation, read.position)
     if not len(path.jumps):
         return read, ()
     first, count = read.stamps_ns[path.jumps[0]], int((~path.on).sum())
     words = f"{what}: {len(path.jumps)} jumps of its poses, the first at {first} ns, by up to {path.size_m:.2g} m"
     words += f" and {path.size_rad:.2g} rad"
-    if sensor.kind == "absolute" and path.lasting_m > max(_LASTING_M, _RETURNS * path.size_m):
+    if sensor.kind == "absolute" and path.lasting_m > max(_MAX_LASTING_M, _MAX_LASTING_SHARE * path.size_m):
         raise RecordingError(
             f"{words}, and do not return, as if an odometry closed a loop or lost its track. Write kind: "
             f"relative for {sensor.name} in the rig file, or cut the recording with --from and --to."
@@ -109,9 +111,10 @@ def _on_path(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseRea
 
 
 def _refuse_stillness(read: PoseReadings, what: str) -> None:
+    """Raises RecordingError if the sensor does not move."""
     far = np.linalg.norm(read.position - np.median(read.position, axis=0), axis=1).max()
     turned = _sizes(so3.log_many(np.ascontiguousarray(read.rotation[0].T @ read.rotation))).max()
-    if far < _STILL_M and turned < _STILL_RAD:
+    if far < _MIN_TRAVEL_M and turned < _MIN_TRAVEL_RAD:
         raise RecordingError(
             f"{what}: all poses are the same within {far:.2g} m and {turned:.2g} rad; check that it follows the robot, "
             "or record again while moving."
@@ -119,9 +122,10 @@ def _refuse_stillness(read: PoseReadings, what: str) -> None:
 
 
 def _refuse_units(read: PoseReadings, what: str) -> None:
+    """Raises RecordingError if the speed is implausible."""
     step = np.diff(read.stamps_ns) * 1e-9
     speed = float(np.median(np.linalg.norm(np.diff(read.position, axis=0), axis=1) / step))
-    if speed > _FASTEST_M_S:
+    if speed > _MAX_SPEED:
         raise RecordingError(
             f"{what}: it moves at {speed:.4g} m/s, which is implausible. Positions must be in metres (divide "
             "millimetres by 1000), and stamps in nanoseconds."
@@ -129,4 +133,5 @@ def _refuse_units(read: PoseReadings, what: str) -> None:
 
 
 def _sizes(vectors: np.ndarray) -> np.ndarray:
+    """(n,) norms of vectors (n, 3)."""
     return np.linalg.norm(vectors, axis=1)

@@ -1,4 +1,4 @@
-"""Poses of a sensor as they were written: tables of a folder, TUM's text, messages of a bag."""
+"""Poses of a sensor as recorded, and their readers from tables: CSV, and TUM text."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, PoseSensor, TableLayout
 from icalib.sensors.stream import RawReadings
 
-RATE_HZ = (1e-3, 5000.0)
+POSE_RATE_HZ = (1e-3, 5000.0)  # lowest and highest plausible rate
 POSES = TableKind(
     ("t [ns]",),
     ("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw"),
@@ -25,25 +25,24 @@ POSES = TableKind(
         *vector_names("p|pos|position|t|trans|translation|p_rs_r|"),
         *vector_names("q|quat|quaternion|orientation|r|rot|rotation|q_rs", "xyzw"),
     ),
-    RATE_HZ,
+    POSE_RATE_HZ,
 )
-# The stamps alone: a row whose pose cannot be read keeps its place in the order.
-_STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=RATE_HZ, more=True)
-_TEXTS = (".tum", ".txt")
-_UNIT = 1e-2  # of the length of a quaternion: of few digits
+# The stamps alone, so that a row whose pose cannot be read keeps its position.
+_STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=POSE_RATE_HZ, more=True)
+_TUM_SUFFIXES = (".tum", ".txt")
+_MAX_QUATERNION_ERROR = 1e-2  # of its length, as of rounded text
 
 
 @dataclass(frozen=True)
 class PoseReadings(RawReadings):
-    """R_frame_sensor (N, 3, 3), NaN where there is none; p_frame_sensor (N, 3) m."""
+    """Recorded poses: rotation R_frame_sensor (N, 3, 3), NaN if invalid; position p_frame_sensor (N, 3) [m]."""
 
     rotation: np.ndarray
     position: np.ndarray
 
 
 def as_frame_sensor(read: PoseReadings, sensor: PoseSensor) -> PoseReadings:
-    """The poses as T_frame_sensor, where the rig file says that they are inverted, or that positions have other axes
-    than rotations."""
+    """The poses as T_frame_sensor, converted if the rig file states inverted poses or other axes of positions."""
     if sensor.position_axes is not None:
         read = replace(read, position=in_axes(read.position, sensor.position_axes))
     if not sensor.inverted:
@@ -53,8 +52,8 @@ def as_frame_sensor(read: PoseReadings, sensor: PoseSensor) -> PoseReadings:
 
 
 def is_tum_text(path: Path) -> bool:
-    """Whether a file is told by its name to be TUM's text, whose stamps are seconds."""
-    return path.suffix.lower() in _TEXTS
+    """Whether a file is TUM text by its name. Stamps are then seconds."""
+    return path.suffix.lower() in _TUM_SUFFIXES
 
 
 def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, note: Note = ignore) -> PoseReadings:
@@ -66,7 +65,7 @@ def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, not
     stamps_ns, values = table.integers[:, 0].copy(), table.decimals
     xyzw = values[:, 3:]
     length = np.linalg.norm(np.clip(xyzw, -1e9, 1e9), axis=1)  # squares must not overflow
-    wrong = ~(np.abs(length - 1.0) < _UNIT)
+    wrong = ~(np.abs(length - 1.0) < _MAX_QUATERNION_ERROR)
     if 2 * wrong.sum() > len(wrong):
         i = int(np.argmax(wrong))
         raise RecordingError(
@@ -77,7 +76,7 @@ def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, not
 
 
 def stamps_by_row(table: Path, layout: TableLayout, note: Note) -> tuple[dict[int, int], int]:
-    """The stamp [ns] of each row that can be read, by the row's number from 0 on, and how many rows there are."""
+    """Stamps [ns] of readable rows, by row number from 0, and the number of all rows."""
     kind = replace(_STAMPS, unit="s") if is_tum_text(table) else _STAMPS
     stamps = 1 if split_kind(POSES, layout.columns) is None else 2  # the first columns of a pose
     read = read_table(table, kind, replace(layout, columns=layout.columns[:stamps]), note)

@@ -1,4 +1,4 @@
-"""Poses of one frame in another from a bag's transforms (/tf, /tf_static), through the tree of frames."""
+"""Poses of one frame in another from the transforms of a bag (/tf, /tf_static), along the tree of frames."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from icalib.geometry import so3
 from icalib.rig import PoseSensor
 from icalib.sensors.pose.read.pose_tables import PoseReadings
 
-TRANSFORMS = "transforms"  # the kind of such a topic
+TRANSFORMS = "transforms"  # kind of topics of transforms
 DEFAULT_TOPIC = "/tf"
 MESSAGE_TYPE = "tf2_msgs/msg/TFMessage"  # tf/msg/tfMessage is the same by an older name
 MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"
-_STATIC = "_static"  # a topic of such a name sends what never changes
-_MOST_PERIODS = 3.0  # of an edge's own: over a longer gap it is not interpolated
-_SWAPPED_NS = 1_000_000_000  # stamps of one edge that go back farther are those of a clock that was set back
-_UNIT = 1e-2  # of the length of a quaternion
-_MOST_LISTED = 30
+_STATIC = "_static"  # suffix of topics with static transforms
+_MAX_INTERPOLATED_PERIODS = 3.0  # of an edge; it is not interpolated over a longer gap
+_MAX_BACKWARDS_NS = 1_000_000_000  # of the stamps of an edge; more is a clock that was set back
+_MAX_QUATERNION_ERROR = 1e-2  # of its length
+_MAX_LISTED_FRAMES = 30  # in a message
 Pair = tuple[str, str]  # parent, child
 
 
@@ -51,13 +51,13 @@ class Edge:
 
     @property
     def changes(self) -> bool:
-        """Whether it is not the same all the time."""
+        """Whether the transform changes."""
         rows = np.hstack([self.position, self.rotation.reshape(-1, 9)])
         return bool((rows != rows[0]).any())
 
     @property
     def rate_hz(self) -> float | None:
-        """Of the median step between stamps; None where there is none."""
+        """Rate of the median step between stamps; None if static or single."""
         if self.static or len(self.stamps_ns) < 2:
             return None
         return 1e9 / float(np.median(np.diff(self.stamps_ns)))
@@ -65,14 +65,14 @@ class Edge:
 
 @dataclass(frozen=True)
 class _TransformEdge:
-    """An edge of a chain; inverted: it is gone from child to parent."""
+    """An edge of a chain. inverted: passed from child to parent."""
 
     edge: Edge
     inverted: bool
 
 
 def transform_topics(topics: Sequence[TopicInfo], given: str = DEFAULT_TOPIC) -> list[TopicInfo]:
-    """The topic `given` of transforms and its static one, as far as there are messages."""
+    """The topic `given` of transforms and its static counterpart, without topics that have no messages."""
     stem = given.strip("/").removesuffix(_STATIC)
     found = [t for t in topics if t.kind == TRANSFORMS and t.count]
     return [t for t in found if t.name.strip("/") in (stem, stem + _STATIC)]
@@ -120,7 +120,7 @@ def refuse_without_frames(root: Path, topics: Sequence[TopicInfo], sensor: PoseS
 def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dict[Pair, Edge]:
     """All edges of `topics` by parent and child; transforms that are sent again with the same stamp count once."""
     found: dict[Pair, Edge] = {}
-    for topic in sorted(topics, key=lambda t: t.name.endswith(_STATIC)):  # what is static goes before what moves
+    for topic in sorted(topics, key=lambda t: t.name.endswith(_STATIC)):  # moving transforms replace static ones
         static, where = topic.name.endswith(_STATIC), f"{bag.root} {topic.name}"
         received = _rows(bag, topic.name)
         if not static and (unstamped := sum(r.unstamped for r in received.values())):
@@ -136,7 +136,8 @@ def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dic
 
 @dataclass
 class _Rows:
-    """One edge as it was received: stamps [ns], without one when that was; x, y, z, qx, qy, qz, qw of each."""
+    """An edge as received. stamps_ns: receive time if a message has none; values: x, y, z, qx, qy, qz, qw of each;
+    unstamped: number of messages without stamp."""
 
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     values: array[float] = field(default_factory=lambda: array("d"))
@@ -144,6 +145,7 @@ class _Rows:
 
 
 def _rows(bag: HasMessages, topic: str) -> dict[Pair, _Rows]:
+    """All transforms of a topic, by edge."""
     rows: dict[Pair, _Rows] = defaultdict(_Rows)
     for received_ns, message in bag.messages(topic, TRANSFORMS):
         for t in message.transforms:
@@ -157,10 +159,13 @@ def _rows(bag: HasMessages, topic: str) -> dict[Pair, _Rows]:
 
 
 def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, where: str, note: Note) -> Edge:
-    """The edge of rows (N, 7), without those that are no poses and those that were sent again."""
+    """The edge of rows (N, 7), without invalid and repeated ones. Raises RecordingError if most are invalid, or the
+    clock was set back."""
     shown = f"{pair[0]} -> {pair[1]}"
     with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(rows).all(axis=1) & (np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < _UNIT)
+        good = np.isfinite(rows).all(axis=1) & (
+            np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < _MAX_QUATERNION_ERROR
+        )
     if 2 * good.sum() < len(good):
         raise RecordingError(
             f"{where}: the transform {shown} at {stamps_ns[np.argmin(good)]} ns is not finite or has no unit "
@@ -172,13 +177,13 @@ def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, whe
             f"quaternion and were removed, the first at {stamps_ns[np.argmin(good)]} ns."
         )
     stamps_ns, rows = stamps_ns[good], rows[good]
-    if static:  # the last one holds
+    if static:  # the last one is valid
         stamps_ns, rows = stamps_ns[-1:], rows[-1:]
     else:
         _, first = np.unique(stamps_ns, return_index=True)
         received = stamps_ns[np.sort(first)]
         back_ns = int((np.maximum.accumulate(received) - received).max(initial=0))
-        if back_ns > _SWAPPED_NS:
+        if back_ns > _MAX_BACKWARDS_NS:
             raise RecordingError(
                 f"{where}: the stamps of {shown} go back by {back_ns * 1e-9:.1f} s, so the clock was set back; cut the "
                 "recording there with --from and --to."
@@ -189,13 +194,14 @@ def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, whe
 
 
 def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[_TransformEdge]:
-    """The fewest edges from `parent` to `child`, whichever way each was published."""
+    """Shortest chain of edges from `parent` to `child`, in either direction (breadth-first search). Raises
+    RecordingError if there is none."""
     frames = sorted({frame for pair in edges for frame in pair})
     for frame in (parent, child):
         if frame not in frames:
-            more = f" and {len(frames) - _MOST_LISTED} more" if len(frames) > _MOST_LISTED else ""
+            more = f" and {len(frames) - _MAX_LISTED_FRAMES} more" if len(frames) > _MAX_LISTED_FRAMES else ""
             raise RecordingError(
-                f"{what}: there is no frame {frame}; there are {', '.join(frames[:_MOST_LISTED])}{more}; correct "
+                f"{what}: there is no frame {frame}; there are {', '.join(frames[:_MAX_LISTED_FRAMES])}{more}; correct "
                 "`frames`."
             )
     steps_to: dict[str, list[_TransformEdge]] = {parent: []}
@@ -209,14 +215,15 @@ def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[
     if child not in steps_to:
         raise RecordingError(
             f"{what}: no transforms connect {parent} and {child}; {parent} is connected with "
-            f"{', '.join(sorted(f for f in steps_to if f != parent)[:_MOST_LISTED])}; correct `frames`, or "
+            f"{', '.join(sorted(f for f in steps_to if f != parent)[:_MAX_LISTED_FRAMES])}; correct `frames`, or "
             "record /tf_static as well."
         )
     return steps_to[child]
 
 
 def _along(steps: Sequence[_TransformEdge], sensor: PoseSensor, where: str, note: Note) -> PoseReadings:
-    """Composes the chain of transforms, at the common stamps of those that move."""
+    """Poses composed along a chain, at the common stamps of its moving edges. Raises RecordingError if nothing
+    moves."""
     assert sensor.frames is not None
     what, shown = f"{where} ({sensor.name})", " -> ".join(sensor.frames)
     sent = [s.edge for s in steps if len(s.edge.stamps_ns) > 1]
@@ -239,7 +246,7 @@ def _along(steps: Sequence[_TransformEdge], sensor: PoseSensor, where: str, note
 
 
 def _common_stamps(moving: Sequence[Edge], what: str, shown: str, note: Note) -> np.ndarray:
-    """(N,) stamps of the edge that was sent most often, the last of such, where all others are known, too."""
+    """(N,) stamps of the moving edge with most transforms, the last of several, at which all others are known."""
     stamps_ns = max(moving[::-1], key=lambda e: len(e.stamps_ns)).stamps_ns
     known = np.logical_and.reduce([_covered(edge, stamps_ns) for edge in moving])
     if not known.any():
@@ -256,12 +263,12 @@ def _common_stamps(moving: Sequence[Edge], what: str, shown: str, note: Note) ->
 
 
 def _covered(edge: Edge, stamps_ns: np.ndarray) -> np.ndarray:
-    """(N,) whether the edge is known at stamps (N,): at its own, and between two that are near each other."""
+    """(N,) whether an edge is known at stamps (N,): at its own stamps, and between near ones."""
     after = np.searchsorted(edge.stamps_ns, stamps_ns)
     last = len(edge.stamps_ns) - 1
     own = edge.stamps_ns[np.minimum(after, last)] == stamps_ns
     gap = edge.stamps_ns[np.minimum(after, last)] - edge.stamps_ns[np.maximum(after - 1, 0)]
-    near = gap <= _MOST_PERIODS * float(np.median(np.diff(edge.stamps_ns)))
+    near = gap <= _MAX_INTERPOLATED_PERIODS * float(np.median(np.diff(edge.stamps_ns)))
     return own | ((after > 0) & (after <= last) & near)
 
 
