@@ -91,7 +91,7 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
                 f"{where}{rig.reference} has a pose at only {len(own.seconds)} instants; record more."
             )
     paths = _smoothed(motion.body)
-    # Densities come out too large rather than too small: a wide window would take motion from them.
+    # The narrow window overestimates densities a little; a wide one would smooth away motion and underestimate them.
     body = _with_assumption(rig, recordings, _smoothed(motion.body, narrow=True))
     inputs = replace(inputs_for(body, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
     ideal = _with_ideal_readings(body, recordings, paths, inputs)

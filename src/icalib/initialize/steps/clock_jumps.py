@@ -14,10 +14,8 @@ from icalib.motion.imu_data import ImuData
 
 MIN_CLOCK_JUMP_S = 0.5  # s: shorter gaps are bridged by interpolation
 MIN_RATES_BESIDE_JUMP = 10  # rates on a side of the gap: with fewer the unexplained share is mostly noise
-MAX_MATCHING_UNEXPLAINED, MIN_DIFFERENT_UNEXPLAINED = (
-    0.35,
-    0.7,
-)  # shares of the angular rate: where two turn alike, and where they do not
+MAX_MATCHING_UNEXPLAINED = 0.35  # unexplained share of the angular rate where both sensors turn alike
+MIN_DIFFERENT_UNEXPLAINED = 0.7  # where they do not
 UnexplainedShare = Callable[[SensorRates, float], float]
 
 

@@ -48,7 +48,7 @@ def merged_value(spec: ParameterSpec, parameter: Parameter, given: np.ndarray | 
     return given
 
 
-_REFUSES_FAR_OFF = ContextVar("_REFUSING", default=False)
+_REFUSES_FAR_OFF = ContextVar("_REFUSES_FAR_OFF", default=False)
 
 
 class MotionContradictedError(EstimationError):
@@ -103,12 +103,14 @@ def has_guesses(sensor: Sensor, known: dict[Key, np.ndarray]) -> bool:
 
 
 def merged_translation(given: np.ndarray, found: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """The guess `given` of a translation (3,) m, replaced by `found` along some principal axes of its `covariance` (3,
-    3) m^2. These are the axes along which `found` is more certain than a guess, and contradicts it."""
+    """The guess `given` of a translation (3,) m, replaced by the estimate `found`, of `covariance` (3, 3) m^2, along
+    some principal axes: those along which the estimate is more certain than a guess, and contradicts it."""
     variance, axes = np.linalg.eigh(covariance)
-    way = axes.T @ (found - given)
-    worth = TRANSLATION.prior_sigma
-    return given + axes @ np.where((variance < worth**2) & (np.abs(way) > MAX_GUESS_SIGMAS * worth), way, 0.0)
+    deviation = axes.T @ (found - given)
+    sigma = TRANSLATION.prior_sigma
+    return given + axes @ np.where(
+        (variance < sigma**2) & (np.abs(deviation) > MAX_GUESS_SIGMAS * sigma), deviation, 0.0
+    )
 
 
 def nearest_about_axis(axis: np.ndarray, guess: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def best_shifts(
     variance = np.maximum(saa - sa**2 / count, 0.0) * np.maximum(sbb - sb**2 / count, 0.0)
     whole = min(mask_a.sum(), mask_b.sum())
     enough = count > min(least, 0.5 * whole)
-    # Against the shift's own overlap and a share of the whole, so that a short overlap of little motion cannot win.
+    # The floor, a share of the whole variance, keeps a short overlap with little motion from winning.
     floor = 1e-3 * (a[mask_a].var() * b[mask_b].var()) * count**2
     r = np.where(enough, covariance / np.sqrt(variance + floor), 0.0)
     score = np.arctanh(np.clip(r, 0.0, 0.999999)) * np.sqrt(count)

@@ -59,5 +59,5 @@ class GyroRotation:
         high = np.minimum(
             np.searchsorted(t, t + SMOOTHING_HALF_WINDOW_S, side="right"), np.searchsorted(part, part, side="right")
         )
-        left, _, right = np.linalg.svd(total[high] - total[low])
-        return left @ right @ turned
+        U, _, Vt = np.linalg.svd(total[high] - total[low])
+        return U @ Vt @ turned

@@ -170,8 +170,8 @@ def _mean_frame(pairs: PosePairs, extrinsics: Extrinsics) -> Frame:
 
 
 def _scales(residual: np.ndarray) -> np.ndarray:
-    """(2,) robust standard deviations of a component of rotation [rad] and position [m], from medians of residuals (n,
-    6), corrected for the twelve estimated parameters."""
+    """(2,) robust standard deviations of a component of rotation [rad] and position [m], from medians of residuals
+    (n, 6), corrected for the twelve estimated parameters."""
     n = len(residual)
     spent = np.sqrt(6.0 * n / max(6.0 * n - 12.0, 1.0))
     sizes = [_median_norm(residual[:, k : k + 3]) for k in (0, 3)]

@@ -25,11 +25,11 @@ from icalib.motion.imu_data import ImuData, clear_of
 TRIPLE_STEP_S = 0.12  # s between images of a triple: long against pose noise, short against the loss of the target
 READINGS_PER_BLOCK = 8192  # IMU readings whose rotations are computed at once: bounds the memory
 ACCEL_BIAS_PRIOR_M_S2 = 0.3  # m/s^2: prior standard deviation
-# on the residuals' size: rows share images, so the variance of a mean falls as if n were a quarter
+# On the residuals' size: rows share images, so the variance of a mean falls as if n were a quarter
 SHARED_IMAGE_FACTOR = 2.0
 MIN_ROW_SIGMA_M_S = 0.05  # m/s: floor of the standard deviation of a row
 TARGET_GRAVITY_TOLERANCE = 0.1  # relative error of gravity: more means wrong units or a wrong target size
-# the same for gravity and size, if the camera's rotation is a guess that may be degrees off
+# The same for gravity and size, if the camera's rotation is a guess that may be degrees off
 GUESSED_ROTATION_TOLERANCE = 0.5
 MAX_UNEXPLAINED_ACCELERATION = 1.2  # median residual over median acceleration
 TARGET_SIZE_TOLERANCE = 0.15  # relative error of the target's size
@@ -139,11 +139,11 @@ def _solve(rows: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x, sigma**2 * np.linalg.inv(A.T @ A)[:3, :3]
 
 
-def scale_by_accelerometer(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
+def scale_by_accelerometer(rows: np.ndarray, rhs: np.ndarray, force_rows: np.ndarray) -> tuple[float, float]:
     """True size of the target, or of a trajectory, over the stated one, and its standard deviation. It is the inverse
     of a factor on the accelerometer's part of the equations; a factor on the noisy positions would be biased towards
-    zero. rows (n, 3, m), rhs (n, 3): of the linear system; felt (n, 3): the accelerometer's part of rhs."""
-    A = np.concatenate([rows, felt[:, :, None]], axis=2).reshape(felt.size, -1)
+    zero. rows (n, 3, m), rhs (n, 3): of the linear system; force_rows (n, 3): the accelerometer's part of rhs."""
+    A = np.concatenate([rows, force_rows[:, :, None]], axis=2).reshape(force_rows.size, -1)
     b = rhs.ravel()
     information = A.T @ A + 1e-9 * np.eye(A.shape[1])
     x = np.linalg.solve(information, A.T @ b)

@@ -10,9 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
-from icalib.geometry import so3
 from icalib.geometry.vectors import MEDIAN_NORM
 from icalib.initialize.steps.clock_jumps import refuse_clock_jumps
 from icalib.initialize.steps.gyro_rates import MeanRates
@@ -22,16 +20,13 @@ from icalib.initialize.steps.rate_correlation import (
     best_offsets,
     interpolated,
     likely_offsets,
-    max_rate_step,
     moving_means,
 )
 from icalib.initialize.steps.rate_regression import no_match_error, rate_difference_noise
-from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.initialize.steps.turned_angles import ChainedRates
 from icalib.motion.axes import other_axes
 from icalib.motion.imu_data import ImuData
 
-MIN_IMAGE_PAIRS = 20  # pairs of consecutive images: below, the median of differences is unreliable
 MAX_UNEXPLAINED_RATE = 0.35  # share of the angular rate; two independent motions leave about 1
 LONG_RATE_MEAN_S = 0.5  # s: duration of means that are compared if those over RATE_MEAN_S do not match
 OFFSET_AGREEMENT_S = 0.01  # s: time offsets that differ by less agree
@@ -42,7 +37,7 @@ MAX_NOISE_RATIO_AT_REST = 1.5  # RMS of the rate over the noise of a gyroscope a
 _SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
 MIN_SECOND_AXIS_RATIO = 0.05  # spread of rates along the second axis over that along the first
 MAX_ALIGNMENT_ITERATIONS = 12  # of the alternation, which usually needs three
-DEG_PER_RAD = 180.0 / np.pi
+DEG_PER_RAD = 180.0 / np.pi  # ratio of rates in deg/s to rates in rad/s
 
 
 class OneAxisError(EstimationError):
@@ -60,29 +55,6 @@ class RateAlignment:
     given: bool = False  # offset and rotation are the rig file's, and as good as these
 
 
-def camera_rates(stream: CornerStream, poses: TargetPoses) -> SensorRates:
-    """Angular rates from consecutive good poses of a camera. Raises EstimationError if fewer than MIN_IMAGE_PAIRS pairs
-    are close enough in time."""
-    t = stream.seconds
-    index = np.flatnonzero(poses.ok)
-    if len(index) < 2:
-        raise EstimationError(
-            f"{stream.name}: the pose of the target was found in only {len(index)} of {len(t)} images; check "
-            "the target, the camera model and the intrinsics in the rig file."
-        )
-    a, b = index[:-1], index[1:]
-    longest = max_rate_step(stream.name, t[index], "images of the target")
-    near = t[b] - t[a] <= longest
-    a, b = a[near], b[near]
-    if len(a) < MIN_IMAGE_PAIRS:
-        raise EstimationError(
-            f"{stream.name}: only {len(a)} pairs of consecutive images, at most {longest:.3g} s apart, show "
-            f"the target, and {MIN_IMAGE_PAIRS} are needed; record for at least ten seconds."
-        )
-    turn = so3.log_many(np.ascontiguousarray(poses.rotation[a].transpose(0, 2, 1) @ poses.rotation[b]))
-    return SensorRates(t[a], t[b], turn / (t[b] - t[a])[:, None], longest_step_s=longest)
-
-
 def align_rates(imu: ImuData, name: str, rates: SensorRates, given_offset: float | None) -> RateAlignment:
     """Estimates the alignment of the sensor `name`; with `given_offset` [s], at this offset. Raises EstimationError if
     the rates do not match at any offset, or units are wrong."""
@@ -92,7 +64,7 @@ def align_rates(imu: ImuData, name: str, rates: SensorRates, given_offset: float
         raise no_match_error(imu, name, rates)
     best, *others = likely_offsets(imu, name, rates) if given_offset is None else [given_offset]
     offsets = [best, *(x for x in others if covered(imu, rates, x).any())]
-    # In a short recording the sizes of the rates may be more alike elsewhere, but not their directions.
+    # In a short recording angular speeds may match better at a wrong offset, but directions do not.
     (alike, found), averaged = _first_match(imu, [_align_near(imu, name, rates, x, keep) for x in offsets])
     refuse_clock_jumps(imu, name, alike, found.offset, lambda part, offset: _unexplained_at(imu, part, found, offset))
     _check_offset(imu, name, _unexplained(imu, alike, found, averaged), keep)
@@ -109,11 +81,12 @@ def _first_match(
     If none matches over RATE_MEAN_S, means over LONG_RATE_MEAN_S are compared: noise shrinks at least with the root of
     the duration, a different motion does not. If none matches then, returns the first.
     """
-    left = [_unexplained(imu, *one) for one in tried]
-    alike = [k for k, share in enumerate(left) if share <= MAX_UNEXPLAINED_RATE]
+    unexplained = [_unexplained(imu, *one) for one in tried]
+    alike = [k for k, share in enumerate(unexplained) if share <= MAX_UNEXPLAINED_RATE]
     if alike:
-        best = int(np.argmin(left))
-        return tried[best if left[best] < MAX_UNEXPLAINED_RATIO_OF_OTHER * left[alike[0]] else alike[0]], RATE_MEAN_S
+        best = int(np.argmin(unexplained))
+        is_clear = unexplained[best] < MAX_UNEXPLAINED_RATIO_OF_OTHER * unexplained[alike[0]]
+        return tried[best if is_clear else alike[0]], RATE_MEAN_S
     for one in tried:
         share = min(MAX_UNEXPLAINED_RATE, np.sqrt(RATE_MEAN_S / LONG_RATE_MEAN_S) * _unexplained(imu, *one))
         if _unexplained(imu, *one, LONG_RATE_MEAN_S) <= share:
@@ -169,9 +142,9 @@ def _unexplained(imu: ImuData, rates: SensorRates, found: RateAlignment, average
     known noise of the sensor's rates is subtracted."""
     gyro, seen = _side_by_side(imu, rates, found.offset, averaged)
     gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
-    left = float(np.median(np.linalg.norm(gyro - seen, axis=1)))
-    left = np.sqrt(max(left**2 - (MEDIAN_NORM * rate_difference_noise(imu, rates, averaged)) ** 2, 0.0))
-    return float(left / np.median(np.linalg.norm(gyro, axis=1)))
+    unexplained = float(np.median(np.linalg.norm(gyro - seen, axis=1)))
+    unexplained = np.sqrt(max(unexplained**2 - (MEDIAN_NORM * rate_difference_noise(imu, rates, averaged)) ** 2, 0.0))
+    return float(unexplained / np.median(np.linalg.norm(gyro, axis=1)))
 
 
 def _unexplained_at(imu: ImuData, rates: SensorRates, found: RateAlignment, offset: float) -> float:
@@ -188,7 +161,7 @@ def _side_by_side(
     inside = covered(imu, rates, offset)
     start, end = rates.start[inside], rates.end[inside]
     gyro = _interval_rates(imu, rates).over(start + offset, end + offset)
-    # Windows may overlap: so many of them cover `averaged` seconds.
+    # Intervals may overlap: `count` of them cover `averaged` seconds.
     step = float(np.median(np.diff(start))) if len(start) > 1 else averaged
     count = min(max(1, 1 + round((averaged - float(np.median(end - start))) / step)), len(start))
     return moving_means(gyro, count), moving_means(rates.rate[inside], count)

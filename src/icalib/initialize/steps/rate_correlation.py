@@ -11,17 +11,16 @@ from icalib.initialize.steps.cross_correlation import CorrelationPeak, best_shif
 from icalib.initialize.steps.turned_angles import offsets_by_angle
 from icalib.motion.imu_data import ImuData
 
-CORRELATION_GRID_HZ = 100.0
-MAX_RATE_STEP_S = 0.25  # images further apart do not give an angular rate, unless all are:
-MAX_USUAL_STEPS, MAX_SLOW_STEP_S = (
-    1.5,
-    2.0,
-)  # then this many usual steps are near, up to 2 s; further apart motion is lost
-MIN_RATE_OVERLAP_S = 4.0
-MIN_RATE_CORRELATION = 0.7
-MAX_OFFSET_PEAKS, MIN_PEAK_DISTANCE_S = 5, 0.25  # of the correlation, that are tried
-RATE_MEAN_S = 0.25  # over which the two are compared
-MAX_ANGLE_MISFIT = 0.5  # of the spread of angles turned in long intervals
+CORRELATION_GRID_HZ = 100.0  # of the grid: offsets are found to 5 ms, and refined later
+MAX_RATE_STEP_S = 0.25  # s between neighbours that give an angular rate, unless the stream is slower:
+MAX_USUAL_STEPS = 1.5  # then the step is at most this many median steps,
+MAX_SLOW_STEP_S = 2.0  # and at most this many s; over longer steps the motion is lost
+MIN_RATE_OVERLAP_S = 4.0  # s: a shorter overlap correlates by chance
+MIN_RATE_CORRELATION = 0.7  # of angular speeds that match
+MAX_OFFSET_PEAKS = 5  # peaks of the correlation that are tried
+MIN_PEAK_DISTANCE_S = 0.25  # s between two of them
+RATE_MEAN_S = 0.25  # s: duration of the means that are compared
+MAX_ANGLE_MISFIT = 0.5  # RMS difference over the spread of rotation angles in long intervals
 
 
 @dataclass(frozen=True)
@@ -82,18 +81,20 @@ def likely_offsets(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
 def _offsets_of_slow_rates(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
     """The same for long intervals, by rotation angles. Raises EstimationError if no offset matches."""
     found = offsets_by_angle(imu, rates.start, rates.end, rates.rate)
-    alike = [offset for offset, left in found if left < MAX_ANGLE_MISFIT]
+    alike = [offset for offset, misfit in found if misfit < MAX_ANGLE_MISFIT]
     if not alike:
         in_radians = replace(imu, gyro=np.deg2rad(imu.gyro))
-        if any(left < MAX_ANGLE_MISFIT for _, left in offsets_by_angle(in_radians, rates.start, rates.end, rates.rate)):
+        if any(
+            misfit < MAX_ANGLE_MISFIT for _, misfit in offsets_by_angle(in_radians, rates.start, rates.end, rates.rate)
+        ):
             raise EstimationError(
                 f"the angular rate of {imu.name} matches {name} if it is in deg/s; set gyro_unit: deg/s of "
                 f"{imu.name} in the rig file."
             )
-        left = f"at best {found[0][1]:.0%} of the rotation is unexplained" if found else "they do not overlap in time"
+        misfit = f"at best {found[0][1]:.0%} of the rotation is unexplained" if found else "they do not overlap in time"
         raise EstimationError(
             f"the rotation of {name}, {MAX_USUAL_STEPS / rates.longest_step_s:.2g} poses per second, does not "
-            f"match that of {imu.name} at any time offset ({left}). Check that both come from the same "
+            f"match that of {imu.name} at any time offset ({misfit}). Check that both come from the same "
             "recording, overlap in time, and are in rad/s, or record at a higher rate."
         )
     return alike

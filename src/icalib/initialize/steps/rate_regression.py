@@ -28,14 +28,14 @@ from icalib.motion.imu_data import ImuData, clear_of
 
 RATE_STEPS_S = (TRACK_RATE_STEP_S, 0.2, 0.1, 0.05)  # s between the two images of a rate
 MIN_STEP_PERIODS = 0.75  # of a step, in periods of the images
-# Of the logarithm of the likelihood ratio of three times three coefficients, twice which is chi^2 of nine degrees of
-# freedom: by chance less than once in 1000, at any of some hundred shifts.
+# Log likelihood ratio of 3 x 3 coefficients: twice it is chi^2 with nine degrees of freedom. By chance some hundred
+# Shifts exceed it less than once in 1000 recordings.
 MIN_REGRESSION_SCORE = 15.0
-# rates from the second choice of starts replace the first if their score is larger by this factor
+# Rates from the second choice of starts replace the first if their score is larger by this factor
 MIN_SCORE_RATIO = 1.3
 MIN_RATE_TO_NOISE = 3.0  # variation of rates over their noise: below, a match may not be significant
 GRID_POINTS_PER_INTERVAL = 10  # offsets are found to a twentieth of an interval
-# of the mean square rate, added to each axis: rotation about one axis leaves the others singular
+# Of the mean square rate, added to each axis: rotation about one axis leaves the others singular
 REGULARISING_SPREAD = (
     1e-3  # of the mean square, that rates count with about each axis: about one axis there may be none
 )
@@ -56,13 +56,13 @@ def best_regressions(imu: ImuData, rates: SensorRates) -> list[Regression]:
     length = float(np.median(rates.end - rates.start))
     step = length / GRID_POINTS_PER_INTERVAL
     middle = 0.5 * (rates.start + rates.end)
-    seen, seen_known = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
+    camera, camera_known = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
     start = np.arange(0.0, imu.seconds[-1] - length, step)
-    felt, felt_known = MeanRates.of(imu).over(start, start + length), clear_of(imu.gaps, start, start + length)
-    if not felt_known.any() or not seen_known.any():
+    gyro, gyro_known = MeanRates.of(imu).over(start, start + length), clear_of(imu.gaps, start, start + length)
+    if not gyro_known.any() or not camera_known.any():
         return []
-    explained, count = _explained_share(felt, felt_known, seen, seen_known)
-    enough = count > min(MIN_RATE_OVERLAP_S / step, 0.5 * min(felt_known.sum(), seen_known.sum()))
+    explained, count = _explained_share(gyro, gyro_known, camera, camera_known)
+    enough = count > min(MIN_RATE_OVERLAP_S / step, 0.5 * min(gyro_known.sum(), camera_known.sum()))
     score = np.where(
         enough, -0.5 * count / GRID_POINTS_PER_INTERVAL * np.log(1.0 - np.minimum(explained, 1.0 - 1e-9)), -np.inf
     )
@@ -70,7 +70,7 @@ def best_regressions(imu: ImuData, rates: SensorRates) -> list[Regression]:
     apart = round(MIN_PEAK_DISTANCE_S / step)
     while len(found) < MAX_OFFSET_PEAKS and np.isfinite(score).any():
         k = int(np.argmax(score))
-        found.append(Regression((k - (len(seen) - 1)) * step + 0.5 * length - float(middle[0]), float(score[k])))
+        found.append(Regression((k - (len(camera) - 1)) * step + 0.5 * length - float(middle[0]), float(score[k])))
         score[max(k - apart, 0) : k + apart + 1] = -np.inf
     return found
 
@@ -107,7 +107,8 @@ def _rates_and_score(
     Returns score and rates of the second if they match the gyroscope clearly better, else of the first.
 
     If a camera moves far sideways, a start without translation often leads to a local minimum, and the previous
-    interval's does not. With a guessed lens it may be the other way round."""
+    interval's does not. With a guessed lens it may be the other way round.
+    """
     found = []
     for chained in (False, True):
         rates = track_rates(stream, model, lens, step, chained=chained)

@@ -64,10 +64,10 @@ def smooth_trajectory(
     fitted = np.empty((len(at), 3, 6))
     reference = np.clip(np.searchsorted(0.5 * (t[1:] + t[:-1]), at), 0, len(t) - 1)
     _parabolas(t, R, p, at, first, last, reference, half, fitted)
-    turn, way = fitted[:, 0, :3], fitted[:, 0, 3:]
+    turn, position = fitted[:, 0, :3], fitted[:, 0, 3:]
     rotation = R[reference] @ so3.exp_many(np.ascontiguousarray(turn))
     acceleration = np.einsum("mji,mj->mi", rotation, fitted[:, 2, 3:])
-    return SmoothTrajectory(at, rotation, way, fitted[:, 1, :3], fitted[:, 1, 3:], acceleration, near)
+    return SmoothTrajectory(at, rotation, position, fitted[:, 1, :3], fitted[:, 1, 3:], acceleration, near)
 
 
 def _min_half_window(t: np.ndarray) -> float:

@@ -13,6 +13,7 @@ from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
+from icalib.initialize.steps.rate_correlation import SensorRates, max_rate_step
 
 MAX_POSE_CORNERS = 48  # corners of an image that are used; more do not improve an initial guess
 MIN_POSE_CORNERS = 6  # corners of a board: fewer are too often nearly collinear
@@ -20,6 +21,7 @@ MIN_RAY_COSINE = 0.15  # cosine of a ray to the optical axis: homographies need 
 MAX_POSE_RMS_PX = 3.0  # px: poses with a larger RMS error are rejected
 POSE_HUBER_PX = 2.0  # px: width of Huber's loss
 POSE_ITERATIONS = 5  # of Gauss-Newton, which starts near the solution
+MIN_IMAGE_PAIRS = 20  # pairs of consecutive images: below, the median of differences is unreliable
 POSES_PER_BLOCK = 512  # poses computed at once: bounds the memory of rays and Jacobians
 
 
@@ -245,6 +247,29 @@ def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, t
     fewest = np.full(len(stream.stamps_ns), target.fewest)
     found = flat_poses(stream, stream.start, fewest, model, params, target.points, 1)
     return TargetPoses(found.rotation[:, 0], found.position[:, 0], found.ok[:, 0], found.rms_px[:, 0])
+
+
+def camera_rates(stream: CornerStream, poses: TargetPoses) -> SensorRates:
+    """Angular rates from consecutive good poses of a camera. Raises EstimationError if fewer than MIN_IMAGE_PAIRS pairs
+    are close enough in time."""
+    t = stream.seconds
+    index = np.flatnonzero(poses.ok)
+    if len(index) < 2:
+        raise EstimationError(
+            f"{stream.name}: the pose of the target was found in only {len(index)} of {len(t)} images; check "
+            "the target, the camera model and the intrinsics in the rig file."
+        )
+    a, b = index[:-1], index[1:]
+    longest = max_rate_step(stream.name, t[index], "images of the target")
+    near = t[b] - t[a] <= longest
+    a, b = a[near], b[near]
+    if len(a) < MIN_IMAGE_PAIRS:
+        raise EstimationError(
+            f"{stream.name}: only {len(a)} pairs of consecutive images, at most {longest:.3g} s apart, show "
+            f"the target, and {MIN_IMAGE_PAIRS} are needed; record for at least ten seconds."
+        )
+    turn = so3.log_many(np.ascontiguousarray(poses.rotation[a].transpose(0, 2, 1) @ poses.rotation[b]))
+    return SensorRates(t[a], t[b], turn / (t[b] - t[a])[:, None], longest_step_s=longest)
 
 
 def check_front_side(camera: str, poses: TargetPoses) -> None:

@@ -61,7 +61,7 @@ def offsets_by_angle(imu: ImuData, start: np.ndarray, end: np.ndarray, rate: np.
     known = clear_of(imu.gaps, grid, grid)
     unknown = np.concatenate([[0], np.cumsum(~known)])
     shifts = np.arange(-int(begin[-1]), len(grid))
-    left = np.concatenate(
+    misfit = np.concatenate(
         [
             _angle_misfit(R, unknown, begin, length, angle, s)
             for s in np.array_split(shifts, 1 + len(shifts) // OFFSETS_PER_BATCH)
@@ -70,11 +70,11 @@ def offsets_by_angle(imu: ImuData, start: np.ndarray, end: np.ndarray, rate: np.
     found: list[tuple[float, float]] = []
     apart = round(MIN_OFFSET_DISTANCE_S / OFFSET_GRID_S)
     for _ in range(MAX_ANGLE_OFFSETS):
-        k = int(np.argmin(left))
-        if not np.isfinite(left[k]):
+        k = int(np.argmin(misfit))
+        if not np.isfinite(misfit[k]):
             break
-        found.append((float(shifts[k] * OFFSET_GRID_S + grid[0]), float(left[k])))
-        left[max(k - apart, 0) : k + apart + 1] = np.inf
+        found.append((float(shifts[k] * OFFSET_GRID_S + grid[0]), float(misfit[k])))
+        misfit[max(k - apart, 0) : k + apart + 1] = np.inf
     return found
 
 

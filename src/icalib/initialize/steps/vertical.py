@@ -10,7 +10,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.initializer import initializer_of
 from icalib.optim.state import State
 
-# between the vehicle's axis of rotation and z of a frame: a frame more than 45 degrees off is not level
+# Between the vehicle's axis of rotation and z of a frame: a frame more than 45 degrees off is not level
 MIN_LEVEL_COSINE = (
     0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
 )

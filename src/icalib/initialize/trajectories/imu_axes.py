@@ -75,17 +75,20 @@ def refuse_other_axes(
         return
     now = _unexplained_or_inf(unexplained, imu)
     found = sorted(
-        ((_unexplained_or_inf(unexplained, way.of(imu)), k, way) for k, way in enumerate(axis_conventions())),
+        (
+            (_unexplained_or_inf(unexplained, convention.of(imu)), k, convention)
+            for k, convention in enumerate(axis_conventions())
+        ),
         key=lambda x: x[:2],
     )
-    best, _, way = found[0]
+    best, _, convention = found[0]
     if best < min(MAX_GOOD_UNEXPLAINED, MAX_UNEXPLAINED_RATIO * now):
         other = (
             f" (or {found[1][2].fields(sensor)}, which fits as well)" if best > _UNIQUE_BEST_RATIO * found[1][0] else ""
         )
         raise EstimationError(
-            f"{sensor.name} {way.words}: its readings fit the cameras only then; set "
-            f"{way.fields(sensor)}{other} of {sensor.name} in the rig file."
+            f"{sensor.name} {convention.words}: its readings fit the cameras only then; set "
+            f"{convention.fields(sensor)}{other} of {sensor.name} in the rig file."
         ) from failed
 
 

@@ -53,8 +53,8 @@ class SignalIntegrals:
 
 @dataclass(frozen=True)
 class ImuTrajectory:
-    """The IMU in a world with z up, at increasing seconds (n,): R_world_imu (n, 3, 3), position (n, 3) m, velocity (n,
-    3) m/s. gyro_bias (3,) rad/s, accel_bias (3,) m/s^2; gravity: magnitude [m/s^2]."""
+    """The IMU in a world with z up, at increasing seconds (n,): R_world_imu (n, 3, 3), position (n, 3) m, velocity
+    (n, 3) m/s. gyro_bias (3,) rad/s, accel_bias (3,) m/s^2; gravity: magnitude [m/s^2]."""
 
     gyro: GyroRotation
     seconds: np.ndarray
@@ -112,17 +112,14 @@ def _least_squares(
     velocity_change: np.ndarray,
     sigma_factor: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities (n, 3) from measured positions (n, 3), and increments of position and velocity (n - 1,
-    3) over intervals h (n - 1,) s, whose standard deviations are scaled by sigma_factor (n - 1,). Solves a
-    block-tridiagonal system by elimination."""
+    """Positions and velocities (n, 3) from measured positions (n, 3), and increments of position and velocity (n -
+    1, 3) over intervals h (n - 1,) s, whose standard deviations are scaled by sigma_factor (n - 1,)."""
     n = len(positions)
     D, U, r = np.zeros((n, 2, 2)), np.zeros((n - 1, 2, 2)), np.zeros((n, 2, 3))
     D[:, 0, 0] = SENSOR_POSITION_SIGMA_M**-2
     r[:, 0] = positions * SENSOR_POSITION_SIGMA_M**-2
-    A, B = (
-        np.zeros((n - 1, 2, 2)),
-        np.tile(np.eye(2), (n - 1, 1, 1)),
-    )  # rows B x_k+1 + A x_k = (displacement, velocity_change)
+    # Rows B x_k+1 + A x_k = (displacement, velocity_change) of x = (position, velocity).
+    A, B = np.zeros((n - 1, 2, 2)), np.tile(np.eye(2), (n - 1, 1, 1))
     A[:, 0, 0] = A[:, 1, 1] = -1.0
     A[:, 0, 1] = -h
     w = np.stack(
@@ -135,6 +132,14 @@ def _least_squares(
     U[:] = At @ B
     r[:-1] += At @ b
     r[1:] += Bt @ b
+    x = _solve_block_tridiagonal(D, U, r)
+    return x[:, 0], x[:, 1]
+
+
+def _solve_block_tridiagonal(D: np.ndarray, U: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """x (n, 2, 3) of the symmetric system with diagonal blocks D (n, 2, 2), blocks U (n - 1, 2, 2) above them and right
+    sides r (n, 2, 3), by block elimination. D and r are overwritten."""
+    n = len(D)
     for k in range(1, n):
         F = np.linalg.solve(D[k - 1], U[k - 1]).T
         D[k] -= F @ U[k - 1]
@@ -143,4 +148,4 @@ def _least_squares(
     x[-1] = np.linalg.solve(D[-1], r[-1])
     for k in range(n - 2, -1, -1):
         x[k] = np.linalg.solve(D[k], r[k] - U[k] @ x[k + 1])
-    return x[:, 0], x[:, 1]
+    return x

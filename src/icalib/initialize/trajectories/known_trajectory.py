@@ -72,8 +72,10 @@ def imu_poses_at(state: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.nd
     k = np.clip(np.searchsorted(state.seconds, t, side="right") - 1, 0, len(state.seconds) - 2)
     h = np.diff(state.seconds)[k][:, None]
     s = (t - state.seconds[k])[:, None] / h
-    way = hermite(s, state.position[k + 1] - state.position[k], state.velocity[k] * h, state.velocity[k + 1] * h)
-    return gyro.carry(state.seconds, state.rotation, t), state.position[k] + way
+    displacement = hermite(
+        s, state.position[k + 1] - state.position[k], state.velocity[k] * h, state.velocity[k + 1] * h
+    )
+    return gyro.carry(state.seconds, state.rotation, t), state.position[k] + displacement
 
 
 def too_few_poses(name: str) -> EstimationError:

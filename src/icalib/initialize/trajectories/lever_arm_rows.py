@@ -38,7 +38,7 @@ SENSOR_RATE_SIGMA_RAD_S = 0.02  # rad/s: standard deviation of a rate of the sen
 DISPLACEMENT_SPANS_S = (0.5, 2.0)  # s between the two poses of a displacement
 MIN_TRIPLE_STEP_S = 0.1  # s between the poses of a triple
 MIN_LEVER_ARM_ROWS = 10  # equations of three components each
-# spread of rates along the second axis over that along the first: below, it is noise
+# Spread of rates along the second axis over that along the first: below, it is noise
 SINGLE_AXIS_RATE_RATIO = (
     0.1  # of the spread of rates about the first axis: below, turns about the second are lost in noise
 )
@@ -56,7 +56,7 @@ class LeverArmRows(NamedTuple):
     motion: np.ndarray
 
 
-# function of R_imu_sensor and of p_imu_sensor, which the derivative by d needs
+# Function of R_imu_sensor and of p_imu_sensor, which the derivative by d needs
 LeverArmSystem = Callable[[np.ndarray, np.ndarray], LeverArmRows]
 
 
@@ -142,8 +142,8 @@ def system_from_readings(
 def solve_lever_arm(
     rows: LeverArmSystem, prior: GaussianPrior, R_is: np.ndarray, rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """R_imu_sensor and x (m,) that fit the system best, starting at the rotation R_is that fits the sensor's rates (n,
-    3). None if the system has too few rows."""
+    """R_imu_sensor and x (m,) that fit the system best, starting at the rotation R_is that fits the sensor's rates
+    (n, 3). None if the system has too few rows."""
     start = prior.mean[3:6]
     if len(rows(R_is, start).b) < MIN_LEVER_ARM_ROWS:
         return None
@@ -163,8 +163,8 @@ def solve_lever_arm(
 def unexplained_displacement(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> float:
     """Median residual of the solution R_is, x (m,) over the median part of the sensor's trajectory in the equations."""
     A, b, motion = rows(R_is, x[3:6])
-    left = b - A[:, :, 3:] @ x[3:]
-    return float(np.median(np.linalg.norm(left, axis=1)) / max(np.median(np.linalg.norm(motion, axis=1)), 1e-30))
+    residual = b - A[:, :, 3:] @ x[3:]
+    return float(np.median(np.linalg.norm(residual, axis=1)) / max(np.median(np.linalg.norm(motion, axis=1)), 1e-30))
 
 
 def is_mirrored(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> bool:

@@ -57,29 +57,22 @@ def fit_imu_trajectory(
     def carry(at_poses: np.ndarray) -> np.ndarray:
         return gyro.carry(t, at_poses, imu.seconds)
 
-    prior = lever_arm_prior(
-        np.array([UNKNOWN_SIGMA] * 3 + [ACCEL_BIAS_PRIOR] * 3),
-        rates.rate,
-        VELOCITY_CHANGE_SIGMA_M_S,
-        known.rotation is not None,
-        known.position,
-    )
+    sigmas = np.array([UNKNOWN_SIGMA] * 3 + [ACCEL_BIAS_PRIOR] * 3)  # of gravity and bias
+    rotation_known = known.rotation is not None
+    prior = lever_arm_prior(sigmas, rates.rate, VELOCITY_CHANGE_SIGMA_M_S, rotation_known, known.position)
     system = system_from_readings(imu, carry, t, path.rotation, path.position)
     found = solve_lever_arm(system, prior, aligned.rotation, rates.rate)
     if found is None:
         return None
     R_is, x = found
-    level, R_imu = _levelling_rotation(x[6:9]), path.rotation @ R_is.T
-    position = (path.position - R_imu @ x[3:6]) @ level.T
-    start = ImuTrajectory(
-        gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity
-    )
+    R_world_map, R_map_imu = _levelling_rotation(x[6:9]), path.rotation @ R_is.T
+    position = (path.position - R_map_imu @ x[3:6]) @ R_world_map.T
+    velocity = np.zeros_like(position)
+    start = ImuTrajectory(gyro, t, R_world_map @ R_map_imu, position, velocity, aligned.gyro_bias, x[9:12], gravity)
     turned = only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is None
-    guess, unexplained = (
-        ExtrinsicsGuess(R_is, x[3:6], aligned.offset, turned),
-        unexplained_displacement(system, R_is, x),
-    )
-    return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, unexplained)
+    guess = ExtrinsicsGuess(R_is, x[3:6], aligned.offset, turned)
+    unexplained = unexplained_displacement(system, R_is, x)
+    return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), R_world_map, unexplained)
 
 
 def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:

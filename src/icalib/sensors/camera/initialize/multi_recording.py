@@ -10,7 +10,8 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.rate_alignment import OneAxisError, camera_rates, contradicting_offset
+from icalib.initialize.steps.rate_alignment import OneAxisError, contradicting_offset
+from icalib.initialize.steps.target_poses import camera_rates
 from icalib.model.bodies import Bodies
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Camera, Rig

@@ -16,8 +16,8 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.contradicted_guesses import merged_translation, merged_value
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.lever_arm import LeverArm, check_gravity, check_target_size, solve_camera_lever_arm
-from icalib.initialize.steps.rate_alignment import RateAlignment, camera_rates
-from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.initialize.steps.rate_alignment import RateAlignment
+from icalib.initialize.steps.target_poses import TargetPoses, camera_rates
 from icalib.initialize.trajectories.imu_axes import refuse_other_axes
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.optim.state import Key

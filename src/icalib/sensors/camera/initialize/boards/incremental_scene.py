@@ -324,7 +324,7 @@ def informative_images(stream: CornerStream, body: np.ndarray) -> CornerStream:
 
 
 def _views(bodies: Bodies, streams: Sequence[CornerStream], begins: np.ndarray) -> SceneViews:
-    """All views of all cameras, with up to `MOST_CORNERS` corners each."""
+    """All views of all cameras, with up to `MAX_POSE_CORNERS` corners each."""
     own, columns = bodies.target.body, []
     for c, stream in enumerate(streams):
         views = Views.of(stream, own)
@@ -338,7 +338,7 @@ def _views(bodies: Bodies, streams: Sequence[CornerStream], begins: np.ndarray) 
 
 
 def _spread_corners(views: Views) -> np.ndarray:
-    """(N,) bool: at most `MOST_CORNERS` corners of each view, spread over it."""
+    """(N,) bool: at most `MAX_POSE_CORNERS` corners of each view, spread over it."""
     length = np.diff(views.start)
     place = np.arange(int(views.start[-1])) - np.repeat(views.start[:-1], length)
     length = np.repeat(length, length)

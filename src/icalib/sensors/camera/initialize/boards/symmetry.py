@@ -21,8 +21,7 @@ from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Target
 from icalib.initialize.steps.gyro_rotation import GyroRotation
-from icalib.initialize.steps.rate_alignment import camera_rates
-from icalib.initialize.steps.target_poses import FlatPoints, TargetPoses, target_poses
+from icalib.initialize.steps.target_poses import FlatPoints, TargetPoses, camera_rates, target_poses
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import taken_at_once

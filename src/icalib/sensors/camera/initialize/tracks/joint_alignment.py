@@ -1,7 +1,7 @@
 """Time offsets, rotations and gyroscope bias together, from the turns of all cameras and the gyroscope's own.
 
 Over half a second or more the gyroscope's turn, seen from camera c, is R_c2_c1 = R_i_c^T R_i2_i1 R_i_c; the epipolar
-geometry of the points in both images says what left turn d it lacks (`turn_information`), and to first order
+geometry of the points in both images says what left turn d it lacks (`rotation_information`), and to first order
 
     d = (R_c2_c1 - 1) theta_i_c + R_i_c^T (R_i2_i1 w_1 - w_2) dt + R_i_c^T (int R_i2_i dt) b_g
 """
