@@ -143,6 +143,7 @@ REVISED = (
     "initialize",
     "model",
     "observability",
+    "optim",
     "report",
     "result",
     "rig",

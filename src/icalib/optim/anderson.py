@@ -1,9 +1,9 @@
 """Anderson acceleration of Gauss-Newton steps.
 
-J^T J lacks the second derivatives of the residuals. Where residuals are large, and a parameter such as the time offset
-of noisy wheels is known from small differences only, steps therefore converge linearly. The last few steps show how the
-step changes as the state moves. Their combination that leaves the smallest step is taken (Anderson, J. ACM 12, 1965;
-Walker and Ni, SIAM J. Numer. Anal. 49, 2011, equation (2.1) with all mixing parameters 1).
+J^T J lacks the second derivatives of the residuals. Steps therefore converge linearly where residuals are large and a
+parameter is weakly observable, such as the time offset of noisy wheels. Differences of the last steps approximate how
+the step changes with the state. The accelerated step is their combination with the smallest predicted step (Anderson,
+J. ACM 12, 1965; Walker and Ni, SIAM J. Numer. Anal. 49, 2011, equation (2.1) with all mixing parameters 1).
 """
 
 from __future__ import annotations
@@ -12,28 +12,29 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-# earlier steps in use; the modes seen so far come in pairs of a parameter and the motion that follows it
+# Number of earlier steps in use. Slow modes come in pairs: a parameter, and the motion that compensates it.
 MAX_EARLIER_STEPS = 3
-SLOW_DECREASE_RATIO = 0.1  # of the predicted decrease before: steps that shrink faster converge well by themselves
-MIN_SINGULAR_RATIO = 1e-6  # relative singular value, below which earlier steps are the same
-MIN_ACCELERATED_GAIN = 0.5  # of what the plain step promises: an accelerated one must gain more
+SLOW_DECREASE_RATIO = 0.1  # of the last predicted decrease: faster convergence needs no help
+MIN_SINGULAR_RATIO = 1e-6  # relative singular value: below it, earlier steps are collinear
+MIN_ACCELERATED_GAIN = 0.5  # of the plain step's predicted decrease: an accelerated step must gain more
 
 
 @dataclass
 class Accelerator:
-    """The last undamped steps: where each was taken from, relative to the one before, and what it was."""
+    """The last undamped steps. moves: displacement to the next state; steps: Gauss-Newton step there; decrease:
+    predicted decrease of half the chi^2 by the last one."""
 
     moves: list[np.ndarray] = field(default_factory=list)
     steps: list[np.ndarray] = field(default_factory=list)
     decrease: float = 0.0
 
     def slow(self, decrease: float) -> bool:
-        """Whether plain steps, of which the next promises `decrease`, converge slowly."""
+        """True if plain steps converge slowly; the next one predicts a decrease of half the chi^2 by `decrease`."""
         return bool(self.moves) and decrease > SLOW_DECREASE_RATIO * self.decrease
 
     def step(self, chain: np.ndarray, calib: np.ndarray, decrease: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """The accelerated step, chain (K, 15) and calib (B,), for a plain one that promises `decrease`; None where
-        plain steps converge well, or too few are known."""
+        """Accelerated step, chain (K, 15) and calib (B,), from the plain step and its predicted `decrease`. None if
+        plain steps converge well or no earlier step is known."""
         if not self.slow(decrease):
             return None
         now = np.concatenate([chain.ravel(), calib])
@@ -44,7 +45,8 @@ class Accelerator:
         return best[: chain.size].reshape(chain.shape), best[chain.size :]
 
     def note(self, plain: tuple[np.ndarray, np.ndarray], taken: tuple[np.ndarray, np.ndarray], decrease: float) -> None:
-        """Remembers that in place of a `plain` step, which promised `decrease`, another or the same was `taken`."""
+        """Records the `plain` step with its predicted `decrease`, and the step that was `taken` instead of it or is the
+        same."""
         self.steps.append(np.concatenate([x.ravel() for x in plain]))
         self.moves.append(np.concatenate([x.ravel() for x in taken]))
         self.steps, self.moves, self.decrease = (
@@ -54,13 +56,13 @@ class Accelerator:
         )
 
     def forget(self) -> None:
-        """After a step that was damped, shortened or not taken."""
+        """Drops all steps, after one that was damped, shortened or rejected."""
         self.steps, self.moves, self.decrease = [], [], 0.0
 
     @staticmethod
     def _scale(chain: np.ndarray, calib: np.ndarray) -> np.ndarray:
-        """What each component of a step is compared with: the root mean square of its kind over all keyframes, so that
-        units do not matter; the calibration parameters count as much as the chain."""
+        """Scale (15 K + B,) of each component of a step, which makes the fit independent of units: the root mean square
+        over all keyframes times sqrt(K) for the chain, the magnitude for calibration parameters."""
         by_kind = np.sqrt((chain**2).mean(axis=0)) * np.sqrt(len(chain))
         own = np.abs(calib)
         both = [np.tile(np.where(by_kind > 0.0, by_kind, 1.0), len(chain)), np.where(own > 0.0, own, 1.0)]

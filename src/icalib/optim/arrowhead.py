@@ -1,12 +1,13 @@
-"""Normal equations of a chain of keyframes with dense calibration parameters: an arrowhead, solved in time linear in
-the chain.
+"""Normal equations of a chain of keyframes with dense calibration parameters: an arrowhead matrix, solved in time
+linear in the length of the chain.
 
     [ T   E ] [chain ]     [g_chain ]      T: block tridiagonal, 15 x 15 blocks
     [ E^T C ] [calib ] = - [g_calib ]      E: chain x calib, C: calib x calib
 
-The chain is cut into pieces that share their end keyframes. Each piece is accumulated and eliminated on its own, by its
-own thread, towards the keyframe that it shares with its neighbour; shared keyframe and calibration parameters are what
-is left at the end. The number of pieces does not depend on the number of cores, so that the answer does not either."""
+The chain is cut into pieces that share their end keyframes. Each piece is accumulated and eliminated by its own thread,
+towards the keyframe that it shares. Shared keyframe and calibration parameters remain at the end. The number of pieces
+does not depend on the number of cores, and so neither does the result.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +31,8 @@ from icalib.optim.front_plan import plan
 from icalib.optim.state import KEYFRAME_DIM
 
 T = TypeVar("T")
-N_THREADS = 2  # pieces of the chain; more would need separators of their own
-SEGMENT_KEYFRAMES = 512  # keyframes at a time, where nothing is asked of the chain itself
+N_THREADS = 2  # one per piece of the chain; more pieces would need more separators
+SEGMENT_KEYFRAMES = 512  # keyframes per segment of `marginalise_in_segments`: bounds memory
 
 
 @cache
@@ -49,8 +50,8 @@ def in_parallel(function: Callable[..., T], items: Iterable) -> list[T]:
 
 
 class Sums(NamedTuple):
-    """What a kernel adds to: the arrays of the `Piece` that starts at keyframe `first`, empty where only residuals are
-    wanted."""
+    """Arrays of the `Piece` that starts at keyframe `first`, for kernels to add to; empty if only residuals are
+    computed."""
 
     first: int
     diagonal: np.ndarray
@@ -61,11 +62,12 @@ class Sums(NamedTuple):
 
 @dataclass
 class Piece:
-    """J^T J and J^T r of the factors between keyframes `first` and `last`, both included.
+    """J^T J and J^T r of the factors between keyframes `first` and `last`, both included; n = last - first + 1.
 
-    diagonal (n, 15, 15); upper (n, 15, 15), keyframe k with keyframe k + 1; side (n, 15, B + 1), keyframe with calib,
-    the keyframe's gradient in the last column; calib (B + 1, B + 1), the calibration parameters' gradient in its last
-    column; features: those that are seen from its keyframes alone, to be eliminated with them."""
+    diagonal (n, 15, 15); upper (n, 15, 15), keyframe k with k + 1; side (n, 15, B + 1), keyframe with calibration
+    parameters, and its gradient in the last column; calib (B + 1, B + 1), the calibration parameters and their gradient
+    in the last column; features: those that are seen from these keyframes alone, which are eliminated with them.
+    """
 
     first: int
     last: int
@@ -89,7 +91,7 @@ class Piece:
 
     @classmethod
     def bare(cls, first: int, last: int) -> Piece:
-        """For residuals alone: nothing to add to."""
+        """A piece for residuals alone, with empty arrays."""
         nothing = np.zeros((0, KEYFRAME_DIM, KEYFRAME_DIM))
         return cls(first, last, nothing, nothing, nothing, np.zeros((0, 0)))
 
@@ -100,7 +102,7 @@ class Piece:
             self.features.sums.clear()
 
     def without_last(self) -> Piece:
-        """The same sums without keyframe `last`, of which they must say nothing."""
+        """The same sums without keyframe `last`, to which no factor may have added."""
         features = self.features
         if features is not None:
             features = PieceFeatures.of(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
@@ -108,23 +110,23 @@ class Piece:
         return Piece(self.first, self.last - 1, *own, self.calib, features)
 
     def sums(self, wanted: bool) -> Sums:
-        """For a kernel to add to; empty where only residuals are wanted."""
+        """The arrays for kernels; empty unless `wanted`."""
         piece = self if wanted else Piece.bare(self.first, self.last)
         return Sums(piece.first, piece.diagonal, piece.upper, piece.side, piece.calib)
 
 
 def chain_cuts(n_keyframes: int) -> tuple[int, ...]:
-    """The keyframes that two pieces share: the middle one; none where the chain is too short."""
+    """Keyframes that two pieces share: the middle one, or none if the chain is too short."""
     middle = n_keyframes // 2
     return () if middle < 2 else (middle,)
 
 
 def make_pieces(n_keyframes: int, n_calib: int | None) -> tuple[Piece, ...]:
-    """Two pieces of about the same length; one where the chain is too short to share. Without calibration parameters,
-    bare ones."""
+    """Two pieces of about equal length, or one if the chain is too short. `n_calib` None: pieces for residuals
+    alone."""
     ends = (0, *chain_cuts(n_keyframes), n_keyframes - 1)
     if n_calib is not None:
-        memory.trim_heap()  # there is no moment at which more is needed
+        memory.trim_heap()  # memory peaks here
     return tuple(Piece.bare(a, b) if n_calib is None else Piece.zeros(a, b, n_calib) for a, b in pairwise(ends))
 
 
@@ -138,11 +140,12 @@ class Draw:
 
 @dataclass(frozen=True)
 class Factors:
-    """Result of block elimination (Cholesky factors) that back substitution and sampling need.
+    """Cholesky factors of the block elimination, for back substitution and sampling.
 
-    pieces: overwritten by their factors. done: per piece, see `_reduce`. shared (15, 15), shared_side (15, B + 1): of
-    the keyframe that all pieces share; empty without one. information (B, B): marginal information of the calibration
-    parameters. tolerance, held: see calib_step."""
+    pieces: overwritten by their factors; done: per piece, see `_reduce`. shared (15, 15), shared_side (15, B + 1):
+    factors of the shared keyframe, empty without one. information (B, B): of the calibration parameters, chain
+    marginalised. tolerance, held: see `calib_step`.
+    """
 
     pieces: tuple[Piece, ...]
     done: list[Eliminated | bool]
@@ -154,10 +157,11 @@ class Factors:
     held: np.ndarray
 
     def back(self, calib: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
-        """Back substitution: (K, 15, m) keyframe parts of m solutions.
+        """Back substitution of m right-hand sides: steps (K, 15, m) of the keyframes.
 
-        calib (B + 1, m): calibration parts; last row: factor on the gradient (1 solves, 0 samples). white: additional
-        right-hand sides after forward substitution, per piece, then of the shared keyframe."""
+        calib (B + 1, m): steps of the calibration parameters; last row: factor of the gradient (1 solves, 0 samples).
+        white: further right-hand sides after forward substitution, per piece, then of the shared keyframe.
+        """
         m = calib.shape[1]
         chain = np.zeros((self.n_keyframes, KEYFRAME_DIM, m))
         if len(self.shared):
@@ -168,12 +172,12 @@ class Factors:
         return chain
 
     def rows(self) -> list[int]:
-        """Unknowns of each piece, and of the shared keyframe."""
+        """Number of unknowns of each piece, then of the shared keyframe."""
         return [*(_unknowns(p, d) for p, d in zip(self.pieces, self.done, strict=True)), len(self.shared)]
 
     def draws(self, rng: np.random.Generator, free: int, still: int) -> tuple[Draw, ...]:
-        """Draws from the posterior, to be made before the pieces are filled anew: `free` ones in which undetermined
-        directions of the calibration parameters are held, then `still` ones in which all of them are."""
+        """Draws from the posterior, before the pieces are filled anew. In the first `free` ones the calibration
+        parameters vary in their observable directions; in the next `still` ones all of them are fixed."""
         m = free + still
         calib = np.zeros((len(self.tolerance) + 1, m))
         calib[:-1, :free] = calib_draws(
@@ -185,10 +189,11 @@ class Factors:
 
 @dataclass(frozen=True)
 class Solution:
-    """Step (chain (K, 15), calib (B,)), `decrease` of half the chi^2 that the linear model predicts, and the factors.
+    """Step (chain (K, 15), calib (B,)), predicted decrease of half the chi^2, and the Cholesky factors.
 
-    gradient (B + 1,): of the calibration parameters, the chain marginalised, and twice what the chain alone takes off
-    half the chi^2."""
+    gradient (B + 1,): of the calibration parameters, chain marginalised; last element: minus twice the decrease of half
+    the chi^2 by the chain alone.
+    """
 
     chain: np.ndarray
     calib: np.ndarray
@@ -198,7 +203,7 @@ class Solution:
 
     @classmethod
     def of(cls, factors: Factors, gradient: np.ndarray) -> Solution:
-        """The step, where the calibration parameters' information and `gradient` (B + 1,) are known."""
+        """The step, from the factors and the `gradient` (B + 1,) of the calibration parameters."""
         calib, decrease = calib_step(factors.information, gradient[:-1], factors.tolerance, factors.held)
         white = [np.zeros((n, 1)) for n in factors.rows()]
         chain = factors.back(np.append(calib, 1.0)[:, None], white)[:, :, 0]
@@ -206,12 +211,12 @@ class Solution:
 
     @property
     def information(self) -> np.ndarray:
-        """(B, B) of the calibration parameters, the chain marginalised (damping included)."""
+        """(B, B) of the calibration parameters, chain marginalised, damping included."""
         return self.factors.information
 
     def less(self, information: np.ndarray, gradient: np.ndarray) -> Solution:
-        """Without what has this information (B, B) and gradient (B,) on the calibration parameters, before the pieces
-        are filled anew."""
+        """The solution without terms that have this information (B, B) and gradient (B,) on the calibration parameters.
+        Must be called before the pieces are filled anew."""
         factors = replace(self.factors, information=self.information - information)
         return Solution.of(factors, self.gradient - np.append(gradient, 0.0))
 
@@ -223,12 +228,12 @@ NOT_DEFINITE = (
 
 
 class NotDefiniteError(EstimationError):
-    """The normal equations are not positive definite: something is not determined, or damping is too small."""
+    """The normal equations are not positive definite: a parameter is unobservable, or damping is too small."""
 
 
 def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
-    """(B + 1, B + 1) what the eliminated chain of a piece, but for a kept end keyframe, takes from the calibration
-    parameters."""
+    """Schur complement term (B + 1, B + 1) that the eliminated keyframes of a piece subtract from the calibration
+    parameters; `keep`: one end keyframe is not eliminated."""
     rows = piece.side
     if keep:
         rows = rows[:-1] if piece.first == 0 else rows[1:]
@@ -237,11 +242,12 @@ def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
 
 
 def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
-    """Eliminates a piece in place, but for a kept end keyframe: that keyframe's sums and the calibration parameters'
-    are left.
+    """Eliminates a piece in place, but for a kept end keyframe. Sums of that keyframe and of the calibration parameters
+    remain.
 
     Returns `Eliminated` for a piece with features. Without features, returns True, and the factors are in the piece's
-    own arrays. False: not positive definite."""
+    own arrays. Returns False if the sums are not positive definite.
+    """
     forwards = piece.first == 0 or not keep
     if piece.features is None:
         done = eliminate_chain(piece.diagonal, piece.upper, piece.side, forwards, keep)
@@ -275,13 +281,14 @@ def _unknowns(piece: Piece, done: Eliminated | bool) -> int:
 
 
 def marginalise(piece: Piece) -> np.ndarray:
-    """Border (B + 1, B + 1) with all keyframes of `piece` eliminated; overwrites the piece. Raises NotDefiniteError."""
+    """System (B + 1, B + 1) of the calibration parameters and their gradient, all keyframes of `piece` eliminated;
+    overwrites the piece. Raises NotDefiniteError."""
     _reduce_all(piece)
     return piece.calib
 
 
 def chain_step_given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
-    """(n, 15, m) the best steps of the keyframes of `piece` where the calibration parameters make steps (B, m);
+    """Optimal steps (n, 15, m) of the keyframes of `piece` for given steps (B, m) of the calibration parameters;
     overwrites the piece. Raises NotDefiniteError."""
     done, m = _reduce_all(piece), calib.shape[1]
     chain = np.zeros((piece.last + 1, KEYFRAME_DIM, m))
@@ -290,8 +297,8 @@ def chain_step_given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
 
 
 def marginalise_in_segments(piece: Callable[[int, int], Piece], n_keyframes: int) -> np.ndarray:
-    """As `marginalise`, of a whole chain whose `piece` from one keyframe to another is made when it is its turn, so
-    that the chain never lies in memory as a whole."""
+    """As `marginalise`, for a chain of `n_keyframes` that is built and eliminated a segment at a time, to bound memory.
+    `piece` makes the piece between two keyframes."""
     ends = [*range(0, n_keyframes - 1, SEGMENT_KEYFRAMES), n_keyframes - 1]
     spans, rest = list(pairwise(ends)), None
     for k in range(0, len(spans), N_THREADS):
@@ -305,7 +312,8 @@ def marginalise_in_segments(piece: Callable[[int, int], Piece], n_keyframes: int
 
 
 def _onto_last(piece: Piece) -> Piece:
-    """The last keyframe and the calibration parameters, all other keyframes eliminated. Raises NotDefiniteError."""
+    """The last keyframe and the calibration parameters of `piece`, all other keyframes eliminated. Raises
+    NotDefiniteError."""
     if not eliminate_chain(piece.diagonal, piece.upper, piece.side, True, True):
         raise NotDefiniteError(NOT_DEFINITE)
     last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1)
@@ -318,8 +326,8 @@ def _onto_last(piece: Piece) -> Piece:
 def _back(
     piece: Piece, done: Eliminated | bool, white: np.ndarray, keep: bool, calib: np.ndarray, chain: np.ndarray
 ) -> None:
-    """Fills the part of `chain` (K, 15, m) that belongs to a piece, from `calib` and the kept keyframe's; see
-    Factors."""
+    """Back substitution of one piece: fills its part of `chain` (K, 15, m), from `calib` and the kept keyframe; see
+    `Factors.back`."""
     own = chain[piece.first : piece.last + 1]
     if isinstance(done, Eliminated):
         done.substitute(calib, white, own)
@@ -328,7 +336,7 @@ def _back(
         one, known = np.ascontiguousarray(own[:, :, k]), np.ascontiguousarray(calib[:, k])
         noise, forwards = np.ascontiguousarray(white[:, k]).reshape(-1, KEYFRAME_DIM), piece.first == 0 or not keep
         substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, known, noise, one)
-        # The shared keyframe is given, and both pieces write their own keyframes alone.
+        # The shared keyframe is an input; each piece writes only its own keyframes.
         inner = slice(None) if not keep else slice(None, -1) if piece.first == 0 else slice(1, None)
         own[inner, :, k] = one[inner]
 
@@ -340,8 +348,10 @@ def solve(
     damping: float = 0.0,
     held: np.ndarray = NO_DIRECTIONS,
 ) -> Solution:
-    """Solves (H + damping diag(H)) step = -gradient, directions of the calibration parameters in `held` left alone (see
-    calib_step); overwrites the pieces. Raises NotDefiniteError."""
+    """Solves (H + damping diag(H)) step = -gradient; overwrites the pieces. Raises NotDefiniteError.
+
+    tolerance (B,); held (B, m): directions of the calibration parameters that are fixed, see `calib_step`.
+    """
     keep = len(pieces) > 1
     n_calib = len(tolerance)
     scale = np.append(np.full(n_calib, damping), 0.0)

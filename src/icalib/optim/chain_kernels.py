@@ -1,4 +1,5 @@
-"""Compiled elimination of a chain of keyframes with calibration parameters, and the way back (`arrowhead.py`)."""
+"""Compiled block Cholesky elimination of a chain of keyframes with calibration parameters, and its back substitution
+(`arrowhead.py`)."""
 
 from __future__ import annotations
 
@@ -40,10 +41,11 @@ def _transpose(A):
 
 @njit(cache=True, nogil=True)
 def eliminate_chain(diagonal, upper, side, forwards, keep):
-    """Factorises in place from one end to the other; with `keep`, the last keyframe is only updated. False: not
-    definite.
+    """Block Cholesky factorisation in place, from the first keyframe on or, not `forwards`, from the last. With `keep`
+    the final keyframe is only updated. Returns False if a block is not positive definite.
 
-    Afterwards diagonal holds L_k, link (upper, turned when running backwards) L_k^-1 T[k, next], side L_k^-1 side.
+    Afterwards diagonal holds L_k, upper L_k^-1 T[k, next] (transposed before, when running backwards), and side L_k^-1
+    side.
     """
     n = diagonal.shape[0]
     for step in range(n):
@@ -66,8 +68,12 @@ def eliminate_chain(diagonal, upper, side, forwards, keep):
 
 @njit(cache=True, nogil=True)
 def substitute_chain(diagonal, upper, side, forwards, keep, calib, white, chain):
-    """Back substitution: fills chain (n, 15) from calib (B + 1,), its last number what the gradient counts, and with
-    `keep` the last keyframe's step in it; white (n, 15): what stands on the right beside the gradient."""
+    """Back substitution with the factors of `eliminate_chain`: fills chain (n, 15). With `keep` the final keyframe's
+    step is an input.
+
+    calib (B + 1,): step of the calibration parameters, and the factor of the gradient (1 solves, 0 samples). white (n,
+    15): further right-hand side after forward substitution.
+    """
     n = diagonal.shape[0]
     for step in range(n - 2 if keep else n - 1, -1, -1):
         k = step if forwards else n - 1 - step
@@ -92,6 +98,7 @@ def substitute_chain(diagonal, upper, side, forwards, keep, calib, white, chain)
 
 @njit(cache=True, nogil=True)
 def damp(diagonal, damping):
+    """Multiplies the diagonal elements of all blocks by 1 + damping (Marquardt)."""
     for k in range(diagonal.shape[0]):
         for i in range(diagonal.shape[1]):
             diagonal[k, i, i] *= 1.0 + damping

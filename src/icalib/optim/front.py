@@ -1,8 +1,8 @@
-"""Elimination of a chain whose keyframes are tied together by features, each seen from many keyframes (paper (15),
-Schur).
+"""Frontal elimination of a chain whose keyframes share features, each seen from many keyframes (paper (15), Schur
+complement).
 
-The plan (`front_plan.py`) says in which order keyframes and features go; the steps (`front_kernels.py`) are compiled.
-The cost of a step grows with the square of the number of features that are alive.
+`front_plan.py` chooses the elimination order; `front_kernels.py` has the compiled steps. The cost of a step grows with
+the square of the number of features in the front.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from icalib.optim.state import KEYFRAME_DIM
 
 @dataclass(frozen=True)
 class PieceFeatures:
-    """Those of a `Piece`: their sums, the steps in which keyframes and features are eliminated, and room for the
-    factors: each elimination overwrites that of the one before, because memory that is new costs more than what it is
-    for."""
+    """Features of a `Piece`: their sums, the elimination plan, and the workspace of the factors. Each elimination
+    overwrites the factors of the one before: writing to freshly mapped memory would cost more than the elimination."""
 
     sums: FeatureSums
     plan: Plan
@@ -31,7 +30,7 @@ class PieceFeatures:
         return cls(sums, plan, np.empty(_sizes(plan, sums.side.shape[2]).start[-1]))
 
     def widened(self, n_calib: int) -> PieceFeatures:
-        """The same with further calibration columns, between those there are and the gradient; zero, this too."""
+        """The same features with more calibration columns, `n_calib` in all. New columns and the gradient are zero."""
         side = self.sums.side
         wide = np.zeros((*side.shape[:2], n_calib + 1))
         wide[:, :, : side.shape[2] - 1] = side[:, :, :-1]
@@ -40,8 +39,9 @@ class PieceFeatures:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """The factors of all steps in `room`, how keyframes were turned, and what is `left` (15 or 0 + B + 1): the kept
-    keyframe and the calibration parameters, upper triangle."""
+    """Result of the elimination: plan and sizes; turn (n, 15, 15), the orthogonal transform of each keyframe; room, the
+    workspace with the factors of all steps; left (15 or 0 + B + 1, same), upper triangle of the remaining system of the
+    kept keyframe, calibration parameters and gradient."""
 
     plan: Plan
     sizes: Sizes
@@ -51,16 +51,20 @@ class Eliminated:
 
     @property
     def rows(self) -> int:
-        """Number of eliminated unknowns, not counting features seen in a single step."""
+        """Number of eliminated unknowns, without the features that a single step sees."""
         return int(self.sizes.rest.sum() + self.sizes.coupled.sum() + self.sizes.dying.sum())
 
     def substitute(self, calib: np.ndarray, white: np.ndarray, chain: np.ndarray) -> None:
-        """Back substitution: fills `chain` (n, 15, m), of which the kept keyframe is given, from calib (B + 1, m), its
-        last row what the gradient counts; white (rows, m): what stands on the right beside the gradient."""
+        """Back substitution of m right-hand sides: fills chain (n, 15, m), whose kept keyframe is an input.
+
+        calib (B + 1, m): steps of the calibration parameters, and in the last row the factor of the gradient. white
+        (rows, m): further right-hand sides after forward substitution.
+        """
         substitute_all(self.plan, self.sizes, self.turn, self.room, calib, white, chain)
 
 
 def _sizes(plan: Plan, n_calib: int) -> Sizes:
+    """Block sizes of every step, and where its factors start in the workspace."""
     coupled = np.add.reduceat(np.append(plan.coupled[plan.keyframes.values], 0), plan.keyframes.start[:-1])
     counts = np.diff(plan.keyframes.start)
     coupled[counts == 0] = 0
@@ -73,7 +77,8 @@ def _sizes(plan: Plan, n_calib: int) -> Sizes:
 def eliminate(
     features: PieceFeatures, diagonal: np.ndarray, upper: np.ndarray, side: np.ndarray, forwards: bool, keep: bool
 ) -> Eliminated | None:
-    """All steps; None where the sums are not positive definite. The factors are in the room of `features`."""
+    """Eliminates all keyframes and features of a piece, but for a kept end keyframe; None if the sums are not positive
+    definite. The factors are in the workspace of `features`."""
     plan, sums, n_calib = features.plan, features.sums, side.shape[2]
     sizes = _sizes(plan, n_calib)
     widest = int(sizes.wide.max())

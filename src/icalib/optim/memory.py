@@ -1,6 +1,6 @@
-"""Memory that goes back to the system when it is let go of.
+"""Large arrays in anonymous mmaps, so that freeing them returns memory to the operating system.
 
-The allocator keeps freed memory that lies between other arrays; where tens of megabytes come and go, that adds up.
+glibc keeps freed heap blocks that lie between used ones. With arrays of tens of megabytes these add up.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import sys
 
 import numpy as np
 
-MIN_MMAP_BYTES = 1 << 20  # bytes, below which the allocator does better
-# bytes of what comes and goes: smaller arrays are made often, and new pages cost more than they do
+MIN_MMAP_BYTES = 1 << 20  # smaller arrays are faster on the heap
+# Smaller arrays are allocated often, and fresh pages would cost more than the work on them.
 MMAP_THRESHOLD_BYTES = 1 << 24
-# Bytes of freed memory at the end of the heap that stay there. By default 128 kB do: arrays of a few megabytes that are
-# made again and again would get new pages each time. More holds more memory than is in use.
+# Free memory at the end of the heap that malloc keeps. With the default of 128 kB, arrays of a few megabytes get fresh
+# pages at each allocation. A larger value wastes as much memory.
 TRIM_THRESHOLD_BYTES = 1 << 22
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt, in malloc.h
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # parameters of mallopt (malloc.h)
 
 
 def mmap_zeros(shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
-    """As np.zeros, with pages of its own where it is large."""
+    """As np.zeros; arrays of MIN_MMAP_BYTES or more are mapped anonymously, except on Windows."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size < MIN_MMAP_BYTES or sys.platform == "win32":
         return np.zeros(shape, dtype)
@@ -30,20 +30,21 @@ def mmap_zeros(shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
 
 
 def trim_heap() -> None:
-    """What nobody uses any more goes back to the system, where the C library knows how to (glibc). Takes about 1 ms."""
+    """Returns free heap memory to the operating system. Takes about 1 ms; does nothing without glibc."""
     _in_glibc("malloc_trim", 0)
 
 
 def set_mmap_threshold() -> None:
-    """From now on large arrays have pages of their own, in the whole process, where the C library can do that (glibc).
+    """Makes malloc map all arrays of MMAP_THRESHOLD_BYTES or more, in the whole process; does nothing without glibc.
 
-    It does so at first, but once such an array has been freed, the next ones as large lie between the small ones.
+    glibc does so at first, but raises its threshold whenever such an array is freed.
     """
     _in_glibc("mallopt", _M_MMAP_THRESHOLD, MMAP_THRESHOLD_BYTES)
     _in_glibc("mallopt", _M_TRIM_THRESHOLD, TRIM_THRESHOLD_BYTES)
 
 
 def _in_glibc(name: str, *arguments: int) -> None:
+    """Calls a function of the C library on Linux, if there is one of this name."""
     function = getattr(ctypes.CDLL(None), name, None) if sys.platform == "linux" else None
     if function is not None:
         function(*arguments)

@@ -1,4 +1,4 @@
-"""Planes of the scene as parameters: what kernels need to know of them."""
+"""Planes of the scene as parameters, in arrays for kernels."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from icalib.optim.state import Key, State
 
 
 class Planes(NamedTuple):
-    """normal (P, 3), tangents (P, 2, 3), point (P, 3) of each plane; columns (P, 3) in the calibration parameters, -1
-    where fixed."""
+    """P planes: unit normal (P, 3), tangents (P, 2, 3), and foot point (P, 3) m, in the world; columns (P, 3) in the
+    calibration parameters, -1 where fixed."""
 
     normal: np.ndarray
     tangents: np.ndarray
@@ -21,7 +21,7 @@ class Planes(NamedTuple):
 
     @classmethod
     def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray) -> Planes:
-        """Those of `keys` as `state` has them."""
+        """Planes `keys` with their values in `state`."""
         value = np.array([state.values[key] for key in keys])
         across = np.array([tangents(v[:3]) for v in value])
         return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns)

@@ -1,4 +1,5 @@
-"""Gaussian priors on lasting parameters, and a very broad one on the biases of each recording's first keyframe."""
+"""Gaussian priors on calibration parameters, and a broad prior on the biases at the first keyframe of each
+recording."""
 
 from __future__ import annotations
 
@@ -11,13 +12,17 @@ from icalib.geometry import so3
 from icalib.optim.arrowhead import Piece
 from icalib.optim.state import Block, State
 
-# Keeps the biases defined where nothing else does (a motionless stretch); far wider than any IMU's turn-on bias.
+# Standard deviations of gyroscope [rad/s] and accelerometer [m/s^2] biases, far wider than the turn-on bias of any IMU.
+# The prior keeps biases defined without motion.
 FIRST_BIAS_SIGMA = np.array([0.5] * 3 + [3.0] * 3)
 
 
 @dataclass(frozen=True)
 class Prior:
-    """residual = (x - value) / sigma; for rotations Log(value^T R) / sigma, Jacobian J_r^-1 / sigma."""
+    """Gaussian prior on one block: mean `value` and `sigma` (n,), SI units or px.
+
+    The residual is (x - value) / sigma. For rotations it is Log(value^T R) / sigma, with the Jacobian J_r^-1 / sigma.
+    """
 
     block: Block
     value: np.ndarray
@@ -32,7 +37,7 @@ class Prior:
         return (x - self.value) / self.sigma, np.diag(1.0 / self.sigma)
 
     def accumulate(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Adds the prior to the sums of `piece`; returns half its chi^2."""
+        """Adds the prior to the sums of `piece`, unless only the cost is wanted; returns half its chi^2."""
         r, J = self.residual(state)
         columns = self.block.columns
         if sums:
@@ -43,21 +48,20 @@ class Prior:
 
 
 def sums_of_priors(priors: Sequence[Prior], state: State, n_calib: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Half the chi^2 of `priors`, and their gradient (B,) and information (B, B) on the calibration parameters."""
+    """Half the chi^2 of `priors`, their gradient (B,) and information (B, B) on the calibration parameters."""
     piece = Piece.zeros(0, 0, n_calib)
     cost = sum(p.accumulate(state, piece) for p in priors)
     return cost, piece.calib[:-1, -1], piece.calib[:-1, :-1]
 
 
 def without_priors(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
-    """(B, B) the calibration parameters' information at `state` less that of `priors`."""
+    """Information (B, B) of the calibration parameters at `state`, with that of `priors` subtracted."""
     return information - sums_of_priors(priors, state, len(information))[2]
 
 
 def variance_of_priors(known: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
-    """(B,) variances that errors of the means of `priors` contribute to an estimate in which the priors count: the
-    diagonal of K W K, with W the information of the priors and K = `known` (B, B) what leads from the normal equations
-    to the estimate: the inverse of its information."""
+    """Variances (B,) that errors of the prior means contribute to the diagonal of `covariance` (B, B): diag(C W C) with
+    the information W of `priors`. Measurement noise contributes the rest."""
     information = sums_of_priors(priors, state, len(known))[2]
     return np.einsum("ij,jk,ki->i", known, information, known, optimize=True)
 
@@ -65,7 +69,7 @@ def variance_of_priors(known: np.ndarray, priors: Sequence[Prior], state: State)
 def accumulate_bias_prior(
     state: State, piece: Piece, sums: bool = True, centre: np.ndarray | None = None, keyframe: int = 0
 ) -> float:
-    """The broad prior on the biases of `keyframe`, a recording's first, about `centre` (6,) or zero. Returns half its
+    """Adds the broad prior on the biases at `keyframe`, with mean `centre` (6,) or zero, to `piece`; returns half its
     chi^2."""
     r = (state.bias[keyframe] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
     if sums:

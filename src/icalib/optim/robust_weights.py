@@ -1,4 +1,4 @@
-"""Weights of the corners of one image: robust loss, and the error that they share, marginalised."""
+"""Robust weights of the corners of one image, and the error that all its corners share, which is marginalised."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-MIN_CURVATURE_RATIO = 1e-3
-LOSSES = {"none": 0, "huber": 1, "cauchy": 2}  # names of the settings; numbers in kernels
+MIN_CURVATURE_RATIO = 1e-3  # floor of the curvature along a residual over its weight: keeps J^T J positive definite
+LOSSES = {"none": 0, "huber": 1, "cauchy": 2}  # numbers of the setting's values in kernels
 
 
 class Loss(NamedTuple):
-    """Robust loss of whitened rows, where it bends, and whether the sums have its true curvature."""
+    """Robust loss of whitened rows: kind (a number of LOSSES), scale in standard deviations, and whether the normal
+    equations use its true curvature."""
 
     kind: int
     scale: float
@@ -22,8 +23,8 @@ class Loss(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def weight(loss, scale, s):
-    """Weight rho' and robust cost (half rho) of a squared whitened norm s, and the curvature along the residual over
-    the weight, 1 + 2 s rho'' / rho' (Triggs 1999), kept positive."""
+    """Weight rho'(s), robust cost rho(s) / 2, and relative curvature 1 + 2 s rho'' / rho' along the residual (Triggs
+    1999), at least MIN_CURVATURE_RATIO; s: squared norm of the whitened residual."""
     if loss == 0:
         return 1.0, 0.5 * s, 1.0
     if loss == 1:
@@ -57,10 +58,11 @@ def _invert_small(M, out):
 
 @njit(cache=True, nogil=True, inline="always")
 def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
-    """root (n,): square roots of the weights over sigma (n,) px; shared (2, m): the image's common error. Returns the
-    cost.
+    """Fills root (n,), square roots of the weights over sigma (n,) px, 0 unless `keep`, and shared (2, m), the image's
+    common error [px]. Returns the cost.
 
-    Weights and common error depend on each other; a few rounds settle them, so that the cost is the least one over it.
+    res (n, 2) px; f (n, m): functions of the common error; precision (m,): its prior information. Weights and common
+    error depend on each other, so a few rounds of reweighting minimise the cost over the common error.
     """
     n, m = len(keep), f.shape[1]
     for k in range(m):
@@ -91,7 +93,7 @@ def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
 
 @njit(cache=True, nogil=True, inline="always")
 def _common_error(res, root, f, precision, M, inv, rhs, shared):
-    """The image's common error (2, m) at given weights: ridge regression of -res on its functions."""
+    """Common error (2, m) at given weights: ridge regression of -res on the functions f."""
     m = f.shape[1]
     for a in range(m):
         rhs[0, a], rhs[1, a] = 0.0, 0.0
@@ -114,7 +116,7 @@ def _common_error(res, root, f, precision, M, inv, rhs, shared):
 
 @njit(cache=True, nogil=True)
 def whole_error(res, f, shared, error):
-    """error (n, 2): residuals with the image's common error in them."""
+    """Fills error (n, 2): residuals with the image's common error added."""
     for i in range(len(res)):
         for axis in range(2):
             error[i, axis] = res[i, axis]
@@ -124,7 +126,8 @@ def whole_error(res, f, shared, error):
 
 @njit(cache=True, nogil=True)
 def correct_curvature(A, D, i, n, r, factor):
-    """Scales the Jacobian rows of corner i along its residual r by `factor`, and the residual by its inverse."""
+    """Triggs' correction of corner i: scales its Jacobian rows along the residual r by `factor`, and the residual by
+    its inverse. A (D + 1, 2 n): rows u, then v, in columns."""
     size = np.sqrt(r[0] * r[0] + r[1] * r[1])
     u, v = r[0] / size, r[1] / size
     for k in range(D + 1):
@@ -136,9 +139,9 @@ def correct_curvature(A, D, i, n, r, factor):
 
 @njit(cache=True, nogil=True, inline="always")
 def marginalise_shared(A, D, n, root, f, precision, G):
-    """Takes the image's common error out of the Gram matrix G (D + 1, D + 1).
+    """Subtracts the Schur complement of the image's common error from the Gram matrix G (D + 1, D + 1).
 
-    Its own gradient is zero: the cost is the least over it.
+    The gradient by the common error is zero, as the cost is minimal over it.
     """
     m = f.shape[1]
     M, inv = np.empty((m, m)), np.empty((m, m))

@@ -1,4 +1,4 @@
-"""Rows of measurements in the normal equations: whitened, weighed, and added to the sums of a piece."""
+"""Rows of measurements in the normal equations: whitened, weighted, and added to the sums of a piece."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from icalib.base.compiled import njit
 from icalib.optim.robust_weights import weight
 from icalib.optim.state import KEYFRAME_DIM
 
-KEYFRAME_PAIR_DIM = 2 * KEYFRAME_DIM  # columns of a row by its keyframe and the next one
+KEYFRAME_PAIR_DIM = 2 * KEYFRAME_DIM  # columns of a row by two neighbouring keyframes
 UInt = np.uint64
 
 
 class Rows(NamedTuple):
-    """n measurements of m rows: residual (n, m), predicted - measured, and J (n, m, 30 + c): by keyframe, next keyframe
-    and calibration parameters. J is of length 0 where it is not wanted."""
+    """n measurements of m rows: residual (n, m), predicted - measured, and J (n, m, 30 + c), by keyframe, next keyframe
+    and c calibration parameters. J has length 0 if Jacobians are not wanted."""
 
     residual: np.ndarray
     J: np.ndarray
 
     @classmethod
     def empty(cls, n: int, m: int, n_columns: int, jacobians: bool) -> Rows:
-        """To be filled: residuals, and zeros for Jacobians by `n_columns` calibration parameters."""
+        """Uninitialised residuals, and zero Jacobians by `n_columns` calibration parameters."""
         return cls(np.empty((n, m)), np.zeros((n if jacobians else 0, m, KEYFRAME_PAIR_DIM + n_columns)))
 
     @property
@@ -42,8 +42,8 @@ class Rows(NamedTuple):
         return self.J[:, :, KEYFRAME_PAIR_DIM:]
 
     def on_intervals(self, keyframe: np.ndarray, n_keyframes: int) -> np.ndarray:
-        """(n,) the interval between keyframes that each measurement at keyframe `keyframe` (n,) is added to. The last
-        keyframe ends one: Jacobians by it move to where those by the next keyframe are."""
+        """Interval (n,) between keyframes that each measurement at `keyframe` (n,) is added to. Jacobians by the last
+        keyframe move to the columns of the next keyframe of the last interval."""
         interval = np.minimum(keyframe, n_keyframes - 2)
         if len(self.J):
             last = keyframe > interval
@@ -56,11 +56,12 @@ class Rows(NamedTuple):
 def add_product(k, n_chain, width, A, B, columns, sums):
     """Adds A^T B to the sums of keyframe k of the piece, of the next one, and of the calibration parameters.
 
-    The first `width` columns of A are by keyframe k and, where n_chain is 30 and not 15, the next one, then by
-    calibration parameters. B (m, n_chain + c + 1): the same columns, perhaps those of more calibration parameters, and
-    the residual. columns (c,): calibration columns of B, -1 where fixed; no two are the same.
+    The first `width` columns of A are by keyframe k, by the next one if n_chain is 30 and not 15, then by calibration
+    parameters. B (m, n_chain + c + 1) has the same columns, possibly more calibration parameters, and the residual.
+    columns (c,): calibration columns of B, -1 where fixed, all different.
 
-    Numbers are unsigned: an index that may be negative is wrapped, and the compiler then takes one column at a time.
+    Indices are unsigned. A signed index may be negative, and the wrap-around check would keep the compiler from
+    vectorising.
     """
     diagonal, upper, side = sums.diagonal, sums.upper, sums.side
     n, end, n_b, block = UInt(n_chain), UInt(len(columns)), UInt(sums.calib.shape[0] - 1), UInt(KEYFRAME_DIM)
@@ -102,7 +103,7 @@ def add_product(k, n_chain, width, A, B, columns, sums):
 
 @njit(cache=True, nogil=True)
 def _add_calib(i, n, width, A, B, columns, calib, rest):
-    """Adds row i of A^T B, by a calibration parameter; columns that A lacks also across the diagonal."""
+    """Adds row i of A^T B, of a calibration parameter. Columns that A lacks are also added below the diagonal."""
     a, end, n_b = UInt(columns[i - n]), UInt(len(columns)), UInt(calib.shape[0] - 1)
     for j in range(end):
         rest[j] = calib[a, UInt(columns[j])] if columns[j] >= 0 else 0.0
@@ -122,11 +123,11 @@ def _add_calib(i, n, width, A, B, columns, calib, rest):
 
 @njit(cache=True, nogil=True)
 def add_gram(k, n_chain, G, T, columns, F, sums):
-    """Adds measurements that share a pose, of which only their Gram matrix by the pose is known.
+    """Adds measurements that share a pose, from their Gram matrix by this pose.
 
-    G (6 + d + 1, 6 + d + 1): by the pose, by d calibration parameters beside it, residual; its first 6 rows are enough
-    where d is 0. T (6, n_chain + c): the pose by keyframes and calibration parameters. columns (c + d,): as in
-    `add_product`. F (6, n_chain + c + d + 1): work space.
+    G (6 + d + 1, 6 + d + 1): by the pose, d further calibration parameters, and residual; the first 6 rows suffice if d
+    is 0. T (6, n_chain + c): Jacobian of the pose by keyframes and c calibration parameters. columns (c + d,): see
+    `add_product`. F (6, n_chain + c + d + 1): workspace.
     """
     calib, width, n_d = sums.calib, T.shape[1], G.shape[1] - 7
     n_c, n_b = width - n_chain, calib.shape[0] - 1
@@ -153,8 +154,8 @@ def add_gram(k, n_chain, G, T, columns, F, sums):
 
 @njit(cache=True, nogil=True)
 def add_gradients(k, n_chain, G, T, columns, first, sums):
-    """Adds gradients G (6 + d, m), by a pose and d calibration parameters, to columns `first` and on of the sums; the
-    others as in `add_gram`."""
+    """Adds m gradients G (6 + d, m), by a pose and d calibration parameters, to the columns from `first` on; other
+    arguments as in `add_gram`."""
     side, calib, n_c = sums.side, sums.calib, T.shape[1] - n_chain
     for g in range(G.shape[1]):
         for d in range(6):
@@ -171,8 +172,9 @@ def add_gradients(k, n_chain, G, T, columns, first, sums):
 
 @njit(cache=True, nogil=True)
 def _weigh(r, loss, scaled, root):
-    """root (m,): square roots of the weights of whitened residuals r (m,); scaled (2, m): factors of Jacobian and
-    residual that make J^T J, J^T r those of the weights or, curved, of the loss. Returns half the robust chi^2."""
+    """Fills root (m,), square roots of the weights of whitened residuals r (m,), and scaled (2, m), the factors of
+    Jacobian rows and residuals. With `loss.curved` the factors include Triggs' correction. Returns half the robust
+    chi^2."""
     cost = 0.0
     for q in range(len(r)):
         w, c, curvature = weight(loss.kind, loss.scale, r[q] * r[q])
@@ -185,7 +187,7 @@ def _weigh(r, loss, scaled, root):
 
 @njit(cache=True, nogil=True)
 def whiten(W, M, out):
-    """The first columns of out (m, .) = W M of lower triangular W (m, m) and M (m, w)."""
+    """Fills the first columns of out (m, .) with W M; W (m, m) lower triangular, M (m, w)."""
     for q in range(len(W)):
         for j in range(M.shape[1]):
             out[q, j] = 0.0
@@ -198,11 +200,11 @@ def whiten(W, M, out):
 
 @njit(cache=True, nogil=True)
 def accumulate_rows(rows, keyframe, W, loss, columns, sums, residual, root):
-    """Whitens rows by W (n, m, m), weighs them, and adds each to the interval that begins at its keyframe `keyframe`
-    (n,), where sums are wanted.
+    """Whitens rows by W (n, m, m), weights them, and adds each to the interval that begins at its `keyframe` (n,),
+    unless the sums are empty.
 
-    columns (c,): of the calibration parameters in rows.J, -1 where fixed. residual, root (n, m): whitened residuals and
-    square roots of their weights, out. Returns half the robust chi^2.
+    columns (c,): calibration columns of rows.J, -1 where fixed. Fills residual and root (n, m): whitened residuals and
+    square roots of their weights. Returns half the robust chi^2.
     """
     m, width = W.shape[1], rows.J.shape[2]
     whitened, scaled = np.empty((m, width + 1)), np.empty((2, m))

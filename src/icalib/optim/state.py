@@ -1,6 +1,6 @@
-"""What is estimated: the inertial states at the keyframes, and the lasting parameters of the calibration parameters.
+"""Estimated quantities: inertial states at the keyframes, and the calibration parameters.
 
-A keyframe is (R_world_imu, p, v, b_g, b_a), 15 tangent dimensions in this order (paper (2)).
+A keyframe is (R_world_imu, p, v, b_g, b_a): 15 tangent dimensions in this order (paper (2)).
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it
 
 
 def in_recording(name: str, recording: int) -> str:
-    """The first part of the key of what each recording has of its own, such as the attitude of the target, counted
-    from 0."""
+    """First part of the key of a quantity that each recording has of its own, such as the attitude of the target;
+    `recording` counts from 0."""
     return name if recording == 0 else f"{name} in recording {recording + 1}"
 
 
 @dataclass(frozen=True)
 class Block:
-    """One lasting parameter. kind: how it is perturbed; start: its first calibration column, None where it is fixed.
+    """One group of calibration parameters. kind: its perturbation; start: its first calibration column, None if fixed.
 
-    rotation: R <- R Exp(d). tilt (2 columns): R_world_board <- Exp((d0, d1, 0)) R_world_board; the third turn, about
-    gravity, is the freedom of the world frame. plane (3 columns): see `geometry.planes.moved`. nuisance: a vector.
+    rotation: R <- R Exp(d). tilt (2 columns): R_world_board <- Exp((d0, d1, 0)) R_world_board; the rotation about
+    gravity is the gauge freedom of the world frame. plane (3 columns): see `geometry.planes.moved`. vector, nuisance:
+    addition.
     """
 
     sensor: str
@@ -51,13 +52,13 @@ class Block:
 
     @property
     def is_nuisance(self) -> bool:
-        """Whether it says how imperfect a sensor or target is: a proper prior bounds it, whatever the data show."""
+        """True for imperfections of a sensor or target, which a proper prior always bounds."""
         return self.kind == "nuisance"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each lasting parameter stands in the calibration parameters."""
+    """Order of the calibration parameters, and their columns in the normal equations."""
 
     blocks: tuple[Block, ...]
 
@@ -71,7 +72,7 @@ class Layout:
 
     @property
     def essential(self) -> np.ndarray:
-        """Columns of all that is estimated but nuisance parameters."""
+        """Columns of all estimated parameters but nuisance parameters."""
         return np.concatenate([np.arange(0), *(b.columns for b in self.free if not b.is_nuisance)])
 
     def block(self, sensor: str, name: str) -> Block:
@@ -90,7 +91,7 @@ class Layout:
 
 
 def make_layout(entries: list[Entry]) -> Layout:
-    """Layout from its entries in order."""
+    """Layout of the entries, in their order."""
     blocks, column = [], 0
     for sensor, name, kind, size, estimated in entries:
         blocks.append(Block(sensor, name, kind, size, column if estimated else None))
@@ -98,15 +99,16 @@ def make_layout(entries: list[Entry]) -> Layout:
     return Layout(tuple(blocks))
 
 
-# Of the weight of planes, or of 1 m^2: where these show nothing, the world turns as the first keyframe does.
+# Weight of the first keyframe's rotation against planes (weight 1) or positions (1 m^2): decides only where these are
+# degenerate.
 FIRST_KEYFRAME_WEIGHT = 1e-4
 
 
 @dataclass(frozen=True)
 class State:
-    """One estimate. seconds (K,) keyframe times on the imu clock since its first stamp; world frame z up.
+    """One estimate. seconds (K,): keyframe times on the IMU clock since its first stamp; world frame z up.
 
-    starts: the first keyframe of each recording; each has a world of its own, whose origin is the board's.
+    starts: first keyframe of each recording. Each recording has its own world frame, whose origin is the target's.
     """
 
     seconds: np.ndarray
@@ -124,17 +126,17 @@ class State:
 
     @property
     def recordings(self) -> list[slice]:
-        """The keyframes of each recording."""
+        """Slice of the keyframes of each recording."""
         return [slice(a, b) for a, b in pairwise((*self.starts, len(self.seconds)))]
 
     def retract(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> State:
         """The state moved by tangent steps chain (K, 15) and calib (B,).
 
-        A tilt of the board turns the whole trajectory of its recording with it, exactly; the keyframes' own steps are
-        what they have beyond that, and turn too. To first order nothing changes. But where gravity is weakly known the
-        tilt is large against the precision of positions relative to the board: moved along the tangent they would leave
-        their circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so. Without
-        a board planes and trajectory turn by what turns them most alike.
+        A tilt of the target rotates the trajectory of its recording with it, exactly. Steps of the keyframes are
+        relative to this rotation, and are rotated too. To first order this equals the plain retraction. If gravity is
+        weakly observable, the tilt is large compared with the precision of positions relative to the target. The plain
+        retraction would then violate the geometry by tilt^2 / 2. Without a target, planes and trajectory rotate by
+        their common rotation.
         """
         turns = self._turns(layout, chain, calib)
         values = self.values | {b.key: self._moved(b, calib[b.columns], turns[0]) for b in layout.free}
@@ -150,16 +152,20 @@ class State:
         return replace(self, rotation=R, position=p, velocity=v, bias=self.bias + chain[:, 9:15], values=values)
 
     def _turns(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> list[np.ndarray]:
-        """(3,) by which each recording's world turns, in world axes. Several without a board share planes."""
+        """Rotation vector (3,) of each recording's world in world axes [rad]. Zero for several recordings without a
+        target, which share planes."""
         tilts = [np.append(calib[b.columns], 0.0) for b in layout.free if b.kind == "tilt"]
         if tilts:
             return tilts
         return [self._common_turn(layout, chain, calib)] if len(self.starts) == 1 else [np.zeros(3)] * len(self.starts)
 
     def _common_turn(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> np.ndarray:
-        """Rotation (3,) [world axes] common to all planes in this step, by least squares; without planes, that of the
-        positions about their mean. Directions that neither determines, such as about a straight path, follow the first
-        keyframe. On a flat floor all sensors may turn against the IMU: map and path turn then, and no keyframe does."""
+        """Rotation vector (3,) [rad, world axes] common to all planes in this step, by least squares; without planes,
+        of the positions about their mean.
+
+        Unobservable directions, such as the axis of a straight path, follow the first keyframe. On a flat floor all
+        sensors can rotate against the IMU: then map and trajectory rotate, and the attitudes of the keyframes do not.
+        """
         free = [b for b in layout.free if b.kind == "plane"]
         if free:
             x = np.array([self.values[b.key][:3] for b in free])
@@ -172,7 +178,7 @@ class State:
         return np.linalg.solve(A, turned + FIRST_KEYFRAME_WEIGHT * (self.rotation[0] @ chain[0, 0:3]))
 
     def _moved(self, block: Block, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """The value of a block of the calibration parameters, moved by `d` in a world that turns by `turn`."""
+        """Value of `block` moved by `d`, in a world that rotates by `turn` (3,)."""
         old = self.values[block.key]
         if block.kind == "rotation":
             return old @ so3.exp(d)
