@@ -155,6 +155,7 @@ REVISED = (
     "sensors/lidar",
     "sensors/parameter*",
     "sensors/pose",
+    "sensors/position",
     "sensors/sensor",
     "sensors/wheels/read",
     "tools",

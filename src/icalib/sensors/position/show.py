@@ -11,8 +11,8 @@ from icalib.report.sections import Section, plot_place, row_sections
 from icalib.report.tables import Html, element
 from icalib.result import Calibration, RowResiduals
 
-OFF = 3.0  # standard deviations: 1 of 34 fixes with white noise are further off (chi, three degrees of freedom)
-MOST_POINTS = 4000  # of a path
+OUTLIER_SIGMA = 3.0  # standard deviations: white noise exceeds it in 1 of 34 fixes (chi, three degrees of freedom)
+MAX_PATH_POINTS = 4000  # of a trajectory in a figure
 _WORDS = (
     "Along x, y and z of the sensor's frame: east, north and up of GNSS. They should look like noise; waves are errors "
     "that last, as of multipath, and steps are changes of the solution."
@@ -27,31 +27,32 @@ _MAP = (
 def sections(c: Calibration) -> Iterator[Section]:
     """Residuals of each position sensor, and the map."""
     yield from row_sections(c, "position", "positions", "Residuals of position sensors", _WORDS)
-    figures = {f"map-{i}": _map(c, r) for i, r in enumerate(_own(c))}
+    figures = {f"map-{i}": _map(c, r) for i, r in enumerate(_residuals_of_positions(c))}
     if figures:
-        parts = [element("h3", r.sensor) + plot_place(name) for name, r in zip(figures, _own(c), strict=True)]
+        shown = zip(figures, _residuals_of_positions(c), strict=True)
+        parts = [element("h3", r.sensor) + plot_place(name) for name, r in shown]
         yield Section("maps", "Map of fixes", _MAP, Html("".join(parts)), figures)
 
 
 def amounts(c: Calibration) -> Iterator[str]:
-    """How much was used."""
-    if own := _own(c):
+    """The number of fixes in use."""
+    if own := _residuals_of_positions(c):
         yield f"{sum(len(r.seconds) for r in own)} fixes"
 
 
-def _own(c: Calibration) -> list[RowResiduals]:
+def _residuals_of_positions(c: Calibration) -> list[RowResiduals]:
     return [r for r in c.residuals.values() if isinstance(r, RowResiduals) and r.sensor in c.of_type("position")]
 
 
 def _map(c: Calibration, r: RowResiduals) -> Figure:
-    """The antenna's path in the world, and the places of fixes that are off."""
+    """The antenna's trajectory in the world from above, and the places of outliers."""
     at = c.trajectory
     path = at.position + at.rotation @ c.value(r.sensor, "translation")
-    keep = thin(len(path), MOST_POINTS)
-    off = r.seconds[np.linalg.norm(r.whitened, axis=1) > OFF]
+    keep = thin(len(path), MAX_PATH_POINTS)
+    off = r.seconds[np.linalg.norm(r.whitened, axis=1) > OUTLIER_SIGMA]
     x, y = (np.interp(off, at.seconds, path[:, k]) for k in range(2))
     traces = [
         line(path[keep, 0], path[keep, 1], "path", COLORS[0]),
-        dots(x, y, f"{len(off)} of {len(r.seconds)} fixes, off by more than {OFF:g} sigma", COLORS[1], 7),
+        dots(x, y, f"{len(off)} of {len(r.seconds)} fixes, off by more than {OUTLIER_SIGMA:g} sigma", COLORS[1], 7),
     ]
     return figure(traces, 480, xaxis=axis("x [m]"), yaxis=axis("y [m]", scaleanchor="x"))

@@ -1,4 +1,4 @@
-"""Initial guess of position sensors: a trajectory with the IMU alone, or lever arm, clock and frame on a known one."""
+"""Initial guess of position sensors: a trajectory with the IMU alone, or extrinsics, clock and frame on a known one."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from icalib.sensors.position.read.outliers import single_wrong
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
 
-NAMES = ("translation", "time_offset")
+GUESSED_GROUPS = ("translation", "time_offset")
 
 
 class PositionInitializer(Initializer[PositionSensor]):
     """The first position sensor gives the motion where no other kind does; all others are placed on it."""
 
     def motion_rank(self, rig: Rig) -> int | None:
-        """Without an IMU positions do not show the attitude. A sensor whose frame another one has needs that one."""
+        """See `Initializer`. Positions need an IMU for the attitude, and a frame of their own for the world."""
         return BY_POSITIONS if rig.imu is not None and self._own_frames(rig) else None
 
     def sources(self, rig: Rig) -> tuple[str, ...]:
@@ -60,14 +60,14 @@ class PositionInitializer(Initializer[PositionSensor]):
         return inputs, state, state.values
 
     def cleaned(self, recording: Measurements) -> Measurements:
-        """Without single wrong fixes, which measurements in memory may have: by them the estimated noise would be too
-        large."""
+        """Without single wrong fixes: they would enlarge the estimated noise. Files are cleaned when they are read,
+        measurements in memory are not."""
         return recording.with_streams(
             *(s.some(~single_wrong(s.seconds, s.position)) for s in recording.of(PositionStream))
         )
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[PositionSensor]) -> Values:
-        """Those whose frames others share come first."""
+        """See `Initializer`. Sensors with a frame of their own come first, as others may share it."""
         out: Values = {}
         for sensor in sorted(sensors, key=lambda s: not s.has_frame):
             out |= _on_motion(inputs, replace(state, values=state.values | out), sensor)
@@ -82,49 +82,50 @@ class PositionInitializer(Initializer[PositionSensor]):
 INITIALIZER = PositionInitializer()
 
 
-def _state_of_one(inputs: Inputs, held: KnownExtrinsics | None) -> State:
-    """Of one recording, in the frame of the fixes; `held`: what another recording has shown of the sensor."""
+def _state_of_one(inputs: Inputs, extrinsics: KnownExtrinsics | None) -> State:
+    """The state of one recording, in the frame of the fixes; extrinsics: those that another recording has given."""
     assert inputs.imu is not None
     sensor = inputs.rig.of(PositionSensor)[0]
-    known = held or _held(inputs, sensor)
+    known = extrinsics or _known_extrinsics(inputs, sensor)
     found = motion_from_fixes(inputs.imu, sensor.name, _fix(inputs, sensor), inputs.rig.gravity, known)
     shown = {
         (sensor.name, name): value
-        for name, value in zip(NAMES, (found.best.at.arm, np.array([found.best.at.offset])), strict=True)
+        for name, value in zip(GUESSED_GROUPS, (found.best.at.arm, np.array([found.best.at.offset])), strict=True)
     }
-    values = start_values(inputs, merged_values(sensor, stated_values(inputs, sensor, NAMES), shown))
+    values = start_values(inputs, merged_values(sensor, stated_values(inputs, sensor, GUESSED_GROUPS), shown))
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     rotation, position, velocity, bias = found.at(keyframes)
     return State(keyframes, rotation, position, velocity, bias, values)
 
 
 def _on_motion(inputs: Inputs, state: State, sensor: PositionSensor) -> Values:
-    """What one sensor shows on the motion of `state`. Of several recordings the one with most fixes gives the lever
-    arm, and the time offset if the clock runs on."""
+    """Lever arm, time offset and frames of one sensor on the trajectory of `state`. Of several recordings the one with
+    most fixes gives the lever arm, and the time offset unless the clock restarts."""
     recordings = [single_recording(inputs, k) for k in range(len(inputs.parts))]
     best = fullest_recording(inputs, sensor.name)
     found: dict[int, PlacedSensor] = {}
     for k in sorted(range(len(recordings)), key=lambda k: k != best):
-        held, frame = _held(recordings[k], sensor), None
+        extrinsics, frame = _known_extrinsics(recordings[k], sensor), None
         if k != best:
             offset = converted_offset(found[best].offset, sensor.name, recordings[best], recordings[k])
-            held = KnownExtrinsics(position=found[best].arm, offset=held.offset if sensor.clock_restarts else offset)
+            offset = extrinsics.offset if sensor.clock_restarts else offset
+            extrinsics = KnownExtrinsics(position=found[best].arm, offset=offset)
         if not sensor.has_frame:
             frame = PositionFrame.of(frame_owner(sensor), k, state.values)
-        known = KnownPlace(_is_levelled(inputs, sensor), held.position, held.offset, frame)
+        known = KnownPlace(_is_levelled(inputs, sensor), extrinsics.position, extrinsics.offset, frame)
         with naming_recording(inputs, k):
             motion = motion_of(recordings[k], state_of_recording(inputs, k, state))
             found[k] = place(motion, sensor.name, _fix(recordings[k], sensor), known)
     clocks = range(len(recordings)) if sensor.clock_restarts else (best,)
     offsets = [converted_offset(found[k].offset, sensor.name, recordings[k], inputs) for k in clocks]
-    shown = {(sensor.name, NAMES[0]): found[best].arm, (sensor.name, NAMES[1]): np.array(offsets)}
+    shown = {(sensor.name, GUESSED_GROUPS[0]): found[best].arm, (sensor.name, GUESSED_GROUPS[1]): np.array(offsets)}
     frames = _frames(inputs, sensor, [(found[k].R_wf, found[k].p_wf) for k in range(len(recordings))])
-    return merged_values(sensor, stated_values(inputs, sensor, NAMES), shown) | frames
+    return merged_values(sensor, stated_values(inputs, sensor, GUESSED_GROUPS), shown) | frames
 
 
-def _held(inputs: Inputs, sensor: PositionSensor) -> KnownExtrinsics:
-    """What the rig file fixes of the sensor or gives as a prior."""
-    known = {name: value for (_, name), value in stated_values(inputs, sensor, NAMES).items()}
+def _known_extrinsics(inputs: Inputs, sensor: PositionSensor) -> KnownExtrinsics:
+    """Lever arm and time offset that the rig file fixes or gives as a prior."""
+    known = {name: value for (_, name), value in stated_values(inputs, sensor, GUESSED_GROUPS).items()}
     known = {name: value for name, value in known.items() if known_value(getattr(sensor, name)) is not None}
     offset = known.get("time_offset")
     return KnownExtrinsics(position=known.get("translation"), offset=None if offset is None else float(offset[0]))

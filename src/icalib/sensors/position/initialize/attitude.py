@@ -9,20 +9,21 @@ import numpy as np
 from icalib.geometry import so3
 from icalib.initialize.steps.lever_arm import Triples
 from icalib.motion.imu_data import ImuData
-from icalib.sensors.position.initialize.triples import MARGIN_S, Carried
+from icalib.sensors.position.initialize.triples import WINDOW_MARGIN_S, IntegratedReadings
 
-ROUNDS = 12
-CONVERGED = 1e-5  # rad, rad/s, m/s^2, m, s: a change below which nothing that the estimator starts from matters
-OUTLIER = 4.0  # median sizes of residuals, beyond which a triple counts no more
-OFFSET_STEP_S = 0.005  # of the difference quotient by the time offset
-FEWEST = 12  # triples in a window
-# Standard deviations of what is assumed before the window is looked at.
-GYRO_BIAS_SIGMA = 0.02  # rad/s, of consumer gyroscopes
-ACCEL_BIAS_SIGMA = 0.3  # m/s^2
-ARM_SIGMA = 2.0  # m, of a car's antenna
-OFFSET_SIGMA = 0.3  # s, about a peak of the correlation
-ROTATION_SIGMA = 10.0  # rad: nothing
-ROW_SIGMA = 0.05  # m/s, least of a row: fixes of 2 cm
+MAX_WINDOW_ROUNDS = 12
+# rad, rad/s, m/s^2, m, s: of a Gauss-Newton step. Smaller changes of a start value do not change the estimate.
+WINDOW_STEP_TOLERANCE = 1e-5
+MAX_TRIPLE_MEDIANS = 4.0  # times the median residual; a triple with a larger one has no weight
+OFFSET_DIFFERENCE_S = 0.005  # half a step of central differences by the time offset: one IMU reading at 200 Hz
+MIN_WINDOW_TRIPLES = 12  # 36 rows for 13 unknowns
+# Prior standard deviations of the unknowns of a window.
+GYRO_BIAS_SIGMA_RAD_S = 0.02  # rad/s, of consumer gyroscopes
+ACCEL_BIAS_SIGMA_M_S2 = 0.3  # m/s^2
+ARM_SIGMA_M = 2.0  # m, of a car's antenna
+OFFSET_SIGMA_S = 0.3  # s, about a peak of the correlation
+ROTATION_SIGMA_RAD = 10.0  # rad: no prior
+MIN_TRIPLE_SIGMA_M_S = 0.05  # m/s, of a second difference of fixes with 2 cm of noise, 1 s apart
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,9 @@ class Fix:
 
 
 @dataclass(frozen=True)
-class Unknowns:
-    """R_wg (3, 3): the IMU at `reference` s on its clock, in the frame of the fixes; gyro_bias (3,) rad/s, accel_bias
-    (3,) m/s^2, arm (3,) m, offset s from the sensor's clock to the IMU's."""
+class WindowUnknowns:
+    """R_wg (3, 3): attitude of the IMU at `reference` s on its clock, in the frame of the fixes; gyro_bias (3,) rad/s,
+    accel_bias (3,) m/s^2; arm (3,) m, the lever arm p_imu_sensor; offset: t_imu - t_sensor [s]."""
 
     reference: float
     R_wg: np.ndarray
@@ -45,8 +46,8 @@ class Unknowns:
     arm: np.ndarray
     offset: float
 
-    def moved(self, step: np.ndarray) -> Unknowns:
-        """By a step (13,) in the order of the fields; rotations in the axes of the world."""
+    def moved(self, step: np.ndarray) -> WindowUnknowns:
+        """The unknowns after a step (13,) in the order of the fields; the rotation is in world axes, on the left."""
         return replace(
             self,
             R_wg=so3.exp(step[:3]) @ self.R_wg,
@@ -56,8 +57,8 @@ class Unknowns:
             offset=self.offset + float(step[12]),
         )
 
-    def minus(self, other: Unknowns) -> np.ndarray:
-        """(13,) the step that leads from `other` here."""
+    def minus(self, other: WindowUnknowns) -> np.ndarray:
+        """(13,) the step from `other` to these unknowns: other.moved(step) is equal to them."""
         return np.concatenate(
             [
                 so3.log(self.R_wg @ other.R_wg.T),
@@ -70,77 +71,88 @@ class Unknowns:
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """left: RMS of what the readings leave of the second differences of the fixes, over that of these; covariance (13,
-    13) as the residuals show it."""
+class WindowFit:
+    """misfit: RMS of the residuals over the RMS of the second differences of the fixes; covariance (13, 13) of the
+    unknowns, scaled by the residuals."""
 
-    at: Unknowns
-    left: float
+    at: WindowUnknowns
+    misfit: float
     covariance: np.ndarray
 
 
-def sigmas(arm: float = ARM_SIGMA, offset: float = OFFSET_SIGMA) -> np.ndarray:
-    """(13,) of a prior where nothing is known but the usual."""
-    groups = (ROTATION_SIGMA, GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA, arm)
+def sigmas(arm: float = ARM_SIGMA_M, offset: float = OFFSET_SIGMA_S) -> np.ndarray:
+    """(13,) prior standard deviations of `WindowUnknowns` for a usual IMU and antenna."""
+    groups = (ROTATION_SIGMA_RAD, GYRO_BIAS_SIGMA_RAD_S, ACCEL_BIAS_SIGMA_M_S2, arm)
     return np.append(np.repeat(groups, 3), offset)
 
 
-def first_attitude(imu: ImuData, fix: Fix, own: Triples, reference: float, offset: float, gravity: float) -> np.ndarray:
-    """R_wg by Kabsch from specific forces: the second differences of the fixes with gravity, and the readings'."""
+def first_attitude(
+    imu: ImuData, fix: Fix, triples: Triples, reference: float, offset: float, gravity: float
+) -> np.ndarray:
+    """R_wg (3, 3) by Kabsch: rotates the double integrals of specific force onto the second differences of the fixes
+    plus gravity."""
     t = fix.t + offset
-    carried = Carried.of(imu, span_of(t, own), reference, np.zeros(3), alone=True)
-    seen = own.second(fix.position)
-    seen[:, 2] += gravity * own.half
-    felt = own.second(carried.doubles_at(t)[:, :3])
+    integrated = IntegratedReadings.of(imu, span_of(t, triples), reference, np.zeros(3), forces_only=True)
+    seen = triples.second(fix.position)
+    seen[:, 2] += gravity * triples.half
+    felt = triples.second(integrated.doubles_at(t)[:, :3])
     return so3.closest_rotation(seen.T @ felt)
 
 
-def fit(
-    imu: ImuData, fix: Fix, own: Triples, start: Unknowns, prior: Unknowns, sigma: np.ndarray, gravity: float
-) -> Fitted:
-    """Gauss-Newton over the triples `own` from `start`, with a prior of standard deviations `sigma` (13,)."""
-    x, row_sigma, information = start, ROW_SIGMA, np.eye(13)
+def fit_window(
+    imu: ImuData,
+    fix: Fix,
+    triples: Triples,
+    start: WindowUnknowns,
+    prior: WindowUnknowns,
+    sigma: np.ndarray,
+    gravity: float,
+) -> WindowFit:
+    """Robust Gauss-Newton on the second differences over `triples` (see module `triples`) from `start`. prior, sigma:
+    means and standard deviations (13,) of a Gaussian prior; gravity [m/s^2]."""
+    x, row_sigma, information = start, MIN_TRIPLE_SIGMA_M_S, np.eye(13)
     r, kept = np.zeros((0, 3)), np.zeros(0, dtype=bool)
-    for _ in range(ROUNDS):
-        r, J = _rows(imu, fix, own, x, gravity)
+    for _ in range(MAX_WINDOW_ROUNDS):
+        r, J = _rows(imu, fix, triples, x, gravity)
         size = np.linalg.norm(r, axis=1)
-        kept = size <= OUTLIER * np.median(size)
-        row_sigma = max(ROW_SIGMA, float(np.median(size)))
+        kept = size <= MAX_TRIPLE_MEDIANS * np.median(size)
+        row_sigma = max(MIN_TRIPLE_SIGMA_M_S, float(np.median(size)))
         A, b = J[kept].reshape(-1, 13) / row_sigma, r[kept].ravel() / row_sigma
         information = A.T @ A + np.diag(sigma**-2)
         step = np.linalg.solve(information, A.T @ b - x.minus(prior) / sigma**2)
         x = x.moved(step)
-        if np.abs(step).max() < CONVERGED:
+        if np.abs(step).max() < WINDOW_STEP_TOLERANCE:
             break
-    seen = own.second(fix.position)[kept]
-    left = np.sqrt((r[kept] ** 2).sum() / max(float((seen**2).sum()), 1e-9))
-    return Fitted(x, float(left), np.linalg.inv(information))
+    seen = triples.second(fix.position)[kept]
+    misfit = np.sqrt((r[kept] ** 2).sum() / max(float((seen**2).sum()), 1e-9))
+    return WindowFit(x, float(misfit), np.linalg.inv(information))
 
 
-def _rows(imu: ImuData, fix: Fix, own: Triples, x: Unknowns, gravity: float) -> tuple[np.ndarray, np.ndarray]:
-    """What is left of A[p_fix] (n, 3) m/s, and the derivatives (n, 3, 13) of what was predicted."""
+def _rows(imu: ImuData, fix: Fix, triples: Triples, x: WindowUnknowns, gravity: float) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of A[p_fix] (n, 3) m/s, and derivatives (n, 3, 13) of the prediction by `WindowUnknowns`."""
     t = fix.t + x.offset
-    carried = Carried.of(imu, span_of(t, own), x.reference, x.gyro_bias)
-    predicted, J = _predicted(carried, t, own, x), np.zeros((len(own.i), 3, 13))
-    R, doubles, turned = carried.rotation_at(t), carried.doubles_at(t), carried.turned_at(t)
+    integrated = IntegratedReadings.of(imu, span_of(t, triples), x.reference, x.gyro_bias)
+    predicted, J = _predicted(integrated, t, triples, x), np.zeros((len(triples.i), 3, 13))
+    R, doubles = integrated.rotation_at(t), integrated.doubles_at(t)
     J[:, :, 0:3] = -so3.hat_many(np.ascontiguousarray(predicted))
-    arm = so3.hat_many(np.ascontiguousarray(R @ x.arm)) @ turned
-    J[:, :, 3:6] = x.R_wg @ (own.second(doubles[:, 12:]).reshape(-1, 3, 3) + own.second(arm))
-    J[:, :, 6:9] = -x.R_wg @ own.second(doubles[:, 3:12]).reshape(-1, 3, 3)
-    J[:, :, 9:12] = x.R_wg @ own.second(R)
-    later, earlier = (_predicted(carried, t + d, own, x) for d in (OFFSET_STEP_S, -OFFSET_STEP_S))
-    J[:, :, 12] = (later - earlier) / (2.0 * OFFSET_STEP_S)
-    r = own.second(fix.position) - predicted
-    r[:, 2] += gravity * own.half
+    J_arm_bias = so3.hat_many(np.ascontiguousarray(R @ x.arm)) @ integrated.rotation_integral_at(t)
+    J[:, :, 3:6] = x.R_wg @ (triples.second(doubles[:, 12:]).reshape(-1, 3, 3) + triples.second(J_arm_bias))
+    J[:, :, 6:9] = -x.R_wg @ triples.second(doubles[:, 3:12]).reshape(-1, 3, 3)
+    J[:, :, 9:12] = x.R_wg @ triples.second(R)
+    later, earlier = (_predicted(integrated, t + d, triples, x) for d in (OFFSET_DIFFERENCE_S, -OFFSET_DIFFERENCE_S))
+    J[:, :, 12] = (later - earlier) / (2.0 * OFFSET_DIFFERENCE_S)
+    r = triples.second(fix.position) - predicted
+    r[:, 2] += gravity * triples.half
     return r, J
 
 
-def _predicted(carried: Carried, t: np.ndarray, own: Triples, x: Unknowns) -> np.ndarray:
-    """(n, 3) A[p_fix] without gravity."""
-    doubles = carried.doubles_at(t)
-    felt = own.second(doubles[:, :3] - doubles[:, 3:12].reshape(-1, 3, 3) @ x.accel_bias)
-    return (felt + own.second(carried.rotation_at(t) @ x.arm)) @ x.R_wg.T
+def _predicted(integrated: IntegratedReadings, t: np.ndarray, triples: Triples, x: WindowUnknowns) -> np.ndarray:
+    """(n, 3) m/s, the prediction of A[p_fix] without its gravity term."""
+    doubles = integrated.doubles_at(t)
+    felt = triples.second(doubles[:, :3] - doubles[:, 3:12].reshape(-1, 3, 3) @ x.accel_bias)
+    return (felt + triples.second(integrated.rotation_at(t) @ x.arm)) @ x.R_wg.T
 
 
-def span_of(t: np.ndarray, own: Triples) -> tuple[float, float]:
-    return float(t[own.i].min()) - MARGIN_S, float(t[own.k].max()) + MARGIN_S
+def span_of(t: np.ndarray, triples: Triples) -> tuple[float, float]:
+    """First and last instant [s] of the readings that `triples` of fixes at t (N,) s on the IMU's clock need."""
+    return float(t[triples.i].min()) - WINDOW_MARGIN_S, float(t[triples.k].max()) + WINDOW_MARGIN_S

@@ -1,4 +1,4 @@
-"""A position sensor on a known motion of the IMU: time offset by correlation, then frame and lever arm linearly."""
+"""A position sensor on a known trajectory: time offset by correlation, frame and lever arm by least squares."""
 
 from __future__ import annotations
 
@@ -14,41 +14,39 @@ from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
 from icalib.motion.sweep import EstimatedMotion
 from icalib.sensors.position.frame import PositionFrame
-from icalib.sensors.position.initialize.attitude import Fix
-from icalib.sensors.position.initialize.clock import likely_offsets, varies
+from icalib.sensors.position.initialize.attitude import ARM_SIGMA_M, OFFSET_SIGMA_S, Fix
+from icalib.sensors.position.initialize.clock import PEAK_SPACING_S, SIGNAL_RATE_HZ, likely_offsets, varies
 
-GRID_HZ = 20.0
-STEP_S = 1.0  # over which speeds are means: fixes of 2 cm make 3 cm/s
-SHORTEST_OVERLAP_S = 5.0
-MOST_PEAKS = 4
-PEAKS_APART_S = 0.3
-FEWEST = 8  # fixes
-SCAN_STEP_S, SCANNED_FIXES = 0.2, 100  # of a grid of offsets: rigs move little in its step
-ROUNDS = 10
-CONVERGED = 1e-6
-OUTLIER = 4.0  # median sizes of residuals
-LEAST_ROW_SIGMA = 0.01  # m
-ARM_SIGMA, OFFSET_SIGMA = 2.0, 0.3  # m, s: of the prior
-FREE_RAD, FREE_M = 10.0, 1e4  # of a frame of which nothing is known
-KNOWN_M, KNOWN_RAD, KNOWN_S = 1e-3, 1e-6, 1e-4  # of what is known: it stays, and normal equations stay regular
-LARGEST_LEFT = 0.3  # of the spread of the fixes
+SPEED_STEP_S = 1.0  # of mean speeds: noise of 2 cm makes 3 cm/s
+MIN_SPEED_OVERLAP_S = 5.0  # s: shorter overlaps correlate by chance
+MAX_SPEED_PEAKS = 4  # candidates
+MIN_PLACED_FIXES = 8  # 24 rows for up to 10 unknowns
+SCAN_STEP_S = 0.2  # of a grid of offsets: shorter than the motions of a rig
+MAX_SCANNED_FIXES = 100  # bounds the time of a scan
+MAX_PLACING_ROUNDS = 10
+PLACING_STEP_TOLERANCE = 1e-6  # m, rad, s: of a Gauss-Newton step
+MAX_FIX_MEDIANS = 4.0  # times the median residual; a fix with a larger one has no weight
+MIN_FIX_SIGMA_M = 0.01  # of a residual, which contains errors of the trajectory
+FREE_FRAME_SIGMA_RAD, FREE_FRAME_SIGMA_M = 10.0, 1e4  # of a frame of which nothing is known
+KNOWN_SIGMA_M, KNOWN_SIGMA_RAD, KNOWN_SIGMA_S = 1e-3, 1e-6, 1e-4  # of known values: nearly fixed, and still regular
+MAX_POSITION_MISFIT = 0.3  # median residual over the spread of the fixes: another motion leaves more
 
 
 class PlacedSensor(NamedTuple):
     """arm: p_imu_sensor (3,) m; R_world_frame (3, 3), p_world_frame (3,) m; offset: t_imu - t_sensor, since the
-    first stamps [s]; left: median size of the residuals over that of the fixes about their median."""
+    first stamps [s]; misfit: median norm of the residuals over that of the fixes about their median."""
 
     arm: np.ndarray
     R_wf: np.ndarray
     p_wf: np.ndarray
     offset: float
-    left: float
+    misfit: float
 
 
 @dataclass(frozen=True)
 class KnownPlace:
-    """What is known before. levelled: the frame differs from the world by a turn about z and its origin; arm:
-    p_imu_sensor (3,) m, offset: as in `PlacedSensor`, and frame, or None."""
+    """What the rig file states of a sensor. levelled: the rotation of its frame in the world is about z; arm (3,) m and
+    offset [s] as in `PlacedSensor`, frame: a shared one; None where they are unknown."""
 
     levelled: bool
     arm: np.ndarray | None = None
@@ -62,18 +60,18 @@ class KnownPlace:
 
 
 def place(motion: EstimatedMotion, name: str, fix: Fix, known: KnownPlace) -> PlacedSensor:
-    """From the fixes of one recording, whose keyframes `motion` has. Raises EstimationError where they do not show
-    it."""
-    found = [x for offset in _offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
-    if min((x.left for x in found), default=np.inf) > LARGEST_LEFT and known.offset is None:
-        found += [x for offset in _scanned(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
+    """Lever arm, frame and time offset of the sensor `name` from its fixes in one recording; motion: the trajectory in
+    it. Raises EstimationError where the fixes are too few, or contradict the trajectory."""
+    found = [x for offset in _candidate_offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
+    if min((x.misfit for x in found), default=np.inf) > MAX_POSITION_MISFIT and known.offset is None:
+        found += [x for offset in _scanned_offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
     if not found:
         raise EstimationError(
             f"{name}: too few of its fixes fall within the motion that the other sensors show; check that the clocks "
             "overlap, or the time_offset in the rig file."
         )
-    best = min(found, key=lambda x: x.left)
-    if best.left > LARGEST_LEFT:
+    best = min(found, key=lambda x: x.misfit)
+    if best.misfit > MAX_POSITION_MISFIT:
         hint = "check that both are on the same vehicle"
         if known.frame is not None:
             hint += ", and that its positions are in the frame that the rig file names"
@@ -81,54 +79,56 @@ def place(motion: EstimatedMotion, name: str, fix: Fix, known: KnownPlace) -> Pl
             hint += ", or write frame: tilted if z of its frame does not point up"
         raise EstimationError(
             f"{name}: its fixes do not follow the motion that the other sensors show: at the best time offset the "
-            f"median residual is {best.left:.0%} of their spread; {hint}."
+            f"median residual is {best.misfit:.0%} of their spread; {hint}."
         )
     return best
 
 
-def _offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> list[float]:
-    """Candidate time offsets [s]: peaks of the correlation of mean speeds, then of third differences with the IMU's
-    readings. The latter are needed where the rig turns and hardly moves: a long lever arm makes speeds differ."""
+def _candidate_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> list[float]:
+    """Candidate time offsets [s]: the known one, or peaks of the correlation of mean speeds, then of third differences
+    with the IMU's readings. Speeds differ where the rig turns on the spot, by the lever arm."""
     if known.offset is not None:
         return [known.offset]
-    felt = [shift.samples / GRID_HZ for shift in likely_offsets(motion.imu, fix)]
+    by_acceleration = [shift.samples / SIGNAL_RATE_HZ for shift in likely_offsets(motion.imu, fix)]
     state = motion.state
     moved = _speeds(state.seconds, state.position)
     seen = _speeds(fix.t, fix.position)
     if not (varies(*moved) and varies(*seen)):
-        return felt
-    peaks = best_shifts(*moved, *seen, SHORTEST_OVERLAP_S * GRID_HZ, MOST_PEAKS, round(PEAKS_APART_S * GRID_HZ))
-    return [*(peak.samples / GRID_HZ for peak in peaks), *felt]
+        return by_acceleration
+    overlap, spacing = MIN_SPEED_OVERLAP_S * SIGNAL_RATE_HZ, round(PEAK_SPACING_S * SIGNAL_RATE_HZ)
+    peaks = best_shifts(*moved, *seen, overlap, MAX_SPEED_PEAKS, spacing)
+    return [*(peak.samples / SIGNAL_RATE_HZ for peak in peaks), *by_acceleration]
 
 
-def _scanned(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> list[float]:
-    """The offsets of a grid at which frame and lever arm fit best, however the rig moves: where it turns in place,
-    neither its speed nor its acceleration is like those of the antenna. Half of the fixes must be used."""
-    some = np.linspace(0, len(fix.t) - 1, min(len(fix.t), SCANNED_FIXES)).astype(int)
+def _scanned_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> list[float]:
+    """Candidate time offsets [s] of a grid, at which frame and lever arm fit best. Correlations fail where the rig
+    turns on the spot: the antenna then has other speeds and accelerations. Half of the fixes must be used."""
+    some = np.linspace(0, len(fix.t) - 1, min(len(fix.t), MAX_SCANNED_FIXES)).astype(int)
     t, p, keyframes = fix.t[some], fix.position[some], motion.state.seconds
     tried: list[tuple[float, float]] = []
     for offset in np.arange(keyframes[0] - t[-1], keyframes[-1] - t[0], SCAN_STEP_S).tolist():
         ok = is_known(keyframes, t + offset)
-        if ok.sum() < max(FEWEST, 0.5 * len(t)):
+        if ok.sum() < max(MIN_PLACED_FIXES, 0.5 * len(t)):
             continue
         at = imu_poses(motion, t[ok] + offset)
         x = _linear(at, p[ok], known, offset)
         r = at.position + at.rotation @ x.arm - p[ok] @ x.R_wf.T - x.p_wf
         tried.append((float(np.median(np.linalg.norm(r, axis=1))), offset))
-    return [offset for _, offset in sorted(tried)[:MOST_PEAKS]]
+    return [offset for _, offset in sorted(tried)[:MAX_SPEED_PEAKS]]
 
 
 def _speeds(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean speed over STEP_S [m/s] of positions p (n, 3) at t (n,) s, on a grid from 0 on, and where it is known."""
-    grid = np.arange(int(t[-1] * GRID_HZ) + 1) / GRID_HZ
-    ends = [grid - 0.5 * STEP_S, grid + 0.5 * STEP_S]
-    apart = max(2.5 * float(np.median(np.diff(t))), 1.5 / GRID_HZ)
+    """Mean speeds (m,) over SPEED_STEP_S [m/s] of positions p (n, 3) at t (n,) s, at SIGNAL_RATE_HZ from 0 s on, and
+    where they are known (m,)."""
+    grid = np.arange(int(t[-1] * SIGNAL_RATE_HZ) + 1) / SIGNAL_RATE_HZ
+    ends = [grid - 0.5 * SPEED_STEP_S, grid + 0.5 * SPEED_STEP_S]
+    apart = max(2.5 * float(np.median(np.diff(t))), 1.5 / SIGNAL_RATE_HZ)
     after = [np.clip(np.searchsorted(t, x), 1, len(t) - 1) for x in ends]
     known = (ends[0] >= t[0]) & (ends[1] <= t[-1])
     for k in after:
         known &= t[k] - t[k - 1] <= apart
     at = [np.stack([np.interp(x, t, p[:, k]) for k in range(3)], axis=1) for x in ends]
-    return np.linalg.norm(at[1] - at[0], axis=1) / STEP_S, known
+    return np.linalg.norm(at[1] - at[0], axis=1) / SPEED_STEP_S, known
 
 
 @dataclass(frozen=True)
@@ -147,45 +147,47 @@ class _Unknowns:
 
 
 def _placed(motion: EstimatedMotion, fix: Fix, offset: float, known: KnownPlace) -> PlacedSensor | None:
-    """By Gauss-Newton from a linear solution, at an offset that is refined."""
+    """Robust Gauss-Newton from `_linear` at a candidate offset [s]; None if fixes are too few, or the offset moves by
+    more than OFFSET_SIGMA_S."""
     t = fix.t + offset
-    ok = is_known(motion.state.seconds, t - OFFSET_SIGMA) & is_known(motion.state.seconds, t + OFFSET_SIGMA)
-    if ok.sum() < FEWEST:
+    ok = is_known(motion.state.seconds, t - OFFSET_SIGMA_S) & is_known(motion.state.seconds, t + OFFSET_SIGMA_S)
+    if ok.sum() < MIN_PLACED_FIXES:
         return None
     t, p = fix.t[ok], fix.position[ok]
     x = _linear(imu_poses(motion, t + offset), p, known, offset)
     start, sigma = x if known.arm is not None else replace(x, arm=np.zeros(3)), _sigmas(known)
     r = np.zeros((0, 3))
-    for _ in range(ROUNDS):
+    for _ in range(MAX_PLACING_ROUNDS):
         r, J = _rows(motion, t, p, x, known.levelled)
         size = np.linalg.norm(r, axis=1)
-        kept = size <= OUTLIER * np.median(size) + 1e-9
-        row = max(LEAST_ROW_SIGMA, float(np.median(size)))
+        kept = size <= MAX_FIX_MEDIANS * np.median(size) + 1e-9
+        row = max(MIN_FIX_SIGMA_M, float(np.median(size)))
         A, b = J[kept].reshape(-1, J.shape[2]) / row, -r[kept].ravel() / row
         away = np.zeros(len(sigma))
         away[:3], away[-1] = x.arm - start.arm, x.offset - start.offset
         step = np.linalg.solve(A.T @ A + np.diag(sigma**-2), A.T @ b - away / sigma**2)
         x = x.moved(step, known.levelled)
-        if abs(x.offset - offset) > OFFSET_SIGMA:
+        if abs(x.offset - offset) > OFFSET_SIGMA_S:
             return None
-        if np.abs(step).max() < CONVERGED:
+        if np.abs(step).max() < PLACING_STEP_TOLERANCE:
             break
     spread = float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
-    left = float(np.median(np.linalg.norm(r, axis=1))) / max(spread, 1e-9)
-    return PlacedSensor(x.arm, x.R_wf, x.p_wf, x.offset, left)
+    misfit = float(np.median(np.linalg.norm(r, axis=1))) / max(spread, 1e-9)
+    return PlacedSensor(x.arm, x.R_wf, x.p_wf, x.offset, misfit)
 
 
 def _sigmas(known: KnownPlace) -> np.ndarray:
     """(8 or 10,) standard deviations of the prior on lever arm, rotation and origin of the frame, and time offset."""
-    arm = ARM_SIGMA if known.arm is None else KNOWN_M
-    turn, origin = (FREE_RAD, FREE_M) if known.frame is None else (KNOWN_RAD, KNOWN_M)
-    offset = OFFSET_SIGMA if known.offset is None else KNOWN_S
+    arm = ARM_SIGMA_M if known.arm is None else KNOWN_SIGMA_M
+    free = FREE_FRAME_SIGMA_RAD, FREE_FRAME_SIGMA_M
+    turn, origin = free if known.frame is None else (KNOWN_SIGMA_RAD, KNOWN_SIGMA_M)
+    offset = OFFSET_SIGMA_S if known.offset is None else KNOWN_SIGMA_S
     return np.repeat([arm, turn, origin, offset], [3, known.turns, 3, 1])
 
 
 def _linear(at: Poses, p: np.ndarray, known: KnownPlace, offset: float) -> _Unknowns:
-    """Frame and lever arm, linear in p_imu + R_imu p_imu_sensor = M p + origin with the fixes p (n, 3); M is then made
-    a rotation."""
+    """Frame and lever arm by linear least squares on p_imu + R_imu p_imu_sensor = M p + origin, fixes p (n, 3). The
+    rotation is the one closest to M."""
     if known.frame is not None:
         return _linear_arm(at, p, known.frame, known.arm, offset)
     n, arm, levelled = len(p), known.arm, known.levelled
@@ -202,7 +204,7 @@ def _linear(at: Poses, p: np.ndarray, known: KnownPlace, offset: float) -> _Unkn
         for k in range(3):
             A[:, k, 3 + 3 * k : 6 + 3 * k] = -p
     weak = np.zeros((3, 15))
-    weak[:, :3] = LEAST_ROW_SIGMA / ARM_SIGMA * np.eye(3)
+    weak[:, :3] = MIN_FIX_SIGMA_M / ARM_SIGMA_M * np.eye(3)
     x = np.linalg.lstsq(np.vstack([A.reshape(-1, 15), weak]), np.append(b.ravel(), np.zeros(3)), rcond=None)[0]
     if levelled:
         R = so3.exp(np.array([0.0, 0.0, np.arctan2(x[4], x[3])]))
@@ -213,7 +215,7 @@ def _linear(at: Poses, p: np.ndarray, known: KnownPlace, offset: float) -> _Unkn
 
 
 def _linear_arm(at: Poses, p: np.ndarray, frame: PositionFrame, arm: np.ndarray | None, offset: float) -> _Unknowns:
-    """As `_linear`, in a known frame: the median over the fixes of what leads from the IMU to each, in its axes."""
+    """As `_linear` in a known frame: the lever arm is the median of R_imu^T (R_wf p + p_wf - p_imu)."""
     if arm is None:
         apart = p @ frame.rotation.T + frame.position - at.position
         arm = np.median(np.einsum("nji,nj->ni", at.rotation, apart), axis=0)
@@ -223,7 +225,8 @@ def _linear_arm(at: Poses, p: np.ndarray, frame: PositionFrame, arm: np.ndarray 
 def _rows(
     motion: EstimatedMotion, t: np.ndarray, p: np.ndarray, x: _Unknowns, levelled: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (n, 3) m in the world, and their derivatives (n, 3, 8 or 10): arm, turn, origin, offset."""
+    """Residuals (n, 3) m in world axes, and derivatives (n, 3, 8 or 10) by lever arm, rotation (on the left) and origin
+    of the frame, and time offset."""
     at, turned = imu_poses(motion, t + x.offset), p @ x.R_wf.T
     r = at.position + at.rotation @ x.arm - turned - x.p_wf
     J_turn = so3.hat_many(np.ascontiguousarray(turned))

@@ -1,8 +1,8 @@
-"""The motion of the IMU from the fixes of a position sensor and the IMU's readings, and nothing else.
+"""Trajectory of the IMU from the fixes of a position sensor and the IMU's readings alone.
 
-The time offset comes from `clock`. In the window with most horizontal motion specific forces give the attitude, by
-Kabsch. Gauss-Newton over second differences gives the biases, the lever arm and the offset, while the window grows.
-Further windows follow on both sides, the lever arm as it was found.
+Candidate time offsets come from `clock`. Kabsch on specific forces gives the attitude in the window with most
+horizontal motion. Gauss-Newton on second differences gives biases, lever arm and offset while the window grows. Further
+windows follow on both sides, with the lever arm of the first.
 """
 
 from __future__ import annotations
@@ -15,21 +15,30 @@ from icalib.errors import EstimationError
 from icalib.initialize.steps.lever_arm import Triples
 from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
-from icalib.sensors.position.initialize.attitude import FEWEST, Fitted, Fix, Unknowns, first_attitude, fit, sigmas
-from icalib.sensors.position.initialize.clock import GRID_HZ, LEAST_CORRELATION, likely_offsets
-from icalib.sensors.position.initialize.triples import Carried, recorded, triples_of
+from icalib.sensors.position.initialize.attitude import (
+    MIN_WINDOW_TRIPLES,
+    Fix,
+    WindowFit,
+    WindowUnknowns,
+    first_attitude,
+    fit_window,
+    sigmas,
+)
+from icalib.sensors.position.initialize.clock import MIN_JERK_CORRELATION, SIGNAL_RATE_HZ, likely_offsets
+from icalib.sensors.position.initialize.triples import IntegratedReadings, recorded, triples_of
 
-HALF_S = 10.0  # half of the first window: a gyroscope's bias turns by some degrees in it, Kabsch bears that
-MOST_HALF_S = 60.0  # and of the last: biases are taken as constant in it
-DOUBTFUL_LEFT, MIRRORED = 0.15, 0.5  # from there on east and north are swapped, and seen if that leaves half as much
-LARGEST_LEFT = 0.3  # of second differences: another motion leaves 0.4 or more
-TRIED = 4  # offsets
-# Between windows that follow one another: what the gyroscope's drift may add, and how much biases change.
-NEXT_ROTATION, NEXT_GYRO_BIAS, NEXT_ACCEL_BIAS = 0.1, 5e-3, 0.1  # rad, rad/s, m/s^2
-KNOWN_ARM, KNOWN_OFFSET = 1e-3, 0.01  # m, s: a clock may drift by 20 ppm
-MOTIONLESS = 0.02  # m/s^2, RMS of accelerations over a second: accelerometers drift by as much
-MORE_THAN_NOISE = 1.5  # times what noise makes of accelerations: less shows nothing
-VELOCITY_STEP_S = 0.25  # to both sides: fixes are noisy
+FIRST_HALF_WINDOW_S = 10.0  # a gyroscope bias of 0.5 deg/s turns 5 degrees in it, which Kabsch tolerates
+MAX_HALF_WINDOW_S = 60.0  # of the largest window: biases are modelled as constant in it
+# A misfit above the first is tried again with east and north swapped, and is a swap if the misfit falls by the second.
+SUSPICIOUS_MISFIT, MIRRORED_RATIO = 0.15, 0.5
+MAX_ACCELERATION_MISFIT = 0.3  # share of the second differences: those of another motion leave 0.4 or more
+MAX_OFFSETS_TRIED = 4  # candidates, by correlation
+# Standard deviations between neighbouring windows: gyroscope drift over a window, and changes of biases.
+NEXT_ROTATION_SIGMA_RAD, NEXT_GYRO_BIAS_SIGMA_RAD_S, NEXT_ACCEL_BIAS_SIGMA_M_S2 = 0.1, 5e-3, 0.1
+KNOWN_ARM_SIGMA_M, KNOWN_OFFSET_SIGMA_S = 1e-3, 0.01  # a clock that drifts by 20 ppm has 10 ms in 500 s
+MIN_ACCELERATION_M_S2 = 0.02  # RMS over a second: accelerometer biases vary by as much
+MIN_ACCELERATION_NOISE_RATIO = 1.5  # RMS acceleration of fixes over what their noise makes of it: less is no motion
+VELOCITY_STEP_S = 0.25  # of central differences: noise of 2 cm makes 6 cm/s
 
 
 @dataclass(frozen=True)
@@ -38,21 +47,21 @@ class MotionWindow:
 
     begin: float
     end: float
-    at: Unknowns
+    at: WindowUnknowns
 
 
 @dataclass(frozen=True)
 class PositionMotion:
-    """windows in order, without a gap; best: what the largest of them showed; fix: the fixes."""
+    """windows: in order, without a gap; best: fit of the largest of them; fix: the fixes."""
 
     imu: ImuData
     fix: Fix
-    best: Fitted
+    best: WindowFit
     windows: tuple[MotionWindow, ...]
 
     def at(self, keyframes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """R_frame_imu (K, 3, 3), p_frame_imu, velocity (K, 3), biases (K, 6) at `keyframes` (K,) s on the IMU's
-        clock."""
+        """R_frame_imu (K, 3, 3), p_frame_imu (K, 3) m, velocity (K, 3) m/s and biases (K, 6) at `keyframes` (K,)
+        s on the IMU's clock."""
         t = self.fix.t + self.best.at.offset
         R, bias = self._attitude(keyframes)
         at_fixes, _ = self._attitude(t)
@@ -73,44 +82,46 @@ class PositionMotion:
         for w, k in zip(self.windows, np.split(np.arange(len(t)), edges), strict=True):
             if len(k):
                 span = min(float(t[k[0]]), w.at.reference), max(float(t[k[-1]]), w.at.reference)
-                carried = Carried.of(self.imu, span, w.at.reference, w.at.gyro_bias, alone=True)
-                R[k] = w.at.R_wg @ carried.rotation_at(t[k])
+                integrated = IntegratedReadings.of(self.imu, span, w.at.reference, w.at.gyro_bias, forces_only=True)
+                R[k] = w.at.R_wg @ integrated.rotation_at(t[k])
                 bias[k] = np.concatenate([w.at.gyro_bias, w.at.accel_bias])
         return R, bias
 
 
 def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: KnownExtrinsics) -> PositionMotion:
-    """Raises EstimationError, one sentence, where fixes and readings do not belong together or do not move."""
+    """Trajectory of the IMU in the frame of the fixes. known: extrinsics and time offset of the rig file.
+
+    Raises EstimationError where fixes and readings contradict each other, are too few, or have no acceleration."""
     triples = triples_of(fix.t)
-    if len(triples.i) < FEWEST:
+    if len(triples.i) < MIN_WINDOW_TRIPLES:
         raise EstimationError(
-            f"{name}: only {len(triples.i)} groups of three fixes about a second apart are usable, and {FEWEST} are "
-            "needed; record for longer, or lower least_status in the rig file."
+            f"{name}: only {len(triples.i)} groups of three fixes about a second apart are usable, and "
+            f"{MIN_WINDOW_TRIPLES} are needed; record for longer, or lower least_status in the rig file."
         )
-    offsets, rms = _offsets(imu, fix, known), _moves_evenly(fix, triples)
+    offsets, rms = _candidate_offsets(imu, fix, known), _moves_evenly(fix, triples)
     if not offsets:
-        raise _motionless(name, rms) if rms is not None else _unlike(imu, name, 1.0, False)
-    found = [one for x in offsets if (one := _tried(imu, fix, triples, x, gravity, known)) is not None]
+        raise _motionless(name, rms) if rms is not None else _contradicting(imu, name, 1.0, False)
+    found = [one for x in offsets if (one := _fit_at_offset(imu, fix, triples, x, gravity, known)) is not None]
     if not found:
         raise EstimationError(
             f"{name}: too few of its fixes fall within the recording of {imu.name}; check that both come from the same "
             "recording, or the time_offset in the rig file."
         )
-    best, window = min(found, key=lambda one: one[0].left)
-    if best.left > LARGEST_LEFT and rms is not None:
+    best, window = min(found, key=lambda one: one[0].misfit)
+    if best.misfit > MAX_ACCELERATION_MISFIT and rms is not None:
         raise _motionless(name, rms)
-    if best.left > DOUBTFUL_LEFT:
+    if best.misfit > SUSPICIOUS_MISFIT:
         other = replace(fix, position=fix.position[:, [1, 0, 2]])
-        tried = [one for x in offsets if (one := _tried(imu, other, triples, x, gravity, known)) is not None]
-        mirrored = min((one[0].left for one in tried), default=np.inf) < MIRRORED * best.left
-        if mirrored or best.left > LARGEST_LEFT:
-            raise _unlike(imu, name, best.left, mirrored)
+        tried = [one for x in offsets if (one := _fit_at_offset(imu, other, triples, x, gravity, known)) is not None]
+        mirrored = min((one[0].misfit for one in tried), default=np.inf) < MIRRORED_RATIO * best.misfit
+        if mirrored or best.misfit > MAX_ACCELERATION_MISFIT:
+            raise _contradicting(imu, name, best.misfit, mirrored)
     usable = recorded(imu, triples, fix.t + best.at.offset)
     return PositionMotion(imu, fix, best, _all_windows(imu, fix, usable, (best, window), gravity))
 
 
-def _unlike(imu: ImuData, name: str, left: float, mirrored: bool) -> EstimationError:
-    told = f"{name}: {imu.name} does not explain {left:.0%} of its acceleration at any time offset"
+def _contradicting(imu: ImuData, name: str, misfit: float, mirrored: bool) -> EstimationError:
+    told = f"{name}: {imu.name} does not explain {misfit:.0%} of its acceleration at any time offset"
     if mirrored:
         return EstimationError(
             f"{told}, but does where east and north are swapped; correct the order of latitude and longitude, or of x "
@@ -128,55 +139,56 @@ def _motionless(name: str, rms: float) -> EstimationError:
     )
 
 
-def _offsets(imu: ImuData, fix: Fix, known: KnownExtrinsics) -> list[float]:
-    """Those to be tried, likely ones first."""
+def _candidate_offsets(imu: ImuData, fix: Fix, known: KnownExtrinsics) -> list[float]:
+    """Time offsets to be tried [s]: the known one, or the highest correlations."""
     if known.offset is not None:
         return [known.offset]
     found = likely_offsets(imu, fix)
-    return [s.samples / GRID_HZ for s in found if s.correlation > LEAST_CORRELATION][:TRIED]
+    return [s.samples / SIGNAL_RATE_HZ for s in found if s.correlation > MIN_JERK_CORRELATION][:MAX_OFFSETS_TRIED]
 
 
 def _moves_evenly(fix: Fix, triples: Triples) -> float | None:
-    """The RMS of accelerations [m/s^2], where these are no more than noise that fourth differences of the fixes, of
-    which motion has little, show; else None."""
+    """RMS acceleration of the fixes [m/s^2] if it is no more than noise, else None. Fourth differences, which contain
+    little motion, show the noise."""
     acceleration = triples.second(fix.position) / triples.half[:, None]
     fourth = np.diff(fix.position, n=4, axis=0)
     rms, noise = (float(np.sqrt(np.median((x**2).sum(axis=1)))) for x in (acceleration, fourth))
     by_noise = noise / np.sqrt(70.0) * np.sqrt(6.0) / float(np.median(triples.half)) ** 2  # sums of squared binomials
-    return rms if rms < MORE_THAN_NOISE * by_noise or rms < MOTIONLESS else None
+    return rms if rms < MIN_ACCELERATION_NOISE_RATIO * by_noise or rms < MIN_ACCELERATION_M_S2 else None
 
 
-def _tried(
+def _fit_at_offset(
     imu: ImuData, fix: Fix, triples: Triples, offset: float, gravity: float, known: KnownExtrinsics
-) -> tuple[Fitted, tuple[float, float]] | None:
-    """What the largest window about the one with most motion shows, and the window on the sensor's clock; None where
-    there are too few triples."""
+) -> tuple[WindowFit, tuple[float, float]] | None:
+    """Fit of a window that grows about the one with most horizontal motion, and its begin and end on the sensor's clock
+    [s]; None where there are too few triples."""
     usable = recorded(imu, triples, fix.t + offset)
-    if len(usable.i) < FEWEST:
+    if len(usable.i) < MIN_WINDOW_TRIPLES:
         return None
     middle = fix.t[usable.j]
     moved = np.concatenate([[0.0], np.cumsum((usable.second(fix.position)[:, :2] ** 2).sum(axis=1))])
-    inside = np.searchsorted(middle, middle + 2.0 * HALF_S, side="right")
+    inside = np.searchsorted(middle, middle + 2.0 * FIRST_HALF_WINDOW_S, side="right")
     begin = int(np.argmax(moved[inside] - moved[:-1]))
     centre = 0.5 * float(middle[begin] + middle[inside[begin] - 1])
-    half, arm = HALF_S, known.position
-    own = _within(fix, usable, centre - half, centre + half)
-    if len(own.i) < FEWEST:
-        own = usable
-    R = first_attitude(imu, fix, own, centre + offset, offset, gravity)
-    start = prior = Unknowns(centre + offset, R, np.zeros(3), np.zeros(3), np.zeros(3) if arm is None else arm, offset)
+    half, arm = FIRST_HALF_WINDOW_S, known.position
+    within = _within(fix, usable, centre - half, centre + half)
+    if len(within.i) < MIN_WINDOW_TRIPLES:
+        within = usable
+    R = first_attitude(imu, fix, within, centre + offset, offset, gravity)
+    no = np.zeros(3)
+    start = prior = WindowUnknowns(centre + offset, R, no, no, no if arm is None else arm, offset)
     sigma = sigmas()
     if arm is not None:
-        sigma[9:12] = KNOWN_ARM
+        sigma[9:12] = KNOWN_ARM_SIGMA_M
     if known.offset is not None:
-        sigma[12] = KNOWN_OFFSET
+        sigma[12] = KNOWN_OFFSET_SIGMA_S
     while True:
-        fitted = fit(imu, fix, own, start, replace(prior, R_wg=start.R_wg), sigma, gravity)
+        fitted = fit_window(imu, fix, within, start, replace(prior, R_wg=start.R_wg), sigma, gravity)
         window = centre - half, centre + half
-        if half >= MOST_HALF_S or len(own.i) == len(usable.i):
+        if half >= MAX_HALF_WINDOW_S or len(within.i) == len(usable.i):
             return fitted, window
-        half, start = min(2.0 * half, MOST_HALF_S), fitted.at
-        own = _within(fix, usable, centre - half, centre + half)
+        half, start = min(2.0 * half, MAX_HALF_WINDOW_S), fitted.at
+        within = _within(fix, usable, centre - half, centre + half)
 
 
 def _within(fix: Fix, triples: Triples, begin: float, end: float) -> Triples:
@@ -185,32 +197,32 @@ def _within(fix: Fix, triples: Triples, begin: float, end: float) -> Triples:
 
 
 def _all_windows(
-    imu: ImuData, fix: Fix, usable: Triples, best: tuple[Fitted, tuple[float, float]], gravity: float
+    imu: ImuData, fix: Fix, usable: Triples, best: tuple[WindowFit, tuple[float, float]], gravity: float
 ) -> tuple[MotionWindow, ...]:
-    """The best window, and those on both sides up to the ends of the IMU's recording."""
+    """The best window, and further ones on both sides up to the ends of the IMU's recording."""
     fitted, (begin, end) = best
     offset = fitted.at.offset
     windows = [MotionWindow(begin + offset, end + offset, fitted.at)]
     while windows[-1].end < imu.seconds[-1]:
-        windows.append(_next(imu, fix, usable, windows[-1], MOST_HALF_S, gravity))
+        windows.append(_next(imu, fix, usable, windows[-1], MAX_HALF_WINDOW_S, gravity))
     while windows[0].begin > imu.seconds[0]:
-        windows.insert(0, _next(imu, fix, usable, windows[0], -MOST_HALF_S, gravity))
+        windows.insert(0, _next(imu, fix, usable, windows[0], -MAX_HALF_WINDOW_S, gravity))
     return tuple(windows)
 
 
 def _next(imu: ImuData, fix: Fix, usable: Triples, last: MotionWindow, length: float, gravity: float) -> MotionWindow:
-    """The window after `last`, or before it where the length [s] is negative; as the gyroscope carries the attitude
-    where there are too few fixes."""
+    """The window after `last`, or before it where the length [s] is negative. With too few fixes its attitude is
+    propagated by the gyroscope."""
     begin, end = (last.end, last.end + length) if length > 0.0 else (last.begin + length, last.begin)
     reference = float(np.clip(0.5 * (begin + end), imu.seconds[0], imu.seconds[-1]))
     span = min(reference, last.at.reference), max(reference, last.at.reference)
-    carried = Carried.of(imu, span, last.at.reference, last.at.gyro_bias, alone=True)
-    R = last.at.R_wg @ carried.rotation_at(np.array([reference]))[0]
+    integrated = IntegratedReadings.of(imu, span, last.at.reference, last.at.gyro_bias, forces_only=True)
+    R = last.at.R_wg @ integrated.rotation_at(np.array([reference]))[0]
     start = replace(last.at, reference=reference, R_wg=R)
-    own = _within(fix, usable, begin - start.offset, end - start.offset)
-    if len(own.i) < FEWEST:
+    within = _within(fix, usable, begin - start.offset, end - start.offset)
+    if len(within.i) < MIN_WINDOW_TRIPLES:
         return MotionWindow(begin, end, start)
-    sigma = sigmas(KNOWN_ARM, KNOWN_OFFSET)
-    sigma[:9] = np.repeat([NEXT_ROTATION, NEXT_GYRO_BIAS, NEXT_ACCEL_BIAS], 3)
-    found = fit(imu, fix, own, start, start, sigma, gravity)
-    return MotionWindow(begin, end, found.at if found.left < 1.0 else start)
+    sigma = sigmas(KNOWN_ARM_SIGMA_M, KNOWN_OFFSET_SIGMA_S)
+    sigma[:9] = np.repeat([NEXT_ROTATION_SIGMA_RAD, NEXT_GYRO_BIAS_SIGMA_RAD_S, NEXT_ACCEL_BIAS_SIGMA_M_S2], 3)
+    found = fit_window(imu, fix, within, start, start, sigma, gravity)
+    return MotionWindow(begin, end, found.at if found.misfit < 1.0 else start)

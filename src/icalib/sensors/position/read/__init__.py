@@ -1,4 +1,4 @@
-"""Positions: tables, RTKLIB's solutions, messages -> a checked stream."""
+"""Tables, solutions of RTKLIB and messages -> checked streams of positions."""
 
 from __future__ import annotations
 
@@ -84,14 +84,14 @@ def _is_solution(path: Path) -> bool:
 
 
 def _topic(recording: Recording, sensor: PositionSensor) -> TopicInfo:
-    """One of messages that have positions alone, or else of poses."""
+    """The topic of a sensor. Messages with positions alone go before poses and odometry."""
     own = any(t.kind in OWN and t.count for t in recording.topics())
     kinds = OWN if own and sensor.topic is None else (*OWN, *OTHERS)
     return recording.topic(sensor.name, sensor.topic, *kinds)
 
 
 def _readings(recording: Recording, sensor: PositionSensor, what: str) -> Noted:
-    """Positions in metres about the first good one, in a frame of their own."""
+    """Readings in metres, and notes."""
     if not _is_table(recording, sensor):
         return _of_topic(recording, sensor, _topic(recording, sensor), what)
     path = recording.table(sensor, sensor.path)
@@ -133,7 +133,7 @@ def _of_solution(recording: Recording, sensor: PositionSensor, path: Path, what:
 
 
 def _levelled(written: PositionReadings) -> PositionReadings:
-    """Earth-centred positions as east, north and up of the first."""
+    """Earth-centred positions, in metres east, north and up of the first."""
     R = east_north_up(*latitude_longitude(written.position[0]))
     covariance = R @ written.covariance @ R.T if len(written.covariance) else written.covariance
     frame = LocalFrame(written.position[0], R, True)

@@ -1,4 +1,4 @@
-"""Whether fixes can be those of one antenna that moves, in metres, in one frame."""
+"""Checks of fixes: stamps, units, motion, repeated fixes, outliers, steps."""
 
 from __future__ import annotations
 
@@ -8,39 +8,42 @@ from icalib.data.stamps.ordered import kept_readings
 from icalib.errors import RecordingError
 from icalib.sensors.position.read.outliers import single_wrong, steps
 from icalib.sensors.position.read.readings import PositionReadings
-from icalib.sensors.position.read.tables import RATE_HZ
+from icalib.sensors.position.read.tables import FIX_RATES_HZ
 from icalib.sensors.position.stream import PositionStream
 
-FEWEST = 3
-_FASTEST_M_S = 350.0  # of an aircraft
-_STILL_M = 0.05  # farthest from the middle: fixes of a centimetre at rest
-_FROZEN = 4  # equal fixes, at least: receivers round, and stand still
-_FROZEN_M_S2 = 5.0  # as it was frozen, or was so no more, the antenna would have felt half of gravity, and
-_FROZEN_M = 0.3  # have moved as far when it went on
+MIN_FIXES = 3  # second differences need as many
+_MAX_SPEED_M_S = 350.0  # of an airliner; more is another unit
+_MIN_RANGE_M = 0.05  # largest distance from the median: fixes with 1 cm of noise stay within it at rest
+_MIN_FROZEN_FIXES = 4  # equal fixes in a row: receivers round, and some stand still
+# A receiver is frozen if the antenna would stop or start with more than this acceleration, half of gravity, and move
+# by more than this distance at once when fixes change again.
+_MAX_ACCELERATION_M_S2, _MIN_LEAP_M = 5.0, 0.3
 
 
 def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream, tuple[str, ...]]:
-    """The fixes with strictly increasing stamps, without single wrong ones, and notes on what was left out.
+    """The fixes with strictly increasing stamps, without outliers and repeated fixes, and notes on those removed.
 
-    Raises RecordingError naming `what` and the instant: too few, not finite, out of order, motionless, in other units.
+    Raises RecordingError naming `what` and the instant where fixes are too few, not finite, not in order, without
+    motion, or in other units.
     """
-    if len(read.stamps_ns) < FEWEST:
+    if len(read.stamps_ns) < MIN_FIXES:
         raise RecordingError(
             f"{what}: only {len(read.stamps_ns)} fixes are usable; a calibration needs the whole recording."
         )
     finite = np.asarray(np.isfinite(read.position).all(axis=1))
     notes: tuple[str, ...] = ()
     if not finite.all():
-        if finite.sum() < FEWEST or finite.mean() < 0.5:
+        if finite.sum() < MIN_FIXES or finite.mean() < 0.5:
             raise RecordingError(
                 f"{what}: {int((~finite).sum())} of {len(finite)} positions are not finite, the first at "
                 f"{read.stamps_ns[np.argmin(finite)]} ns; correct the program that writes them."
             )
         notes += (f"{what}: {int((~finite).sum())} of {len(finite)} positions are not finite and were removed.",)
         read = read.some(finite)
-    kept, found = kept_readings(read.stamps_ns, read.position, what, RATE_HZ, "fix", "write the receiver's own stamps")
+    remedy = "write the receiver's own stamps"
+    kept, found = kept_readings(read.stamps_ns, read.position, what, FIX_RATES_HZ, "fix", remedy)
     read = read.some(kept)
-    if len(read.stamps_ns) < FEWEST:
+    if len(read.stamps_ns) < MIN_FIXES:
         raise RecordingError(
             f"{what}: only {len(read.stamps_ns)} fixes are usable; a calibration needs the whole recording."
         )
@@ -54,7 +57,7 @@ def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream
 
 def _refuse_stillness(read: PositionReadings, what: str) -> None:
     far = float(np.linalg.norm(read.position - np.median(read.position, axis=0), axis=1).max())
-    if far < _STILL_M:
+    if far < _MIN_RANGE_M:
         raise RecordingError(
             f"{what}: all fixes are the same within {far:.2g} m; check that the receiver was running, or record again "
             "while moving."
@@ -63,7 +66,7 @@ def _refuse_stillness(read: PositionReadings, what: str) -> None:
 
 def _refuse_units(read: PositionReadings, what: str) -> None:
     speed = float(np.median(np.linalg.norm(np.diff(read.position, axis=0), axis=1) / np.diff(read.seconds)))
-    if speed > _FASTEST_M_S:
+    if speed > _MAX_SPEED_M_S:
         raise RecordingError(
             f"{what}: it moves at {speed:.4g} m/s, which is implausible. Positions must be in metres (divide "
             "millimetres by 1000) or degrees, and stamps in nanoseconds."
@@ -71,14 +74,14 @@ def _refuse_units(read: PositionReadings, what: str) -> None:
 
 
 def _without_frozen(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:
-    """Without runs of equal fixes of a receiver that repeats its last one while the antenna moves: it stops, or starts,
-    faster than a vehicle can. The first fix of a run stays."""
+    """The fixes without runs that a frozen receiver repeats, and a note. Before or after such a run the acceleration is
+    beyond that of a vehicle. The first fix of a run stays."""
     t, p = read.seconds, read.position
     same = np.concatenate([[False], (np.diff(p, axis=0) == 0.0).all(axis=1)])
     edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
     frozen = np.zeros(len(t), dtype=bool)
     for begin, end in edges.reshape(-1, 2).tolist():
-        if end - begin + 1 >= _FROZEN and (_stops_hard(t, p, begin - 1) or _leaps(t, p, end - 1)):
+        if end - begin + 1 >= _MIN_FROZEN_FIXES and (_stops_hard(t, p, begin - 1) or _leaps(t, p, end - 1)):
             frozen[begin:end] = True
     if not frozen.any():
         return read, ()
@@ -91,19 +94,19 @@ def _without_frozen(read: PositionReadings, what: str) -> tuple[PositionReadings
 
 
 def _stops_hard(t: np.ndarray, p: np.ndarray, k: int) -> bool:
-    """Whether the speed before fix k, with no speed after it, is an acceleration beyond _FROZEN_M_S2."""
+    """Whether stopping at fix k, from the speed before it, takes more than _MAX_ACCELERATION_M_S2."""
     if k < 1 or k + 1 >= len(t):
         return False
     speed = np.linalg.norm(p[k] - p[k - 1]) / (t[k] - t[k - 1])
-    return bool(speed > _FROZEN_M_S2 * (t[k + 1] - t[k]))
+    return bool(speed > _MAX_ACCELERATION_M_S2 * (t[k + 1] - t[k]))
 
 
 def _leaps(t: np.ndarray, p: np.ndarray, k: int) -> bool:
-    """Whether from standing still at fix k to the next one takes an acceleration beyond _FROZEN_M_S2."""
+    """Whether reaching the fix after k, from rest at k, takes more than _MAX_ACCELERATION_M_S2."""
     if k + 1 >= len(t):
         return False
     step, way = t[k + 1] - t[k], float(np.linalg.norm(p[k + 1] - p[k]))
-    return way > max(_FROZEN_M, 0.5 * _FROZEN_M_S2 * step**2)
+    return way > max(_MIN_LEAP_M, 0.5 * _MAX_ACCELERATION_M_S2 * step**2)
 
 
 def _without_singles(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:

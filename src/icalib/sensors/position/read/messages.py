@@ -16,7 +16,7 @@ COVARIANCE_UNKNOWN = 0
 
 
 def from_navsat(name: str, found: Iterable[tuple[int, Any]]) -> tuple[PositionReadings, np.ndarray]:
-    """Readings of sensor_msgs/NavSatFix, positions still to come, and (N, 3) latitude, longitude [deg], height [m]."""
+    """Readings of sensor_msgs/NavSatFix, not yet in metres; and latitude, longitude [deg], height [m] (N, 3)."""
     messages = list(found)
     stamps_ns = np.array([stamp for stamp, _ in messages], np.int64)
     degrees = np.array([(m.latitude, m.longitude, m.altitude) for _, m in messages]).reshape(-1, 3)
@@ -30,7 +30,7 @@ def from_navsat(name: str, found: Iterable[tuple[int, Any]]) -> tuple[PositionRe
 
 
 def from_positions(name: str, found: Iterable[tuple[int, Any]]) -> PositionReadings:
-    """Of PointStamped, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry."""
+    """Readings of PointStamped, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry."""
     stamps, positions, covariances = [], [], []
     for stamp, message in found:
         stamps.append(stamp)
@@ -57,7 +57,7 @@ def _point(message: Any) -> tuple[Any, Any]:
 
 
 def _usable(covariance: np.ndarray, known: np.ndarray, needed: np.ndarray) -> np.ndarray:
-    """The covariances (N, 3, 3), or none where not all that are `needed` (N,) are known and positive definite."""
+    """The covariances (N, 3, 3), or NO_COVARIANCE unless all that are `needed` (N,) are known and positive definite."""
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
     good = known & (np.linalg.eigvalsh(finite)[:, 0] > 0.0) if len(finite) else known

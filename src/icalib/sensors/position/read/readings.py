@@ -1,4 +1,4 @@
-"""Fixes as they were written, and as positions in metres about the first good one."""
+"""Fixes as recorded, and as positions in metres relative to the first good one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from icalib.sensors.position.spec import STATUSES, Status
 from icalib.sensors.stream import RawReadings
 
 NO_COVARIANCE = np.zeros((0, 3, 3))
-FAR_M = 20_000.0  # from the first fix: over more, "up" turns by 3 mrad, 0.03 m/s^2 of gravity
+MAX_DISTANCE_M = 20_000.0  # from the first fix: the vertical turns by 3 mrad, which is 0.03 m/s^2 of gravity
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class PositionReadings(RawReadings):
 
 
 def good_fixes(status: np.ndarray, least: Status, n: int) -> np.ndarray:
-    """(n,) whether fixes have a status (n,) of at least `least`; all where none is stated."""
+    """(n,) bool: which of n fixes have at least the status `least`; all of them if status, (n,) or (0,), is empty."""
     return status >= STATUSES.index(least) if len(status) else np.ones(n, dtype=bool)
 
 
@@ -72,10 +72,10 @@ def left_out(what: str, status: np.ndarray, good: np.ndarray, least: Status) -> 
 def from_geodetic(
     what: str, readings: PositionReadings, degrees: np.ndarray, good: np.ndarray
 ) -> tuple[PositionReadings, tuple[str, ...]]:
-    """The `readings`, whose covariances are in east, north and up, with positions in metres about the first of the
-    `good` (N,) ones. degrees (N, 3): latitude and longitude [deg], height over the ellipsoid [m].
+    """The `good` (N,) ones of `readings` in metres east, north and up of the first, and a note. Covariances are in
+    these axes already. degrees (N, 3): latitude and longitude [deg], height over the WGS84 ellipsoid [m].
 
-    Raises RecordingError where these can be none.
+    Raises RecordingError where latitudes, longitudes or heights cannot be right.
     """
     own = good & np.isfinite(degrees).all(axis=1) & (np.abs(degrees[:, :2]) > 1e-9).any(axis=1)
     _refuse_heights(what, degrees, good)
@@ -93,7 +93,7 @@ def from_geodetic(
     first = int(np.argmax(own))
     position, axes = local_metres(xyz, xyz[first])
     away = float(np.linalg.norm(position[own], axis=1).max())
-    if away > FAR_M:
+    if away > MAX_DISTANCE_M:
         raise RecordingError(
             f"{what}: its fixes are up to {away / 1e3:.0f} km from the first one; the plane of east and north does not "
             "follow the Earth so far. Cut the recording with --from and --to, or leave out fixes without a solution."
@@ -116,7 +116,8 @@ def _refuse_heights(what: str, degrees: np.ndarray, good: np.ndarray) -> None:
 
 
 def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings, tuple[str, ...]]:
-    """Metric positions about whole metres at the first one, where the origin of their frame is far away."""
+    """Positions in metres, and a note. If the origin of their frame is more than 100 m from the first one, they are
+    relative to this one, rounded to whole metres."""
     p = readings.position
     finite = np.isfinite(p).all(axis=1)
     if not finite.any():

@@ -29,10 +29,11 @@ _EPOCH_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class PosFile:
-    """stamps_ns (N,) int64, nanoseconds since 1970 of the file's own `scale` of time (GPST or UTC), leap seconds not
-    counted; kind: geodetic, earth or local; values (N, 3): latitude, longitude [deg], height [m], or Earth-centred or
-    local metres; covariance (N, 3, 3) m^2, of geodetic and local ones in east, north and up, or (0, 3, 3); status (N,)
-    index into `STATUSES`, -1: no fix."""
+    """stamps_ns (N,) int64: nanoseconds since 1970 in the file's `scale` of time, GPST or UTC, without leap seconds.
+
+    kind: geodetic, earth or local; values (N, 3): latitude, longitude [deg] and height [m], or Earth-centred or local
+    metres; covariance (N, 3, 3) m^2, for geodetic and local in axes east, north and up, or (0, 3, 3); status (N,) index
+    into `STATUSES`, -1: no fix."""
 
     stamps_ns: np.ndarray
     scale: str
@@ -43,7 +44,7 @@ class PosFile:
 
 
 def read_pos(path: Path) -> PosFile:
-    """Raises RecordingError naming file and line."""
+    """The solutions in a `.pos` file, which may be gzipped. Raises RecordingError naming file and line."""
     try:
         content = path.read_bytes()
         hash_of(path).saw(0, content)
@@ -93,13 +94,13 @@ def _kind(path: Path, header: str, names: list[str]) -> str:
             return kind
     shown = header.strip() or "there is no line that starts with % and names the columns"
     raise RecordingError(
-        f"{path}: the columns of an RTKLIB solution are not told ({shown:.80}); write the file with its header, with "
-        "latitude, longitude and height, or x, y and z."
+        f"{path}: the header does not name the columns of an RTKLIB solution ({shown:.80}); write the file with its "
+        "header, with latitude, longitude and height, or x, y and z."
     )
 
 
 def _stamp_ns(first: str, second: str) -> int:
-    """Of a date and a time, or of a week and seconds of GPS."""
+    """Nanoseconds since 1970 of the first two columns: date and time, or GPS week and seconds."""
     if "/" in first:
         year, month, day = (int(x) for x in first.split("/"))
         hours, minutes, seconds = second.split(":")
@@ -114,7 +115,7 @@ def _stamp_ns(first: str, second: str) -> int:
 
 
 def _in_degrees(values: list[float]) -> list[float]:
-    """The row with latitude and longitude in degrees, of degrees, minutes and seconds in three columns each."""
+    """The row with latitude and longitude [deg] from three columns each: degrees, minutes, seconds."""
     angles = []
     for k in (0, 3):
         degrees, minutes, seconds = values[k : k + 3]
@@ -124,8 +125,8 @@ def _in_degrees(values: list[float]) -> list[float]:
 
 
 def _covariance(table: np.ndarray, columns: list[str], kind: str) -> np.ndarray:
-    """(N, 3, 3) in east, north and up, or x, y and z; off the diagonal the file has roots with the sign of what they
-    are roots of."""
+    """(N, 3, 3) m^2 in axes east, north and up, or x, y and z; (0, 3, 3) where the file has none. Off the diagonal the
+    file has the signed root of the absolute covariance."""
     names = _SIGMAS[kind]
     if any(name not in columns or columns.index(name) >= table.shape[1] for name in names[:3]):
         return np.zeros((0, 3, 3))

@@ -14,7 +14,7 @@ from icalib.data.tables.table import named, read_table
 from icalib.sensors.position.read.readings import NO_COVARIANCE, PositionReadings
 from icalib.sensors.position.spec import PositionSensor
 
-RATE_HZ = (1e-2, 1000.0)
+FIX_RATES_HZ = (1e-2, 1000.0)  # lowest and highest: other rates show another unit of the stamps
 _SIGMA = r"(s|sd|std|stddev|sigma|std_dev)"
 METRIC = TableKind(
     ("t [ns]",),
@@ -25,7 +25,7 @@ METRIC = TableKind(
         (r"(p|pos|position|point|p_rs_r)_?y|y|north(ing)?|n",),
         (r"(p|pos|position|point|p_rs_r)_?z|z|up|u|height|h|altitude|alt",),
     ),
-    RATE_HZ,
+    FIX_RATES_HZ,
 )
 GEODETIC = TableKind(
     ("t [ns]",),
@@ -36,7 +36,7 @@ GEODETIC = TableKind(
         (r"lon(g|gitude)?(_deg)?",),
         (r"(ellipsoid(al)?_)?h(eight)?(_m)?|alt(itude)?(_m)?|hgt|hae",),
     ),
-    RATE_HZ,
+    FIX_RATES_HZ,
 )
 _DEVIATIONS = (
     (rf"{_SIGMA}_?(x|e|east)",),
