@@ -38,7 +38,7 @@ def whitened(factor, setup, state):
 def test_no_residual_at_the_truth(factor, setup):
     """Unwhitened, in rad, m/s, m."""
     _, out = whitened(factor, setup, setup.state)
-    np.testing.assert_allclose(np.linalg.solve(factor.made.W, out[..., None]), 0.0, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.solve(factor.increments.W, out[..., None]), 0.0, atol=1e-13)
 
 
 def test_residual_is_the_formula(factor, setup):
@@ -46,8 +46,8 @@ def test_residual_is_the_formula(factor, setup):
     cost, out = whitened(factor, setup, state)
     dx = state.values["imu0", "intrinsics"] - factor.intrinsics0
     for k, dt in enumerate(np.diff(state.seconds)):
-        change = factor.made.J[k] @ np.concatenate([state.bias[k] - factor.made.bias0[k], dx])
-        dR = factor.made.dR[k] @ Rotation.from_rotvec(change[:3]).as_matrix()
+        change = factor.increments.J[k] @ np.concatenate([state.bias[k] - factor.increments.bias0[k], dx])
+        dR = factor.increments.dR[k] @ Rotation.from_rotvec(change[:3]).as_matrix()
         Rt, v = state.rotation[k].T, state.velocity
         turn = Rotation.from_matrix(dR.T @ Rt @ state.rotation[k + 1]).as_rotvec()
         gained_v = Rt @ (v[k + 1] - v[k] - GRAVITY * dt)
@@ -55,12 +55,12 @@ def test_residual_is_the_formula(factor, setup):
         residual = np.concatenate(
             [
                 turn,
-                gained_v - factor.made.dv[k] - change[3:6],
-                gained_p - factor.made.dp[k] - change[6:],
+                gained_v - factor.increments.dv[k] - change[3:6],
+                gained_p - factor.increments.dp[k] - change[6:],
                 state.bias[k + 1] - state.bias[k],
             ]
         )
-        np.testing.assert_allclose(np.linalg.solve(factor.made.W[k], out[k]), residual, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(np.linalg.solve(factor.increments.W[k], out[k]), residual, rtol=0, atol=1e-13)
     assert cost == pytest.approx(0.5 * (out**2).sum(), rel=1e-13)
 
 
@@ -71,9 +71,9 @@ def test_residuals_are_whitened_with_the_covariance_of_the_increments(factor, se
         out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), J, P)
         by, room, bias = correction(factor.intrinsics0), integration_room(COVARIANCE_SIZE), tuple(setup.state.bias[k])
         integrate(t[k], t[k + 1], first, bias, readings_of(imu, False), by, room, out)
-        np.testing.assert_allclose(factor.made.W[k] @ P @ factor.made.W[k].T, np.eye(15), rtol=0, atol=1e-9)
-        assert (np.triu(factor.made.W[k], 1) == 0).all()
-        np.testing.assert_allclose(factor.made.J[k, :, :6], J, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(factor.increments.W[k] @ P @ factor.increments.W[k].T, np.eye(15), rtol=0, atol=1e-9)
+        assert (np.triu(factor.increments.W[k], 1) == 0).all()
+        np.testing.assert_allclose(factor.increments.J[k, :, :6], J, rtol=0, atol=1e-15)
 
 
 def test_corrections_by_bias_and_intrinsics_are_right_to_first_order(factor, setup):
@@ -87,6 +87,6 @@ def test_corrections_by_bias_and_intrinsics_are_right_to_first_order(factor, set
     for size in (1.0, 0.5):
         state = setup.state.retract(setup.layout, size * chain, size * calib)
         anew = ImuFactor.build(setup.imu, state, 9.81, factor.columns)
-        a, b = (np.linalg.solve(f.made.W, whitened(f, setup, state)[1][..., None]) for f in (factor, anew))
+        a, b = (np.linalg.solve(f.increments.W, whitened(f, setup, state)[1][..., None]) for f in (factor, anew))
         left.append(np.abs(a - b).max())
     assert 0.2 < left[1] / left[0] < 0.3

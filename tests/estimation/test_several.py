@@ -124,7 +124,7 @@ def test_nothing_is_known_across_the_seam(problem):
     chain = built.chain
     assert isinstance(chain, ImuFactor)
     k = state.starts[1]
-    W = chain.made.W
+    W = chain.increments.W
     assert not W[k - 1].any() and W[k - 2].any() and W[k].any()
     pieces, out = built.pieces(), built.residuals()
     built.linearise(state, pieces, out)

@@ -16,7 +16,7 @@ from icalib.errors import RecordingError, RigError
 from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels, by_name
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
 from icalib.sensors.camera.read import tracks as recorded_tracks
-from icalib.sensors.imu.read.imu_tables import IMU
+from icalib.sensors.imu.read.table_kinds import IMU
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.pose.read import readings as pose_readings
 from icalib.sensors.wheels.read import readings as wheel_readings

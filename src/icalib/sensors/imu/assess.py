@@ -1,4 +1,4 @@
-"""What a result keeps and says of the IMU: residuals of its intervals, its noise, and its gaps."""
+"""Assessment of the IMU in a result: residuals, and notes on noise, intrinsics and gaps."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from icalib.sensors.imu.spec import INTRINSICS_LABELS, class_of_sigma
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[ImuResiduals]:
-    """Of all intervals but those between recordings, which hold no data."""
+    """The record of all intervals between keyframes, without those between recordings, which have no data."""
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
     chain, state = found.problem.chain, found.outcome.state
-    seconds, seams = timeline.shown(state.seconds, state.recording)[:-1], np.array(chain.starts[1:], dtype=np.int64) - 1
+    seconds = timeline.shown(state.seconds, state.recording)[:-1]
+    between = np.array(chain.starts[1:], dtype=np.int64) - 1
     whitened = found.outcome.residuals[chain.key].residual
-    yield ImuResiduals(chain.name, np.delete(seconds, seams), np.delete(whitened, seams, axis=0))
+    yield ImuResiduals(chain.name, np.delete(seconds, between), np.delete(whitened, between, axis=0))
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """Its noise, the prior of its intrinsics, and gaps; or what is assumed in place of an IMU."""
+    """Notes on noise, prior of the intrinsics and gaps; without an IMU on the assumption of smooth motion."""
     imu = inputs.imu
     if imu is None:
         return
@@ -49,7 +50,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
 
 
 def _intrinsics_words(imu: ImuSensor) -> str:
-    """What was assumed of the IMU's scale and misalignment, where they are estimated; else empty."""
+    """A sentence on the prior of the intrinsics; empty if they have none."""
     if imu.intrinsics.mode != "prior" or imu.intrinsics.sigma is None:
         return ""
     sigma = dict(zip(INTRINSICS_LABELS, imu.intrinsics.sigma.tolist(), strict=True))
@@ -63,5 +64,5 @@ def _intrinsics_words(imu: ImuSensor) -> str:
 
 
 def misfit(imu: ImuSensor, f: SensorFit, is_noise: bool) -> str | None:
-    """Nothing: the noise of the IMU has tests of its own, as all other sensors depend on it."""
+    """None: `validation` tests the noise of the IMU by itself, as all other sensors depend on it."""
     return None

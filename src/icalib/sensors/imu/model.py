@@ -1,4 +1,4 @@
-"""How an IMU enters the problem: its intrinsics. Its readings tie the keyframes together, see `residual`."""
+"""The model of an IMU: its parameters are the intrinsics; the factor of its readings is in `residual`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from icalib.rig import ImuNoise, ImuSensor, Settings
 
 
 class ImuModel(SensorModel[ImuSensor, ImuNoise]):
-    """The IMU is the body: it has neither pose nor clock."""
+    """The IMU is the reference of poses and clocks, so that it has neither extrinsics nor a time offset."""
 
     def first_noise(self, sensor: ImuSensor, settings: Settings) -> ImuNoise:
-        """As stated."""
+        """See `SensorModel`; the noise of the rig file."""
         del settings
         return sensor.noise
 

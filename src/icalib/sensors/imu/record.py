@@ -1,4 +1,4 @@
-"""Residuals of the IMU."""
+"""The record of IMU residuals in a result."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 
 from icalib.sensors.records import Shapes, Successive, successive_rows
 
-# Of columns of residuals, three each.
+# Names of the blocks of three columns of the residuals.
 BLOCKS = ("rotation", "velocity", "position", "gyroscope walk", "accelerometer walk")
 
 
 @dataclass(frozen=True)
 class ImuResiduals:
-    """Whitened residuals of the IMU factor, one row an interval between keyframes.
+    """Whitened residuals of the IMU factor, a row per interval between keyframes.
 
     Columns: rotation, velocity, position, gyroscope walk, accelerometer walk, three each.
     """
@@ -28,11 +28,11 @@ class ImuResiduals:
     whitened: np.ndarray  # (K - 1, 15)
 
     def normalised(self) -> dict[str, np.ndarray]:
-        """Nothing: states between two keyframes follow the IMU, so that residuals are smaller than their noise."""
+        """Empty: the trajectory follows the IMU, so that residuals are smaller than their noise."""
         return {}
 
     def successive(self) -> dict[str, Successive]:
-        """By what is integrated, or walks; each interval follows the one before."""
+        """Successive residuals by block; each interval follows the one before."""
         return successive_rows(BLOCKS, self.whitened)
 
 

@@ -1,4 +1,8 @@
-"""The IMU factor: readings between neighbouring keyframes, preintegrated once (paper (16)-(19))."""
+"""The IMU factor: readings between neighbouring keyframes, preintegrated once (the paper's (16)-(19)).
+
+Rows of an interval: rotation 3 [rad], velocity 3 [m/s], position 3 [m], change of gyroscope bias 3 [rad/s] and of
+accelerometer bias 3 [m/s^2]; see `ImuFactor`.
+"""
 
 from __future__ import annotations
 
@@ -20,22 +24,24 @@ from icalib.optim.prior_factor import accumulate_bias_prior
 from icalib.optim.rows import KEYFRAME_PAIR_DIM, add_product, whiten
 from icalib.optim.state import KEYFRAME_DIM, State
 
-ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
-KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS)}
+N_ROWS = 15  # of an interval
+KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, N_ROWS)}
 
 
 @njit(cache=True, nogil=True)
 def _preintegrate(k0, k1, keyframes, first, readings, bias, intrinsics, dR, dv, dp, J, W):
-    """Increments, bias (and intrinsics) Jacobians and inverse Cholesky factor W of the covariance, intervals k0..k1."""
-    P, by, room = np.empty((ROWS, ROWS)), correction(intrinsics), integration_room(COVARIANCE_SIZE)
+    """Fills the fields of `Increments` of intervals k0 to k1 - 1; keyframes (K,) s; first (K - 1,): the reading at the
+    start of each interval."""
+    P, corrected, workspace = np.empty((N_ROWS, N_ROWS)), correction(intrinsics), integration_room(COVARIANCE_SIZE)
     for k in range(k0, k1):
         out = Increment(dR[k], dv[k], dp[k], J[k], P)
-        integrate(keyframes[k], keyframes[k + 1], first[k], bias_of(bias, k), readings, by, room, out)
+        integrate(keyframes[k], keyframes[k + 1], first[k], bias_of(bias, k), readings, corrected, workspace, out)
         inverse_cholesky(P, W[k])
 
 
 class Chain(NamedTuple):
-    """The keyframes: R_world_imu (K, 3, 3), p, v (K, 3), biases (K, 6), seconds (K,); gravity m/s^2."""
+    """States of K keyframes: R_world_imu (K, 3, 3), p [m] and v [m/s] (K, 3) in the world, biases b (K, 6), seconds
+    (K,); gravity [m/s^2]."""
 
     R: np.ndarray
     p: np.ndarray
@@ -46,8 +52,11 @@ class Chain(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """Preintegrated intervals (K - 1, ...): rotation, velocity, position; their Jacobians J (9, 6 or 30) by biases and
-    intrinsics, the inverse Cholesky factor W (15, 15), the biases that they were made with."""
+    """K - 1 preintegrated intervals, in the axes of their first keyframe.
+
+    dR (K - 1, 3, 3), dv [m/s], dp [m] (K - 1, 3), at the biases bias0 (K, 6); J (K - 1, 9, 6 or 30): their Jacobians by
+    biases and intrinsics; W (K - 1, 15, 15): inverse Cholesky factor of the covariance, which whitens the rows.
+    """
 
     dR: np.ndarray
     dv: np.ndarray
@@ -58,19 +67,20 @@ class Increments(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _correction(k, chain, made, dx, change):
-    """change (9,): the increments' by biases and intrinsics `dx` other than those that they were made with."""
+def _bias_correction(k, chain, increments, dx, change):
+    """Fills change (9,): of the increment of interval k, to first order in the changes of the biases and of the
+    intrinsics, dx (24 or 0,), since preintegration."""
     for i in range(9):
         change[i] = 0.0
         for j in range(6):
-            change[i] += made.J[k, i, j] * (chain.b[k, j] - made.bias0[k, j])
+            change[i] += increments.J[k, i, j] * (chain.b[k, j] - increments.bias0[k, j])
         for j in range(len(dx)):
-            change[i] += made.J[k, i, 6 + j] * dx[j]
+            change[i] += increments.J[k, i, 6 + j] * dx[j]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _motion(k, chain):
-    """R_k^T R_k+1, and velocity and position gained without gravity, in the axes of keyframe k."""
+def _state_change(k, chain):
+    """R_k^T R_k+1, and changes of velocity and position over interval k without gravity, in the axes of keyframe k."""
     R0, dt, g = chain.R[k], chain.seconds[k + 1] - chain.seconds[k], chain.gravity
     mv, mp, hv, hp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
@@ -85,26 +95,26 @@ def _motion(k, chain):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _residual(k, chain, made, change, R01, hv, hp, r):
-    """r (15,) = predicted - measured of interval k, not whitened."""
-    error = so3.log(tmul3(so3.exp(change[:3]), tmul3(made.dR[k], R01)))
+def _residual(k, chain, increments, change, R01, hv, hp, r):
+    """Fills r (15,) = predicted - measured of interval k, not whitened."""
+    error = so3.log(tmul3(so3.exp(change[:3]), tmul3(increments.dR[k], R01)))
     for i in range(3):
         r[i] = error[i]
-        r[3 + i] = hv[i] - made.dv[k, i] - change[3 + i]
-        r[6 + i] = hp[i] - made.dp[k, i] - change[6 + i]
+        r[3 + i] = hv[i] - increments.dv[k, i] - change[3 + i]
+        r[6 + i] = hp[i] - increments.dp[k, i] - change[6 + i]
     for i in range(6):
         r[9 + i] = chain.b[k + 1, i] - chain.b[k, i]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _jacobians(k, chain, made, change, R01, hv, hp, r, J):
-    """J (15, 30 + 24 or 0): d r / d keyframe k, d r / d keyframe k + 1, d r / d intrinsics. What no interval changes is
-    there already: 1 and -1 of the biases, zeros."""
+def _jacobians(k, chain, increments, change, R01, hv, hp, r, J):
+    """Fills J (15, 30 + 24 or 0) of r by keyframe k, keyframe k + 1 and intrinsics. The caller has set the constant
+    entries, zeros and the 1 and -1 of the biases."""
     Jr_inv, R0 = so3.right_jacobian_inverse(r[:3]), chain.R[k]
-    turned, J_v, J_p = mul3(Jr_inv, tmul3(chain.R[k + 1], R0)), so3.hat(hv), so3.hat(hp)
+    J_first, J_v, J_p = mul3(Jr_inv, tmul3(chain.R[k + 1], R0)), so3.hat(hv), so3.hat(hp)
     for i in range(3):
         for j in range(3):
-            J[i, j], J[3 + i, j], J[6 + i, j] = -turned[i, j], J_v[i, j], J_p[i, j]
+            J[i, j], J[3 + i, j], J[6 + i, j] = -J_first[i, j], J_v[i, j], J_p[i, j]
             J[3 + i, 6 + j], J[6 + i, 3 + j] = -R0[j, i], -R0[j, i]
             J[6 + i, 6 + j] = (chain.seconds[k] - chain.seconds[k + 1]) * R0[j, i]
             J[i, KEYFRAME_DIM + j], J[3 + i, KEYFRAME_DIM + 6 + j], J[6 + i, KEYFRAME_DIM + 3 + j] = (
@@ -112,42 +122,43 @@ def _jacobians(k, chain, made, change, R01, hv, hp, r, J):
                 R0[j, i],
                 R0[j, i],
             )
-    J_turn = mul3(Jr_inv, tmul3(so3.exp(r[:3]), so3.right_jacobian(change[:3])))
+    J_change = mul3(Jr_inv, tmul3(so3.exp(r[:3]), so3.right_jacobian(change[:3])))
     for i in range(3):
         for j in range(6 + J.shape[1] - KEYFRAME_PAIR_DIM):
-            turn = 0.0
+            J_rotation = 0.0
             for m in range(3):
-                turn -= J_turn[i, m] * made.J[k, m, j]
+                J_rotation -= J_change[i, m] * increments.J[k, m, j]
             c = 9 + j if j < 6 else KEYFRAME_PAIR_DIM + j - 6
-            J[i, c] = turn
-            J[3 + i, c], J[6 + i, c] = -made.J[k, 3 + i, j], -made.J[k, 6 + i, j]
+            J[i, c] = J_rotation
+            J[3 + i, c], J[6 + i, c] = -increments.J[k, 3 + i, j], -increments.J[k, 6 + i, j]
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(k1, chain, made, dx, columns, sums, out):
-    """Adds intervals from `sums.first` to k1 to the normal equations; whitened residuals into out (K - 1, 15).
+def _accumulate(k1, chain, increments, dx, columns, sums, out):
+    """Adds intervals `sums.first` to k1 - 1 to the normal equations, and fills whitened residuals out (K - 1, 15).
 
-    dx, columns (24 or 0,): change and calibration columns of the intrinsics. Returns half the chi^2.
+    dx, columns (24 or 0,): changes of the intrinsics since preintegration, and their calibration columns. Returns half
+    the chi^2. Without sums (empty arrays) only the residuals are filled.
     """
     width = KEYFRAME_PAIR_DIM + len(columns)
-    r, change, J, whitened = np.zeros(ROWS), np.zeros(9), np.zeros((ROWS, width)), np.empty((ROWS, width + 1))
-    for i in range(9, ROWS):
+    r, change, J, whitened = np.zeros(N_ROWS), np.zeros(9), np.zeros((N_ROWS, width)), np.empty((N_ROWS, width + 1))
+    for i in range(9, N_ROWS):
         J[i, i], J[i, KEYFRAME_DIM + i] = -1.0, 1.0
-    wanted = len(sums.diagonal) > 0
+    with_sums = len(sums.diagonal) > 0
     cost = 0.0
     for k in range(sums.first, k1):
-        R01, hv, hp = _motion(k, chain)
-        _correction(k, chain, made, dx, change)
-        _residual(k, chain, made, change, R01, hv, hp, r)
-        for i in range(ROWS):
+        R01, hv, hp = _state_change(k, chain)
+        _bias_correction(k, chain, increments, dx, change)
+        _residual(k, chain, increments, change, R01, hv, hp, r)
+        for i in range(N_ROWS):
             s = 0.0
             for m in range(i + 1):
-                s += made.W[k, i, m] * r[m]
+                s += increments.W[k, i, m] * r[m]
             out[k, i] = whitened[i, width] = s
             cost += 0.5 * s * s
-        if wanted:
-            _jacobians(k, chain, made, change, R01, hv, hp, r, J)
-            whiten(made.W[k], J, whitened)
+        if with_sums:
+            _jacobians(k, chain, increments, change, R01, hv, hp, r, J)
+            whiten(increments.W[k], J, whitened)
             add_product(k - sums.first, KEYFRAME_PAIR_DIM, width, whitened, whitened, columns, sums)
     return cost
 
@@ -156,15 +167,20 @@ def _accumulate(k1, chain, made, dx, columns, sums, out):
 class ImuFactor(RowFactor):
     """All intervals of one IMU between neighbouring keyframes.
 
-    residual (15,) of interval k: Log((dR Exp(J_R db))^T R_k^T R_k+1); R_k^T (v_k+1 - v_k - g dt) - dv - J_v db;
-    R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db; b_k+1 - b_k, whitened jointly. The interval before each of
-    `starts`, recordings' first keyframes, carries no information.
+    The residual (15,) of interval k, whitened jointly, with db the change of the biases since preintegration:
+
+        Log((dR Exp(J_R db))^T R_k^T R_k+1)
+        R_k^T (v_k+1 - v_k - g dt) - dv - J_v db
+        R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db
+        b_k+1 - b_k
+
+    starts: first keyframe of each recording; the intervals before them carry no information.
     """
 
     imu: ImuData
     gravity: float
     columns: np.ndarray  # (24,) calibration columns of the intrinsics, or (0,) where they are fixed
-    made: Increments
+    increments: Increments
     intrinsics0: np.ndarray
     starts: tuple[int, ...] = (0,)
 
@@ -183,26 +199,26 @@ class ImuFactor(RowFactor):
 
     @property
     def n_keyframes(self) -> int:
-        return len(self.made.dR) + 1
+        return len(self.increments.dR) + 1
 
     def output(self) -> Whitened:
-        """Empty rows (K - 1, 15) for `accumulate` to fill."""
-        return Whitened.without_loss(self.n_keyframes - 1, ROWS)
+        """See `Factor`; K - 1 rows of 15."""
+        return Whitened.without_loss(self.n_keyframes - 1, N_ROWS)
 
     def count(self, out: Whitened, kind: str) -> int:
-        """Rows of a kind, without those of intervals between recordings."""
+        """See `RowFactor`; intervals between recordings do not count."""
         rows = out.residual[:, self.kinds[kind]]
         return rows.size - (len(self.starts) - 1) * rows.shape[1]
 
     def times(self, state: State) -> np.ndarray:
-        """(K - 1,) the keyframe at which each interval starts."""
+        """(K - 1,) s, of the keyframe at which each interval starts."""
         return state.seconds[:-1]
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """The broad prior on the biases of the recordings' first keyframes in `piece`, about those of the pass's start.
-        Returns half its chi^2."""
+        """Adds the broad prior on the biases at the first keyframes of recordings in `piece`, about those at the start
+        of the pass. Returns half its chi^2."""
         own = [k for k in self.starts if piece.first <= k < piece.last]
-        return sum(accumulate_bias_prior(state, piece, sums, self.made.bias0[k], k) for k in own)
+        return sum(accumulate_bias_prior(state, piece, sums, self.increments.bias0[k], k) for k in own)
 
     @classmethod
     def build(cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray) -> ImuFactor:
@@ -214,7 +230,7 @@ class ImuFactor(RowFactor):
             np.empty((n, 3)),
             np.empty((n, 3)),
             memory.mmap_zeros((n, 9, width)),
-            memory.mmap_zeros((n, ROWS, ROWS)),
+            memory.mmap_zeros((n, N_ROWS, N_ROWS)),
         )
         bias0 = state.bias.copy()
         intrinsics = state.values[imu.name, "intrinsics"].copy()
@@ -229,13 +245,13 @@ class ImuFactor(RowFactor):
         seams = np.array(state.starts[1:], dtype=np.int64) - 1
         dR, _, _, _, W = arrays
         W[seams] = 0.0
-        # As if met: the logarithm of a rotation that means nothing could lie where it has no derivative.
+        # Zero residual between recordings: Log of an arbitrary rotation may have no derivative.
         dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
         return cls(imu, gravity, columns, Increments(*arrays, bias0), intrinsics, state.starts)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `Factor`. There is no robust loss, so `curved` changes nothing."""
+        """See `Factor`; `curved` has no effect, as there is no robust loss."""
         del curved
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0 if len(self.columns) else np.zeros(0)
         chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, self.gravity)
-        return _accumulate(piece.last, chain, self.made, dx, self.columns, piece.sums(sums), out.residual)
+        return _accumulate(piece.last, chain, self.increments, dx, self.columns, piece.sums(sums), out.residual)

@@ -1,4 +1,4 @@
-"""What the report shows of the IMU: its residuals."""
+"""The IMU in the report: its residuals."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _WORDS = (
 
 
 def sections(c: Calibration) -> Iterator[Section]:
-    """Residuals of the intervals between keyframes."""
+    """The section with the residuals of the intervals between keyframes."""
     if c.imu is not None:
         figures = {"imu-residuals": motion_figures.imu_residuals(c)}
         yield Section("inertial", "IMU residuals", _WORDS, plot_place("imu-residuals"), figures)
 
 
 def curves(r: ImuResiduals) -> Iterator[ResidualCurve]:
-    """Whitened residuals of the intervals, three axes each."""
+    """A curve of whitened residuals (n, 3) for each block of the record."""
     for b, block in enumerate(motion_figures.BLOCKS):
         yield ResidualCurve(block, r.seconds, r.whitened[:, 3 * b : 3 * b + 3], ("x", "y", "z"))

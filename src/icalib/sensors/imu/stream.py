@@ -1,4 +1,4 @@
-"""What an IMU measured."""
+"""The stream of an IMU."""
 
 from __future__ import annotations
 

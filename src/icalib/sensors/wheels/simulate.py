@@ -22,7 +22,7 @@ from icalib.tools.simulation.scenario.room import Room
 from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
-_GAUSS = np.polynomial.legendre.leggauss(3)  # nodes and weights on [-1, 1]
+_GAUSS = np.polynomial.legendre.leggauss(3)  # points and weights on [-1, 1]
 _MAX_STEERING_RAD = 1.3  # of front wheels; those of a car reach 0.7
 _SUBSTEPS = 12  # of an interval of (27), over which its noise is integrated
 _CHUNK = 100_000  # instants at a time: motion and its derivatives take 2 kB each

@@ -13,7 +13,7 @@ from icalib.data.tables.table import holds, read_table
 from icalib.data.topics import MessageType
 from icalib.sensors.imu.read.checks import checked_imu
 from icalib.sensors.imu.read.halves import ImuHalf, ImuHalves, both, imu_source, one_stream, values_of
-from icalib.sensors.imu.read.imu_tables import IMU, IMU_ACCEL, IMU_GYRO
+from icalib.sensors.imu.read.table_kinds import IMU, IMU_ACCEL, IMU_GYRO
 from icalib.sensors.imu.spec import ImuSensor, TwoSources
 from icalib.sensors.imu.stream import ImuStream
 from icalib.sensors.sensor import TableLayout

@@ -11,7 +11,7 @@ from icalib.data.stamps.ordered import kept_readings, longest_run
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
 from icalib.sensors.imu.read.cleaning import in_time, without_wrong
-from icalib.sensors.imu.read.imu_tables import RATE_HZ
+from icalib.sensors.imu.read.table_kinds import RATE_HZ
 from icalib.sensors.imu.read.units import in_si, recognised_unit
 
 _SATURATED_RUN = 5

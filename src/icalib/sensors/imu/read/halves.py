@@ -14,7 +14,7 @@ from icalib.data.stamps.ordered import kept_readings
 from icalib.data.topics import TopicInfo, choose_topic
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor, TwoSources
-from icalib.sensors.imu.read.imu_tables import RATE_HZ
+from icalib.sensors.imu.read.table_kinds import RATE_HZ
 
 _LOOKED_AT = 50  # readings that tell which sensor a topic carries; a driver leaves the other at zero or NaN
 _LEAST_COMMON_S = 1.0
