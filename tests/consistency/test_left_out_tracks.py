@@ -52,9 +52,9 @@ def passes(inputs, found, turned_deg: float):
 def test_tracks_that_a_wrong_pose_left_out_come_back(settled):
     inputs, found = settled
     again, begun = passes(inputs, found, 15.0)
-    assert begun[0].followed < 0.5 * features_of(found.problem).followed
+    assert begun[0].n_used < 0.5 * features_of(found.problem).n_used
     assert len(begun) == 2
-    assert features_of(again.problem).followed >= 0.99 * features_of(found.problem).followed
+    assert features_of(again.problem).n_used >= 0.99 * features_of(found.problem).n_used
     way = so3.log(
         np.ascontiguousarray(
             found.outcome.state.values["cam0", "rotation"].T @ again.outcome.state.values["cam0", "rotation"]
@@ -67,6 +67,4 @@ def test_where_enough_take_part_there_is_one_pass(settled):
     inputs, found = settled
     again, begun = passes(inputs, found, 0.5)
     assert len(begun) == 1
-    assert features_of(again.problem).followed > ENOUGH_USED * sum(
-        int(k.sum()) for k in features_of(again.problem).keep
-    )
+    assert features_of(again.problem).n_used > ENOUGH_USED * sum(int(k.sum()) for k in features_of(again.problem).keep)

@@ -64,8 +64,8 @@ def moved(problem: Problem, by: list[np.ndarray]) -> Problem:
 
 
 def image_cells(problem: Problem) -> tuple[FeatureFactor, dict[FactorKey, Any]]:
-    (features,) = of_type(problem.factors, FeatureFactor)
-    return features, cells_of(of_type(problem.factors, CornerFactor), (features,))
+    features = of_type(problem.factors, FeatureFactor)
+    return features[0], cells_of(of_type(problem.factors, CornerFactor), features)
 
 
 def test_the_gradient_of_a_cell_is_what_its_residuals_change(solved: tuple[Problem, Outcome]):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icalib.optim.arrowhead import make_pieces
-from icalib.sensors.camera.features.kernels import FARTHEST_M
+from icalib.sensors.camera.features.kernels import MAX_DISTANCE_M
 from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.features.statistics import FeatureOutput
 from icalib.tools.simulation import handheld, simulate
@@ -63,7 +63,7 @@ def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
     for view in views:
         own = np.flatnonzero((factor.tracks.track[view.index] == track) & factor.keep[view.index])
         assert np.abs(out.residual[view.index][own]).max(initial=0.0) < 0.02
-    assert np.linalg.norm(out.points[track]) == pytest.approx(FARTHEST_M, rel=1e-6)
+    assert np.linalg.norm(out.points[track]) == pytest.approx(MAX_DISTANCE_M, rel=1e-6)
 
 
 def test_coarse_noise_is_as_large_as_most_errors_and_no_less_than_stated(factor, setup):
@@ -84,8 +84,8 @@ def test_none_is_followed_where_every_other_image_looks_away(factor, setup):
     """As where a first motion is wrong: no point is seen by all images of its track, and there is no usual misfit."""
     rotation = setup.state.rotation.copy()
     rotation[::2] = rotation[::2] @ np.diag([-1.0, 1.0, -1.0])
-    assert factor.followed > 0
-    assert factor.cut(replace(setup.state, rotation=rotation), ()).followed == 0
+    assert factor.n_used > 0
+    assert factor.cut(replace(setup.state, rotation=rotation), ()).n_used == 0
 
 
 def test_settled_features_are_where_they_were(factor, setup):

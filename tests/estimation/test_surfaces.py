@@ -9,7 +9,7 @@ import pytest
 
 from icalib.motion.clouds import Clouds
 from icalib.optim.arrowhead import make_pieces
-from icalib.sensors.camera.features.surfaces import CELL_M, PATCH_M, REACH_M, Surfaces, most_alike
+from icalib.sensors.camera.features.surfaces import CELL_M, MAX_PLANE_DISTANCE_M, PATCH_M, Surfaces, most_alike
 from icalib.sensors.lidar.binning import points_on_planes
 from icalib.tools.simulation import handheld, simulate
 
@@ -79,7 +79,7 @@ def test_points_that_are_all_off_by_as_much_are_found(surfaces, seen):
 
 def test_points_that_are_anywhere_lie_on_nothing(surfaces, seen):
     rng, (points, _) = np.random.default_rng(2), seen
-    scattered = points + rng.uniform(-REACH_M, REACH_M, points.shape)
+    scattered = points + rng.uniform(-MAX_PLANE_DISTANCE_M, MAX_PLANE_DISTANCE_M, points.shape)
     assert (under(surfaces, scattered) >= 0).mean() < 0.02
 
 

@@ -17,15 +17,17 @@ from icalib.rig import scene
 from icalib.rig.scene import BOW_LABELS, IN_PLANE_LABELS, SHAPE_LABELS
 
 SIZE: Key = (BOARD, scene.SIZE.name)  # (1,) true lengths over those of the target as stated
-# Priors: boards are flat to a few millimetres, and printed true to about one.
+# Standard deviations of the prior: boards are flat to a few millimetres, and printed to about one.
 SHAPE_SIGMA_M = np.array([3e-3] * len(BOW_LABELS) + [1e-3] * len(IN_PLANE_LABELS))
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """used: indices of the target's bodies that are estimated, the reference first; left_out: those that were seen, but
-    too seldom with others; bent: whether bodies may bend; size: of each body, in what the target says. sized: whether
-    the size is a parameter of its own, on which `size` is a factor."""
+    """The bodies of a target that are in use.
+
+    used: their indices, the reference first; left_out: bodies that were seen, but in too few images with others; bent:
+    whether their shapes are estimated; size: true lengths over those of the target; sized: whether a factor on `size`
+    is a parameter as well."""
 
     target: Target
     used: tuple[int, ...]
@@ -40,7 +42,7 @@ class Bodies:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of those in use."""
+        """Names of the bodies in use."""
         return tuple(self.target.bodies[k] for k in self.used)
 
     @property
@@ -50,31 +52,31 @@ class Bodies:
 
     @cached_property
     def basis(self) -> np.ndarray:
-        """(n_points, s, 3) displacement of each point by unit of its body's shape parameters, in the body's frame."""
+        """(n_points, s, 3) m: displacement of each point, in its body's frame, by unit of its shape parameters."""
         return shape_basis(self.target, self.bent)
 
     @cached_property
     def deformation(self) -> np.ndarray:
-        """(n_points, s or s + 1, 3) `basis`, and after it by unit of the size where it is a parameter."""
+        """(n_points, s or s + 1, 3) m: `basis`, then displacement by unit of the size, if that is a parameter."""
         grown = self.size * self.target.points[:, None, :]
         return np.concatenate([self.basis, grown], axis=1) if self.sized else self.basis
 
     def size_entries(self) -> list[Entry]:
-        """The block of a layout for the size of all bodies together."""
+        """Entry of the size, which all bodies share, in a layout; empty if it is no parameter."""
         return [scene.SIZE.entry(BOARD)] if self.sized and self.used else []
 
     def shape_entries(self) -> list[Entry]:
-        """Blocks of a layout for how bodies bend."""
+        """Entries of the shapes of bending bodies in a layout."""
         return [scene.SHAPE.entry(name) for name in self.bending]
 
     def pose_entries(self) -> list[Entry]:
-        """Blocks of a layout for poses in the scene, the reference's fixed; none where there is one body only."""
+        """Entries of the poses in the scene in a layout, that of the reference fixed; empty for one body."""
         names = self.names if self.several else ()
         return [spec.entry(name, name != self.names[0]) for name in names for spec in scene.BODY]
 
     def columns(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Border columns of each of the target's bodies: pose (n, 6, or 0 where only one is in use), and shape and size
-        as in `deformation` (n, s or s + 1), -1 where there are none."""
+        """Calibration columns of all bodies of the target, -1 where there are none: of the pose (n, 6, or 0 if only one
+        is in use), and of shape and size (n, s or s + 1) as in `deformation`."""
         names, n = self.target.bodies, len(self.target.bodies)
         pose, shape = np.full((n, 6 if self.several else 0), -1), np.full((n, self.deformation.shape[1]), -1)
         for k in self.used if self.several else ():

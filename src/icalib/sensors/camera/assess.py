@@ -1,4 +1,4 @@
-"""What a result keeps and says of cameras: corners, tracked points, and how well both fit."""
+"""Residuals of cameras that a result keeps, and notes and warnings about corners and feature tracks."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.sensors.camera.model import CameraNoise
 
-MOST_NAMED = 10  # images
-GROWN_VIEWS = 10  # after which the noise of tracks is told once more
-POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images by half
-MANY_REJECTED = 0.05  # of the corners or tracks of a camera
-FEW_ON_PLANES = 0.1  # of the tracks: rough walls have as many where they should have two thirds
+MAX_NAMED_IMAGES = 10  # in a sentence
+N_LATER_VIEWS = 10  # after which the noise of tracks is told once more
+POOR_CORNER_RMS_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images by half
+MANY_REJECTED_SHARE = 0.05  # of the corners or tracks of a camera
+FEW_ON_PLANES_SHARE = 0.1  # of the tracks: rough walls have as many where they should have two thirds
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[CornerResiduals | TrackResiduals]:
-    """Corners of each camera; then tracked points of each, where there are any."""
+    """Residuals of the corners of each camera; then of the tracks of each, if there are any."""
     yield from _corner_residuals(found, timeline)
     yield from _track_residuals(found, timeline)
 
 
 def _corner_residuals(found: Estimate, timeline: Timeline) -> Iterator[CornerResiduals]:
-    """By camera; those that saw no target have no corners in any image."""
+    """By camera; one that saw no target has images without corners."""
     for i, (camera, corners) in enumerate(pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)):
         stream = camera.stream
         yield CornerResiduals(
@@ -53,7 +53,7 @@ def _corner_residuals(found: Estimate, timeline: Timeline) -> Iterator[CornerRes
 
 
 def _track_residuals(found: Estimate, timeline: Timeline) -> Iterator[TrackResiduals]:
-    """By camera, where any of them tracks points."""
+    """By camera, if there are tracks."""
     pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
     if not pairs:
         return
@@ -76,13 +76,13 @@ def _track_residuals(found: Estimate, timeline: Timeline) -> Iterator[TrackResid
 
 
 def _seconds(found: Estimate, timeline: Timeline, index: int) -> np.ndarray:
-    """(M,) of the images of a camera."""
+    """(M,) s: instants of the images of camera number `index`, as the result shows them."""
     stream = of_type(found.problem.factors, CornerFactor)[index].stream
     return timeline.shown(instants(stream, found.outcome.state.values), timeline.recordings_of(stream.key))
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """Noise and outliers of corners and tracks, and images that are left out."""
+    """Sentences on noise and outliers of corners and tracks, and on images that are left out."""
     if words := words_on_left_out(inputs.bodies):
         yield words
     factors = of_type(found.problem.factors, CornerFactor)
@@ -96,7 +96,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
 
 
 def _outside_imu_notes(inputs: Inputs, found: Estimate, factors: Sequence[CornerFactor]) -> Iterator[str]:
-    """Of images that were taken while the IMU was not running."""
+    """Sentences on images that were taken while the IMU was not running."""
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
     for camera in factors:
@@ -136,8 +136,8 @@ def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> 
             first_of.setdefault(keyframe, camera.stream.which(stamp))
     if not first_of:
         return ""
-    named = ", ".join(first_of[keyframe] for keyframe in sorted(first_of)[:MOST_NAMED])
-    which = f", the first {MOST_NAMED}" if len(first_of) > MOST_NAMED else ""
+    named = ", ".join(first_of[keyframe] for keyframe in sorted(first_of)[:MAX_NAMED_IMAGES])
+    which = f", the first {MAX_NAMED_IMAGES}" if len(first_of) > MAX_NAMED_IMAGES else ""
     return (
         f"{len(first_of)} sets of images of {' and '.join(names)} were not exposed together, or the rig moved between, "
         f"and are left out{which}: {named}."
@@ -187,18 +187,18 @@ def _feature_notes(found: Estimate) -> Iterator[str]:
         share = f"{int((root > 0.0).sum())} of {len(stream.uv)}"
         grows = ""
         if noise.growth > 0.0:
-            last = float(noise.sigma * np.sqrt(1.0 + noise.growth * GROWN_VIEWS))
-            grows = f" in the first view, {last:.3f} px after {GROWN_VIEWS} more"
+            last = float(noise.sigma * np.sqrt(1.0 + noise.growth * N_LATER_VIEWS))
+            grows = f" in the first view, {last:.3f} px after {N_LATER_VIEWS} more"
         yield f"{camera.name}: track noise {noise.sigma:.3f} px{grows}; {share} observations of tracks are in use."
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where tracked points do not lie on planes that they should lie on."""
+    """Sentences on tracked points that should lie on planes of LiDARs, and do not."""
     yield from plane_warnings(inputs.rig, found.problem.factors)
 
 
 def plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[str]:
-    """Where points should lie on planes, and none do, or so few that it may be chance."""
+    """A sentence if points should lie on planes, and none do, or so few that it may be chance."""
     if rig.settings.points_on_planes_m == 0.0:
         return
     features = of_type(factors, FeatureFactor)
@@ -208,7 +208,7 @@ def plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[st
             "no tracked points lie on planes of the LiDARs, so points_on_planes_m in the rig file has no effect; make "
             "it larger, or remove it if little is flat."
         )
-    elif on < FEW_ON_PLANES * tracks:
+    elif on < FEW_ON_PLANES_SHARE * tracks:
         yield (
             f"only {on} of the {tracks} tracks that cameras follow lie on planes of the LiDARs, so few that it may be "
             "chance; make points_on_planes_m in the rig file larger, or take it out where little is flat."
@@ -216,15 +216,15 @@ def plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[st
 
 
 def rejected_words(f: SensorFit) -> str | None:
-    """A sentence where many corners or tracks of a camera are rejected."""
-    if f.kind not in ("corners", "features") or f.rejected <= MANY_REJECTED * 0.5 * f.count:
+    """A sentence if many corners or tracks of a camera are rejected."""
+    if f.kind not in ("corners", "features") or f.rejected <= MANY_REJECTED_SHARE * 0.5 * f.count:
         return None
     share = f.rejected / (f.rejected + 0.5 * f.count)
     return f"{share:.0%} of the {f.kind} of {f.sensor} are rejected as outliers; look at its residuals in the report."
 
 
 def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> str | None:
-    """A sentence where corners, or points on planes, leave more than is stated, or than detectors are off by."""
+    """A sentence if residuals of corners or of points on planes exceed the stated noise, or any detector's."""
     if f.kind == ON_PLANES and excess(f) > 1.0:
         return (
             f"tracked points of {f.sensor} lie {times(f)} farther from planes of the LiDARs than points_on_planes_m "
@@ -232,7 +232,7 @@ def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> str | None:
         )
     if f.kind != "corners":
         return None
-    if f.rms is not None and f.rms > POOR_FIT_PX:
+    if f.rms is not None and f.rms > POOR_CORNER_RMS_PX:
         return (
             f"the corners of {f.sensor} fit to {f.rms:.1f} px only, ten times the error of a detector, and the cause "
             "is unknown. Check its camera model, fixed intrinsics, its topic, the target in the rig file, jumps of its "
@@ -248,7 +248,7 @@ def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def length(camera: Camera, rig: Rig) -> str | None:
-    """What shows how long a metre is: a translation that the rig file states."""
+    """The source of the scale: a translation that the rig file states; None without one."""
     p = camera.translation
     stated = camera.name != rig.reference and p.mode != "free" and p.value is not None and bool(np.any(p.value))
     return f"the stated translation of {camera.name}" if stated else None

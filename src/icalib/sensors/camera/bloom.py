@@ -24,7 +24,8 @@ def with_bloom(factor: CornerFactor, state: State) -> CornerFactor:
 
 
 def bloom_direction(model: CameraModel, params: np.ndarray, X: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """(N, 2) unit image direction of `towards` (N, 3, camera axes) at points X (N, 3) in the camera frame."""
+    """(N, 2) unit image directions of vectors `towards` (N, 3) at points X (N, 3) m, both in the camera frame; zero
+    outside the range of the lens model. params (P,): of the model."""
     _, valid, J, _ = model.project_with_jacobians(params, X)
     d = np.einsum("nij,nj->ni", J, towards)
     norm = np.linalg.norm(d, axis=1)

@@ -18,10 +18,10 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.optim.state import State
 from icalib.sensors.camera.corner_factor import CornerFactor
 
-N_CONTOUR = 32  # points of a circle; the sums over a smooth contour converge faster than any power of it
-ROUNDS = 3  # Gauss-Newton steps from the affine image of the circle; the second is of the order of the first squared
-ANGLES = 2.0 * np.pi * np.arange(N_CONTOUR) / N_CONTOUR
-UNIT_CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
+N_CONTOUR_POINTS = 32  # of a circle; sums over a smooth contour converge faster than any power of their number
+ELLIPSE_ITERATIONS = 3  # Gauss-Newton steps from the affine image of the circle; convergence is quadratic
+CONTOUR_ANGLES = 2.0 * np.pi * np.arange(N_CONTOUR_POINTS) / N_CONTOUR_POINTS
+UNIT_CIRCLE = np.stack([np.cos(CONTOUR_ANGLES), np.sin(CONTOUR_ANGLES)], axis=1)
 
 
 def with_circle_centres(factor: CornerFactor, state: State) -> CornerFactor:
@@ -57,13 +57,13 @@ def ellipse_shift(
     uv, valid, J_point, _ = model.project_with_jacobians(params, X)
     rim = X[:, None] + radius[:, None, None] * np.einsum("nij,kj->nki", plane, UNIT_CIRCLE)
     contour, seen = model.project(params, rim.reshape(-1, 3))
-    contour = contour.reshape(len(X), N_CONTOUR, 2)
+    contour = contour.reshape(len(X), N_CONTOUR_POINTS, 2)
     shape = radius[:, None, None] * (J_point @ plane)
     known = valid & seen.reshape(len(X), -1).all(axis=1) & (np.abs(np.linalg.det(shape)) > 0.0)
     contour, centre = contour[known], uv[known]
     W = np.linalg.inv(shape[known])  # 1/px; maps the ellipse to the unit circle
     arc = np.linalg.norm(np.roll(contour, -1, axis=1) - np.roll(contour, 1, axis=1), axis=2)
-    for _ in range(ROUNDS):
+    for _ in range(ELLIPSE_ITERATIONS):
         centre, W = _step(contour, arc, centre, W)
     shift = np.zeros((len(X), 2))
     shift[known] = centre - uv[known]

@@ -1,4 +1,4 @@
-"""Which bodies of the target are estimated: those that images tie to each other."""
+"""Which bodies of the target are estimated: those that images connect."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from icalib.model.bodies import Bodies
 from icalib.motion.keyframe_placement import MERGED_WITHIN_S
 from icalib.rig import Rig
 
-FEWEST_TOGETHER = 3  # images with both of two bodies that tie them to each other
-MOST_NAMED = 8  # bodies in a sentence
+MIN_SHARED_IMAGES = 3  # that show both of two bodies, for their relative pose to count as observed
+MAX_NAMED_BODIES = 8  # in a sentence
 
 
 def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool, rig: Rig | None = None) -> Bodies:
-    """The bodies that images tie to each other, directly or through others, in whichever recording; the one with most
-    corners is the reference. Of a `rig` of cameras alone, images that different cameras take at once tie bodies, too.
+    """The bodies that images connect, directly or through others, in any recording; the one with most corners is the
+    reference. In a `rig` of cameras alone, simultaneous images of different cameras connect bodies, too.
 
-    Raises EstimationError where no corner was seen, or a camera saw bodies only that nothing ties to the others.
+    Raises EstimationError if no corner was seen, or if a camera saw only bodies that nothing connects to the others.
     """
     streams = [c for m in recordings for c in m.cameras]
     n = len(target.bodies)
@@ -42,7 +42,7 @@ def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool
 
 
 def tied_by_images(bodies: Bodies, recordings: Sequence[Measurements]) -> list[tuple[int, ...]]:
-    """The bodies in use, in groups that images tie, directly or through others; the reference is the first."""
+    """The bodies in use, in groups that images connect, directly or through others; the reference is in the first."""
     together = _in_images(bodies.target.body, recordings, len(bodies.target.bodies))
     left, groups = list(bodies.used), []
     while left:
@@ -52,10 +52,10 @@ def tied_by_images(bodies: Bodies, recordings: Sequence[Measurements]) -> list[t
 
 
 def _tied_to(first: int, together: np.ndarray) -> tuple[int, ...]:
-    """`first`, and then in order all bodies that are tied to it; together (n, n): how often two were seen together."""
+    """`first`, and then in order all bodies connected to it; together (n, n): number of images that show two bodies."""
     reached = [first]
     for k in reached:
-        reached += [int(j) for j in np.flatnonzero(together[k] >= FEWEST_TOGETHER) if j not in reached]
+        reached += [int(j) for j in np.flatnonzero(together[k] >= MIN_SHARED_IMAGES) if j not in reached]
     return (first, *sorted(reached[1:]))
 
 
@@ -65,7 +65,7 @@ def _in_images(body: np.ndarray, recordings: Sequence[Measurements], n: int) -> 
 
 
 def _check_cameras(target: Target, streams: Sequence[CornerStream], used: Sequence[int], imu: bool) -> None:
-    """Raises EstimationError naming a camera that saw none of the bodies in use; imu: whether the rig has one."""
+    """Raises EstimationError naming a camera that saw none of the bodies in use. imu: whether the rig has an IMU."""
     for name in dict.fromkeys(s.name for s in streams):
         seen = np.unique(np.concatenate([target.body[s.point] for s in streams if s.name == name]))
         if len(seen) and not np.isin(seen, used).any():
@@ -76,7 +76,7 @@ def _check_cameras(target: Target, streams: Sequence[CornerStream], used: Sequen
             )
             own, first = _listed([target.bodies[k] for k in seen]), target.bodies[used[0]]
             raise EstimationError(
-                f"{name} sees {own} only, and fewer than {FEWEST_TOGETHER} images determine its pose relative "
+                f"{name} sees {own} only, and fewer than {MIN_SHARED_IMAGES} images determine its pose relative "
                 f"to {first}; show both in the same images, or {how}."
             )
 
@@ -105,7 +105,7 @@ def _at_once(body: np.ndarray, rig: Rig, recording: Measurements, n: int) -> np.
 
 
 def camera_times(rig: Rig, recording: Measurements, origin_ns: int) -> list[np.ndarray]:
-    """(M,) s since `origin_ns` of the images of each camera, by the time offsets that the rig gives or none."""
+    """By camera (M,) s since `origin_ns`: instants of the images, by stated time offsets, or zero ones."""
     given = [c.time_offset.value for c in rig.cameras]
     offsets_ns = [0 if v is None else round(float(v[0]) * 1e9) for v in given]
     pairs = zip(recording.cameras, offsets_ns, strict=True)
@@ -113,21 +113,21 @@ def camera_times(rig: Rig, recording: Measurements, origin_ns: int) -> list[np.n
 
 
 def taken_at_once(ta: np.ndarray, tb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of images at ta and tb [s], the indices of those that two cameras took at the same instant."""
+    """Indices of the images at ta (n,) and tb (m,) s that two cameras took at the same instant."""
     j = np.clip(np.searchsorted(tb, ta - MERGED_WITHIN_S), 0, len(tb) - 1)
     i = np.flatnonzero(np.abs(tb[j] - ta) <= MERGED_WITHIN_S)
     return i, j[i]
 
 
 def restrict(bodies: Bodies, recording: Measurements) -> Measurements:
-    """The recording without corners of bodies that are not in use, corners of an image body by body."""
+    """The recording without corners of bodies that are not in use; corners of each image are sorted by body."""
     if len(bodies.target.bodies) == 1:
         return recording
     return recording.with_streams(*(_restricted(bodies, c) for c in recording.cameras))
 
 
 def without_bodies(target: Target, names: Sequence[str], recording: Measurements) -> Measurements:
-    """The recording without corners of the bodies given by `names`, which a note says."""
+    """The recording without corners of the bodies called `names`, with a note on them."""
     kept = tuple(k for k, name in enumerate(target.bodies) if name not in names)
     cameras = [_restricted(Bodies(target, kept), c) for c in recording.cameras]
     note = f"ignored, because no image determines their poses relative to the others: {_listed(names)}."
@@ -143,13 +143,15 @@ def _restricted(bodies: Bodies, stream: CornerStream) -> CornerStream:
 
 
 def words_on_left_out(bodies: Bodies) -> str:
-    """A sentence on the bodies that were seen but not used; empty where there are none."""
+    """A sentence on the bodies that were seen but are not used; empty if there are none."""
     if not bodies.left_out:
         return ""
     names = [bodies.target.bodies[k] for k in bodies.left_out]
-    return f"ignored, because fewer than {FEWEST_TOGETHER} images show them together with the others: {_listed(names)}."
+    return (
+        f"ignored, because fewer than {MIN_SHARED_IMAGES} images show them together with the others: {_listed(names)}."
+    )
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return f"{', '.join(names[:MOST_NAMED])}{more}"
+    more = f" and {len(names) - MAX_NAMED_BODIES} more" if len(names) > MAX_NAMED_BODIES else ""
+    return f"{', '.join(names[:MAX_NAMED_BODIES])}{more}"

@@ -1,12 +1,14 @@
 """Corners of a known target in the images of one camera (paper (20)-(22)).
 
-residual = K(X) + bloom * direction - uv,  X = R_cam_world (R_world_scene (R_scene_body P + p_scene_body) - p_world_cam)
-with P the target's point, moved by its body's shape. All corners of one body in an image, a view, share one pose: their
-small Gram matrix over (pose, what belongs to the camera or the body) is summed first, the pose's Jacobians are applied
-once a view.
+    residual = K(X) + bloom * direction - uv
+    X = R_cam_world (R_world_scene (R_scene_body P + p_scene_body) - p_world_cam)
 
-An error that all corners of a view share, a field of functions of the corner with sizes N(0, tau^2), is marginalised
-view by view.
+P is the target's point, displaced by the shape of its body. A view is one body in one image: all its corners share one
+pose. Their small Gram matrix, over the pose and the parameters of camera and body, is summed first; the Jacobians of
+the pose are applied once a view.
+
+The error that all corners of a view share is a sum of functions of the corner with coefficients ~ N(0, tau^2). It is
+marginalised view by view.
 """
 
 from __future__ import annotations
@@ -33,12 +35,12 @@ from icalib.optim.robust_weights import LOSSES
 from icalib.optim.state import Layout, State, in_recording
 from icalib.rig import Scheme
 from icalib.sensors.camera.corner_kernels import (
-    Direct,
-    Found,
-    Images,
-    Motion,
+    CornerProjection,
+    CornerResidualArrays,
+    DirectParameters,
     Noise,
-    Predicted,
+    ViewCorners,
+    ViewPoses,
     accumulate,
     accumulate_clusters,
     camera_points,
@@ -46,15 +48,17 @@ from icalib.sensors.camera.corner_kernels import (
 from icalib.sensors.camera.corner_statistics import CORNERS, corner_squares, image_rows, rms_px, spent_by_corners
 from icalib.sensors.camera.corner_views import Views
 
-BLOCK = 256  # images at a time, where nothing is summed
-POSES = 1024  # views at a time, whose poses and how these move are made together
-CHUNK = 64  # views at a time: what a chunk needs stays in the cache
+IMAGES_PER_BLOCK = 256  # for statistics: bounds the memory
+VIEWS_PER_BLOCK = 1024  # for poses and their Jacobians: bounds the memory
+VIEWS_PER_CHUNK = 64  # for projections: their arrays stay in the cache of the processor
 
 
 @dataclass(frozen=True)
 class CornerNoise:
-    """What is known of corner errors: sigma (N,) px per axis of each corner; tau (m,) px, sizes of the error an image
-    shares, along the functions `field` (N, m) of the corner; the robust loss and where it starts to bend, in sigma."""
+    """Noise of corners.
+
+    sigma (N,) px per axis; tau (m,) px, standard deviations of the error that a view shares, along the functions
+    `field` (N, m) of the corner; loss: the robust loss, which bends at `loss_scale` sigma."""
 
     sigma: np.ndarray
     tau: np.ndarray
@@ -65,9 +69,10 @@ class CornerNoise:
 
 @dataclass(frozen=True)
 class CornerOutput:
-    """Per corner: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0
-    where left out), in single precision because there are many; per view: shared (V, 2, m), the sizes of the common
-    error."""
+    """Residuals of N corners in V views.
+
+    residual (N, 2) px, predicted - measured, and root (N,) 1/px, square root of the robust weight over sigma, 0 if not
+    in use: in single precision, to save memory. shared (V, 2, m) px: coefficients of the common error."""
 
     residual: np.ndarray
     root: np.ndarray
@@ -75,17 +80,17 @@ class CornerOutput:
 
     @classmethod
     def empty(cls, n: int, n_views: int, m: int, dtype: type = np.float32) -> CornerOutput:
-        """For n corners in `n_views` views with m sizes of a common error."""
+        """For n corners in `n_views` views with m coefficients of a common error."""
         return cls(memory.mmap_zeros((n, 2), dtype), memory.mmap_zeros((n,), dtype), np.zeros((n_views, 2, m)))
 
 
 @dataclass(frozen=True)
 class CornerFactor(FactorDefaults):
-    """All images of one camera.
+    """All corners of one camera, in M images.
 
-    times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; `keyframe` (M,), increasing: the
-    keyframe each image hangs on; keep (N,): corners in use; direction (N, 2) image direction of the bloom, (0, 2)
-    without it; seams: the images that begin further recordings, in which the scene stands elsewhere."""
+    times (M,) s: instants of the images without the time offset; keyframe (M,), increasing: index of the keyframe whose
+    pose each image depends on; keep (N,) bool: corners in use; direction (N, 2): unit image direction of the bloom,
+    (0, 2) without it; seams: first images of further recordings, each of which has a scene pose of its own."""
 
     stream: CornerStream
     model: CameraModel
@@ -124,7 +129,7 @@ class CornerFactor(FactorDefaults):
         return Views.of(self.stream, self.bodies.target.body)
 
     def parts(self, v0: int, v1: int) -> Iterator[tuple[int, int, int]]:
-        """Views v0..v1 recording by recording, each with the number of it."""
+        """Ranges of the views v0..v1 of one recording each, and the index of the recording."""
         seams = np.searchsorted(self.views.image, (0, *self.seams, len(self.keyframe)))
         for k, (first, end) in enumerate(pairwise(seams)):
             a, b = max(v0, int(first)), min(v1, int(end))
@@ -132,7 +137,7 @@ class CornerFactor(FactorDefaults):
                 yield a, b, k
 
     def world_points(self, state: State, recording: int) -> np.ndarray:
-        """(n_points, 3) the target's points, shapes and size included, in the world frame of a recording."""
+        """(n_points, 3) m: the target's points, shapes and size included, in the world of a recording."""
         return self.bodies.points(state.values) @ _scene(state, recording).T
 
     @cached_property
@@ -148,10 +153,10 @@ class CornerFactor(FactorDefaults):
         return SensorPose.at(self.kinematics, self.times[i0:i1], self.keyframe[i0:i1], state)
 
     def blocks(self) -> Iterator[tuple[int, int]]:
-        """Views v0..v1, whole images, a few at a time: what all corners need at once fills the memory."""
+        """Ranges of views v0..v1 of whole images, `IMAGES_PER_BLOCK` at a time."""
         image, n = self.views.image, len(self.keyframe)
-        for first in range(0, n, BLOCK):
-            v0, v1 = np.searchsorted(image, [first, min(first + BLOCK, n)])
+        for first in range(0, n, IMAGES_PER_BLOCK):
+            v0, v1 = np.searchsorted(image, [first, min(first + IMAGES_PER_BLOCK, n)])
             if v0 < v1:
                 yield int(v0), int(v1)
 
@@ -160,7 +165,7 @@ class CornerFactor(FactorDefaults):
         return slice(int(self.views.start[v0]), int(self.views.start[v1]))
 
     def points_in_camera(self, state: State, v0: int, v1: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of views v0..v1: X (n, 3), each corner's point in its camera's frame, and R_cam_body (v1 - v0, 3, 3)."""
+        """X (n, 3) m: point of each corner of views v0..v1 in the camera frame, and R_cam_body (v1 - v0, 3, 3)."""
         image, body, start = self.views.image[v0:v1], self.views.body[v0:v1], self.views.start[v0 : v1 + 1]
         i0 = int(image[0])
         camera, R_sb = self.poses(state, i0, int(image[-1]) + 1), self.bodies.poses(state.values)[0]
@@ -174,7 +179,7 @@ class CornerFactor(FactorDefaults):
         return X, R_cb
 
     def in_camera(self, state: State) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """A few images at a time, which corners; X (n, 3) m, each one's point, and R_cam_body (n, 3, 3)."""
+        """For each block: the slice of its corners, their points X (n, 3) m in the camera, and R_cam_body (n, 3, 3)."""
         for v0, v1 in self.blocks():
             X, R_cam_body = self.points_in_camera(state, v0, v1)
             yield self.corners_of(v0, v1), X, R_cam_body[self.views.of_corners(v0, v1) - v0]
@@ -199,7 +204,7 @@ class CornerFactor(FactorDefaults):
         return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau), dtype)
 
     def errors(self, out: CornerOutput) -> np.ndarray:
-        """(N, 2) px, the residuals with their images' common errors in them."""
+        """(N, 2) px: the residuals with the common errors of their views, which `out.residual` lacks."""
         error = np.empty((len(out.root), 2), np.float32)
         for v0, v1 in self.blocks():
             own = self.corners_of(v0, v1)
@@ -208,7 +213,7 @@ class CornerFactor(FactorDefaults):
         return error
 
     def chi2(self, out: CornerOutput) -> float:
-        """Of the corners that have weight. The others may lie anywhere, those of images without a pose at 1e20 px."""
+        """chi^2 of the corners with weight. Others may project anywhere: those of images without a pose to 1e20 px."""
         used = out.root > 0.0
         return float(((self.errors(out)[used] * out.root[used, None]) ** 2).sum(dtype=np.float64))
 
@@ -220,7 +225,7 @@ class CornerFactor(FactorDefaults):
         return corner_squares(self, out) if len(self.stream.uv) else {}
 
     def sizes(self, out: CornerOutput) -> dict[FitKey, RawSize]:
-        """See `Factor`; that of the corners stands for the errors that images share, too."""
+        """See `Factor`; common errors have the RMS of the corners."""
         size = RawSize(rms_px(out.residual, out.root), "px", int((out.root == 0.0).sum()))
         return dict.fromkeys(self.squares(out), size)
 
@@ -231,7 +236,7 @@ class CornerFactor(FactorDefaults):
         return [rows] if len(seconds) else []
 
     def dof_used(self, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
-        """See `Factor`. A few images at a time: residuals of all at another state would fill the memory."""
+        """See `Factor`."""
         return spent_by_corners(self, out, along)
 
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
@@ -239,7 +244,7 @@ class CornerFactor(FactorDefaults):
         return replace(self, direction=direction)
 
     def _columns(self, recording: int, body: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Calibration columns (n, c + d) of views of `body` (n,), see `Motion`, and which model parameters are free."""
+        """Calibration columns (n, c + d) of views of `body` (n,), see `ViewPoses`; indices of free lens parameters."""
         pose, shape = (columns[body] for columns in self.bodies.columns(self.layout))
         tilt = self.layout.columns(in_recording(BOARD, recording), "tilt")
         chained = np.concatenate([self.kinematics.columns(recording), tilt])
@@ -253,42 +258,42 @@ class CornerFactor(FactorDefaults):
     def accumulate(
         self, state: State, piece: Piece, out: CornerOutput | None, sums: bool = True, curved: bool = False
     ) -> float:
-        """See `Factor`: of the images whose keyframe lies in `piece`. Without `out` residuals are not kept."""
+        """See `Factor`: of the images whose keyframe is in `piece`. Residuals are not kept if `out` is None."""
         into, total = piece.sums(sums), 0.0
         for v0, v1, recording in self._blocks_of(piece):
             images, noise, direct, motion = self._arguments(state, v0, v1, recording, curved)
             if out is None:
                 first, end = int(images.start[0]), int(images.start[-1])
                 own = CornerOutput.empty(end - first, v1 - v0, len(self.noise.tau))
-                found = Found(first, own.residual, own.root, own.shared)
+                kept = CornerResidualArrays(first, own.residual, own.root, own.shared)
             else:
-                found = Found(0, out.residual, out.root, out.shared[v0:v1])
-            for a, b, predicted in self._chunks(state, images, motion, recording, sums):
-                total += accumulate(a, b, images, noise, direct, motion, predicted, into, found)
+                kept = CornerResidualArrays(0, out.residual, out.root, out.shared[v0:v1])
+            for a, b, projection in self._chunks(state, images, motion, recording, sums):
+                total += accumulate(a, b, images, noise, direct, motion, projection, into, kept)
         return total
 
     def accumulate_clusters(
         self, state: State, piece: Piece, at: CornerOutput, cluster: np.ndarray, n_clusters: int, column: int
     ) -> None:
-        """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from
-        `column` on."""
+        """Adds the gradient of each cluster of corners to columns `column` and on of `piece`, with the weights of `at`.
+        cluster (N,): index of each corner's, below n_clusters."""
         into = piece.sums(True)
         for v0, v1, recording in self._blocks_of(piece):
             images, noise, direct, motion = self._arguments(state, v0, v1, recording, False)
-            found = Found(0, at.residual, at.root, at.shared[v0:v1])
-            for a, b, predicted in self._chunks(state, images, motion, recording, True):
+            kept = CornerResidualArrays(0, at.residual, at.root, at.shared[v0:v1])
+            for a, b, projection in self._chunks(state, images, motion, recording, True):
                 accumulate_clusters(
-                    a, b, cluster, n_clusters, column, images, noise, direct, motion, predicted, into, found
+                    a, b, cluster, n_clusters, column, images, noise, direct, motion, projection, into, kept
                 )  # fmt: skip
 
     def _arguments(
         self, state: State, v0: int, v1: int, recording: int, curved: bool
-    ) -> tuple[Images, Noise, Direct, Motion]:
-        """What the kernels need to know of views v0..v1, of one recording."""
+    ) -> tuple[ViewCorners, Noise, DirectParameters, ViewPoses]:
+        """Arguments of the kernels for views v0..v1, of one recording."""
         image, body = self.views.image[v0:v1], self.views.body[v0:v1]
         columns, pars = self._columns(recording, body)
         s, n = self.stream, self.noise
-        images = Images(self.views.start[v0 : v1 + 1], s.uv, s.point, self.keep, self.keyframe[image])
+        images = ViewCorners(self.views.start[v0 : v1 + 1], s.uv, s.point, self.keep, self.keyframe[image])
         noise = Noise(n.sigma, LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
         bloom = float(state.values[self.name, "bloom"][0])
         R_ws, R_sb = _scene(state, recording), self.bodies.poses(state.values)[0]
@@ -296,43 +301,43 @@ class CornerFactor(FactorDefaults):
             self.bodies.deformation @ (R_ws @ R_sb)[self.bodies.target.body].transpose(0, 2, 1)
         )
         motion = self._motion(state, image, body, R_ws, columns)
-        return images, noise, Direct(pars, bloom, self.direction, basis), motion
+        return images, noise, DirectParameters(pars, bloom, self.direction, basis), motion
 
     def _motion(
         self, state: State, image: np.ndarray, body: np.ndarray, R_ws: np.ndarray, columns: np.ndarray
-    ) -> Motion:
-        """What moves views of `body` (n,) in images (n,), one behind the other."""
+    ) -> ViewPoses:
+        """Poses in n views of `body` (n,), in images `image` (n,), in order; columns: see `ViewPoses`."""
         i0 = int(image[0])
         camera = self.poses(state, i0, int(image[-1]) + 1)
         if not np.array_equal(image, np.arange(i0, i0 + len(camera.R_sensor_world))):
             camera = camera.part(image - i0)
         R_sb, p_sb = (x[body if self.bodies.several else body[:0]] for x in self.bodies.poses(state.values))
-        return Motion(camera, np.ascontiguousarray(R_ws), R_ws @ R_sb, p_sb @ R_ws.T, columns)
+        return ViewPoses(camera, np.ascontiguousarray(R_ws), R_ws @ R_sb, p_sb @ R_ws.T, columns)
 
     def _chunks(
-        self, state: State, images: Images, motion: Motion, recording: int, jacobians: bool
-    ) -> Iterator[tuple[int, int, Predicted]]:
-        """Views a..b by the chunk, and what the model makes of them."""
+        self, state: State, images: ViewCorners, motion: ViewPoses, recording: int, jacobians: bool
+    ) -> Iterator[tuple[int, int, CornerProjection]]:
+        """Ranges a..b of `VIEWS_PER_CHUNK` views, and their projections."""
         params = self.lens(state)
         world, start, camera = self.world_points(state, recording), images.start, motion.camera
-        for a in range(0, len(images.keyframe), CHUNK):
-            b = min(a + CHUNK, len(images.keyframe))
+        for a in range(0, len(images.keyframe), VIEWS_PER_CHUNK):
+            b = min(a + VIEWS_PER_CHUNK, len(images.keyframe))
             X = np.empty((start[b] - start[a], 3))
             camera_points(a, b, start, images.point, camera.R_sensor_world, camera.p_world_sensor, world, X)
             if jacobians:
-                yield a, b, Predicted(int(start[a]), X, *self.model.project_with_jacobians(params, X))
+                yield a, b, CornerProjection(int(start[a]), X, *self.model.project_with_jacobians(params, X))
             else:
                 uv, valid = self.model.project(params, X)
-                yield a, b, Predicted(int(start[a]), X, uv, valid, np.zeros((0, 2, 3)), np.zeros((0, 2, 0)))
+                yield a, b, CornerProjection(int(start[a]), X, uv, valid, np.zeros((0, 2, 3)), np.zeros((0, 2, 0)))
 
     def _blocks_of(self, piece: Piece) -> Iterator[tuple[int, int, int]]:
-        """The views that belong to `piece`, keyframes from first to before last, the chain's very last keyframe
-        included; some at a time, as `parts` has them."""
+        """Ranges of the views whose keyframe is in `piece`, and their recording. The last keyframe of a piece belongs
+        to the next one, except at the end of the chain."""
         stop = piece.last + 1 if piece.last == self.n_keyframes - 1 else piece.last
         images = np.searchsorted(self.keyframe, [piece.first, stop])
         v0, v1 = (int(v) for v in np.searchsorted(self.views.image, images))
-        for first in range(v0, v1, POSES):
-            yield from self.parts(first, min(first + POSES, v1))
+        for first in range(v0, v1, VIEWS_PER_BLOCK):
+            yield from self.parts(first, min(first + VIEWS_PER_BLOCK, v1))
 
 
 def _scene(state: State, recording: int) -> np.ndarray:

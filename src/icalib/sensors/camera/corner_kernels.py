@@ -1,6 +1,6 @@
 """Compiled sums of the corner factor: from residuals and model Jacobians to the normal equations of a piece.
 
-Images are counted from the first one of the piece, corners from the first of the recording.
+ViewCorners are counted from the first one of the piece, corners from the first of the recording.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from icalib.optim.robust_weights import correct_curvature, marginalise_shared, r
 from icalib.optim.rows import add_gradients, add_gram
 
 
-class Images(NamedTuple):
-    """What was seen, each body of the target in an image taken as an image of its own: corners of image i are
-    start[i]:start[i+1]; uv (N, 2), point (N,), keep (N,); keyframe (n,)."""
+class ViewCorners(NamedTuple):
+    """Corners of n views; a view is one body of the target in one image.
+
+    start (n + 1,): corners of view i are start[i]:start[i+1]; uv (N, 2) px; point (N,) index of the target's point;
+    keep (N,) bool, corners in use; keyframe (n,) index."""
 
     start: np.ndarray
     uv: np.ndarray
@@ -28,8 +30,10 @@ class Images(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """sigma (N,) px; the robust loss, where it bends, and whether the sums have its true curvature; the functions
-    field (N, m) and precision (m,) of the common error."""
+    """Noise of all corners, and the robust loss.
+
+    sigma (N,) px per axis; loss: number in `LOSSES`; scale: where it bends, in sigma; curved: whether the sums have its
+    true curvature; field (N, m): functions of the error that a view shares, with precision (m,) 1/px^2."""
 
     sigma: np.ndarray
     loss: int
@@ -39,9 +43,11 @@ class Noise(NamedTuple):
     precision: np.ndarray
 
 
-class Direct(NamedTuple):
-    """What shows in the image beyond the pose: model parameters `pars` that are free, bloom along direction (N, 2) or
-    (0, 2), the shape's basis (n_points, s, 3) in the world."""
+class DirectParameters(NamedTuple):
+    """Parameters that move corners in the image without moving the camera.
+
+    pars: indices of the free parameters of the camera model; bloom [px] along direction (N, 2), (0, 2) without bloom;
+    basis (n_points, s, 3) m: displacement of points in the world by unit of the body's shape parameters."""
 
     pars: np.ndarray
     bloom: float
@@ -49,10 +55,12 @@ class Direct(NamedTuple):
     basis: np.ndarray
 
 
-class Motion(NamedTuple):
-    """Poses of the camera at n images; where there are several bodies, the scene's rotation and each image's body (n,
-    ...) in the world. columns (n, c + d): calibration columns, -1 where fixed: of the camera's pose, tilt of the scene
-    2, pose of the body 6 or 0; then those of `Direct`."""
+class ViewPoses(NamedTuple):
+    """Poses of the camera and of the target in n views.
+
+    R_world_body (n, 3, 3) and p_world_body (n, 3) m: of each view's body; empty where the target is one body. columns
+    (n, c + d): calibration columns, -1 where fixed: c of the camera's pose, of the scene's tilt (2) and of the body's
+    pose (6, or 0 for one body); then d of `DirectParameters`."""
 
     camera: SensorPose
     R_world_scene: np.ndarray
@@ -61,8 +69,11 @@ class Motion(NamedTuple):
     columns: np.ndarray
 
 
-class Predicted(NamedTuple):
-    """What the model makes of corners `first` and on: uv, valid, X in the camera, Jacobians by X and parameters."""
+class CornerProjection(NamedTuple):
+    """The camera model at corners `first` and on.
+
+    X (n, 3) m: points in the camera frame; uv (n, 2) px; valid (n,) bool, within the range of the model; J_point
+    (n, 2, 3) px/m and J_params (n, 2, P): Jacobians of uv, empty where no sums are wanted."""
 
     first: int
     X: np.ndarray
@@ -72,9 +83,11 @@ class Predicted(NamedTuple):
     J_params: np.ndarray
 
 
-class Found(NamedTuple):
-    """What is left: residual (n, 2) and root (n,) of corners `first` and on, in single precision; shared (n, 2, m) by
-    image."""
+class CornerResidualArrays(NamedTuple):
+    """Arrays for residuals of corners `first` and on, in single precision.
+
+    residual (n, 2) px, predicted - measured; root (n,) 1/px, square root of the robust weight over sigma; shared
+    (n, 2, m) px: common error of each view."""
 
     first: int
     residual: np.ndarray
@@ -83,23 +96,23 @@ class Found(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def camera_points(i0, i1, start, point, R_cw, p_wc, world_points, X):
-    """X (n, 3): the points of images i0..i1 in their camera's frame."""
+def camera_points(i0, i1, start, point, R_cam_world, p_world_cam, world_points, X):
+    """Points of views i0..i1 in the camera frame, into X (n, 3) m; world_points (n_points, 3) m: the target's."""
     o = start[i0]
     for i in range(i0, i1):
         for n in range(start[i], start[i + 1]):
             q = point[n]
-            a = world_points[q, 0] - p_wc[i, 0]
-            b = world_points[q, 1] - p_wc[i, 1]
-            c = world_points[q, 2] - p_wc[i, 2]
+            a = world_points[q, 0] - p_world_cam[i, 0]
+            b = world_points[q, 1] - p_world_cam[i, 1]
+            c = world_points[q, 2] - p_world_cam[i, 2]
             for r in range(3):
-                X[n - o, r] = R_cw[i, r, 0] * a + R_cw[i, r, 1] * b + R_cw[i, r, 2] * c
+                X[n - o, r] = R_cam_world[i, r, 0] * a + R_cam_world[i, r, 1] * b + R_cam_world[i, r, 2] * c
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _gram(A, D, n, out):
-    """out (D, D) = A[:D, :n] A[:D, :n]^T, upper triangle mirrored. Sums may be reordered: they are vectorised, four at
-    a time, so that each number loaded is used twice."""
+    """out (D, D) = A[:D, :n] A[:D, :n]^T. Blocks of 2 x 2 sums use each loaded number twice; the compiler may reorder
+    sums to vectorise them."""
     for i in range(0, D, 2):
         i1 = min(i + 1, D - 1)
         for j in range(i, D, 2):
@@ -116,180 +129,188 @@ def _gram(A, D, n, out):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _predict_image(i, images, noise, direct, predicted, res, root, found):
-    """Residuals res (n, 2), weights root (n,) and common error of image i; returns its half robust chi^2."""
-    n0, n1, o, f0 = images.start[i], images.start[i + 1], predicted.first, images.start[i] - found.first
+def _predict_view(i, corners, noise, direct, projection, residual, root, kept):
+    """Residuals (n, 2), weights root (n,) and common error of view i. Returns half its robust chi^2."""
+    n0, n1, o, f0 = corners.start[i], corners.start[i + 1], projection.first, corners.start[i] - kept.first
     ok = np.empty(n1 - n0, np.bool_)
     for k in range(n1 - n0):
         n = n0 + k
-        ok[k] = images.keep[n] and predicted.valid[n - o]
+        ok[k] = corners.keep[n] and projection.valid[n - o]
         for r in range(2):
-            res[k, r] = predicted.uv[n - o, r] - images.uv[n, r]
+            residual[k, r] = projection.uv[n - o, r] - corners.uv[n, r]
             if len(direct.direction):
-                res[k, r] += direct.bloom * direct.direction[n, r]
-    cost = robust_weights(
-        res, ok, noise.field[n0:n1], noise.precision, noise.sigma[n0:n1], noise.loss, noise.scale, root, found.shared[i]
-    )
+                residual[k, r] += direct.bloom * direct.direction[n, r]
+    field, sigma = noise.field[n0:n1], noise.sigma[n0:n1]
+    cost = robust_weights(residual, ok, field, noise.precision, sigma, noise.loss, noise.scale, root, kept.shared[i])
     for k in range(n1 - n0):
-        found.root[f0 + k] = root[k]
+        kept.root[f0 + k] = root[k]
         for r in range(2):
-            found.residual[f0 + k, r] = res[k, r]
+            kept.residual[f0 + k, r] = residual[k, r]
     return cost
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _recall_image(i, images, found, res, root):
-    """What `_predict_image` left of image i."""
-    n0, f0 = images.start[i], images.start[i] - found.first
-    for k in range(images.start[i + 1] - n0):
-        root[k] = found.root[f0 + k]
+def _recall_view(i, corners, kept, residual, root):
+    """Residuals and weights of view i as `_predict_view` stored them."""
+    n0, f0 = corners.start[i], corners.start[i] - kept.first
+    for k in range(corners.start[i + 1] - n0):
+        root[k] = kept.root[f0 + k]
         for r in range(2):
-            res[k, r] = found.residual[f0 + k, r]
+            residual[k, r] = kept.residual[f0 + k, r]
 
 
 @njit(cache=True, nogil=True)
-def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
-    """Weighted Jacobian of image i, transposed: A (D + 1, 2 n), u rows first; the last row the residual.
-
-    With `curved`, where the loss bends the rows are scaled so that A^T A is the true curvature, A^T r the true
-    gradient.
-    """
-    n0, n1 = images.start[i], images.start[i + 1]
-    n, ns, n_pars = n1 - n0, direct.basis.shape[1], len(direct.pars)
-    has_bloom = len(direct.direction) > 0
+def _fill_rows(i, corners, noise, direct, poses, projection, roots, error, J_rows):
+    """Weighted Jacobian of view i, transposed, into J_rows (D + 1, 2 n): by camera pose 6, free model parameters,
+    bloom, shape; the last row is the residual."""
+    n0, n = corners.start[i], corners.start[i + 1] - corners.start[i]
+    ns, n_pars, has_bloom = direct.basis.shape[1], len(direct.pars), len(direct.direction) > 0
     D = 6 + n_pars + has_bloom + ns
-    R = motion.camera.R_sensor_world[i]
+    R = poses.camera.R_sensor_world[i]
     for k in range(n):
-        c, root = n0 + k - predicted.first, roots[k]
-        x, y, z = predicted.X[c, 0], predicted.X[c, 1], predicted.X[c, 2]
-        basis = direct.basis[images.point[n0 + k]]
+        c, root = n0 + k - projection.first, roots[k]
+        x, y, z = projection.X[c, 0], projection.X[c, 1], projection.X[c, 2]
+        basis = direct.basis[corners.point[n0 + k]]
         for r in range(2):
             at = r * n + k
-            a0, a1 = root * predicted.J_point[c, r, 0], root * predicted.J_point[c, r, 1]
-            a2 = root * predicted.J_point[c, r, 2]
-            A[0, at] = a1 * z - a2 * y
-            A[1, at] = a2 * x - a0 * z
-            A[2, at] = a0 * y - a1 * x
-            A[3, at], A[4, at], A[5, at] = -a0, -a1, -a2
+            a0, a1 = root * projection.J_point[c, r, 0], root * projection.J_point[c, r, 1]
+            a2 = root * projection.J_point[c, r, 2]
+            J_rows[0, at] = a1 * z - a2 * y
+            J_rows[1, at] = a2 * x - a0 * z
+            J_rows[2, at] = a0 * y - a1 * x
+            J_rows[3, at], J_rows[4, at], J_rows[5, at] = -a0, -a1, -a2
             for q in range(n_pars):
-                A[6 + q, at] = root * predicted.J_params[c, r, direct.pars[q]]
+                J_rows[6 + q, at] = root * projection.J_params[c, r, direct.pars[q]]
             d = 6 + n_pars
             if has_bloom:
-                A[d, at] = root * direct.direction[n0 + k, r]
+                J_rows[d, at] = root * direct.direction[n0 + k, r]
                 d += 1
             w0 = a0 * R[0, 0] + a1 * R[1, 0] + a2 * R[2, 0]
             w1 = a0 * R[0, 1] + a1 * R[1, 1] + a2 * R[2, 1]
             w2 = a0 * R[0, 2] + a1 * R[1, 2] + a2 * R[2, 2]
             for q in range(ns):
-                A[d + q, at] = w0 * basis[q, 0] + w1 * basis[q, 1] + w2 * basis[q, 2]
-            A[D, at] = root * error[k, r]
-        if noise.curved and noise.loss > 0 and root > 0.0:
+                J_rows[d + q, at] = w0 * basis[q, 0] + w1 * basis[q, 1] + w2 * basis[q, 2]
+            J_rows[D, at] = root * error[k, r]
+    if noise.curved and noise.loss > 0:
+        _bend_rows(n0, n, noise, roots, error, D, J_rows)
+
+
+@njit(cache=True, nogil=True)
+def _bend_rows(n0, n, noise, roots, error, D, J_rows):
+    """Scales rows of the n corners from n0 on where the loss bends: J_rows J_rows^T gets its true curvature, and the
+    gradient stays (Triggs et al. 2000)."""
+    for k in range(n):
+        if roots[k] > 0.0:
             sigma = noise.sigma[n0 + k]
             square = (error[k, 0] ** 2 + error[k, 1] ** 2) / (sigma * sigma)
             _, _, curvature = weight(noise.loss, noise.scale, square)
             if curvature < 1.0:
-                correct_curvature(A, D, k, n, error[k], np.sqrt(curvature))
+                correct_curvature(J_rows, D, k, n, error[k], np.sqrt(curvature))
 
 
-class _Work(NamedTuple):
-    """For one image: rows A and their Gram matrix G; residual and error (n, 2), root (n,); its pose by that of the IMU,
-    A_imu, and by keyframes and calibration parameters, T; F: see `add_gram`."""
+class _Workspace(NamedTuple):
+    """Arrays for one view of at most n corners.
 
-    A: np.ndarray
+    J_rows (D + 1, 2 n): weighted rows, see `_fill_rows`; G (D + 1, D + 1): their Gram matrix; residual and error (n, 2)
+    px, root (n,); J_imu (6, 6) and J_chain (6, w): camera pose by IMU pose, and by keyframes and calibration
+    parameters; F: see `add_gram`."""
+
+    J_rows: np.ndarray
     G: np.ndarray
     residual: np.ndarray
     error: np.ndarray
     root: np.ndarray
-    A_imu: np.ndarray
-    T: np.ndarray
+    J_imu: np.ndarray
+    J_chain: np.ndarray
     F: np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _work_space(images, direct, motion):
+def _workspace(corners, direct, poses):
     most = 0
-    for i in range(len(images.start) - 1):
-        most = max(most, images.start[i + 1] - images.start[i])
+    for i in range(len(corners.start) - 1):
+        most = max(most, corners.start[i + 1] - corners.start[i])
     n_d = len(direct.pars) + (len(direct.direction) > 0) + direct.basis.shape[1]
-    width, D = chain_width(motion.camera) + motion.columns.shape[1], 6 + n_d
-    return _Work(
+    width, D = chain_width(poses.camera) + poses.columns.shape[1], 6 + n_d
+    return _Workspace(
         np.empty((D + 1, 2 * most)), np.empty((D + 1, D + 1)), np.empty((most, 2)), np.empty((most, 2)), np.empty(most),
         np.empty((6, 6)), np.empty((6, width - n_d)), np.empty((6, width + 1)),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def _fill_chain(i, motion, A_imu, T):
-    """T (6, w): the camera's pose by keyframes and calibration parameters, in the order of `Motion.columns`."""
-    fill_chain(i, motion.camera, A_imu, T)
-    R_cw, p_wc = motion.camera.R_sensor_world[i], motion.camera.p_world_sensor[i]
-    o = T.shape[1] - (8 if len(motion.R_world_body) else 2)
+def _fill_chain(i, poses, J_imu, J_chain):
+    """Camera pose by keyframes and calibration parameters into J_chain (6, w), columns as in `ViewPoses.columns`."""
+    fill_chain(i, poses.camera, J_imu, J_chain)
+    R_cam_world, p_world_cam = poses.camera.R_sensor_world[i], poses.camera.p_world_sensor[i]
+    o = J_chain.shape[1] - (8 if len(poses.R_world_body) else 2)
     for r in range(3):
-        # Turning the board about world x (y) is turning the camera the other way about the board's origin.
-        T[r, o], T[r, o + 1] = -R_cw[r, 0], -R_cw[r, 1]
-        T[3 + r, o] = R_cw[r, 1] * p_wc[2] - R_cw[r, 2] * p_wc[1]
-        T[3 + r, o + 1] = R_cw[r, 2] * p_wc[0] - R_cw[r, 0] * p_wc[2]
-    if len(motion.R_world_body):
-        _fill_body(i, motion, T)
+        # Tilting the scene about world x (y) equals rotating the camera the other way about the scene's origin.
+        J_chain[r, o], J_chain[r, o + 1] = -R_cam_world[r, 0], -R_cam_world[r, 1]
+        J_chain[3 + r, o] = R_cam_world[r, 1] * p_world_cam[2] - R_cam_world[r, 2] * p_world_cam[1]
+        J_chain[3 + r, o + 1] = R_cam_world[r, 2] * p_world_cam[0] - R_cam_world[r, 0] * p_world_cam[2]
+    if len(poses.R_world_body):
+        _fill_body(i, poses, J_chain)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _fill_body(i, motion, T):
-    """The last 6 columns of T: moving the body is moving the camera the other way, turning about the body's origin."""
-    R_cw, R_wb, o = motion.camera.R_sensor_world[i], motion.R_world_body[i], T.shape[1] - 6
-    away = so3.hat(motion.camera.p_world_sensor[i] - motion.p_world_body[i])
+def _fill_body(i, poses, J_chain):
+    """Camera pose by body pose into the last 6 columns of J_chain. Moving the body by d equals moving the camera by the
+    inverse of d, rotation about the body's origin."""
+    R_cam_world, R_world_body, o = poses.camera.R_sensor_world[i], poses.R_world_body[i], J_chain.shape[1] - 6
+    away = so3.hat(poses.camera.p_world_sensor[i] - poses.p_world_body[i])
     for r in range(3):
         for j in range(3):
             for k in range(3):
-                T[r, o + j] -= R_cw[r, k] * R_wb[k, j]
-                T[3 + r, o + 3 + j] -= R_cw[r, k] * motion.R_world_scene[k, j]
+                J_chain[r, o + j] -= R_cam_world[r, k] * R_world_body[k, j]
+                J_chain[3 + r, o + 3 + j] -= R_cam_world[r, k] * poses.R_world_scene[k, j]
                 for m in range(3):
-                    T[3 + r, o + j] += R_cw[r, k] * away[k, m] * R_wb[m, j]
+                    J_chain[3 + r, o + j] += R_cam_world[r, k] * away[k, m] * R_world_body[m, j]
 
 
 @njit(cache=True, nogil=True)
-def accumulate(i0, i1, images, noise, direct, motion, predicted, sums, found):
-    """Images i0..i1: residuals, weights and common errors out, and the normal equations where they are wanted.
+def accumulate(i0, i1, corners, noise, direct, poses, projection, sums, kept):
+    """Residuals, weights and common errors of views i0..i1 into `kept`, and the normal equations where they are wanted.
 
     Returns half the robust chi^2.
     """
-    work, total = _work_space(images, direct, motion), 0.0
-    A, G, T, D, n_chain = work.A, work.G, work.T, len(work.G) - 1, chain_width(motion.camera)
+    work, total = _workspace(corners, direct, poses), 0.0
+    J_rows, G, J_chain, D, n_chain = work.J_rows, work.G, work.J_chain, len(work.G) - 1, chain_width(poses.camera)
     for i in range(i0, i1):
-        n0, n1 = images.start[i], images.start[i + 1]
+        n0, n1 = corners.start[i], corners.start[i + 1]
         n = n1 - n0
-        res, root = work.residual[:n], work.root[:n]
-        total += _predict_image(i, images, noise, direct, predicted, res, root, found)
+        residual, root = work.residual[:n], work.root[:n]
+        total += _predict_view(i, corners, noise, direct, projection, residual, root, kept)
         if len(sums.diagonal) == 0:
             continue
-        whole_error(res, noise.field[n0:n1], found.shared[i], work.error)
-        _fill_rows(i, images, noise, direct, motion, predicted, root, work.error, A)
-        _gram(A, D + 1, 2 * n, G)
+        whole_error(residual, noise.field[n0:n1], kept.shared[i], work.error)
+        _fill_rows(i, corners, noise, direct, poses, projection, root, work.error, J_rows)
+        _gram(J_rows, D + 1, 2 * n, G)
         if len(noise.precision):
-            marginalise_shared(A, D, n, root, noise.field[n0:n1], noise.precision, G)
-        _fill_chain(i, motion, work.A_imu, T)
-        add_gram(images.keyframe[i] - sums.first, n_chain, G, T, motion.columns[i], work.F, sums)
+            marginalise_shared(J_rows, D, n, root, noise.field[n0:n1], noise.precision, G)
+        _fill_chain(i, poses, work.J_imu, J_chain)
+        add_gram(corners.keyframe[i] - sums.first, n_chain, G, J_chain, poses.columns[i], work.F, sums)
     return total
 
 
 @njit(cache=True, nogil=True)
-def accumulate_clusters(i0, i1, cluster, n_clusters, column, images, noise, direct, motion, predicted, sums, found):
-    """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and calibration
+def accumulate_clusters(i0, i1, cluster, n_clusters, column, corners, noise, direct, poses, projection, sums, kept):
+    """Gradients of views i0..i1 by cluster of corners, into columns `column` and on of side and calibration
     parameters."""
-    work = _work_space(images, direct, motion)
-    A, T, D, n_chain = work.A, work.T, len(work.G) - 1, chain_width(motion.camera)
+    work = _workspace(corners, direct, poses)
+    J_rows, J_chain, D, n_chain = work.J_rows, work.J_chain, len(work.G) - 1, chain_width(poses.camera)
     G = np.empty((D, n_clusters))
     for i in range(i0, i1):
-        n0, n1 = images.start[i], images.start[i + 1]
+        n0, n1 = corners.start[i], corners.start[i + 1]
         n = n1 - n0
-        res, root = work.residual[:n], work.root[:n]
-        _recall_image(i, images, found, res, root)
-        whole_error(res, noise.field[n0:n1], found.shared[i], work.error)
-        _fill_rows(i, images, noise, direct, motion, predicted, root, work.error, A)
+        residual, root = work.residual[:n], work.root[:n]
+        _recall_view(i, corners, kept, residual, root)
+        whole_error(residual, noise.field[n0:n1], kept.shared[i], work.error)
+        _fill_rows(i, corners, noise, direct, poses, projection, root, work.error, J_rows)
         for d in range(D):
             for g in range(n_clusters):
                 G[d, g] = 0.0
             for k in range(n):
-                G[d, cluster[n0 + k]] += A[d, k] * A[D, k] + A[d, n + k] * A[D, n + k]
-        _fill_chain(i, motion, work.A_imu, T)
-        add_gradients(images.keyframe[i] - sums.first, n_chain, G, T, motion.columns[i], column, sums)
+                G[d, cluster[n0 + k]] += J_rows[d, k] * J_rows[D, k] + J_rows[d, n + k] * J_rows[D, n + k]
+        _fill_chain(i, poses, work.J_imu, J_chain)
+        add_gradients(corners.keyframe[i] - sums.first, n_chain, G, J_chain, poses.columns[i], column, sums)

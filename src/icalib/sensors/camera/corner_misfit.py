@@ -14,13 +14,11 @@ import numpy as np
 
 from icalib.data.measurements import CornerStream
 
-CELLS = (
-    12,
-    8,
-)  # columns, rows of the rectangle that holds all corners; smaller ones follow a finer misfit, with more noise each
-GROUPS = 200  # at most; consecutive images of a video share errors, which must stay within a group
-FEWEST_GROUPS = 3  # with corners in a cell; cells with fewer are left out
-SIGNIFICANT = 5.0  # standard deviations under noise; a smaller misfit counts as none
+# Columns and rows of the rectangle that holds all corners. Smaller cells resolve a finer misfit, with more noise each.
+MISFIT_CELLS = (12, 8)
+MAX_IMAGE_GROUPS = 200  # consecutive images of a video share errors, which must stay within a group
+MIN_GROUPS_IN_CELL = 3  # that have corners in it; other cells are left out
+SIGNIFICANT_STD = 5.0  # standard deviations under noise alone; a smaller misfit counts as none
 
 
 @dataclass(frozen=True)
@@ -43,15 +41,15 @@ def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) ->
     nothing = LensMisfit(0.0, np.zeros((len(used), 2), np.float32))
     if not used.any():
         return nothing
-    cell, n, images = _cells(stream.uv, used), CELLS[0] * CELLS[1], len(stream.stamps_ns)
-    group_of_image = np.arange(images) * min(images, GROUPS) // images
+    cell, n, images = _cells(stream.uv, used), MISFIT_CELLS[0] * MISFIT_CELLS[1], len(stream.stamps_ns)
+    group_of_image = np.arange(images) * min(images, MAX_IMAGE_GROUPS) // images
     n_groups = int(group_of_image[-1]) + 1
     key = (group_of_image * n).astype(np.int32)[stream.image[used]] + cell[used]
     count = np.bincount(key, minlength=n_groups * n).reshape(n_groups, n)
     means = np.stack([np.bincount(key, residual[used, k], n_groups * n) for k in range(2)], axis=1)
     means = means.reshape(n_groups, n, 2) / np.maximum(count, 1)[:, :, None]
     groups = (count > 0).sum(axis=0)
-    enough = groups >= FEWEST_GROUPS
+    enough = groups >= MIN_GROUPS_IN_CELL
     share = np.where(enough, count.sum(axis=0), 0.0)
     # products[a, b]: over all cells, weighted by their corners, the products of the means of groups a and b, over the
     # number of pairs. Without misfit those off the diagonal have mean zero; the diagonal holds the noise.
@@ -60,7 +58,7 @@ def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) ->
     products = np.einsum("acx,bcx->ab", scaled, scaled, optimize=True)
     np.fill_diagonal(products, 0.0)
     square = float(products.sum())  # of both components together
-    if not square > SIGNIFICANT * np.sqrt(2.0 * float((products**2).sum())):
+    if not square > SIGNIFICANT_STD * np.sqrt(2.0 * float((products**2).sum())):
         return nothing
     mean = np.where(enough[:, None], means.sum(axis=0) / np.maximum(groups, 1)[:, None], 0.0)
     return LensMisfit(float(np.sqrt(0.5 * square)), mean.astype(np.float32)[cell])
@@ -68,8 +66,8 @@ def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) ->
 
 def _cells(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
     """(N,) int: the cell of each corner at uv (N, 2) px, in the rectangle that holds the `used` ones."""
-    column, row = (_strips(uv[:, k], used, CELLS[k]) for k in range(2))
-    return row * np.int16(CELLS[0]) + column
+    column, row = (_strips(uv[:, k], used, MISFIT_CELLS[k]) for k in range(2))
+    return row * np.int16(MISFIT_CELLS[0]) + column
 
 
 def _strips(x: np.ndarray, used: np.ndarray, count: int) -> np.ndarray:

@@ -1,15 +1,15 @@
-"""How large the errors of corners are, judged from what a pass leaves behind.
+"""Noise of corners, estimated from the residuals of a pass.
 
-    sigma_n^2 = (base s_n)^2 + (exposure v_i)^2 + misfit^2   corner n of image i, whose corners move at v_i px/s: blur
-    shared    ~ N(0, tau_k^2), u and v apart   an error that the corners of an image have in common: a shift, a tilt
+    sigma_n^2 = (base s_n)^2 + (exposure v_i)^2 + misfit^2      of corner n of image i, v_i px/s: image speed (blur)
+    shared    ~ N(0, tau_k^2), u and v apart                    errors that all corners of an image share
 
-s_n is the detector's standard deviation of the corner over that of the median corner, 1 where it states none. Sizes
-of single corners come from medians, so that outliers have no say. Those of the common errors come from their chi^2 over
-post-fit degrees of freedom, pass by pass (Foerstner's variance components): the poses soak most of them up.
+s_n is the detector's standard deviation of the corner over that of the median corner, 1 if it states none. Noise of
+single corners comes from medians, which outliers do not move. Sizes of shared errors come from their chi^2 over
+post-fit degrees of freedom, pass by pass (variance components; Foerstner 1979), because poses absorb most of them.
 
-The misfit is what the model of the lens cannot follow. It is many times its RMS near the border of the image, which a
-robust loss takes for outliers. With other sensors that is as well, for the border would pull their parameters. With
-cameras alone the lens is to leave little over the whole image, and the loss bends `LATER` where the misfit is large.
+The misfit is the error of the lens model. Near the border of the image it is many times its RMS, and a robust loss
+rejects corners there. Beside other sensors this is right: the border would bias their parameters. With cameras alone
+the lens should fit the whole image, so the robust loss is `WIDE_LOSS_FACTOR` times as wide where the misfit is large.
 """
 
 from __future__ import annotations
@@ -27,33 +27,36 @@ from icalib.rig import Camera, Settings
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.corner_misfit import LensMisfit, lens_misfit
 
-FIRST_GUESS_PX = 0.5
-SMALLEST_PX, LARGEST_PX = 1e-3, 5.0
-FIRST_TAU_PX = 0.1
-COMMON_ERRORS = 1
-MIN_CORNER_NOISE_PX = 0.005  # no detector does better; keeps weights finite where corners are exact
-BINS = 12  # of image speed
-LARGE_MISFIT = 0.5  # times the noise: a fifth of the variance
-# Times the `loss_scale`. On stereo stills whose lenses leave 8 px near the border it takes the error of images that
+INITIAL_CORNER_NOISE_PX = 0.5  # per axis, in the first pass: of the order of a detector's error with a rough lens
+MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX = 1e-3, 5.0  # of tau: keep weights finite, and far errors out
+INITIAL_COMMON_ERROR_PX = 0.1  # of tau, in the first pass that has it
+N_COMMON_ERRORS = 1  # functions of the error that an image shares: a shift; 3 would be an affine field
+MIN_CORNER_NOISE_PX = 0.005  # per axis: no detector is better; keeps weights finite where corners are exact
+SPEED_BINS = 12  # of image speed, for the fit of blur
+MIN_CORNERS_IN_BIN = 50  # for their median variance to be known to a fifth
+LARGE_MISFIT_RATIO = 0.5  # of misfit to noise: a fifth of the variance
+# Factor on `loss_scale`. On stereo stills whose lenses leave 8 px near the border it takes the error of images that
 # were left out from 0.29 px to 0.27 px. No robust loss at all leaves 0.25 px, but moves the baseline by 0.15 mm more.
-LATER = 2.5
+WIDE_LOSS_FACTOR = 2.5
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """One camera's corner noise: base [px] of its median corner, exposure [s], tau (m,) [px] (empty: images share no
-    error), misfit of the lens [px]. later: the loss bends at `LATER` times the `loss_scale` of the rig file."""
+    """Noise of the corners of one camera.
+
+    base [px]: of its median corner; exposure [s]; tau (m,) px, empty if images share no error; misfit [px] of the lens
+    model. wide_loss: the robust loss bends at `WIDE_LOSS_FACTOR` times the `loss_scale` of the rig file."""
 
     base: float
     exposure: float = 0.0
     tau: tuple[float, ...] = ()
     misfit: float = 0.0
-    later: bool = False
+    wide_loss: bool = False
 
     def noise(
         self, stream: CornerStream, camera: Camera, settings: Settings, speed: np.ndarray | None = None
     ) -> CornerNoise:
-        """What the corner factor needs; speed (M,) px/s of each image."""
+        """The noise of each corner of `stream`; speed (M,) px/s: of each image, no blur if None."""
         blur = 0.0 if speed is None else self.exposure * speed[stream.image]
         sigma = np.hypot(np.hypot(self.base * stream.relative_sigma, blur), self.misfit)
         field = np.ones((len(stream.uv), len(self.tau)))
@@ -61,17 +64,17 @@ class NoiseModel:
             half = 0.5 * np.array(camera.resolution)
             x, y = ((stream.uv - half) / half[0]).T
             field[:] = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)[:, : len(self.tau)]
-        scale = settings.loss_scale * (LATER if self.later else 1.0)
+        scale = settings.loss_scale * (WIDE_LOSS_FACTOR if self.wide_loss else 1.0)
         return CornerNoise(sigma, np.array(self.tau), field, settings.loss, scale)
 
 
 def first_noise(camera: Camera) -> NoiseModel:
-    """Before anything is known: what the rig file says, or half a pixel."""
-    return NoiseModel(camera.corner_noise_px or FIRST_GUESS_PX)
+    """Noise of the first pass: stated in the rig file, or `INITIAL_CORNER_NOISE_PX`."""
+    return NoiseModel(camera.corner_noise_px or INITIAL_CORNER_NOISE_PX)
 
 
 def image_speed(factor: CornerFactor, state: State) -> np.ndarray:
-    """(M,) px/s, RMS over the corners of each image."""
+    """(M,) px/s: image speed, RMS over the corners in use of each image; 0 without any."""
     square = np.empty(len(factor.stream.uv))
     for v0, v1 in factor.blocks():
         square[factor.corners_of(v0, v1)] = _squared_flow(factor, state, v0, v1)
@@ -101,8 +104,8 @@ def image_mean(stream: CornerStream, x: np.ndarray, keep: np.ndarray) -> np.ndar
 
 @dataclass(frozen=True)
 class ResidualNoise:
-    """What the residuals of one camera show: base [px] of its median corner and exposure [s] as in `NoiseModel`, and
-    the misfit of the lens."""
+    """Noise that the residuals of one camera show: base [px] and exposure [s] as in `NoiseModel`, and the misfit of the
+    lens model."""
 
     base: float
     exposure: float
@@ -110,14 +113,14 @@ class ResidualNoise:
 
     @property
     def lens_misfit_is_large(self) -> bool:
-        """The one test for the later robust loss and for the warning that names another camera model."""
-        return self.lens.rms > LARGE_MISFIT * self.base
+        """Whether the robust loss is to be wide, and a warning to name another camera model."""
+        return self.lens.rms > LARGE_MISFIT_RATIO * self.base
 
 
 def residual_noise(factor: CornerFactor, out: CornerOutput, settings: Settings, speed: np.ndarray) -> ResidualNoise:
-    """The noise and misfit that the residuals of a pass show; speed (M,) px/s as of `image_speed`.
+    """The noise and misfit that the residuals `out` of a pass show; speed (M,) px/s as of `image_speed`.
 
-    Only corners that take part count; there must be one.
+    Only corners in use count; there must be one.
     """
     stream, used = factor.stream, out.root > 0.0
     error = factor.errors(out)
@@ -139,10 +142,10 @@ def estimate_noise(
     speed: np.ndarray,
     tau: tuple[float, ...],
 ) -> tuple[NoiseModel, bool]:
-    """The noise that the residuals of a pass show, with `tau` for its common errors; whether the lens misfit is large.
+    """The noise that the residuals `out` of a pass show, with `tau` of its common errors, and whether the misfit of the
+    lens model is large. speed (M,) px/s as of `image_speed`.
 
-    A size given in the rig file is kept. Raises EstimationError where the pass led so far away that no corner is in
-    front of the camera.
+    Stated noise is kept. Raises EstimationError if the pass diverged so far that no corner is in front of the camera.
     """
     if not (out.root > 0.0).any():
         raise EstimationError(
@@ -162,17 +165,18 @@ def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float,
     fits: those of one camera's common errors, in order.
     """
     return tuple(
-        float(np.clip(t * np.sqrt(f.chi2 / max(f.dof, 1.0)), SMALLEST_PX, LARGEST_PX))
+        float(np.clip(t * np.sqrt(f.chi2 / max(f.dof, 1.0)), MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX))
         for t, f in zip(tau, fits, strict=True)
     )
 
 
 def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
-    """base, exposure from squared errors (n,) and image speeds (n,), both over the corners' relative standard
-    deviations, each bin of speeds with relative weight."""
-    edges = np.quantile(speed, np.linspace(0.0, 1.0, BINS + 1))
-    which = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, BINS - 1)
-    bins = [k for k in range(BINS) if (which == k).sum() >= 50]
+    """base [px] and exposure [s]: line through the median variances of bins of squared speed, weighted by variance.
+
+    square (n,) px^2, squared errors, and speed (n,) px/s, both over the corners' relative standard deviations."""
+    edges = np.quantile(speed, np.linspace(0.0, 1.0, SPEED_BINS + 1))
+    which = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, SPEED_BINS - 1)
+    bins = [k for k in range(SPEED_BINS) if (which == k).sum() >= MIN_CORNERS_IN_BIN]
     if len(bins) < 3:
         return float(np.sqrt(median_variance(square))), 0.0
     variance = np.array([median_variance(square[which == k]) for k in bins])

@@ -17,12 +17,12 @@ from icalib.optim.medians import grouped_quantiles, largest_normal
 from icalib.rig import Settings
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
-NEIGHBOURS = 12  # with twice as many, small outliers near the border find a similar residual by chance
-# Corners that are not suspect, among which neighbours are looked for: in images of 752 x 480 px one for each 4 px in
-# either direction. With fewer neighbours are further away; more take time and memory.
-MOST_OTHERS = 20_000
-TAG_CORNERS = 4  # of one image, that are no neighbours: a tag that is taken for another is off alike in all of them
-SIMILAR = 0.7  # of a residual's length: its largest distance from a similar one; at 1 zero would be similar
+N_NEIGHBOURS = 12  # nearest corners; with twice as many, small outliers near the border find similar ones by chance
+# Corners that are not suspect, among which neighbours are searched: one for every 4 x 4 px of 752 x 480. With fewer,
+# neighbours are farther away; more take time and memory.
+MAX_UNSUSPECT_CORNERS = 20_000
+CORNERS_PER_TAG = 4  # in one image they are no neighbours: all corners of a misidentified tag err alike
+SIMILAR_RATIO = 0.7  # largest distance of two similar residuals over their length; at 1 zero would be similar
 
 
 def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:
@@ -62,9 +62,9 @@ def rejected(factor: CornerFactor, rows: np.ndarray, residual: np.ndarray, setti
 
 
 def _with_neighbours(suspect: np.ndarray) -> np.ndarray:
-    """(n,) int, in order: all `suspect` (N,) corners, and of the others MOST_OTHERS at most, evenly drawn."""
+    """(n,) int, in order: all `suspect` (N,) corners, and of the others MAX_UNSUSPECT_CORNERS at most, evenly drawn."""
     others = np.flatnonzero(~suspect)
-    return np.union1d(np.flatnonzero(suspect), others[:: 1 + len(others) // MOST_OTHERS])
+    return np.union1d(np.flatnonzero(suspect), others[:: 1 + len(others) // MAX_UNSUSPECT_CORNERS])
 
 
 def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.ndarray) -> np.ndarray:
@@ -77,9 +77,9 @@ def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.
     own = np.flatnonzero(suspect)
     if not len(own):
         return np.zeros(len(uv), dtype=bool)
-    near = KDTree(uv).query(uv[own], min(NEIGHBOURS + TAG_CORNERS, len(uv)))[1].reshape(len(own), -1)
+    near = KDTree(uv).query(uv[own], min(N_NEIGHBOURS + CORNERS_PER_TAG, len(uv)))[1].reshape(len(own), -1)
     difference = np.linalg.norm(residual[near] - residual[own, None], axis=2)
-    similar = difference < SIMILAR * np.linalg.norm(residual[own], axis=1)[:, None]
+    similar = difference < SIMILAR_RATIO * np.linalg.norm(residual[own], axis=1)[:, None]
     similar &= tag[near] != tag[own, None]
     # A graph with a vertex for each suspect corner; vertex 0 stands for all corners that are not suspect.
     keyframe = np.zeros(len(uv), dtype=np.int64)

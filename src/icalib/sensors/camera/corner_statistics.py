@@ -13,11 +13,11 @@ from icalib.optim.arrowhead import in_parallel
 if TYPE_CHECKING:
     from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
-CORNERS = "corners"  # the kind of their rows
+CORNERS = "corners"  # kind of their residuals
 
 
 def corner_squares(camera: CornerFactor, out: CornerOutput) -> dict[FitKey, Squares]:
-    """Number and chi^2 of the corners' rows and of each kind of common error's rows."""
+    """Number and chi^2 of the corners, and of the coefficients of each common error."""
     found = {(camera.name, CORNERS): Squares(2 * int(np.count_nonzero(out.root)), camera.chi2(out))}
     for k, tau in enumerate(camera.noise.tau):
         rows = out.shared[:, :, k] / tau
@@ -28,7 +28,7 @@ def corner_squares(camera: CornerFactor, out: CornerOutput) -> dict[FitKey, Squa
 def image_rows(
     sensor: str, kind: str, seconds: np.ndarray, residual: np.ndarray, sigma: np.ndarray, root: np.ndarray
 ) -> ResidualRows:
-    """Of residuals (n, 2) px with sigma (n,) px per axis; root (n,): of the robust weights over sigma^2."""
+    """Rows of residuals (n, 2) px. sigma (n,) px: per axis; root (n,) 1/px: square root of robust weight over sigma."""
     two = residual.shape
     sigma, root = np.broadcast_to(sigma[:, None], two), np.broadcast_to((root * sigma)[:, None], two)
     return ResidualRows(sensor, kind, "px", seconds, residual, sigma, residual / sigma, root)
@@ -41,7 +41,7 @@ def rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
 
 
 def spent_by_corners(camera: CornerFactor, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
-    """See `Factor.spent`."""
+    """See `Factor.dof_used`."""
     found = in_parallel(partial(_spent_by_views, camera, out, along), camera.blocks())
     return {(camera.name, kind): sum(one[kind] for one in found) for kind in (found[0] if found else ())}
 
@@ -49,14 +49,14 @@ def spent_by_corners(camera: CornerFactor, out: CornerOutput, along: StateDiffer
 def _spent_by_views(
     camera: CornerFactor, at: CornerOutput, step: StateDifference, views: tuple[int, int]
 ) -> dict[str, float]:
-    """|J x|^2 of some views, its mean over their images' common errors, which follow x."""
+    """|J x|^2 of views v0..v1 by kind of residual, as a mean over the posterior of their common errors given x."""
     own, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
     up, down = (camera.residual(state, *views) for state in (step.end, step.start))
     root, view = at.root[own], camera.views.of_corners(*views) - views[0]
     along = (up - down) / step.share * root[:, None]
     if m == 0:
         return {CORNERS: float((along**2).sum())}
-    # An error c takes what is least: |along + f c|^2 + |c / tau|^2; about that its covariance is M^-1, on each axis.
+    # The common error c minimises |along + f c|^2 + |c / tau|^2; its covariance about the minimum is M^-1, per axis.
     f = camera.noise.field[own] * root[:, None]
     M, rhs = np.zeros((n, m, m)), np.zeros((n, m, 2))
     np.add.at(M, view, f[:, :, None] * f[:, None, :])

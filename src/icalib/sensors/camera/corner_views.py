@@ -11,7 +11,8 @@ from icalib.data.measurements import CornerStream
 
 @dataclass(frozen=True)
 class Views:
-    """One body of the target in one image each: corners of view j are start[j]:start[j + 1]; image and body (V,)."""
+    """V views, each of one body of the target in one image: corners of view j are start[j]:start[j + 1]; image and body
+    (V,) are indices."""
 
     start: np.ndarray
     image: np.ndarray
@@ -19,7 +20,7 @@ class Views:
 
     @classmethod
     def of(cls, stream: CornerStream, body: np.ndarray) -> Views:
-        """Of a stream whose corners stand body by body in each image; body (n_points,) of each point."""
+        """Views of a stream whose corners are sorted by body in each image; body (n_points,): of each point."""
         if not body.any():
             seen = np.flatnonzero(np.diff(stream.start))
             start = np.append(stream.start[seen], stream.start[-1])

@@ -20,9 +20,9 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.optim.state import State
 from icalib.sensors.camera.corner_factor import CornerFactor
 
-# Image of a unit area of the target at unit depth, over fx^2: 0 where the plane is seen edge-on. Below, the affine map
-# to the image is not inverted, and the corner stays where it is.
-LEAST_AREA = 1e-6
+# Image area of a unit area of the target at unit depth, over fx^2: 0 if the plane is edge-on. Below this value the
+# affine map to the image is not inverted, and the corner is not corrected.
+MIN_RELATIVE_AREA = 1e-6
 
 
 def with_bent_edges(factor: CornerFactor, state: State) -> CornerFactor:
@@ -56,7 +56,7 @@ def predicted_curvature(
     _, valid, J_point, _ = model.project_with_jacobians(params, X)
     A = J_point @ plane  # px/m, from the target's plane to the image
     area = np.linalg.det(A)
-    known = valid & (np.abs(area * X[:, 2] ** 2) > LEAST_AREA * params[0] ** 2)
+    known = valid & (np.abs(area * X[:, 2] ** 2) > MIN_RELATIVE_AREA * params[0] ** 2)
     inverse = np.linalg.inv(np.where(known[:, None, None], A, np.eye(2)))
     uv = []
     for offset in (piece[:, 0], piece.mean(axis=1), piece[:, 1]):

@@ -15,8 +15,8 @@ from icalib.optim.medians import grouped_quantiles
 from icalib.rig import Settings
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
-MEDIAN_RATIO = 8.0  # of an image's median to the median of all images' medians; lenses and blur reach a few times that
-MOST_SHARE = 0.2  # of the shared keyframes: where more do not fit, no single set is to blame, and none is rejected
+MAX_MEDIAN_RATIO = 8.0  # of the median residual of an image to that of most images; blur and lenses reach a few
+MAX_REJECTED_SHARE = 0.2  # of the shared keyframes; if more do not fit, the cause is another, and none is rejected
 
 
 def not_simultaneous(
@@ -24,8 +24,8 @@ def not_simultaneous(
 ) -> list[np.ndarray]:
     """For each camera (M,) bool: its images at keyframes that several cameras share and where an image does not fit.
 
-    An image does not fit where its median residual is above `outlier_min_px` and `MEDIAN_RATIO` times the usual one.
-    All images of its keyframe are rejected: which of them was late is not known.
+    An image does not fit if its median residual is above `outlier_min_px` and above `MAX_MEDIAN_RATIO` times that of
+    most images. All images of its keyframe are rejected: which of them was late is unknown.
     """
     shared = _shared_keyframes(cameras)
     bad = np.zeros(len(shared), dtype=bool)
@@ -34,9 +34,9 @@ def not_simultaneous(
         medians = grouped_quantiles(size, camera.stream.image, len(camera.keyframe), 0.5)
         own = shared[camera.keyframe] & np.isfinite(medians)
         if own.any():
-            limit = max(MEDIAN_RATIO * float(np.median(medians[own])), settings.outlier_min_px)
+            limit = max(MAX_MEDIAN_RATIO * float(np.median(medians[own])), settings.outlier_min_px)
             bad[camera.keyframe[own & (medians > limit)]] = True
-    if bad.sum() > MOST_SHARE * shared.sum():
+    if bad.sum() > MAX_REJECTED_SHARE * shared.sum():
         bad[:] = False
     return [bad[camera.keyframe] for camera in cameras]
 

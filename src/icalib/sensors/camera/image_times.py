@@ -1,4 +1,4 @@
-"""Images of a camera: corners and tracks on the same ones, their instants, keyframes, and whether they are used."""
+"""Images of cameras: corners and tracks on the same images, their instants and keyframes, and which are used."""
 
 from __future__ import annotations
 

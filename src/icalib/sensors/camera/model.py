@@ -19,8 +19,8 @@ from icalib.sensors.camera.bloom import with_bloom
 from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.corner_noise import (
-    COMMON_ERRORS,
-    FIRST_TAU_PX,
+    INITIAL_COMMON_ERROR_PX,
+    N_COMMON_ERRORS,
     NoiseModel,
     estimate_noise,
     first_noise,
@@ -140,9 +140,9 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
     def uses_more(self, used: Mapping[FactorKey, Factor], rebuilt: Callable[[], Mapping[FactorKey, Factor]]) -> bool:
         """See `SensorModel`: of tracks whose points the first poses of the pass did not find, and its last ones do."""
         (now,) = of_tracks(used) or (None,)
-        if now is None or now.followed > ENOUGH_USED * sum(int(k.sum()) for k in now.keep):
+        if now is None or now.n_used > ENOUGH_USED * sum(int(k.sum()) for k in now.keep):
             return False
-        return any(f.followed > MORE_USED * now.followed for f in of_tracks(rebuilt()))
+        return any(f.n_used > MORE_USED * now.n_used for f in of_tracks(rebuilt()))
 
     def clusters(self, factors: Mapping[FactorKey, Factor]) -> Iterator[Clusters]:
         """See `error_clusters`."""
@@ -226,12 +226,12 @@ def _next_corner_noise(
     if not factor.sees_target:
         return first_noise(camera), factor.noise
     speed = image_speed(factor, end.state)
-    tau = (FIRST_TAU_PX,) * COMMON_ERRORS if settings.common_error else ()
+    tau = (INITIAL_COMMON_ERROR_PX,) * N_COMMON_ERRORS if settings.common_error else ()
     if len(factor.noise.tau):
         common = [f for kind, f in end.of(camera.name).fits.items() if kind.startswith("common")]
         tau = scale_common_errors(tuple(factor.noise.tau), common)
     model, large = estimate_noise(camera, settings, factor, out, speed, tau)
-    model = replace(model, later=large and end.rig.cameras_alone)
+    model = replace(model, wide_loss=large and end.rig.cameras_alone)
     return model, model.noise(factor.stream, camera, settings, speed)
 
 

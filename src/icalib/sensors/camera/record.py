@@ -21,7 +21,7 @@ _IMAGES: Shapes = {
 
 
 class _PointsInImages:
-    """What both records share: rows of points, image by image."""
+    """Base of both records: residuals of points, image by image."""
 
     kind: str
     start: np.ndarray
@@ -31,20 +31,20 @@ class _PointsInImages:
 
     @property
     def used(self) -> np.ndarray:
-        """(N,) bool"""
+        """(N,) bool: residuals in use."""
         raise NotImplementedError
 
     @property
     def whitened(self) -> np.ndarray:
-        """(N, 2) residuals over their standard deviation, NaN where there are none."""
+        """(N, 2) residuals over their standard deviations; NaN where there is no residual."""
         return self.residual / self.sigma[:, None]
 
     def normalised(self) -> dict[str, np.ndarray]:
-        """Of both coordinates together."""
+        """Whitened residuals in use, both coordinates together, by a title."""
         return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
 
     def successive(self) -> dict[str, Successive]:
-        """Of the same corner or tracked point, from one image to the next."""
+        """Whitened residuals, and which pairs are of one corner or track in two consecutive images."""
         image, point = image_of(self), self.point
         order = np.lexsort((image, point))
         order = order[self.used[order]]
@@ -70,7 +70,7 @@ class CornerResiduals(_PointsInImages):
 
     @property
     def used(self) -> np.ndarray:
-        """(N,) bool"""
+        """(N,) bool: residuals in use."""
         return ~self.rejected
 
 
@@ -99,7 +99,7 @@ class TrackResiduals(_PointsInImages):
 
     @property
     def used(self) -> np.ndarray:
-        """(N,) bool"""
+        """(N,) bool: residuals in use."""
         return np.isfinite(self.residual[:, 0])
 
 
@@ -108,12 +108,12 @@ ImageResiduals = CornerResiduals | TrackResiduals
 
 
 def image_of(r: _PointsInImages) -> np.ndarray:
-    """(N,) the image that each was seen in."""
+    """(N,) index of the image of each residual."""
     return np.repeat(np.arange(len(r.start) - 1), np.diff(r.start))
 
 
 def rms_of_images(r: ImageResiduals) -> np.ndarray:
-    """(M,) RMS [px] per coordinate of each image, NaN where nothing was used."""
+    """(M,) px: RMS per coordinate of each image, NaN if it has no residuals in use."""
     image, square = image_of(r)[r.used], (r.residual[r.used].astype(np.float64) ** 2).sum(axis=1)
     count = np.bincount(image, minlength=len(r.seconds))
     return np.sqrt(np.bincount(image, square, len(r.seconds)) / np.where(count > 0, 2.0 * count, np.nan))

@@ -1,4 +1,4 @@
-"""What report and 3D view show of cameras: residuals in the images, how well each lens is known, fields of view."""
+"""Cameras in the report and in the 3D view: residuals in images, uncertainty of each lens, fields of view."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LENS_WORDS = (
 
 
 def sections(c: Calibration) -> Iterator[Section]:
-    """Residuals in images, where any were seen; and the uncertainty of each lens."""
+    """Residuals in images, if there are any, and the uncertainty of each lens."""
     if c.image_residuals:
         figures, parts = {}, []
         for i, r in enumerate(c.image_residuals):
@@ -50,7 +50,7 @@ def sections(c: Calibration) -> Iterator[Section]:
 
 
 def _counts(r: ImageResiduals) -> str:
-    """How many are in use, and what became of the others."""
+    """Numbers of residuals in use, of rejected ones, and of those left out with their tracks."""
     used, rejected = int(r.used.sum()), int(r.rejected.sum())
     left_out = len(r.uv) - used - rejected
     more = f", {left_out} left out with their tracks" if left_out else ""
@@ -58,7 +58,8 @@ def _counts(r: ImageResiduals) -> str:
 
 
 def _projection_section(c: Calibration) -> Section:
-    """The maps of camera i as `projection-i-0`, `projection-i-1`; or that its lens is fixed."""
+    """Maps of projection uncertainty, as `projection-i-0` and `projection-i-1` of camera i; a sentence if its lens is
+    fixed."""
     figures, parts = {}, []
     for i, name in enumerate(c.cameras):
         size, seen = c.rig["sensors"][name]["resolution"], [r for r in c.image_residuals if r.sensor == name]
@@ -81,7 +82,7 @@ def curves(r: ImageResiduals) -> Iterator[ResidualCurve]:
 
 
 def amounts(c: Calibration) -> Iterator[str]:
-    """How much was used."""
+    """Numbers of images, corners and observations."""
     if c.cameras:
         images = sum(len(r.seconds) for r in c.corner_residuals)
         counts = {kind: sum(len(r.uv) for r in c.image_residuals if r.kind == kind) for kind in _SEEN}

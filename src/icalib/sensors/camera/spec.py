@@ -1,4 +1,4 @@
-"""A camera (its lens, its corners and its feature tracks), and its fields in the rig file."""
+"""A camera: its parameters, and its fields in the rig file."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ INTRINSICS = ParameterSpec(
     motion="show the target at different distances, tilted, and in every part of the image",
     motion_without_target="move so that near and far points of the scene cross the whole image",
 )
-# Of a polynomial model; `specs` gives those of the camera's own model.
+# For polynomial models; `Camera.specs` adapts it to the camera's own model.
 DISTORTION = ParameterSpec(
     name="distortion",
     size=4,

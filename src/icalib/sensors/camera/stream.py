@@ -10,21 +10,21 @@ import numpy as np
 
 from icalib.sensors.stream import Stream, check, check_groups, which_image
 
-EDGE = 7  # numbers that say how an edge was fitted: see `CornerStream`
+EDGE = 7  # columns that describe the fit of an edge, see `CornerStream`
 NO_EDGES = np.zeros((0, 2, EDGE), dtype=np.float32)
 NO_VIEWS = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class _ImageStream(Stream):
-    """Rows of image i are start[i]:start[i + 1]."""
+    """Observations in images; those of image i are rows start[i]:start[i + 1]."""
 
     sensor_type: ClassVar[str] = "camera"
     start: np.ndarray
 
     @property
     def image(self) -> np.ndarray:
-        """(N,) the image that each row belongs to."""
+        """(N,) index of the image of each row."""
         return np.repeat(np.arange(len(self.stamps_ns)), np.diff(self.start))
 
 
@@ -35,12 +35,12 @@ class CornerStream(_ImageStream):
     stamps_ns (M,) int64, one per image, strictly increasing; start (M + 1,) int64, corners of image i are
     start[i]:start[i+1]; point (N,) int64, index into the target's points; uv (N, 2) pixels, (0, 0) is the
     centre of the top-left pixel; sigma (N,) pixels, the detector's standard deviation of each corner per axis up to a
-    factor common to all, (0,) where it states none.
+    factor common to all, (0,) if it states none.
 
-    edges (N, 2, EDGE) float32, (0, 2, EDGE) where it states none: the two edges that meet in each corner, as they were
-    fitted. Columns: the piece of the edge that was used, from (2,) and to (2,) px beside the corner; gain (2,) px^2, by
-    how much the corner moves where the piece's curvature is larger than the fitted one; that curvature [1 / px]. The
-    curvature is positive where the piece, as u is to the right and v down, turns to the left on its way.
+    edges (N, 2, EDGE) float32, (0, 2, EDGE) if it states none: the fits of the two edges that meet in each corner.
+    Columns: ends (2,) and (2,) px of the fitted piece, relative to the corner; gain (2,) px^2, derivative of the corner
+    by the curvature of the edge; fitted curvature [1 / px]. It is positive if the piece turns left on its way from the
+    first end to the second, with u to the right and v down.
 
     files: names of the files that images come from, by stamp, "" for those of no file; also of images without corners.
     """
@@ -77,24 +77,24 @@ class CornerStream(_ImageStream):
         return replace(super().joined(streams, shifts_ns), files=files)
 
     def which(self, stamp_ns: int) -> str:
-        """Tells the image with this stamp from others, in sentences."""
+        """Name of the image with this stamp in sentences: its file, or its stamp."""
         return which_image(self.files.get(stamp_ns, ""), stamp_ns)
 
     @property
     def relative_sigma(self) -> np.ndarray:
-        """(N,) each corner's standard deviation over that of the median corner; ones where the detector states none."""
+        """(N,) standard deviation of each corner over that of the median corner; ones if the detector states none."""
         return self.sigma / np.median(self.sigma) if len(self.sigma) else np.ones(len(self.uv))
 
 
 @dataclass(frozen=True)
 class TrackStream(_ImageStream):
-    """Points of the scene that one camera followed, image by image, as a front end reports them.
+    """Feature tracks of one camera, image by image, as a front end reports them.
 
     stamps_ns (M,) int64, one per image, strictly increasing; start (M + 1,) int64, observations of image i are
-    start[i]:start[i+1]; feature (N,) int64, the same number is the same point of the scene, in all cameras; uv (N, 2)
-    pixels, (0, 0) is the centre of the top-left pixel; views (N,) int64, how many images the tracker had seen the
-    feature in before, (0,) where it does not say; spread (N,) px^2, second moment of the patch that was aligned, along
-    each axis, as the alignment weighs its points, (0,) where it does not say.
+    start[i]:start[i+1]; feature (N,) int64, number of the point of the scene, the same in all cameras; uv (N, 2)
+    pixels, (0, 0) is the centre of the top-left pixel; views (N,) int64, number of earlier images with the feature,
+    (0,) if unknown; spread (N,) px^2, second moment of the aligned patch along each axis, weighted as in the alignment,
+    (0,) if unknown.
     """
 
     feature: np.ndarray
@@ -112,12 +112,12 @@ class TrackStream(_ImageStream):
 
     @property
     def key(self) -> str:
-        """A camera may have corners as well."""
+        """See `Stream`; not the name of the camera, which is the key of its corners."""
         return f"{self.name}/tracks"
 
     @classmethod
     def disjoint(cls, recordings: Sequence[Sequence[Any]]) -> Sequence[Sequence[Self]]:
-        """Features numbered anew, so that no two recordings share one; cameras of one recording still do."""
+        """See `Stream`: features are renumbered, so that recordings share none; cameras of one recording still do."""
         numbered, first = [], 0
         for streams in recordings:
             least = min((int(t.feature.min(initial=0)) for t in streams), default=0)
@@ -127,12 +127,12 @@ class TrackStream(_ImageStream):
         return numbered
 
     def which(self, stamp_ns: int) -> str:
-        """Tells the image with this stamp from others, in sentences."""
+        """Name of the image with this stamp in sentences: its file, or its stamp."""
         return which_image("", stamp_ns)
 
 
 def shared_rows(start: np.ndarray, feature: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the features that images i and j share, as i and as j saw them; start (M + 1,), feature (N,) as in
+    """Rows (n,) in image i and rows (n,) in image j of the features that both show; start (M + 1,), feature (N,) as in
     `TrackStream`."""
     own, other = feature[start[i] : start[i + 1]], feature[start[j] : start[j + 1]]
     _, p, q = np.intersect1d(own, other, return_indices=True)

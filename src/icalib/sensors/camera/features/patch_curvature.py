@@ -20,12 +20,13 @@ import numpy as np
 from icalib.data.measurements import TrackStream
 from icalib.geometry.cameras.base import CameraModel
 
+# Directions of four points around an observation.
 _AROUND = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 def with_curved_patches(stream: TrackStream, model: CameraModel, params: np.ndarray) -> TrackStream:
-    """The stream with corrected observations, by lens `params` (P,). Unchanged where it states no spread; observations
-    whose surroundings the model cannot see stay."""
+    """The stream with corrected observations, by lens `params` (P,). Unchanged if it states no spread. Observations
+    whose patch is outside the range of the lens model stay as they are."""
     if not len(stream.spread):
         return stream
     # Four points at this distance have the second moment of the patch.

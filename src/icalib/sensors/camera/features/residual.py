@@ -1,10 +1,11 @@
-"""Points of the scene, of unknown position, as the cameras follow them (paper (20)-(22)).
+"""Feature tracks: points of the scene, of unknown position, that cameras observe (paper (20)-(22)).
 
-residual = K(R_cam_world (P - p_world_cam)) - uv
+    residual = K(R_cam_world (P - p_world_cam)) - uv
 
-Points are no part of the state: at every linearisation each is moved to where the poses and the calibration want it
-(variable projection), so that the cost is the least over all points. Their columns are eliminated with the keyframes
-that saw them (`front.py`). Those that lie on planes of the LiDARs have a row for that, too (`surfaces.py`)."""
+Points are no part of the state. At every linearisation each point P moves to where its cost is least (variable
+projection; Golub and Pereyra 1973). Columns of points are eliminated with the keyframes that observe them
+(`optim/front.py`). Points on planes of the LiDARs have one more row each (`surfaces.py`).
+"""
 
 from __future__ import annotations
 
@@ -26,12 +27,12 @@ from icalib.optim.planes import Planes
 from icalib.optim.robust_weights import LOSSES, Loss
 from icalib.optim.state import Layout, State
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.camera_images import View
+from icalib.sensors.camera.features.camera_images import CameraImages
 from icalib.sensors.camera.features.cluster_kernels import accumulate_clusters
 from icalib.sensors.camera.features.kernels import (
-    Points,
-    Range,
-    Seen,
+    PieceStart,
+    PointSearch,
+    TrackObservations,
     accumulate,
     add_rays,
     held_back,
@@ -45,27 +46,29 @@ from icalib.sensors.camera.features.statistics import (
     spent_by_features,
 )
 from icalib.sensors.camera.features.surfaces import (
-    NOWHERE,
-    Distances,
+    NO_PLANES,
     OnPlanes,
+    PlaneDistances,
     Surfaces,
     add_planes_to_points,
     add_points_on_planes,
 )
-from icalib.sensors.camera.features.tracks import NO_TRACKS, Sightings, TrackNoise, Tracks
+from icalib.sensors.camera.features.tracks import NO_TRACKS, ObservationTable, TrackNoise, Tracks
 
-MOST_STEPS = 20  # of a point; most settle in three
-WEAK = 1e-6  # information [1/m^2]: keeps a point defined that no image shows any more; steers nothing else
-LONGEST_GAP_S = 1.0  # a feature that was out of sight for longer is a new track
-MOST_UNCERTAIN = 0.1  # of its distance: a point that is less certain is left out
-MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits worse is left out
+MAX_POINT_STEPS = 20  # of Levenberg-Marquardt; most points converge in three
+MIN_POINT_INFORMATION = 1e-6  # 1/m^2: keeps the elimination of a point without observations defined, to 1 km
+MAX_TRACK_GAP_S = 1.0  # a feature that was out of sight for longer begins a new track
+MAX_RELATIVE_SIGMA = 0.1  # standard deviation of a point over its distance, above which its track is left out
+MAX_RESIDUAL_RATIO = 10.0  # to the RMS residual of the median track, above which a track is left out
 
 
 @dataclass(frozen=True)
 class FeatureFactor(FactorDefaults):
-    """All features of all cameras. cameras: their poses and models; streams: one per camera, on its images; noise: of
-    each camera's observations; keep: (N,) by camera, observations in use; seams: keyframes at which further recordings
-    begin; surfaces: planes that points may lie on, and which tracks are on them."""
+    """All feature tracks of all cameras.
+
+    cameras: their poses and models; by camera: streams, on the images of its corners; noise; keep (N,) bool,
+    observations in use; outliers (N,) bool, empty before any were found. seams: first keyframes of further recordings;
+    surfaces: planes that points may lie on; on: the plane of each track."""
 
     cameras: tuple[CornerFactor, ...]
     streams: tuple[TrackStream, ...]
@@ -77,8 +80,8 @@ class FeatureFactor(FactorDefaults):
     layout: Layout
     seams: tuple[int, ...] = ()
     surfaces: Surfaces | None = None
-    on: OnPlanes = NOWHERE
-    outliers: tuple[np.ndarray, ...] = ()  # (N,) bool by camera; () before any were judged
+    on: OnPlanes = NO_PLANES
+    outliers: tuple[np.ndarray, ...] = ()
 
     @classmethod
     def build(
@@ -93,8 +96,8 @@ class FeatureFactor(FactorDefaults):
         seams: tuple[int, ...] = (),
         surfaces: Surfaces | None = None,
     ) -> FeatureFactor:
-        """Tracks chosen, and points first looked for, with the poses of `state`; the chain is cut at keyframes
-        `cuts`."""
+        """The factor with tracks and initial points by the poses of `state`. Tracks end at keyframes `cuts`. loss: its
+        name, and where it bends, in sigma."""
         factor = cls(cameras, streams, noise, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
         return factor.cut(state, cuts)
 
@@ -102,7 +105,7 @@ class FeatureFactor(FactorDefaults):
 
     @property
     def name(self) -> str:
-        """Of all cameras: a track is one feature that several may see."""
+        """Of all cameras, because several may observe one track."""
         return "cameras"
 
     @property
@@ -111,7 +114,7 @@ class FeatureFactor(FactorDefaults):
 
     @cached_property
     def sigmas(self) -> tuple[np.ndarray, ...]:
-        """(N,) px, by camera: of each observation, per axis."""
+        """By camera (N,) px: standard deviation of each observation per axis."""
         return tuple(noise.of(stream) for noise, stream in zip(self.noise, self.streams, strict=True))
 
     @property
@@ -119,34 +122,33 @@ class FeatureFactor(FactorDefaults):
         return self.cameras[0].n_keyframes
 
     @property
-    def followed(self) -> int:
-        """How many observations take part."""
+    def n_used(self) -> int:
+        """Number of observations in tracks."""
         return sum(int((t >= 0).sum()) for t in self.tracks.track)
 
     def cut(self, state: State, keyframes: tuple[int, ...]) -> FeatureFactor:
-        """The same features as tracks that end at `keyframes`. A track is left out whose point the poses of `state` do
-        not find where all its images can show it, whose distance they leave uncertain, or that fits far worse than
-        most."""
+        """The same features as tracks that end at `keyframes`. A track is left out if, with the poses of `state`, its
+        point is not in front of all its cameras, its distance is uncertain, or its residuals are far above most."""
         edges = np.unique([0, *keyframes, *self.seams, self.n_keyframes])
-        sightings = self._sightings()
-        label = sightings.in_order(sightings.labels(state.seconds, edges, LONGEST_GAP_S))
-        tracks = sightings.tracks(label, edges)
+        table = self._table()
+        label = table.in_order(table.labels(state.seconds, edges, MAX_TRACK_GAP_S))
+        tracks = table.tracks(label, edges)
         factor = replace(self, tracks=tracks, on=OnPlanes.none(tracks.count))
         points, good, on = factor._triangulated(state)
         label = np.where(label >= 0, np.where(np.append(good, False)[label], label, -1), -1)
         number = np.append(np.where(good, np.cumsum(good) - 1, -1), -1)
-        tracks = sightings.tracks(number[label], edges)
+        tracks = table.tracks(number[label], edges)
         return replace(factor, tracks=replace(tracks, start=points[good]), on=on)
 
     def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray, OnPlanes]:
-        """Points (T, 3) in the frames of the cameras that they move with, from the rays with the poses of `state`;
-        whether each is certain enough; and of those that are, the planes that they lie on."""
+        """Points by the poses of `state`: (T, 3) m in their anchor cameras; (T,) bool, whether each is certain enough;
+        and the planes that those lie on."""
         views, n = self._views(state, 0, self.n_keyframes), self.tracks.count
         A, b = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for view in views:
-            rays, valid = view.camera.model.unproject(view.params, view.seen.uv)
+            rays, valid = view.camera.model.unproject(view.params, view.observed.uv)
             at = view.poses
-            add_rays(view.seen, 0, at.R_sensor_world, at.p_world_sensor, rays, valid, A, b)
+            add_rays(view.observed, 0, at.R_sensor_world, at.p_world_sensor, rays, valid, A, b)
         found = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n), None)
         points = self._in_anchors(views, found.xyz, slice(0, n))
         distance = np.linalg.norm(points, axis=1)
@@ -157,8 +159,8 @@ class FeatureFactor(FactorDefaults):
         )
         square = found.cost / np.maximum(seen, 1)
         whole = found.shown == seen
-        fits = square <= MOST_UNLIKE**2 * np.median(square[whole] if whole.any() else 0.0) + MOST_UNLIKE
-        certain = information * (MOST_UNCERTAIN * distance) ** 2 > 1.0
+        fits = square <= MAX_RESIDUAL_RATIO**2 * np.median(square[whole] if whole.any() else 0.0) + MAX_RESIDUAL_RATIO
+        certain = information * (MAX_RELATIVE_SIGMA * distance) ** 2 > 1.0
         good = np.isfinite(points).all(axis=1) & whole & fits & certain
         if self.surfaces is None:
             return points, good, OnPlanes.none(int(good.sum()))
@@ -166,22 +168,22 @@ class FeatureFactor(FactorDefaults):
         return points, good, self.surfaces.under(found.xyz[good], found.A[good], recording)
 
     def coarse(self, state: State) -> FeatureFactor:
-        """The same features, their noise as large as most errors with the poses of `state` and a guessed lens. Taken as
-        exact, what fits by chance would draw the lens far from its guess, where other tracks are lost."""
+        """The same tracks with noise as large as most residuals at `state`. In early passes with stated noise, the few
+        tracks that fit by chance would draw the lens away, and other tracks would be lost."""
         views = self._views(state, 0, self.n_keyframes)
         points = self._from_anchors(views, slice(0, self.tracks.count), self.tracks.start)
         noise = list(self.noise)
         for view in views:
             uv, valid, *_ = view.camera.model.project_with_jacobians(view.params, view.in_camera(points, 0))
-            used = valid & (view.seen.track >= 0) & view.seen.keep
+            used = valid & (view.observed.track >= 0) & view.observed.keep
             if used.any():
-                variance = median_variance(((uv - view.seen.uv)[used] ** 2).sum(axis=1))
+                variance = median_variance(((uv - view.observed.uv)[used] ** 2).sum(axis=1))
                 if variance > noise[view.index].sigma ** 2:
                     noise[view.index] = TrackNoise(float(np.sqrt(variance)))
         return replace(self, noise=tuple(noise))
 
     def on_planes_of(self, camera: int) -> np.ndarray:
-        """Those tracks on planes whose points move with camera number `camera`."""
+        """Indices of tracks on planes whose anchor is camera number `camera`."""
         return np.flatnonzero((self.on.plane >= 0) & (self.tracks.camera == camera))
 
     def output(self) -> FeatureOutput:
@@ -190,7 +192,7 @@ class FeatureFactor(FactorDefaults):
         points = self.tracks.count
         return FeatureOutput(
             tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes), np.zeros((points, 3)),
-            Distances.zeros(points),
+            PlaneDistances.zeros(points),
         )  # fmt: skip
 
     def with_imu(self, imu: ImuData) -> FeatureFactor:
@@ -203,8 +205,7 @@ class FeatureFactor(FactorDefaults):
         return self.output()
 
     def warm_started(self, out: FeatureOutput) -> FeatureFactor:
-        """See `Factor`: from far off a point may stop short, or end elsewhere, and the cost would jump from one step to
-        the next."""
+        """See `Factor`. From a distant start a point may stop early or in another minimum, and the cost would jump."""
         return replace(self, tracks=replace(self.tracks, start=out.points.copy()))
 
     def squares(self, out: FeatureOutput) -> dict[FitKey, Squares]:
@@ -224,7 +225,7 @@ class FeatureFactor(FactorDefaults):
         return spent_by_features(self, out, along)
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
-        """The piece with room for the features that its keyframes saw; `keep`: its end is shared with another piece."""
+        """See `Factor`: room for the tracks that the keyframes of the piece observe."""
         tracks, pairs = self._within(piece)
         images = self._images(piece.first, self._stop(piece))
         begins = np.cumsum([0] + [len(i) for i in images])[:-1] - np.array([i.start for i in images])
@@ -242,9 +243,9 @@ class FeatureFactor(FactorDefaults):
     def accumulate(
         self, state: State, piece: Piece, out: FeatureOutput, sums: bool = True, curved: bool = False
     ) -> float:
-        """See `Factor`: of the features that the keyframes of `piece` saw, the cost is the least over the points."""
+        """See `Factor`: of the tracks that the keyframes of `piece` observe, the least cost over their points."""
         tracks, pairs = self._within(piece)
-        views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
+        views, base = self._views(state, piece.first, self._stop(piece)), PieceStart(tracks.start, pairs.start)
         planes = self._planes(state)
         points = self._descend(views, self._from_anchors(views, tracks, self.tracks.start[tracks]), tracks, planes)
         out.points[tracks] = self._in_anchors(views, points.xyz, tracks)
@@ -252,7 +253,7 @@ class FeatureFactor(FactorDefaults):
         features = NO_SUMS
         if sums and piece.features is not None:
             features = piece.features.sums
-            features.own[:, range(3), range(3)] += WEAK
+            features.own[:, range(3), range(3)] += MIN_POINT_INFORMATION
         total, begin = 0.0, 0
         for view in views:
             i, loss = view.index, self._loss(curved)
@@ -261,10 +262,10 @@ class FeatureFactor(FactorDefaults):
                 mine = features._replace(pose=features.pose[own], next_pose=features.next_pose[own])
                 X = part.in_camera(points.xyz, tracks.start)
                 total += accumulate(
-                    X, part.seen, base, part.poses, part.columns, part.seeing(X), loss, into, mine, out.residual[i],
-                    out.root[i],
+                    X, part.observed, base, part.poses, part.columns, part.projection(X), loss, into, mine,
+                    out.residual[i], out.root[i],
                 )  # fmt: skip
-            begin += len(view.seen.keyframe)
+            begin += len(view.observed.keyframe)
         if planes is not None:
             loss, off = self._loss(curved), out.off.of(tracks)
             total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
@@ -275,23 +276,23 @@ class FeatureFactor(FactorDefaults):
     def accumulate_clusters(
         self, state: State, piece: Piece, at: FeatureOutput, cluster: list[np.ndarray], n_clusters: int, column: int
     ) -> None:
-        """Adds the gradient of each cluster of observations, by camera (N,), to columns of `piece` from `column` on;
-        points are those of `at`."""
+        """Adds the gradient of each cluster of observations to columns `column` and on of `piece`, points as in `at`.
+        cluster: by camera (N,) index of each observation's, below n_clusters."""
         assert piece.features is not None
         tracks, pairs = self._within(piece)
-        views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
+        views, base = self._views(state, piece.first, self._stop(piece)), PieceStart(tracks.start, pairs.start)
         points, side = self._from_anchors(views, tracks, at.points[tracks]), piece.features.sums.side
         for view in views:
             loss, own = self._loss(False), cluster[view.index]
             for part, _ in view.chunks():
                 X = part.in_camera(points, tracks.start)
                 accumulate_clusters(
-                    X, part.seen, base, part.poses, part.columns, part.seeing(X), loss, own, n_clusters, column,
+                    X, part.observed, base, part.poses, part.columns, part.projection(X), loss, own, n_clusters, column,
                     piece.sums(True), side,
                 )  # fmt: skip
 
     def _planes(self, state: State) -> Planes | None:
-        """As `state` has them; None where no point lies on any."""
+        """The planes at `state`; None if no point lies on any."""
         if self.surfaces is None or not (self.on.plane >= 0).any():
             return None
         return Planes.of(self.surfaces.keys, state, self._of_planes)
@@ -309,16 +310,17 @@ class FeatureFactor(FactorDefaults):
         return self.tracks.within(piece.first, self._stop(piece))
 
     def _stop(self, piece: Piece) -> int:
-        """The keyframe before which the images of `piece` hang: the last, or behind the chain's very last."""
+        """End of the range of keyframes of `piece`. The last one belongs to the next piece, except at the end of the
+        chain."""
         return piece.last + 1 if piece.last == self.n_keyframes - 1 else piece.last
 
     def _images(self, first: int, stop: int) -> list[range]:
-        """By camera, the images that hang on keyframes first..stop."""
+        """By camera, the images of keyframes first..stop."""
         return [range(*(int(i) for i in np.searchsorted(c.keyframe, [first, stop]))) for c in self.cameras]
 
-    def _sightings(self) -> Sightings:
+    def _table(self) -> ObservationTable:
         pairs = list(zip(self.streams, self.cameras, strict=True))
-        return Sightings(
+        return ObservationTable(
             np.concatenate([s.feature for s in self.streams]),
             np.concatenate([s.image for s in self.streams]),
             np.concatenate([c.keyframe[s.image] for s, c in pairs]),
@@ -326,14 +328,14 @@ class FeatureFactor(FactorDefaults):
             tuple(len(s.feature) for s in self.streams),
         )
 
-    def _views(self, state: State, first: int, stop: int) -> list[View]:
-        """What hangs on keyframes first..stop."""
+    def _views(self, state: State, first: int, stop: int) -> list[CameraImages]:
+        """By camera, its images of keyframes first..stop."""
         return [self._view(state, i, images, first) for i, images in enumerate(self._images(first, stop))]
 
-    def _view(self, state: State, index: int, images: range, first: int) -> View:
+    def _view(self, state: State, index: int, images: range, first: int) -> CameraImages:
         camera, stream, tracks = self.cameras[index], self.streams[index], self.tracks
         i0, i1 = images.start, images.stop
-        seen = Seen(
+        observed = TrackObservations(
             stream.start[i0 : i1 + 1], stream.uv, self.keep[index], tracks.track[index], tracks.pair[index],
             camera.keyframe[i0:i1] - first, self.sigmas[index],
         )  # fmt: skip
@@ -342,17 +344,17 @@ class FeatureFactor(FactorDefaults):
         clocks = range(len(state.values[camera.name, "time_offset"]))
         own = np.array([np.concatenate([camera.kinematics.columns(k), lens[pars]]) for k in clocks])
         columns = own[clock_numbers(state, camera.name, camera.keyframe[i0:i1])]
-        return View(camera, index, i0, camera.lens(state), seen, camera.poses(state, i0, i1), columns, pars)
+        return CameraImages(camera, index, i0, camera.lens(state), observed, camera.poses(state, i0, i1), columns, pars)
 
-    def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> Points:
-        """The points of `tracks` where their cost is least, that of their `planes` with it, from `xyz` (n, 3) on."""
-        n, eyes = len(xyz), self._from_anchors(views, tracks, np.zeros_like(xyz))
-        points = Points(
-            eyes, xyz, xyz.copy(), np.zeros(n), np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)),
-            np.zeros((n, 3)), np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64), np.zeros(n),
-            np.ones(n, dtype=bool),
+    def _descend(self, views: list[CameraImages], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> PointSearch:
+        """The points of `tracks` at their least cost, rows of `planes` included, from xyz (n, 3) m in the world on."""
+        n, anchors = len(xyz), self._from_anchors(views, tracks, np.zeros_like(xyz))
+        points = PointSearch(
+            anchors, xyz, xyz.copy(), np.zeros(n), np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)),
+            np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64),
+            np.zeros(n), np.ones(n, dtype=bool),
         )  # fmt: skip
-        for step in range(MOST_STEPS):
+        for step in range(MAX_POINT_STEPS):
             for view in views:
                 view.add_to_points(tracks.start, self._loss(False), points)
             if planes is not None:
@@ -361,8 +363,8 @@ class FeatureFactor(FactorDefaults):
                 break
         return points
 
-    def _from_anchors(self, views: list[View], tracks: slice, points: np.ndarray) -> np.ndarray:
-        """(n, 3) in the world what is at `points` (n, 3) in the frames of the cameras that `tracks` move with."""
+    def _from_anchors(self, views: list[CameraImages], tracks: slice, points: np.ndarray) -> np.ndarray:
+        """(n, 3) m in the world: `points` (n, 3) m of `tracks` in the frames of their anchor cameras."""
         out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
             own = np.flatnonzero(camera == view.index)
@@ -371,8 +373,8 @@ class FeatureFactor(FactorDefaults):
             out[own] = turned + view.poses.position[i]
         return out
 
-    def _in_anchors(self, views: list[View], points: np.ndarray, tracks: slice) -> np.ndarray:
-        """(n, 3) the points of `tracks`, in the world, in the frames of the cameras that they move with."""
+    def _in_anchors(self, views: list[CameraImages], points: np.ndarray, tracks: slice) -> np.ndarray:
+        """(n, 3) m in the frames of their anchor cameras: `points` (n, 3) m of `tracks` in the world."""
         out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
             own = np.flatnonzero(camera == view.index)

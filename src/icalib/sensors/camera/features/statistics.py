@@ -1,4 +1,4 @@
-"""Residual statistics of feature tracks, and the degrees of freedom that points and parameters take from them."""
+"""Residual statistics of feature tracks, with the degrees of freedom that points and parameters take."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ import numpy as np
 from icalib.motion.factor import FitKey, RawSize, ResidualRows, Squares, StateDifference, output_at
 from icalib.optim.state import State
 from icalib.sensors.camera.corner_statistics import image_rows, rms_px
-from icalib.sensors.camera.features.surfaces import ON_PLANES, Distances
+from icalib.sensors.camera.features.surfaces import ON_PLANES, PlaneDistances
 
 if TYPE_CHECKING:
     from icalib.sensors.camera.features.residual import FeatureFactor
 
-FEATURES = "features"  # the kind of a track's rows
+FEATURES = "features"  # kind of the residuals of tracks
 
 
 @dataclass(frozen=True)
 class FeatureOutput:
-    """By camera: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
-    left out); points (T, 3) in the frames of the cameras that they move with, and how far each is off its plane."""
+    """Residuals of all tracks. By camera: residual (N, 2) px, predicted - measured, and root (N,) 1/px, square root of
+    the robust weight over sigma, 0 if not in use. points (T, 3) m in the frames of their anchor cameras; off: distances
+    from planes."""
 
     residual: tuple[np.ndarray, ...]
     root: tuple[np.ndarray, ...]
     points: np.ndarray
-    off: Distances
+    off: PlaneDistances
 
 
 def feature_squares(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, Squares]:
@@ -42,8 +43,8 @@ def feature_squares(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, S
 
 
 def feature_sizes(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, RawSize]:
-    """RMS of each camera's features and of its points on planes. Rejected are observations that stood out; those whose
-    track was left out are not."""
+    """RMS of the tracks of each camera and of its points on planes. Outliers count as rejected, observations of tracks
+    that are left out do not."""
     found = {}
     for i, camera in enumerate(factor.cameras):
         rejected = int(factor.outliers[i].sum()) if factor.outliers else 0
@@ -54,7 +55,7 @@ def feature_sizes(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, Raw
 
 
 def feature_rows(factor: FeatureFactor, out: FeatureOutput, state: State) -> list[ResidualRows]:
-    """Of each camera's features."""
+    """Residuals of the tracks of each camera."""
     found = []
     for camera, stream, sigma, residual, root in zip(
         factor.cameras, factor.streams, factor.sigmas, out.residual, out.root, strict=True
@@ -65,8 +66,8 @@ def feature_rows(factor: FeatureFactor, out: FeatureOutput, state: State) -> lis
 
 
 def spent_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
-    """|J x|^2 of each camera's features. Their points follow x, and three degrees of freedom a point are its own: the
-    plane that it lies on pays for its share, and the cameras by the number of observations."""
+    """|J x|^2 of the tracks of each camera, points at their least cost. Each point takes three degrees of freedom: a
+    plane gives its share, the cameras the rest in proportion to their observations."""
     there, count = output_at(factor, along.end), np.zeros(factor.tracks.count)
     used = [root > 0.0 for root in at.root]
     for track, u in zip(factor.tracks.track, used, strict=True):
@@ -79,7 +80,7 @@ def spent_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateDiff
         spent[camera.name, FEATURES] = own + float(((slope * root[:, None])[u] ** 2).sum())
         if len(on := factor.on_planes_of(i)):
             slope = (there.off.residual - at.off.residual)[on] / along.share * at.off.root[on]
-            # Of several on a patch each row weighs less than what it is off by would have it.
+            # Rows of one patch share the weight of one: chi^2 counts each by `weight`.
             left, weight = 1.0 - at.off.share[on], factor.on.weight[on]
             own = float((1.0 - left * (left * weight + at.off.share[on])).sum())
             spent[camera.name, ON_PLANES] = own + float((slope**2).sum())

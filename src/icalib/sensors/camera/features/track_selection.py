@@ -20,18 +20,18 @@ from icalib.sensors.camera.features.statistics import FeatureOutput
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.camera.image_times import are_used
 
-FIRST_GUESS_PX = 1.0
-SMALLEST_PX = 0.005
-# So many of an image's observations are no outliers. At first a lens that is not found yet leaves large errors at the
-# edges, which are none either.
-GOOD_AT_FIRST, GOOD = 0.9, 0.5
-FEWEST_IN_GROUP = 50  # observations, for their median variance to be known to a fifth
+INITIAL_TRACK_NOISE_PX = 1.0  # per axis, in the first pass
+MIN_TRACK_NOISE_PX = 0.005  # per axis: no tracker is better; keeps weights finite
+# Share of the observations of an image that count as inliers. In the first pass a rough lens leaves large residuals at
+# the border, which are no outliers.
+INLIER_SHARE_FIRST, INLIER_SHARE = 0.9, 0.5
+MIN_GROUP_OBSERVATIONS = 50  # for their median variance to be known to a fifth
 
 
 @dataclass(frozen=True)
 class TrackSelection:
-    """The feature tracks of one camera: their noise; keep (N,) bool, observations in use; outliers (N,) bool, those not
-    in use because their residuals are large."""
+    """Noise and inliers of the feature tracks of one camera: keep (N,) bool, observations in use; outliers (N,) bool,
+    observations of tracks that are rejected because their residuals are large."""
 
     noise: TrackNoise
     keep: np.ndarray
@@ -41,7 +41,7 @@ class TrackSelection:
     def first(cls, camera: Camera, stream: TrackStream) -> TrackSelection:
         """Before any pass: stated noise, or a pixel, and all observations."""
         none = np.zeros(len(stream.uv), dtype=bool)
-        return cls(TrackNoise(camera.track_noise_px or FIRST_GUESS_PX), ~none, none)
+        return cls(TrackNoise(camera.track_noise_px or INITIAL_TRACK_NOISE_PX), ~none, none)
 
 
 def next_selections(
@@ -58,13 +58,13 @@ def next_selections(
     noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(cameras))
     if settings.outlier_std <= 0.0:
         return [replace(own, noise=n) for own, n in zip(now, noise, strict=True)]
-    # All that was seen, with the poses of the pass's end: those of its beginning left tracks out that these find, and
-    # what a lens that was not found yet made an outlier may be none.
-    shown = observed_at_keyframes(factor.cameras, factor.streams, state, settings.max_gap_s)
-    anew = replace(factor, noise=noise, keep=shown).cut(state, chain_cuts(factor.n_keyframes))
-    left, share = output_at(anew, state), GOOD_AT_FIRST if is_first else GOOD
-    # The next pass uses no observation that was not judged, as those of tracks that the poses do not find.
-    return [TrackSelection(n, *_judged(anew, left, i, settings, share)) for i, n in enumerate(noise)]
+    # All observations are tested again at the end of the pass: its first poses may have left out tracks that the last
+    # ones find, and its first lens may have made outliers of inlier observations.
+    observed = observed_at_keyframes(factor.cameras, factor.streams, state, settings.max_gap_s)
+    anew = replace(factor, noise=noise, keep=observed).cut(state, chain_cuts(factor.n_keyframes))
+    left, share = output_at(anew, state), INLIER_SHARE_FIRST if is_first else INLIER_SHARE
+    # Observations of tracks that are left out are not in use: their residuals are unknown.
+    return [TrackSelection(n, *_tested(anew, left, i, settings, share)) for i, n in enumerate(noise)]
 
 
 def observed_at_keyframes(
@@ -76,8 +76,8 @@ def observed_at_keyframes(
 
 
 def _noise(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> TrackNoise:
-    """As the rig file has it, or as medians show it, so that outliers have no say; each point takes three of its
-    observations' rows."""
+    """Stated noise, or by the median of squared residuals, which outliers do not move. Each point takes three
+    degrees of freedom."""
     used = [root > 0.0 for root in out.root]
     if camera.track_noise_px is not None:
         return TrackNoise(camera.track_noise_px)
@@ -90,20 +90,20 @@ def _noise(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int
         square = square / (1.0 + growth * views[used[index]])
     rows, points = 2 * sum(int(u.sum()) for u in used), factor.tracks.count
     sigma = float(np.sqrt(median_variance(square) / max(1.0 - 3.0 * points / rows, 0.1)))
-    return TrackNoise(max(sigma, SMALLEST_PX), growth)
+    return TrackNoise(max(sigma, MIN_TRACK_NOISE_PX), growth)
 
 
 def variance_growth(square: np.ndarray, views: np.ndarray) -> float:
-    """By how much the variance of observations grows with each view, over that of a first view.
+    """Growth of the variance of observations with each view, over the variance of the first view; 0 if none.
 
-    square (n,) px^2: squared residuals; views (n,). A line through the median variances of groups of views, each with
-    its number of observations as weight; 0 where they do not grow.
+    square (n,) px^2: squared residuals; views (n,): earlier views of the feature. A line is fitted to the median
+    variances of groups of views, weighted by their numbers of observations.
     """
     group = np.floor(np.log2(views + 1.0)).astype(int)
     rows = []
     for k in np.unique(group):
         own = group == k
-        if own.sum() >= FEWEST_IN_GROUP:
+        if own.sum() >= MIN_GROUP_OBSERVATIONS:
             rows.append((float(views[own].mean()), median_variance(square[own]), float(own.sum())))
     if len(rows) < 2:
         return 0.0
@@ -112,21 +112,20 @@ def variance_growth(square: np.ndarray, views: np.ndarray) -> float:
     return float(max(slope, 0.0) / max(first, 0.1 * variance.min()))
 
 
-def _judged(
+def _tested(
     factor: FeatureFactor, out: FeatureOutput, index: int, settings: Settings, share: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool: observations of tracks in use that are no outliers and that the model can see; and those that are
-    outliers, or that it cannot see.
+    """Inliers (N,) bool and outliers (N,) bool among the observations in tracks of camera number `index`.
 
-    An outlier is `outlier_std` standard deviations above the mean of its image, and above `outlier_min_px`. Both are
-    those of normal errors as large as that `share` of the image's: where few points are followed, one outlier alone
-    would make mean and standard deviation so large that it is none.
+    An outlier is `outlier_std` standard deviations above the mean residual of its image, and above `outlier_min_px`; or
+    the camera model does not project its point. Mean and standard deviation follow from the quantile `share` of the
+    image as those of normal errors, because a single outlier among few points would inflate sample moments.
     """
     stream = factor.streams[index]
-    used, followed = out.root[index] > 0.0, factor.tracks.track[index] >= 0
+    used, in_track = out.root[index] > 0.0, factor.tracks.track[index] >= 0
     size, image = np.linalg.norm(out.residual[index], axis=1), stream.image
     relative = factor.sigmas[index] / factor.noise[index].sigma
     most = grouped_quantiles((size / relative)[used], image[used], len(stream.stamps_ns), share)
     limit = largest_normal(settings.outlier_std, share) * most[image] * relative
-    good = followed & used & (size <= np.maximum(limit, settings.outlier_min_px))
-    return good, followed & ~good
+    inlier = in_track & used & (size <= np.maximum(limit, settings.outlier_min_px))
+    return inlier, in_track & ~inlier

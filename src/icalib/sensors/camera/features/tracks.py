@@ -1,8 +1,8 @@
-"""Which features the estimate uses, and where each begins and ends: tracks.
+"""Tracks: which features the estimate uses, and where each begins and ends.
 
-A feature of the scene becomes one track, or several: it is cut where the chain is cut, between recordings, and where
-it was out of sight for long, because a track costs while it lives. Cutting loses what ties the parts together, and
-nothing else: each part is a point of unknown position of its own.
+A feature becomes one track or several. A track ends where the chain is cut, between recordings, and where the feature
+was out of sight for long, because the cost of elimination grows with the length of tracks. Each track is a point of
+its own, of unknown position; only the constraint between the tracks of one feature is lost.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ import numpy as np
 
 from icalib.data.measurements import TrackStream
 
-FEWEST = 3  # observations of a track; two images of one point are met by almost any pose
+MIN_TRACK_OBSERVATIONS = 3  # two observations fit almost any pose
 
 
 @dataclass(frozen=True)
 class TrackNoise:
-    """Noise of one camera's tracks: sigma [px] per axis of a feature's first view, and by how much its variance grows
-    with each further view, over that of the first: sigma_n^2 = sigma^2 (1 + growth n)."""
+    """Noise of the tracks of one camera: sigma [px] per axis of the first view of a feature, and the growth of its
+    variance with each later view n: sigma_n^2 = sigma^2 (1 + growth n)."""
 
     sigma: float
     growth: float = 0.0
 
     def of(self, stream: TrackStream) -> np.ndarray:
-        """(N,) px: standard deviation of each observation per axis. It is the same for all where the tracker does not
-        say how often it had seen a feature."""
+        """(N,) px: standard deviation of each observation per axis, the same for all if the tracker does not count
+        views."""
         if not len(stream.views):
             return np.full(len(stream.uv), self.sigma)
         return self.sigma * np.sqrt(1.0 + self.growth * stream.views)
@@ -34,13 +34,13 @@ class TrackNoise:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Tracks in the order of their first keyframes. By camera, of each observation: track (N,), -1 where it has none;
-    pair (N,), of its track with its image.
+    """Tracks in the order of their first keyframes.
 
-    pair_track, pair_camera and pair_image (E,): what each pair joins, in the order of keyframes; edges (S + 1,):
-    keyframes between which tracks are cut; tracks_from and pairs_from (S + 1,): the first of each stretch; start (T,
-    3): where each point is first looked for, in the frame of the camera that saw it in the middle of its life; camera
-    and image (T,): which that was."""
+    By camera: track (N,), index for each observation, -1 without one; pair (N,), index of its pair. A pair is a track
+    and one of its images: pair_track, pair_camera and pair_image (E,), in the order of keyframes. edges (S + 1,):
+    keyframes at which all tracks end; tracks_from and pairs_from (S + 1,): the first behind each edge. The anchor of a
+    track is the camera that observes it in the middle of its length: camera and image (T,); start (T, 3) m: initial
+    point, in the frame of the anchor."""
 
     track: tuple[np.ndarray, ...]
     pair: tuple[np.ndarray, ...]
@@ -59,19 +59,19 @@ class Tracks:
         return len(self.start)
 
     def stretch_of(self) -> np.ndarray:
-        """(T,) the edge behind which each track lies."""
+        """(T,) the last edge before each track."""
         return self.edges[np.searchsorted(self.tracks_from, np.arange(self.count), side="right") - 1]
 
     def within(self, first: int, stop: int) -> tuple[slice, slice]:
-        """Tracks and pairs of keyframes first..stop, both of them edges."""
+        """Slices of the tracks and pairs between keyframes first and stop, which must be edges."""
         a, b = np.searchsorted(self.edges, [first, stop])
         return slice(*self.tracks_from[[a, b]].tolist()), slice(*self.pairs_from[[a, b]].tolist())
 
 
 @dataclass(frozen=True)
-class Sightings:
-    """All observations, camera after camera: feature, image of the camera, and `keyframe` (N,); used (N,): whether they
-    count; counts: how many of them each camera has."""
+class ObservationTable:
+    """All N observations, camera by camera: feature, image of its camera, and keyframe (N,); used (N,) bool, whether
+    they may be in a track; counts: number of observations of each camera."""
 
     feature: np.ndarray
     image: np.ndarray
@@ -80,8 +80,8 @@ class Sightings:
     counts: tuple[int, ...]
 
     def labels(self, seconds: np.ndarray, edges: np.ndarray, longest_gap: float) -> np.ndarray:
-        """(N,) a number for each stretch of a feature's life, -1 for observations that do not count; `seconds` (K,) of
-        the keyframes."""
+        """(N,) label of the track of each observation, -1 if not used. Tracks end at keyframes `edges`, and where a
+        feature was out of sight for `longest_gap` [s]; seconds (K,): of the keyframes."""
         at = np.flatnonzero(self.used)
         order = at[np.lexsort((self.keyframe[at], self.feature[at]))]
         feature, keyframe = self.feature[order], self.keyframe[order]
@@ -93,20 +93,19 @@ class Sightings:
         return out
 
     def in_order(self, label: np.ndarray) -> np.ndarray:
-        """(N,) the same labels, but for those with too few observations, numbered in the order of their first
-        keyframes."""
+        """(N,) labels numbered in the order of first keyframes; -1 for tracks with too few observations."""
         seen = label >= 0
         n = int(label.max(initial=-1)) + 1
         first = np.full(n, np.iinfo(np.int64).max)
         np.minimum.at(first, label[seen], self.keyframe[seen])
-        left = np.bincount(label[seen], minlength=n) >= FEWEST
+        left = np.bincount(label[seen], minlength=n) >= MIN_TRACK_OBSERVATIONS
         order = np.argsort(first, kind="stable")
         number = np.full(n + 1, -1)
         number[order[left[order]]] = np.arange(int(left.sum()))
         return number[label]
 
     def tracks(self, label: np.ndarray, edges: np.ndarray) -> Tracks:
-        """Of labels that are in order; where points are looked for is unknown as yet."""
+        """Tracks of labels that are in order, with all initial points at zero."""
         seen, n = np.flatnonzero(label >= 0), int(label.max(initial=-1)) + 1
         pairs = seen[np.argsort(self.keyframe[seen], kind="stable")]
         pair = np.full(len(label), -1)

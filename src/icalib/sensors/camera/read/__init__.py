@@ -1,4 +1,4 @@
-"""What cameras see: images, tables of corners and of feature tracks -> checked streams."""
+"""Images, tables of corners and tables of feature tracks -> checked streams of cameras."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ TABLES = (
 
 
 def read(recording: Recording, sensors: Sequence[Camera], reading: Reading) -> list[ReadStream]:
-    """The feature tracks of each camera that has some, and the corners of each that sees the target, both from its
-    table or its images; and notes. Raises RecordingError as the readers do, and where cameras share images."""
+    """Feature tracks of each camera that has some, and corners of each that sees the target, from its table or its
+    images; with notes. Raises RecordingError as the readers do, and if cameras share images."""
     return _tracks(recording, sensors, reading) + _corners(recording, sensors, reading)
 
 
@@ -65,13 +65,13 @@ def where(recording: Recording, camera: Camera) -> str:
 
 
 def has_corners(recording: Recording, camera: Camera) -> bool:
-    """Whether the camera's corners are there as a table; else they are to be found in its images."""
-    # Where there are neither corners nor images, the sentence on the missing table is the better one.
+    """Whether there is a table of the camera's corners; otherwise they are detected in its images."""
+    # Without corners and images, the error names the missing table.
     return not recording.has_messages and (recording.find(camera.path) is not None or not recording.image_topics())
 
 
 def sees(recording: Recording, camera: Camera) -> bool:
-    """Whether there are images or corners of the camera at all."""
+    """Whether there are images or corners of the camera."""
     return bool(recording.image_topics()) or (
         has_corners(recording, camera) and recording.find(camera.path) is not None
     )
@@ -91,9 +91,9 @@ def corners(recording: Recording, camera: Camera, target: Target) -> CornerStrea
 
 
 def tracks(recording: Recording, camera: Camera) -> TrackStream:
-    """The points of the scene that the camera followed, from the table at its `tracks`.
+    """Feature tracks of the camera, from the table at its `tracks`.
 
-    Raises RecordingError as `read_tracks`, and where there is no such table.
+    Raises RecordingError as `read_tracks`, and if there is no such table.
     """
     assert camera.tracks is not None
     path = recording.table(camera, camera.tracks, "tracks")
@@ -101,7 +101,7 @@ def tracks(recording: Recording, camera: Camera) -> TrackStream:
 
 
 def image_topics(recording: Recording, cameras: Sequence[Camera]) -> dict[str, str]:
-    """The topic of each camera's images, by the camera's name. Raises RecordingError where two would share one."""
+    """Topic of the images, by camera name. Raises RecordingError if two cameras would share one."""
     chosen: dict[str, str] = {}
     for camera in cameras:
         topic = recording.image_topic(camera)

@@ -1,4 +1,4 @@
-"""What a driver says of its camera."""
+"""CameraInfo messages of ROS: what a driver states about its camera."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from icalib.data.messages.streams import HasMessages
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """What the driver says of its camera: resolution (width, height) px, distortion model as ROS calls it, K (3, 3)."""
+    """What a driver states: resolution (width, height) px; distortion model, by its name in ROS, with its coefficients;
+    K (3, 3) px."""
 
     resolution: tuple[int, int]
     model: str

@@ -1,4 +1,4 @@
-"""Do these corners belong to this camera, and are they enough?"""
+"""Checks of corners and tracks against the resolution of their camera, and of stamps and counts."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from icalib.errors import RecordingError
 
 _RATE_HZ = (1e-3, 1000.0)
 _MIN_CORNERS = 4  # fewer do not give a pose
-_MARGIN_PX = 1.0  # corner refinement may step over the edge
-_MOST_OUTSIDE = 0.1  # of all points: more are no single bad ones, but of a camera of another resolution
+_MARGIN_PX = 1.0  # outside the image, which corner refinement may reach
+_MOST_OUTSIDE = 0.1  # share of all points: more are of a camera with another resolution
 
 
 def checked_corners(
@@ -35,7 +35,7 @@ def checked_corners(
 
 
 def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tuple[CornerStream, tuple[str, ...]]:
-    """Without the few corners outside the image, and a note on these. Raises RecordingError where they are many."""
+    """The corners inside the image, and a note on the others. Raises RecordingError if there are many others."""
     inside = in_image(corners.uv, resolution, _MARGIN_PX)
     if inside.all():
         return corners, ()
@@ -46,8 +46,9 @@ def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tu
 
 
 def image_starts(what: str, stamps_ns: np.ndarray) -> np.ndarray:
-    """(M + 1,) where the rows of each image begin, and the last end; stamps_ns (N,) of the rows, image by image. Raises
-    RecordingError naming `what` and the instant where images are out of order."""
+    """(M + 1,) first row of each image, and the number of rows; stamps_ns (N,) of the rows.
+
+    Raises RecordingError naming `what` and the instant if images are out of order."""
     step = np.diff(stamps_ns)
     if (step < 0).any():
         i = int(np.argmax(step < 0))
@@ -59,15 +60,16 @@ def image_starts(what: str, stamps_ns: np.ndarray) -> np.ndarray:
 
 
 def in_image(uv: np.ndarray, resolution: tuple[int, int], margin_px: float) -> np.ndarray:
-    """(N,) bool: which points (N, 2) lie in the image, or so near outside."""
+    """(N,) bool: points uv (N, 2) px in the image, or at most margin_px outside."""
     return np.logical_and.reduce((uv >= -0.5 - margin_px) & (uv <= np.array(resolution) - 0.5 + margin_px), axis=1)
 
 
 def outside_note(
     stream: CornerStream | TrackStream, inside: np.ndarray, thing: str, what: str, resolution: tuple[int, int]
 ) -> str:
-    """The note on points that are not `inside` (N,) the image, of which the first is `thing`. Raises RecordingError
-    where they are too many to be single bad ones."""
+    """A note on points that are not `inside` (N,) the image; `thing` names the first.
+
+    Raises RecordingError if there are many."""
     first, count = int(np.argmin(inside)), int((~inside).sum())
     (u, v), (width, height) = stream.uv[first], resolution
     which = stream.which(int(stream.stamps_ns[stream.image[first]]))

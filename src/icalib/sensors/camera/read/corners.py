@@ -56,7 +56,7 @@ def _point_index(source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np
 
 
 def _first_unknown(tag: np.ndarray, corner: np.ndarray, target: Target) -> int:
-    """Bisects for the first row that `target` refuses, so that what it refuses is written in one place only."""
+    """Index of the first row that `target` refuses, by bisection: only `Target.point_index` knows its rules."""
     known, refused = 0, len(tag)
     while refused - known > 1:
         middle = (known + refused) // 2

@@ -22,7 +22,7 @@ _KIND = TableKind(
     (STAMP, (r"(feature|track|point|landmark)(_?id)?|id",), (r"u(_?px)?|x(_?px)?",), (r"v(_?px)?|y(_?px)?",)),
     _RATE_HZ,
 )
-_MARGIN_PX = 5.0  # trackers step over the edge by a few times their noise
+_MARGIN_PX = 5.0  # outside the image, which trackers may reach by a few times their noise
 
 
 def read_track_stamps(path: Path) -> np.ndarray:
@@ -33,8 +33,8 @@ def read_track_stamps(path: Path) -> np.ndarray:
 def read_tracks(
     name: str, path: Path, resolution: tuple[int, int], layout: TableLayout = PLAIN_TABLE, note: Note = ignore
 ) -> TrackStream:
-    """The table t [ns], feature, u, v [px] at `path`; `resolution` (width, height) px of the camera; `note` is told
-    what was left out.
+    """The table t [ns], feature, u, v [px] at `path`; `resolution` (width, height) px of the camera; `note` is called
+    with sentences on what was left out.
 
     Raises RecordingError naming file and line or instant: a table that cannot be read, images out of order or at an
     impossible rate, a feature that appears twice in an image, many outside of it, and tracks of one image only.
@@ -56,7 +56,7 @@ def read_tracks(
 
 
 def _those(stream: TrackStream, kept: np.ndarray) -> TrackStream:
-    """The observations kept (N,); an image that has none left is gone."""
+    """The observations `kept` (N,) bool, without images that have none."""
     count = np.bincount(stream.image[kept], minlength=len(stream.stamps_ns))
     seen = count > 0
     start = np.concatenate([[0], np.cumsum(count[seen])]).astype(np.int64)

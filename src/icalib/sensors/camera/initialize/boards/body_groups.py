@@ -25,7 +25,7 @@ from icalib.motion.pose_rows import Extrinsics, Frame
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import (
-    FEWEST_TOGETHER,
+    MIN_SHARED_IMAGES,
     camera_times,
     restrict,
     taken_at_once,
@@ -49,7 +49,7 @@ def register_groups(
     while len(frames) < len(groups):
         tied = [(g, h, _tied(groups[g], groups[h])) for g in frames for h in range(len(groups)) if h not in frames]
         g, h, best = max(tied, key=lambda item: len(item[2].pairs.p_body))
-        if len(best.pairs.p_body) < FEWEST_TOGETHER:
+        if len(best.pairs.p_body) < MIN_SHARED_IMAGES:
             lost = [x.scene.bodies.names for k, x in enumerate(groups) if k not in frames]
             raise UnconnectedBodiesError(tuple(name for names in lost for name in names))
         found = _solved(best, rig.cameras)
