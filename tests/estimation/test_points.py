@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icalib.optim.arrowhead import make_pieces
-from icalib.sensors.camera.features.kernels import MAX_DISTANCE_M
+from icalib.sensors.camera.features.point_search import MAX_DISTANCE_M
 from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.features.statistics import FeatureOutput
 from icalib.tools.simulation import handheld, simulate

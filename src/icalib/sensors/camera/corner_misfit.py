@@ -23,7 +23,7 @@ SIGNIFICANT_STD = 5.0  # standard deviations under noise alone; a smaller misfit
 
 @dataclass(frozen=True)
 class LensMisfit:
-    """rms [px]: of either component over all corners, 0 where noise explains it; field (N, 2) [px]: the mean residual
+    """rms [px]: of either component over all corners, 0 if it is not significant; field (N, 2) [px]: the mean residual
     in each corner's cell, 0 where too few groups have corners in it.
 
     Residuals are predicted - measured, and so is the field.

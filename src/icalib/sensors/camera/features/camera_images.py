@@ -10,14 +10,8 @@ import numpy as np
 from icalib.motion.sensor_pose import SensorPose
 from icalib.optim.robust_weights import Loss
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.kernels import (
-    PointSearch,
-    TrackObservations,
-    TrackProjection,
-    add_to_points,
-    camera_points,
-    moving_points,
-)
+from icalib.sensors.camera.features.kernels import TrackObservations, TrackProjection, camera_points
+from icalib.sensors.camera.features.point_search import PointSearch, add_to_points, moving_points
 
 OBSERVATIONS_PER_CHUNK = 4096  # for projections: their arrays stay in the cache of the processor
 

@@ -29,15 +29,8 @@ from icalib.optim.state import Layout, State
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.camera_images import CameraImages
 from icalib.sensors.camera.features.cluster_kernels import accumulate_clusters
-from icalib.sensors.camera.features.kernels import (
-    PieceStart,
-    PointSearch,
-    TrackObservations,
-    accumulate,
-    add_rays,
-    held_back,
-    take_trials,
-)
+from icalib.sensors.camera.features.kernels import PieceStart, TrackObservations, accumulate, held_back
+from icalib.sensors.camera.features.point_search import PointSearch, add_rays, take_trials
 from icalib.sensors.camera.features.statistics import (
     FeatureOutput,
     feature_rows,

@@ -24,7 +24,7 @@ from icalib.optim.front_plan import FeatureSums
 from icalib.optim.planes import Planes
 from icalib.optim.robust_weights import Loss, weight
 from icalib.optim.state import Key
-from icalib.sensors.camera.features.kernels import PointSearch
+from icalib.sensors.camera.features.point_search import PointSearch
 
 ON_PLANES = "points on planes"  # kind of these residuals
 CELL_M = 0.25  # a plane ends where no LiDAR saw it, to a cell; smaller ones have gaps between the lines of few lasers
