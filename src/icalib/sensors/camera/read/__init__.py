@@ -15,7 +15,7 @@ from icalib.data.topics import MessageType, UnreadType
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.sensors.camera.read.checks import checked_corners
-from icalib.sensors.camera.read.corners import CORNERS, group_corners
+from icalib.sensors.camera.read.corners import CORNER_TABLE, group_corners
 from icalib.sensors.camera.read.tracks import read_track_stamps, read_tracks
 from icalib.sensors.camera.spec import Camera
 from icalib.sensors.camera.stream import CornerStream, TrackStream
@@ -37,7 +37,7 @@ UNREAD = (
 
 def _corner_stamps(path: Path, layout: TableLayout) -> np.ndarray:
     del layout
-    return np.unique(read_table(path, CORNERS).integers[:, 0])
+    return np.unique(read_table(path, CORNER_TABLE).integers[:, 0])
 
 
 def _track_stamps(path: Path, layout: TableLayout) -> np.ndarray:
@@ -85,7 +85,7 @@ def corners(recording: Recording, camera: Camera, target: Target) -> CornerStrea
     """
     layout = camera.layout if camera.tracks is None else TableLayout(time_unit=camera.layout.time_unit)
     path = recording.table(camera, camera.path)
-    table = read_table(path, CORNERS, layout, recording.note)
+    table = read_table(path, CORNER_TABLE, layout, recording.note)
     stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))
     return recording.inside(group_corners(camera.name, str(path), stamps, tag, corner, table.decimals, target), path)
 

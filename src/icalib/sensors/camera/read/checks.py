@@ -8,10 +8,10 @@ from icalib.data.measurements import CornerStream, TrackStream
 from icalib.data.stamps.clocks import rate_sentence
 from icalib.errors import RecordingError
 
-_RATE_HZ = (1e-3, 1000.0)
-_MIN_CORNERS = 4  # fewer do not give a pose
-_MARGIN_PX = 1.0  # outside the image, which corner refinement may reach
-_MOST_OUTSIDE = 0.1  # share of all points: more are of a camera with another resolution
+IMAGE_RATE_HZ = (1e-3, 1000.0)  # slowest and fastest that a camera takes images
+_MIN_IMAGE_CORNERS = 4  # fewer do not determine a pose
+_CORNER_MARGIN_PX = 1.0  # outside the image, which corner refinement may reach
+_MAX_OUTSIDE_SHARE = 0.1  # share of all points: more are of a camera with another resolution
 
 
 def checked_corners(
@@ -26,7 +26,7 @@ def checked_corners(
     what = f"{where} ({corners.name})"
     if len(corners.stamps_ns) == 0:
         raise RecordingError(f"{what}: no corners at all; check the camera's path and the detector.")
-    sentence = rate_sentence(what, corners.stamps_ns, *_RATE_HZ) if len(corners.stamps_ns) > 1 else None
+    sentence = rate_sentence(what, corners.stamps_ns, *IMAGE_RATE_HZ) if len(corners.stamps_ns) > 1 else None
     if sentence:
         raise RecordingError(sentence)
     corners, outside = _inside(corners, what, resolution)
@@ -36,7 +36,7 @@ def checked_corners(
 
 def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tuple[CornerStream, tuple[str, ...]]:
     """The corners inside the image, and a note on the others. Raises RecordingError if there are many others."""
-    inside = in_image(corners.uv, resolution, _MARGIN_PX)
+    inside = in_image(corners.uv, resolution, _CORNER_MARGIN_PX)
     if inside.all():
         return corners, ()
     tag, corner = divmod(int(corners.point[np.argmin(inside)]), 4)
@@ -75,20 +75,20 @@ def outside_note(
     which = stream.which(int(stream.stamps_ns[stream.image[first]]))
     words = f"{thing} lies at ({u:.1f}, {v:.1f}), outside the image of {width} x {height} px"
     told = f"{what}: in the image {which}, {words}"
-    if count > _MOST_OUTSIDE * len(inside):
+    if count > _MAX_OUTSIDE_SHARE * len(inside):
         raise RecordingError(f"{told}; check the camera's resolution [width, height] in the rig file.")
     return f"{told}; {count} of {len(inside)} such points were left out."
 
 
 def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream, tuple[str, ...]]:
     count = np.diff(corners.start)
-    keep = count >= _MIN_CORNERS
+    keep = count >= _MIN_IMAGE_CORNERS
     if keep.all():
         return corners, ()
     if not keep.any():
-        raise RecordingError(f"{what}: no image has {_MIN_CORNERS} corners or more; check the detector.")
+        raise RecordingError(f"{what}: no image has {_MIN_IMAGE_CORNERS} corners or more; check the detector.")
     rows = keep[corners.image]
     first = int(corners.stamps_ns[np.argmin(keep)])
-    dropped = f"{int((~keep).sum())} images with fewer than {_MIN_CORNERS} corners were dropped"
+    dropped = f"{int((~keep).sum())} images with fewer than {_MIN_IMAGE_CORNERS} corners were dropped"
     note = f"{what}: {dropped}, the first {corners.which(first)}."
     return corners.of_rows(rows, corners.stamps_ns[keep], count[keep]), (note,)

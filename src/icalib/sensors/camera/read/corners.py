@@ -8,9 +8,9 @@ from icalib.data.measurements import CornerStream
 from icalib.data.tables.columns import STAMP, TableKind
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.sensors.camera.read.checks import image_starts
+from icalib.sensors.camera.read.checks import IMAGE_RATE_HZ, image_starts
 
-CORNERS = TableKind(
+CORNER_TABLE = TableKind(
     ("t [ns]", "tag id", "corner"),
     ("u [px]", "v [px]"),
     (
@@ -20,7 +20,7 @@ CORNERS = TableKind(
         (r"u(_?px)?|x(_?px)?",),
         (r"v(_?px)?|y(_?px)?",),
     ),
-    (1e-3, 1000.0),
+    IMAGE_RATE_HZ,
 )
 
 

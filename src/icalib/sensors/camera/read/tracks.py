@@ -13,21 +13,20 @@ from icalib.data.tables.columns import STAMP, TableKind
 from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, TableLayout
-from icalib.sensors.camera.read.checks import image_starts, in_image, outside_note
+from icalib.sensors.camera.read.checks import IMAGE_RATE_HZ, image_starts, in_image, outside_note
 
-_RATE_HZ = (1e-3, 1000.0)
-_KIND = TableKind(
+_TRACK_TABLE = TableKind(
     ("t [ns]", "feature"),
     ("u [px]", "v [px]"),
     (STAMP, (r"(feature|track|point|landmark)(_?id)?|id",), (r"u(_?px)?|x(_?px)?",), (r"v(_?px)?|y(_?px)?",)),
-    _RATE_HZ,
+    IMAGE_RATE_HZ,
 )
-_MARGIN_PX = 5.0  # outside the image, which trackers may reach by a few times their noise
+_TRACK_MARGIN_PX = 5.0  # outside the image, which trackers may reach by a few times their noise
 
 
 def read_track_stamps(path: Path) -> np.ndarray:
     """(M,) int64 ns: one stamp for each image of the table at `path`. Raises RecordingError as `read_table`."""
-    return np.unique(read_table(path, _KIND).integers[:, 0])
+    return np.unique(read_table(path, _TRACK_TABLE).integers[:, 0])
 
 
 def read_tracks(
@@ -39,14 +38,14 @@ def read_tracks(
     Raises RecordingError naming file and line or instant: a table that cannot be read, images out of order or at an
     impossible rate, a feature that appears twice in an image, many outside of it, and tracks of one image only.
     """
-    table = read_table(path, _KIND, layout)
+    table = read_table(path, _TRACK_TABLE, layout)
     for sentence in table.notes:
         note(sentence)
     stamps_ns, feature, uv = table.integers[:, 0].copy(), table.integers[:, 1].copy(), table.decimals
     what = f"{path} ({name})"
     start = image_starts(what, stamps_ns)
     stream = TrackStream(name, stamps_ns[start[:-1]], start, feature, np.ascontiguousarray(uv))
-    inside = in_image(stream.uv, resolution, _MARGIN_PX)
+    inside = in_image(stream.uv, resolution, _TRACK_MARGIN_PX)
     if not inside.all():
         first = stream.feature[np.argmin(inside)]
         note(outside_note(stream, inside, f"feature {first}", what, resolution))
@@ -72,7 +71,7 @@ def _check(stream: TrackStream, what: str) -> None:
             f"{what}: the image at {stream.stamps_ns[stream.image[row]]} ns has feature {stream.feature[row]} "
             "twice; remove one, for a feature is one point of the scene."
         )
-    sentence = rate_sentence(what, stream.stamps_ns, *_RATE_HZ) if len(stream.stamps_ns) > 1 else None
+    sentence = rate_sentence(what, stream.stamps_ns, *IMAGE_RATE_HZ) if len(stream.stamps_ns) > 1 else None
     if sentence:
         raise RecordingError(sentence)
     if np.unique(stream.feature).size == len(stream.feature):
