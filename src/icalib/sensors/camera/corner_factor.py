@@ -45,7 +45,7 @@ from icalib.sensors.camera.corner_kernels import (
     accumulate_clusters,
     camera_points,
 )
-from icalib.sensors.camera.corner_statistics import CORNERS, corner_squares, image_rows, rms_px, spent_by_corners
+from icalib.sensors.camera.corner_statistics import CORNERS, corner_squares, dof_used_by_corners, image_rows, rms_px
 from icalib.sensors.camera.corner_views import Views
 
 IMAGES_PER_BLOCK = 256  # for statistics: bounds the memory
@@ -237,7 +237,7 @@ class CornerFactor(FactorDefaults):
 
     def dof_used(self, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
         """See `Factor`."""
-        return spent_by_corners(self, out, along)
+        return dof_used_by_corners(self, out, along)
 
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
         """The same factor with bloom along `direction` (N, 2)."""

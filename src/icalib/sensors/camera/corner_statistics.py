@@ -40,13 +40,13 @@ def rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
     return float(np.sqrt(np.mean(used**2, dtype=np.float64))) if len(used) else None
 
 
-def spent_by_corners(camera: CornerFactor, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
+def dof_used_by_corners(camera: CornerFactor, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
     """See `Factor.dof_used`."""
-    found = in_parallel(partial(_spent_by_views, camera, out, along), camera.blocks())
+    found = in_parallel(partial(_dof_used_by_views, camera, out, along), camera.blocks())
     return {(camera.name, kind): sum(one[kind] for one in found) for kind in (found[0] if found else ())}
 
 
-def _spent_by_views(
+def _dof_used_by_views(
     camera: CornerFactor, at: CornerOutput, step: StateDifference, views: tuple[int, int]
 ) -> dict[str, float]:
     """|J x|^2 of views v0..v1 by kind of residual, as a mean over the posterior of their common errors given x."""

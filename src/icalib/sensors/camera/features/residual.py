@@ -33,10 +33,10 @@ from icalib.sensors.camera.features.kernels import PieceStart, TrackObservations
 from icalib.sensors.camera.features.point_search import PointSearch, add_rays, take_trials
 from icalib.sensors.camera.features.statistics import (
     FeatureOutput,
+    dof_used_by_features,
     feature_rows,
     feature_sizes,
     feature_squares,
-    spent_by_features,
 )
 from icalib.sensors.camera.features.surfaces import (
     NO_PLANES,
@@ -215,7 +215,7 @@ class FeatureFactor(FactorDefaults):
 
     def dof_used(self, out: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
         """See `Factor`."""
-        return spent_by_features(self, out, along)
+        return dof_used_by_features(self, out, along)
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
         """See `Factor`: room for the tracks that the keyframes of the piece observe."""

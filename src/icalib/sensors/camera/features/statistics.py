@@ -65,7 +65,7 @@ def feature_rows(factor: FeatureFactor, out: FeatureOutput, state: State) -> lis
     return found
 
 
-def spent_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
+def dof_used_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
     """|J x|^2 of the tracks of each camera, points at their least cost. Each point takes three degrees of freedom: a
     plane gives its share, the cameras the rest in proportion to their observations."""
     there, count = output_at(factor, along.end), np.zeros(factor.tracks.count)
