@@ -142,6 +142,7 @@ REVISED = (
     "geometry",
     "initialize",
     "model",
+    "motion",
     "observability",
     "optim",
     "report",

@@ -1,4 +1,4 @@
-"""About which axes a body turned, and about which it hardly did, in words."""
+"""Axes about which a body rotated, and about which it hardly did, in words."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ MIN_KEYFRAMES_FOR_AXES = 2  # keyframes
 
 
 def hardly_turned(seconds: np.ndarray, rotation: np.ndarray, body: str) -> str:
-    """The axes about which `body` hardly turned, as "the y and z axes of imu0"; empty where it turned about all three.
+    """Words for the axes about which `body` hardly rotated, such as "the y and z axes of imu0"; empty if it rotated
+    about all three.
 
-    seconds (K,), rotation (K, 3, 3) R_world_body: its keyframes. Steps back in time, between recordings, do not count.
+    seconds (K,), rotation (K, 3, 3) R_world_body: its keyframes. Backward steps in time, between recordings, are
+    ignored.
     """
     if len(seconds) < MIN_KEYFRAMES_FOR_AXES:
         return ""
@@ -30,7 +32,7 @@ def hardly_turned(seconds: np.ndarray, rotation: np.ndarray, body: str) -> str:
 
 
 def axis_words(body: str, direction: np.ndarray | tuple[float, float, float]) -> str:
-    """A unit vector (3,) in the axes of `body`, as "the z axis of imu0" where it is near one."""
+    """Words for a unit vector (3,) in the axes of `body`: "the z axis of imu0" if it is close to an axis."""
     k = int(np.argmax(np.abs(direction)))
     if abs(direction[k]) > NAMED_AXIS_COSINE:
         return f"the {'xyz'[k]} axis of {body}"
@@ -38,7 +40,8 @@ def axis_words(body: str, direction: np.ndarray | tuple[float, float, float]) ->
 
 
 def other_axes(body: str, direction: np.ndarray | tuple[float, float, float]) -> str:
-    """The two axes perpendicular to a unit vector (3,) in the axes of `body`, as "the x and y axes of imu0"."""
+    """Words for the two axes perpendicular to a unit vector (3,) in the axes of `body`, such as "the x and y axes of
+    imu0"."""
     k = int(np.argmax(np.abs(direction)))
     if abs(direction[k]) > NAMED_AXIS_COSINE:
         return f"the {' and '.join(c for c in 'xyz' if c != 'xyz'[k])} axes of {body}"

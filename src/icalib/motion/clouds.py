@@ -1,4 +1,4 @@
-"""Which plane of the scene each point of the LiDARs lies on."""
+"""Association of LiDAR points with planes of the scene."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from icalib.motion.point_planes import count_points
 from icalib.optim.state import Entry, Key
 from icalib.rig.scene import PLANE
 
-MIN_PLANE_POINTS = 100  # of a plane
+MIN_PLANE_POINTS = 100  # points of a plane: with fewer, its normal is too uncertain to be of use
 
 
 @dataclass(frozen=True)
 class Clouds:
-    """Which plane each point lies on. names (P,): of the planes, no sensor is called so; plane (N,) int32 by LiDAR:
-    index of each point's plane, -1: none."""
+    """Plane of each LiDAR point. names (P,): of the planes, different from all sensor names; plane (N,) int32 by LiDAR:
+    index of each point's plane, -1 for none."""
 
     names: tuple[str, ...]
     plane: tuple[np.ndarray, ...]
@@ -29,23 +29,23 @@ class Clouds:
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """Where the planes' values stand in a state."""
+        """Keys of the planes' values in a state."""
         return tuple((name, PLANE.name) for name in self.names)
 
     @property
     def recording(self) -> np.ndarray:
-        """(P,) number of the recording that each plane belongs to, see `joined_clouds`."""
+        """(P,) number of the recording of each plane, see `joined_clouds`."""
         numbers = (name.removeprefix("plane ").split(".") for name in self.names)
         return np.array([int(n[0]) - 1 if len(n) > 1 else 0 for n in numbers], dtype=np.int64)
 
     @property
     def entries(self) -> list[Entry]:
-        """The planes as parameters of a layout."""
+        """Layout entries of the planes."""
         return [PLANE.entry(name) for name in self.names]
 
     @property
     def points(self) -> np.ndarray:
-        """(P,) how many lie on each plane."""
+        """(P,) number of points on each plane."""
         return sum((count_points(p, self.count) for p in self.plane), np.zeros(self.count, dtype=np.int64))
 
 
@@ -53,8 +53,8 @@ NO_CLOUDS = Clouds((), ())
 
 
 def joined_clouds(each: Sequence[Clouds]) -> Clouds:
-    """Of recordings whose points follow one another. Each has a world and planes of its own: "plane 2.0" is of the
-    second recording."""
+    """Associations of consecutive recordings as one. Each recording has its own world and planes: "plane 2.0" belongs
+    to the second recording."""
     if len(each) == 1:
         return each[0]
     names = tuple(f"plane {r}.{own.removeprefix('plane ')}" for r, c in enumerate(each, 1) for own in c.names)
@@ -68,7 +68,7 @@ def joined_clouds(each: Sequence[Clouds]) -> Clouds:
 
 
 def known_planes(streams: Sequence[LidarStream]) -> Clouds:
-    """The association that streams come with, planes with few points left out."""
+    """The association that the streams have, without planes of fewer than MIN_PLANE_POINTS points."""
     most = max((int(s.plane.max(initial=-1)) for s in streams), default=-1) + 1
     count = sum((count_points(s.plane, most) for s in streams), np.zeros(most, dtype=np.int64))
     used = np.flatnonzero(count >= MIN_PLANE_POINTS)

@@ -1,4 +1,4 @@
-"""What the problem asks of a factor: all measurements of one kind by one sensor, whatever they are."""
+"""Interface of a factor: all measurements of one kind by one sensor."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ T = TypeVar("T")
 
 
 class Squares(NamedTuple):
-    """Of one kind of residual: n: how many measurements are in use; and their chi^2, robust weights as they are."""
+    """Residual statistics of one kind: number of measurements in use, and their chi^2 with the current robust
+    weights."""
 
     n: int
     chi2: float
 
 
 class RawSize(NamedTuple):
-    """RMS of one kind of residual as it was before whitening, and its unit; None and "" where it has none. rejected:
-    how many measurements are outliers."""
+    """RMS of one kind of residual before whitening, and its unit; None and "" if not defined. rejected: number of
+    outliers."""
 
     rms: float | None
     unit: str
@@ -38,10 +39,10 @@ class RawSize(NamedTuple):
 class ResidualRows:
     """Residuals (predicted - measured) of one kind by one sensor: n measurements with m columns each.
 
-    seconds (n,): on the body's clock since its first stamp, of the measurement, or of the start of the interval that it
-    spans. residual, sigma (n, m) in `unit`, SI or px; whitened (n, m): jointly where errors of columns correlate;
-    root (n, m): square root of the robust weight, 0 for outliers. Where the rows are whitened combinations of
-    measurements and nothing else, residual is whitened, sigma 1 and unit empty.
+    seconds (n,): time of the measurement, or start of its interval, on the clock of the body since its first stamp.
+    residual, sigma (n, m) in `unit`, SI or px; whitened (n, m): jointly if errors of columns correlate; root (n, m):
+    square root of the robust weight, 0 for outliers. For rows that are defined only whitened, residual is whitened,
+    sigma 1 and unit empty.
     """
 
     sensor: str
@@ -55,13 +56,13 @@ class ResidualRows:
 
     @property
     def weighted(self) -> np.ndarray:
-        """(n, m) whitened, with the roots of the robust weights."""
+        """(n, m) whitened residuals times the square roots of their robust weights."""
         return np.where(self.root > 0.0, self.whitened * self.root, 0.0)
 
 
 class StateDifference(NamedTuple):
-    """A step from `start`, scaled by `share`, that ends at `end`; for difference quotients of residuals. The share is
-    small enough for residuals to be linear."""
+    """A step from `start` to `end` that is `share` times the actual one, for difference quotients of residuals. The
+    share is small enough for residuals to be linear."""
 
     start: State
     end: State
@@ -69,11 +70,10 @@ class StateDifference(NamedTuple):
 
 
 class Factor(Protocol):
-    """All measurements of one kind by one sensor. The output of `accumulate` is the factor's own class of arrays.
+    """All measurements of one kind by one sensor. `accumulate` fills the factor's own class of arrays.
 
-    is_sparse: one keyframe alone has too few rows to say anything of the calibration. ties_distant_keyframes: rows
-    share what is eliminated with the keyframes, such as points of the scene, so that segments of the chain do not stand
-    alone.
+    is_sparse: one keyframe alone has too few rows to determine the calibration. ties_distant_keyframes: rows share
+    eliminated parameters, such as points of the scene, so that segments of the chain are not independent.
     """
 
     is_sparse: ClassVar[bool]
@@ -84,7 +84,7 @@ class Factor(Protocol):
 
     @property
     def name(self) -> str:
-        """The sensor's."""
+        """Name of the sensor."""
         ...
 
     def output(self) -> Any:
@@ -92,10 +92,10 @@ class Factor(Protocol):
         ...
 
     def accumulate(self, state: State, piece: Piece, out: Any, sums: bool = True, curved: bool = False) -> float:
-        """Fills `out` for what lies in `piece`, and adds it to the piece's sums where `sums` are wanted. Returns half
-        the robust chi^2.
+        """Fills `out` for the measurements in `piece`, and adds them to its sums if `sums`. Returns half the robust
+        chi^2.
 
-        `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
+        `curved`: J^T J uses the true curvature of the robust loss instead of its weights alone.
         """
         ...
 
@@ -112,37 +112,38 @@ class Factor(Protocol):
         ...
 
     def dof_used(self, out: Any, along: StateDifference) -> dict[FitKey, float]:
-        """|J x|^2 of each kind of residual for the step x, `out` at its start: of a draw x from the posterior, the mean
-        is the number of parameters that these residuals pay for."""
+        """|J x|^2 of each kind of residual for the step x, with `out` at its start. For draws x from the posterior, the
+        mean is the number of degrees of freedom that the fit takes from these residuals."""
         ...
 
     def with_imu(self, imu: ImuData) -> Self:
-        """The same measurements, at the motion that other readings give."""
+        """The same measurements, with other IMU readings for the motion between keyframes."""
         ...
 
     def discarded_output(self) -> Any:
-        """Output for one piece that nobody will read."""
+        """Output arrays for one piece, if they are not needed afterwards."""
         ...
 
     def reusable_output(self, out: Any) -> Any:
-        """`out`, of this factor or of the one that it was cut from, to be filled once more."""
+        """`out`, of this factor or of the one that it was cut from, as arrays to be overwritten."""
         ...
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
-        """The piece with room for what the factor eliminates; `keep`: another piece shares a keyframe with it."""
+        """The piece with workspace for the parameters that the factor eliminates; `keep`: a keyframe is shared with
+        another piece."""
         ...
 
     def cut(self, state: State, keyframes: tuple[int, ...]) -> Self:
-        """The same measurements, of which none ties keyframes on both sides of one of `keyframes`."""
+        """The same measurements, none of which depends on keyframes on both sides of one of `keyframes`."""
         ...
 
     def warm_started(self, out: Any) -> Self:
-        """The same factor, which first looks for what it eliminates where `out` found it."""
+        """The same factor, which starts the search for its eliminated parameters from those of `out`."""
         ...
 
 
 class FactorDefaults:
-    """A factor that ties a keyframe to the next one at most, and keeps all it needs in the state."""
+    """Defaults for factors that depend on neighbouring keyframes only, and have no eliminated parameters."""
 
     is_sparse: ClassVar[bool] = False
     ties_distant_keyframes: ClassVar[bool] = False
@@ -179,8 +180,8 @@ class FactorDefaults:
 
 @dataclass(frozen=True)
 class Whitened:
-    """Rows of a factor: residual (n, m), whitened, predicted - measured, and root (n, m), square root of the robust
-    weight of each."""
+    """Rows of a factor: residual (n, m), whitened, predicted - measured, and root (n, m), square root of each robust
+    weight."""
 
     residual: np.ndarray
     root: np.ndarray
@@ -197,7 +198,7 @@ class Whitened:
 
 
 class _HasRows(Protocol):
-    """What `RowFactor` asks of the factor. kinds: columns of its rows by kind of residual; units: by kind, SI."""
+    """Requirements of `RowFactor`. kinds: columns of its rows by kind of residual; units: by kind, SI."""
 
     units: ClassVar[Mapping[str, str]]
 
@@ -225,17 +226,17 @@ class _HasRows(Protocol):
 
 
 class RowFactor(FactorDefaults):
-    """A factor whose output are `Whitened` rows, of which some columns are of one kind."""
+    """A factor whose output is `Whitened` rows, with columns for each kind of residual."""
 
     is_sparse: ClassVar[bool] = True
     units: ClassVar[Mapping[str, str]] = {}
 
     def times(self, state: State) -> np.ndarray:
-        """(n,) of the rows, see `ResidualRows.seconds`."""
+        """(n,) times of the rows, see `ResidualRows.seconds`."""
         raise NotImplementedError
 
     def raw(self, out: Whitened) -> np.ndarray | None:
-        """(n, m) residuals before whitening; None where they have no meaning one by one."""
+        """(n, m) residuals before whitening; None if they are defined only whitened."""
         del out
         return None
 
@@ -255,7 +256,8 @@ class RowFactor(FactorDefaults):
         return found
 
     def rms(self: _HasRows, out: Whitened, kind: str) -> tuple[float | None, str]:
-        """Of the residuals of `kind` before whitening, and its unit; None where these have no meaning one by one."""
+        """RMS of the residuals of `kind` before whitening, and its unit; None and "" if they are defined only
+        whitened."""
         raw = self.raw(out)
         if raw is None:
             return None, ""
@@ -263,7 +265,7 @@ class RowFactor(FactorDefaults):
         return float(np.sqrt(np.mean(own**2))) if own.size else 0.0, self.units[kind]
 
     def count(self: _HasRows, out: Whitened, kind: str) -> int:
-        """Number of scalar residuals of a kind in use."""
+        """Number of scalar residuals of `kind` in use."""
         return out.residual[:, self.kinds[kind]].size
 
     def squares(self: _HasRows, out: Whitened) -> dict[FitKey, Squares]:
@@ -281,7 +283,7 @@ class RowFactor(FactorDefaults):
 
 
 def output_at(factor: Any, state: State) -> Any:
-    """A factor's output at `state`, the chain cut where `make_pieces` cuts it."""
+    """Output of a factor at `state`."""
     out = factor.output()
     pieces = make_pieces(len(state.seconds), None)
     in_parallel(lambda piece: factor.accumulate(state, piece, out, sums=False), pieces)
@@ -289,12 +291,12 @@ def output_at(factor: Any, state: State) -> Any:
 
 
 def chi2(out: Whitened, rows: slice) -> float:
-    """Of some columns of the rows, robust weights as they are."""
+    """chi^2 of the columns `rows`, with the current robust weights."""
     return float(((out.residual[:, rows] * out.root[:, rows]) ** 2).sum())
 
 
 def keyed(factors: Iterable[Factor]) -> dict[FactorKey, Factor]:
-    """Factors by sensor and by what of it is measured, in order."""
+    """Factors by sensor and kind of measurement, in order."""
     return {factor.key: factor for factor in factors}
 
 

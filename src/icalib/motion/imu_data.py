@@ -1,4 +1,4 @@
-"""IMU readings made ready for integration: seconds, noise per interval, gaps."""
+"""IMU readings prepared for integration: seconds, noise per interval, gaps."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from icalib.data.measurements import ImuStream, Measurements
 from icalib.data.stamps.clocks import usual_step
 from icalib.rig import ImuNoise, Rig
 
-MIN_GAP_S, MIN_GAP_PERIODS = 0.01, 3.0  # an interval longer than both this and so many periods is a gap
-# Within a gap the motion goes on unseen: what is not known of rate and force, their spread over the recording,
-# is taken to stay correlated for this long.
+MIN_GAP_S, MIN_GAP_PERIODS = 0.01, 3.0  # an interval longer than both, seconds and periods, is a gap
+# Correlation time of rate and specific force within a gap. Their unknown variation there has their variance over the
+# recording.
 MOTION_CORRELATION_S = 0.1
 # with 20 Hz, jumping rates moved a time offset by a whole step; with 100 Hz, steady ones by 0.6 ms
 MAX_DENSE_PERIOD_S = 0.025
-WITHIN_INTERVAL_SHARE = 1e-4  # keeps the covariance of a stretch without a stamp in it definite; nothing else
+WITHIN_INTERVAL_SHARE = 1e-4  # keeps the covariance of an interval without inner stamps definite
 
 
 def clear_of(gaps: Iterable[tuple[float, float]], start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(n,) whether each span from `start` to `end` (n,) has no part within one of `gaps`, all in seconds."""
+    """(n,) whether each span from `start` to `end` (n,) overlaps none of `gaps`, all in seconds."""
     clear = np.ones(len(start), dtype=bool)
     for a, b in gaps:
         clear &= (end <= a) | (start >= b)
@@ -31,13 +31,13 @@ def clear_of(gaps: Iterable[tuple[float, float]], start: np.ndarray, end: np.nda
 
 @dataclass(frozen=True)
 class ImuData:
-    """Readings on the imu clock, seconds since its first stamp.
+    """Readings on the IMU clock, seconds since its first stamp; gyro [rad/s], accel [m/s^2] (N, 3).
 
-    variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and how the force departs
-    from its mean within the interval; walk (2,): squared densities of the bias walks. gaps: (start, end) of intervals
-    without readings. seams: (end, begin) of recordings that were joined; nothing is known of what lies between.
-    forwards: the biases of a keyframe hold until the next one, and what is between is carried forwards only; they are
-    what is assumed of the motion, and change a lot from keyframe to keyframe.
+    variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and deviation of the
+    specific force from its mean within the interval; walk (2,): squared densities of the bias random walks. gaps:
+    (start, end) of intervals without readings. seams: (end, begin) of joined recordings, between which nothing is
+    known. forwards: biases of a keyframe hold until the next one, and motion is propagated forwards only. This is so if
+    the readings are an assumption on the motion, whose biases change a lot between keyframes.
     """
 
     name: str
@@ -51,7 +51,7 @@ class ImuData:
     forwards: bool = False
 
     def covers(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n,) whether each span from `start` to `end` (n,) seconds lies within the recording and none of its gaps."""
+        """(n,) whether each span from `start` to `end` (n,) seconds lies within the recording and outside its gaps."""
         inside = (start >= self.seconds[0]) & (end <= self.seconds[-1])
         return inside & clear_of(self.gaps, start, end)
 
@@ -63,7 +63,7 @@ class ImuData:
         gap = dt > max(MIN_GAP_S, MIN_GAP_PERIODS * _period(t))
         gyro, accel = stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0
         variance[gap] += 2.0 * MOTION_CORRELATION_S * np.array([gyro, accel, accel])
-        # A step of integration holds biases still; what their walk makes of so long a one is white noise here.
+        # Biases are constant within an integration step; their random walk over a gap becomes white noise.
         walked = np.array([noise.gyro_walk, noise.accel_walk, noise.accel_walk]) * dt[gap][:, None]
         variance[gap] += walked**2 / 3.0
         return cls(
@@ -78,12 +78,12 @@ class ImuData:
         )
 
     def interval(self, seconds: np.ndarray) -> np.ndarray:
-        """(n,) index of the reading interval that each time lies in, the first or last for times outside."""
+        """Index (n,) of the reading interval of each time; the first or last one for times outside."""
         return np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
 
     def turned_by_noise(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n,) rad by which the gyroscope's noise turns, about each axis, what its readings carry from `begin` to `end`
-        (n,) s, one standard deviation; negative backwards."""
+        """Standard deviation (n,) rad, about each axis, of the rotation that gyroscope noise adds from `begin` to `end`
+        (n,) s; negative backwards."""
         dt = np.diff(self.seconds)
         variance = np.concatenate([[0.0], np.cumsum(self.variance[:, 0] * dt)])
         a, b = (np.interp(t, self.seconds, variance) for t in (begin, end))
@@ -91,25 +91,26 @@ class ImuData:
 
 
 def _period(seconds: np.ndarray) -> float:
-    """The median step between readings; where these come in bursts, whose steps are far shorter, the usual mean."""
+    """Period [s] of the readings: the median step, or the mean one if readings come in bursts with far shorter
+    steps."""
     median, usual = float(np.median(np.diff(seconds))), usual_step(seconds)
     return usual if median < 0.5 * usual else median
 
 
 def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
-    """The rig's IMU, or None where it has none."""
+    """Readings of the rig's IMU; None if it has none."""
     if rig.imu is None or measurements.imu is None:
         return None
     return ImuData.build(measurements.imu, rig.imu.noise, rig.assumes_motion and _is_dense(measurements))
 
 
 def _is_dense(measurements: Measurements) -> bool:
-    """Whether the body's poses, where there is no IMU, come so fast that rates may jump at keyframes."""
+    """True if the poses of the body, without an IMU, are so dense that rates may jump at keyframes."""
     return float(np.median(np.diff(measurements.body.seconds))) <= MAX_DENSE_PERIOD_S
 
 
 def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> ImuData | None:
-    """The same of recordings joined: each with the noise in its gaps that its own motion gives them."""
+    """As `imu_data`, for joined recordings. The noise within gaps follows from the motion of each recording."""
     found = [(p, imu) for p in parts if (imu := imu_data(rig, p.measurements)) is not None]
     if len(found) < 2 or joined.imu is None:
         return found[0][1] if found else None

@@ -1,10 +1,10 @@
-"""From raw IMU readings to body rates: Kalibr's scale-misalignment model.
+"""Kalibr's scale-misalignment model of IMU readings.
 
-    gyro  = M_g C w + A_g f + b_g + noise        f: specific force, w: angular rate, both in the imu frame
+    gyro  = M_g C w + A_g f + b_g + noise        f: specific force, w: angular rate, both in the IMU frame
     accel = M_a f + b_a + noise                  M: lower triangular, C = Exp(r): accelerometer to gyroscope axes
 
-Intrinsics are 24 numbers (`rig.imu_classes.INTRINSICS_LABELS`), zero for an ideal IMU:
-M_a - I (xx yx yy zx zy zz), M_g - I (same), r (3), A_g (row-major 9).
+Intrinsics are 24 numbers (`rig.imu_classes.INTRINSICS_LABELS`), zero for an ideal IMU: M_a - I (xx yx yy zx zy zz), M_g
+- I (same), r (3), A_g (row-major 9).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LOWER_COLUMN = np.array([0, 0, 1, 0, 1, 2])
 
 @njit(cache=True, nogil=True)
 def _lower_inverse(m):
-    """Inverse of a lower triangular 3x3 matrix."""
+    """Inverse of a lower triangular matrix (3, 3)."""
     inv = np.zeros((3, 3))
     for i in range(3):
         inv[i, i] = 1.0 / m[i, i]
@@ -33,7 +33,7 @@ def _lower_inverse(m):
 
 @njit(cache=True, nogil=True)
 def sensitivity(intrinsics):
-    """A_g (3, 3)."""
+    """Matrix A_g (3, 3) of the intrinsics (24,)."""
     out = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -43,7 +43,7 @@ def sensitivity(intrinsics):
 
 @njit(cache=True, nogil=True)
 def correction_matrices(intrinsics):
-    """Matrices that undo the model: f = F (accel - b_a), w = G (gyro - b_g) + H (accel - b_a); returns F, G, H."""
+    """Matrices F, G, H that invert the model: f = F (accel - b_a), w = G (gyro - b_g) + H (accel - b_a)."""
     ma, mg = np.eye(3), np.eye(3)
     for n in range(6):
         ma[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[n]

@@ -1,4 +1,4 @@
-"""In place of an IMU: keyframes that nothing ties to each other. Each is an instant at which images were taken."""
+"""Replacement of the IMU factor in a rig without IMU: keyframes at image instants, with no term between them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WEAK_POSE_INFORMATION = 1e-9
 
 @dataclass(frozen=True)
 class IndependentKeyframes(RowFactor):
-    """Velocity and biases, which nothing sees, are held where they are."""
+    """Velocity and biases, which no measurement depends on, are fixed at their values."""
 
     name: str  # of the body's sensor
     n_keyframes: int
@@ -28,25 +28,25 @@ class IndependentKeyframes(RowFactor):
 
     @property
     def kinds(self) -> dict[str, slice]:
-        """None: no measurement."""
+        """Empty: there is no measurement."""
         return {}
 
     @property
     def starts(self) -> tuple[int, ...]:
-        """One chain: where nothing ties neighbours, recordings make no difference."""
+        """One chain for all recordings, as no term ties neighbours."""
         return (0,)
 
     def with_imu(self, imu: ImuData) -> IndependentKeyframes:
-        """The same: there is none."""
+        """The same factor, as there is no IMU."""
         del imu
         return self
 
     def output(self) -> Whitened:
-        """Rows (K - 1, 15) that stay empty."""
+        """Empty rows (K - 1, 15)."""
         return Whitened.without_loss(self.n_keyframes - 1, KEYFRAME_DIM)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """Defines what corners leave open in the keyframes of `piece`. Returns half a chi^2 of nothing."""
+        """Adds information that keeps the keyframes of `piece` positive definite. Returns 0, its cost."""
         del state, out, curved
         if sums:
             own = np.concatenate([np.full(POSE_DIM, WEAK_POSE_INFORMATION), np.ones(KEYFRAME_DIM - POSE_DIM)])
@@ -54,6 +54,6 @@ class IndependentKeyframes(RowFactor):
         return 0.0
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Nothing: there are no biases."""
+        """Returns 0, as there are no biases."""
         del state, piece, sums
         return 0.0

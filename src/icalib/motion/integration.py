@@ -1,10 +1,8 @@
-"""IMU readings integrated from one instant to another, forwards or backwards, with Jacobians and covariance.
+"""Integration of IMU readings between two instants, forwards or backwards, with Jacobians and covariance.
 
-Between two IMU stamps the body rate and the specific force are constant, the mean of the two readings; see
-`integration_step` for what such a stretch adds. Increments relative to the start of the interval: R_0^T R_1;
-R_0^T (v_1 - v_0 - g T); R_0^T (p_1 - p_0 - v_0 T - g T^2/2).
-Errors are perturbed as the states are: rotation on the right, velocity and position added, in the order
-rotation, velocity, position, gyro bias, accelerometer bias.
+Between two IMU stamps body rate and specific force are constant, the mean of the two readings; see `integration_step`.
+Increments are relative to the start: R_0^T R_1; R_0^T (v_1 - v_0 - g T); R_0^T (p_1 - p_0 - v_0 T - g T^2/2). Errors
+are rotation (on the right), velocity, position, gyroscope bias, accelerometer bias, in this order.
 """
 
 from __future__ import annotations
@@ -33,10 +31,10 @@ from icalib.motion.integration_step import (
 
 
 class Readings(NamedTuple):
-    """t (N,) seconds on the IMU's clock; gyro, accel (N, 3); variance (N, 3): see ImuData; walk (2,).
+    """t (N,) seconds on the IMU clock; gyro, accel (N, 3); variance (N, 3), walk (2,): see `ImuData`.
 
-    linear: readings go linearly from stamp to stamp, and a part of an interval takes their mean over that part: whole
-    intervals are the same, but the pose at the end then has a continuous derivative, the rate there.
+    linear: readings are interpolated linearly between stamps, and a part of an interval uses their mean over that part.
+    Whole intervals are unchanged. The pose at the end then has a continuous time derivative.
     """
 
     t: np.ndarray
@@ -48,9 +46,8 @@ class Readings(NamedTuple):
 
 
 class Increment(NamedTuple):
-    """R (3, 3), v (3,), p (3,): the increments; J (9, 6 or 30): their derivative with respect to gyro bias,
-    accelerometer bias (and the 24 IMU intrinsics), of no columns where it is not wanted; P (15, 15): covariance, of no
-    size where it is not wanted."""
+    """R (3, 3), v (3,), p (3,): the increments; J (9, 6 or 30): their Jacobian by gyroscope bias, accelerometer bias
+    and, if 30, the 24 IMU intrinsics; P (15, 15): covariance. J and P are empty if not wanted."""
 
     R: np.ndarray
     v: np.ndarray
@@ -61,7 +58,8 @@ class Increment(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _corrected(gyro, accel, j, share, bias, by):
-    """Body rate and specific force (3,) from the readings at a `share` of the way from stamp j to stamp j + 1."""
+    """Body rate and specific force (3,), from readings interpolated at `share` of the interval from stamp j to j +
+    1."""
     w = (
         gyro[j, 0] + share * (gyro[j + 1, 0] - gyro[j, 0]) - bias[0],
         gyro[j, 1] + share * (gyro[j + 1, 1] - gyro[j, 1]) - bias[1],
@@ -83,14 +81,14 @@ def _corrected(gyro, accel, j, share, bias, by):
 
 @njit(cache=True, nogil=True)
 def bias_of(bias, k):
-    """Row k of bias (K, 6), as numbers."""
+    """Row k of bias (K, 6), as six numbers."""
     return bias[k, 0], bias[k, 1], bias[k, 2], bias[k, 3], bias[k, 4], bias[k, 5]
 
 
 @njit(cache=True, nogil=True)
 def advance(t1, only_whole, j, now, bias, readings, by, run, width, cov, cov_t):
-    """Advances `run` from `now` in interval j to t1 (seconds), or where `only_whole` through whole intervals to the one
-    that holds t1, or is the last. Returns that one, where it begins, and rate and force (3,) at t1."""
+    """Advances `run` from `now` in interval j to t1 (s); with `only_whole` through whole intervals up to the one that
+    holds t1, or the last. Returns that interval, its start, and rate and specific force (3,) at t1."""
     t, gyro, accel, linear = readings.t, readings.gyro, readings.accel, readings.linear
     backwards, last, rate, force = t1 < now, len(t) - 2, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     while True:
@@ -115,13 +113,13 @@ def advance(t1, only_whole, j, now, bias, readings, by, run, width, cov, cov_t):
 
 @njit(cache=True, nogil=True)
 def _share(t, j, at):
-    """How far `at` is from stamp j to the next, from 0 to 1."""
+    """Fraction of the interval from stamp j to the next at time `at`, clipped to 0..1."""
     return min(max((at - t[j]) / (t[j + 1] - t[j]), 0.0), 1.0)
 
 
 @njit(cache=True, nogil=True)
 def finish(run, cov, out):
-    """Fills `out`, an `Increment`, with what `run` and `cov` have."""
+    """Copies `run` and `cov` to `out`, an `Increment`."""
     for i in range(3):
         out.v[i], out.p[i] = run[AT_V + i], run[AT_P + i]
         for k in range(3):
@@ -136,10 +134,11 @@ def finish(run, cov, out):
 
 @njit(cache=True, nogil=True)
 def integrate(t0, t1, first, bias, readings, by, room, out):
-    """Integrates `readings` from t0 to t1 (seconds, imu clock; t1 < t0 runs backwards), starting at interval `first`.
+    """Integrates `readings` from t0 to t1 (seconds on the IMU clock; t1 < t0 integrates backwards), starting in
+    interval `first`; overwrites `out`, an `Increment`.
 
-    bias: six numbers; room: see `integration_room`. `out` is overwritten. Beyond the recording the first or last
-    interval is continued. Returns the corrected rate (3,) and specific force (3,) at t1.
+    bias: six numbers; by: see `correction`; room: see `integration_room`. Beyond the recording, the first or last
+    interval is extrapolated. Returns the corrected rate (3,) and specific force (3,) at t1.
     """
     run, cov, cov_t = room
     start(run)
@@ -154,10 +153,10 @@ def integrate(t0, t1, first, bias, readings, by, room, out):
 
 @njit(cache=True, nogil=True)
 def integration_room(n):
-    """What `integrate` needs on its way; n: COVARIANCE_SIZE where a covariance is wanted, or else 0."""
+    """Workspace of `integrate`; n: COVARIANCE_SIZE with a covariance, else 0."""
     return np.empty(RUN_SIZE), np.empty(n), np.empty(n)
 
 
 def readings_of(imu: ImuData, linear: bool) -> Readings:
-    """The kernels' view of `imu`: its readings and noise. linear: see `Readings`."""
+    """`imu` as arrays for kernels; linear: see `Readings`."""
     return Readings(imu.seconds, imu.gyro, imu.accel, imu.variance, imu.walk, linear)

@@ -5,8 +5,8 @@ increments since the start of the interval become, exactly,
 
     R <- R Exp(phi)    v <- v + R G1(phi) f dt    p <- p + v dt + R G2(phi) f dt^2
 
-Vectors and matrices within a step are tuples, and all that is on its way is one array: numba counts references to every
-array that a function takes, and with an array for each these counts took longer than the sums.
+Vectors and matrices within a step are tuples, and the running integral is one array. numba counts references to each
+array argument, and with separate arrays that took longer than the arithmetic.
 """
 
 from __future__ import annotations
@@ -21,19 +21,21 @@ from icalib.motion.imu_model import correction_matrices, sensitivity
 _1_12, _1_48, _1_60, _1_99, _1_180, _1_360 = (1.0 / n for n in (12.0, 48.0, 60.0, 99.0, 180.0, 360.0))
 _1_1260, _1_10080, _3_112, _2_135, _2_165 = 1.0 / 1260.0, 1.0 / 10080.0, 3.0 / 112.0, 2.0 / 135.0, 2.0 / 165.0
 ROW_F, ROW_G, ROW_H, ROW_C, ROW_JR, ROW_GA = range(6)  # rows of a `correction`
-# What is on its way is one array, `run`: R row by row, v, p; derivatives of a step, STEP_STRIDE numbers a row, by rate,
-# force and both biases, at AT_STEP; of rate and force by the IMU intrinsics, J_STRIDE numbers a row, at AT_INTRINSICS;
-# AT_J, J_STRIDE numbers a row, of which `width` count: 6 biases, 24 IMU intrinsics. As the compiler knows the distance
-# from row to row, it takes several columns at a time.
+# The running integral is one array, `run`, with these parts at these indices:
+# - 0: R row by row; AT_V: v; AT_P: p
+# - AT_STEP: derivatives of the current step by rate, force and both biases, STEP_STRIDE numbers a row
+# - AT_INTRINSICS: derivatives of rate and force by the IMU intrinsics, J_STRIDE numbers a row
+# - AT_J: J, J_STRIDE numbers a row, of which the first `width` are in use: 6 biases, 24 IMU intrinsics
+# Strides are compile-time constants, so that the compiler can vectorise over columns.
 AT_V, AT_P, AT_STEP, AT_INTRINSICS, AT_J, STEP_STRIDE, J_STRIDE = 9, 12, 15, 128, 320, 12, 32
 RUN_SIZE = AT_J + 9 * J_STRIDE
-# The covariance of rotation, velocity, position and biases has its rows at the same places as AT_J.
+# The covariance of rotation, velocity, position and biases is laid out like J, with 15 rows.
 COVARIANCE_SIZE = AT_J + 15 * J_STRIDE
 
 
 @njit(cache=True, nogil=True)
 def start(run):
-    """No motion yet."""
+    """Resets `run` to no motion."""
     for i in range(RUN_SIZE):
         run[i] = 0.0
     run[0] = run[4] = run[8] = 1.0
@@ -41,8 +43,8 @@ def start(run):
 
 @njit(cache=True, nogil=True)
 def correction(intrinsics):
-    """(6, 9) matrices row by row: ROW_F, ROW_G, ROW_H, see `correction_matrices`; C = Exp(r), J_r(r) and ROW_G A_g, see
-    `imu_model`."""
+    """Matrices (6, 9), row by row: F, G, H (see `correction_matrices`); C = Exp(r), J_r(r) and G A_g (see
+    `imu_model`)."""
     r, by = intrinsics[12:15], np.empty((6, 9))
     F_, G_, H_ = correction_matrices(intrinsics)
     matrices = F_, G_, H_, so3.exp(r), so3.right_jacobian(r), mul3(G_, sensitivity(intrinsics))
@@ -152,10 +154,12 @@ def _series_slope(phi, f, products, c1, c2, d1, d2):
 
 @njit(cache=True, nogil=True)
 def step(rate, force, dt, by, run, width):
-    """Advances `run` by dt (either sign) of constant body `rate` and specific `force`; returns what `carry` needs.
+    """Advances `run` by dt (either sign) of constant body `rate` and specific `force`. Returns the arguments that
+    `carry` needs.
 
-    run: the increments and their derivatives, laid out as at AT_V, AT_P, ... above. by: see `correction`; read only if
-    derivatives are wanted. width, columns of AT_J that are advanced: 0 none, 6 biases, more: IMU intrinsics too."""
+    run: increments and derivatives, laid out as above. by: see `correction`, read only if derivatives are wanted.
+    width: columns of J to advance: 0 none, 6 biases, more: IMU intrinsics too.
+    """
     phi = rate[0] * dt, rate[1] * dt, rate[2] * dt
     x = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s0, s1, s2, s3 = so3.jacobian_coefficients(x)
@@ -228,7 +232,7 @@ def _fill_row(o, s, by_rate, t, by_force, C_f, C_w, C_wf, run):
 
 @njit(cache=True, nogil=True)
 def carry(turn, by_turn, dt, width, x):
-    """Rows of AT_J in x: errors after a step from those before it, what the step itself adds aside."""
+    """Propagates the rows of J in x through one step; the step's own contribution is added elsewhere."""
     E0, E1, E2, E3, E4, E5, E6, E7, E8 = turn
     A0, A1, A2, A3, A4, A5, A6, A7, A8 = by_turn[0]
     B0, B1, B2, B3, B4, B5, B6, B7, B8 = by_turn[1]
@@ -248,6 +252,7 @@ def carry(turn, by_turn, dt, width, x):
 
 @njit(cache=True, nogil=True)
 def _add_biases(run):
+    """Adds the step's own contribution to the bias columns of J."""
     for i in range(9):
         for j in range(6):
             run[AT_J + J_STRIDE * i + j] += run[AT_STEP + STEP_STRIDE * i + 6 + j]
@@ -255,8 +260,8 @@ def _add_biases(run):
 
 @njit(cache=True, nogil=True)
 def fill_intrinsics(rate, force, by, run):
-    """Fills the derivatives of corrected rate (three rows) and force (three rows), from number AT_INTRINSICS on, by the
-    24 IMU intrinsics, see `imu_model`; what does not depend on one is zero already."""
+    """Fills the derivatives of corrected rate (three rows) and force (three rows) by the 24 IMU intrinsics, from
+    run[AT_INTRINSICS] on, see `imu_model`. Elements that are always zero stay zero."""
     u, turn = times(matrix(by, ROW_C), rate), _cross_product(rate, matrix(by, ROW_JR))
     f, lower = force, (force[0], force[0], force[1], force[0], force[1], force[2])
     for i in range(3):
@@ -285,7 +290,7 @@ def fill_intrinsics(rate, force, by, run):
 
 @njit(cache=True, nogil=True)
 def _add_intrinsics(run):
-    """AT_J += what the step adds by the IMU intrinsics."""
+    """Adds the step's own contribution to the intrinsics columns of J."""
     for i in range(9):
         o, d = J_STRIDE * i + 6, AT_STEP + STEP_STRIDE * i
         a, b, c = run[d], run[d + 1], run[d + 2]
@@ -304,10 +309,11 @@ def _add_intrinsics(run):
 
 @njit(cache=True, nogil=True)
 def add_covariance(turn, by_turn, dt, variance, walk, run, cov, cov_t):
-    """cov, see COVARIANCE_SIZE, after the step of `run` that gave turn and by_turn; cov_t: room.
+    """Propagates the covariance `cov` (layout: see COVARIANCE_SIZE) through the step of `run` that returned turn and
+    by_turn; cov_t: workspace.
 
-    ROW_F cov ROW_F^T, both halves by the same row operation, and noise. variance (3,): squared densities, see
-    `ImuData`, walk (2,): of the biases' random walks.
+    F cov F^T takes the same row operation twice, with transpositions, and noise is added. variance (3,): squared
+    densities, see `ImuData`; walk (2,): squared densities of the bias random walks.
     """
     for half in range(2):
         source, target = (cov, cov_t) if half == 0 else (cov_t, cov)
@@ -327,8 +333,8 @@ def add_covariance(turn, by_turn, dt, variance, walk, run, cov, cov_t):
                 s += run[AT_STEP + STEP_STRIDE * i + 6 + k] * run[AT_STEP + STEP_STRIDE * j + 6 + k] * variance[k // 3]
             cov[AT_J + J_STRIDE * i + j] += s / dt
     for i in range(6, 9):
-        # A force that is not constant within the stretch: white, it moves the position by dt^3 / 3, its mean by
-        # dt^3 / 4. Without it position follows velocity exactly where a stretch holds no other stamp (a bridged gap).
+        # Variation of the force within the interval: white noise has the position variance dt^3 / 3, its mean over the
+        # interval dt^3 / 4. Without the rest, position and velocity errors would be collinear across a bridged gap.
         cov[AT_J + J_STRIDE * i + i] += variance[2] * dt * dt * dt / 12.0
     for k in range(6):
         cov[AT_J + (J_STRIDE + 1) * (9 + k)] += walk[k // 3] * dt

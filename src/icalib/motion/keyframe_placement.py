@@ -1,4 +1,4 @@
-"""Where the keyframes of the chain stand: at every distinct image instant, and often enough in between."""
+"""Placement of keyframes: at every distinct image instant, and evenly in between where these are sparse."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from icalib.motion.imu_data import ImuData, clear_of
 
-MERGED_WITHIN_S = 2e-3  # images closer than this share a keyframe
-SPACING_SLACK = 0.1  # of the spacing: a camera of 20 Hz whose stamps jitter needs no keyframe in between
+MERGED_WITHIN_S = 2e-3  # images closer in time share a keyframe
+SPACING_SLACK = 0.1  # of the spacing: jitter of stamps at the spacing's own rate adds no keyframes
 
 
 def place_keyframes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max_gap: float) -> np.ndarray:
-    """(K,) keyframe times, seconds on the imu clock: all image instants, none further apart than 1.1 `spacing`.
+    """Keyframe times (K,), seconds on the IMU clock: all image instants, none further apart than 1.1 `spacing` s.
 
-    IMU gaps are filled too, up to `max_gap` seconds; in longer ones there is no keyframe, and none between recordings.
+    IMU gaps up to `max_gap` seconds have keyframes too; longer ones, and intervals between recordings, have none.
     """
     times = np.sort(np.concatenate(image_times))
     own = distinct(times[usable(imu, times, max_gap)])
@@ -23,7 +23,7 @@ def place_keyframes(imu: ImuData, image_times: list[np.ndarray], spacing: float,
 
 
 def _filled(times: np.ndarray, spacing: float) -> np.ndarray:
-    """Sorted `times` (n,), and instants evenly in between where they are further apart than 1.1 `spacing`."""
+    """Sorted `times` (n,) with evenly spaced instants inserted where they are further apart than 1.1 `spacing`."""
     apart = np.diff(times)
     steps = np.maximum(np.ceil(apart / spacing - SPACING_SLACK), 1.0).astype(np.int64)
     last = np.cumsum(steps)
@@ -34,18 +34,18 @@ def _filled(times: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def first_keyframes(imu: ImuData | None, keyframes: np.ndarray) -> tuple[int, ...]:
-    """The first of the `keyframes` (K,) of each recording; without an IMU keyframes know of no recordings."""
+    """Index of the first keyframe of each recording, in `keyframes` (K,) s; (0,) without an IMU."""
     seams = () if imu is None else imu.seams
     return (0, *(int(k) for k in np.searchsorted(keyframes, [end for end, _ in seams], side="right")))
 
 
 def distinct(times: np.ndarray) -> np.ndarray:
-    """The first of each group of sorted `times` that lie close together."""
+    """The first of each group of sorted `times` within MERGED_WITHIN_S of one another."""
     return times[np.diff(times, prepend=-np.inf) > MERGED_WITHIN_S]
 
 
 def usable(imu: ImuData, times: np.ndarray, max_gap: float) -> np.ndarray:
-    """(n,) whether the IMU was running at each time, gaps up to `max_gap` seconds allowed."""
+    """(n,) whether the IMU has readings at each time; gaps up to `max_gap` seconds count as readings."""
     inside = (times >= imu.seconds[0]) & (times <= imu.seconds[-1])
     return inside & clear_of((*_long_gaps(imu, max_gap), *imu.seams), times, times)
 

@@ -1,4 +1,4 @@
-"""Compiled passes over the points of a LiDAR, tens of millions, and over which plane each lies on."""
+"""Compiled passes over the points of a LiDAR, tens of millions, and over the plane of each."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-MAX_COARSE_POINTS = 3_000_000  # of a LiDAR, where some of its points will do
-MAX_PLANE_POINTS_KEPT_WHOLE = 20_000  # points of a plane that are all looked at
+MAX_COARSE_POINTS = 3_000_000  # points of a LiDAR in a pass that may be coarse
+MAX_PLANE_POINTS_KEPT_WHOLE = 20_000  # points of a plane that is not thinned
 
 
 @njit(cache=True, nogil=True)
 def are_somewhere(xyz):
-    """(N,) bool which points xyz (N, 3) are anywhere but at the LiDAR itself: finite, and not all zeros."""
+    """(N,) whether each point of xyz (N, 3) is a return: finite, and not all zeros."""
     out = np.empty(len(xyz), np.bool_)
     for i in range(len(xyz)):
         size2 = xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1] + xyz[i, 2] * xyz[i, 2]
@@ -22,7 +22,7 @@ def are_somewhere(xyz):
 
 @njit(cache=True, nogil=True)
 def count_points(plane, n):
-    """(n,) how many points lie on each of n planes; plane (N,), -1: on none."""
+    """Number (n,) of points on each of n planes; plane (N,), -1 for points on none."""
     count = np.zeros(n, dtype=np.int64)
     for q in plane:
         if q >= 0:
@@ -32,6 +32,7 @@ def count_points(plane, n):
 
 @njit(cache=True, nogil=True)
 def _some(plane, step, count, out):
+    """Fills out (N,): plane of every step-th point and of all points of small planes, -1 for the others."""
     due = 0
     for i in range(len(plane)):
         q = plane[i]
@@ -41,7 +42,8 @@ def _some(plane, step, count, out):
 
 
 def thinned(plane: np.ndarray) -> np.ndarray:
-    """(N,) plane of each point, -1 for all but some of very many; by an odd step, or some lasers would be left out."""
+    """Plane (N,) of each point, -1 for most points of very large clouds. The step is odd, so that no laser ring is left
+    out."""
     step = len(plane) // MAX_COARSE_POINTS | 1
     if step == 1:
         return plane

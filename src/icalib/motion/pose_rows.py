@@ -1,7 +1,7 @@
-"""Residuals of poses that a sensor reports, with derivatives by its own pose (`sensor_pose`) and by the frame.
+"""Residuals of poses that a sensor reports, with Jacobians by its own pose (`sensor_pose`) and by the reference frame.
 
-Rotations e = Log(measured^T predicted), positions predicted - measured in the axes in which they were measured. As
-rotations are perturbed on the right, de = J_r^-1(e) d of whatever stands on the right of the prediction.
+Rotation: e = Log(measured^T predicted). Position: predicted - measured, in the axes of the measurement. Rotations are
+perturbed on the right, so de = J_r^-1(e) d for a factor on the right of the prediction.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Extrinsics:
 
 @dataclass(frozen=True)
 class Frame:
-    """R_world_frame (3, 3), p_world_frame (3,) m."""
+    """Pose of a reference frame: R_world_frame (3, 3), p_world_frame (3,) m."""
 
     R: np.ndarray
     p: np.ndarray
@@ -33,8 +33,8 @@ class Frame:
 @dataclass(frozen=True)
 class PoseResiduals:
     """n poses of 6 rows, rotation and position, not whitened. residual (n, 6); J_pose: (n, 6, 6) by the sensor's pose,
-    of relative poses one for each end; J_frame (n, 6, 6 or 0): by R_world_frame, p_world_frame. Jacobians of length 0
-    where they are not wanted."""
+    for relative poses one for each end; J_frame (n, 6, 6 or 0): by R_world_frame, p_world_frame. Jacobians have length
+    0 if not wanted."""
 
     residual: np.ndarray
     J_pose: tuple[np.ndarray, ...]
@@ -50,10 +50,10 @@ class PoseResiduals:
 def absolute_residuals(
     R: np.ndarray, p: np.ndarray, frame: Frame, rotation: np.ndarray, position: np.ndarray, jacobians: bool = True
 ) -> PoseResiduals:
-    """Of poses R_frame_sensor `rotation` (n, 3, 3), p_frame_sensor `position` (n, 3), while the sensor was at R (n, 3,
-    3), p (n, 3) in the world:
+    """Residuals of measured poses R_frame_sensor `rotation` (n, 3, 3), p_frame_sensor `position` (n, 3), for predicted
+    poses R (n, 3, 3), p (n, 3) of the sensor in the world:
 
-    Log(rotation^T R_world_frame^T R),  R_world_frame^T (p - p_world_frame) - position
+        Log(rotation^T R_world_frame^T R),  R_world_frame^T (p - p_world_frame) - position
     """
     n, predicted = len(R), frame.R.T @ R
     e = so3.log_many(np.ascontiguousarray(_t(rotation) @ predicted))
@@ -78,10 +78,10 @@ def relative_residuals(
     position: np.ndarray,
     jacobians: bool = True,
 ) -> PoseResiduals:
-    """Of poses `rotation` (n, 3, 3), `position` (n, 3) of the sensor at the later of two instants, seen from the
-    earlier, while it was at R[0], p[0] and R[1], p[1]:
+    """Residuals of measured poses `rotation` (n, 3, 3), `position` (n, 3) of the sensor at the later instant relative
+    to the earlier, for predicted poses R[0], p[0] and R[1], p[1]:
 
-    Log(rotation^T Q), Q = R_0^T R_1,  R_0^T (p_1 - p_0) - position
+        Log(rotation^T Q), Q = R_0^T R_1,  R_0^T (p_1 - p_0) - position
     """
     n, Q = len(R[0]), _t(R[0]) @ R[1]
     e = so3.log_many(np.ascontiguousarray(_t(rotation) @ Q))
@@ -101,7 +101,7 @@ def relative_residuals(
 
 @njit(cache=True, nogil=True)
 def right_jacobians_inverse(e: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) J_r^-1 at rotation vectors e (n, 3) rad."""
+    """Inverse right Jacobians (n, 3, 3) at rotation vectors e (n, 3) rad."""
     out = np.empty((len(e), 3, 3))
     for i in range(len(e)):
         out[i] = so3.right_jacobian_inverse(e[i])

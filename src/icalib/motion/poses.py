@@ -1,10 +1,10 @@
-"""Where the IMU was at a sensor's own instant: three schemes behind one function, `poses_at`.
+"""Pose of the IMU at a sensor's own instant: three schemes behind one function, `poses_at`.
 
-    inertial    the IMU's readings integrated from the nearest keyframe to t, forwards or backwards
+    inertial    IMU readings integrated from the nearest keyframe to t, forwards or backwards
     kinematic   constant angular rate and velocity from the nearest keyframe, paper (8)-(9)
-    pose        between the two bounding keyframes, paper (10)-(12); position interpolated linearly
+    pose        between the two neighbouring keyframes, paper (10)-(12); position interpolated linearly
 
-A measurement keeps its keyframe (`Assignment`) while the solver runs; only the time itself moves with the offset.
+A measurement keeps its keyframe while the solver runs; only its time moves with the time offset.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from icalib.sensors.imu.spec import N_INTRINSICS
 
 @dataclass(frozen=True)
 class Poses:
-    """IMU poses at n instants, and how they move. Rows of the Jacobians: rotation (right), position (world).
+    """IMU poses at n instants with Jacobians. Rows of the Jacobians: rotation (on the right), position (world).
 
-    rotation (n, 3, 3), position (n, 3); rate (n, 3) body rad/s and velocity (n, 3) world m/s, the time derivative;
-    J_keyframe, J_next (n, 6, 15): with respect to the keyframe and, for `pose` alone, the one after it (else of length
-    0); J_imu (n, 6, 24 or 0): with respect to the IMU intrinsics.
+    rotation (n, 3, 3), position (n, 3) m; rate (n, 3) body rad/s and velocity (n, 3) world m/s, the time derivative;
+    J_keyframe, J_next (n, 6, 15): by the keyframe and, for `pose` alone, the next one (else of length 0); J_imu (n, 6,
+    24 or 0): by the IMU intrinsics.
     """
 
     rotation: np.ndarray
@@ -62,10 +62,10 @@ class Poses:
 
 
 class VelocityDerivatives(NamedTuple):
-    """How the velocity in `Poses` (world, m/s) moves in the `inertial` scheme.
+    """Derivatives of the velocity in `Poses` (world, m/s), in the `inertial` scheme.
 
-    acceleration (n, 3) world m/s^2, its time derivative; J_keyframe (n, 3, 15), J_imu (n, 3, 24 or 0): with respect to
-    the keyframe and the IMU intrinsics. All of length 0 where not wanted.
+    acceleration (n, 3) world m/s^2: by time; J_keyframe (n, 3, 15), J_imu (n, 3, 24 or 0): by the keyframe and the IMU
+    intrinsics. All of length 0 if not wanted.
     """
 
     acceleration: np.ndarray
@@ -78,8 +78,8 @@ class VelocityDerivatives(NamedTuple):
 
 
 def assign_keyframes(scheme: Scheme, keyframes: np.ndarray, times: np.ndarray, forwards: bool = False) -> np.ndarray:
-    """(n,) keyframe of each time: the nearest one, or for `pose`, and where motion is carried `forwards` only (see
-    `ImuData`), the one before it."""
+    """Keyframe (n,) of each time: the nearest one. For `pose`, or if motion is propagated `forwards` only (see
+    `ImuData`), the one before."""
     after = np.clip(np.searchsorted(keyframes, times, side="right"), 1, len(keyframes) - 1)
     if scheme == "pose" or forwards:
         return after - 1
@@ -88,8 +88,8 @@ def assign_keyframes(scheme: Scheme, keyframes: np.ndarray, times: np.ndarray, f
 
 @njit(cache=True, nogil=True)
 def _velocity(i, R, run, force, g, at, moving):
-    """Fills entry i of `moving`: increments `run` (see `integration_step`) from a keyframe at R, and `force` at the
-    instant."""
+    """Fills entry i of `moving` from increments `run` (see `integration_step`), the rotation R of the keyframe, and the
+    specific `force` at the instant."""
     first = 0 * i
     _fill_start(i, first, R, run, AT_J + 3 * J_STRIDE, moving.J_keyframe, moving.J_imu)
     _fill_turn(i, first, R, run, AT_V, moving.J_keyframe)
@@ -102,9 +102,9 @@ def _velocity(i, R, run, force, g, at, moving):
 
 @njit(cache=True, nogil=True)
 def _fill_pose(i, dt, R, run, Jn, Jx):
-    """Fills entry i of the Jacobians of a pose: dt and increments `run` (see `integration_step`) from a keyframe at
-    R."""
-    first = 0 * i  # an integer and no literal, for which all is compiled once more
+    """Fills entry i of the pose Jacobians Jn (keyframe) and Jx (intrinsics) from increments `run` (see
+    `integration_step`), elapsed time dt, and the rotation R of the keyframe."""
+    first = 0 * i  # not a literal: numba would compile the callees once more for a literal type
     _fill_start(i, first + 3, R, run, AT_J + 6 * J_STRIDE, Jn, Jx)
     _fill_turn(i, first + 3, R, run, AT_P, Jn)
     for a in range(3):
@@ -120,7 +120,7 @@ def _fill_pose(i, dt, R, run, Jn, Jx):
 
 @njit(cache=True, nogil=True)
 def _fill_turn(i, r, R, run, o, Jn):
-    """Rows r.. of Jn[i] by the rotation R of the keyframe, of an increment d (3,), run[o:], in its axes: -R hat(d)."""
+    """Rows r.. of Jn[i], by the rotation R of the keyframe, of an increment d (3,) = run[o:] in its axes: -R hat(d)."""
     d = run[o], run[o + 1], run[o + 2]
     for a in range(3):
         R0, R1, R2 = R[3 * a], R[3 * a + 1], R[3 * a + 2]
@@ -131,7 +131,7 @@ def _fill_turn(i, r, R, run, o, Jn):
 
 @njit(cache=True, nogil=True)
 def _fill_start(i, r, R, x, o, Jn, Jx):
-    """Rows r.. of Jn[i] and Jx[i] by biases and intrinsics: R times three rows of AT_J in x, from number o on."""
+    """Rows r.. of Jn[i] and Jx[i], by biases and intrinsics: R times three rows of J, which start at x[o]."""
     for a in range(3):
         R0, R1, R2 = R[3 * a], R[3 * a + 1], R[3 * a + 2]
         for c in range(6):
@@ -142,7 +142,7 @@ def _fill_start(i, r, R, x, o, Jn, Jx):
 
 @njit(cache=True, nogil=True)
 def _inertial(ways, keyframes, readings, intrinsics, at, Jn, Jx, moving):
-    """Fills `at`, a `Moving`, and where they are not empty the Jacobians and `moving`."""
+    """Fills `at`, a `Moving`, and, unless they are empty, the Jacobians and `moving`."""
     width = 6 + Jx.shape[2] if len(Jn) else 0
     by, carried, run = correction(intrinsics), empty_prefix(), np.empty(RUN_SIZE)
     for i in ways.order:
@@ -220,8 +220,8 @@ def _between(times, keyframe, keyframes, R, p, out_R, out_p, rate, vel, Jn, Jm):
 
 
 def poses_of_keyframes(keyframe: np.ndarray, state: State) -> Poses:
-    """IMU poses at the keyframes, with zero rate and velocity: without an IMU, measurements lie at keyframes and time
-    derivatives play no role."""
+    """IMU poses at keyframes, with zero rate and velocity. In a rig without IMU measurements are at keyframes, and time
+    offsets have no effect."""
     n = len(keyframe)
     J_keyframe, still = np.zeros((n, 6, KEYFRAME_DIM)), np.zeros((n, 3))
     J_keyframe[:, range(6), range(6)] = 1.0
@@ -234,7 +234,7 @@ def poses_of_keyframes(keyframe: np.ndarray, state: State) -> Poses:
 def poses_at(
     scheme: Scheme, times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> Poses:
-    """IMU poses at `times` (n,) seconds on the imu clock, each from its `keyframe` (see `assign_keyframes`)."""
+    """IMU poses at `times` (n,) seconds on the IMU clock, each from its `keyframe` (see `assign_keyframes`)."""
     n = len(times)
     if scheme == "inertial":
         return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
@@ -258,21 +258,21 @@ def poses_at(
 def poses_without_jacobians(
     times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float
 ) -> Poses:
-    """The `inertial` poses of `poses_at` with Jacobians of length 0."""
+    """The `inertial` poses of `poses_at`, with Jacobians of length 0."""
     return _carried(_empty(len(times), 0, False), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
 
 
 def poses_and_velocity_derivatives(
     times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> tuple[Poses, VelocityDerivatives]:
-    """The `inertial` poses of `poses_at`, and how their velocities move."""
+    """The `inertial` poses of `poses_at`, and derivatives of their velocities."""
     n = len(times)
     moving = VelocityDerivatives.empty(n, N_INTRINSICS if imu_free else 0)
     return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, moving), moving
 
 
 def _empty(n: int, n_jacobians: int, imu_free: bool) -> Poses:
-    """To be filled with n `inertial` poses and the Jacobians of as many, or of none."""
+    """Arrays for n `inertial` poses, with Jacobians of `n_jacobians` (n or 0) of them."""
     J_imu = np.zeros((n_jacobians, 6, N_INTRINSICS if imu_free else 0))
     return Poses(*Moving.empty(n), np.zeros((n_jacobians, 6, KEYFRAME_DIM)), np.zeros((0, 6, KEYFRAME_DIM)), J_imu)
 
@@ -286,7 +286,7 @@ def _carried(
     gravity: float,
     moving: VelocityDerivatives,
 ) -> Poses:
-    """Fills `out` with the `inertial` poses, and `moving` where it is not empty; returns `out`."""
+    """Fills `out` with the `inertial` poses, and `moving` unless it is empty; returns `out`."""
     ways, keyframes = propagation_query(state, times, keyframe, imu), keyframes_of(state, gravity)
     at = Moving(out.rotation, out.position, out.rate, out.velocity)
     intrinsics = state.values[imu.name, "intrinsics"]

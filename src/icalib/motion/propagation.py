@@ -1,4 +1,4 @@
-"""From keyframes to the instants that hang on them, forwards or backwards, by the IMU's readings."""
+"""Propagation of the IMU's pose from keyframes to other instants, forwards or backwards, by its readings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icalib.optim.state import State
 
 
 class Keyframes(NamedTuple):
-    """Those of a `State`, as kernels take them, and gravity [m/s^2]."""
+    """Keyframes of a `State` as arrays for kernels, and gravity [m/s^2]."""
 
     seconds: np.ndarray
     rotation: np.ndarray
@@ -29,8 +29,8 @@ def keyframes_of(state: State, gravity: float) -> Keyframes:
 
 
 class PropagationQuery(NamedTuple):
-    """How n instants are reached: times (n,) seconds on the IMU's clock, keyframe (n,) of each, first (n,) the interval
-    of the readings in which its way begins, order (n,) in which to go."""
+    """n instants to propagate to: times (n,) seconds on the IMU clock; keyframe (n,) to start from; first (n,),
+    interval of the readings at the start; order (n,), see `in_order_of_keyframes`."""
 
     times: np.ndarray
     keyframe: np.ndarray
@@ -39,8 +39,8 @@ class PropagationQuery(NamedTuple):
 
 
 class Moving(NamedTuple):
-    """The IMU at n instants: R_world_imu (n, 3, 3), p_world_imu (n, 3), rate (n, 3) of the body [rad/s], velocity
-    (n, 3) in the world [m/s]."""
+    """Pose and velocities of the IMU at n instants: R_world_imu (n, 3, 3), p_world_imu (n, 3) m, rate (n, 3) of the
+    body [rad/s], velocity (n, 3) in the world [m/s]."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -54,10 +54,12 @@ class Moving(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def integrate_from_keyframe(keyframe, t0, t1, first, bias, readings, by, carried, run, width):
-    """As `integrate`, without a covariance and into `run` (RUN_SIZE,). What was `carried` from the same keyframe in the
-    same direction, and not as far as t1, is carried on, so that many instants (`in_order_of_keyframes`) cost little
-    more than the last one. carried (RUN_SIZE + 3,): a run through whole intervals; its way, its interval, its
-    instant."""
+    """As `integrate`, without covariance and into `run` (RUN_SIZE,).
+
+    `carried` (RUN_SIZE + 3,) is the integral over whole intervals from the same keyframe in the same direction, with an
+    identifier of both, the interval and the instant reached. It is extended to t1, so that many instants in the order
+    of `in_order_of_keyframes` cost little more than the last one.
+    """
     backwards = t1 < t0
     way = 2 * keyframe + backwards
     if carried[RUN_SIZE] != way or (t1 >= carried[RUN_SIZE + 2] if backwards else t1 <= carried[RUN_SIZE + 2]):
@@ -82,7 +84,7 @@ def integrate_from_keyframe(keyframe, t0, t1, first, bias, readings, by, carried
 
 @njit(cache=True, nogil=True)
 def empty_prefix():
-    """See `integrate_from_keyframe`."""
+    """Initial `carried` of `integrate_from_keyframe`."""
     carried = np.zeros(RUN_SIZE + 3)
     carried[RUN_SIZE] = -1.0
     return carried
@@ -90,15 +92,15 @@ def empty_prefix():
 
 @njit(cache=True, nogil=True)
 def rotation_of(keyframes, k):
-    """R_world_imu of keyframe k: nine numbers, row by row."""
+    """R_world_imu of keyframe k, row by row as nine numbers."""
     R = keyframes.rotation
     return R[k, 0, 0], R[k, 0, 1], R[k, 0, 2], R[k, 1, 0], R[k, 1, 1], R[k, 1, 2], R[k, 2, 0], R[k, 2, 1], R[k, 2, 2]
 
 
 @njit(cache=True, nogil=True)
 def place(i, seconds, k, keyframes, way, rate, out):
-    """Fills entry i of `out`, a `Moving`, `seconds` and increments `way` (15,), see `integration_step`, from keyframe
-    k."""
+    """Fills entry i of `out`, a `Moving`, from keyframe k, the elapsed `seconds`, and the increments `way` (see
+    `integration_step`)."""
     R, g = keyframes.rotation, keyframes.gravity
     for a in range(3):
         out.rate[i, a] = rate[a]
@@ -114,16 +116,16 @@ def place(i, seconds, k, keyframes, way, rate, out):
 
 
 def in_order_of_keyframes(times: np.ndarray, keyframe: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """(n,) the order in which instants at `times` (n,), in order themselves, lead away from their `keyframe` (n,),
-    which are at `seconds` (K,): first all behind their keyframes, then backwards those before."""
+    """Order (n,) of sorted instants `times` (n,) in which each follows the one nearer to its `keyframe` (n,): first
+    those after their keyframes, then backwards those before. seconds (K,): keyframe times."""
     before = times < seconds[keyframe]
     return np.concatenate([np.flatnonzero(~before), np.flatnonzero(before)[::-1]])
 
 
 def propagation_query(state: State, times: np.ndarray, keyframe: np.ndarray, imu: ImuData) -> PropagationQuery:
-    """To `times` (n,), in order, from their `keyframe` (n,)."""
+    """Query for sorted `times` (n,) from their `keyframe` (n,)."""
     begin = state.seconds[keyframe]
     first = imu.interval(begin)
-    # Integration backwards starts in the interval that ends at the keyframe, if the keyframe lies on a stamp.
+    # If the keyframe is at a stamp, backward integration starts in the interval that ends there.
     on_stamp = (times < begin) & (imu.seconds[first] == begin) & (first > 0)
     return PropagationQuery(times, keyframe, first - on_stamp, in_order_of_keyframes(times, keyframe, state.seconds))

@@ -1,4 +1,4 @@
-"""Poses of a sensor at its own instants, and the chain rule from its pose to all that the pose depends on.
+"""Poses of a sensor at its own instants, and the chain rule from its pose to the parameters it depends on.
 
     R_world_sensor = R_world_imu(t) R_imu_sensor        p_world_sensor = p_world_imu(t) + R_world_imu(t) p_imu_sensor
 
@@ -27,13 +27,13 @@ from icalib.optim.rows import KEYFRAME_PAIR_DIM, Rows, UInt
 from icalib.optim.state import KEYFRAME_DIM, Layout, State
 from icalib.rig import Scheme
 
-OFFSET_COLUMN = 6  # number of the time offset among the calibration parameters of a pose
+OFFSET_COLUMN = 6  # index of the time offset among the calibration parameters of a pose
 N_POSE_PARAMETERS = 7  # extrinsics and time offset; the IMU intrinsics follow
-IDENTITY_6 = np.eye(6)  # a pose by itself
+IDENTITY_6 = np.eye(6)  # Jacobian of a pose by itself
 
 
 class _Moving(Protocol):
-    """A factor of measurements by a sensor on the body."""
+    """A factor of measurements by a sensor on the moving body."""
 
     @property
     def name(self) -> str: ...
@@ -50,8 +50,8 @@ class _Moving(Protocol):
 
 @dataclass(frozen=True)
 class Kinematics:
-    """What the pose of a sensor depends on beside a state. imu: None where measurements are taken at keyframes; gravity
-    [m/s^2]; scheme: how poses between keyframes are found, see `poses`."""
+    """Fixed inputs of a sensor's pose. imu: None if measurements are at keyframes; gravity [m/s^2]; scheme: of poses
+    between keyframes, see `poses`."""
 
     sensor: str
     layout: Layout
@@ -61,22 +61,22 @@ class Kinematics:
 
     @classmethod
     def of(cls, factor: _Moving) -> Kinematics:
-        """That of the sensor of a factor, by the readings of the IMU."""
+        """Kinematics of the sensor of a factor, in the `inertial` scheme."""
         return cls(factor.name, factor.layout, factor.imu, factor.gravity)
 
     def columns(self, clock: int = 0) -> np.ndarray:
-        """(7 + 24 or 0,) calibration columns of the sensor's pose, -1 where fixed; `clock`: number of its time
+        """Calibration columns (7 + 24 or 0,) of the sensor's pose, -1 where fixed; `clock`: number of its time
         offset."""
         own = pose_columns(self.layout, self.sensor, clock)
         return np.concatenate([own, self.layout.columns(self._imu, "intrinsics")]) if self._imu else own
 
     @property
     def _imu(self) -> str:
-        """The IMU whose intrinsics are estimated; empty where there is none."""
+        """Name of the IMU whose intrinsics are estimated; empty if there is none."""
         return self.imu.name if self.imu is not None and self.layout.is_free(self.imu.name, "intrinsics") else ""
 
     def imu_poses(self, seconds: np.ndarray, keyframe: np.ndarray, state: State, jacobians: bool = True) -> Poses:
-        """Poses of the IMU at `seconds` (n,) on the sensor's clock, each from its keyframe `keyframe` (n,)."""
+        """IMU poses at `seconds` (n,) on the sensor's clock, each from its `keyframe` (n,)."""
         if self.imu is None:
             return poses_of_keyframes(keyframe, state)
         times = seconds + offset_at(state, self.sensor, keyframe)
@@ -86,8 +86,7 @@ class Kinematics:
 
 
 class SensorPose(NamedTuple):
-    """n poses of a sensor, and of the IMU what `Poses` has: rate, velocity, Jacobians by keyframe, next keyframe and
-    intrinsics."""
+    """n poses of a sensor, and rate, velocity and Jacobians of the IMU as in `Poses`."""
 
     R_imu_sensor: np.ndarray
     p_imu_sensor: np.ndarray
@@ -103,8 +102,8 @@ class SensorPose(NamedTuple):
     def at(
         cls, kinematics: Kinematics, seconds: np.ndarray, keyframe: np.ndarray, state: State, jacobians: bool = True
     ) -> SensorPose:
-        """At `seconds` (n,) on the sensor's clock, each from its keyframe `keyframe` (n,). Without `jacobians` these
-        may be of length 0. A sensor without a rotation has the axes of the body."""
+        """Poses at `seconds` (n,) on the sensor's clock, each from its `keyframe` (n,). Without `jacobians` these may
+        have length 0. A sensor without a rotation has the axes of the IMU."""
         name, imu = kinematics.sensor, kinematics.imu_poses(seconds, keyframe, state, jacobians)
         R_is = np.ascontiguousarray(state.values.get((name, "rotation"), np.eye(3)))
         p_is = state.values[name, "translation"]
@@ -123,21 +122,21 @@ class SensorPose(NamedTuple):
         return self.p_world_sensor
 
     def part(self, own: slice | np.ndarray) -> SensorPose:
-        """Some of the poses."""
+        """The poses `own`."""
         R_is, p_is, *each = self
         return SensorPose(R_is, p_is, *(x[own] if len(x) else x for x in each))
 
     @property
     def n_calib(self) -> int:
-        """How many calibration parameters the poses depend on."""
+        """Number of calibration parameters that the poses depend on."""
         return N_POSE_PARAMETERS + self.J_imu.shape[2]
 
 
 def rows_at(residual: np.ndarray, J_pose: Sequence[np.ndarray], ends: Sequence[SensorPose], J_own: np.ndarray) -> Rows:
-    """Rows of n residuals (n, m) whose derivatives by sensor poses are J_pose (n, m, 6).
+    """Rows of n residuals (n, m), from their Jacobians J_pose (n, m, 6) by sensor poses.
 
-    Of one pose each, by its keyframe and the one after; of two, the earlier by its keyframe, the later by the one
-    after. J_own (n, m, c): by calibration parameters of the residual itself, which follow those of the pose.
+    For one pose each: by its keyframe and the next one. For two: the earlier by its keyframe, the later by the next
+    one. J_own (n, m, c): by further calibration parameters, whose columns follow those of the pose.
     """
     n, m, n_pose = *residual.shape, ends[0].n_calib
     if not len(J_own):
@@ -151,7 +150,8 @@ def rows_at(residual: np.ndarray, J_pose: Sequence[np.ndarray], ends: Sequence[S
 
 @njit(cache=True, nogil=True)
 def fill_imu_pose(i, at, A):
-    """A (6, 6): pose i of the sensor by that of the IMU (rotation on the right, position in the world)."""
+    """Fills A (6, 6): Jacobian of pose i of the sensor by that of the IMU (rotation on the right, position in the
+    world)."""
     R, p, R_sw = at.R_imu_sensor, at.p_imu_sensor, at.R_sensor_world
     for a in range(3):
         r0, r1, r2 = R[0, a], R[1, a], R[2, a]
@@ -162,9 +162,9 @@ def fill_imu_pose(i, at, A):
 
 @njit(cache=True, nogil=True)
 def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
-    """Adds to T (m, w) the derivatives of m rows through pose i of the sensor, J_pose (m, 6), or through that of the
-    IMU, J_imu_pose (m, 6): by its keyframe from column `first` on, by calibration parameters from column `calib` on.
-    Numbers are unsigned, see `add_product`."""
+    """Adds to T (m, w) the derivatives of m rows with Jacobians J_pose (m, 6) by pose i of the sensor, and J_imu_pose
+    (m, 6) by that of the IMU. Keyframe columns start at `first`, calibration columns at `calib`. Indices are unsigned,
+    see `add_product`."""
     R, rate, velocity, J_keyframe, J_next, J_imu = (
         at.R_imu_sensor,
         at.rate,
@@ -197,8 +197,8 @@ def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
 
 @njit(cache=True, nogil=True)
 def fill_chain(i, at, A, T):
-    """T (6, w), the first columns: pose i of the sensor by keyframe, next keyframe where this counts, and calibration
-    parameters. A (6, 6): by the pose of the IMU, out."""
+    """Fills the first columns of T (6, w): Jacobian of pose i of the sensor by keyframe, next keyframe if it has an
+    effect, and calibration parameters. A (6, 6) is workspace."""
     fill_imu_pose(i, at, A)
     for r in range(6):
         for j in range(T.shape[1]):
@@ -208,13 +208,13 @@ def fill_chain(i, at, A, T):
 
 @njit(cache=True, nogil=True)
 def chain_width(at):
-    """How many columns keyframes have: 30 where poses depend on two, else 15."""
+    """Number of keyframe columns: 30 if poses depend on two keyframes, else 15."""
     return KEYFRAME_PAIR_DIM if len(at.J_next) else KEYFRAME_DIM
 
 
 @njit(cache=True, nogil=True)
 def _chain_rows(J_pose, at, first, J):
-    """Adds to J (n, m, w) the derivatives of rows through the poses `at`, J_pose (n, m, 6)."""
+    """Adds to J (n, m, w) the derivatives of rows with Jacobians J_pose (n, m, 6) by the poses `at`."""
     m = J_pose.shape[1]
     A, B = np.empty((6, 6)), np.empty((m, 6))
     for i in range(len(J_pose)):

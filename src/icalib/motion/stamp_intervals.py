@@ -1,4 +1,4 @@
-"""Between which stamps what a sensor integrates, turns of wheels or odometry, is compared with the motion."""
+"""Intervals between stamps over which a sensor that integrates (wheels, odometry) is compared with the motion."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from icalib.motion.imu_data import ImuData, clear_of
 
-MAX_INTERVAL_S = 0.5  # intervals longer than this are no longer consistent
+MAX_INTERVAL_S = 0.5  # the approximations within an interval hold up to this length
 
 
 @dataclass(frozen=True)
 class StampIntervals:
-    """n stretches between stamps `first` and `last` (n,) of a sensor. The first end hangs on `keyframe` (n,), in order,
-    the last one on the keyframe after it."""
+    """n intervals between stamps `first` and `last` (n,) of a sensor. The first end belongs to `keyframe` (n,), sorted,
+    the last one to the next keyframe."""
 
     first: np.ndarray
     last: np.ndarray
@@ -22,13 +22,12 @@ class StampIntervals:
 
 
 def choose_intervals(imu: ImuData, keyframes: np.ndarray, starts: tuple[int, ...], times: np.ndarray) -> StampIntervals:
-    """Stretches from the stamp nearest to a keyframe to the one nearest to the next; `times` (N,): stamps on the imu
-    clock.
+    """Intervals between the stamps nearest to neighbouring keyframes; `times` (N,): stamps on the IMU clock.
 
-    Where keyframes are denser than stamps, neighbours may share a stamp; the stretch to the next stamp then hangs on
-    the two keyframes about its middle. None leaves the IMU's recording, touches a gap in it, or goes from one of the
-    recordings that begin at the keyframes `starts` to another. Where motion is carried forwards only (see `ImuData`),
-    the stamp is the first after the keyframe.
+    If keyframes are denser than stamps, neighbours may share a stamp. The interval to the next stamp then belongs to
+    the two keyframes about its middle. No interval leaves the IMU's recording, touches a gap in it, or crosses the
+    first keyframes `starts` of recordings. If motion is propagated forwards only (see `ImuData`), the stamp is the
+    first after the keyframe.
     """
     after = np.clip(np.searchsorted(times, keyframes), 1, len(times) - 1)
     near = after if imu.forwards else after - (keyframes - times[after - 1] < times[after] - keyframes)
@@ -40,9 +39,8 @@ def choose_intervals(imu: ImuData, keyframes: np.ndarray, starts: tuple[int, ...
 
 
 def pose_intervals(imu: ImuData, keyframes: np.ndarray, starts: tuple[int, ...], times: np.ndarray) -> StampIntervals:
-    """All stretches from one stamp to the next, each on the two keyframes about its middle; `times` (N,): stamps on the
-    imu clock. None leaves the IMU's recording, touches a gap in it, or lies beyond the keyframes or between
-    recordings."""
+    """All intervals between neighbouring stamps `times` (N,) on the IMU clock, each at the two keyframes about its
+    middle. None leaves the IMU's recording, touches a gap in it, or lies beyond the keyframes or between recordings."""
     a, b = times[:-1], times[1:]
     middle = 0.5 * (a + b)
     good = _usable(imu, a, b) & (middle > keyframes[0]) & (middle < keyframes[-1])
@@ -53,5 +51,5 @@ def pose_intervals(imu: ImuData, keyframes: np.ndarray, starts: tuple[int, ...],
 
 
 def _usable(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(n,) whether each span is short, and lies within the IMU's recordings and none of their gaps."""
+    """(n,) whether each interval is short, and lies within one recording of the IMU and outside its gaps."""
     return (end - start <= MAX_INTERVAL_S) & imu.covers(start, end) & clear_of(imu.seams, start, end)

@@ -1,4 +1,4 @@
-"""The motion of the IMU as a state has it: keyframes of measurements, and the poses and twists of a LiDAR."""
+"""Motion of the IMU as a state has it: keyframes of measurements, and poses and twists of a LiDAR."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from icalib.optim.state import State
 
 @dataclass(frozen=True)
 class EstimatedMotion:
-    """The IMU's motion as a state has it. gravity [m/s^2]; IMU gaps up to max_gap_s are bridged."""
+    """Motion of the IMU as a state has it. gravity [m/s^2]; IMU gaps up to max_gap_s are bridged."""
 
     state: State
     imu: ImuData
@@ -27,8 +27,8 @@ class EstimatedMotion:
     max_gap_s: float
 
     def near_keyframes(self, stream: Stream, within_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (n,) of the stream's measurements that lie within `within_s` of a keyframe and in no gap of the IMU
-        that is not bridged, in the order of their keyframes; and these keyframes (n,)."""
+        """Indices (n,) of the stream's measurements within `within_s` of a keyframe and outside long gaps of the IMU,
+        sorted by keyframe; and these keyframes (n,)."""
         times = instants(stream, self.state.values)
         keyframe = assign_keyframes("inertial", self.state.seconds, times, self.imu.forwards)
         near = np.abs(times - self.state.seconds[keyframe]) <= within_s
@@ -38,7 +38,8 @@ class EstimatedMotion:
 
 
 class Sweep(NamedTuple):
-    """The LiDAR at the centres of bins: R_world_lidar, p_world_lidar, and the twist in its own axes: rad/s, m/s."""
+    """Pose and twist of the LiDAR at bin centres: R_world_lidar, p_world_lidar [m], and rad/s and m/s in its own
+    axes."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -48,7 +49,7 @@ class Sweep(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _to_lidar(R_il, p_il, R, p, rate, velocity):
-    """From the IMU's pose, rate and velocity to the LiDAR's, in place: its twist in its own axes."""
+    """Transforms pose, rate and velocity of the IMU to those of the LiDAR, in place; the twist in its own axes."""
     for i in range(len(R)):
         w0, w1, w2 = rate[i, 0], rate[i, 1], rate[i, 2]
         lever = (w1 * p_il[2] - w2 * p_il[1], w2 * p_il[0] - w0 * p_il[2], w0 * p_il[1] - w1 * p_il[0])
@@ -68,8 +69,8 @@ def _to_lidar(R_il, p_il, R, p, rate, velocity):
 
 
 def sweep(drive: EstimatedMotion, name: str, times: np.ndarray, near: np.ndarray | None = None) -> Sweep:
-    """Where LiDAR `name` is and how it moves at `times` (n,) on the IMU's clock, by the IMU's readings from the
-    keyframes next to them, or next to `near` (n,)."""
+    """Poses and twists of LiDAR `name` at `times` (n,) on the IMU clock, integrated from the keyframes nearest to
+    these, or to `near` (n,)."""
     state, imu = drive.state, drive.imu
     keyframe = assign_keyframes("inertial", state.seconds, times if near is None else near)
     imu_at = poses_without_jacobians(times, keyframe, state, imu, drive.gravity)

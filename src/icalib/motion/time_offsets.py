@@ -1,7 +1,7 @@
-"""Sensors' clocks against the body's: one time offset, or one in each recording where the clock restarts between them.
+"""Time offsets of sensor clocks against the clock of the body: one, or one per recording if the clock restarts.
 
-The value of the block time_offset is (1,) or (R,), seconds to add to a sensor's time since its first stamp to get the
-body's.
+The value of the block time_offset is (1,) or (R,): seconds to add to a sensor's time since its first stamp to get the
+time of the body.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import numpy as np
 from icalib.data.measurements import Stream
 from icalib.optim.state import Key, Layout, State
 
-RECORDING_MARGIN_S = 5.0  # by which what a stamp stands for may come before it; recordings are further apart
+RECORDING_MARGIN_S = 5.0  # a measurement may precede its stamp by as much; recordings are further apart
 
 
 def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
-    """(n,) on the body's clock, of a stream's own stamps or of other `seconds` (n,) since its first."""
+    """Times (n,) on the clock of the body, of the stream's own stamps or of other `seconds` (n,) since its first
+    stamp."""
     own, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
     if len(offset) == 1:
         return own + offset[0]
@@ -27,20 +28,19 @@ def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray 
 
 
 def clock_numbers(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
-    """(n,) number of the time offset that a sensor's measurements which hang on `keyframe` (n,) go by."""
+    """Number (n,) of the time offset that applies to measurements at `keyframe` (n,)."""
     if len(state.values[name, "time_offset"]) == 1:
         return np.zeros(len(keyframe), dtype=np.int64)
     return np.searchsorted(state.starts, keyframe, side="right") - 1
 
 
 def offset_at(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
-    """(n,) time offset of a sensor's measurements that hang on `keyframe` (n,)."""
+    """Time offset (n,) s of a sensor's measurements at `keyframe` (n,)."""
     return state.values[name, "time_offset"][clock_numbers(state, name, keyframe)]
 
 
 def slices_by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[tuple[int, slice]]:
-    """Stretches of measurements that hang on `keyframe` (n,), in order, and go by one time offset: its number, and
-    which they are."""
+    """For each time offset, its number and the slice of measurements at `keyframe` (n,), sorted, that it applies to."""
     if len(state.values[name, "time_offset"]) == 1:
         yield 0, slice(0, len(keyframe))
         return
@@ -51,8 +51,8 @@ def slices_by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[t
 
 
 def pose_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
-    """(7,) calibration columns of a sensor's rotation, -1 where it has none, translation and the time offset number
-    `clock`, or its only one."""
+    """Calibration columns (7,) of a sensor's rotation (-1 if it has none), translation, and time offset number `clock`
+    or the only one."""
     offset = layout.columns(name, "time_offset")
     own = offset[clock if len(offset) > 1 else 0]
     rotation = layout.columns(name, "rotation") if layout.has(name, "rotation") else np.full(3, -1)
