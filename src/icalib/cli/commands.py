@@ -73,6 +73,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"icalib {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_calibrate(commands)
+    _add_inspect(commands)
+    add_target_command(commands)
+    _add_simulate(commands)
+    _add_montecarlo(commands)
+    _add_fleet(commands)
+    add_result_commands(commands)
+    return parser
+
+
+def _add_calibrate(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "calibrate the sensors of a rig from one recording or several"
     c = add_command(
         commands,
@@ -106,13 +117,6 @@ def _parser() -> argparse.ArgumentParser:
     c.add_argument("--strict", action="store_true", help=strict)
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table; warnings go to stderr")
     c.set_defaults(run=_calibrate)
-    _add_inspect(commands)
-    add_target_command(commands)
-    _add_simulate(commands)
-    _add_montecarlo(commands)
-    _add_fleet(commands)
-    add_result_commands(commands)
-    return parser
 
 
 def _add_inspect(commands: argparse._SubParsersAction[CommandParser]) -> None:

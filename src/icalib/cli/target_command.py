@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from icalib.cli.command_parser import CommandParser, add_command, count, examples, whole
 
@@ -38,12 +39,16 @@ _FIELDS = {
 
 def add_target_command(commands: argparse._SubParsersAction[CommandParser]) -> None:
     """`icalib target TYPE`: its options are the fields of the rig file's target."""
-    from icalib.tools.printing import PAPERS
-
     about = "write a target as PDF, to print at true scale"
     t = add_command(commands, "target", about, _EXAMPLES["aprilgrid"], "icalib target aprilgrid --help")
     types = t.add_subparsers(required=True, metavar="TYPE", dest="type")
-    fields = {
+    for name, options in _options().items():
+        _add_type(types, name, options)
+
+
+def _options() -> dict[str, dict[str, Any]]:
+    """By type of target: its fields, and how their text is parsed."""
+    return {
         "aprilgrid": {"rows": count, "cols": count, "tag_size": _metres, "tag_spacing": _metres},
         "charuco": {
             "squares_x": count,
@@ -57,25 +62,29 @@ def add_target_command(commands: argparse._SubParsersAction[CommandParser]) -> N
         "markers": {"family": str, "size": _metres, "ids": _ids},
         "tag": {"family": str, "id": whole, "size": _metres},
     }
-    for name, options in fields.items():
-        one = types.add_parser(name, help=f"{name}, with the fields of the rig file", epilog=examples(_EXAMPLES[name]))
-        for field, kind in options.items():
-            unit = {_metres: "METRES", count: "N", whole: "N", _ids: "0-11 or 0,3,7"}.get(kind, "NAME")
-            one.add_argument(
-                f"--{field.replace('_', '-')}",
-                type=kind,
-                required=True,
-                metavar="RATIO" if field == "tag_spacing" else unit,
-                help=_FIELDS[field],
-            )
-        if name == "circles":
-            one.add_argument("--asymmetric", action="store_true", help="shift every other row by one spacing")
-            options = options | {"asymmetric": bool}
-        elif name != "checkerboard":
-            one.add_argument("--border-bits", type=count, metavar="N", help="width of the tags' black border, 1 or 2")
-        one.add_argument("--paper", choices=tuple(PAPERS), default="a4", help="size of the paper; default: a4")
-        one.add_argument("--output", "-o", type=Path, required=True, metavar="FILE.pdf", help="file to write")
-        one.set_defaults(run=_print_target, fields=tuple(options))
+
+
+def _add_type(types: argparse._SubParsersAction[CommandParser], name: str, options: dict[str, Any]) -> None:
+    from icalib.tools.printing import PAPERS
+
+    one = types.add_parser(name, help=f"{name}, with the fields of the rig file", epilog=examples(_EXAMPLES[name]))
+    for field, kind in options.items():
+        unit = {_metres: "METRES", count: "N", whole: "N", _ids: "0-11 or 0,3,7"}.get(kind, "NAME")
+        one.add_argument(
+            f"--{field.replace('_', '-')}",
+            type=kind,
+            required=True,
+            metavar="RATIO" if field == "tag_spacing" else unit,
+            help=_FIELDS[field],
+        )
+    if name == "circles":
+        one.add_argument("--asymmetric", action="store_true", help="shift every other row by one spacing")
+        options = options | {"asymmetric": bool}
+    elif name != "checkerboard":
+        one.add_argument("--border-bits", type=count, metavar="N", help="width of the tags' black border, 1 or 2")
+    one.add_argument("--paper", choices=tuple(PAPERS), default="a4", help="size of the paper; default: a4")
+    one.add_argument("--output", "-o", type=Path, required=True, metavar="FILE.pdf", help="file to write")
+    one.set_defaults(run=_print_target, fields=tuple(options))
 
 
 def _ids(text: str) -> tuple[int, ...]:

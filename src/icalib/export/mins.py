@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from icalib.export.common import (
+    CameraParameters,
     Export,
     guesses,
     imu_intrinsics,
@@ -33,20 +34,9 @@ def mins(c: Calibration) -> Export:
     positions = c.of_type("position")
     taken = [*c.cameras, *c.lidars, *pairs[:1], *positions]
     sentences += no_place_for("MINS", [*imu_intrinsics(c), *others(c, *taken)]) + guesses(c, taken)
-    noise = c.rig["sensors"][imu]["noise"]
-    fields = {"accel_noise": "accel", "accel_bias": "accel_walk", "gyro_noise": "gyro", "gyro_bias": "gyro_walk"}
-    imu_data = {theirs: float(noise[ours]) for theirs, ours in fields.items()} | {"topic": topic(c, imu, f"/{imu}")}
-    files = {"config_imu.yaml": _file(["Densities in continuous time, SI."], {"imu": imu_data}, ())}
+    files = {"config_imu.yaml": _imu(c, imu)}
     if c.cameras:
-        cameras = {}
-        for i, (name, lens) in enumerate(lenses.items()):
-            cameras[f"cam{i}"] = _placed(c, name, "cam") | {
-                "intrinsics": lens.intrinsics,
-                "distortion_coeffs": lens.distortion,
-                "distortion_model": MODELS[lens.model],
-                "resolution": list(lens.resolution),
-                "topic": topic(c, name, f"/{name}/image_raw"),
-            }
+        cameras = {f"cam{i}": _camera(c, name, lens) for i, (name, lens) in enumerate(lenses.items())}
         files["config_camera.yaml"] = _file(_said("cam", "camera", c.cameras), cameras, sentences)
     if c.lidars:
         lidars = {
@@ -61,6 +51,25 @@ def mins(c: Calibration) -> Export:
     if pairs:
         files["config_wheel.yaml"] = _wheels(c, pairs[0], sentences)
     return Export(files, sentences)
+
+
+def _imu(c: Calibration, imu: str) -> str:
+    """The file of the IMU: its noise."""
+    noise = c.rig["sensors"][imu]["noise"]
+    fields = {"accel_noise": "accel", "accel_bias": "accel_walk", "gyro_noise": "gyro", "gyro_bias": "gyro_walk"}
+    data = {theirs: float(noise[ours]) for theirs, ours in fields.items()} | {"topic": topic(c, imu, f"/{imu}")}
+    return _file(["Densities in continuous time, SI."], {"imu": data}, ())
+
+
+def _camera(c: Calibration, name: str, lens: CameraParameters) -> dict[str, Any]:
+    """The entry of a camera."""
+    return _placed(c, name, "cam") | {
+        "intrinsics": lens.intrinsics,
+        "distortion_coeffs": lens.distortion,
+        "distortion_model": MODELS[lens.model],
+        "resolution": list(lens.resolution),
+        "topic": topic(c, name, f"/{name}/image_raw"),
+    }
 
 
 def _placed(c: Calibration, name: str, kind: str) -> dict[str, Any]:

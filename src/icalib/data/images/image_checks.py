@@ -57,14 +57,9 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
                 raise RecordingError(error)
             dropped.add(f"have another size than {size[0]} x {size[1]} px", payload, error)
             continue
-        if last is not None:
-            _refuse_other_clock(last, payload, where)
-            if payload.stamp_ns <= last.stamp_ns:
-                dropped.add("are not later than their predecessor", payload)
-                continue
-            if payload.data == last.data:
-                dropped.add("repeat their predecessor exactly (the camera froze)", payload)
-                continue
+        if last is not None and (reason := _does_not_follow(last, payload, where)):
+            dropped.add(reason, payload)
+            continue
         last = payload
         kept += 1
         yield payload
@@ -72,6 +67,15 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
         raise RecordingError(dropped.first_error)
     _refuse_too_few(kept, dropped, where)
     dropped.note(where, note)
+
+
+def _does_not_follow(last: Payload, payload: Payload, where: str) -> str:
+    """Why an image after the image `last` is left out; empty if it is not. Raises RecordingError if its clock was set
+    back."""
+    _refuse_other_clock(last, payload, where)
+    if payload.stamp_ns <= last.stamp_ns:
+        return "are not later than their predecessor"
+    return "repeat their predecessor exactly (the camera froze)" if payload.data == last.data else ""
 
 
 def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[DecodedImage]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -49,12 +50,7 @@ def stamped_by_rows(
     pictures have the same number, where one has no row, and where many rows cannot be read.
     """
     folder, numbers = found[0][1].parent, [number for number, _ in found]
-    twice = next((k for k in range(1, len(numbers)) if numbers[k] == numbers[k - 1]), None)
-    if twice is not None:
-        raise RecordingError(
-            f"{found[twice - 1][1]} and {found[twice][1].name} have the same number, {numbers[twice]}; number "
-            "each image as the row of its pose."
-        )
+    _refuse_twice(found)
     stamp_of, count = read()
     in_order = len(numbers) == count
     first = min(1, numbers[0])  # the number of the first row
@@ -77,3 +73,12 @@ def stamped_by_rows(
             f"of its pose in {table} cannot be read."
         )
     return [(stamp_of[row], path) for row, path in zip(rows, own, strict=True) if row in stamp_of]
+
+
+def _refuse_twice(found: list[tuple[int, Path]]) -> None:
+    """Raises RecordingError if two pictures, in order of their numbers, have the same number."""
+    for (number, path), (other, second) in pairwise(found):
+        if number == other:
+            raise RecordingError(
+                f"{path} and {second.name} have the same number, {number}; number each image as the row of its pose."
+            )

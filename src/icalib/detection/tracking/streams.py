@@ -27,7 +27,7 @@ from icalib.detection.images.image_work import (
 from icalib.detection.tracking.moving import moving_features
 from icalib.detection.tracking.robot_parts import stay_in_place
 from icalib.detection.tracking.stereo import matched
-from icalib.detection.tracking.tracker import Tracker
+from icalib.detection.tracking.tracker import Observations, Tracker
 from icalib.errors import RecordingError
 from icalib.rig import Camera
 
@@ -145,24 +145,29 @@ def _track_segment(payloads: Iterable[Payload]) -> _Found:
             continue
         stamps.append(p.stamp_ns)
         seen.append(tracker.add(image))
-    count = [len(s.feature) for s in seen]
-    whole = _Found(
-        np.array(stamps, np.int64),
-        np.cumsum([0, *count]).astype(np.int64),
-        np.concatenate([np.zeros(0, np.int64), *(s.feature for s in seen)]),
-        np.concatenate([np.zeros((0, 2)), *(s.uv for s in seen)]),
-        np.concatenate([np.zeros(0, np.int64), *(s.views for s in seen)]),
-        np.concatenate([np.zeros(0), *(s.spread for s in seen)]),
-        0,
-        0,
-        np.array(damaged, np.int64),
-        error,
-    )
+    whole = _observed(stamps, seen, damaged, error)
     good = np.bincount(whole.feature) >= FEWEST_VIEWS
     in_place = good & stay_in_place(whole.start, whole.feature, whole.uv)
     moving = good & ~in_place & moving_features(whole.start, whole.feature, whole.uv, size)
     kept = _some(whole, (good & ~in_place & ~moving)[whole.feature])
     return replace(kept, moving=int(moving.sum()), in_place=int(in_place.sum()))
+
+
+def _observed(stamps_ns: list[int], found: list[Observations], damaged_ns: list[int], error: str) -> _Found:
+    """All observations of images at stamps_ns; damaged_ns and error as in `_Found`."""
+    count = [len(s.feature) for s in found]
+    return _Found(
+        np.array(stamps_ns, np.int64),
+        np.cumsum([0, *count]).astype(np.int64),
+        np.concatenate([np.zeros(0, np.int64), *(s.feature for s in found)]),
+        np.concatenate([np.zeros((0, 2)), *(s.uv for s in found)]),
+        np.concatenate([np.zeros(0, np.int64), *(s.views for s in found)]),
+        np.concatenate([np.zeros(0), *(s.spread for s in found)]),
+        0,
+        0,
+        np.array(damaged_ns, np.int64),
+        error,
+    )
 
 
 def _some(found: _Found, kept: np.ndarray) -> _Found:

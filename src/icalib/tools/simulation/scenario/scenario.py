@@ -39,6 +39,7 @@ _EUROC_T_IMU_CAM0 = (
     (-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949),
     (0.0, 0.0, 0.0, 1.0),
 )
+_EUROC_EPOCH_NS = 1_403_715_273_262_142_976  # a stamp of the data set, for clocks as long as real ones
 _EUROC_T_IMU_CAM1 = (
     (0.0125552670891, -0.999755099723, 0.0182237714554, -0.0198435579556),
     (0.999598781151, 0.0130119051815, 0.0251588363115, 0.0453689425024),
@@ -222,8 +223,19 @@ def handheld(
     exact: see `HandheldMotion`. noiseless: neither corners nor IMU have noise, but `rig_for` still states the sigmas.
     """
     scale = {"datasheet": 1.0, "noisy": 10.0}[imu]
-    noise = replace(ADIS16448.scaled(scale), source="simulation")
-    epoch_ns = 1_403_715_273_262_142_976
+    return Scenario(
+        _euroc_cameras(phase_s=0.025 if asynchronous else 0.0),
+        duration_s=duration_s,
+        motion=HandheldMotion(exact=exact),
+        imu_noise=replace(ADIS16448.scaled(scale), source="simulation"),
+        imu_noise_enabled=not noiseless,
+        corner_noise_enabled=not noiseless,
+        imu_clock_origin_ns=_EUROC_EPOCH_NS,
+    )
+
+
+def _euroc_cameras(phase_s: float) -> tuple[SimCamera, SimCamera]:
+    """Both cameras of the EuRoC sensor unit; phase_s [s]: by which cam1 takes its images after cam0."""
     cam0 = SimCamera(
         "cam0",
         "pinhole-radtan",
@@ -232,7 +244,7 @@ def handheld(
         (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
         pose_from_rows(_EUROC_T_IMU_CAM0),
         time_offset_s=0.0042,
-        clock_origin_ns=epoch_ns,
+        clock_origin_ns=_EUROC_EPOCH_NS,
     )
     cam1 = SimCamera(
         "cam1",
@@ -242,15 +254,7 @@ def handheld(
         (-0.28368365, 0.07451284, -0.00010473, -3.555907e-05),
         pose_from_rows(_EUROC_T_IMU_CAM1),
         time_offset_s=-0.0073,
-        phase_s=0.025 if asynchronous else 0.0,
-        clock_origin_ns=epoch_ns,
+        phase_s=phase_s,
+        clock_origin_ns=_EUROC_EPOCH_NS,
     )
-    return Scenario(
-        (cam0, cam1),
-        duration_s=duration_s,
-        motion=HandheldMotion(exact=exact),
-        imu_noise=noise,
-        imu_noise_enabled=not noiseless,
-        corner_noise_enabled=not noiseless,
-        imu_clock_origin_ns=epoch_ns,
-    )
+    return cam0, cam1
