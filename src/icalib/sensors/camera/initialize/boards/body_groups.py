@@ -1,10 +1,10 @@
-"""Bodies that no image shows together, but that different cameras of a rig see at once: how they stand to each other.
+"""Relative poses of bodies that no image shows together, but that two cameras of a rig see at the same instants.
 
-Two cameras a, b on a rig see bodies A, B that stand still. At every instant
+Cameras a, b of a rig see bodies A, B, which do not move. At each instant i
 
     T_A_a(i) T_a_b = T_A_B T_B_b(i),
 
-which is AX = YB, as robot-world and hand-eye calibration have it (Zhuang, Roth, Sudhakar 1994; Shah 2013).
+which is AX = YB, robot-world/hand-eye calibration (Zhuang, Roth, Sudhakar 1994; Shah 2013).
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, sc
 def register_groups(
     rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]
 ) -> TargetScene:
-    """How the bodies stand to each other: those that images tie by these, groups of them by what cameras see at once.
+    """Poses of all bodies: within groups that images connect, then between groups by simultaneous images.
 
-    params: (P,) by camera, which are held. Raises UnconnectedBodiesError naming bodies that nothing ties to the others,
-    EstimationError where images are mirrored, or cameras do not move alike.
+    params: fixed intrinsics and distortion (P,) by camera. Raises UnconnectedBodiesError naming bodies that are not
+    connected to the first group; EstimationError if images are mirrored, or cameras are not rigidly connected.
     """
     used = tied_by_images(bodies, recordings)
     groups = [_Group.of(rig, replace(bodies, used=own), recordings, params) for own in used]
@@ -60,8 +60,10 @@ def register_groups(
 
 @dataclass(frozen=True)
 class _Group:
-    """Bodies that images tie, in the frame of their first; by recording and camera the instants [s] of images that show
-    them, and poses in that frame."""
+    """Bodies that images connect, in the frame of the first one.
+
+    times, poses: by recording and camera, instants [s] of the images that show these bodies, and their poses.
+    """
 
     scene: TargetScene
     times: list[list[np.ndarray]]
@@ -69,6 +71,7 @@ class _Group:
 
     @classmethod
     def of(cls, rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]) -> _Group:
+        """The group of `bodies`, with poses in all `recordings`; params: (P,) by camera."""
         own = [restrict(bodies, r) for r in recordings]
         models = [camera_model(c.model) for c in rig.cameras]
         scene = TargetScene(bodies)
@@ -83,7 +86,7 @@ class _Group:
         return cls(scene, times, poses)
 
     def values_at(self, frame: Frame) -> dict[Key, np.ndarray]:
-        """Poses of its bodies, as in a state, where it stands at `frame`."""
+        """Poses of the bodies as in a state, if `frame` is the pose of the group."""
         R, p = self.scene.bodies.poses(self.scene.values)
         found: dict[Key, np.ndarray] = {}
         for k, name in zip(self.scene.bodies.used, self.scene.bodies.names, strict=True):
@@ -93,7 +96,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Tied:
-    """Poses of camera `a` in one group, and of `b` in another, at the same instants."""
+    """Poses of camera number `a` in one group, and of camera `b` in another, at the same instants."""
 
     a: int
     b: int
@@ -101,12 +104,13 @@ class _Tied:
 
 
 def _tied(g: _Group, h: _Group) -> _Tied:
-    """By the two cameras that see most at once."""
+    """The poses of the two cameras with most simultaneous images of the groups `g` and `h`."""
     cameras = permutations(range(len(g.poses[0])), 2)
     return max((_Tied(a, b, _pairs(g, h, a, b)) for a, b in cameras), key=lambda t: len(t.pairs.p_body))
 
 
 def _pairs(g: _Group, h: _Group, a: int, b: int) -> PosePairs:
+    """Simultaneous poses of camera `a` in group `g` and of camera `b` in group `h`, of all recordings."""
     found = []
     for times_g, poses_g, times_h, poses_h in zip(g.times, g.poses, h.times, h.poses, strict=True):
         i, j = taken_at_once(times_g[a], times_h[b])
@@ -117,7 +121,7 @@ def _pairs(g: _Group, h: _Group, a: int, b: int) -> PosePairs:
 
 
 def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
-    """Where the second group stands in the first. Raises EstimationError where the cameras do not move alike."""
+    """Pose of the second group in the first. Raises EstimationError if the cameras are not rigidly connected."""
     a, b = cameras[tied.a], cameras[tied.b]
     found = hand_eye(tied.pairs, _given(a, b, tied.a == 0, tied.b == 0), (False, False))
     if (left := unexplained_motion(tied.pairs, found)) > MAX_UNEXPLAINED_MOTION:
@@ -130,7 +134,7 @@ def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
 
 
 def _given(a: Camera, b: Camera, a_is_body: bool, b_is_body: bool) -> Extrinsics | None:
-    """T_a_b where the rig file gives it."""
+    """T_a_b if the rig file gives both extrinsics, else None. The body camera has the identity."""
     mounts = []
     for camera, is_body in ((a, a_is_body), (b, b_is_body)):
         R, p = camera.rotation.value, camera.translation.value

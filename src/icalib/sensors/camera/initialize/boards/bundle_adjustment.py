@@ -1,6 +1,8 @@
-"""Bundle adjustment of tags, images and lenses: Levenberg-Marquardt, the images' poses eliminated (Schur complement).
+"""Bundle adjustment of the poses of bodies, the poses of images, and the intrinsics of cameras.
 
-It is for first guesses: robust, with broad priors on the lenses, which keep a small problem physically possible.
+Levenberg-Marquardt with Huber's loss; the poses of images are eliminated by the Schur complement. Broad priors on the
+intrinsics keep problems with few images regular. Steps of a pose are perturbations in its own frame, (rotation,
+translation) in rad and m.
 """
 
 from __future__ import annotations
@@ -13,17 +15,20 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 
-HUBER_PX = 2.0
-UNSEEN_PX = 8.0  # a corner that the model cannot see counts as one so far off: looking away must not pay
-LEAST_GAIN = 1e-4  # of the cost, by a step; smaller ones end the descent
-MOST_DAMPING = 1e6
-FIRST_DAMPING = 1e-3
-RIDGE = 1e-9  # keeps the blocks of images with few corners regular
+SCENE_HUBER_PX = 2.0  # px; a few times the noise of detected corners
+# px, the error of a corner that the model cannot project. Without this cost, poses that look away would fit best.
+INVISIBLE_ERROR_PX = 8.0
+MIN_COST_DECREASE = 1e-4  # relative decrease of the cost at which the adjustment has converged
+FIRST_SCENE_DAMPING, MAX_SCENE_DAMPING = 1e-3, 1e6  # relative to the diagonal of the normal matrix
+POSE_RIDGE = 1e-9  # px^2, added to the diagonal of each pose block; keeps images with few corners regular
 
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """A camera's parameters (P,); prior: Gaussian, mean and sigma (P,); free: (P,) bool."""
+    """Intrinsics and distortion of a camera, params (P,), in an adjustment.
+
+    mean, sigma: (P,) of their Gaussian prior; free: (P,) bool, those that are adjusted.
+    """
 
     model: CameraModel
     params: np.ndarray
@@ -34,8 +39,10 @@ class CameraIntrinsics:
 
 @dataclass(frozen=True)
 class SceneState:
-    """T_scene_cam of images (M, ...), T_scene_body of bodies (B, ...), and lenses. The scene is the frame of one fixed
-    image."""
+    """Poses T_scene_cam of M images and T_scene_body of B bodies, and intrinsics of the cameras.
+
+    The scene is the frame of one fixed image.
+    """
 
     R_image: np.ndarray
     p_image: np.ndarray
@@ -46,8 +53,11 @@ class SceneState:
 
 @dataclass(frozen=True)
 class SceneViews:
-    """Corners by view, one body in one image: start (V + 1,), image, body (V,), points (N, 3) in the body's frame, uv
-    (N, 2); camera (M,) the lens of each image."""
+    """N corners in V views; a view is one body in one image, and the views of an image follow one another.
+
+    start: (V + 1,), view v has the corners start[v]:start[v + 1]; image, body: (V,) of each view.
+    points: (N, 3) [m] in the frames of the bodies; uv: (N, 2) [px]; camera: (M,) of each image.
+    """
 
     start: np.ndarray
     image: np.ndarray
@@ -61,8 +71,13 @@ class SceneViews:
         """(N,) the view that each corner belongs to."""
         return np.repeat(np.arange(len(self.image)), np.diff(self.start))
 
-    def some(self, views: np.ndarray) -> SceneViews:
-        """Those `views` (V,) bool only."""
+    @property
+    def first_of_images(self) -> np.ndarray:
+        """The first view of each image that has views, and the number of views at the end."""
+        return np.flatnonzero(np.diff(self.image, prepend=-1, append=-1))
+
+    def select(self, views: np.ndarray) -> SceneViews:
+        """The selected `views`, (V,) bool."""
         rows = views[self.of_corner]
         start = np.concatenate([[0], np.cumsum(np.diff(self.start)[views])])
         return replace(
@@ -75,93 +90,83 @@ class SceneViews:
         )
 
 
-def bundle_adjust(seen: SceneViews, state: SceneState, fixed_image: int, rounds: int) -> SceneState:
-    """`state` after up to `rounds` steps; bodies and images that are in no view of `seen` stay."""
-    damping, sums = FIRST_DAMPING, _Sums.of(seen, state)
-    for _ in range(rounds):
-        trial = sums.step(seen, state, fixed_image, damping)
-        after = None if trial is None else _Sums.of(seen, trial)
-        if trial is None or after is None or not after.cost < sums.cost:
+def bundle_adjust(views: SceneViews, state: SceneState, fixed_image: int, max_steps: int) -> SceneState:
+    """`state` after up to `max_steps` steps; bodies and images without a view do not change."""
+    damping, system = FIRST_SCENE_DAMPING, _SceneSystem.at(views, state)
+    for _ in range(max_steps):
+        trial = system.step(views, state, fixed_image, damping)
+        after = None if trial is None else _SceneSystem.at(views, trial)
+        if trial is None or after is None or not after.cost < system.cost:
             damping *= 10.0
-            if damping > MOST_DAMPING:
+            if damping > MAX_SCENE_DAMPING:
                 break
             continue
-        done = sums.cost - after.cost < LEAST_GAIN * sums.cost
-        state, sums, damping = trial, after, 0.2 * damping
-        if done:
+        has_converged = system.cost - after.cost < MIN_COST_DECREASE * system.cost
+        state, system, damping = trial, after, 0.2 * damping
+        if has_converged:
             break
     return state
 
 
-def reprojection_errors(seen: SceneViews, state: SceneState) -> np.ndarray:
-    """(N,) px: how far each corner is from where it is predicted; `UNSEEN_PX` at most."""
-    size = np.full(len(seen.uv), UNSEEN_PX)
-    local = _in_camera(seen, state)
-    own = seen.camera[seen.image][seen.of_corner]
+def reprojection_errors(views: SceneViews, state: SceneState) -> np.ndarray:
+    """(N,) [px] distance of each corner from its projection, `INVISIBLE_ERROR_PX` at most."""
+    error = np.full(len(views.uv), INVISIBLE_ERROR_PX)
+    points = _points_in_camera(views, state)
+    camera = views.camera[views.image][views.of_corner]
     for c, lens in enumerate(state.lenses):
-        rows = np.flatnonzero(own == c)
-        uv, valid = lens.model.project(lens.params, local[rows])
-        off = np.linalg.norm(uv - seen.uv[rows], axis=1)
-        size[rows] = np.where(valid, np.minimum(off, UNSEEN_PX), UNSEEN_PX)
-    return size
+        rows = np.flatnonzero(camera == c)
+        uv, valid = lens.model.project(lens.params, points[rows])
+        distance = np.linalg.norm(uv - views.uv[rows], axis=1)
+        error[rows] = np.where(valid, np.minimum(distance, INVISIBLE_ERROR_PX), INVISIBLE_ERROR_PX)
+    return error
 
 
-def _in_camera(seen: SceneViews, state: SceneState) -> np.ndarray:
-    """(N, 3) the corners' points in their cameras."""
-    view = seen.of_corner
-    i, k = seen.image[view], seen.body[view]
-    scene = np.einsum("nij,nj->ni", state.R_body[k], seen.points) + state.p_body[k]
+def _points_in_camera(views: SceneViews, state: SceneState) -> np.ndarray:
+    """(N, 3) [m] the point of each corner in the frame of its camera."""
+    view = views.of_corner
+    i, k = views.image[view], views.body[view]
+    scene = np.einsum("nij,nj->ni", state.R_body[k], views.points) + state.p_body[k]
     return np.einsum("nji,nj->ni", state.R_image[i], scene - state.p_image[i])
 
 
 @dataclass(frozen=True)
-class _Sums:
-    """Robust cost, and by view the Gram matrix (V, D, D) and gradient (V, D) over image (6), body (6) and lens."""
+class _SceneSystem:
+    """Robust cost [px^2] and its second-order terms by view: Gauss-Newton matrix (V, D, D) and gradient (V, D).
+
+    Columns of a view: pose of the image (6), pose of the body (6), parameters of the camera.
+    """
 
     cost: float
-    gram: np.ndarray
+    matrix: np.ndarray
     gradient: np.ndarray
 
     @classmethod
-    def of(cls, seen: SceneViews, state: SceneState) -> _Sums:
-        local, view = _in_camera(seen, state), seen.of_corner
-        own = seen.camera[seen.image][view]
-        most = max(len(lens.params) for lens in state.lenses)
-        jacobian, residual = np.zeros((len(local), 2, 12 + most)), np.zeros((len(local), 2))
-        valid = np.zeros(len(local), dtype=bool)
-        for c, lens in enumerate(state.lenses):
-            rows = np.flatnonzero(own == c)
-            uv, ok, j_point, j_params = lens.model.project_with_jacobians(lens.params, local[rows])
-            R = state.R_image[seen.image[view[rows]]].swapaxes(1, 2) @ state.R_body[seen.body[view[rows]]]
-            j_body = j_point @ R
-            jacobian[rows, :, 0:3] = np.cross(j_point, local[rows, None])
-            jacobian[rows, :, 3:6] = -j_point
-            jacobian[rows, :, 6:9] = np.cross(seen.points[rows, None], j_body)
-            jacobian[rows, :, 9:12] = j_body
-            jacobian[rows, :, 12 : 12 + j_params.shape[2]] = j_params * lens.free
-            residual[rows], valid[rows] = uv - seen.uv[rows], ok
-        size = np.where(valid, np.linalg.norm(residual, axis=1), UNSEEN_PX)
-        weight = np.where(valid, np.minimum(1.0, HUBER_PX / np.maximum(size, 1e-12)), 0.0)
-        cost = np.where(size > HUBER_PX, HUBER_PX * (size - 0.5 * HUBER_PX), 0.5 * size**2).sum()
+    def at(cls, views: SceneViews, state: SceneState) -> _SceneSystem:
+        """The linearisation at `state`."""
+        residual, J, valid = _residuals(views, state)
+        size = np.where(valid, np.linalg.norm(residual, axis=1), INVISIBLE_ERROR_PX)
+        k = SCENE_HUBER_PX
+        weight = np.where(valid, np.minimum(1.0, k / np.maximum(size, 1e-12)), 0.0)
+        cost = np.where(size > k, k * (size - 0.5 * k), 0.5 * size**2).sum()
         cost += sum(0.5 * (((lens.params - lens.mean) / lens.sigma) ** 2).sum() for lens in state.lenses)
-        return cls(float(cost), *_grams(seen.start, jacobian, residual, weight))
+        return cls(float(cost), *_view_terms(views.start, J, residual, weight))
 
-    def step(self, seen: SceneViews, state: SceneState, fixed_image: int, damping: float) -> SceneState | None:
-        """The state after one damped step; None where it cannot be solved."""
-        begins = [6 * len(state.R_body)]
+    def step(self, views: SceneViews, state: SceneState, fixed_image: int, damping: float) -> SceneState | None:
+        """The state after one damped step; None if the normal equations are singular."""
+        begins = [6 * len(state.R_body)]  # first column of each camera
         for lens in state.lenses:
             begins.append(begins[-1] + len(lens.params))
         S, g, diagonal = np.zeros((begins[-1], begins[-1])), np.zeros(begins[-1]), np.zeros(begins[-1])
         for c, lens in enumerate(state.lenses):
-            own = slice(begins[c], begins[c + 1])
-            diagonal[own] = lens.free / lens.sigma**2
-            g[own] = lens.free * (lens.params - lens.mean) / lens.sigma**2
+            columns = slice(begins[c], begins[c + 1])
+            diagonal[columns] = lens.free / lens.sigma**2
+            g[columns] = lens.free * (lens.params - lens.mean) / lens.sigma**2
         S[np.diag_indices_from(S)] = diagonal
-        edges = np.flatnonzero(np.diff(seen.image, prepend=-1, append=-1))  # of the views of one image
-        camera, bounds = seen.camera[seen.image[edges[:-1]]], np.array(begins)
-        fixed = seen.image[edges[:-1]] == fixed_image
-        inverse, slope = _eliminate(
-            self.gram, self.gradient, edges, seen.body, camera, bounds, fixed, damping, S, g, diagonal
+        first = views.first_of_images
+        images, bounds = views.image[first[:-1]], np.array(begins)
+        camera, fixed = views.camera[images], images == fixed_image
+        H_inverse, g_pose = _eliminate_poses(
+            self.matrix, self.gradient, first, views.body, camera, bounds, fixed, damping, S, g, diagonal
         )
         S[np.diag_indices_from(S)] += np.where(diagonal > 0.0, damping * diagonal, 1.0)
         try:
@@ -170,122 +175,156 @@ class _Sums:
             return None
         if not np.isfinite(step).all():
             return None
-        turns = _image_steps(self.gram, edges, seen.body, camera, bounds, step, inverse, slope)
-        return _moved(state, step, begins, seen.image[edges[:-1]], turns)
+        pose_steps = _back_substitute(self.matrix, first, views.body, camera, bounds, step, H_inverse, g_pose)
+        return _moved(state, step, begins, images, pose_steps)
+
+
+def _residuals(views: SceneViews, state: SceneState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals (N, 2) [px], their Jacobians (N, 2, D) by the columns of a view, and (N,) bool, corners in view."""
+    points, view = _points_in_camera(views, state), views.of_corner
+    camera = views.camera[views.image][view]
+    n_params = max(len(lens.params) for lens in state.lenses)
+    J, residual = np.zeros((len(points), 2, 12 + n_params)), np.zeros((len(points), 2))
+    valid = np.zeros(len(points), dtype=bool)
+    for c, lens in enumerate(state.lenses):
+        rows = np.flatnonzero(camera == c)
+        uv, ok, J_point, J_params = lens.model.project_with_jacobians(lens.params, points[rows])
+        R_cam_body = state.R_image[views.image[view[rows]]].swapaxes(1, 2) @ state.R_body[views.body[view[rows]]]
+        J_body_point = J_point @ R_cam_body
+        J[rows, :, 0:3] = np.cross(J_point, points[rows, None])
+        J[rows, :, 3:6] = -J_point
+        J[rows, :, 6:9] = np.cross(views.points[rows, None], J_body_point)
+        J[rows, :, 9:12] = J_body_point
+        J[rows, :, 12 : 12 + J_params.shape[2]] = J_params * lens.free
+        residual[rows], valid[rows] = uv - views.uv[rows], ok
+    return residual, J, valid
 
 
 def _moved(
-    state: SceneState, step: np.ndarray, begins: list[int], images: np.ndarray, image_step: np.ndarray
+    state: SceneState, step: np.ndarray, begins: list[int], images: np.ndarray, pose_steps: np.ndarray
 ) -> SceneState:
+    """The state after a `step` of bodies and cameras, and `pose_steps` (m, 6) of the images numbered `images` (m,)."""
     R, p = state.R_image.copy(), state.p_image.copy()
-    p[images] += np.einsum("nij,nj->ni", R[images], image_step[:, 3:])
-    R[images] = R[images] @ so3.exp_many(np.ascontiguousarray(image_step[:, :3]))
+    p[images] += np.einsum("nij,nj->ni", R[images], pose_steps[:, 3:])
+    R[images] = R[images] @ so3.exp_many(np.ascontiguousarray(pose_steps[:, :3]))
     body = step[: begins[0]].reshape(-1, 6)
-    turn = so3.exp_many(np.ascontiguousarray(body[:, :3]))
+    rotation = so3.exp_many(np.ascontiguousarray(body[:, :3]))
     p_body = state.p_body + np.einsum("kij,kj->ki", state.R_body, body[:, 3:])
     lenses = tuple(
         replace(lens, params=lens.params + np.where(lens.free, step[begins[c] : begins[c + 1]], 0.0))
         for c, lens in enumerate(state.lenses)
     )
-    return SceneState(R, p, state.R_body @ turn, p_body, lenses)
+    return SceneState(R, p, state.R_body @ rotation, p_body, lenses)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _columns(a, b, body, camera, begins, columns, own):
-    """Columns of the calibration parameters that the views a..b of one image meet, the lens last, and where each view
-    has them."""
+def _columns(a, b, body, camera, begins, columns, local):
+    """Writes the columns of the calibration parameters in views a..b of one image: poses of bodies, then the camera.
+
+    columns: in the normal equations of all; local: in the terms of one view. Returns their number.
+    """
     n = 0
     for v in range(a, b):
         for k in range(6):
             columns[n] = 6 * body[v] + k
-            own[n] = 6 + k
+            local[n] = 6 + k
             n += 1
     for k in range(begins[camera + 1] - begins[camera]):
         columns[n] = begins[camera] + k
-        own[n] = 12 + k
+        local[n] = 12 + k
         n += 1
     return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _eliminate(gram, gradient, edges, body, camera, begins, fixed, damping, S, g, diagonal):
-    """Adds all images to the normal equations S (n, n), g (n,) of bodies and lenses, their poses eliminated (Schur
-    complement), and to `diagonal` (n,) without that. Returns (images, 6, 6) inverse blocks and (images, 6) gradients,
-    zero where an image is fixed."""
-    m, most = len(edges) - 1, gram.shape[1] - 12
-    inverse, slope = np.zeros((m, 6, 6)), np.zeros((m, 6))
-    longest = 0
-    for i in range(m):
-        longest = max(longest, edges[i + 1] - edges[i])
-    columns, own = np.empty(6 * longest + most, dtype=np.int64), np.empty(6 * longest + most, dtype=np.int64)
-    for i in range(m):
-        a, b = edges[i], edges[i + 1]
-        n = _columns(a, b, body, camera[i], begins, columns, own)
-        coupling, block = np.zeros((6, n)), RIDGE * np.eye(6)
-        for v in range(a, b):
-            first = 6 * (v - a)
-            for j in range(n):
-                if first <= j < first + 6 or j >= 6 * (b - a):
-                    g[columns[j]] += gradient[v, own[j]]
-                    diagonal[columns[j]] += gram[v, own[j], own[j]]
-                    for k in range(n):
-                        if first <= k < first + 6 or k >= 6 * (b - a):
-                            S[columns[j], columns[k]] += gram[v, own[j], own[k]]
-                    for k in range(6):
-                        coupling[k, j] += gram[v, k, own[j]]
-            for j in range(6):
-                slope[i, j] += gradient[v, j]
-                for k in range(6):
-                    block[j, k] += gram[v, j, k]
-        if fixed[i]:
-            slope[i] = 0.0
-            continue
-        for k in range(6):
-            block[k, k] *= 1.0 + damping
-        inverse[i] = np.linalg.inv(block)
-        solved = inverse[i] @ coupling
+def _add_views(matrix, gradient, a, b, columns, local, S, g, diagonal, C, H_pose, g_pose):
+    """Adds views a..b of one image to S, g, diagonal of the calibration parameters, to H_pose (6, 6) and g_pose (6,) of
+    the image's pose, and to C (6, n), the block between both."""
+    n = C.shape[1]
+    for v in range(a, b):
+        first = 6 * (v - a)
         for j in range(n):
+            if first <= j < first + 6 or j >= 6 * (b - a):
+                g[columns[j]] += gradient[v, local[j]]
+                diagonal[columns[j]] += matrix[v, local[j], local[j]]
+                for k in range(n):
+                    if first <= k < first + 6 or k >= 6 * (b - a):
+                        S[columns[j], columns[k]] += matrix[v, local[j], local[k]]
+                for k in range(6):
+                    C[k, j] += matrix[v, k, local[j]]
+        for j in range(6):
+            g_pose[j] += gradient[v, j]
             for k in range(6):
-                g[columns[j]] -= solved[k, j] * slope[i, k]
-            for k in range(n):
-                for q in range(6):
-                    S[columns[j], columns[k]] -= coupling[q, j] * solved[q, k]
-    return inverse, slope
+                H_pose[j, k] += matrix[v, j, k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _image_steps(gram, edges, body, camera, begins, step, inverse, slope):
-    """(images, 6) steps of the images' poses, from the `step` of bodies and lenses."""
-    m = len(edges) - 1
+def _eliminate_poses(matrix, gradient, first, body, camera, begins, fixed, damping, S, g, diagonal):
+    """Adds the Schur complements of m images to the normal equations S (n, n), g (n,) of bodies and cameras, and the
+    diagonal before elimination to `diagonal` (n,). first: (m + 1,) the first view of each image.
+
+    Returns inverse blocks (m, 6, 6) and gradients (m, 6) of the poses, zero for a fixed image.
+    """
+    m, n_params = len(first) - 1, matrix.shape[1] - 12
+    H_inverse, g_pose = np.zeros((m, 6, 6)), np.zeros((m, 6))
+    longest = 0
+    for i in range(m):
+        longest = max(longest, first[i + 1] - first[i])
+    columns, local = np.empty(6 * longest + n_params, dtype=np.int64), np.empty(6 * longest + n_params, dtype=np.int64)
+    for i in range(m):
+        a, b = first[i], first[i + 1]
+        n = _columns(a, b, body, camera[i], begins, columns, local)
+        C, H_pose = np.zeros((6, n)), POSE_RIDGE * np.eye(6)
+        _add_views(matrix, gradient, a, b, columns, local, S, g, diagonal, C, H_pose, g_pose[i])
+        if fixed[i]:
+            g_pose[i] = 0.0
+            continue
+        for k in range(6):
+            H_pose[k, k] *= 1.0 + damping
+        H_inverse[i] = np.linalg.inv(H_pose)
+        solved = H_inverse[i] @ C
+        for j in range(n):
+            for k in range(6):
+                g[columns[j]] -= solved[k, j] * g_pose[i, k]
+            for k in range(n):
+                for q in range(6):
+                    S[columns[j], columns[k]] -= C[q, j] * solved[q, k]
+    return H_inverse, g_pose
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _back_substitute(matrix, first, body, camera, begins, step, H_inverse, g_pose):
+    """(m, 6) steps of the images' poses, from the `step` (n,) of bodies and cameras."""
+    m = len(first) - 1
     out = np.zeros((m, 6))
     for i in range(m):
-        right = slope[i].copy()
-        for v in range(edges[i], edges[i + 1]):
+        right = g_pose[i].copy()
+        for v in range(first[i], first[i + 1]):
             for k in range(6):
                 for j in range(6):
-                    right[k] += gram[v, k, 6 + j] * step[6 * body[v] + j]
+                    right[k] += matrix[v, k, 6 + j] * step[6 * body[v] + j]
                 for j in range(begins[camera[i] + 1] - begins[camera[i]]):
-                    right[k] += gram[v, k, 12 + j] * step[begins[camera[i]] + j]
-        out[i] = -(inverse[i] @ right)
+                    right[k] += matrix[v, k, 12 + j] * step[begins[camera[i]] + j]
+        out[i] = -(H_inverse[i] @ right)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _grams(start, jacobian, residual, weight):
-    """Gram matrices (V, D, D) and gradients (V, D) of the views."""
-    n_views, d = len(start) - 1, jacobian.shape[2]
-    gram, gradient = np.zeros((n_views, d, d)), np.zeros((n_views, d))
+def _view_terms(start, J, residual, weight):
+    """Gauss-Newton matrices J^T W J (V, D, D) and gradients J^T W r (V, D) of the views."""
+    n_views, d = len(start) - 1, J.shape[2]
+    matrix, gradient = np.zeros((n_views, d, d)), np.zeros((n_views, d))
     for v in range(n_views):
         for n in range(start[v], start[v + 1]):
             if weight[n] == 0.0:
                 continue
             for row in range(2):
                 for a in range(d):
-                    scaled = weight[n] * jacobian[n, row, a]
+                    scaled = weight[n] * J[n, row, a]
                     gradient[v, a] += scaled * residual[n, row]
                     for b in range(a + 1):
-                        gram[v, a, b] += scaled * jacobian[n, row, b]
+                        matrix[v, a, b] += scaled * J[n, row, b]
         for a in range(d):
             for b in range(a):
-                gram[v, b, a] = gram[v, a, b]
-    return gram, gradient
+                matrix[v, b, a] = matrix[v, a, b]
+    return matrix, gradient

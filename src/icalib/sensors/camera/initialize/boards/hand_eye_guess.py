@@ -1,8 +1,7 @@
-"""Cameras that see a target from a robot that turns about one axis, as on a floor, placed on the motion that a LiDAR
-or a pose sensor shows.
+"""Extrinsics of cameras by hand-eye calibration with the trajectory of a LiDAR or a pose sensor.
 
-The rotation about that axis is unobservable from angular rates. The trajectories of the cameras' poses and of the robot
-show it.
+A robot on a floor rotates about one axis only. The rotation of a camera about that axis is then unobservable from
+angular rates, but observable from the translations of both trajectories.
 """
 
 from __future__ import annotations
@@ -29,17 +28,16 @@ from icalib.sensors.sensor import mounted
 from icalib.sensors.stream import seconds_since
 
 
-def with_hand_eye_guess(rig: Rig, seen: Inputs, others: Inputs, state: State) -> Rig:
-    """`rig` with a guess of how each camera stands whose rotation it does not give. Of several recordings the one in
-    which it saw most says so. seen: what the cameras are estimated from; others: what `state`, which has the motion,
-    is made from.
+def with_hand_eye_guess(rig: Rig, camera_inputs: Inputs, others: Inputs, state: State) -> Rig:
+    """`rig` with an initial guess of the extrinsics and time offset of each camera without a stated rotation.
 
-    Raises EstimationError where the motion does not show it.
+    The recording with most corners of the camera is used. camera_inputs: inputs of the cameras; others: inputs of the
+    sensors whose trajectory is in `state`. Raises EstimationError if the motion does not determine the extrinsics.
     """
-    recordings = [m.measurements for m in seen.motions]
-    scene = find_scene(rig, seen.bodies, recordings)
+    recordings = [m.measurements for m in camera_inputs.motions]
+    scene = find_scene(rig, camera_inputs.bodies, recordings)
 
-    def placed(number: int, camera: Camera) -> Camera:
+    def with_guess(number: int, camera: Camera) -> Camera:
         best = int(np.argmax([len(r.cameras[number].uv) for r in recordings]))
         stream, own = recordings[best].cameras[number], single_recording(others, best)
         poses = scene_poses(stream, camera_model(camera.model), intrinsics_of(camera, stream, rig.target, scene), scene)
@@ -57,4 +55,4 @@ def with_hand_eye_guess(rig: Rig, seen: Inputs, others: Inputs, state: State) ->
             camera, **{k: Parameter("free", v) for k, v in guess.items() if getattr(camera, k).value is None}
         )
 
-    return rig.with_sensors(*(placed(k, c) for k, c in enumerate(rig.cameras) if c.rotation.value is None))
+    return rig.with_sensors(*(with_guess(k, c) for k, c in enumerate(rig.cameras) if c.rotation.value is None))

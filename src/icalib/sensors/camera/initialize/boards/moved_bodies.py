@@ -1,7 +1,7 @@
-"""Whether the bodies of a target stand to each other alike in all recordings.
+"""Detects bodies of a target that were moved relative to each other between recordings.
 
-Each recording's error in the common scene is compared with the errors in scenes of single recordings. Errors of the
-lens and of the target are in all of them. Bodies that were moved between recordings raise the first alone.
+The reprojection error of each recording in the common scene is compared with the errors in scenes of single recordings.
+Errors of the lens and of the target raise all of them. Bodies that were moved raise only the error in the common scene.
 """
 
 from __future__ import annotations
@@ -20,38 +20,41 @@ from icalib.sensors.camera.corner_noise import MIN_CORNER_NOISE_PX
 from icalib.sensors.camera.initialize.boards.incremental_scene import fixed_lens, reconstruct_scene
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, multi_body_poses
 
-# Ratio of the errors of median images. At 1.5 the movement adds as much again to the errors that single recordings
-# leave. At twice that, movements by two standard deviations of the corners would pass.
-CHANGED = 1.5
+# Ratio of the reprojection errors of median images. At 1.5 the movement adds 1.25 times the variance that the scenes of
+# single recordings have. At 3, movements of two standard deviations of the corners would pass.
+MAX_SCENE_ERROR_RATIO = 1.5
 
 
 def check_bodies_still(rig: Rig, scene: TargetScene, recordings: Sequence[Measurements]) -> None:
-    """Raises EstimationError naming the recording that differs most from the `scene` of all, if it differs clearly."""
+    """Raises EstimationError if bodies were moved between recordings.
+
+    scene: the common scene of all recordings. The message names the recording with the largest error ratio.
+    """
     if not scene.bodies.several:
         return
-    changes = scene_error_ratios(rig, scene, recordings)
-    most = int(np.argmax(changes))
-    if changes[most] > CHANGED:
+    ratios = scene_error_ratios(rig, scene, recordings)
+    worst = int(np.argmax(ratios))
+    if ratios[worst] > MAX_SCENE_ERROR_RATIO:
         raise EstimationError(
-            f"{recordings[most].name}: the poses of the targets relative to each other differ from the other "
+            f"{recordings[worst].name}: the poses of the targets relative to each other differ from the other "
             "recordings; calibrate it alone, or remove the targets that were moved."
         )
 
 
 def scene_error_ratios(rig: Rig, scene: TargetScene, recordings: Sequence[Measurements]) -> np.ndarray:
-    """(n,) RMS error of each recording's median image in the `scene` of all, over the largest in scenes of their own.
+    """(n,) RMS error of each recording's median image in the common `scene`, over the largest error in own scenes.
 
-    The largest, because few images alike in a scene of their own hide the errors of a wrong lens.
+    The largest is the reference, because a scene from few similar images fits these too well if the lens is wrong.
     """
-    common, own = np.array([_median_errors(rig, scene, r) for r in recordings]).T
-    return common / max(float(own.max()), MIN_CORNER_NOISE_PX)
+    common, single = np.array([_median_errors(rig, scene, r) for r in recordings]).T
+    return common / max(float(single.max()), SMALLEST_BASE_PX)
 
 
 def _median_errors(rig: Rig, scene: TargetScene, recording: Measurements) -> tuple[float, float]:
-    """RMS errors [px] of the recording's median image in the `scene`, and in a scene of its own.
+    """RMS errors [px] of the recording's median image in the common `scene`, and in the scene of this recording.
 
-    The latter is corrected for the degrees of freedom that its bodies take. Zeros where the recording is too short to
-    show a scene of its own.
+    The latter is corrected for the degrees of freedom of its bodies. Both are zero if the recording alone does not
+    determine relative poses of bodies.
     """
     models = [camera_model(c.model) for c in rig.cameras]
     params = [scene.params[c.name] for c in rig.cameras]
@@ -61,15 +64,15 @@ def _median_errors(rig: Rig, scene: TargetScene, recording: Measurements) -> tup
     if len(placed) < 2:
         return 0.0, 0.0
     bodies = replace(scene.bodies, used=placed)
-    own = TargetScene(bodies, grown.in_frame_of(placed[0], bodies), scene.params)
+    single = TargetScene(bodies, grown.in_frame_of(placed[0], bodies), scene.params)
     streams = restrict(bodies, recording).cameras
-    free = 2 * sum(len(s.uv) for s in streams) - 6 * sum(len(s.stamps_ns) for s in streams)
-    left = free - 6 * (len(placed) - 1)
-    if left <= 0:
+    degrees = 2 * sum(len(s.uv) for s in streams) - 6 * sum(len(s.stamps_ns) for s in streams)
+    remaining = degrees - 6 * (len(placed) - 1)
+    if remaining <= 0:
         return 0.0, 0.0
-    seen = list(zip(streams, models, params, strict=True))
+    cameras = list(zip(streams, models, params, strict=True))
 
-    def median(placing: TargetScene) -> float:
-        return float(np.median(np.concatenate([multi_body_poses(*s, placing).rms_px for s in seen])))
+    def median_rms(scene: TargetScene) -> float:
+        return float(np.median(np.concatenate([multi_body_poses(*camera, scene).rms_px for camera in cameras])))
 
-    return median(scene), median(own) * float(np.sqrt(free / left))
+    return median_rms(scene), median_rms(single) * float(np.sqrt(degrees / remaining))

@@ -1,4 +1,7 @@
-"""Lenses and poses of a target of several bodies: one small tag alone leaves both unsure, all together do not."""
+"""Intrinsics of cameras, and poses of bodies, from a target of several bodies.
+
+One small tag alone determines neither well; a reconstruction of the scene by all bodies together does.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +25,27 @@ from icalib.sensors.camera.initialize.boards.incremental_scene import place_bodi
 from icalib.sensors.camera.initialize.boards.intrinsics import camera_params
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene
 
-TRIAL_WIDTHS = (0.6, 1.0, 0.35)  # focal lengths to try, in image widths: views of 80, 53 and 110 degrees
-JUDGED_SHARE = 0.9  # of the images tell whether a scene fits: where a part of it stands wrongly, most still do
-GOOD_RMS_PX = 0.3  # a scene that fits so well needs no other trial: corners are seldom found better
-REGROWN = 4  # times that a start is followed
-WORTH_GROWING = 0.9  # another time is worth it where the error became so many times the one before
-LARGEST_RMS_PX = 2.0  # of the median image in a scene that fits
-CENTRE_SIGMA = 0.1  # of the image's width: the prior on the principal point, about the middle
-DISTORTION_SIGMA = 1.0  # the prior on each, about where it starts
-OFF_CENTRE = 0.25  # of the image's sides, by which a principal point may lie outside the image
-FOCAL_RANGE = (0.05, 20.0)  # image widths; a fisheye's is 0.2, that of a view of 5 degrees 11
-MOST_STRETCHED = 2.0  # fx over fy
-UNSEEN_SHARE = 0.05  # of the corners, that a lens may not be able to see
+TRIAL_FOCAL_WIDTHS = (0.6, 1.0, 0.35)  # focal lengths to try, in image widths: views of 80, 53 and 110 degrees
+# Quantile of the errors of images by which scenes are compared. The median would not see a wrong pose of a few bodies.
+SCENE_RMS_QUANTILE = 0.9
+EXPECTED_SCENE_RMS_PX = 0.3  # px; a better fit than this is the global minimum, as detected corners are rarely better
+MAX_RECONSTRUCTIONS = 4  # from one start; each begins at the intrinsics of the one before
+MAX_REPEATED_ERROR = 0.9  # of the error before; with less progress a start is not repeated
+MAX_SCENE_RMS_PX = 2.0  # px, of the median image in a scene that fits; wrong models and sizes give more
+CENTRE_SIGMA = 0.1  # image widths, the prior of the principal point about the middle; wide, it only regularises
+DISTORTION_SIGMA = 1.0  # the prior of each coefficient about its start; wide, it only regularises
+MAX_OFF_CENTRE = 0.25  # image sides, by which a principal point may lie outside the image
+FOCAL_RANGE = (0.05, 20.0)  # image widths; a fisheye lens has 0.2, a field of view of 5 deg has 11
+MAX_FOCAL_RATIO = 2.0  # fx over fy; pixels are square to a few percent, images squeezed to half width are rare
+MAX_INVISIBLE_SHARE = 0.05  # of the corners, that cannot be unprojected; they may be outliers
 
 
 def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> TargetScene:
-    """How the bodies stand to each other, from the images of all recordings, whose streams hold corners of these bodies
-    only. Raises EstimationError where images do not tell; `UnconnectedBodiesError` where they do not of some."""
+    """Relative poses of the bodies in use, from the images of all recordings.
+
+    recordings: their streams hold corners of these bodies only. Raises EstimationError if the images do not determine
+    the poses; `UnconnectedBodiesError` if they do not determine those of some bodies.
+    """
     if not bodies.several:
         return TargetScene(bodies)
     streams = [CornerStream.joined([r.cameras[i] for r in recordings]) for i in range(len(rig.cameras))]
@@ -49,15 +56,15 @@ def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> 
 
 
 def intrinsics_of(camera: Camera, stream: CornerStream, target: Target, scene: TargetScene) -> np.ndarray:
-    """(P,) parameters: what the scene has, or else a camera by itself."""
+    """(P,) intrinsics and distortion: those of the scene, else those of the camera alone."""
     return scene.params[camera.name] if camera.name in scene.params else camera_params(camera, stream, target)
 
 
 def scene_intrinsics(target: Target, camera: Camera, stream: CornerStream) -> np.ndarray:
-    """(P,) what the rig gives, else the lens that fits all bodies together best, among those that growing a scene from
-    several starts leads to. A camera that shows one body only is judged by that.
+    """(P,) intrinsics and distortion: those of the rig file, else the ones that fit all bodies together best.
 
-    Raises EstimationError where no lens explains the bodies together.
+    Scenes are reconstructed from several start values. If the camera saw one body only, `camera_params` is used. Raises
+    EstimationError if no intrinsics explain the bodies together.
     """
     if camera.intrinsics.value is not None and camera.distortion.value is not None:
         return camera_params(camera, stream, target)
@@ -65,9 +72,9 @@ def scene_intrinsics(target: Target, camera: Camera, stream: CornerStream) -> np
     bodies = choose_bodies(target, [alone], bent=False)
     if not bodies.several:
         return camera_params(camera, stream, target)
-    seen = restrict(bodies, alone).cameras[0]
-    rms, params = _best(bodies, camera, seen, _starts(target, camera, seen))
-    if not rms < LARGEST_RMS_PX:
+    stream = restrict(bodies, alone).cameras[0]
+    rms, params = _best_reconstruction(bodies, camera, stream, _starts(target, camera, stream))
+    if not rms < MAX_SCENE_RMS_PX:
         error = f"best median error {rms:.1f} px" if np.isfinite(rms) else "the best fit is not a valid lens"
         raise EstimationError(
             f"{camera.name}: no lens of model {camera.model} explains the bodies of the target together ({error}); "
@@ -76,49 +83,56 @@ def scene_intrinsics(target: Target, camera: Camera, stream: CornerStream) -> np
     return params
 
 
-def _best(
-    bodies: Bodies, camera: Camera, seen: CornerStream, starts: Iterator[CameraIntrinsics]
+def _best_reconstruction(
+    bodies: Bodies, camera: Camera, stream: CornerStream, starts: Iterator[CameraIntrinsics]
 ) -> tuple[float, np.ndarray]:
-    """The median error [px] and the lens (P,) of the scene that fits best, or fits well; each start is followed anew
-    from where it led, as long as that fits better: where bodies stand wrongly, a nearly right lens places them right.
-    Infinite where no scene fits a lens that can be."""
+    """Error of the median image [px] and intrinsics (P,) of the best scene, or of the first one that fits well.
+
+    Each start is repeated from its result while the error falls, because better intrinsics correct wrong poses of
+    bodies. Returns infinity and an empty array if no scene has plausible intrinsics.
+    """
     best, median, params = np.inf, np.inf, np.empty(0)
     for start in starts:
         before = np.inf
-        for _ in range(REGROWN):
-            grown = reconstruct_scene(bodies, [seen], [start])
-            lens, rms = grown.state.lenses[0], grown.rms_of(JUDGED_SHARE)
-            if not is_plausible_lens(lens.model, lens.params, camera.resolution, seen.uv):
+        for _ in range(MAX_RECONSTRUCTIONS):
+            grown = reconstruct_scene(bodies, [stream], [start])
+            lens, rms = grown.state.lenses[0], grown.rms_of(SCENE_RMS_QUANTILE)
+            if not is_plausible_lens(lens.model, lens.params, camera.resolution, stream.uv):
                 break
             if rms < best:
                 best, median, params = rms, grown.rms_of(0.5), lens.params
-            if best < GOOD_RMS_PX:
+            if best < EXPECTED_SCENE_RMS_PX:
                 return median, params
-            if not rms < WORTH_GROWING * before:
+            if not rms < MAX_REPEATED_ERROR * before:
                 break
             before, start = rms, replace(start, params=lens.params)
     return median, params
 
 
 def is_plausible_lens(model: CameraModel, params: np.ndarray, resolution: tuple[int, int], uv: np.ndarray) -> bool:
-    """Whether parameters (P,) are those of a lens: sane focal lengths, a principal point in or near the image, and rays
-    for nearly all corners uv (N, 2), so that the distortion is monotone where it is used."""
+    """Whether parameters (P,) can be those of a real lens.
+
+    It has a focal length in `FOCAL_RANGE`, a principal point in or near the image, and rays for nearly all corners
+    uv (N, 2) [px], so that its distortion is monotone where it is used.
+    """
     if not np.isfinite(params).all():
         return False
     middle = 0.5 * (np.array(resolution) - 1.0)
-    _, _, j_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
-    focal = np.array([j_point[0, 0, 0], j_point[0, 1, 1]])  # pixels per radian in the middle: not fx in every model
-    near = np.abs(params[2:4] - middle) < (0.5 + OFF_CENTRE) * np.array(resolution)
+    _, _, J_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
+    focal = np.array([J_point[0, 0, 0], J_point[0, 1, 1]])  # px/rad in the middle, which is not fx in every model
+    near = np.abs(params[2:4] - middle) < (0.5 + MAX_OFF_CENTRE) * np.array(resolution)
     in_range = (focal > FOCAL_RANGE[0] * resolution[0]) & (focal < FOCAL_RANGE[1] * resolution[0])
-    if not (near.all() and in_range.all() and 1.0 / MOST_STRETCHED < focal[0] / focal[1] < MOST_STRETCHED):
+    if not (near.all() and in_range.all() and 1.0 / MAX_FOCAL_RATIO < focal[0] / focal[1] < MAX_FOCAL_RATIO):
         return False
     _, valid = model.unproject(params, uv)
-    return bool((~valid).mean() < UNSEEN_SHARE)
+    return bool((~valid).mean() < MAX_INVISIBLE_SHARE)
 
 
 def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[CameraIntrinsics]:
-    """What each body by itself says, with what the rig gives, if that can be; then each kind of lens of the model at
-    several focal lengths, whatever the guess."""
+    """Start values: intrinsics by single bodies, if plausible; then each start distortion with several focal lengths.
+
+    Fixed values and priors of the rig file are kept in all of them.
+    """
     model, width = camera_model(camera.model), camera.resolution[0]
     middle = 0.5 * (np.array(camera.resolution) - 1.0)
     given = [camera.intrinsics, camera.distortion]
@@ -138,9 +152,9 @@ def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[Ca
             yield lens(params)
     for distortion in model.start_distortions:
         params = np.array([1.0, 1.0, *middle, *distortion])
-        _, _, j_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
-        for widths in TRIAL_WIDTHS if free[0] else TRIAL_WIDTHS[:1]:
-            start = np.array([*np.full(2, widths * width / j_point[0, 0, 0]), *middle, *distortion])
+        _, _, J_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
+        for widths in TRIAL_FOCAL_WIDTHS if free[0] else TRIAL_FOCAL_WIDTHS[:1]:
+            start = np.array([*np.full(2, widths * width / J_point[0, 0, 0]), *middle, *distortion])
             for part, parameter in zip((slice(0, 4), slice(4, None)), given, strict=True):
                 if parameter.value is not None and parameter.mode != "free":
                     start[part] = parameter.value

@@ -1,7 +1,7 @@
-"""Poses of cameras in a scene of several bodies, whose poses are known: image by image, no guess needed.
+"""Camera poses in a scene of bodies with known poses, image by image, without an initial guess.
 
-Each body's pose is found in each image alone. Small flat bodies far away look the same from two sides; all bodies of an
-image tell which is meant.
+The pose of each body in each image is found first. A small flat body far away has two poses that project alike; the
+other bodies in the image decide between them.
 """
 
 from __future__ import annotations
@@ -32,13 +32,17 @@ from icalib.model.bodies import Bodies
 from icalib.optim.state import Key
 from icalib.sensors.camera.corner_factor import Views
 
-MIRRORS = 2
+POSES_PER_VIEW = 2  # a flat body and its mirror image, with depths reflected about the middle of the body
+NO_POSE_RMS_PX = 1e9  # px, stands for the error of an image without a pose
 
 
 @dataclass(frozen=True)
 class TargetScene:
-    """Where the bodies stand: R_scene_body, p_scene_body by body and name, as in a state. params: those (P,) of the
-    cameras that saw it, by name, where there are several bodies."""
+    """Poses of the bodies of a target.
+
+    values: R_scene_body, p_scene_body by body and name, as in a state; the scene is the frame of the first body in use.
+    params: intrinsics and distortion (P,) by camera, with which the poses were found, if there are several bodies.
+    """
 
     bodies: Bodies
     values: dict[Key, np.ndarray] = field(default_factory=dict)
@@ -46,7 +50,7 @@ class TargetScene:
 
     @property
     def points(self) -> np.ndarray:
-        """(n_points, 3) the target's points in the scene."""
+        """(n_points, 3) [m] the target's points in the scene."""
         zeros = {(name, "shape"): np.zeros(self.bodies.basis.shape[1]) for name in self.bodies.bending}
         return self.bodies.points(self.values | zeros)
 
@@ -54,20 +58,24 @@ class TargetScene:
     def known(self) -> np.ndarray:
         """(n_points,) bool: points of bodies that have a pose."""
         names = self.bodies.target.bodies
-        have = [k == self.bodies.used[0] or (names[k], "rotation") in self.values for k in range(len(names))]
-        return np.array(have)[self.bodies.target.body]
+        has_pose = [k == self.bodies.used[0] or (names[k], "rotation") in self.values for k in range(len(names))]
+        return np.array(has_pose)[self.bodies.target.body]
 
 
-def view_poses(stream: CornerStream, views: Views, bodies: Bodies, model: CameraModel, params: np.ndarray):
-    """Both poses (V, 2, ...) of the camera in the frame of each view's body."""
+def view_poses(
+    stream: CornerStream, views: Views, bodies: Bodies, model: CameraModel, params: np.ndarray
+) -> TargetPoses:
+    """Both poses (V, 2, ...) of the camera in the frame of the body, for each of V views of one body in one image."""
     size = np.bincount(bodies.target.body)
     fewest = np.minimum(size, MIN_POSE_CORNERS)[views.body]
-    return flat_poses(stream, views.start, fewest, model, params, bodies.target.points, MIRRORS)
+    return flat_poses(stream, views.start, fewest, model, params, bodies.target.points, POSES_PER_VIEW)
 
 
 def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: TargetScene) -> TargetPoses:
-    """Poses of the camera in the scene, image by image, from all its bodies together. Raises EstimationError where
-    images are mirrored."""
+    """Camera poses in the scene, one for each image; params: (P,) intrinsics and distortion.
+
+    Raises EstimationError if the images are mirrored (checked for targets of one body).
+    """
     if not scene.bodies.several:
         poses = target_poses(stream, model, params, FlatPoints(scene.bodies.target.points))
         check_front_side(stream.name, poses)
@@ -76,14 +84,14 @@ def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, sc
 
 
 def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: TargetScene) -> TargetPoses:
-    """Poses of the camera in the scene from the bodies of the target that have a pose in it."""
+    """Camera poses in the scene, one for each image, from the bodies that have a pose in it; params: (P,)."""
     views = Views.of(stream, scene.bodies.target.body)
-    seen = view_poses(stream, views, scene.bodies, model, params)
+    by_view = view_poses(stream, views, scene.bodies, model, params)
     R_sb, p_sb = scene.bodies.poses(scene.values)
     rays, density, good = usable_rays(stream.uv, model, params)
     n = len(stream.stamps_ns)
-    rotation, position, rms = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.full(n, 1e9)
-    first = np.searchsorted(views.image, np.arange(n + 1))
+    rotation, position, rms = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.full(n, NO_POSE_RMS_PX)
+    first_view = np.searchsorted(views.image, np.arange(n + 1))
     _best_poses(
         stream.start,
         stream.point,
@@ -91,11 +99,11 @@ def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarra
         density,
         good & scene.known[stream.point],
         scene.points,
-        first,
+        first_view,
         views.body,
-        seen.rotation,
-        seen.position,
-        seen.ok,
+        by_view.rotation,
+        by_view.position,
+        by_view.ok,
         R_sb,
         p_sb,
         rotation,
@@ -107,16 +115,35 @@ def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarra
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_poses(
-    start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms
+    start,
+    point,
+    rays,
+    density,
+    good,
+    scene_points,
+    first_view,
+    body,
+    R_bc,
+    p_bc,
+    ok,
+    R_sb,
+    p_sb,
+    rotation,
+    position,
+    rms,
 ):
-    """Of each image: the pose that one of its views suggests and all its corners like best, refined on all of them."""
+    """Writes the pose of each image into rotation, position and rms (M, ...).
+
+    Of the poses of its views, composed with the poses R_sb, p_sb of the bodies, the one with the least error over all
+    corners is taken and refined on all corners. R_bc, p_bc, ok: (V, 2, ...) poses by view.
+    """
     points, seen = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     R, t, trial_R, trial_t = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     R_sc, p_sc = np.empty((3, 3)), np.empty(3)
     for i in range(len(start) - 1):
         count = select_corners(start[i], start[i + 1], point, rays, density, good, scene_points, points, seen)
-        best = 1e9
-        for v in range(first[i], first[i + 1]):
+        best = NO_POSE_RMS_PX
+        for v in range(first_view[i], first_view[i + 1]):
             for side in range(R_bc.shape[1]):
                 if count < 4 or not ok[v, side]:
                     continue
@@ -133,9 +160,9 @@ def _best_poses(
                 if error < best:
                     best = error
                     R[:], t[:] = trial_R, trial_t
-        if best < 1e9:
+        if best < NO_POSE_RMS_PX:
             rms[i] = refine_pose(points[:count], seen[:count], R, t, POSE_ITERATIONS)
-            if rms[i] < 1e9:
+            if rms[i] < NO_POSE_RMS_PX:
                 camera_in_target(R, t, rotation[i], position[i])
             else:
-                rms[i] = 1e9
+                rms[i] = NO_POSE_RMS_PX
