@@ -18,7 +18,7 @@ from icalib.initialize.steps.single_recording import joined_states
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.rig import Parameter
-from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import NEAREST_M, _misses, lens_slopes
+from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import MIN_POINT_RANGE_M, _ray_errors, ray_derivatives
 from icalib.sensors.camera.initialize.tracks.placement import track_camera_values
 from icalib.tools.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
 
@@ -192,15 +192,15 @@ def test_rays_that_meet_before_both_cameras_miss_nothing():
     f, h = (points - b) @ R, points / np.linalg.norm(points, axis=1)[:, None]
     f /= np.linalg.norm(f, axis=1)[:, None]
     e, begin = np.empty(50), np.array([0, 50])
-    _misses(f, h, *STIFF, begin, R[None], b[None], e)
+    _ray_errors(f, h, *STIFF, begin, R[None], b[None], e)
     assert np.abs(e).max() < 1e-12
     # The other way they meet behind, and the angle between them counts.
-    _misses(f, h, *STIFF, begin, R[None], -b[None], e)
+    _ray_errors(f, h, *STIFF, begin, R[None], -b[None], e)
     angle = np.linalg.norm(np.cross(f @ R.T, h), axis=1)
     np.testing.assert_allclose(e, np.sqrt(0.5) * angle, atol=1e-12)
-    _misses(f, h, *STIFF, begin, R[None], 1e-3 * b[None], e)  # a way a thousandth as long: some meet too near
+    _ray_errors(f, h, *STIFF, begin, R[None], 1e-3 * b[None], e)  # a way a thousandth as long: some meet too near
     np.testing.assert_allclose(
-        e, np.sqrt(0.5) * np.maximum(angle - 1e-3 * np.linalg.norm(b) / NEAREST_M, 0.0), atol=1e-9
+        e, np.sqrt(0.5) * np.maximum(angle - 1e-3 * np.linalg.norm(b) / MIN_POINT_RANGE_M, 0.0), atol=1e-9
     )
 
 
@@ -210,7 +210,7 @@ def test_a_ray_misses_by_its_own_error_across_the_plane_of_both():
     f, h = point - b, point + np.array([0.0, by * np.linalg.norm(point), 0.0])
     f, h = f / np.linalg.norm(f), h / np.linalg.norm(h)
     e = np.empty(1)
-    _misses(f[None], h[None], *STIFF, np.array([0, 1]), R[None], b[None], e)
+    _ray_errors(f[None], h[None], *STIFF, np.array([0, 1]), R[None], b[None], e)
     # Both rays could be off: of two alike the error is shared, by the root of the sum of what each tells.
     across = np.sin(np.arccos(f[0])) ** 2 + np.sin(np.arccos(h[0])) ** 2
     assert abs(abs(e[0]) / by * np.sqrt(across) / np.sin(np.arccos(f[0])) - 1.0) < 1e-3
@@ -221,8 +221,8 @@ def test_a_bent_lens_moves_rays_along_their_slopes():
     f, h, f_by, h_by = (rng.standard_normal(shape) for shape in ((20, 3), (20, 3), (2, 20, 3), (2, 20, 3)))
     bent, begin, R, b = np.array([0.3, -0.2]), np.array([0, 12, 20]), np.stack([np.eye(3)] * 2), np.ones((2, 3))
     once, other = np.empty(20), np.empty(20)
-    _misses(f, h, f_by, h_by, bent, begin, R, b, once)
-    _misses(f + np.tensordot(bent, f_by, 1), h + np.tensordot(bent, h_by, 1), *STIFF, begin, R, b, other)
+    _ray_errors(f, h, f_by, h_by, bent, begin, R, b, once)
+    _ray_errors(f + np.tensordot(bent, f_by, 1), h + np.tensordot(bent, h_by, 1), *STIFF, begin, R, b, other)
     np.testing.assert_allclose(once, other, rtol=1e-12)
 
 
@@ -238,7 +238,7 @@ def test_slopes_of_rays_are_those_of_the_rays_of_another_lens(name: str, distort
     uv = np.vstack([rng.uniform([100, 60], [640, 430], (200, 2)), [np.nan, np.nan]])
     rays, valid = model.unproject(lens, uv)
     assert valid[:-1].all() and not valid[-1]
-    slopes = lens_slopes(model, lens, directions, np.where(valid[:, None], rays, 0.0))
+    slopes = ray_derivatives(model, lens, directions, np.where(valid[:, None], rays, 0.0))
     for direction, found in zip(directions, slopes, strict=True):
         (up, _), (down, _) = (model.unproject(lens + d * direction, uv[:-1]) for d in (h, -h))
         np.testing.assert_allclose(found[:-1], (up - down) / (2.0 * h), atol=1e-8)

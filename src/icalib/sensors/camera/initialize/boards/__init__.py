@@ -1,1 +1,1 @@
-"""Initial guess from targets."""
+"""Initial guess of cameras that see a target of one or several bodies."""

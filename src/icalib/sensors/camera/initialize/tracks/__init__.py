@@ -1,1 +1,1 @@
-"""Initial guess from feature tracks."""
+"""Initial guess of cameras with feature tracks."""

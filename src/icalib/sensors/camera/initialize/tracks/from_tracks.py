@@ -1,7 +1,8 @@
-"""The first guess where there is no target: rotations from the gyroscope, everything else linearly from tracks.
+"""Initial guess from feature tracks and an IMU, without a target.
 
-Cameras turn as the epipolar geometry of their tracks says; what the gyroscope says of the same turns gives time
-offsets, rotations and its bias. With the gyroscope's rotations the rest is linear (`solve_linear_motion`).
+Epipolar geometry gives the rotations of each camera between images. Their comparison with the gyroscope gives time
+offsets, extrinsic rotations and the gyroscope bias. With rotations known, velocities, gravity, accelerometer bias and
+lever arms are a linear problem (`linear_motion`).
 """
 
 from __future__ import annotations
@@ -25,14 +26,18 @@ from icalib.sensors.camera.initialize.tracks.linear_motion import Rays, WindowMo
 from icalib.sensors.camera.initialize.tracks.track_intrinsics import find_intrinsics
 from icalib.sensors.sensor import ROTATION
 
-APART_S, FEWEST_SEEN = 0.15, 3
-LEAST_FELT = 0.7  # of gravity; half the time a rig is not thrown about
+MAX_IMAGE_STEP_S = 0.15  # s between images in the linear problem; images in between add little information
+MIN_TRACK_IMAGES = 3  # images in which a typical track is seen; the linear problem uses no shorter ones
+MIN_GRAVITY_RATIO = 0.7  # median specific force over gravity; hand-held and driven rigs accelerate by less than 3 m/s^2
 
 
 def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
-    """Raises EstimationError, one sentence, where the tracks do not carry a guess, or do not show the lens."""
+    """The initial guess of one recording; the poses in it are those of the cameras in the world.
+
+    Raises EstimationError if the tracks do not determine the guess, or the intrinsics of a camera.
+    """
     imu = imu_data(rig, measurements)
-    assert imu is not None  # tracks without an IMU are refused before
+    assert imu is not None  # the rig file reader refuses tracks without an IMU
     params = [start_intrinsics(c, t, imu, measurements) for c, t in zip(rig.cameras, measurements.tracks, strict=True)]
     rates = [
         matching_track_rates(imu, t, camera_model(c.model), p)
@@ -62,19 +67,20 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
 def _aligned_together(
     rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], aligned: list[RateAlignment]
 ) -> list[RateAlignment]:
+    """The alignments of all cameras refined together: see `joint_alignment`; params: (P,) by camera."""
     pairs = []
     for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
         pairs += shared_rays(k, stream, camera_model(camera.model), params[k])
-    held = [(known_value(c.rotation) is not None, known_value(c.time_offset) is not None) for c in rig.cameras]
-    return align_jointly(GyroRotation.integrate(imu, aligned[0].gyro_bias), pairs, aligned, held)
+    fixed = [(known_value(c.rotation) is not None, known_value(c.time_offset) is not None) for c in rig.cameras]
+    return align_jointly(GyroRotation.integrate(imu, aligned[0].gyro_bias), pairs, aligned, fixed)
 
 
 def _check_units(imu: ImuData, gravity: float) -> None:
-    """Raises EstimationError where the accelerometer does not feel about `gravity` m/s^2."""
-    felt = float(np.median(np.linalg.norm(imu.accel, axis=1)))
-    if not LEAST_FELT < felt / gravity < 1.0 / LEAST_FELT:
+    """Raises EstimationError if the median specific force is far from `gravity` [m/s^2]."""
+    force = float(np.median(np.linalg.norm(imu.accel, axis=1)))
+    if not MIN_GRAVITY_RATIO < force / gravity < 1.0 / MIN_GRAVITY_RATIO:
         raise EstimationError(
-            f"{imu.name} measures {felt:.3g} m/s^2 most of the time instead of about {gravity:.3g}; check that "
+            f"{imu.name} measures {force:.3g} m/s^2 most of the time instead of about {gravity:.3g}; check that "
             "the accelerometer is in m/s^2, not in g."
         )
 
@@ -96,31 +102,33 @@ def start_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, measurem
 
 
 def _rays(rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], offsets: list[float]) -> Rays:
-    """What was seen while the IMU was running, in images some way apart: those between say little more."""
+    """Rays of all cameras in the selected images within the IMU's recording; offsets: [s] between first stamps."""
     parts = []
     for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
         direction, valid = camera_model(camera.model).unproject(params[k], stream.uv)
         t = (stream.seconds + offsets[k])[stream.image]
-        own = valid & (t >= imu.seconds[0]) & (t <= imu.seconds[-1]) & _apart(stream)[stream.image]
-        parts.append((t[own], np.full(int(own.sum()), k), stream.feature[own], direction[own]))
+        used = valid & (t >= imu.seconds[0]) & (t <= imu.seconds[-1]) & _selected_images(stream)[stream.image]
+        parts.append((t[used], np.full(int(used.sum()), k), stream.feature[used], direction[used]))
     return Rays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _apart(stream: TrackStream) -> np.ndarray:
-    """(n,) whether images are used: the first of each stretch of APART_S that has any, or of less where most points
-    are seen too shortly for FEWEST_SEEN of these."""
+def _selected_images(stream: TrackStream) -> np.ndarray:
+    """(M,) bool: the first image in each interval of `MAX_IMAGE_STEP_S`.
+
+    The interval is shorter if most tracks are too short for `MIN_TRACK_IMAGES` such images.
+    """
     t = stream.seconds
     numbers, track = np.unique(stream.feature, return_inverse=True)
     first, last = np.full(len(numbers), np.inf), np.full(len(numbers), -np.inf)
     np.minimum.at(first, track, t[stream.image])
     np.maximum.at(last, track, t[stream.image])
-    lasted = float(np.median((last - first)[track]))  # by observation, of which short tracks have few
-    apart = min(APART_S, lasted / FEWEST_SEEN)
-    return np.diff(np.floor((t - t[0]) / max(apart, 1e-3) + 1e-6), prepend=-1.0) > 0.0
+    duration = float(np.median((last - first)[track]))  # over observations, so that short tracks count little
+    step = min(MAX_IMAGE_STEP_S, duration / MIN_TRACK_IMAGES)
+    return np.diff(np.floor((t - t[0]) / max(step, 1e-3) + 1e-6), prepend=-1.0) > 0.0
 
 
 def _poses(motion: WindowMotion, times: np.ndarray, R_imu_cam: np.ndarray, p_imu_cam: np.ndarray) -> TargetPoses:
-    """A camera's poses in the world at `times` (M,)."""
+    """Poses of a camera in the world at `times` (M,) [s] on the IMU's clock; `ok` within the IMU's recording."""
     imu = motion.gyro.imu
     R, p = motion.poses(times)
     inside = (times >= imu.seconds[0]) & (times <= imu.seconds[-1])

@@ -1,13 +1,13 @@
-"""How the IMU moved, from points that cameras followed: linear in everything once rotations are known.
+"""Trajectory of the IMU from feature tracks and known rotations: a linear problem (as Dong-Si and Mourikis 2012).
 
-Rotations come from the gyroscope. Within a window of a few seconds the position is, from its beginning on,
+Rotations come from the gyroscope. Within a window of a few seconds the position relative to its beginning is
 
     p(t) = v0 t + g t^2 / 2 + D_f(t) - D_R(t) b_a        D_f'' = R f,  D_R'' = R
 
-and a camera at p(t) + R p_imu_cam sees its points along known rays: the distance of each point from its rays is linear
-in the points, v0, g, b_a and the lever arms. Points are eliminated, then the windows' own v0 and g. A distance counts
-by the inverse of the point's range, found in rounds. A window's gravity may differ a little from that of all, because
-the gyroscope drifts; how long gravity is is known.
+A camera at p(t) + R p_imu_cam sees its points along known rays. The distances of points from their rays are linear in
+the points, v0, g, b_a and the lever arms. Points are eliminated first, then v0 and g of each window. A distance is
+weighted by the inverse of the range of its point, which is found iteratively. The gravity of a window may differ a
+little from the common one, because the gyroscope drifts; the length of gravity is known.
 """
 
 from __future__ import annotations
@@ -20,21 +20,26 @@ import numpy as np
 
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 
-WINDOW_S = 4.0
-ROUNDS = 5
-BIAS_SIGMA = 0.3  # m/s^2
-ARM_SIGMA = 0.5  # m
-RAY_SIGMA = 5e-3  # rad, of a ray: what rough intrinsics leave
-ALIKE = 100  # rays of a window: more tell no more, because rough intrinsics bend them alike
-OWN = 6  # unknowns of a window: v0, what its g differs by
-SHARED = 6  # of all: g, b_a, then the lever arms
-DRIFT_SIGMA = 0.3  # m/s^2, of a window's gravity about that of all
-GRAVITY_SIGMA = 0.05  # m/s^2, of its length
+MOTION_WINDOW_S = 4.0  # s; over longer windows the drift of the gyroscope bends the parabola of gravity
+REWEIGHTING_ROUNDS = 5  # ranges and weights change little after the third
+MIN_WINDOW_OBSERVATIONS = 3  # of a point in a window; with two, the point takes up nearly all information
+MIN_RANGE_M = 0.1  # m, of a point, in the weights
+ACCEL_BIAS_SIGMA = 0.3  # m/s^2, the prior about zero; of consumer MEMS accelerometers
+WINDOW_ARM_SIGMA_M = 0.5  # m, the prior of lever arms about zero
+GRAVITY_DRIFT_SIGMA = 0.3  # m/s^2, of the gravity of one window about the common one: 2 deg of gyroscope drift
+GRAVITY_NORM_SIGMA = 0.05  # m/s^2, of the length of gravity; it varies by as much over the earth
+WINDOW_RAY_SIGMA = 5e-3  # rad, of a ray, by rough intrinsics
+MAX_INDEPENDENT_RAYS = 100  # of a window; rough intrinsics bend rays alike, so that more add no information
+N_WINDOW, N_COMMON = 6, 6  # unknowns: v0, g - g_common of a window; g_common, b_a of all, before the lever arms
+FIXED_INFORMATION = 1e12  # m^-2, of a known lever arm: a standard deviation of a micrometre
 
 
 @dataclass(frozen=True)
 class Rays:
-    """What all cameras saw: times (n,) on the imu clock; camera (n,); feature (n,); direction (n, 3) in the camera."""
+    """n observations of all cameras: times (n,) [s] on the IMU's clock, camera and feature (n,) numbers.
+
+    direction: (n, 3) unit rays in the frame of the camera.
+    """
 
     times: np.ndarray
     camera: np.ndarray
@@ -44,8 +49,11 @@ class Rays:
 
 @dataclass(frozen=True)
 class WindowMotion:
-    """begins (W,) s: windows, each until the next begins; in the frame of the gyroscope's start velocity (W, 3) there,
-    gravity (W, 3); accel_bias (3,); arms (C, 3) p_imu_cam."""
+    """The solution for W windows, in the frame in which `gyro` starts.
+
+    begins: (W,) [s], each window lasts until the next begins. velocity: (W, 3) [m/s] at the beginnings; gravity: (W, 3)
+    [m/s^2]; accel_bias: (3,) [m/s^2]; arms: (C, 3) p_imu_cam [m].
+    """
 
     gyro: GyroRotation
     begins: np.ndarray
@@ -59,29 +67,34 @@ class WindowMotion:
         return _Integrals.of(self.gyro)
 
     def within(self, window: int, t: np.ndarray) -> np.ndarray:
-        """(n, 3) positions of the IMU from the window's beginning on."""
+        """(n, 3) [m] positions of the IMU at times t (n,) [s], relative to that at the beginning of the window."""
         s = (t - self.begins[window])[:, None]
         D_f, D_R = self._integrals.since(self.begins[window], t)
         return self.velocity[window] * s + 0.5 * self.gravity[window] * s**2 + D_f - D_R @ self.accel_bias
 
     def poses(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """R_world_imu (n, 3, 3) and position (n, 3) at times t, world z up: windows follow one another."""
+        """R_world_imu (n, 3, 3) and position (n, 3) [m] at times t (n,) [s]; world z is up.
+
+        Each window begins where the one before ends. Each is rotated so that its own gravity points down.
+        """
         window = np.clip(np.searchsorted(self.begins, t, side="right") - 1, 0, None)
         rotation, position = np.empty((len(t), 3, 3)), np.empty((len(t), 3))
-        at, R = np.zeros(3), self.gyro.at(t)
-        for k, begin in enumerate(self.begins):
-            del begin
-            level, own = _level(self.gravity[k]), window == k
-            rotation[own] = level @ R[own]
-            position[own] = at + self.within(k, t[own]) @ level.T
+        origin, R = np.zeros(3), self.gyro.at(t)
+        for k in range(len(self.begins)):
+            R_world_start, rows = _levelling_rotation(self.gravity[k]), window == k
+            rotation[rows] = R_world_start @ R[rows]
+            position[rows] = origin + self.within(k, t[rows]) @ R_world_start.T
             if k + 1 < len(self.begins):
-                at = at + level @ self.within(k, self.begins[k + 1 : k + 2])[0]
+                origin = origin + R_world_start @ self.within(k, self.begins[k + 1 : k + 2])[0]
         return rotation, position
 
 
 @dataclass(frozen=True)
 class _Integrals:
-    """First and second integrals of R f (N, 3) and R (N, 3, 3) at the IMU's stamps, as one array (N, 12)."""
+    """First and second time integrals, (N, 12) each, of R f (3) and R (9) at the IMU's stamps `seconds` (N,).
+
+    f is the specific force, R = R_start_imu by the gyroscope.
+    """
 
     seconds: np.ndarray
     once: np.ndarray
@@ -89,6 +102,7 @@ class _Integrals:
 
     @classmethod
     def of(cls, gyro: GyroRotation) -> _Integrals:
+        """Integrals of the readings of the IMU, linear in between."""
         imu, R = gyro.imu, gyro.rotation
         x = np.concatenate([np.einsum("nij,nj->ni", R, imu.accel), R.reshape(-1, 9)], axis=1)
         h = np.diff(imu.seconds)[:, None]
@@ -98,7 +112,7 @@ class _Integrals:
         return cls(imu.seconds, once, twice)
 
     def since(self, begin: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """D_f (n, 3) and D_R (n, 3, 3) at times t, both and their slopes zero at `begin`."""
+        """D_f (n, 3) [m] and D_R (n, 3, 3) [s^2] at times t (n,) [s]; values and derivatives are zero at `begin`."""
 
         def at(x: np.ndarray, s: np.ndarray) -> np.ndarray:
             return np.stack([np.interp(s, self.seconds, x[:, k]) for k in range(x.shape[1])], axis=1)
@@ -111,44 +125,68 @@ class _Integrals:
 def solve_linear_motion(
     gyro: GyroRotation, rays: Rays, R_imu_cam: list[np.ndarray], arms: list[np.ndarray | None], gravity: float
 ) -> WindowMotion:
-    """The IMU's motion while `rays` were seen, by cameras of known rotation; `arms` where they are known; `gravity`
-    m/s^2."""
+    """The motion of the IMU while `rays` were observed, by cameras with known rotations R_imu_cam (3, 3).
+
+    arms: lever arms (3,) [m] that are known, else None; gravity: its length [m/s^2].
+    """
     low, high = float(rays.times.min()), float(rays.times.max())
-    edges = np.linspace(low, high, max(int(round((high - low) / WINDOW_S)), 1) + 1)
+    edges = np.linspace(low, high, max(int(round((high - low) / MOTION_WINDOW_S)), 1) + 1)
     edges[-1] += 1e-6
-    integrals, shared = _Integrals.of(gyro), SHARED + 3 * len(R_imu_cam)
-    systems = [_Window.of(gyro, integrals, rays, R_imu_cam, a, b) for a, b in pairwise(edges)]
-    prior = np.concatenate([np.zeros(3), np.full(3, BIAS_SIGMA**-2), np.full(shared - 6, ARM_SIGMA**-2)])
-    mean = np.zeros(shared)
-    for k, arm in enumerate(arms):
-        if arm is not None:
-            at = slice(SHARED + 3 * k, SHARED + 3 * k + 3)
-            prior[at], mean[at] = 1e12, arm
-    own, common = np.zeros((len(systems), OWN)), mean
-    for _ in range(ROUNDS):
-        reduced = [w.normal(np.concatenate([x, common])) for w, x in zip(systems, own, strict=True)]
-        N, r = np.diag(prior), prior * mean
+    integrals = _Integrals.of(gyro)
+    windows = [_Window.of(gyro, integrals, rays, R_imu_cam, a, b) for a, b in pairwise(edges)]
+    mean, information = _common_prior(arms)
+    local, common = np.zeros((len(windows), N_WINDOW)), mean
+    for _ in range(REWEIGHTING_ROUNDS):
+        systems = [w.normal_equations(np.concatenate([x, common])) for w, x in zip(windows, local, strict=True)]
+        N, r = np.diag(information), information * mean
         if (length := float(np.linalg.norm(common[:3]))) > 0.0:
             down = common[:3] / length
-            N[:3, :3] += np.outer(down, down) / GRAVITY_SIGMA**2
-            r[:3] += gravity * down / GRAVITY_SIGMA**2
-        for A, b in reduced:
-            A[range(3, OWN), range(3, OWN)] += DRIFT_SIGMA**-2
-            K = np.linalg.solve(A[:OWN, :OWN], np.column_stack([A[:OWN, OWN:], b[:OWN]]))
-            N = N + A[OWN:, OWN:] - A[OWN:, :OWN] @ K[:, :-1]
-            r = r + b[OWN:] - A[OWN:, :OWN] @ K[:, -1]
-        common = np.linalg.solve(N, r)
-        own = np.array([np.linalg.solve(A[:OWN, :OWN], b[:OWN] - A[:OWN, OWN:] @ common) for A, b in reduced])
-    arms_found = common[SHARED:].reshape(-1, 3)
-    return WindowMotion(gyro, edges[:-1], own[:, :3], own[:, 3:] + common[:3], common[3:6], arms_found)
+            N[:3, :3] += np.outer(down, down) / GRAVITY_NORM_SIGMA**2
+            r[:3] += gravity * down / GRAVITY_NORM_SIGMA**2
+        local, common = _solve_windows(systems, N, r)
+    arms_found = common[N_COMMON:].reshape(-1, 3)
+    return WindowMotion(gyro, edges[:-1], local[:, :3], local[:, 3:] + common[:3], common[3:6], arms_found)
+
+
+def _common_prior(arms: list[np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and information (6 + 3 C,) of the prior of the common unknowns: g, b_a, lever arms."""
+    information = np.concatenate(
+        [np.zeros(3), np.full(3, ACCEL_BIAS_SIGMA**-2), np.full(3 * len(arms), WINDOW_ARM_SIGMA_M**-2)]
+    )
+    mean = np.zeros(len(information))
+    for k, arm in enumerate(arms):
+        if arm is not None:
+            columns = slice(N_COMMON + 3 * k, N_COMMON + 3 * k + 3)
+            information[columns], mean[columns] = FIXED_INFORMATION, arm
+    return mean, information
+
+
+def _solve_windows(
+    systems: list[tuple[np.ndarray, np.ndarray]], N: np.ndarray, r: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unknowns of the windows (W, 6) and common unknowns (6 + 3 C,), by the Schur complement of each window.
+
+    systems: normal matrix and right-hand side of each window; N, r: those of the priors of the common unknowns.
+    """
+    n = N_WINDOW
+    for A, b in systems:
+        A[range(3, n), range(3, n)] += GRAVITY_DRIFT_SIGMA**-2
+        K = np.linalg.solve(A[:n, :n], np.column_stack([A[:n, n:], b[:n]]))
+        N = N + A[n:, n:] - A[n:, :n] @ K[:, :-1]
+        r = r + b[n:] - A[n:, :n] @ K[:, -1]
+    common = np.linalg.solve(N, r)
+    return np.array([np.linalg.solve(A[:n, :n], b[:n] - A[:n, n:] @ common) for A, b in systems]), common
 
 
 @dataclass
 class _Window:
-    """One window's observations, those of a track together: camera centre = full (x, 1) with full (n, 3, m + 1);
-    direction (n, 3) of the ray; track (n,), and where each begins (t,); weight (n,), of the round."""
+    """The n observations of one window, sorted by track, as linear functions of the m unknowns x.
 
-    full: np.ndarray
+    position: (n, 3, m + 1), the camera centre is position (x, 1). direction: (n, 3) of the ray in the gyroscope's start
+    frame. track: (n,) numbers; begins: (t,) the first observation of each track. weight: (n,) [m^-2] of the last round.
+    """
+
+    position: np.ndarray
     direction: np.ndarray
     track: np.ndarray
     begins: np.ndarray
@@ -158,59 +196,62 @@ class _Window:
     def of(
         cls, gyro: GyroRotation, integrals: _Integrals, rays: Rays, R_ic: list[np.ndarray], begin: float, end: float
     ) -> _Window:
-        own = np.flatnonzero((rays.times >= begin) & (rays.times < end))
-        number, track, count = np.unique(rays.feature[own], return_inverse=True, return_counts=True)
-        own, feature = own[count[track] >= 3], rays.feature[own[count[track] >= 3]]
-        own = own[np.argsort(feature, kind="stable")]
-        _, begins, track = np.unique(rays.feature[own], return_index=True, return_inverse=True)
-        del number
-        t, camera = rays.times[own], rays.camera[own]
+        """The observations from `begin` to `end` [s] of tracks that have enough of them."""
+        rows = np.flatnonzero((rays.times >= begin) & (rays.times < end))
+        _, track, count = np.unique(rays.feature[rows], return_inverse=True, return_counts=True)
+        rows = rows[count[track] >= MIN_WINDOW_OBSERVATIONS]
+        rows = rows[np.argsort(rays.feature[rows], kind="stable")]
+        _, begins, track = np.unique(rays.feature[rows], return_index=True, return_inverse=True)
+        t, camera = rays.times[rows], rays.camera[rows]
         s, R = (t - begin)[:, None, None], gyro.at(t)
         D_f, D_R = integrals.since(begin, t)
-        A = np.zeros((len(t), 3, OWN + SHARED + 3 * len(R_ic) + 1))
-        A[:, :, 0:3], A[:, :, 3:6] = s * np.eye(3), 0.5 * s**2 * np.eye(3)
-        A[:, :, 6:9], A[:, :, 9:12], A[:, :, -1] = A[:, :, 3:6], -D_R, D_f
+        position = np.zeros((len(t), 3, N_WINDOW + N_COMMON + 3 * len(R_ic) + 1))
+        position[:, :, 0:3], position[:, :, 3:6] = s * np.eye(3), 0.5 * s**2 * np.eye(3)
+        position[:, :, 6:9], position[:, :, 9:12], position[:, :, -1] = position[:, :, 3:6], -D_R, D_f
         for k in range(len(R_ic)):
-            A[camera == k, :, 12 + 3 * k : 15 + 3 * k] = R[camera == k]
-        direction = np.einsum("nij,njk,nk->ni", R, np.stack(R_ic)[camera], rays.direction[own])
-        return cls(A, direction, track, begins)
+            position[camera == k, :, 12 + 3 * k : 15 + 3 * k] = R[camera == k]
+        direction = np.einsum("nij,njk,nk->ni", R, np.stack(R_ic)[camera], rays.direction[rows])
+        return cls(position, direction, track, begins)
 
     def _by_track(self, x: np.ndarray) -> np.ndarray:
         """(t, ...) sums of x (n, ...) over the observations of each track."""
         return np.add.reduceat(x, self.begins, axis=0) if len(x) else x
 
-    def normal(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix and right-hand side of the unknowns x, points eliminated; weights by those found with x."""
+    def normal_equations(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix (m, m) and right-hand side (m,), points eliminated; weights at the solution `x` (m,) before."""
         Q = np.eye(3) - self.direction[:, :, None] * self.direction[:, None, :]
         if self.weight is not None:
             self.weight = self._reweighted(Q, self.weight, x)
         else:
             self.weight = np.ones(len(self.track))
-        full, m = self.full, self.full.shape[2]
-        along = np.einsum("ni,nia->na", self.direction, full)
-        QA = self.weight[:, None, None] * (full - self.direction[:, :, None] * along[:, None, :])
-        M, side = self._by_track(self.weight[:, None, None] * Q), self._by_track(QA)
+        position, m = self.position, self.position.shape[2]
+        along = np.einsum("ni,nia->na", self.direction, position)
+        QA = self.weight[:, None, None] * (position - self.direction[:, :, None] * along[:, None, :])
+        M, C = self._by_track(self.weight[:, None, None] * Q), self._by_track(QA)
         M += 1e-9 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        G = full.reshape(-1, m).T @ QA.reshape(-1, m) - side.reshape(-1, m).T @ np.linalg.solve(M, side).reshape(-1, m)
+        G = position.reshape(-1, m).T @ QA.reshape(-1, m) - C.reshape(-1, m).T @ np.linalg.solve(M, C).reshape(-1, m)
         G[range(len(x)), range(len(x))] += 1e-9 * np.trace(G) / len(x)
         return G[:-1, :-1], -G[:-1, -1]
 
     def _reweighted(self, Q: np.ndarray, weight: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """By the inverse square of each point's range, less where a ray misses its point."""
-        centre, wQ = self.full @ np.append(x, 1.0), weight[:, None, None] * Q
+        """(n,) [m^-2] weights by the range of each point at the solution `x` (m,), with Cauchy's loss.
+
+        Q: (n, 3, 3) projections perpendicular to the rays. The points are intersected with the present `weight`.
+        """
+        centre, wQ = self.position @ np.append(x, 1.0), weight[:, None, None] * Q
         M, b = self._by_track(wQ), self._by_track(np.einsum("nij,nj->ni", wQ, centre))
         M += 1e-9 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        away = np.linalg.solve(M, b[:, :, None])[self.track, :, 0] - centre
-        reach = np.maximum(np.linalg.norm(away, axis=1), 0.1)
-        miss = np.linalg.norm(np.einsum("nij,nj->ni", Q, away), axis=1) / reach
-        typical = float(np.median(miss))
-        alike = max(1.0, len(reach) / ALIKE)
-        sigma, scale = np.sqrt(alike) * max(RAY_SIGMA, typical), 3.0 * typical + 1e-12
-        return 1.0 / ((sigma * reach) ** 2 * (1.0 + (miss / scale) ** 2))
+        to_point = np.linalg.solve(M, b[:, :, None])[self.track, :, 0] - centre
+        range_m = np.maximum(np.linalg.norm(to_point, axis=1), MIN_RANGE_M)
+        error = np.linalg.norm(np.einsum("nij,nj->ni", Q, to_point), axis=1) / range_m
+        typical = float(np.median(error))
+        redundancy = max(1.0, len(range_m) / MAX_INDEPENDENT_RAYS)
+        sigma, scale = np.sqrt(redundancy) * max(WINDOW_RAY_SIGMA, typical), 3.0 * typical + 1e-12
+        return 1.0 / ((sigma * range_m) ** 2 * (1.0 + (error / scale) ** 2))
 
 
-def _level(gravity: np.ndarray) -> np.ndarray:
-    """R_world_start: the smallest turn that brings gravity down."""
+def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:
+    """R_world_start (3, 3): the smallest rotation that maps `gravity` (3,) to -z."""
     d = -gravity / np.linalg.norm(gravity)
     axis = np.cross(d, [0.0, 0.0, 1.0])
     K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])

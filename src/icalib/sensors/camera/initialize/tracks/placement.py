@@ -1,4 +1,4 @@
-"""Cameras that follow points, placed on a motion that other sensors have shown: see `track_mount`."""
+"""Calibration parameters of cameras with feature tracks, on a trajectory by other sensors."""
 
 from __future__ import annotations
 
@@ -35,75 +35,83 @@ from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 
 
 def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
-    """Of all cameras, which follow points, `state` having the motion: what the rig gives, or what their tracks show.
+    """Calibration parameters of all cameras: values of the rig file, else estimates from their tracks.
 
-    Raises EstimationError where neither does.
+    state: has the trajectory of the IMU. Raises EstimationError if neither determines a parameter.
     """
 
-    def values(number: int) -> dict[Key, np.ndarray]:
+    def values_of(number: int) -> dict[Key, np.ndarray]:
         camera, best = inputs.rig.cameras[number], fullest_recording(inputs, inputs.measurements.tracks[number].key)
         with naming_recording(inputs, best):
-            lens = _lens(inputs, number, best)
+            lens = _start_lens(inputs, number, best)
         known = stated_values(inputs, camera)
-        guessed = {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]}
-        return guessed | (_placed(inputs, state, number, lens) if len(known) < len(MOUNTED_NAMES) else {}) | known
+        values = {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]}
+        if len(known) < len(MOUNTED_NAMES):
+            values |= _estimated_values(inputs, state, number, lens)
+        return values | known
 
-    with ThreadPoolExecutor(N_THREADS) as pool:  # its own: what it does may use the solver's
-        return {k: v for own in pool.map(values, range(len(inputs.rig.cameras))) for k, v in own.items()}
+    with ThreadPoolExecutor(THREADS) as pool:  # not the solver's pool, whose threads the tasks may wait for
+        return {k: v for own in pool.map(values_of, range(len(inputs.rig.cameras))) for k, v in own.items()}
 
 
-def _lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
-    """(P,) where a lens is sought from."""
+def _start_lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
+    """(P,) start values of the intrinsics and distortion of camera `number`, by one recording."""
     own = single_recording(inputs, recording)
     assert own.imu is not None
     return start_intrinsics(inputs.rig.cameras[number], own.measurements.tracks[number], own.imu, own.measurements)
 
 
-def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
-    """Where a camera stands, and its lens, sought from `lens` (P,). Of several recordings the one in which it saw most
-    says so."""
+def _estimated_values(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
+    """Extrinsics, time offset, intrinsics and distortion of camera `number`, with start values `lens` (P,).
+
+    The recording with most observations determines them. A clock that restarts has one offset for each recording.
+    """
     camera, best = inputs.rig.cameras[number], fullest_recording(inputs, inputs.measurements.tracks[number].key)
-    mount_in = partial(_mount_in, inputs, state, number, lens)
+    estimate_in = partial(_estimate_in, inputs, state, number, lens)
     with naming_recording(inputs, best):
-        found, lens = mount_in(best)
+        found, lens = estimate_in(best)
     if camera.clock_restarts:
-        offset = offset_of_each_clock(inputs, camera.name, lambda k: mount_in(k, found)[0].offset, {best: found.offset})
+        offset = offset_of_each_clock(
+            inputs, camera.name, lambda k: estimate_in(k, found)[0].offset, {best: found.offset}
+        )
     else:
         offset = np.array([converted_offset(found.offset, camera.name, single_recording(inputs, best), inputs)])
     values = mounted(found.rotation, found.position, offset) | {"intrinsics": lens[:4], "distortion": lens[4:]}
     return {(camera.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 
-def _mount_in(
-    inputs: Inputs, state: State, number: int, lens: np.ndarray, recording: int, placed: CameraExtrinsics | None = None
+def _estimate_in(
+    inputs: Inputs, state: State, number: int, lens: np.ndarray, recording: int, known: CameraExtrinsics | None = None
 ) -> tuple[CameraExtrinsics, np.ndarray]:
-    """Mount and lens, as one recording shows them; `placed`: how the camera stands, where another has shown it."""
+    """Extrinsics and intrinsics (P,) of camera `number` by one recording; known: extrinsics that are kept."""
     own, camera = single_recording(inputs, recording), inputs.rig.cameras[number]
     assert own.imu is not None
     stream, model = own.measurements.tracks[number], camera_model(camera.model)
-    known = {name: value for (_, name), value in stated_values(own, camera).items()}
-    if placed is not None:
-        known |= {"rotation": placed.rotation, "translation": placed.position}
-    offsets = [float(known["time_offset"][0])] if "time_offset" in known else None
+    fixed = {name: value for (_, name), value in stated_values(own, camera).items()}
+    if known is not None:
+        fixed |= {"rotation": known.rotation, "translation": known.position}
+    offsets = [float(fixed["time_offset"][0])] if "time_offset" in fixed else None
     same_clock = relative_offset(np.zeros(1), own.measurements.cameras[number], own.measurements)
-    followed = ImagePairs.of(stream, model, lens, _open(camera, lens))
-    bent = np.zeros(len(followed.bends))
+    pairs = ImagePairs.of(stream, model, lens, _free_directions(camera, lens))
+    lens_step = np.zeros(len(pairs.lens_directions))
+    rates = matching_track_rates(own.imu, stream, model, lens)
     starts = [
-        CameraExtrinsics(known.get("rotation", a.rotation), known.get("translation", np.zeros(3)), a.offset, bent)
-        for a in rough_alignments(
-            own.imu, camera.name, matching_track_rates(own.imu, stream, model, lens), offsets, same_clock
-        )
+        CameraExtrinsics(fixed.get("rotation", a.rotation), fixed.get("translation", np.zeros(3)), a.offset, lens_step)
+        for a in rough_alignments(own.imu, camera.name, rates, offsets, same_clock)
     ]
     motion = motion_of(own, state_of_recording(inputs, recording, state))
-    held = np.repeat([name in known for name in MOUNTED_NAMES], [3, 3, 1])
-    axis = None if "rotation" in known else main_axis(own.imu.gyro)
-    found = extrinsics_on_motion(followed, motion, starts, axis, held)
-    return found, followed.lens_of(found)
+    is_fixed = np.repeat([name in fixed for name in MOUNTED_NAMES], [3, 3, 1])
+    axis = None if "rotation" in fixed else main_axis(own.imu.gyro)
+    found = extrinsics_on_motion(pairs, motion, starts, axis, is_fixed)
+    return found, pairs.lens_of(found)
 
 
-def _open(camera: Camera, lens: np.ndarray) -> np.ndarray:
-    """(L, P) directions in which the lens is sought: longer, unless the rig file is sure of it, and another first
-    coefficient of distortion, which bends most, where the rig file has none."""
+def _free_directions(camera: Camera, lens: np.ndarray) -> np.ndarray:
+    """(L, P) free directions of the intrinsics and distortion `lens` (P,).
+
+    These are a common scale of fx and fy, unless the rig file fixes them or states a prior, and the first coefficient
+    of distortion, which has the largest effect, if the rig file has none.
+    """
     rows = np.zeros((2, len(lens)))
     rows[0, :2], rows[1, 4] = lens[:2], 1.0
     return rows[[known_value(camera.intrinsics) is None, camera.distortion.value is None]]

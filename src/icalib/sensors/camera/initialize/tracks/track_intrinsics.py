@@ -1,15 +1,16 @@
-"""The lens of a camera that follows points, from nothing: by the turns that a gyroscope felt.
+"""Intrinsics and distortion of a camera from its feature tracks and a gyroscope, without an initial guess.
 
-Where the focal length is taken to be s times too long, rates from tracks are s times too small about the axes of the
-image plane, and right about the optical axis:
+If the assumed focal length is s times too long, rates from tracks are s times too small about the axes of the image
+plane, and right about the optical axis:
 
-    w_imu = R_imu_cam diag(s, s, 1) w_cam + b
+    w_imu = R_imu_cam diag(s, s, 1) w_cam + b.
 
-The shift of the clocks is where the gyroscope's rates regress best on the camera's, whatever the matrix between them
-(see `rate_shifts`); s then gives the focal length. From there Gauss-Newton finds all together: rotation, time offset,
-bias of the gyroscope, focal length, principal point and distortion, from the epipolar geometry of the points that two
-images share, given the gyroscope's turn between both (see `track_alignment`). The lens is sought as one whose radius
-is a polynomial of the angle, which is near every lens, and then written in the model of the rig file.
+1. The time offset is where the gyroscope's rates regress best on the camera's, whatever the matrix between them
+   (`rate_regression`). Then s gives the focal length.
+2. Gauss-Newton refines rotation, time offset, gyroscope bias, focal length, principal point and distortion together,
+   from the epipolar geometry of pairs of images, given the gyroscope's rotation in between (`joint_alignment`). The
+   distortion is that of `FREE_MODEL` here.
+3. The result is fitted by the camera model of the rig file.
 """
 
 from __future__ import annotations
@@ -33,34 +34,36 @@ from icalib.initialize.steps.rate_correlation import SensorRates
 from icalib.initialize.steps.rate_regression import best_regressions, matching_track_rates
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
-from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import ImagePairs, lens_slopes
-from icalib.sensors.camera.initialize.tracks.joint_alignment import gyro_turns
+from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import ImagePairs, ray_derivatives
+from icalib.sensors.camera.initialize.tracks.joint_alignment import gyro_rotations
 
-ANY_LENS = "pinhole-equidistant"  # its start, r = f theta, is near every lens, wide and narrow
-STARTS = (1.0, 0.35)  # of the image width: near a usual lens, and a fisheye one
-SCALES = np.geomspace(0.1, 10.0, 100)  # 5 % apart
-SCALED_ROUNDS, SCALED_ENOUGH = 4, 0.05
-BENDS_FROM = 3.0  # medians, of what rates differ by, from where on they count less
-ANY_BENDS = 2  # of its coefficients
-# Of what is known beforehand, one standard deviation in units of `Followed.bends`, 0.03 rad RMS over the rays: hardly
-# anything of focal length and distortion; pixels are square to 1 %, the principal point is near the middle.
-PRIOR, BENT = np.array([10.0, 0.1, 1.0, 1.0]), 3.0
-ALIKE = 300.0  # of how many rays the errors are alike: those of one point in many pairs, and what the lens leaves
-ROUNDS = 15
-MOST_TURN, MOST_SHIFT_S, MOST_BENT = 0.3, 0.05, 3.0  # of a round
-ENOUGH = 0.1  # standard deviations, of a round
-LARGEST_SIGMA = 0.1  # of the logarithm of the focal length: from further off the solver may not find back
-LARGEST_UNEXPLAINED = 0.35  # of the angular rate
-FEWEST_SEEN = 4  # times the parameters of a model, of rays that show them
-MOST_FITTED = 400  # rays
-ALSO_NEAR_PX = 0.5  # RMS, by which a lens of two coefficients may miss another
-UNSEEN = 5.0  # of the cost: a ray outside the range of the model, or lenses would learn to look away
+FREE_MODEL = "pinhole-equidistant"  # r = f theta plus a polynomial; its start is near every lens, narrow and wide
+START_FOCAL_WIDTHS = (1.0, 0.35)  # image widths: near a usual lens, and near a fisheye lens
+FOCAL_SCALES = np.geomspace(0.1, 10.0, 100)  # of a start focal length, 5 % apart
+MAX_SCALE_ROUNDS, SCALE_TOLERANCE = 4, 0.05  # rates depend on the focal length, so that the scale is found repeatedly
+RATE_CAUCHY_MEDIANS = 3.0  # medians of the rate error, the scale of Cauchy's weights
+N_FREE_DISTORTION = 2  # coefficients of `FREE_MODEL` that are estimated; higher ones matter at the image border only
+# Standard deviations of the priors, in steps of `ImagePairs.lens_directions` (0.03 rad RMS over the rays): the focal
+# length is nearly free, pixels are square to 1 %, the principal point is near the middle; then each coefficient.
+LENS_PRIOR_SIGMAS, DISTORTION_PRIOR_SIGMA = np.array([10.0, 0.1, 1.0, 1.0]), 3.0
+CORRELATED_TRACK_RAYS = 300.0  # rays with the same error: one point is in many pairs, and wrong intrinsics bend many
+MAX_REFINEMENT_STEPS = 15
+MAX_ROTATION_STEP, MAX_OFFSET_STEP_S, MAX_LENS_STEP = 0.3, 0.05, 3.0  # rad, s, steps of `lens_directions`
+REFINEMENT_TOLERANCE = 0.1  # standard deviations; with a smaller step the refinement has converged
+MAX_LOG_FOCAL_SIGMA = 0.1  # of log(focal length); the estimator may not converge from a start further off
+MAX_UNEXPLAINED_TRACK_RATE = 0.35  # share of the angular rate
+MIN_RAYS_PER_PARAMETER = 4  # of a model that is fitted to rays
+MAX_FITTED_RAYS = 400  # rays to which a model is fitted, spread over the tracks
+EQUAL_FIT_PX = 0.5  # px RMS by which a fit may be worse than the best one and is still compared by the tracks
+INVISIBLE_RAY_COST = 5.0  # of a ray that the model cannot unproject; else lenses that see less would fit best
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """lens (P,), how the camera is aligned with the IMU, the standard deviation of the logarithm of the focal length,
-    and the cost."""
+    """lens: (P,) intrinsics and distortion; aligned: rotation, time offset and gyroscope bias.
+
+    sigma: standard deviation of the logarithm of the focal length; cost: negative log-likelihood.
+    """
 
     lens: np.ndarray
     aligned: RateAlignment
@@ -69,36 +72,37 @@ class _Fit:
 
 
 def find_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, offset: float | None) -> np.ndarray:
-    """(P,) intrinsics and distortion; the distortion of the rig file, where it has one. offset: t_imu - t_camera, both
-    since their clock's first stamp [s], where it is known.
+    """(P,) intrinsics and distortion; a distortion in the rig file is kept.
 
-    Raises EstimationError, one sentence, where the tracks or the motion do not show the lens.
+    offset: t_imu - t_camera [s], each clock counted from its first stamp, if it is known.
+    Raises EstimationError if the tracks and the motion do not determine the intrinsics.
     """
-    given = camera.distortion.value
-    model = camera_model(ANY_LENS if given is None else camera.model)
-    distortion = model.start_distortions[0] if given is None else given
+    stated = camera.distortion.value
+    model = camera_model(FREE_MODEL if stated is None else camera.model)
+    distortion = model.start_distortions[0] if stated is None else stated
     rough = _rough(stream, imu, model, _starts(camera, distortion, model), offset)
-    found = _refined(stream, imu, model, rough, offset is not None, ANY_BENDS if given is None else 0)
-    if not found.sigma < LARGEST_SIGMA:
+    found = _refined(stream, imu, model, rough, offset is not None, N_FREE_DISTORTION if stated is None else 0)
+    if not found.sigma < MAX_LOG_FOCAL_SIGMA:
         raise EstimationError(
             f"{camera.name}: the rotation in the recording does not determine the focal length; turn the rig "
             "about axes perpendicular to the optical axis, or give intrinsics: [fx, fy, cx, cy] in the rig "
             "file."
         )
-    return found.lens if given is not None else _in_model(camera, stream, imu, model, found, offset is not None)
+    return found.lens if stated is not None else _in_model(camera, stream, imu, model, found, offset is not None)
 
 
 def _starts(camera: Camera, distortion: np.ndarray | tuple[float, ...], model: CameraModel) -> list[np.ndarray]:
+    """Start values (P,) with each of `START_FOCAL_WIDTHS`, the principal point in the middle."""
     width, height = camera.resolution
     lens = np.array([1.0, 1.0, 0.5 * (width - 1), 0.5 * (height - 1), *distortion])
-    long = [share * width / model.central_scale(lens) for share in STARTS]
-    return [np.array([f, f, *lens[2:]]) for f in long]
+    focal = [share * width / model.central_scale(lens) for share in START_FOCAL_WIDTHS]
+    return [np.array([f, f, *lens[2:]]) for f in focal]
 
 
 def _rough(
     stream: TrackStream, imu: ImuData, model: CameraModel, starts: list[np.ndarray], offset: float | None
 ) -> _Fit:
-    """The focal length by the regression of rates. Raises EstimationError where they do not match."""
+    """Focal length, rotation, time offset and bias by regression of the rates. Raises EstimationError if none fit."""
     rates, best = [matching_track_rates(imu, stream, model, starts[0])], 0
     step = float(np.median(rates[0].end - rates[0].start))
     rates += [track_rates(stream, model, lens, step, thinned=True) for lens in starts[1:]]
@@ -108,15 +112,15 @@ def _rough(
             raise no_overlap(imu, stream.name)
         shift, best = max(shifts, key=lambda found: found[0].score)
         offset = shift.offset
-    lens, own = starts[best], rates[best]
-    aligned, scale, unexplained = _scaled(imu, own, offset, stream.name)
-    for _ in range(SCALED_ROUNDS):
+    lens, camera_rates = starts[best], rates[best]
+    aligned, scale, unexplained = _scaled(imu, camera_rates, offset, stream.name)
+    for _ in range(MAX_SCALE_ROUNDS):
         lens = np.concatenate([lens[:2] / scale, lens[2:]])
-        if abs(np.log(scale)) < SCALED_ENOUGH:
+        if abs(np.log(scale)) < SCALE_TOLERANCE:
             break
-        own = track_rates(stream, model, lens, step, thinned=True)
-        aligned, scale, unexplained = _scaled(imu, own, offset, stream.name)
-    if unexplained > LARGEST_UNEXPLAINED:
+        camera_rates = track_rates(stream, model, lens, step, thinned=True)
+        aligned, scale, unexplained = _scaled(imu, camera_rates, offset, stream.name)
+    if unexplained > MAX_UNEXPLAINED_TRACK_RATE:
         raise EstimationError(
             f"the motion of {stream.name} does not match that of {imu.name} at any time offset and focal "
             f"length ({unexplained:.0%} of the angular rate is unexplained). Check that both come from the "
@@ -126,102 +130,123 @@ def _rough(
 
 
 def _scaled(imu: ImuData, rates: SensorRates, offset: float, name: str) -> tuple[RateAlignment, float, float]:
-    """How camera and IMU go together, how many times as fast the camera turns about the axes of its image plane as it
-    says, and what share of the rate is unexplained then."""
+    """Alignment of the rates, scale s of the camera's rates about the axes of its image plane, and unexplained share.
+
+    offset: [s] between first stamps. The share is the median error over the median rate about its median.
+    """
     inside = covered(imu, rates, offset)
     if not inside.any():
         raise no_overlap(imu, name)
     gyro = MeanRates.of(imu).over(rates.start[inside] + offset, rates.end[inside] + offset)
-    found = [(*_turned(gyro, rates.rate[inside] * [scale, scale, 1.0]), float(scale)) for scale in SCALES]
-    left, R, bias, scale = min(found, key=lambda x: x[0])
+    found = [
+        (*_robust_rotation(gyro, rates.rate[inside] * [scale, scale, 1.0]), float(scale)) for scale in FOCAL_SCALES
+    ]
+    error, R, bias, scale = min(found, key=lambda x: x[0])
     spread = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1)))
-    return RateAlignment(offset, R, bias), scale, left / max(spread, 1e-9)
+    return RateAlignment(offset, R, bias), scale, error / max(spread, 1e-9)
 
 
-def _turned(gyro: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """How far rates gyro = R seen + b (n, 3) are apart, by the median [rad/s], and R and b, robustly."""
-    R, bias = kabsch(gyro, seen, np.ones(len(gyro)))
+def _robust_rotation(gyro: np.ndarray, rates: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Median error [rad/s], R (3, 3) and b (3,) of gyro = R rates + b (n, 3), by reweighted least squares."""
+    R, bias = kabsch(gyro, rates, np.ones(len(gyro)))
     for _ in range(2):
-        left = np.linalg.norm(gyro - seen @ R.T - bias, axis=1)
-        R, bias = kabsch(gyro, seen, 1.0 / (1.0 + (left / (BENDS_FROM * np.median(left) + 1e-12)) ** 2))
-    return float(np.median(np.linalg.norm(gyro - seen @ R.T - bias, axis=1))), R, bias
+        error = np.linalg.norm(gyro - rates @ R.T - bias, axis=1)
+        weight = 1.0 / (1.0 + (error / (RATE_CAUCHY_MEDIANS * np.median(error) + 1e-12)) ** 2)
+        R, bias = kabsch(gyro, rates, weight)
+    return float(np.median(np.linalg.norm(gyro - rates @ R.T - bias, axis=1))), R, bias
 
 
-def _refined(stream: TrackStream, imu: ImuData, model: CameraModel, rough: _Fit, keep_offset: bool, bends: int) -> _Fit:
-    """All together by Gauss-Newton, with the first `bends` coefficients of the distortion."""
-    aligned, n = rough.aligned, 4 + bends
-    followed = ImagePairs.of(stream, model, rough.lens, _directions(rough.lens, bends))
-    bent, sigma, cost = np.zeros(n), np.ones(7 + n), np.inf
-    known = np.concatenate([np.zeros(7), PRIOR, np.full(bends, BENT)])
-    known[7:] **= -2.0
-    known[3] = 1e12 if keep_offset else 0.0
-    for _ in range(ROUNDS):
-        N, r, cost = _normal(followed, imu, bent, aligned)
-        N += np.diag(known + 1e-9 * N.diagonal())
-        x = np.linalg.solve(N, r - known * np.append(np.zeros(7), bent))
+def _refined(
+    stream: TrackStream, imu: ImuData, model: CameraModel, rough: _Fit, keep_offset: bool, n_distortion: int
+) -> _Fit:
+    """All unknowns together by Gauss-Newton, with the first `n_distortion` coefficients of the distortion."""
+    aligned, n = rough.aligned, 4 + n_distortion
+    pairs = ImagePairs.of(stream, model, rough.lens, _free_directions(rough.lens, n_distortion))
+    lens_step, sigma, cost = np.zeros(n), np.ones(7 + n), np.inf
+    prior = np.concatenate([np.zeros(7), LENS_PRIOR_SIGMAS, np.full(n_distortion, DISTORTION_PRIOR_SIGMA)])
+    prior[7:] **= -2.0
+    prior[3] = 1e12 if keep_offset else 0.0
+    for _ in range(MAX_REFINEMENT_STEPS):
+        N, r, cost = _normal_equations(pairs, imu, lens_step, aligned)
+        N += np.diag(prior + 1e-9 * N.diagonal())
+        x = np.linalg.solve(N, r - prior * np.append(np.zeros(7), lens_step))
         sigma = np.sqrt(np.diag(np.linalg.inv(N)))
-        most = (np.linalg.norm(x[:3]) / MOST_TURN, abs(x[3]) / MOST_SHIFT_S, np.abs(x[7:]).max() / MOST_BENT)
-        x /= max(1.0, *most)
+        x /= max(1.0, _step_length(x))
         R, bias = aligned.rotation @ so3.exp(x[:3].copy()), aligned.gyro_bias + x[4:7]
-        aligned, bent = replace(aligned, offset=aligned.offset + x[3], rotation=R, gyro_bias=bias), bent + x[7:]
-        if np.abs(x / sigma).max() < ENOUGH:
+        aligned = replace(aligned, offset=aligned.offset + x[3], rotation=R, gyro_bias=bias)
+        lens_step = lens_step + x[7:]
+        if np.abs(x / sigma).max() < REFINEMENT_TOLERANCE:
             break
-    longer = float(followed.bends[0, 0] / rough.lens[0])
-    return _Fit(rough.lens + bent @ followed.bends, aligned, longer * float(sigma[7]), cost)
+    log_focal = float(pairs.lens_directions[0, 0] / rough.lens[0])  # for one step along the first direction
+    return _Fit(rough.lens + lens_step @ pairs.lens_directions, aligned, log_focal * float(sigma[7]), cost)
 
 
-def _directions(lens: np.ndarray, bends: int) -> np.ndarray:
-    """(4 + bends, P) in which a lens is sought: longer, longer down than across, principal point, distortion."""
-    out = np.zeros((4 + bends, len(lens)))
+def _step_length(x: np.ndarray) -> float:
+    """The largest ratio of a part of the step x (7 + L,) to its limit."""
+    rotation, offset, lens = np.linalg.norm(x[:3]), abs(x[3]), np.abs(x[7:]).max()
+    return max(rotation / MAX_ROTATION_STEP, offset / MAX_OFFSET_STEP_S, lens / MAX_LENS_STEP)
+
+
+def _free_directions(lens: np.ndarray, n_distortion: int) -> np.ndarray:
+    """(4 + n_distortion, P) directions in which `lens` (P,) is adjusted.
+
+    Scale of fx and fy, fy alone, principal point (2), then the first coefficients of the distortion.
+    """
+    out = np.zeros((4 + n_distortion, len(lens)))
     out[0, :2], out[1, 1], out[2, 2], out[3, 3] = lens[:2], lens[1], lens[0], lens[1]
-    out[range(4, 4 + bends), range(4, 4 + bends)] = 1.0
+    out[range(4, 4 + n_distortion), range(4, 4 + n_distortion)] = 1.0
     return out
 
 
-def _normal(
-    followed: ImagePairs, imu: ImuData, bent: np.ndarray, aligned: RateAlignment
+def _normal_equations(
+    pairs: ImagePairs, imu: ImuData, lens_step: np.ndarray, aligned: RateAlignment
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Normal matrix and right-hand side of rotation, time offset, bias of the gyroscope, and the lens (7 + L,); and
-    minus the logarithm of the likelihood, where the noise of each pair of images is not known."""
-    own, D, swept, turned = gyro_turns(
-        GyroRotation.integrate(imu, aligned.gyro_bias), *(followed.times + aligned.offset).T
-    )
-    seen = followed.some(np.isin(np.arange(len(followed.times)), own))
-    lens = seen.lens + bent @ seen.bends
-    rays, valid = seen.model.unproject(lens, seen.uv)
+    """Normal matrix (7 + L, 7 + L), right-hand side (7 + L,), and the negative log-likelihood.
+
+    Unknowns: rotation (3), time offset, gyroscope bias (3), steps of the intrinsics (L). The noise of each pair of
+    images is unknown, so that the likelihood is the product of powers of their sums of squares.
+    """
+    rotations = gyro_rotations(GyroRotation.integrate(imu, aligned.gyro_bias), *(pairs.times + aligned.offset).T)
+    pairs = pairs.select(np.isin(np.arange(len(pairs.times)), rotations.covered))
+    lens = pairs.lens + lens_step @ pairs.lens_directions
+    rays, valid = pairs.model.unproject(lens, pairs.uv)
     rays = np.where(valid[:, None], rays, 0.0)
-    by = np.where(valid[:, None], lens_slopes(seen.model, lens, seen.bends, rays), 0.0).transpose(1, 0, 2)
-    p, q = seen.shared.T
-    m, n, R_ci = len(own), len(bent), aligned.rotation.T
-    R = np.ascontiguousarray(R_ci @ D @ aligned.rotation)
-    H, g, left = np.empty((m, 3 + n, 3 + n)), np.empty((m, 3 + n)), np.empty(m)
-    rotation_information_of_pairs(rays[p], rays[q], by[p], by[q], seen.begin, R, H, g, left)
+    J_rays = ray_derivatives(pairs.model, lens, pairs.lens_directions, rays)
+    J_rays = np.where(valid[:, None], J_rays, 0.0).transpose(1, 0, 2)
+    p, q = pairs.shared.T
+    m, n, R_ci = len(rotations.covered), len(lens_step), aligned.rotation.T
+    R = np.ascontiguousarray(R_ci @ rotations.R @ aligned.rotation)
+    H, g, squares = np.empty((m, 3 + n, 3 + n)), np.empty((m, 3 + n)), np.empty(m)
+    rotation_information_of_pairs(rays[p], rays[q], J_rays[p], J_rays[q], pairs.begin, R, H, g, squares)
     J = np.zeros((m, 3 + n, 7 + n))
-    J[:, :3, :3], J[:, :3, 3], J[:, :3, 4:7] = R - np.eye(3), swept @ aligned.rotation, R_ci @ turned
-    J[:, 3:, 7:] = np.eye(n)
-    count = np.diff(seen.begin)
-    weight = 1.0 / (ALIKE * np.median(left / count) + 1e-18)
+    J[:, :3, :3], J[:, :3, 3] = R - np.eye(3), rotations.J_offset @ aligned.rotation
+    J[:, :3, 4:7], J[:, 3:, 7:] = R_ci @ rotations.J_bias, np.eye(n)
+    count = np.diff(pairs.begin)
+    weight = 1.0 / (CORRELATED_TRACK_RAYS * np.median(squares / count) + 1e-18)
     flat = J.reshape(-1, 7 + n)
-    cost = float(0.5 * (count * np.log(left / count + 1e-18)).sum() + UNSEEN * (~valid[p] | ~valid[q]).sum())
-    return weight * flat.T @ (H @ J).reshape(-1, 7 + n), weight * flat.T @ g.ravel(), cost
+    cost = 0.5 * (count * np.log(squares / count + 1e-18)).sum() + INVISIBLE_RAY_COST * (~valid[p] | ~valid[q]).sum()
+    return weight * flat.T @ (H @ J).reshape(-1, 7 + n), weight * flat.T @ g.ravel(), float(cost)
 
 
 def _in_model(
     camera: Camera, stream: TrackStream, imu: ImuData, model: CameraModel, fit: _Fit, keep_offset: bool
 ) -> np.ndarray:
-    """(P,) of the camera's model: nearest to the lens where points were seen. Where several are as near, as in models
-    of two shape parameters, that which the tracks fit best from there."""
+    """(P,) intrinsics and distortion of the camera's model, fitted to the rays of `fit` where points were seen.
+
+    Models with two shape parameters may have several fits of about the same error. Of these the one that explains the
+    tracks best after a refinement is taken. Raises EstimationError if the model fits no such rays.
+    """
     wanted = camera_model(camera.model)
-    uv = stream.uv[:: max(1, len(stream.uv) // MOST_FITTED)]
+    uv = stream.uv[:: max(1, len(stream.uv) // MAX_FITTED_RAYS)]
     rays, valid = model.unproject(fit.lens, uv)
     rays, uv, found = rays[valid], uv[valid], []
     for distortion in wanted.start_distortions:
         start = np.array([*fit.lens[:4], *distortion])
         start[:2] *= model.central_scale(fit.lens) / wanted.central_scale(start)
-        seen = wanted.project(start, rays)[1]
-        if seen.sum() > FEWEST_SEEN * len(start):
+        visible = wanted.project(start, rays)[1]
+        if visible.sum() > MIN_RAYS_PER_PARAMETER * len(start):
             with suppress(np.linalg.LinAlgError):
-                params = fit_rays(wanted, start, rays[seen], uv[seen], 1e-3)
+                params = fit_rays(wanted, start, rays[visible], uv[visible], 1e-3)
                 if not any(np.allclose(params, other, rtol=2e-2, atol=1e-2) for other in found):
                     found.append(params)
     if not found:
@@ -229,16 +254,16 @@ def _in_model(
             f"{camera.name}: its lens is too wide for {camera.model}; choose a fisheye model, or give intrinsics in "
             "the rig file."
         )
-    missed = [_missed(wanted, params, rays, uv) for params in found]
-    near = [params for params, px in zip(found, missed, strict=True) if px < ALSO_NEAR_PX + min(missed)]
-    if len(near) == 1:
-        return near[0]
-    bends = len(near[0]) - 4
-    fits = [_refined(stream, imu, wanted, replace(fit, lens=params), keep_offset, bends) for params in near]
+    errors = [_fit_error(wanted, params, rays, uv) for params in found]
+    good = [params for params, error in zip(found, errors, strict=True) if error < EQUAL_FIT_PX + min(errors)]
+    if len(good) == 1:
+        return good[0]
+    n_distortion = len(good[0]) - 4
+    fits = [_refined(stream, imu, wanted, replace(fit, lens=params), keep_offset, n_distortion) for params in good]
     return min(fits, key=lambda one: one.cost).lens
 
 
-def _missed(model: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray) -> float:
-    """RMS [px]; a ray that the model cannot see misses by as much as the image's size."""
-    found, valid = model.project(params, rays)
-    return float(np.sqrt(np.mean(np.where(valid, ((found - uv) ** 2).sum(axis=1), np.ptp(uv) ** 2))))
+def _fit_error(model: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray) -> float:
+    """RMS distance [px] of projected rays from uv (n, 2); a ray that cannot be projected counts as one image size."""
+    projected, valid = model.project(params, rays)
+    return float(np.sqrt(np.mean(np.where(valid, ((projected - uv) ** 2).sum(axis=1), np.ptp(uv) ** 2))))
