@@ -47,7 +47,7 @@ def scene_error_ratios(rig: Rig, scene: TargetScene, recordings: Sequence[Measur
     The largest is the reference, because a scene from few similar images fits these too well if the lens is wrong.
     """
     common, single = np.array([_median_errors(rig, scene, r) for r in recordings]).T
-    return common / max(float(single.max()), SMALLEST_BASE_PX)
+    return common / max(float(single.max()), MIN_CORNER_NOISE_PX)
 
 
 def _median_errors(rig: Rig, scene: TargetScene, recording: Measurements) -> tuple[float, float]:

@@ -192,7 +192,7 @@ class _PairResiduals:
     J_h: np.ndarray
 
     @classmethod
-    def of(cls, pairs: ImagePairs, motion: Motion, at: CameraExtrinsics) -> _PairResiduals:
+    def of(cls, pairs: ImagePairs, motion: EstimatedMotion, at: CameraExtrinsics) -> _PairResiduals:
         """The residuals of all pairs within the known `motion`."""
         t = pairs.times + at.offset
         pairs = pairs.select(is_known(motion.state.seconds, t[:, 0]) & is_known(motion.state.seconds, t[:, 1]))
@@ -271,7 +271,11 @@ def _after(poses: Poses, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def extrinsics_on_motion(
-    pairs: ImagePairs, motion: Motion, starts: Sequence[CameraExtrinsics], axis: np.ndarray | None, fixed: np.ndarray
+    pairs: ImagePairs,
+    motion: EstimatedMotion,
+    starts: Sequence[CameraExtrinsics],
+    axis: np.ndarray | None,
+    fixed: np.ndarray,
 ) -> CameraExtrinsics:
     """The extrinsics of the camera that fit its `pairs` of images best, given the `motion` of the IMU.
 
@@ -300,7 +304,7 @@ def extrinsics_on_motion(
     return camera
 
 
-def _share_in_common(pairs: ImagePairs, motion: Motion) -> float:
+def _share_in_common(pairs: ImagePairs, motion: EstimatedMotion) -> float:
     """The largest share of the pairs of images that can lie within the known motion, at any time offset."""
     span, known = np.ptp(pairs.times), np.ptp(motion.state.seconds)
     return min(1.0, float(known / span)) if span > 0.0 else 1.0

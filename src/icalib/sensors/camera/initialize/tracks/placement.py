@@ -50,7 +50,7 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             values |= _estimated_values(inputs, state, number, lens)
         return values | known
 
-    with ThreadPoolExecutor(THREADS) as pool:  # not the solver's pool, whose threads the tasks may wait for
+    with ThreadPoolExecutor(N_THREADS) as pool:  # not the solver's pool, whose threads the tasks may wait for
         return {k: v for own in pool.map(values_of, range(len(inputs.rig.cameras))) for k, v in own.items()}
 
 
