@@ -25,14 +25,14 @@ IDENTITY = np.eye(3)
 def rotation_of_positions(rows: LeverArmRows, R_world_frame: np.ndarray = IDENTITY) -> np.ndarray | None:
     """Estimated rotation C (3, 3) from the frame of positions to that of rotations; None if it is the identity, not a
     rotation, or rows are few. R_world_frame (3, 3): rotation from the frame of rotations to the axes of the rows."""
-    from_imu, n = rows.seen - rows.b, len(rows.b)
+    from_imu, n = rows.motion - rows.b, len(rows.b)
     X = np.concatenate([from_imu, rows.A[:, :, 3:6].reshape(n, 9), rows.A[:, 0, 6:7]], axis=1)
     if n < MIN_FRAME_ROWS:
         return None
     weight, M = np.ones(n), np.eye(3)
     for _ in range(3):
-        x = np.linalg.lstsq(X * weight[:, None], rows.seen * weight[:, None], rcond=None)[0]
-        size = np.linalg.norm(rows.seen - X @ x, axis=1)
+        x = np.linalg.lstsq(X * weight[:, None], rows.motion * weight[:, None], rcond=None)[0]
+        size = np.linalg.norm(rows.motion - X @ x, axis=1)
         weight, M = (size < 4.0 * np.median(size) + 1e-9).astype(float), x[:3].T
     U, singular, Vt = np.linalg.svd(M)
     if singular[2] < MIN_SINGULAR_RATIO * singular[0] or np.linalg.det(U @ Vt) < 0.0:
