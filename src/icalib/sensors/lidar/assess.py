@@ -26,7 +26,7 @@ from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
 
 MAX_KEPT_POINTS = 200_000  # of all LiDARs together, in a result: some 10 MB
-MIN_PLANE_POINTS = 4  # a plane has 3 unknowns; fewer points leave no residual
+MIN_FITTED_POINTS = 4  # a plane has 3 unknowns; fewer points leave no residual
 MIN_SHARE_ON_PLANES = 0.2  # of the points; fewer lie on planes only if the scene is not flat, or points are misplaced
 PERIOD_TOLERANCE = 0.15  # of the scan period: a time offset so near a period means stamps at the other end of a scan
 # Relative error of the times of points within a scan: 0.0015 if they are right, 0.06 and more if they are half or
@@ -96,7 +96,7 @@ def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarr
     out = values.copy()
     for k in range(len(values)):
         own = np.concatenate([points[plane == k] for points, plane in clouds]).astype(np.float64)
-        if len(own) >= MIN_PLANE_POINTS:
+        if len(own) >= MIN_FITTED_POINTS:
             centre = own.mean(axis=0)
             normal = np.linalg.eigh(np.cov(own.T))[1][:, 0]
             out[k] = plane_of(np.copysign(1.0, normal @ values[k, :3]) * normal, centre)
@@ -190,7 +190,7 @@ def _time_stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, f
     state = found.outcome.state
     motion, values = motion_of(inputs, state), np.array([state.values[key] for key in inputs.clouds.keys])
     stream, plane = _thinned(inputs, index, state)
-    if len(plane) < MIN_PLANE_POINTS:
+    if len(plane) < MIN_FITTED_POINTS:
         return 0.0, np.inf
     later, earlier = (
         _on_planes(*in_world(motion, replace(stream, offset_s=stream.offset_s + step)), values[plane])[0].astype(float)

@@ -40,7 +40,7 @@ from icalib.sensors.lidar.moments import (
 
 BIN_S = 3e-3  # time of a bin: its points share the pose perturbation of its centre
 COARSE_BIN_S = 11e-3  # time of a bin in early passes: fewer bins while the state is still rough
-STEP_S = 1e-3  # time of a step within a longer bin: constant twist is wrong by 1e-6 m at 5 m/s^2
+BIN_STEP_S = 1e-3  # time of a step within a longer bin: constant twist is wrong by 1e-6 m at 5 m/s^2
 MAX_OUTLINE_POINTS = 500_000  # points of a LiDAR that show where planes end; more cost memory and show no more
 POINTS_PER_CHUNK = 150_000  # of a thread at a time: their entries need 20 MB at most
 
@@ -164,7 +164,7 @@ def _empty_entries(n: int) -> tuple[np.ndarray, ...]:
 
 def steps_of(bin_s: float) -> int:
     """Number of steps of a bin of bin_s seconds. It is odd, so that the middle of a step is the centre of the bin."""
-    return max(2 * (int(bin_s / STEP_S + 0.5) // 2) + 1, 1) if bin_s > STEP_S else 1
+    return max(2 * (int(bin_s / BIN_STEP_S + 0.5) // 2) + 1, 1) if bin_s > BIN_STEP_S else 1
 
 
 def in_world(motion: EstimatedMotion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray]:
@@ -175,9 +175,9 @@ def in_world(motion: EstimatedMotion, stream: LidarStream) -> tuple[np.ndarray, 
     points, seen_from = np.empty((len(stream.xyz), 3), np.float32), np.empty((len(stream.xyz), 3), np.float32)
 
     def move(group: slice) -> None:
-        scans, seconds, own = _scans_with_steps(stream, stream.plane, STEP_S, 1, group)
+        scans, seconds, own = _scans_with_steps(stream, stream.plane, BIN_STEP_S, 1, group)
         lidar = sweep(motion, stream.name, instants(stream, motion.state.values, seconds))
-        move_to_world(scans, lidar, STEP_S, points[own], seen_from[own])
+        move_to_world(scans, lidar, BIN_STEP_S, points[own], seen_from[own])
 
     in_parallel(move, _scan_groups(stream))
     return points, seen_from

@@ -15,8 +15,8 @@ from icalib.motion.sensor_pose import chain_width, fill_chain, fill_imu_pose
 from icalib.optim.rows import add_gram, add_product
 from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.lidar.propagation_noise import (
-    PLANE,
-    POSE,
+    PLANE_DIM,
+    POSE_DIM,
     add_entry_noise,
     add_plane_noise,
     add_pose_noise,
@@ -26,7 +26,7 @@ from icalib.sensors.lidar.propagation_noise import (
 )
 
 N_WHITENED = 4  # residuals of an entry
-DISTANCE = POSE + PLANE  # row of the residual itself in the Jacobians of an entry, after its derivatives
+DISTANCE = POSE_DIM + PLANE_DIM  # row of the residual itself in the Jacobians of an entry, after its derivatives
 
 
 class Bins(NamedTuple):
@@ -75,10 +75,10 @@ def _fill_jacobian(R_lw, p_wl, q, planes, m, J_distance):
         A[3 + a, 0] = m[1 + a]
     for t in range(2):
         for a in range(3):
-            A[POSE + t, 0] += planes.tangents[q, t, a] * (p_wl[a] - planes.point[q, a])
+            A[POSE_DIM + t, 0] += planes.tangents[q, t, a] * (p_wl[a] - planes.point[q, a])
             for b in range(3):
-                A[POSE + t, 1 + a] += R_lw[a, b] * planes.tangents[q, t, b]
-    A[POSE + 2, 0] = -1.0
+                A[POSE_DIM + t, 1 + a] += R_lw[a, b] * planes.tangents[q, t, b]
+    A[POSE_DIM + 2, 0] = -1.0
     for c in range(N_WHITENED):
         A[DISTANCE, c] = m[c]
 
@@ -97,16 +97,16 @@ def _times_root(A, root, B):
 def _add_pose_gram(J_rows, J_distance, incidence, gram):
     """Adds an entry to gram (6, 7): products of its derivatives by the pose with one another and with the residual,
     and the gradient of the incidence term, whose second derivative is negligible."""
-    for i in range(POSE):
-        for j in range(POSE + 1):
-            c = j if j < POSE else DISTANCE
+    for i in range(POSE_DIM):
+        for j in range(POSE_DIM + 1):
+            c = j if j < POSE_DIM else DISTANCE
             gram[i, j] += (
                 J_rows[i, 0] * J_rows[c, 0]
                 + J_rows[i, 1] * J_rows[c, 1]
                 + J_rows[i, 2] * J_rows[c, 2]
                 + J_rows[i, 3] * J_rows[c, 3]
             )
-        gram[i, POSE] += (
+        gram[i, POSE_DIM] += (
             J_distance[i, 1] * incidence[1] + J_distance[i, 2] * incidence[2] + J_distance[i, 3] * incidence[3]
         )
 
@@ -119,28 +119,28 @@ def _add_plane(k, J_rows, J_pose, columns, own, sums, V):
     """
     B, n_b, n_chain = J_rows, sums.calib.shape[0] - 1, J_pose.shape[1] - len(columns)
     V[:] = 0.0
-    for i in range(POSE):
-        for t in range(PLANE):
-            b = B[POSE + t]
+    for i in range(POSE_DIM):
+        for t in range(PLANE_DIM):
+            b = B[POSE_DIM + t]
             v = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
             for j in range(J_pose.shape[1]):
                 V[t, j] += v * J_pose[i, j]
     for h in range(n_chain // KEYFRAME_DIM):
         for r in range(KEYFRAME_DIM):
-            for t in range(PLANE):
+            for t in range(PLANE_DIM):
                 sums.side[k + h, r, own[t]] += V[t, KEYFRAME_DIM * h + r]
     for j in range(len(columns)):
         if columns[j] >= 0:
-            for t in range(PLANE):
+            for t in range(PLANE_DIM):
                 sums.calib[columns[j], own[t]] += V[t, n_chain + j]
                 sums.calib[own[t], columns[j]] += V[t, n_chain + j]
-    for t in range(PLANE):
-        b = B[POSE + t]
-        for c in range(PLANE + 1):
-            d, other = B[POSE + c], n_b if c == PLANE else own[c]
+    for t in range(PLANE_DIM):
+        b = B[POSE_DIM + t]
+        for c in range(PLANE_DIM + 1):
+            d, other = B[POSE_DIM + c], n_b if c == PLANE_DIM else own[c]
             s = b[0] * d[0] + b[1] * d[1] + b[2] * d[2] + b[3] * d[3]
             sums.calib[own[t], other] += s
-            if c == PLANE:
+            if c == PLANE_DIM:
                 sums.calib[n_b, own[t]] += s
 
 
@@ -148,8 +148,8 @@ def _add_plane(k, J_rows, J_pose, columns, own, sums, V):
 def _add_plane_incidence(J_distance, incidence, own, sums):
     """Adds the gradient of the incidence term by the plane with columns `own` (3,) to the sums."""
     n_b = sums.calib.shape[0] - 1
-    for t in range(PLANE):
-        J = J_distance[POSE + t]
+    for t in range(PLANE_DIM):
+        J = J_distance[POSE_DIM + t]
         s = J[1] * incidence[1] + J[2] * incidence[2] + J[3] * incidence[3]
         sums.calib[own[t], n_b] += s
         sums.calib[n_b, own[t]] += s
@@ -196,15 +196,15 @@ def _work_space(at, n_columns):
     width = chain_width(at) + n_columns
     shape = (DISTANCE + 1, N_WHITENED)
     return _BinWork(
-        np.empty((POSE, width)),
-        np.empty((POSE, POSE)),
+        np.empty((POSE_DIM, width)),
+        np.empty((POSE_DIM, POSE_DIM)),
         np.empty(N_WHITENED),
         np.empty(shape),
         np.empty(shape),
-        np.empty((POSE, POSE + 1)),
-        np.empty((3, POSE)),
-        np.empty((POSE, width + 1)),
-        np.empty((PLANE, width)),
+        np.empty((POSE_DIM, POSE_DIM + 1)),
+        np.empty((3, POSE_DIM)),
+        np.empty((POSE_DIM, width + 1)),
+        np.empty((PLANE_DIM, width)),
     )
 
 
@@ -238,9 +238,9 @@ def linearise_noise(bins, at, columns, planes):
         for e in range(bins.start[i], bins.start[i + 1]):
             _fill_distance(R_lw, p_wl, bins.plane[e], planes, work.m)
             _fill_jacobian(R_lw, p_wl, bins.plane[e], planes, work.m, A)
-            _times_root(A, bins.root[e], B[:POSE])
+            _times_root(A, bins.root[e], B[:POSE_DIM])
             for a in range(3):
-                for j in range(POSE):
+                for j in range(POSE_DIM):
                     w = bins.noise_angle[i] * J_imu_pose[j, a]
                     for c in range(N_WHITENED):
                         bins.J_rows_noise[e, a, c] += w * B[j, c]

@@ -20,7 +20,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry.small import cholesky
 
-POSE, PLANE = 6, 3  # number of columns by a pose, and by a plane
+POSE_DIM, PLANE_DIM = 6, 3  # number of columns by a pose, and by a plane
 
 
 class NoiseSums(NamedTuple):
@@ -41,7 +41,7 @@ class NoiseSums(NamedTuple):
 @njit(cache=True, nogil=True, inline="always")
 def empty_noise_sums(width, n_planes):
     """Sums of no bin, for `width` columns that act through the pose."""
-    by_plane = np.zeros((n_planes, 3, PLANE))
+    by_plane = np.zeros((n_planes, 3, PLANE_DIM))
     return NoiseSums(
         np.zeros((3, 3)), np.zeros((3, width + 1)), by_plane, np.zeros(n_planes, np.int64), np.zeros(1, np.int64)
     )
@@ -62,7 +62,7 @@ def add_entry_noise(J_rows_noise, J_incidence_noise, row, J_rows, gram, noise):
             noise.by_pose[a, last] += d * row[c]
             for b in range(3):
                 noise.information[a, b] += d * J_rows_noise[b, c]
-            for j in range(POSE):
+            for j in range(POSE_DIM):
                 gram[a, j] += d * J_rows[j, c]
 
 
@@ -70,7 +70,7 @@ def add_entry_noise(J_rows_noise, J_incidence_noise, row, J_rows, gram, noise):
 def add_pose_noise(gram, J_pose, noise):
     """Adds the products gram (3, 6) of a bin by the chain rule J_pose (6, w): its pose by keyframes and columns."""
     for a in range(3):
-        for j in range(POSE):
+        for j in range(POSE_DIM):
             for i in range(J_pose.shape[1]):
                 noise.by_pose[a, i] += gram[a, j] * J_pose[j, i]
 
@@ -85,9 +85,9 @@ def add_plane_noise(J_rows_noise, J_rows, q, noise):
         noise.seen[noise.n_seen[0]] = q
         noise.n_seen[0] += 1
     for a in range(3):
-        for t in range(PLANE):
+        for t in range(PLANE_DIM):
             for c in range(4):
-                noise.by_plane[q, a, t] += J_rows_noise[a, c] * J_rows[POSE + t, c]
+                noise.by_plane[q, a, t] += J_rows_noise[a, c] * J_rows[POSE_DIM + t, c]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -95,12 +95,12 @@ def noise_columns(noise, columns, plane_columns):
     """(m,) calibration columns of the sums: `columns` (c,), which act through the pose, then those of the planes seen,
     from plane_columns (P, 3)."""
     n_c, n = len(columns), noise.n_seen[0]
-    own = np.empty(n_c + PLANE * n, np.int64)
+    own = np.empty(n_c + PLANE_DIM * n, np.int64)
     for j in range(n_c):  # in loops: copies of arrays take seconds to compile
         own[j] = columns[j]
     for i in range(n):
-        for t in range(PLANE):
-            own[n_c + PLANE * i + t] = plane_columns[noise.seen[i], t]
+        for t in range(PLANE_DIM):
+            own[n_c + PLANE_DIM * i + t] = plane_columns[noise.seen[i], t]
     return own
 
 
@@ -112,15 +112,15 @@ def eliminated_noise(noise):
     sums.
     """
     n, width, L = noise.n_seen[0], noise.by_pose.shape[1] - 1, noise.information
-    last = width + PLANE * n
+    last = width + PLANE_DIM * n
     V = np.empty((3, last + 1))
     for a in range(3):
         for j in range(width):
             V[a, j] = noise.by_pose[a, j]
         V[a, last] = noise.by_pose[a, width]
         for i in range(n):
-            for t in range(PLANE):
-                V[a, width + PLANE * i + t] = noise.by_plane[noise.seen[i], a, t]
+            for t in range(PLANE_DIM):
+                V[a, width + PLANE_DIM * i + t] = noise.by_plane[noise.seen[i], a, t]
         L[a, a] += 1.0
     cholesky(L)
     for a in range(3):

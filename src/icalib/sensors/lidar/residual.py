@@ -104,6 +104,7 @@ class LidarFactor(RowFactor):
 
     @property
     def key(self) -> FactorKey:
+        """See `Factor`."""
         return self.name, "points"
 
     @property

@@ -25,7 +25,7 @@ MAX_RESIDUAL_RMS = 5.0  # end of the residual axis, in RMS of the residuals
 MIN_SLOPE = 0.1  # sine; the outline of a flatter plane is aligned with the axes of the world
 _WALL = "#64748b"
 _MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-after"))
-_WORDS = (
+_SECTION_WORDS = (
     "Planes in the world, and distances of points from them. A good calibration leaves thin planes of one colour, and "
     "a mean without a pattern in time and distance. The planes of the first guess are those that fit its points "
     "best. Each recording has a world of its own; the menu above each map chooses among several. At most "
@@ -50,7 +50,7 @@ def sections(c: Calibration) -> Iterator[Section]:
         plots = [plot_place(f"points-{i}", ""), plot_place(f"distance-{i}", "")]
         parts.append(Html(head + element("div", plots, "pair")))
         figures |= {f"points-{i}": residuals_over_time(r), f"distance-{i}": residuals_over_distance(r)}
-    yield Section("points", "LiDAR points on planes", _WORDS, Html("".join(parts)), figures)
+    yield Section("points", "LiDAR points on planes", _SECTION_WORDS, Html("".join(parts)), figures)
 
 
 def curves(r: LidarResiduals) -> Iterator[ResidualCurve]:

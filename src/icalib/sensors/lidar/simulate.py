@@ -23,7 +23,7 @@ from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, 
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
 _FIRING_S = 2.304e-6  # between two lasers of a column (Velodyne VLP-16 manual)
-_POINTS = "sensor_msgs/msg/PointCloud2"
+_CLOUD_MESSAGE = "sensor_msgs/msg/PointCloud2"
 _FLOAT32 = 7  # datatype of sensor_msgs/PointField
 
 
@@ -99,7 +99,7 @@ class SimLidar(SimSensor):
 
     def bag_topic(self, stream: LidarStream, offset_ns: int) -> BagTopic:
         """PointCloud2 with x, y, z [m] and `time` [s] since the stamp."""
-        return BagTopic(f"/{self.name}/points", _POINTS, _clouds(stream, offset_ns))
+        return BagTopic(f"/{self.name}/points", _CLOUD_MESSAGE, _clouds(stream, offset_ns))
 
 
 SIMULATED = SimLidar
@@ -124,7 +124,7 @@ def _cloud(bag: BagWriter, stamp_ns: int, frame: str, xyz: np.ndarray, offset_s:
     rows = np.ascontiguousarray(np.column_stack([xyz, offset_s]), dtype="<f4")
     data, size = rows.view(np.uint8).reshape(-1), 4 * len(names)
     header = bag.header(stamp_ns, frame)
-    return bag.make(_POINTS, header, 1, len(rows), fields, False, size, size * len(rows), data, True)
+    return bag.make(_CLOUD_MESSAGE, header, 1, len(rows), fields, False, size, size * len(rows), data, True)
 
 
 class _Turn(NamedTuple):

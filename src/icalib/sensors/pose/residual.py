@@ -34,8 +34,8 @@ from icalib.optim.state import Layout, State
 
 # From the nearest keyframe to a pose; a pose farther off is left out, as the noise of propagation is not modelled.
 MAX_POSE_PROPAGATION_S = 0.05
-KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
-UNITS = {"rotation": "rad", "position": "m"}
+POSE_KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
+POSE_UNITS = {"rotation": "rad", "position": "m"}
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class _PoseFactor(RowFactor):
     """Common part of both factors: n measurements with three rows of rotation and three of position. name: of the
     sensor."""
 
-    units: ClassVar[Mapping[str, str]] = UNITS
+    units: ClassVar[Mapping[str, str]] = POSE_UNITS
 
     name: str
     rotation: np.ndarray
@@ -66,12 +66,13 @@ class _PoseFactor(RowFactor):
 
     @property
     def key(self) -> FactorKey:
+        """See `Factor`."""
         return self.name, "poses"
 
     @property
     def kinds(self) -> dict[str, slice]:
         """See `Factor`."""
-        return KINDS
+        return POSE_KINDS
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""

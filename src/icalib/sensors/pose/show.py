@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from icalib.report.sections import Section, row_sections
 from icalib.result import Calibration
 
-_WORDS = (
+_SECTION_WORDS = (
     "Rotation about the axes of the sensor, position along the axes of its frame. They should look like white noise; "
     "slow waves come from poses that drift or are filtered."
 )
@@ -15,4 +15,4 @@ _WORDS = (
 
 def sections(c: Calibration) -> Iterator[Section]:
     """One section with the residuals of each pose sensor."""
-    yield from row_sections(c, "pose", "poses", "Residuals of pose sensors", _WORDS)
+    yield from row_sections(c, "pose", "poses", "Residuals of pose sensors", _SECTION_WORDS)

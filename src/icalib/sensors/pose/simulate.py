@@ -19,7 +19,7 @@ from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
 from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
 
-_POSE = "geometry_msgs/msg/PoseStamped"
+_POSE_MESSAGE = "geometry_msgs/msg/PoseStamped"
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class SimPoses(SimSensor):
 
     def bag_topic(self, stream: PoseStream, offset_ns: int) -> BagTopic:
         """Messages PoseStamped."""
-        return BagTopic(f"/{self.name}/pose", _POSE, _messages(stream, offset_ns))
+        return BagTopic(f"/{self.name}/pose", _POSE_MESSAGE, _messages(stream, offset_ns))
 
 
 SIMULATED = SimPoses
@@ -115,7 +115,7 @@ def _message(bag: BagWriter, stamp_ns: int, frame: str, position: np.ndarray, R:
     """PoseStamped with position (3,) [m] and rotation R (3, 3) of a sensor in `frame`."""
     point = bag.make("geometry_msgs/msg/Point", *position.tolist())
     turn = bag.make("geometry_msgs/msg/Quaternion", *quaternion(R).tolist())
-    return bag.make(_POSE, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Pose", point, turn))
+    return bag.make(_POSE_MESSAGE, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Pose", point, turn))
 
 
 def _with_white_noise(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:

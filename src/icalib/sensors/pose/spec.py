@@ -26,7 +26,7 @@ from icalib.sensors.parameter_spec import ParameterSpec
 from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, Lack, MountedSensor, Sensor, TableLayout, has_imu
 
 PoseKind = Literal["absolute", "relative"]
-SCALE = ParameterSpec("scale", 1, "nuisance", "", ("scale",), 1e-2, 0.1)  # true lengths over reported ones
+POSE_SCALE = ParameterSpec("scale", 1, "nuisance", "", ("scale",), 1e-2, 0.1)  # true lengths over reported ones
 _FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted", "frames", "scale_sigma")
 _NOISE = ("rotation_noise", "position_noise")
 
@@ -43,7 +43,7 @@ class PoseSensor(MountedSensor):
     sensor_type: ClassVar[str] = "pose"
     noun: ClassVar[str] = "pose sensor"
     gives_motion: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, SCALE)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, POSE_SCALE)
 
     path: str
     kind: PoseKind = "absolute"

@@ -24,7 +24,7 @@ POINTS_PER_PART = 200_000  # of a thread at a time: bounds the memory beside the
 ASSOCIATION_ROUNDS = 4
 # Assumed error of the state in each round: position [m], and rotation about the sensor [rad].
 STATE_ERRORS = (0.03, 0.01, 0.003, 0.001)
-MIN_SHARED_POINTS = 0.5  # share of a plane's points that had a plane before: the majority keeps the name
+MIN_KEPT_POINTS = 0.5  # share of a plane's points that had a plane before: the majority keeps the name
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def _plane_names(count: int, plane: tuple[np.ndarray, ...], before: Clouds | Non
     for flat in np.argsort(-shared, axis=None, kind="stable"):
         q, k = divmod(int(flat), len(before.names))
         name = before.names[k]
-        if not names[q] and name not in names and shared[q, k] > MIN_SHARED_POINTS * total[q]:
+        if not names[q] and name not in names and shared[q, k] > MIN_KEPT_POINTS * total[q]:
             names[q] = name
     number = 1 + max(int(name.removeprefix("plane ")) for name in before.names)
     for q in range(count):

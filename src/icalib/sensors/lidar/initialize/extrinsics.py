@@ -138,6 +138,7 @@ def _rates(name: str, trajectory: SensorTrajectory) -> SensorRates:
 
 
 def _too_short(stream: LidarStream) -> EstimationError:
+    """The error if too few scans remain for the lever arm."""
     return EstimationError(
         f"{stream.name}: too few of its scans fall within the recording of the IMU to estimate its lever arm; "
         "check that both clocks overlap, or record for longer."
@@ -155,6 +156,7 @@ def _check_axes(lidar: str, imu: str, mirrored: bool) -> None:
 
 
 def _check_gravity(measured: float, expected: float, imu: str, lidar: str) -> None:
+    """Raises EstimationError if the estimated gravity [m/s^2] is far from the expected one."""
     if abs(measured / expected - 1.0) > TRAJECTORY_GRAVITY_TOLERANCE:
         raise EstimationError(
             f"{imu} and {lidar} together give a gravity of {measured:.3g} m/s^2 instead of {expected:.3g}; "

@@ -177,6 +177,7 @@ class _KnownSteps:
 
     @classmethod
     def of(cls, seconds: np.ndarray, rotation_at: RotationAt | None, position_at: PositionAt | None) -> _KnownSteps:
+        """Steps between scans whose middles are at `seconds` (n,) on the LiDAR's clock."""
         if rotation_at is None:
             return cls(None, None)
         R = rotation_at(seconds)

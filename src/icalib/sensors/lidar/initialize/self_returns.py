@@ -104,6 +104,7 @@ class _NearPoints:
 
     @classmethod
     def of(cls, stream: LidarStream) -> _NearPoints:
+        """Near points of all scans of a stream."""
         size2 = np.einsum("na,na->n", stream.xyz, stream.xyz)
         point = np.flatnonzero((size2 < np.float32(ROBOT_RADIUS_M) ** 2) & (size2 > 0.0))
         ijk = np.floor(stream.xyz[point] / np.float32(ROBOT_VOXEL_M)).astype(np.int64) + N_VOXELS_SIDE // 2 + 1

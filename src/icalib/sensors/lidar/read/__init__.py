@@ -34,6 +34,7 @@ UNREAD = (
 
 
 def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    """(S,) int64 stamps [ns] of a file of scans."""
     del layout
     return read_scan_stamps(path)
 
@@ -80,4 +81,5 @@ def where(recording: Recording, sensor: Lidar) -> str:
 
 
 def _topic(recording: Recording, sensor: Lidar) -> str:
+    """Name of the topic of clouds."""
     return recording.topic(sensor.name, sensor.topic, "points").name

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg", "livox_interfaces/msg/CustomMsg")
-_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
+_POINT_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
 _POINT_BYTES = 19  # in CDR padded to a multiple of 4
 
 
@@ -67,7 +67,7 @@ def _points(content: bytes, at: int, order: str, step: int) -> np.ndarray:
     data = content[at + 4 : at + 4 + size]
     if len(data) < size:
         raise ValueError(f"{count} points do not fit {len(content)} bytes")
-    offsets = np.cumsum([0, *(np.dtype(kind).itemsize for kind in _FIELDS.values())])[:-1].tolist()
-    kinds = [order + kind for kind in _FIELDS.values()]
-    dtype = np.dtype({"names": list(_FIELDS), "formats": kinds, "offsets": offsets, "itemsize": step})
+    offsets = np.cumsum([0, *(np.dtype(kind).itemsize for kind in _POINT_FIELDS.values())])[:-1].tolist()
+    kinds = [order + kind for kind in _POINT_FIELDS.values()]
+    dtype = np.dtype({"names": list(_POINT_FIELDS), "formats": kinds, "offsets": offsets, "itemsize": step})
     return np.frombuffer(data + bytes(step * count - size), dtype)

@@ -47,7 +47,7 @@ _MAX_TIME = 1e25  # larger values are no times: ns since 1970 are some 1e18
 _BULK_PERCENT = (5.0, 95.0)  # percentiles: the times of a scan without single wrong ones
 _LIKE_A_TIME = re.compile(r"time|stamp|offset|curvature|(^|_)(t|ts|dt|s|ms|us|ns|[mun]?secs?)\d*(_|$)", re.IGNORECASE)
 _NO_TIMES = {"x", "y", "z", "intensity", "reflectivity", "ring", "line", "tag", "range", "rgb", "rgba"}
-_CHOICES = "set point_time to azimuth (it turns) or snapshot (all points at the stamp) in the rig file"
+_POINT_TIME_CHOICES = "set point_time to azimuth (it turns) or snapshot (all points at the stamp) in the rig file"
 
 
 @dataclass(frozen=True)
@@ -180,14 +180,14 @@ def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
         )
     if known:
         raise RecordingError(
-            f"{what}: all points of a scan have the same `{known[0]}`; correct the driver, or {_CHOICES}."
+            f"{what}: all points of a scan have the same `{known[0]}`; correct the driver, or {_POINT_TIME_CHOICES}."
         )
     others = [n for n in differs if n.lower() not in _NO_TIMES]
     if_any = (
         f"set point_time_field of {lidar.name} if one of {', '.join(others)} is their time; else " if others else ""
     )
     raise RecordingError(
-        f"{what}: the points have no times ({listed}); {if_any}record a cloud that has them, or {_CHOICES}."
+        f"{what}: the points have no times ({listed}); {if_any}record a cloud that has them, or {_POINT_TIME_CHOICES}."
     )
 
 
@@ -224,6 +224,7 @@ def _timed(times: np.ndarray, absolute: bool) -> np.ndarray:
 
 
 def _median(values: Sequence[float]) -> float:
+    """Median of some numbers."""
     return float(np.median(values))
 
 

@@ -76,6 +76,7 @@ def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStrea
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The arrays `names` of a file, as far as it has them. Raises RecordingError if it cannot be read."""
     try:
         with path.open("rb") as file:
             sentence = not_data(path, file.read(HEAD_BYTES))
@@ -89,6 +90,7 @@ def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 
 def _of_kind(path: Path, name: str, array: np.ndarray, kind: type[np.generic]) -> np.ndarray:
+    """The array as `kind`, contiguous. Raises RecordingError if it has other axes or no such numbers."""
     axes = 2 if name == "xyz" else 1
     numbers = "iu" if np.issubdtype(kind, np.integer) else "iuf"
     if array.ndim != axes or array.dtype.kind not in numbers or (name == "start" and not array.size):

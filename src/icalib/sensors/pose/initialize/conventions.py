@@ -24,7 +24,7 @@ from icalib.sensors.pose.initialize.position_frame import axes_text
 Conversion = Callable[[PoseStream], PoseStream]  # from a convention to that of `PoseStream`
 T = TypeVar("T")
 MAX_UNEXPLAINED = 0.1  # share of the motion: poses with less have the right convention
-MAX_UNEXPLAINED_RATIO = 0.5  # to that of the unconverted poses, of a convention that fits far better
+MAX_CONVERTED_RATIO = 0.5  # to that of the unconverted poses, of a convention that fits far better
 
 
 def _inverse(x: PoseStream) -> PoseStream:
@@ -112,7 +112,7 @@ def with_checked_convention(
     except EstimationError as error:
         failed = error
     if unexplained > MAX_UNEXPLAINED:
-        most = MAX_UNEXPLAINED_RATIO * unexplained
+        most = MAX_CONVERTED_RATIO * unexplained
         _refuse_two_frames(stream, place, rotation_of, most)
         for words, convert in CONVENTIONS:
             if _unexplained(place, convert(stream)) < most:

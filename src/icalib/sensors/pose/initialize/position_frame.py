@@ -17,7 +17,7 @@ import numpy as np
 from icalib.initialize.trajectories.lever_arm_rows import LeverArmRows
 
 MAX_AXES_ERROR = 0.35  # largest difference of an entry: rotations within 20 deg of exchanged axes are taken for these
-MIN_SINGULAR_RATIO = 0.5  # smallest over largest singular value of M: 1 for a rotation
+MIN_POLAR_RATIO = 0.5  # smallest over largest singular value of M: 1 for a rotation
 MIN_FRAME_ROWS = 40  # three times the 13 regressors
 IDENTITY = np.eye(3)
 
@@ -35,7 +35,7 @@ def rotation_of_positions(rows: LeverArmRows, R_world_frame: np.ndarray = IDENTI
         size = np.linalg.norm(rows.motion - X @ x, axis=1)
         weight, M = (size < 4.0 * np.median(size) + 1e-9).astype(float), x[:3].T
     U, singular, Vt = np.linalg.svd(M)
-    if singular[2] < MIN_SINGULAR_RATIO * singular[0] or np.linalg.det(U @ Vt) < 0.0:
+    if singular[2] < MIN_POLAR_RATIO * singular[0] or np.linalg.det(U @ Vt) < 0.0:
         return None
     C = nearest_axes(R_world_frame.T @ (U @ Vt).T @ R_world_frame)
     return None if np.allclose(C, np.eye(3)) else C

@@ -16,7 +16,7 @@ from icalib.data.topics import MessageType, TopicInfo
 from icalib.errors import RecordingError
 from icalib.sensors.pose.read.checks import checked_poses
 from icalib.sensors.pose.read.pose_tables import (
-    POSES,
+    POSE_TABLE,
     PoseReadings,
     as_frame_sensor,
     is_tum_text,
@@ -48,16 +48,17 @@ MESSAGES = (
 
 
 def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    """(N,) int64 stamps [ns] of a table."""
     return read_pose_file(path.parent.name, path, layout).stamps_ns
 
 
 def _is_one(path: Path) -> bool:
     """Whether a `poses.csv` is a table of poses: other sensors have tables of that name."""
-    return is_tum_text(path) or holds(path, POSES)
+    return is_tum_text(path) or holds(path, POSE_TABLE)
 
 
 TABLES = (
-    TableFile("poses.csv", "table of poses", "pose", _stamps, _is_one, POSES, stamps_by_row),
+    TableFile("poses.csv", "table of poses", "pose", _stamps, _is_one, POSE_TABLE, stamps_by_row),
     TableFile("poses.tum", "table of poses", "pose", _stamps, rows=stamps_by_row),
     TableFile("poses.txt", "table of poses", "pose", _stamps, rows=stamps_by_row),
 )

@@ -93,9 +93,11 @@ def continuous_poses(seconds: np.ndarray, rotation: np.ndarray, position: np.nda
         return ContinuousPoses(np.ones(n, dtype=bool), np.empty(0, np.int64), 0.0, 0.0, 0.0, 0.0)
 
     def moved(i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Displacement (n, 3) from poses i to j beyond steady motion, and whether it is a jump."""
         return way.left(seconds[j] - seconds[i], position[j] - position[i], i, j)
 
     def apart(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """(n,) whether position or rotation jump between poses i and j."""
         turned = so3.log_many(np.ascontiguousarray(rotation[i].transpose(0, 2, 1) @ rotation[j]))
         return moved(i, j)[1] | turn.left(seconds[j] - seconds[i], turned, i, j)[1]
 

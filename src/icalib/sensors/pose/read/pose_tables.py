@@ -17,7 +17,7 @@ from icalib.rig import PLAIN_TABLE, PoseSensor, TableLayout
 from icalib.sensors.stream import RawReadings
 
 POSE_RATE_HZ = (1e-3, 5000.0)  # lowest and highest plausible rate
-POSES = TableKind(
+POSE_TABLE = TableKind(
     ("t [ns]",),
     ("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw"),
     (
@@ -30,7 +30,7 @@ POSES = TableKind(
 # The stamps alone, so that a row whose pose cannot be read keeps its position.
 _STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=POSE_RATE_HZ, more=True)
 _TUM_SUFFIXES = (".tum", ".txt")
-_MAX_QUATERNION_ERROR = 1e-2  # of its length, as of rounded text
+MAX_QUATERNION_ERROR = 1e-2  # of its length, as of rounded text
 
 
 @dataclass(frozen=True)
@@ -60,12 +60,12 @@ def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, not
     """The poses of the sensor `name` in the table at `path`: t [ns], x, y, z, qx, qy, qz, qw; stamps of a file .tum or
     .txt are seconds. `note` is told what was left out. Rotations of quaternions that are none are NaN. Raises
     RecordingError naming file and line, and where most quaternions are none."""
-    kind = replace(POSES, unit="s") if is_tum_text(path) else POSES
+    kind = replace(POSE_TABLE, unit="s") if is_tum_text(path) else POSE_TABLE
     table = read_table(path, kind, layout, note)
     stamps_ns, values = table.integers[:, 0].copy(), table.decimals
     xyzw = values[:, 3:]
     length = np.linalg.norm(np.clip(xyzw, -1e9, 1e9), axis=1)  # squares must not overflow
-    wrong = ~(np.abs(length - 1.0) < _MAX_QUATERNION_ERROR)
+    wrong = ~(np.abs(length - 1.0) < MAX_QUATERNION_ERROR)
     if 2 * wrong.sum() > len(wrong):
         i = int(np.argmax(wrong))
         raise RecordingError(
@@ -78,6 +78,6 @@ def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, not
 def stamps_by_row(table: Path, layout: TableLayout, note: Note) -> tuple[dict[int, int], int]:
     """Stamps [ns] of readable rows, by row number from 0, and the number of all rows."""
     kind = replace(_STAMPS, unit="s") if is_tum_text(table) else _STAMPS
-    stamps = 1 if split_kind(POSES, layout.columns) is None else 2  # the first columns of a pose
+    stamps = 1 if split_kind(POSE_TABLE, layout.columns) is None else 2  # the first columns of a pose
     read = read_table(table, kind, replace(layout, columns=layout.columns[:stamps]), note)
     return dict(zip(read.numbers.tolist(), read.integers[:, 0].tolist(), strict=True)), read.written

@@ -17,7 +17,7 @@ from icalib.data.topics import TopicInfo, find_topic
 from icalib.errors import RecordingError
 from icalib.geometry import so3
 from icalib.rig import PoseSensor
-from icalib.sensors.pose.read.pose_tables import PoseReadings
+from icalib.sensors.pose.read.pose_tables import MAX_QUATERNION_ERROR, PoseReadings
 
 TRANSFORMS = "transforms"  # kind of topics of transforms
 DEFAULT_TOPIC = "/tf"
@@ -26,7 +26,6 @@ MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"
 _STATIC = "_static"  # suffix of topics with static transforms
 _MAX_INTERPOLATED_PERIODS = 3.0  # of an edge; it is not interpolated over a longer gap
 _MAX_BACKWARDS_NS = 1_000_000_000  # of the stamps of an edge; more is a clock that was set back
-_MAX_QUATERNION_ERROR = 1e-2  # of its length
 _MAX_LISTED_FRAMES = 30  # in a message
 Pair = tuple[str, str]  # parent, child
 
@@ -164,7 +163,7 @@ def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, whe
     shown = f"{pair[0]} -> {pair[1]}"
     with np.errstate(over="ignore", invalid="ignore"):
         good = np.isfinite(rows).all(axis=1) & (
-            np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < _MAX_QUATERNION_ERROR
+            np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < MAX_QUATERNION_ERROR
         )
     if 2 * good.sum() < len(good):
         raise RecordingError(
