@@ -84,11 +84,11 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
     for m in recordings:
         for kind in kinds_of(rig):
             kind.check_moving(m)
-    for own, m in zip(motion.body, recordings, strict=True):
-        if len(own.seconds) < MIN_PARABOLA_POSES:
+    for poses, m in zip(motion.body, recordings, strict=True):
+        if len(poses.seconds) < MIN_PARABOLA_POSES:
             where = f"{m.name}: " if len(recordings) > 1 else ""
             raise EstimationError(
-                f"{where}{rig.reference} has a pose at only {len(own.seconds)} instants; record more."
+                f"{where}{rig.reference} has a pose at only {len(poses.seconds)} instants; record more."
             )
     paths = _smoothed(motion.body)
     # The narrow window overestimates densities a little; a wide one would smooth away motion and underestimate them.
@@ -129,7 +129,7 @@ class _BodyMotion:
 def _smoothed(body: Sequence[BodyPoses], narrow: bool = False) -> list[SmoothTrajectory]:
     """The trajectory of the body in each recording, every ASSUMED_IMU_STEP_S from its first stamp. narrow: see
     `smooth_trajectory`."""
-    return [own.at(np.arange(0.0, own.seconds[-1], ASSUMED_IMU_STEP_S), narrow=narrow) for own in body]
+    return [poses.at(np.arange(0.0, poses.seconds[-1], ASSUMED_IMU_STEP_S), narrow=narrow) for poses in body]
 
 
 def _keyframe_hosts(rig: Rig) -> list[Sensor]:
@@ -181,9 +181,9 @@ def _keyframe_motion(inputs: Inputs, shown: Sequence[BodyPoses], found: Values) 
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     starts = first_keyframes(inputs.imu, keyframes)
     parts = np.split(keyframes, starts[1:])
-    ways = [own.at(t - part.begin) for own, t, part in zip(shown, parts, inputs.parts, strict=True)]
+    trajectories = [poses.at(t - part.begin) for poses, t, part in zip(shown, parts, inputs.parts, strict=True)]
     R, p, v, rate, force = (
-        np.concatenate([getattr(w, name) for w in ways])
+        np.concatenate([getattr(trajectory, name) for trajectory in trajectories])
         for name in ("rotation", "position", "velocity", "rate", "acceleration")
     )
     still = np.zeros((len(keyframes), 6))
@@ -237,10 +237,10 @@ def _with_assumed_readings(
 def _within_short_gaps(path: SmoothTrajectory, max_gap_s: float) -> np.ndarray:
     """(m,) whether poses are nearby, or the gap between poses is at most `max_gap_s`. Over longer gaps the assumption
     does not constrain the motion."""
-    seen = path.seconds[path.near]
-    if not len(seen):
+    known_s = path.seconds[path.near]
+    if not len(known_s):
         return np.zeros(len(path.seconds), dtype=bool)
-    after, ends = np.searchsorted(seen, path.seconds), np.concatenate([[-np.inf], seen, [np.inf]])
+    after, ends = np.searchsorted(known_s, path.seconds), np.concatenate([[-np.inf], known_s, [np.inf]])
     before, behind = ends[after], ends[after + 1]
     return path.near | (behind - before <= max_gap_s)
 
@@ -248,7 +248,7 @@ def _within_short_gaps(path: SmoothTrajectory, max_gap_s: float) -> np.ndarray:
 def _body_identities(inputs: Inputs) -> Values:
     """Identity values: the body coincides with the assumed IMU, and its target or frame with the world."""
     sensor = inputs.rig.sensors[inputs.rig.reference_without_imu]
-    out, own = stated_values(inputs, sensor), {block.key for block in inputs.layout.blocks}
+    out, keys = stated_values(inputs, sensor), {block.key for block in inputs.layout.blocks}
     for k in range(len(inputs.parts)):
         frame = frame_of(sensor.name, k)
         world = {
@@ -256,5 +256,5 @@ def _body_identities(inputs: Inputs) -> Values:
             (frame, FRAME[0]): np.eye(3),
             (frame, FRAME[1]): np.zeros(3),
         }
-        out |= {key: value for key, value in world.items() if key in own}
+        out |= {key: value for key, value in world.items() if key in keys}
     return out

@@ -73,10 +73,10 @@ def with_stated_values(inputs: Inputs, sensor: str, found: Values) -> Values:
     out, rig = dict(found), inputs.rig
     for other in (*rig.cameras[1:], rig.sensors[sensor]):
         names = MOUNTED_NAMES if other.name != sensor else [spec.name for spec in other.specs()]
-        known, own = stated_values(inputs, other, names), {k: v for k, v in found.items() if k[0] == other.name}
+        known, estimated = stated_values(inputs, other, names), {k: v for k, v in found.items() if k[0] == other.name}
         arm = sensor, "translation"
-        if arm in known and arm in own:
-            up = own[sensor, "rotation"][:, 2]
-            own[arm] = own[arm] + up * (up @ (known[arm] - own[arm]))
-        out |= merged_values(other, known, own)
+        if arm in known and arm in estimated:
+            up = estimated[sensor, "rotation"][:, 2]
+            estimated[arm] = estimated[arm] + up * (up @ (known[arm] - estimated[arm]))
+        out |= merged_values(other, known, estimated)
     return out

@@ -56,11 +56,11 @@ def _guess(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], No
     for kind in kinds_of(rig):
         recordings = [kind.cleaned(m) for m in recordings]
     whole = inputs_for(rig, recordings)
-    source, own, state = _trajectory(whole, recordings, motion_kinds(rig))
+    source, source_inputs, state = _trajectory(whole, recordings, motion_kinds(rig))
     lap("first guess")
-    if own is whole and not source.refined_alone:
+    if source_inputs is whole and not source.refined_alone:
         return whole, state, state.values
-    found = _place_others(whole, source, *source.refined(own, state))
+    found = _place_others(whole, source, *source.refined(source_inputs, state))
     lap("other sensors")
     return found
 
@@ -74,23 +74,26 @@ def _trajectory(
     if not kinds:
         raise EstimationError("no sensor of the rig shows its motion; add a camera, a LiDAR or a pose sensor.")
     kind, *others = kinds
-    own = inputs_of_sensors(whole, recordings, kind.sources(whole.rig))
+    source_inputs = inputs_of_sensors(whole, recordings, kind.sources(whole.rig))
 
     def other() -> tuple[Inputs, State]:
         return _trajectory(whole, recordings, others)[1:]
 
     try:
-        return kind, own, kind.trajectory(own, other)
+        return kind, source_inputs, kind.trajectory(source_inputs, other)
     except EstimationError:
-        if own.rig.has_target or not others:
+        if source_inputs.rig.has_target or not others:
             raise
     return _trajectory(whole, recordings, others)
 
 
-def _place_others(whole: Inputs, source: Initializer[Any], own: Inputs, state: State, guess: Values) -> InitialGuess:
-    """The whole initial guess, from the trajectory in `state` by the sensors of `own`: all others are aligned to it."""
-    inputs = source.adopted(whole, own)
-    known = {s.name for s in own.rig.mounted}
+def _place_others(
+    whole: Inputs, source: Initializer[Any], source_inputs: Inputs, state: State, guess: Values
+) -> InitialGuess:
+    """The whole initial guess, from the trajectory in `state` by the sensors of `source_inputs`. All others
+    are aligned to it."""
+    inputs = source.adopted(whole, source_inputs)
+    known = {s.name for s in source_inputs.rig.mounted}
     others = [s for s in whole.rig.mounted if s.name not in known]
     hosts = [s for s in others if initializer_of(s).hosts_keyframes]
     found = place_sensors(inputs, state, hosts)

@@ -38,21 +38,21 @@ def refuse_clock_jumps(
     """Raises EstimationError if a gap is a jump of a clock: on one side of it both sensors turn alike at the `offset`
     [s], on the other only at an offset that differs by the length of the gap. unexplained(rates, offset): share of the
     angular rate that the IMU does not explain, from 0 to 1."""
-    for step in _possible_jumps(imu, name, rates, offset):
-        for side, shift in ((rates.start < step.before, -step.growth), (rates.start >= step.after, step.growth)):
-            own, other = _selected(rates, side), _selected(rates, ~side)
+    for jump in _possible_jumps(imu, name, rates, offset):
+        for side, shift in ((rates.start < jump.before, -jump.growth), (rates.start >= jump.after, jump.growth)):
+            one_side, other_side = _selected(rates, side), _selected(rates, ~side)
             if (
-                min(len(own.start), len(other.start)) < MIN_RATES_BESIDE_JUMP
-                or unexplained(own, offset) < MIN_DIFFERENT_UNEXPLAINED
+                min(len(one_side.start), len(other_side.start)) < MIN_RATES_BESIDE_JUMP
+                or unexplained(one_side, offset) < MIN_DIFFERENT_UNEXPLAINED
             ):
                 continue
             if (
-                unexplained(own, offset + shift) < MAX_MATCHING_UNEXPLAINED
-                and unexplained(other, offset) < MAX_MATCHING_UNEXPLAINED
+                unexplained(one_side, offset + shift) < MAX_MATCHING_UNEXPLAINED
+                and unexplained(other_side, offset) < MAX_MATCHING_UNEXPLAINED
             ):
-                at = (step.before if shift == -step.growth else step.after) - rates.start[0]
+                at = (jump.before if shift == -jump.growth else jump.after) - rates.start[0]
                 raise EstimationError(
-                    f"the clock of {step.whose} was set forward by {step.size:.3g} s about {at:.3g} s after "
+                    f"the clock of {jump.whose} was set forward by {jump.size:.3g} s about {at:.3g} s after "
                     f"{name} began, so the time offset differs before and after; use one side with --from and "
                     "--to."
                 )

@@ -303,5 +303,5 @@ def _shortened_steps(stream: TrackStream, valid: np.ndarray, steps: Sequence[flo
 def shared_points(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the points that images i and j share, in i and in j; only those with a valid ray."""
     p, q = shared_rows(stream.start, stream.feature, i, j)
-    seen = valid[p] & valid[q]
-    return p[seen], q[seen]
+    valid_rows = valid[p] & valid[q]
+    return p[valid_rows], q[valid_rows]

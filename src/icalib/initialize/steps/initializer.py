@@ -153,8 +153,8 @@ def initializer_of(sensor: Sensor) -> Initializer[Any]:
 
 def kinds_of(rig: Rig) -> list[Initializer[Any]]:
     """Initializers of all kinds of which `rig` has a sensor, in the order of `SENSOR_KINDS`."""
-    own = {s.sensor_type for s in rig.mounted}
-    return [initializer(kind) for kind in SENSOR_KINDS if kind in own]
+    types = {s.sensor_type for s in rig.mounted}
+    return [initializer(kind) for kind in SENSOR_KINDS if kind in types]
 
 
 def motion_kinds(rig: Rig) -> list[Initializer[Any]]:
@@ -170,8 +170,8 @@ def place_sensors(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Va
     sensors = list(sensors)
     kinds = [initializer(kind) for kind in SENSOR_KINDS]
     for kind in sorted(kinds, key=lambda kind: kind.asks_for_vertical):
-        if own := [s for s in sensors if initializer_of(s) is kind]:
-            out |= kind.place(inputs, replace(state, values=state.values | out), own)
+        if of_kind := [s for s in sensors if initializer_of(s) is kind]:
+            out |= kind.place(inputs, replace(state, values=state.values | out), of_kind)
     return out
 
 

@@ -175,10 +175,10 @@ def _double_integrals(
     stamp of the IMU."""
     s, x = imu.seconds, np.empty((12, len(imu.seconds)))
     for a in range(0, len(s), READINGS_PER_BLOCK):
-        own = slice(a, min(a + READINGS_PER_BLOCK, len(s)))
-        R = gyro.carry(t, R_bi, s[own])
-        x[:3, own] = (R @ imu.accel[own, :, None])[:, :, 0].T
-        x[3:, own] = R.reshape(-1, 9).T
+        block = slice(a, min(a + READINGS_PER_BLOCK, len(s)))
+        R = gyro.carry(t, R_bi, s[block])
+        x[:3, block] = (R @ imu.accel[block, :, None])[:, :, 0].T
+        x[3:, block] = R.reshape(-1, 9).T
     j = imu.interval(t)
     out = np.stack([_double_integral(s, row, t, j) for row in x], axis=1)
     return out[:, :3], out[:, 3:].reshape(-1, 3, 3)

@@ -140,9 +140,9 @@ def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> N
 def _unexplained(imu: ImuData, rates: SensorRates, found: RateAlignment, averaged: float = RATE_MEAN_S) -> float:
     """Median difference between the rates of IMU and sensor, over the median rate, of means over `averaged` s. The
     known noise of the sensor's rates is subtracted."""
-    gyro, seen = _side_by_side(imu, rates, found.offset, averaged)
-    gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
-    unexplained = float(np.median(np.linalg.norm(gyro - seen, axis=1)))
+    gyro, sensor = _side_by_side(imu, rates, found.offset, averaged)
+    gyro, sensor = gyro - found.gyro_bias, sensor @ found.rotation.T
+    unexplained = float(np.median(np.linalg.norm(gyro - sensor, axis=1)))
     unexplained = np.sqrt(max(unexplained**2 - (MEDIAN_NORM * rate_difference_noise(imu, rates, averaged)) ** 2, 0.0))
     return float(unexplained / np.median(np.linalg.norm(gyro, axis=1)))
 
@@ -170,15 +170,15 @@ def _side_by_side(
 def contradicting_offset(imu: ImuData, name: str, rates: SensorRates, expected: float) -> float | None:
     """The offset [s] at which the rates match, if it is clearly better than `expected`; else None."""
     try:
-        own = align_rates(imu, name, rates, None)
+        alignment = align_rates(imu, name, rates, None)
     except EstimationError:
         return None  # the motion does not show it
-    if abs(own.offset - expected) < OFFSET_AGREEMENT_S:
+    if abs(alignment.offset - expected) < OFFSET_AGREEMENT_S:
         return None
     if not covered(imu, rates, expected).any():
-        return own.offset
+        return alignment.offset
     there = _unexplained(imu, rates, _alignment_at_offset(expected, *_side_by_side(imu, rates, expected)))
-    return own.offset if _unexplained(imu, rates, own) < MAX_UNEXPLAINED_RATIO_OF_OTHER * there else None
+    return alignment.offset if _unexplained(imu, rates, alignment) < MAX_UNEXPLAINED_RATIO_OF_OTHER * there else None
 
 
 def rms_rates(imu: ImuData, rates: SensorRates) -> tuple[float, float]:
@@ -192,18 +192,18 @@ def rms_rates(imu: ImuData, rates: SensorRates) -> tuple[float, float]:
     return float(np.sqrt((rate**2).sum(axis=1).mean())), float(np.sqrt(np.median((rates.rate**2).sum(axis=1))))
 
 
-def is_still(turned: float, seen: float) -> bool:
-    """Whether neither sensor turned significantly. turned, seen: results of `rms_rates`."""
-    return turned < STILL_RATE_RAD_S and seen < 3.0 * STILL_RATE_RAD_S
+def is_still(imu_rate: float, sensor_rate: float) -> bool:
+    """Whether neither sensor turned significantly. imu_rate, sensor_rate: results of `rms_rates`."""
+    return imu_rate < STILL_RATE_RAD_S and sensor_rate < 3.0 * STILL_RATE_RAD_S
 
 
 def _check_motion(imu: ImuData, name: str, rates: SensorRates) -> None:
     """Raises EstimationError if neither sensor turned significantly."""
-    turned, seen = rms_rates(imu, rates)
-    if is_still(turned, seen):
+    imu_rate, sensor_rate = rms_rates(imu, rates)
+    if is_still(imu_rate, sensor_rate):
         raise EstimationError(
-            f"the recording is motionless ({imu.name} turns at {turned:.4f} rad/s RMS, {name} at {seen:.4f}); "
-            "record again while turning the rig about all axes in front of the target."
+            f"the recording is motionless ({imu.name} turns at {imu_rate:.4f} rad/s RMS, {name} at "
+            f"{sensor_rate:.4f}); record again while turning the rig about all axes in front of the target."
         )
 
 
@@ -218,10 +218,10 @@ def kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np
     return R, mi - R @ mc
 
 
-def _alignment_at_offset(offset: float, gyro: np.ndarray, seen: np.ndarray) -> RateAlignment:
+def _alignment_at_offset(offset: float, gyro: np.ndarray, sensor: np.ndarray) -> RateAlignment:
     """Rotation and bias at this offset from rates side by side. Means over several images suppress poses that flip to
     their mirrored solution and back."""
-    return RateAlignment(offset, *kabsch(gyro, seen, np.ones(len(gyro))))
+    return RateAlignment(offset, *kabsch(gyro, sensor, np.ones(len(gyro))))
 
 
 def _interval_rates(imu: ImuData, rates: SensorRates) -> MeanRates | ChainedRates:
@@ -344,10 +344,10 @@ def no_overlap(imu: ImuData, name: str) -> EstimationError:
     )
 
 
-def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, seen: np.ndarray) -> None:
+def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, sensor: np.ndarray) -> None:
     """Raises EstimationError if the gyroscope is in deg/s, by the norms of the rates (n, 3). It comes before the checks
     of the motion, which such rates would fail."""
-    size = [np.linalg.norm(w - np.median(w, axis=0), axis=1) for w in (gyro, seen)]
+    size = [np.linalg.norm(w - np.median(w, axis=0), axis=1) for w in (gyro, sensor)]
     ratio = float(np.median(size[0]) / max(np.median(size[1]), 1e-9))
     if 0.8 < ratio / DEG_PER_RAD < 1.25:
         raise EstimationError(

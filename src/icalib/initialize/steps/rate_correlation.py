@@ -127,13 +127,14 @@ def _peaks_of_means(imu: ImuData, rates: SensorRates, count: int) -> list[Correl
     known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < rates.longest_step_s
-    seen = _rate_size_on_grid(middle, rates.rate, near, count)
-    own = (
+    sensor_speed = _rate_size_on_grid(middle, rates.rate, near, count)
+    gyro_speeds = (
         _rate_size_on_grid(imu.seconds, imu.gyro - about, known, count) for about in (0.0, np.median(imu.gyro, axis=0))
     )
     least, apart = MIN_RATE_OVERLAP_S * CORRELATION_GRID_HZ, round(MIN_PEAK_DISTANCE_S * CORRELATION_GRID_HZ)
     return max(
-        (best_shifts(*a, *seen, least, MAX_OFFSET_PEAKS, apart) for a in own), key=lambda p: _correlation_or_least(p[0])
+        (best_shifts(*a, *sensor_speed, least, MAX_OFFSET_PEAKS, apart) for a in gyro_speeds),
+        key=lambda p: _correlation_or_least(p[0]),
     )
 
 

@@ -178,13 +178,13 @@ def _explained_share(
         np.stack([correlated(*p) for p in pairs], axis=1)
         for pairs in ([(fa[:, k], mb) for k in range(3)], [(ma, fb[:, k]) for k in range(3)])
     )
-    across, own = np.empty((n, 3, 3)), np.empty((n, 3, 3))
+    cross_covariance, auto_covariance = np.empty((n, 3, 3)), np.empty((n, 3, 3))
     for i in range(3):
         for j in range(3):
-            across[:, i, j] = correlated(fa[:, i], fb[:, j]) - sa[:, i] * sb[:, j] / count
-            own[:, i, j] = correlated(ma, transformed(b[:, i] * b[:, j])) - sb[:, i] * sb[:, j] / count
+            cross_covariance[:, i, j] = correlated(fa[:, i], fb[:, j]) - sa[:, i] * sb[:, j] / count
+            auto_covariance[:, i, j] = correlated(ma, transformed(b[:, i] * b[:, j])) - sb[:, i] * sb[:, j] / count
     spread = correlated(transformed((a**2).sum(axis=1)), mb) - (sa**2).sum(axis=1) / count
     least = REGULARISING_SPREAD * count * float((b**2).sum(axis=1).mean()) + 1e-12
-    slope = np.linalg.solve(own + least[:, None, None] * np.eye(3), across.transpose(0, 2, 1))
+    slope = np.linalg.solve(auto_covariance + least[:, None, None] * np.eye(3), cross_covariance.transpose(0, 2, 1))
     spread = spread + REGULARISING_SPREAD * count * float((a**2).sum(axis=1).mean()) + 1e-12
-    return np.clip(np.einsum("nij,nji->n", across, slope) / spread, 0.0, 1.0), count
+    return np.clip(np.einsum("nij,nji->n", cross_covariance, slope) / spread, 0.0, 1.0), count

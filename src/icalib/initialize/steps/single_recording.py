@@ -33,8 +33,8 @@ def single_recording(inputs: Inputs, k: int) -> Inputs:
     if len(inputs.parts) == 1:
         return inputs
     part = inputs.parts[k]
-    own = replace(part, shift_ns=0, begin=0.0)
-    return replace(inputs, measurements=part.measurements, imu=imu_data(inputs.rig, part.measurements), parts=(own,))
+    alone = replace(part, shift_ns=0, begin=0.0)
+    return replace(inputs, measurements=part.measurements, imu=imu_data(inputs.rig, part.measurements), parts=(alone,))
 
 
 def fullest_recording(inputs: Inputs, key: str) -> int:
@@ -51,9 +51,16 @@ def state_of_recording(inputs: Inputs, k: int, state: State) -> State:
     """The part of `state` that belongs to recording `k`, on its own clock."""
     if len(inputs.parts) == 1:
         return state
-    own = state.recordings[k]
-    seconds = state.seconds[own] - inputs.parts[k].begin
-    return State(seconds, state.rotation[own], state.position[own], state.velocity[own], state.bias[own], state.values)
+    keyframes = state.recordings[k]
+    seconds = state.seconds[keyframes] - inputs.parts[k].begin
+    return State(
+        seconds,
+        state.rotation[keyframes],
+        state.position[keyframes],
+        state.velocity[keyframes],
+        state.bias[keyframes],
+        state.values,
+    )
 
 
 def joined_states(inputs: Inputs, states: Sequence[State], values: dict[Key, np.ndarray]) -> State:
@@ -85,12 +92,12 @@ def states_from_best(
     with naming_recording(inputs, best):
         states = {best: state_of(recordings[best], None)}
     values, name = dict(states[best].values), sensor.name
-    for k, own in enumerate(recordings):
+    for k, recording in enumerate(recordings):
         if k != best:
-            there = None if restarts else _offset_between(states[best], name, recordings[best], own)
+            there = None if restarts else _offset_between(states[best], name, recordings[best], recording)
             with naming_recording(inputs, k):
                 states[k] = state_of(
-                    own, KnownExtrinsics(values.get((name, "rotation")), values[name, "translation"], there)
+                    recording, KnownExtrinsics(values.get((name, "rotation")), values[name, "translation"], there)
                 )
     clocks = range(len(recordings)) if restarts else (best,)
     offsets = [_offset_between(states[k], name, recordings[k], inputs) for k in clocks]

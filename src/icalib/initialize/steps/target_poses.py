@@ -37,14 +37,14 @@ class TargetPoses:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _homography(points, seen, centre, h):
-    """Fills h (9,) = H with seen ~ H (point - centre, 1) and h33 = 1, by linear least squares (DLT). points (n, 3),
-    seen (n, 3). Returns False if singular."""
+def _homography(points, observed, centre, h):
+    """Fills h (9,) = H with observed ~ H (point - centre, 1) and h33 = 1, by linear least squares (DLT). points (n, 3),
+    observed (n, 3). Returns False if singular."""
     A, b, row = np.zeros((8, 8)), np.zeros(8), np.empty(8)
     for n in range(len(points)):
         x, y = points[n, 0] - centre[0], points[n, 1] - centre[1]
         for axis in range(2):
-            m = seen[n, axis]
+            m = observed[n, axis]
             o = 3 * axis
             for i in range(6):
                 row[i] = 0.0
@@ -124,9 +124,9 @@ def _add_corner(X, iz, density, r0, r1, w, J, H, g):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refine_pose(points, seen, R, t, rounds):
-    """Gauss-Newton on R_cam_board and t with Huber weights. points (n, 3) m: corners on the board; seen (n, 3): x / z,
-    y / z, and pixels per unit of these, which fall to a tenth towards the border of a fisheye.
+def refine_pose(points, observed, R, t, rounds):
+    """Gauss-Newton on R_cam_board and t with Huber weights. points (n, 3) m: corners on the board; observed (n, 3):
+    x / z, y / z, and pixels per unit of these, which fall to a tenth towards the border of a fisheye.
 
     Returns the RMS error [px] before the last step, with errors capped at 4 POSE_HUBER_PX; points behind the camera
     count as this much. Returns 1e9 if singular, or if fewer than 4 points are in front of the camera.
@@ -142,8 +142,8 @@ def refine_pose(points, seen, R, t, rounds):
                 behind += 1
                 total += 16.0 * POSE_HUBER_PX * POSE_HUBER_PX
                 continue
-            iz, density = 1.0 / X[2], seen[n, 2]
-            r0, r1 = density * (X[0] * iz - seen[n, 0]), density * (X[1] * iz - seen[n, 1])
+            iz, density = 1.0 / X[2], observed[n, 2]
+            r0, r1 = density * (X[0] * iz - observed[n, 0]), density * (X[1] * iz - observed[n, 1])
             e = np.sqrt(r0 * r0 + r1 * r1)
             total += min(e, 4.0 * POSE_HUBER_PX) ** 2
             _add_corner(X, iz, density, r0, r1, 1.0 if e <= POSE_HUBER_PX else POSE_HUBER_PX / e, J, H, g)
@@ -157,9 +157,9 @@ def refine_pose(points, seen, R, t, rounds):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def select_corners(a, b, point, rays, density, good, target, points, seen):
-    """Fills points (n, 3) and seen (n, 3), as `refine_pose` needs them, with good corners among a..b, evenly spread if
-    there are more than n. Returns their number."""
+def select_corners(a, b, point, rays, density, good, target, points, observed):
+    """Fills points (n, 3) and observed (n, 3), as `refine_pose` needs them, with good corners among a..b, evenly
+    spread if there are more than n. Returns their number."""
     most, total = len(points), 0
     for n in range(a, b):
         total += good[n]
@@ -169,8 +169,8 @@ def select_corners(a, b, point, rays, density, good, target, points, seen):
             if passed * wanted // max(total, 1) >= count and count < wanted:
                 for k in range(3):
                     points[count, k] = target[point[n], k]
-                seen[count, 0], seen[count, 1] = rays[n, 0] / rays[n, 2], rays[n, 1] / rays[n, 2]
-                seen[count, 2] = density[n]
+                observed[count, 0], observed[count, 1] = rays[n, 0] / rays[n, 2], rays[n, 1] / rays[n, 2]
+                observed[count, 2] = density[n]
                 count += 1
             passed += 1
     return count
@@ -208,17 +208,17 @@ def _mirrored_pose(centre, R, t):
 def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, rotation, position, rms):
     """Fills poses (n, 1 or 2, ...) of the images; with two, the mirrored solution is second."""
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
-    points, seen = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
+    points, observed = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     for i in range(len(start) - 1):
         rms[i] = 1e9
-        count = select_corners(start[i], start[i + 1], point, rays, density, good, target, points, seen)
+        count = select_corners(start[i], start[i + 1], point, rays, density, good, target, points, observed)
         if count < fewest[i]:
             continue
         for k in range(2):
             centre[k] = 0.0
             for n in range(count):
                 centre[k] += points[n, k] / count
-        if not _homography(points[:count], seen[:count], centre, h):
+        if not _homography(points[:count], observed[:count], centre, h):
             continue
         _pose_from_homography(h, R, t)
         for k in range(3):
@@ -226,7 +226,7 @@ def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, 
         for turn in range(rms.shape[1]):
             if turn == 1:
                 _mirrored_pose(centre, R, t)
-            rms[i, turn] = refine_pose(points[:count], seen[:count], R, t, rounds)
+            rms[i, turn] = refine_pose(points[:count], observed[:count], R, t, rounds)
             if not rms[i, turn] < 1e9:  # corners on a line, or in one point
                 rms[i, turn] = 1e9
                 break
@@ -301,11 +301,11 @@ def flat_poses(
     rms = np.empty((n, sides))
     for a in range(0, n, POSES_PER_BLOCK):
         i = slice(a, min(a + POSES_PER_BLOCK, n))
-        own = slice(int(start[i.start]), int(start[i.stop]))
-        rays, density, good = usable_rays(stream.uv[own], model, params)
+        rows = slice(int(start[i.start]), int(start[i.stop]))
+        rays, density, good = usable_rays(stream.uv[rows], model, params)
         _poses_of_images(
-            start[i.start : i.stop + 1] - own.start,
-            stream.point[own],
+            start[i.start : i.stop + 1] - rows.start,
+            stream.point[rows],
             rays,
             density,
             good,

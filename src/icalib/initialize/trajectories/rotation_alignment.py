@@ -34,10 +34,10 @@ def align_trajectory(imu: ImuData, name: str, rates: SensorRates, known: KnownEx
 
 def _check_turning(imu: ImuData, name: str, rates: SensorRates) -> None:
     """Raises EstimationError if neither sensor turned significantly."""
-    turned, seen = rms_rates(imu, rates)
-    if is_still(turned, seen):
+    imu_rate, sensor_rate = rms_rates(imu, rates)
+    if is_still(imu_rate, sensor_rate):
         raise EstimationError(
-            f"{name} and {imu.name} hardly turn ({turned:.4f} rad/s RMS), so time offset and rotation are "
+            f"{name} and {imu.name} hardly turn ({imu_rate:.4f} rad/s RMS), so time offset and rotation are "
             "unobservable; record again with rotation about two axes or more, or give rotation and "
             f"time_offset of {name} in the rig file."
         )
