@@ -35,8 +35,11 @@ class SimPositions(SimSensor):
 
     Errors of a fix: white ones of position_noise [m] on x and y and vertical_noise on z, by default the same; and a
     slow one of drift_noise [m], a Gauss-Markov process of correlation time drift_time_s, as multipath makes it. A share
-    outliers of the fixes is off by up to outlier_m on each axis. shared_frame: what the rig file says of the frame
-    where it is one of the target or of another sensor; T_world_frame must then be its pose.
+    outliers of the fixes is off by up to outlier_m on each axis. random_walk [m/sqrt(s)]: a random walk of each axis
+    that starts at 0. A share bursts of the time, in stretches of burst_s on average, all fixes of a stretch are off by
+    the same vector of burst_m / 2 to burst_m, as behind a building that hides the direct signal.
+    shared_frame: what the rig file says of the frame where it is one of the target or of another sensor; T_world_frame
+    must then be its pose.
     """
 
     sensor_type: ClassVar[str] = "position"
@@ -51,10 +54,17 @@ class SimPositions(SimSensor):
     drift_time_s: float = 10.0
     outliers: float = 0.0
     outlier_m: float = 3.0
+    random_walk: float = 0.0
+    bursts: float = 0.0
+    burst_s: float = 4.0
+    burst_m: float = 3.0
 
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimPositions:
-        sizes = ("position_noise", "vertical_noise", "drift_noise", "drift_time_s", "outliers", "outlier_m")
+        sizes = (
+            "position_noise", "vertical_noise", "drift_noise", "drift_time_s", "outliers", "outlier_m", "random_walk",
+            "bursts", "burst_s", "burst_m",
+        )  # fmt: skip
         found, common = mounted_fields(value, start_ns, options=("T_world_frame", "shared_frame", *sizes))
         chosen: dict[str, Any] = {key: at_least(found[key], 0.0) for key in sizes if key in found}
         if "T_world_frame" in found:
@@ -90,11 +100,25 @@ class SimPositions(SimSensor):
         if self.outliers:
             wrong = rng.random(len(seconds)) < self.outliers
             error[wrong] += self.outlier_m * rng.uniform(-1.0, 1.0, (int(wrong.sum()), 3))
+        if self.random_walk:
+            steps = np.sqrt(np.diff(seconds, prepend=seconds[0]))[:, None] * rng.standard_normal((len(seconds), 3))
+            error += self.random_walk * np.cumsum(steps, axis=0)
+        return error + self._bursts(seconds, rng) if self.bursts else error
+
+    def _bursts(self, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(N, 3) m: good stretches and bursts alternate; the durations of both are exponentially distributed."""
+        error, t = np.zeros((len(seconds), 3)), seconds[0]
+        while t < seconds[-1]:
+            begin = t + rng.exponential(self.burst_s * (1.0 - self.bursts) / self.bursts)
+            t = begin + rng.exponential(self.burst_s)
+            direction = rng.standard_normal(3)
+            size = self.burst_m * rng.uniform(0.5, 1.0) / np.linalg.norm(direction)
+            error[(seconds >= begin) & (seconds < t)] = size * direction
         return error
 
     def rig_entry(self) -> PositionSensor:
         vertical = self.position_noise if self.vertical_noise is None else self.vertical_noise
-        plain = vertical == self.position_noise and not (self.drift_noise or self.outliers)
+        plain = vertical == self.position_noise and not (self.drift_noise or self.outliers or self.bursts)
         tilted = abs(self.T_world_frame[2, 2] - 1.0) > 1e-12
         return PositionSensor(
             self.name,
