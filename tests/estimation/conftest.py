@@ -61,6 +61,7 @@ TOLERANCE = {
     "frame_rotation": 2e-3,
     "frame_yaw": 2e-3,
     "frame_translation": 5e-3,
+    "frame_offset": 5e-3,
     "size": 1e-2,
     "scale": 1e-2,
 }

@@ -40,6 +40,7 @@ from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.position.residual import PositionFactor, PositionNoise
 from icalib.sensors.position.stream import PositionStream
+from icalib.sensors.position.walk_factor import OffsetWalkFactor, knot_entries
 from icalib.sensors.wheels.ground_factor import GroundFactor
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
 
@@ -531,10 +532,11 @@ def pose_sample(
 
 def position_sample(
     unlike, setup_of, imu_free=False, frame="frame_yaw", loss="none", curved=False, starts=(0,), restarts=False,
-    stated=True,
+    stated=True, density=0.0, increments=False,
 ):  # fmt: skip
     """Fixes that wander by 0.3 m, far from what the state predicts, with correlated covariances where they are
-    `stated`; the frame is levelled, turned anyhow, or that of the target."""
+    `stated`; the frame is levelled, turned anyhow, or that of the target. density: of their slow offset, or 0, and
+    every fourth fix is then an outlier; `increments`: the factor of this offset."""
     setup = with_poses(setup_of(unlike, imu_free=imu_free), starts)
     blocks = [b for b in setup.layout.blocks if b.key not in (("mocap0", "rotation"), ("mocap0", "scale"))]
     values = dict(setup.state.values)
@@ -545,6 +547,9 @@ def position_sample(
             values[b.sensor, "frame_yaw"] = np.array([2.0 + len(entries)])
         else:
             entries.append((b.sensor, b.name, b.kind, b.size, b.start is not None))
+    for entry in knot_entries("mocap0", len(starts)) if density else ():
+        entries.append(entry)
+        values[entry[:2]] = 0.3 * np.sin(np.arange(3.0) + len(entries))
     setup = replace(setup, layout=make_layout(entries), state=replace(setup.state, values=values))
     setup = with_two_clocks(setup, starts[1]) if restarts else setup
     rng = np.random.default_rng(8)
@@ -558,6 +563,10 @@ def position_sample(
         stream, EstimatedMotion(setup.state, setup.imu, 9.81, 0.5), PositionNoise(0.3, 0.5, loss, LOSS_SCALE),
         setup.layout, "target" if frame == "tilt" else "mocap0",
     )  # fmt: skip
+    if increments:
+        made = OffsetWalkFactor.build(stream, EstimatedMotion(setup.state, setup.imu, 9.81, 0.5), density, setup.layout)
+    elif density:
+        made = replace(made.with_slow_offset(stream, density), used=np.arange(len(made.seconds)) % 4 > 0)
     state = setup.perturbed(rng, 0.3)
 
     return row_sample(setup, state, made, loss if curved else "none", curved)
@@ -705,6 +714,19 @@ SAMPLES = {
     "positions of two recordings, clock that restarts, cauchy, curved": (
         "PositionFactor",
         lambda u, s, f: position_sample(u, s, loss="cauchy", curved=True, starts=(0, 5), restarts=True),
+    ),
+    "positions with a slow offset and outliers, huber": (
+        "PositionFactor",
+        lambda u, s, f: position_sample(u, s, loss="huber", density=0.4),
+    ),
+    "positions of two recordings with a slow offset": (
+        "PositionFactor",
+        lambda u, s, f: position_sample(u, s, density=0.4, starts=(0, 5), restarts=True),
+    ),
+    "slow offset": ("OffsetWalkFactor", lambda u, s, f: position_sample(u, s, density=0.4, increments=True)),
+    "slow offset in two recordings": (
+        "OffsetWalkFactor",
+        lambda u, s, f: position_sample(u, s, density=0.4, starts=(0, 5), restarts=True, increments=True),
     ),
     "bias prior": ("accumulate_bias_prior", lambda u, s, f: bias_prior_sample(u, s)),
 }

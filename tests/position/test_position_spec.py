@@ -37,6 +37,7 @@ def test_defaults(tmp_path):
         "topic: /fix; frame: tilted; position_noise: 0.02; clock_restarts: true",
         "coordinates: geodetic; columns: [t, lat, lon, h]; time_unit: s; position_noise: messages",
         "least_status: fixed; translation: {prior: [0.1, 0, 1.2], sigma: 0.01}; time_offset: {fixed: 0.1}",
+        "position_random_walk: 0.02",
     ],
 )
 def test_fields_are_read_and_written_back(tmp_path, fields):
@@ -51,6 +52,7 @@ def test_fields_are_read_and_written_back(tmp_path, fields):
     ("fields", "sentence"),
     [
         ("position_noise: -1", "position_noise: must be above 0"),
+        ("position_random_walk: 0", "position_random_walk: must be above 0"),
         ("position_noise: mesages", "position_noise: must be a number"),
         ("least_status: rtk", "available are single, differential, float, fixed"),
         ("frame: known", "there is no frame known; available are levelled, tilted."),

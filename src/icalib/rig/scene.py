@@ -50,7 +50,9 @@ PLANE = ParameterSpec(
 FRAME_ROTATION = ParameterSpec("frame_rotation", 3, "rotation", "rad", AXES, radians(10.0), 10.0)
 FRAME_YAW = ParameterSpec("frame_yaw", 1, "vector", "rad", ("frame_yaw",), radians(10.0), 10.0)
 FRAME_TRANSLATION = ParameterSpec("frame_translation", 3, "vector", "m", AXES, 0.5, 10.0)
+# Slow offset of fixes in it, at one instant. Wide, as random walks of an hour may reach metres.
+FRAME_OFFSET = ParameterSpec("frame_offset", 3, "vector", "m", AXES, 0.5, 10.0)
 FRAME = (FRAME_ROTATION, FRAME_TRANSLATION)  # pose of a pose sensor's frame in the world
 LEVEL_FRAME = (FRAME_YAW, FRAME_TRANSLATION)  # the same of a frame that is as level as the world
 BODY = (ROTATION, TRANSLATION)  # pose of one of several bodies of a target in the scene
-SCENE = (SIZE, TILT, SHAPE, PLANE, FRAME_YAW, *FRAME, *BODY)
+SCENE = (SIZE, TILT, SHAPE, PLANE, FRAME_YAW, FRAME_OFFSET, *FRAME, *BODY)

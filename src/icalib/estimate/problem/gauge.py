@@ -11,10 +11,10 @@ import numpy as np
 from icalib.optim.arrowhead import Piece
 from icalib.optim.state import State
 from icalib.rig.scene import FRAME as SENSOR_FRAME
-from icalib.rig.scene import LEVEL_FRAME, PLANE
+from icalib.rig.scene import FRAME_OFFSET, LEVEL_FRAME, PLANE
 
 # Blocks that are estimated along, in a world of which gravity alone is known.
-IN_THE_WORLD = (PLANE.name, *(spec.name for spec in (*SENSOR_FRAME, *LEVEL_FRAME)))
+IN_THE_WORLD = (PLANE.name, *(spec.name for spec in (*SENSOR_FRAME, *LEVEL_FRAME, FRAME_OFFSET)))
 
 # Information [1/m^2, 1/rad^2] along what nothing sees. Any number does if everything else is observable. But a
 # step could move along a fixed direction of planes and sensors all the same, and compensate by a rotation of the world

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs, origin_difference
-from icalib.motion.factor import pairs_of
+from icalib.motion.factor import Whitened, pairs_of
 from icalib.result import RowResiduals, SensorFit
 from icalib.result.excess import excess, times
 from icalib.result.row_records import lag_one_correlation, row_record
 from icalib.result.timeline import Timeline
 from icalib.rig import Rig
+from icalib.sensors.position.fix_errors import random_walk_of
 from icalib.sensors.position.model import FIRST_NOISE_M
 from icalib.sensors.position.residual import PositionFactor, PositionNoise
 from icalib.sensors.position.spec import MESSAGES, PositionSensor
 from icalib.sensors.position.stream import PositionStream
+from icalib.sensors.position.walk_factor import SLOW_OFFSET
 
-CORRELATED = 0.5  # of a residual with the one before: white noise has 0, an error that lasts for two fixes 0.6
+# Correlation of a residual with the one before, above which errors last, and the same in standard errors. White noise
+# leaves 0 or less. With 0.1 the standard deviations of a lever arm were 1.4 times too small.
+MIN_CORRELATION, MIN_CORRELATION_SIGMAS = 0.1, 3.0
 # Seconds by which clocks of satellite systems and of computers differ: GPS time is ahead of UTC by 18 s since 2017, and
 # behind TAI by 19 s. Source: IERS Bulletin C.
 SCALES = {18.0: "GPS time and UTC", 19.0: "TAI and GPS time", 37.0: "TAI and UTC"}
@@ -35,13 +41,20 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[R
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
     """How many fixes are in use, their noise, and scales of time."""
     del timeline
-    for factor, _ in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
+    for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
         sensor, stream = inputs.sensor(factor.name), inputs.stream(factor.name)
         assert isinstance(stream, PositionStream)
-        used = f"{len(factor.seconds)} of {len(stream.stamps_ns)} fixes of {factor.name}"
-        yield f"{used}; {_noise(sensor, stream, factor.noise)}."
+        used = f"{int(factor.used.sum())} of {len(stream.stamps_ns)} fixes of {factor.name}"
+        wrong = int((~factor.used).sum())
+        rejected = f"; {wrong} are outliers of the trajectory, the largest by {_largest(factor, rows):.2g} m"
+        yield f"{used}{rejected if wrong else ''}; {_noise(sensor, stream, factor.noise)}."
         own = found.outcome.state.values[factor.name, "time_offset"] - origin_difference(inputs.measurements, stream)
         yield from scale_of_time(factor.name, float(own[0]))
+
+
+def _largest(factor: PositionFactor, rows: Whitened) -> float:
+    """The largest residual of an outlier [m]."""
+    return float(np.linalg.norm(factor.raw(rows)[~factor.used], axis=1).max(initial=0.0))
 
 
 def _noise(sensor: PositionSensor, stream: PositionStream, noise: PositionNoise) -> str:
@@ -71,15 +84,19 @@ def scale_of_time(name: str, offset: float) -> Iterator[str]:
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """Where errors of fixes last, so that they count for less than their number."""
-    del inputs
     for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
-        correlation = lag_one_correlation(rows.residual)
-        if correlation > CORRELATED:
-            yield (
-                f"the residuals of {factor.name} follow one another (correlation {correlation:.2f} from fix to fix), "
-                "as those of multipath, or of a receiver that filters; the empirical factor counts it in the standard "
-                "deviations. Record for longer, or leave out worse fixes with least_status."
-            )
+        whitened = rows.residual[factor.used]
+        correlation = lag_one_correlation(whitened)
+        if correlation <= max(MIN_CORRELATION, MIN_CORRELATION_SIGMAS / np.sqrt(max(whitened.size, 1))):
+            continue
+        density = random_walk_of(factor.seconds, np.where(factor.used[:, None], factor.raw(rows), np.nan))
+        known = inputs.sensor(factor.name).position_random_walk
+        advice = f"set position_random_walk: {np.hypot(known, density):.2g} in the rig file" if density else ""
+        yield (
+            f"the residuals of {factor.name} are correlated ({correlation:.2f} from fix to fix), as by multipath or by "
+            "a receiver that filters. Its standard deviations may be too small by a factor of two; "
+            f"{advice or 'leave out worse fixes with least_status'}."
+        )
 
 
 def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> str | None:
@@ -87,6 +104,8 @@ def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> str | None:
     del is_noise
     if excess(f) == 1.0:
         return None
+    if f.kind == SLOW_OFFSET:
+        return f"the slow offset of {f.sensor} is {times(f)} larger than position_random_walk predicts; make it larger."
     stated = "the recording states" if sensor.position_noise == MESSAGES else "position_noise predicts"
     return (
         f"{f.kind} residuals of {f.sensor} are {times(f)} larger than {stated}; leave position_noise out, and it is "

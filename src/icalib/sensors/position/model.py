@@ -17,6 +17,7 @@ from icalib.sensors.position.frame import frame_owner
 from icalib.sensors.position.residual import PositionFactor, PositionNoise
 from icalib.sensors.position.spec import LEVELLED, PositionSensor
 from icalib.sensors.position.stream import PositionStream
+from icalib.sensors.position.walk_factor import OffsetWalkFactor, knot_entries
 
 FIRST_NOISE_M = 0.05  # of each axis where nothing is stated: between differential and carrier-phase fixes
 # m, or times the standard deviation of the weights: keeps the weights of fixes without any noise finite.
@@ -31,11 +32,12 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
 
     def scene_entries(self, sensor: PositionSensor, rig: Rig, n_recordings: int) -> list[Entry]:
         """The frame of its fixes in the world of each recording, unless it shares one: its yaw and origin where both
-        are levelled."""
+        are levelled. Then the knots of their slow offset."""
+        knots = knot_entries(sensor.name, n_recordings) if sensor.position_random_walk else []
         if not sensor.has_frame:
-            return []
+            return knots
         levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == LEVELLED
-        return frame_entries(sensor.name, n_recordings, specs=LEVEL_FRAME if levelled else FRAME)
+        return frame_entries(sensor.name, n_recordings, specs=LEVEL_FRAME if levelled else FRAME) + knots
 
     def keyframe_times(
         self, sensor: PositionSensor, stream: PositionStream, values: dict[Key, np.ndarray], rig: Rig
@@ -66,10 +68,17 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
 
     def factors(
         self, sensor: PositionSensor, stream: PositionStream, noise: PositionNoise, at: Pass
-    ) -> Iterator[PositionFactor]:
-        """One, of all fixes."""
+    ) -> Iterator[PositionFactor | OffsetWalkFactor]:
+        """One of all fixes, outliers rejected by their residuals where the pass begins, and one of their slow
+        offset."""
         assert at.motion is not None
-        yield PositionFactor.build(weighted(sensor, stream), at.motion, noise, at.layout, frame_owner(sensor))
+        density, deviations = sensor.position_random_walk, at.rig.settings.outlier_std
+        factor = PositionFactor.build(weighted(sensor, stream), at.motion, noise, at.layout, frame_owner(sensor))
+        factor = factor.with_slow_offset(stream, density) if density else factor
+        # Where the first pass begins, the trajectory follows the fixes, and shows no outliers.
+        yield factor if at.coarse or deviations <= 0.0 else factor.without_outliers(at.state, deviations)
+        if density:
+            yield OffsetWalkFactor.build(stream, at.motion, density, at.layout)
 
 
 def weighted(sensor: PositionSensor, stream: PositionStream) -> PositionStream:

@@ -4,18 +4,19 @@
 
 at the instant of the fix on the IMU's clock. The trajectory is carried to that instant by the IMU's readings; fixes are
 never interpolated. Parameters: the sensor's blocks translation (p_imu_sensor) and time_offset; of its frame in each
-recording frame_yaw or frame_rotation, and frame_translation, or the tilt of the target: see `frame`.
+recording frame_yaw or frame_rotation, and frame_translation, or the tilt of the target: see `frame`. A slow offset of
+the fixes adds to e: see `walk_factor`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
-from icalib.motion.factor import FactorKey, RowFactor, Whitened
+from icalib.motion.factor import FactorKey, FitKey, RawSize, RowFactor, Whitened, output_at
 from icalib.motion.imu_data import ImuData
 from icalib.motion.row_sums import Into, RobustNoise, add_rows, rows_by_recording
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
@@ -24,8 +25,10 @@ from icalib.motion.time_offsets import offset_at
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
+from icalib.sensors.position.fix_errors import bursts_of, outliers_of, rms
 from icalib.sensors.position.frame import PositionFrame
 from icalib.sensors.position.stream import PositionStream
+from icalib.sensors.position.walk_factor import OffsetWalk
 
 # Fixes further from all keyframes are left out. The noise of an accelerometer of 0.01 m/s^2/sqrt(Hz), a poor one, moves
 # a position by 1 mm over this time; the row does not count it.
@@ -54,8 +57,9 @@ class PositionNoise:
 
 @dataclass(frozen=True)
 class PositionFactor(RowFactor):
-    """n fixes of one sensor. frame: whose frame they are in, see `frame_owner`; keyframe (n,): of each, in order; root
-    (n, 3, 3): see `PositionStream`."""
+    """n fixes of one sensor. frame: whose frame they are in, see `frame_owner`; keyframe (n,): of each, in order;
+    whitening (n, 3, 3): W with W^T W the inverse of the covariance [1/m]; used (n,) bool: without outliers; walk: the
+    slow offset of the fixes, None without any."""
 
     units: ClassVar[Mapping[str, str]] = {"horizontal": "m", "vertical": "m"}
 
@@ -63,7 +67,8 @@ class PositionFactor(RowFactor):
     frame: str
     seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
     position: np.ndarray  # (n, 3) m
-    root: np.ndarray
+    whitening: np.ndarray
+    used: np.ndarray
     keyframe: np.ndarray
     starts: tuple[int, ...]  # the first keyframe of each recording
     n_keyframes: int
@@ -71,6 +76,7 @@ class PositionFactor(RowFactor):
     gravity: float
     noise: PositionNoise
     layout: Layout
+    walk: OffsetWalk | None = None
 
     @classmethod
     def build(
@@ -79,10 +85,24 @@ class PositionFactor(RowFactor):
         """The fixes near keyframes and outside gaps of the IMU; their keyframes stay while the solver runs. The
         covariances of `stream` are the weights: see `model.weighted`."""
         state, (k, keyframe) = motion.state, motion.near_keyframes(stream, NEAR_KEYFRAME_S)
+        whitening, used = stream.root[k] / noise.sizes[:, None], np.ones(len(keyframe), dtype=bool)
         return cls(
-            stream.name, frame, stream.seconds[k], stream.position[k], stream.root[k], keyframe, state.starts,
+            stream.name, frame, stream.seconds[k], stream.position[k], whitening, used, keyframe, state.starts,
             len(state.seconds), motion.imu, motion.gravity, noise, layout,
         )  # fmt: skip
+
+    def with_slow_offset(self, stream: PositionStream, density: float) -> PositionFactor:
+        """The same with an offset that is a random walk of this density [m/sqrt(s)]; stream: with all fixes."""
+        walk, root = OffsetWalk.of(stream, self.seconds, density, self.layout), np.linalg.inv(self.whitening)
+        covariance = root @ root.transpose(0, 2, 1) + walk.bridge_variance[:, None, None] * np.eye(3)
+        return replace(self, whitening=np.linalg.inv(np.linalg.cholesky(covariance)), walk=walk)
+
+    def without_outliers(self, state: State, deviations: float) -> PositionFactor:
+        """The same without fixes whose residuals at `state` are outliers, alone or in bursts."""
+        out = output_at(self, state)
+        raw = self.raw(out)
+        wrong = outliers_of(out.residual, raw, deviations) | bursts_of(self.seconds, raw, self.raw_sigma())
+        return replace(self, used=~wrong)
 
     @property
     def key(self) -> FactorKey:
@@ -103,11 +123,22 @@ class PositionFactor(RowFactor):
 
     def raw(self, out: Whitened) -> np.ndarray:
         """(n, 3) residuals in the frame's axes [m]."""
-        return np.linalg.solve(self.root, (self.noise.sizes * out.residual)[:, :, None])[:, :, 0]
+        return np.linalg.solve(self.whitening, out.residual[:, :, None])[:, :, 0]
 
     def raw_sigma(self) -> np.ndarray:
         """(n, 3) m in the frame's axes."""
-        return np.sqrt(((np.linalg.inv(self.root) * self.noise.sizes) ** 2).sum(axis=2))
+        return np.sqrt((np.linalg.inv(self.whitening) ** 2).sum(axis=2))
+
+    def count(self, out: Whitened, kind: str) -> int:
+        """Number of scalar residuals of a kind in use."""
+        return int((out.root[:, self.kinds[kind]] > 0.0).sum())
+
+    def sizes(self, out: Whitened) -> dict[FitKey, RawSize]:
+        """See `Factor`; the RMS is that of fixes in use."""
+        raw, used = self.raw(out), out.root[:, 0] > 0.0
+        return {
+            (self.name, kind): RawSize(rms(raw[used][:, c]), "m", int((~used).sum())) for kind, c in self.kinds.items()
+        }
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`."""
@@ -122,18 +153,33 @@ class PositionFactor(RowFactor):
         frame, keyframe = PositionFrame.of(self.frame, recording, state.values), self.keyframe[own]
         kinematics = Kinematics.of(self)
         at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
-        rows = _rows(self.position[own], frame, at, into.sums)
-        columns = [kinematics.columns(recording), frame.columns(self.layout)]
-        noise = RobustNoise(self.root[own] / self.noise.sizes[:, None], self.noise.loss, self.noise.loss_scale)
-        interval = rows.on_intervals(keyframe, self.n_keyframes)
-        return add_rows(rows, own, interval, np.concatenate(columns), noise, into)
+        rows = self._rows(own, frame, at, state, into.sums)
+        columns = np.concatenate([kinematics.columns(recording), frame.columns(self.layout)])
+        return self._add(rows, own, rows.on_intervals(keyframe, self.n_keyframes), columns, into)
 
+    def _rows(self, own: slice, frame: PositionFrame, at: SensorPose, state: State, jacobians: bool) -> Rows:
+        """Rows of residuals (n, 3) m of the fixes `own`, by the calibration parameters of the sensor's pose, then those
+        of the frame, then the knots before and after each."""
+        inside, walk = frame.inward(at.position), self.walk
+        residual = inside - self.position[own]
+        if walk is not None:
+            residual += walk.offsets(own, state)
+        if not jacobians:
+            return rows_at(residual, (), (at,), np.zeros((0, 3, 0)))
+        J_pose = np.concatenate([np.zeros((len(inside), 3, 3)), frame.rotation.T @ at.rotation], axis=2)
+        J_own = [frame.jacobian(inside)] if walk is None else [frame.jacobian(inside), walk.weights(own)]
+        return rows_at(residual, (J_pose,), (at,), np.concatenate(J_own, axis=2))
 
-def _rows(measured: np.ndarray, frame: PositionFrame, at: SensorPose, jacobians: bool) -> Rows:
-    """Rows of residuals (n, 3) m of `measured` fixes (n, 3), by the calibration parameters of the sensor's pose, then
-    those of the frame."""
-    n, inside = len(measured), frame.inward(at.position)
-    if not jacobians:
-        return rows_at(inside - measured, (), (at,), np.zeros((0, 3, 0)))
-    J_pose = np.concatenate([np.zeros((n, 3, 3)), frame.rotation.T @ at.rotation], axis=2)
-    return rows_at(inside - measured, (J_pose,), (at,), frame.jacobian(inside))
+    def _add(self, rows: Rows, own: slice, interval: np.ndarray, columns: np.ndarray, into: Into) -> float:
+        """Adds the rows `own`, outliers with weight 0. columns: those that all rows share."""
+        W, used, cost = self.whitening[own], self.used[own], 0.0
+        weighted = np.where(used[:, None, None], W, 0.0)
+        whole = [(slice(0, len(used)), np.zeros(0, dtype=np.int64))]
+        for part, knots in whole if self.walk is None else self.walk.stretches(own):
+            some = Rows(rows.residual[part], rows.J[part])
+            where = slice(own.start + part.start, own.start + part.stop)
+            noise = RobustNoise(weighted[part], self.noise.loss, self.noise.loss_scale)
+            cost += add_rows(some, where, interval[part], np.concatenate([columns, knots]), noise, into)
+        into.out.residual[own][~used] = np.einsum("nij,nj->ni", W[~used], rows.residual[~used])
+        into.out.root[own][~used] = 0.0
+        return cost

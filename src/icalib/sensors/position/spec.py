@@ -36,7 +36,7 @@ Coordinates = Literal["metric", "geodetic"]
 Status = Literal["single", "differential", "float", "fixed"]  # quality of a GNSS fix, worst first
 STATUSES: tuple[Status, ...] = ("single", "differential", "float", "fixed")
 MESSAGES: Literal["messages"] = "messages"
-_FIELDS = ("path", "topic", "coordinates", "frame", "position_noise", "least_status")
+_FIELDS = ("path", "topic", "coordinates", "frame", "position_noise", "position_random_walk", "least_status")
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,8 @@ class PositionSensor(ClockedSensor):
     rotation is (UWB anchors); else the name of a sensor, or target, whose frame it shares: nothing is estimated of it.
     position_noise [m]: standard deviation of each axis; "messages": the covariances of the
     recording as they are; None: estimated from the residuals, the covariances of the recording as weights.
-    least_status: worse fixes are left out.
+    position_random_walk [m/sqrt(s)]: density of a slow offset of the fixes, of each axis; 0: none. least_status: worse
+    fixes are left out.
     """
 
     sensor_type: ClassVar[str] = "position"
@@ -60,6 +61,7 @@ class PositionSensor(ClockedSensor):
     coordinates: Coordinates | None = None
     frame: str = LEVELLED
     position_noise: float | Literal["messages"] | None = None
+    position_random_walk: float = 0.0
     least_status: Status = "single"
     translation: Parameter = Parameter()  # (3,) lever arm: the antenna in the body's frame [m]
     topic: str | None = None  # of its messages; None: the one with the sensor's name, or the only one
@@ -92,6 +94,7 @@ class PositionSensor(ClockedSensor):
             coordinates=choice_or(found, "coordinates", Coordinates, None),
             frame=found["frame"].text() if "frame" in found else cls.frame,
             position_noise=_noise(found["position_noise"]) if "position_noise" in found else None,
+            position_random_walk=found["position_random_walk"].positive() if "position_random_walk" in found else 0.0,
             least_status=choice_or(found, "least_status", Status, cls.least_status),
             topic=topic_or_none(found),
             layout=table_layout(found),
@@ -102,6 +105,7 @@ class PositionSensor(ClockedSensor):
         plain: dict[str, Any] = {"type": "position", "path": self.path, "frame": self.frame}
         plain |= layout_to_plain(self.layout) | {"least_status": self.least_status}
         given = {name: getattr(self, name) for name in ("coordinates", "position_noise", "topic")}
+        given["position_random_walk"] = self.position_random_walk or None
         return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
 
 

@@ -34,6 +34,7 @@ from icalib.sensors.position.initialize.with_imu import motion_from_fixes
 from icalib.sensors.position.read.outliers import single_wrong
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
+from icalib.sensors.position.walk_factor import knot_keys
 
 GUESSED_GROUPS = ("translation", "time_offset")
 
@@ -143,8 +144,10 @@ def _is_levelled(inputs: Inputs, sensor: PositionSensor) -> bool:
 
 
 def _frames(inputs: Inputs, sensor: PositionSensor, found: Sequence[tuple[np.ndarray, np.ndarray]]) -> Values:
-    """Blocks of the sensor's own frame in each recording: R_world_frame, p_world_frame."""
+    """Blocks of the sensor's own frame in each recording: R_world_frame, p_world_frame; and no offset of the fixes."""
     out: Values = {}
+    if sensor.position_random_walk:
+        out |= {key: np.zeros(3) for k in range(len(found)) for key in knot_keys(sensor.name, k, len(found))}
     if not sensor.has_frame:
         return out
     levelled = _is_levelled(inputs, sensor)

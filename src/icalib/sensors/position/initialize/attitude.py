@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from icalib.geometry import so3
 from icalib.initialize.steps.lever_arm import Triples
 from icalib.motion.imu_data import ImuData
-from icalib.sensors.position.initialize.triples import WINDOW_MARGIN_S, IntegratedReadings
+from icalib.sensors.position.initialize.triples import WINDOW_MARGIN_S, IntegratedReadings, triples_of
+from icalib.sensors.position.read.outliers import steps
 
 MAX_WINDOW_ROUNDS = 12
 # rad, rad/s, m/s^2, m, s: of a Gauss-Newton step. Smaller changes of a start value do not change the estimate.
@@ -32,6 +34,18 @@ class Fix:
 
     t: np.ndarray
     position: np.ndarray
+
+    @cached_property
+    def run(self) -> np.ndarray:
+        """(N,) int, the same for fixes that no step of the solution separates: differences of these hold no step."""
+        at, _ = steps(self.t, self.position)
+        return np.cumsum(np.bincount(at, minlength=len(self.t)))
+
+    @property
+    def triples(self) -> Triples:
+        """Of fixes about a second apart, no step of the solution between them."""
+        found = triples_of(self.t)
+        return found.some(self.run[found.i] == self.run[found.k])
 
 
 @dataclass(frozen=True)

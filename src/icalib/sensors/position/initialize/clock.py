@@ -53,7 +53,7 @@ def _of_fixes(fix: Fix) -> tuple[np.ndarray, np.ndarray]:
     good = index[3] < len(t)
     i, j, k, m = (x[good] for x in index)
     h1, h2, h3 = (t[b] - t[a] for a, b in ((i, j), (j, k), (k, m)))
-    even = np.max([h1, h2, h3], axis=0) < 1.2 * step
+    even = (np.max([h1, h2, h3], axis=0) < 1.2 * step) & (fix.run[i] == fix.run[m])
     v1, v2, v3 = ((fix.position[b] - fix.position[a]) / h[:, None] for a, b, h in ((i, j, h1), (j, k, h2), (k, m, h3)))
     third = (v3 - v2) / (0.5 * (h2 + h3))[:, None] - (v2 - v1) / (0.5 * (h1 + h2))[:, None]
     middle = 0.25 * (t[i] + t[j] + t[k] + t[m])

@@ -91,8 +91,8 @@ def _candidate_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> 
         return [known.offset]
     by_acceleration = [shift.samples / SIGNAL_RATE_HZ for shift in likely_offsets(motion.imu, fix)]
     state = motion.state
-    moved = _speeds(state.seconds, state.position)
-    seen = _speeds(fix.t, fix.position)
+    moved = _speeds(state.seconds, state.position, np.zeros(len(state.seconds)))
+    seen = _speeds(fix.t, fix.position, fix.run)
     if not (varies(*moved) and varies(*seen)):
         return by_acceleration
     overlap, spacing = MIN_SPEED_OVERLAP_S * SIGNAL_RATE_HZ, round(PEAK_SPACING_S * SIGNAL_RATE_HZ)
@@ -117,14 +117,14 @@ def _scanned_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> li
     return [offset for _, offset in sorted(tried)[:MAX_SPEED_PEAKS]]
 
 
-def _speeds(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _speeds(t: np.ndarray, p: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean speeds (m,) over SPEED_STEP_S [m/s] of positions p (n, 3) at t (n,) s, at SIGNAL_RATE_HZ from 0 s on, and
-    where they are known (m,)."""
+    where they are known (m,): not across fixes of another `run` (n,)."""
     grid = np.arange(int(t[-1] * SIGNAL_RATE_HZ) + 1) / SIGNAL_RATE_HZ
     ends = [grid - 0.5 * SPEED_STEP_S, grid + 0.5 * SPEED_STEP_S]
     apart = max(2.5 * float(np.median(np.diff(t))), 1.5 / SIGNAL_RATE_HZ)
     after = [np.clip(np.searchsorted(t, x), 1, len(t) - 1) for x in ends]
-    known = (ends[0] >= t[0]) & (ends[1] <= t[-1])
+    known = (ends[0] >= t[0]) & (ends[1] <= t[-1]) & (run[after[0] - 1] == run[after[1]])
     for k in after:
         known &= t[k] - t[k - 1] <= apart
     at = [np.stack([np.interp(x, t, p[:, k]) for k in range(3)], axis=1) for x in ends]

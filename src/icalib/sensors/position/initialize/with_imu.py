@@ -25,7 +25,7 @@ from icalib.sensors.position.initialize.attitude import (
     sigmas,
 )
 from icalib.sensors.position.initialize.clock import MIN_JERK_CORRELATION, SIGNAL_RATE_HZ, likely_offsets
-from icalib.sensors.position.initialize.triples import IntegratedReadings, recorded, triples_of
+from icalib.sensors.position.initialize.triples import IntegratedReadings, recorded
 
 FIRST_HALF_WINDOW_S = 10.0  # a gyroscope bias of 0.5 deg/s turns 5 degrees in it, which Kabsch tolerates
 MAX_HALF_WINDOW_S = 60.0  # of the largest window: biases are modelled as constant in it
@@ -92,7 +92,7 @@ def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: 
     """Trajectory of the IMU in the frame of the fixes. known: extrinsics and time offset of the rig file.
 
     Raises EstimationError where fixes and readings contradict each other, are too few, or have no acceleration."""
-    triples = triples_of(fix.t)
+    triples = fix.triples
     if len(triples.i) < MIN_WINDOW_TRIPLES:
         raise EstimationError(
             f"{name}: only {len(triples.i)} groups of three fixes about a second apart are usable, and "

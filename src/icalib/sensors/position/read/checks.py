@@ -121,12 +121,13 @@ def _without_singles(read: PositionReadings, what: str) -> tuple[PositionReading
 
 def _jumps(read: PositionReadings, what: str) -> tuple[str, ...]:
     """A note on steps of the solution."""
-    first, size = steps(read.seconds, read.position)
+    first, vectors = steps(read.seconds, read.position)
     if not len(first):
         return ()
+    size = np.linalg.norm(vectors, axis=1)
     times = "once" if len(first) == 1 else f"{len(first)} times"
     return (
         f"{what}: its fixes jump {times}, by up to {size.max():.2g} m, the first at {read.stamps_ns[first[0]]} ns, as "
-        "when a receiver gains or loses its carrier-phase solution. The robust "
-        "loss reduces their weight; leave such fixes out with least_status, or cut the recording with --from and --to.",
+        "when a receiver gains or loses its carrier-phase solution. Fixes that do not fit the trajectory are rejected; "
+        "leave worse fixes out with least_status, or cut the recording with --from and --to.",
     )

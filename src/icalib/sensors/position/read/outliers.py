@@ -48,14 +48,12 @@ def _from_cubic(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def steps(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (m,) of fixes before which p (n, 3) at t (n,) s steps, and sizes (m,) m."""
+    """Numbers (m,) of fixes before which p (n, 3) at t (n,) s steps, and by how much (m, 3) m, beyond the motion."""
     dt, moved = np.diff(t), np.diff(p, axis=0)
     if len(dt) < 5:
-        return np.zeros(0, dtype=np.int64), np.zeros(0)
-    beyond = np.linalg.norm(
-        moved - dt[:, None] * median_filter(moved / dt[:, None], size=(5, 1), mode="nearest"), axis=1
-    )
-    typical = float(np.median(dt))
-    limit = max(MIN_STEP_M, MIN_STEP_M_S2 * typical**2, MAX_MEDIAN_DISTANCES * float(np.median(beyond)))
-    found = np.flatnonzero((beyond > limit) & (dt < MAX_GAP_STEPS * typical))
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+    beyond = moved - dt[:, None] * median_filter(moved / dt[:, None], size=(5, 1), mode="nearest")
+    typical, size = float(np.median(dt)), np.linalg.norm(beyond, axis=1)
+    limit = max(MIN_STEP_M, MIN_STEP_M_S2 * typical**2, MAX_MEDIAN_DISTANCES * float(np.median(size)))
+    found = np.flatnonzero((size > limit) & (dt < MAX_GAP_STEPS * typical))
     return found + 1, beyond[found]

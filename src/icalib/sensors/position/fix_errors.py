@@ -1,0 +1,77 @@
+"""What residuals show of the errors of fixes.
+
+Some fixes do not fit the trajectory: single ones, and bursts in which consecutive fixes are off by the same metres,
+as between buildings.
+
+The first pass bounds their influence by Huber's loss, which is convex. Each later pass rejects them by their residuals
+where it begins: least squares of the rest, the scale by the median (reweighted least squares; Rousseeuw and Leroy,
+Robust Regression and Outlier Detection, 1987, section 1.2). A rejected fix is tested again before each pass.
+
+A long burst pulls the trajectory to itself, so that its own residuals are small. But the IMU does not let the
+trajectory jump between neighbouring fixes: where the burst begins and ends, residuals step by its whole offset.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+from scipy.stats import chi2
+
+from icalib.sensors.position.read.outliers import MAX_GAP_STEPS, MIN_OUTLIER_M, MIN_STEP_M
+
+MIN_STEP_SIGMAS = 6.0  # a smaller step of the residuals may be noise: 1 of 10^8 is larger
+STRUCTURE_LAG_S = 1.0  # the trajectory absorbs most of errors that are much slower
+
+
+def outliers_of(whitened: np.ndarray, raw: np.ndarray, deviations: float) -> np.ndarray:
+    """(n,) bool: fixes that are outliers by their residuals, whitened (n, 3) and raw (n, 3) m.
+
+    Horizontal and vertical residuals are compared with their own medians, so that the size of the noise need not be
+    known. The limit is what a standard normal number exceeds as rarely as `deviations`.
+    """
+    rare, found = 2.0 * ndtr(-deviations), np.zeros(len(whitened), dtype=bool)
+    for columns, freedom in ((slice(0, 2), 2), (slice(2, 3), 1)):
+        squares = (whitened[:, columns] ** 2).sum(axis=1)
+        typical = np.median(squares) / chi2.ppf(0.5, freedom) if len(squares) else 1.0
+        far = np.linalg.norm(raw[:, columns], axis=1) > MIN_OUTLIER_M
+        found |= far & (squares > typical * chi2.isf(rare, freedom))
+    return found
+
+
+def bursts_of(seconds: np.ndarray, raw: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """(n,) bool: fixes at `seconds` (n,) that steps of the residuals separate from most others. raw, sigma (n, 3) m:
+    residuals, and their standard deviations up to a common factor.
+
+    The steps add up to the offset of each fix from the first. Between gaps, offsets near the median are right.
+    """
+    wrong, dt = np.zeros(len(seconds), dtype=bool), np.diff(seconds)
+    if not len(dt):
+        return wrong
+    moved = np.diff(raw, axis=0)
+    size, expected = (moved**2).sum(axis=1), (sigma[1:] ** 2 + sigma[:-1] ** 2).sum(axis=1)
+    typical = np.median(size / expected) * 3.0 / chi2.ppf(0.5, 3)
+    gap = dt > MAX_GAP_STEPS * np.median(dt)
+    is_step = (size > MIN_STEP_M**2) & (size > MIN_STEP_SIGMAS**2 * typical * expected) & ~gap
+    offset = np.cumsum(np.vstack([np.zeros(3), np.where(is_step[:, None], moved, 0.0)]), axis=0)
+    for own in np.split(np.arange(len(seconds)), np.flatnonzero(gap) + 1):
+        wrong[own] = np.linalg.norm(offset[own] - np.median(offset[own], axis=0), axis=1) > MIN_STEP_M
+    return wrong
+
+
+def random_walk_of(seconds: np.ndarray, raw: np.ndarray) -> float:
+    """Density [m/sqrt(s)] of the random walk that residuals `raw` (n, 3) m at `seconds` (n,) have beside white noise;
+    NaN for those that do not count. It is too small by a fifth, as the trajectory absorbs some of a walk.
+
+    By the structure function D(h) = <(r(t + h) - r(t))^2> = 2 sigma^2 + q^2 h, between one fix and about a second.
+    """
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else STRUCTURE_LAG_S
+    longer = max(2, round(STRUCTURE_LAG_S / step))
+    if len(seconds) <= longer:
+        return 0.0
+    short, long = (float(np.nanmean((raw[k:] - raw[:-k]) ** 2)) for k in (1, longer))
+    return float(np.sqrt(max(long - short, 0.0) / ((longer - 1) * step)))
+
+
+def rms(x: np.ndarray) -> float:
+    """Root mean square of all of `x`; 0 of none."""
+    return float(np.sqrt(np.mean(x**2))) if x.size else 0.0
