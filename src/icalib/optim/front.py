@@ -1,7 +1,7 @@
 """Frontal elimination of a chain whose keyframes share features, each seen from many keyframes (paper (15), Schur
 complement).
 
-`front_plan.py` chooses the elimination order; `front_kernels.py` has the compiled steps. The cost of a step grows with
+`front_plan.py` chooses the elimination order; `front_kernels.py` and `front_substitution.py` have the compiled steps. The cost of a step grows with
 the square of the number of features in the front.
 """
 
@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.optim.front_kernels import FrontChain, Sizes, eliminate_all, rotate_keyframes, substitute_all
+from icalib.optim.front_kernels import FrontChain, Sizes, eliminate_all, rotate_keyframes
 from icalib.optim.front_plan import FeatureSums, Plan
+from icalib.optim.front_substitution import substitute_all
 from icalib.optim.state import KEYFRAME_DIM
 
 

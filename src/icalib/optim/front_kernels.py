@@ -1,9 +1,10 @@
-"""Compiled steps of the elimination of keyframes and features (`front.py`), in place in a front that fits the cache.
+"""Compiled elimination steps of keyframes and features (`front.py`), in place in a front that fits the cache.
 
-The front is the upper triangle over calibration parameters and features in slots; `carry` (15, 15 + .) what is left of
-the keyframe that comes next: with itself, calibration parameters, features. Matrices are split into rows that meet no
-feature ("rest") and those that do ("coupled"), and the former are eliminated first: of a keyframe that one camera sees
-from, six dimensions of 15 meet any."""
+The front is the upper triangle over calibration parameters and the features in its slots. `carry` (15, 15 + .) is the
+remaining system of the next keyframe: with itself, calibration parameters, features. The rows of keyframes are rotated
+so that some of them involve no feature ("rest"), and the others do ("coupled"). Rest rows are eliminated first. A
+keyframe with images of one camera has six coupled dimensions of 15.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.geometry.blas import factorise, solve_transposed, solve_upper, subtract_gram, subtract_product
+from icalib.geometry.blas import factorise, solve_transposed, subtract_gram, subtract_product
 from icalib.optim.state import KEYFRAME_DIM, POSE_DIM
 
 
 class FrontChain(NamedTuple):
-    """Keyframes of the piece: diagonal, upper (n, 15, 15), side (n, 15, B + 1), the direction, and how each is turned:
-    turn (n, 15, 15), its columns the new dimensions; pose and next_pose by these (I, 6, 15)."""
+    """Keyframes of the piece: diagonal, upper (n, 15, 15), side (n, 15, B + 1); direction; turn (n, 15, 15),
+    orthogonal, its columns the rotated dimensions; pose and next_pose (I, 6, 15), Jacobians of image poses by these."""
 
     diagonal: np.ndarray
     upper: np.ndarray
@@ -30,8 +31,8 @@ class FrontChain(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Of each step (G,): rows that meet no feature, rows that do, those of features that die, columns of the front; and
-    where its factors begin in the room (G + 1,)."""
+    """Sizes of each step (G,): rest rows, coupled rows, rows of features that leave (dying), columns of the front;
+    start (G + 1,): of its factors in the workspace."""
 
     rest: np.ndarray
     coupled: np.ndarray
@@ -41,9 +42,9 @@ class Sizes(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _factors(g, sizes, n_b, room):
-    """Views of step g: U of the keyframes, and of dying features; keyframes by these; rows of rest, and of all
-    others."""
+def step_factors(g, sizes, n_b, room):
+    """Views of the factors of step g: U of the keyframes, U of the dying features, coupled keyframes by these, rest
+    rows, and all other rows."""
     a, c, d, w = sizes.rest[g], sizes.coupled[g], sizes.dying[g], sizes.wide[g]
     o, p = sizes.start[g], a + c
     U = room[o : o + p * p].reshape(p, p)
@@ -59,7 +60,7 @@ def _factors(g, sizes, n_b, room):
 
 @njit(cache=True, nogil=True)
 def _mirror(v, first, M):
-    """M <- (1 - 2 v v^T) M for a unit vector v, zeros before its element `first`."""
+    """Householder reflection M <- (1 - 2 v v^T) M for a unit vector v that is zero before element `first`."""
     for j in range(M.shape[1]):
         s = 0.0
         for i in range(first, len(v)):
@@ -70,7 +71,7 @@ def _mirror(v, first, M):
 
 @njit(cache=True, nogil=True)
 def _reflect(T, Q):
-    """Q (15, 15), orthogonal: T Q has nothing but zeros behind its first rows' number of columns (Householder)."""
+    """Fills Q (15, 15), orthogonal, such that T Q is zero beyond its first len(T) columns (Householder QR of T^T)."""
     A, v = T.T.copy(), np.empty(KEYFRAME_DIM)
     Q[:] = np.eye(KEYFRAME_DIM)
     for k in range(A.shape[1]):
@@ -87,7 +88,8 @@ def _reflect(T, Q):
 
 @njit(cache=True, nogil=True)
 def rotate_keyframes(plan, sums, turn, pose, next_pose):
-    """Turns every keyframe such that what meets features comes first."""
+    """Fills the rotation of every keyframe that puts its coupled dimensions first, and the image poses by rotated
+    dimensions."""
     n, seeing = len(turn), np.zeros(len(sums.keyframe), dtype=np.bool_)
     for e in range(len(sums.image)):
         seeing[sums.image[e]] = True
@@ -109,10 +111,10 @@ def rotate_keyframes(plan, sums, turn, pose, next_pose):
 
 @njit(cache=True, nogil=True)
 def _join(g, plan, sums, n_b, front, carry, old_wide):
-    """Features move, and others join."""
+    """Moves features to other slots of the front, and adds those that join."""
     for q in range(plan.leave.start[g], plan.leave.start[g + 1]):
         a, b = n_b + 3 * plan.leave.values[q], n_b + 3 * plan.enter[q]
-        # Columns of a row lie side by side, rows do not: all three of a feature at a time.
+        # Rows are contiguous, columns are not: all three columns of a feature are moved together.
         for x in range(old_wide):
             if b <= x < b + 3 or a <= x < a + 3:
                 continue
@@ -140,7 +142,7 @@ def _join(g, plan, sums, n_b, front, carry, old_wide):
 
 @njit(cache=True, nogil=True)
 def _places(g, plan, rest, row):
-    """row (K, 15): where each dimension of the step's keyframes stands, rest first."""
+    """Fills row (K, 15): row index of each dimension of the step's keyframes, rest rows first."""
     r, c = 0, rest
     for q in range(plan.keyframes.start[g], plan.keyframes.start[g + 1]):
         k = plan.keyframes.values[q]
@@ -155,11 +157,12 @@ def _places(g, plan, rest, row):
 
 @njit(cache=True, nogil=True)
 def _fill_keyframes(g, plan, chain, row, U, Wr, Wc):
-    """Adds the sums of the step's keyframes, each turned by its Q, to U, Wr and Wc.
+    """Adds the sums of the step's keyframes, each rotated by its Q, to U, Wr and Wc.
 
-    U (a + c, a + c), upper triangle: the keyframes with one another. Wr (a, .), Wc (c + d, .): the a rest rows and the
-    c coupled ones (then the d of dying features) by columns: 15 of the keyframe after, calib, gradient, and features in
-    Wc. row (K, 15): see `_places`. q counts the step's keyframes, k those of the piece."""
+    U (a + c, a + c), upper triangle: the keyframes with one another. Wr (a, .), Wc (c + d, .): the a rest rows, and the
+    c coupled rows followed by d rows of dying features. Their columns: 15 of the next keyframe, calibration parameters,
+    gradient, and features (Wc only). row (K, 15): see `_places`. q counts the step's keyframes, k those of the piece.
+    """
     a, n_b, last = len(Wr), chain.side.shape[2], plan.keyframes.start[g + 1] - 1
     for q in range(plan.keyframes.start[g], last + 1):
         k = plan.keyframes.values[q]
@@ -188,7 +191,7 @@ def _fill_keyframes(g, plan, chain, row, U, Wr, Wc):
 
 @njit(cache=True, nogil=True)
 def _fill_carry(g, plan, row, carry, U, Wc, rest):
-    """What the step before left of the first keyframe."""
+    """Adds the remaining system of the step's first keyframe that the step before left."""
     k = plan.keyframes.values[plan.keyframes.start[g]]
     x = row[k, 0]
     for i in range(KEYFRAME_DIM):
@@ -199,7 +202,7 @@ def _fill_carry(g, plan, row, carry, U, Wc, rest):
 
 @njit(cache=True, nogil=True)
 def _add_pose(T, n, block, rows, column, into):
-    """into[rows:rows + n, column:column + 3] += (block T)^T, T (6, 15) its first n columns."""
+    """Adds (block T)^T to into[rows:rows + n, column:column + 3], with the first n columns of T (6, 15)."""
     for j in range(POSE_DIM):
         for k in range(n):
             f = T[j, k]
@@ -209,7 +212,7 @@ def _add_pose(T, n, block, rows, column, into):
 
 @njit(cache=True, nogil=True)
 def _fill_pairs(g, plan, sums, chain, row, rest, n_b, Wc, carry):
-    """Features in the front with the step's keyframes, and with the one after (carry)."""
+    """Adds the terms of features in the front with the step's keyframes, and with the next one (carry)."""
     here, after = plan.keyframes.start[g + 1] > plan.keyframes.start[g], plan.after[g]
     for q in range(plan.pair.start[g], plan.pair.start[g + 1]):
         e, column = plan.pair.values[q], KEYFRAME_DIM + n_b + 3 * plan.pair_at[q]
@@ -228,7 +231,7 @@ def _fill_pairs(g, plan, sums, chain, row, rest, n_b, Wc, carry):
 
 @njit(cache=True, nogil=True)
 def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
-    """Features that this step alone sees. False: not definite."""
+    """Eliminates features that only this step sees. Returns False if they are not positive definite."""
     n, n_b = plan.local.start[g + 1] - plan.local.start[g], sums.side.shape[2]
     V, own, used = np.zeros((3 * n, coupled + n_b)), np.empty((3, 3)), 0
     for q in range(n):
@@ -254,7 +257,7 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
             return False
         solve_transposed(own, rows)
     subtract_gram(V[:, :coupled], U[rest:, rest:])
-    # Of the calibration parameters features meet the `used` columns at most, and the gradient.
+    # Features depend on the first `used` calibration columns at most, and on the gradient.
     here, gradient, last = V[:, coupled : coupled + used], V[:, coupled + n_b - 1 :], KEYFRAME_DIM + n_b
     subtract_product(V[:, :coupled], here, Wc[:coupled, KEYFRAME_DIM : KEYFRAME_DIM + used])
     subtract_product(V[:, :coupled], gradient, Wc[:coupled, last - 1 : last])
@@ -266,7 +269,8 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
 
 @njit(cache=True, nogil=True)
 def _eliminate_keyframes(U, Wr, Wc, carry, front):
-    """Takes the step's keyframes out of what comes next, but for the front, which is left to `_eliminate_dying`."""
+    """Eliminates the step's keyframes from the following ones; coupled rows are subtracted from the front in
+    `_eliminate_dying`. Returns False if they are not positive definite."""
     a, c, thin = len(Wr), len(U) - len(Wr), Wr.shape[1]
     if not factorise(U):
         return False
@@ -281,8 +285,8 @@ def _eliminate_keyframes(U, Wr, Wc, carry, front):
 
 @njit(cache=True, nogil=True)
 def _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
-    """Takes dying features out of what comes next, and these and the keyframes out of the front. False: not
-    definite."""
+    """Eliminates dying features, and subtracts these and the coupled rows from the front. Returns False if they are not
+    positive definite."""
     dying, W, wide = (
         plan.dying.values[plan.dying.start[g] : plan.dying.start[g + 1]],
         Wc[c:],
@@ -315,13 +319,13 @@ def _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
 
 @njit(cache=True, nogil=True)
 def eliminate_all(plan, sizes, sums, chain, room, front, carry):
-    """All steps; their factors are left in `room`, the kept keyframe's sums in `carry`, the calibration parameters' in
-    `front`. False: not definite."""
+    """All steps. Factors remain in `room`, the system of the kept keyframe in `carry`, that of the calibration
+    parameters in `front`. Returns False if the sums are not positive definite."""
     n_b, old_wide = chain.side.shape[2], 0
     row = np.zeros((len(chain.diagonal), KEYFRAME_DIM), dtype=np.int64)
     for g in range(len(plan.after)):
         a, c = sizes.rest[g], sizes.coupled[g]
-        U, Ud, D, Wr, Wc = _factors(g, sizes, n_b, room)
+        U, Ud, D, Wr, Wc = step_factors(g, sizes, n_b, room)
         _join(g, plan, sums, n_b, front, carry, old_wide)
         old_wide = sizes.wide[g]
         if a + c:
@@ -339,64 +343,3 @@ def eliminate_all(plan, sizes, sums, chain, room, front, carry):
         if not _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
             return False
     return True
-
-
-@njit(cache=True, nogil=True)
-def _solve_columns(U, X):
-    """X (p, m) <- U^-1 X."""
-    for j in range(X.shape[1]):
-        solve_upper(U, X[:, j])
-
-
-@njit(cache=True, nogil=True)
-def substitute_all(plan, sizes, turn, room, calib, white, chain):
-    """Fills `chain` (n, 15, m), of which the kept keyframe is given, from calib (B + 1, m), its last row what the
-    gradient counts; white (rows, m): what stands on the right beside the gradient, by step: rest, coupled, dying."""
-    n_b, m, end = len(calib), calib.shape[1], len(white)
-    known = np.zeros((KEYFRAME_DIM + sizes.wide.max(), m))
-    known[KEYFRAME_DIM : KEYFRAME_DIM + n_b] = calib
-    for g in range(len(plan.after) - 1, -1, -1):
-        a, c = sizes.rest[g], sizes.coupled[g]
-        U, Ud, D, Wr, Wc = _factors(g, sizes, n_b, room)
-        begin = end - a - len(Wc)
-        known[:KEYFRAME_DIM] = 0.0
-        if plan.after[g] >= 0:
-            known[:KEYFRAME_DIM] = chain[plan.after[g]]
-        x = white[begin + a : end] - Wc @ known[: Wc.shape[1]]
-        _solve_columns(Ud, x[c:])
-        z = np.empty((a + c, m))
-        z[a:] = x[:c] - D @ x[c:]
-        _solve_columns(U[a:, a:], z[a:])
-        z[:a] = white[begin : begin + a] - Wr @ known[: KEYFRAME_DIM + n_b]
-        for i in range(a):
-            for j in range(a, a + c):
-                for k in range(m):
-                    z[i, k] -= U[i, j] * z[j, k]
-        _solve_columns(U[:a, :a], z[:a])
-        _take_back(g, plan, n_b, x[c:], known)
-        _turn_back(g, plan, a, turn, z, chain)
-        end = begin
-
-
-@njit(cache=True, nogil=True)
-def _take_back(g, plan, n_b, dying, known):
-    """Features in the slots that they had at the end of the step before."""
-    o = KEYFRAME_DIM + n_b
-    for q in range(plan.dying.start[g], plan.dying.start[g + 1]):
-        at, x = o + 3 * plan.dying.values[q], 3 * (q - plan.dying.start[g])
-        known[at : at + 3] = dying[x : x + 3]
-    for q in range(plan.leave.start[g], plan.leave.start[g + 1]):
-        a, b = o + 3 * plan.leave.values[q], o + 3 * plan.enter[q]
-        known[a : a + 3] = known[b : b + 3]
-
-
-@njit(cache=True, nogil=True)
-def _turn_back(g, plan, rest, turn, z, chain):
-    """Steps of the keyframes, in their own dimensions."""
-    r, c, x = 0, rest, np.empty((KEYFRAME_DIM, z.shape[1]))
-    for q in range(plan.keyframes.start[g], plan.keyframes.start[g + 1]):
-        k = plan.keyframes.values[q]
-        n = plan.coupled[k]
-        x[:n], x[n:] = z[c : c + n], z[r : r + KEYFRAME_DIM - n]
-        c, r = c + n, r + KEYFRAME_DIM - n
-        chain[k] = turn[k] @ x

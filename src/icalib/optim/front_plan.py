@@ -1,9 +1,10 @@
-"""In which order the keyframes of a piece and the features seen from them are eliminated, and what that costs.
+"""Elimination order of the keyframes of a piece and the features seen from them, chosen by cost.
 
-Keyframes go in groups, from one end of the piece to the other. A feature that one group alone sees goes before that
-group, whatever else there is. Any other joins the front with the first group that sees it and leaves with the last one,
-so that the answer is exact however long it lives; one that lives as long as the piece is a calibration parameter in all
-but name. A larger group keeps more features out of the front, and fewer are at its end: its size is chosen by cost."""
+Keyframes are eliminated in groups, from one end of the piece to the other. A feature that a single group sees is
+eliminated before that group. Any other feature joins the front with the first group that sees it and leaves with the
+last one, so the result is exact for tracks of any length. A larger group keeps more features out of the front, but has
+fewer of them leave at its end.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +16,21 @@ import numpy as np
 from icalib.optim.state import KEYFRAME_DIM, POSE_DIM
 
 GROUP_SIZES = (4, 8, 12, 16, 24, 32)  # keyframes of a group
-# What costs beside the products of the front, in their multiplications (measured on one machine; groups of half or
-# twice the size that this finds best cost 10 % more):
-SMALL_PRODUCT_COST = 3.0  # one of a small factorisation or triangular solve
-FRONT_MOVE_COST, FACTOR_MOVE_COST = 2.0, 32.0  # moving a number of the front, and of the factors
-STEP_COST = 3e5  # a step's many small calls
+# Costs in units of one multiplication in the products of the front, measured on one machine. Groups of half or twice
+# the best size cost 10 % more, so the values are uncritical.
+SMALL_PRODUCT_COST = 3.0  # multiplication in a small factorisation or triangular solve
+FRONT_MOVE_COST, FACTOR_MOVE_COST = 2.0, 32.0  # moving a number of the front, of the factors
+STEP_COST = 3e5  # overhead of a step's calls
 NO_TRACK_ENDS = np.zeros(0, dtype=np.int64)
 
 
 class FeatureSums(NamedTuple):
-    """What features add to the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with calib,
-    its gradient in the last column; block (E, 3, 6), feature with the camera's pose, of each pair of feature and image.
+    """Terms of features in the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with
+    calibration parameters, its gradient in the last column; block (E, 3, 6), feature with the camera's pose, for each
+    pair of feature and image.
 
-    pose (I, 6, 15), a camera's pose by the keyframe its image hangs on; next_pose (I or 0, 6, 15), by the keyframe
-    after. track and image (E,) of the pairs, keyframe (I,) of the images, all counted from the first of the piece.
+    pose (I, 6, 15), Jacobian of a camera's pose by the keyframe of its image; next_pose (I or 0, 6, 15), by the next
+    keyframe. track and image (E,) of the pairs, keyframe (I,) of the images, all counted from the first of the piece.
     """
 
     own: np.ndarray
@@ -68,7 +70,7 @@ class FeatureSums(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """Lists of integers, one for each step: that of step g is values[start[g]:start[g + 1]]."""
+    """One list of integers per step; that of step g is values[start[g]:start[g + 1]]."""
 
     start: np.ndarray
     values: np.ndarray
@@ -81,21 +83,20 @@ class Lists(NamedTuple):
 
     @classmethod
     def sorted_by(cls, step: np.ndarray, values: np.ndarray, n_steps: int) -> Lists:
-        """`values` (n,), each in the list of its `step` (n,); those of step -1 in none."""
+        """Lists of `values` (n,), each in the list of its `step` (n,); those of step -1 are left out."""
         order = np.argsort(step, kind="stable")
         start = np.searchsorted(step[order], np.arange(n_steps + 1))
         return cls((start - start[0]).astype(np.int64), values[order][start[0] :].astype(np.int64))
 
 
 class Plan(NamedTuple):
-    """Steps of the elimination; each takes its keyframes, in order, and `after` them (G,) comes another keyframe (-1:
-    none).
+    """Steps of the elimination. Each eliminates its keyframes, in order; after (G,): the next keyframe, -1 for none.
 
-    coupled (K,): how many of a keyframe's dimensions meet features; turned such that these come first. Features in the
-    front have slots 0..alive (G,): at a step's beginning some move from slots `leave` to `enter`, then `born` ones join
-    in slots `born_at`; at its end those in slots `dying` go. pair: pairs of the step's images with features in slots
-    `pair_at`. local: features that go before all else, with their pairs: local_pair, of local feature l from
-    local_start[l] on.
+    coupled (K,): number of a keyframe's rotated dimensions that involve features. Features in the front have slots
+    0..alive (G,). At the start of a step some move from slots `leave` to `enter`, then `born` ones join in slots
+    `born_at`; at its end those in slots `dying` are eliminated. pair: pairs of the step's images with features in slots
+    `pair_at`. local: features that are eliminated first. The pairs of local feature l start at local_start[l] in
+    local_pair.
     """
 
     keyframes: Lists
@@ -116,8 +117,8 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True)
 class _Lives:
-    """Groups of keyframes, the step (I,) of each image, first and last step (T,) of each feature (none: first > last),
-    and whether that is `local` (T,)."""
+    """Groups of keyframes; step (I,) of each image; first and last step (T,) of each feature (first > last if none);
+    local (T,), whether a single group sees it."""
 
     groups: list[np.ndarray]
     step: np.ndarray
@@ -132,7 +133,7 @@ class _Lives:
         stretches = np.split(pivots, np.flatnonzero(np.diff(np.searchsorted(ends, pivots, side="right"))) + 1)
         groups = [s[k : k + size] for s in stretches for k in range(0, len(s), size)]
         if keep:
-            groups.append(order[:0])  # what still ties the kept keyframe to features
+            groups.append(order[:0])  # terms of the kept keyframe with features
         which = np.full(n_keyframes + 1, len(groups) - 1)
         for g, keyframes in enumerate(groups):
             which[keyframes] = g
@@ -147,7 +148,7 @@ class _Lives:
         return cls(groups, step, first, last, local)
 
     def cost(self, coupled: np.ndarray, n_calib: int) -> float:
-        """Multiplications of an elimination, moving numbers included."""
+        """Cost of an elimination in multiplications, including memory traffic."""
         n, lasting = len(self.groups), ~self.local & (self.last >= 0)
         born = np.bincount(self.first[lasting], minlength=n)[:n]
         died = np.bincount(self.last[lasting], minlength=n)[:n]
@@ -169,7 +170,7 @@ def plan(
     sizes: tuple[int, ...] = GROUP_SIZES,
 ) -> Plan:
     """Steps that eliminate `n_keyframes` keyframes and all features; with `keep`, all but the last keyframe in this
-    direction. ends: keyframes before which all features end; sizes: of groups, tried for the cheapest."""
+    direction. ends: keyframes before which all features end; sizes: group sizes, of which the cheapest is taken."""
     met = np.zeros(n_keyframes, dtype=np.int64)
     np.add.at(met, sums.keyframe[np.unique(sums.image)], POSE_DIM)
     coupled = np.minimum(met, KEYFRAME_DIM) if not len(sums.next_pose) else np.full(n_keyframes, KEYFRAME_DIM)
@@ -185,7 +186,7 @@ def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_keyframes: i
     after = np.append(order, -1)[np.minimum(ends, n_keyframes)]
     own = coupled.copy()
     for group in groups:
-        own[group[:1]] = KEYFRAME_DIM  # the step before left something in all of its dimensions
+        own[group[:1]] = KEYFRAME_DIM  # the step before coupled all of its dimensions
     own[after[after >= 0]] = KEYFRAME_DIM
     tracks, in_front = np.arange(len(sums.own)), ~lives.local
     slots = _slots(lives, n)
@@ -215,7 +216,7 @@ def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_keyframes: i
 
 @dataclass(frozen=True)
 class _Slots:
-    """What moves, joins and leaves in each step, and `at`: tracks in the order of the slots, of each step."""
+    """Moves, joining and leaving features of each step, and `at`: tracks in the order of the slots, of each step."""
 
     alive: np.ndarray
     leave: list[np.ndarray]
@@ -227,7 +228,7 @@ class _Slots:
 
 
 def _slots(lives: _Lives, n_steps: int) -> _Slots:
-    """Slots without holes: who stays keeps its own but for those beyond the end, who move into holes."""
+    """Assignment of slots without holes: features keep their slots; those beyond the new end move into holes."""
     lasting = ~lives.local
     born = Lists.sorted_by(np.where(lasting & (lives.last >= 0), lives.first, -1), np.arange(len(lasting)), n_steps)
     here, out = np.zeros(0, dtype=np.int64), _Slots(np.zeros(n_steps, dtype=np.int64), [], [], [], [], [], [])
@@ -252,7 +253,7 @@ def _slots(lives: _Lives, n_steps: int) -> _Slots:
 
 
 def _places(slots: _Slots, pair: Lists, track: np.ndarray, n_steps: int) -> np.ndarray:
-    """(e,) the slot of the feature of each pair in the front."""
+    """(e,) slot in the front of the feature of each pair."""
     at, found = np.full(int(track.max(initial=-1)) + 1, -1), np.empty(len(pair.values), dtype=np.int64)
     for g in range(n_steps):
         at[slots.at[g]] = np.arange(len(slots.at[g]))
