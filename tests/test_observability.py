@@ -24,10 +24,15 @@ def shared(worth: float, converged: bool = True) -> Any:
     """Five sensors whose turns against each other are known to 0.1 tolerances, and a sixth column to 0.1: open is the
     turn of all five together, of which the guess is worth so many tolerances."""
     n = len(SENSORS)
-    held = np.append(np.ones(n), 0.0)[:, None] / np.sqrt(n)
+    fixed_directions = np.append(np.ones(n), 0.0)[:, None] / np.sqrt(n)
     spread = np.sqrt(0.01 + np.append(np.full(n, worth**2 / n), 0.0))
     estimate = SimpleNamespace(outcome=SimpleNamespace(converged=converged))
-    return cast(Any, SimpleNamespace(held=held, spread=spread, covariance=np.diag(spread**2), estimate=estimate))
+    return cast(
+        Any,
+        SimpleNamespace(
+            fixed_directions=fixed_directions, spread=spread, covariance=np.diag(spread**2), estimate=estimate
+        ),
+    )
 
 
 @pytest.mark.parametrize(("worth", "verdict"), [(50.0, "undetermined"), (1.0, "determined"), (10.0, "weak")])
@@ -43,12 +48,16 @@ def test_what_five_share_is_as_open_as_the_guess_is_wide(worth: float, verdict: 
 def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
     names = ("left_cam.translation.z", "left_cam.time_offset.time_offset", "wheel0.baseline.baseline")
     for first, last in ((0.75, 0.65), (0.65, 0.75)):
-        held = np.array([first, 0.1, last])[:, None]
+        fixed_directions = np.array([first, 0.1, last])[:, None]
         found = shared(50.0)
-        found.held, found.spread, found.covariance = held / np.linalg.norm(held), np.full(3, 50.0), np.eye(3)
+        found.fixed_directions, found.spread, found.covariance = (
+            fixed_directions / np.linalg.norm(fixed_directions),
+            np.full(3, 50.0),
+            np.eye(3),
+        )
         (sentence,) = observe(found, names, specs_of(names), True).undetermined
         assert sentence.startswith("left_cam translation z with wheel0 baseline: not determined by this motion; ")
-    found.held = np.array([0.0, 1.0, 0.0])[:, None]
+    found.fixed_directions = np.array([0.0, 1.0, 0.0])[:, None]
     assert observe(found, names, specs_of(names)).undetermined[0].startswith("left_cam time offset: ")
 
 
@@ -63,7 +72,7 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
 )
 def test_the_missing_motion_is_that_of_the_sensor(parameter, on_wheels, tracking, advice):
     found = shared(50.0)
-    found.held, found.spread, found.covariance = np.ones((1, 1)), np.full(1, 50.0), np.eye(1)
+    found.fixed_directions, found.spread, found.covariance = np.ones((1, 1)), np.full(1, 50.0), np.eye(1)
     (sentence,) = observe(found, (parameter,), specs_of((parameter,)), on_wheels, tracking).undetermined
     assert advice in sentence
 

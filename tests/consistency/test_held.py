@@ -25,7 +25,7 @@ def test_of_an_estimate_that_failed_no_answers_are_looked_for(robot, monkeypatch
     rig = with_drawn_guess(rig_for(scenario), scenario, 0)
     found = determine(*guess_of_rig(rig, [simulate(scenario, 0).measurements])[:2])
     assert not found.estimate.outcome.converged
-    assert found.held.shape[1] == found.shifts.shape[0] > 0
+    assert found.fixed_directions.shape[1] == found.shifts.shape[0] > 0
 
 
 def test_held_directions_are_moved_in_the_estimate_without_them(robot):
@@ -35,15 +35,15 @@ def test_held_directions_are_moved_in_the_estimate_without_them(robot):
     simulation = simulate(scenario, 0)
     rig = with_drawn_guess(rig_for(scenario), scenario, 0)
     inputs, state, guess = guess_of_rig(rig, [simulation.measurements])
-    held, steps = [0], list[tuple[int, str, Step]]()
+    fixed_directions, steps = [0], list[tuple[int, str, Step]]()
     found = determine(
         inputs,
         state,
-        lambda stage, step: steps.append((held[-1], stage, step)),
-        lambda stage, problem, visit: held.append(problem.held.size),
+        lambda stage, step: steps.append((fixed_directions[-1], stage, step)),
+        lambda stage, problem, visit: fixed_directions.append(problem.fixed_directions.size),
         guess,
     )
-    assert found.held.shape[1] > 0
+    assert found.fixed_directions.shape[1] > 0
     again = next(k for k, (n, _, _) in enumerate(steps) if n > 0)
     ended, begun = steps[again - 1][2].cost, steps[again][2].cost
     assert steps[0][2].cost > 10.0 * ended

@@ -55,8 +55,10 @@ def test_draws_have_the_covariance_of_the_posterior_where_features_tie_keyframes
 
 
 def test_still_draws_leave_the_calibration_and_free_ones_what_is_held():
-    pieces, held = random_pieces(6, 3), np.eye(3)[:, 1:2]
-    drawn = solve(pieces, 6, np.array([1.0, 2.0, 3.0]), held=held).factors.draws(np.random.default_rng(1), 4, 2)
+    pieces, fixed_directions = random_pieces(6, 3), np.eye(3)[:, 1:2]
+    drawn = solve(pieces, 6, np.array([1.0, 2.0, 3.0]), fixed_directions=fixed_directions).factors.draws(
+        np.random.default_rng(1), 4, 2
+    )
     assert [bool(d.calib.any()) for d in drawn] == [True] * 4 + [False] * 2
     assert all(d.calib[1] == 0.0 and d.calib[[0, 2]].all() and d.chain.all() for d in drawn[:4])
     assert all(d.chain.all() for d in drawn[4:])

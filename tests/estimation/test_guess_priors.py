@@ -75,7 +75,7 @@ def information_of(found: Estimate) -> np.ndarray:
     problem = found.problem
     pieces = problem.pieces()
     problem.linearise(found.outcome.state, pieces, problem.residuals(), curved=True)
-    return solve(pieces, problem.n_keyframes, problem.tolerance, held=problem.held).information
+    return solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions).information
 
 
 def same_information(found: Estimate) -> None:
@@ -153,12 +153,12 @@ def test_while_something_is_held_they_count_and_the_estimate_is_half_way(begun, 
     """What is half-way is judged anew; with no guess given it goes to the end."""
     monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-3))
     inputs, state = begun
-    held = np.zeros((inputs.layout.size, 1))
-    held[inputs.layout.columns(inputs.rig.cameras[1].name, "translation")[0]] = 1.0
-    free = estimate(inputs, state, held=held)
+    fixed_directions = np.zeros((inputs.layout.size, 1))
+    fixed_directions[inputs.layout.columns(inputs.rig.cameras[1].name, "translation")[0]] = 1.0
+    free = estimate(inputs, state, fixed_directions=fixed_directions)
     key = inputs.rig.cameras[1].name, "time_offset"
     elsewhere = replace(state, values=state.values | {key: free.outcome.state.values[key] + 5e-3})
-    led = estimate(inputs, state, held=held, guess=elsewhere)
+    led = estimate(inputs, state, fixed_directions=fixed_directions, guess=elsewhere)
     assert led.outcome.stopped_early
     assert not free.outcome.stopped_early
     assert len(led.problem.priors) == len(free.problem.priors) == len(given_priors(inputs))

@@ -36,11 +36,13 @@ def given(monkeypatch):
     values = {b.key: np.zeros(b.size) for b in layout.free}
     zeros = np.zeros((2, 3))
     state = State(np.arange(2.0), np.stack([np.eye(3)] * 2), zeros, zeros, np.zeros((2, 6)), values)
-    held = np.zeros((8, 2))
-    held[[0, 4], 0] = np.sqrt(0.5)
-    held[[2, 3], 1] = 0.6, 0.8
+    fixed_directions = np.zeros((8, 2))
+    fixed_directions[[0, 4], 0] = np.sqrt(0.5)
+    fixed_directions[[2, 3], 1] = 0.6, 0.8
     problem = SimpleNamespace(
-        layout=layout, held=held, tolerance=np.concatenate([np.full(b.size, TOLERANCE[b.name]) for b in layout.free])
+        layout=layout,
+        fixed_directions=fixed_directions,
+        tolerance=np.concatenate([np.full(b.size, TOLERANCE[b.name]) for b in layout.free]),
     )
     priors: list = []
     sigma = np.concatenate([SIGMA[b.name] for b in layout.free])
@@ -58,9 +60,9 @@ def landed(given, rng) -> np.ndarray:
     for errors in given.sigma * rng.standard_normal((DRAWS, 8)):
         guess = given.state.retract(given.problem.layout, np.zeros((2, 15)), errors)
         moved = (
-            moved_to_worth(given.inputs, given.problem, given.state, guess, given.problem.held)
+            moved_to_worth(given.inputs, given.problem, given.state, guess, given.problem.fixed_directions)
             if given.priors
-            else moved_to_guess(given.problem, given.state, guess, given.problem.held)
+            else moved_to_guess(given.problem, given.state, guess, given.problem.fixed_directions)
         )
         moved = given.state if moved is None else moved
         out.append(np.concatenate([moved.values[b.key] for b in given.problem.layout.free]))
@@ -71,14 +73,14 @@ def landed(given, rng) -> np.ndarray:
 def test_only_where_noise_pulls_to_near_the_guess_a_direction_stays(given, pull: float, sigmas: float, moves: bool):
     """The mixture of height and time, pulled to some standard deviations from the guess; nothing pulls at the shift of
     both. Which axes the span is given in does not matter."""
-    held, tolerance = given.problem.held, given.problem.tolerance
-    mixture = held[:, 1]
+    fixed_directions, tolerance = given.problem.fixed_directions, given.problem.tolerance
+    mixture = fixed_directions[:, 1]
     worth = np.sqrt(np.square(mixture * given.sigma / tolerance).sum())
     asked = np.diag(np.full(8, 1e-3)) + pull * np.outer(mixture, mixture)
     to = given.state.retract(given.problem.layout, np.zeros((2, 15)), sigmas * worth * mixture * tolerance)
-    turned = held @ np.array([[0.6, -0.8], [0.8, 0.6]])
+    turned = fixed_directions @ np.array([[0.6, -0.8], [0.8, 0.6]])
     found = astray(given.inputs, given.problem, given.state, to, turned, asked)
-    expected = held if moves else held[:, :1]
+    expected = fixed_directions if moves else fixed_directions[:, :1]
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-9)
 
 
@@ -115,7 +117,7 @@ def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
 
 
 def test_nothing_is_tried_out_where_the_guess_alone_leaves_all_open(given, monkeypatch):
-    given.problem.held = np.eye(8)
+    given.problem.fixed_directions = np.eye(8)
     monkeypatch.setattr(guess_worth, "minimise", None)
     shifts = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
     np.testing.assert_allclose(np.sqrt((shifts**2).sum(axis=0)), given.sigma)
@@ -144,7 +146,7 @@ def test_what_nobody_guessed_moves_no_further_than_the_data_leave_open(given):
     given.inputs.is_sensor = lambda name: name == "b"
     data = np.diag(np.full(8, 5e-3))
     data[0, 0] = 0.0
-    given.problem.held = np.eye(8)[:, [0, 1]]  # of a, which is no sensor now
+    given.problem.fixed_directions = np.eye(8)[:, [0, 1]]  # of a, which is no sensor now
     shifts = owed_to_guess(given.inputs, given.outcome, data)
     width = np.sqrt((shifts**2).sum(axis=0)) / given.problem.tolerance
     assert width[0] == pytest.approx(guess_worth.UNGUESSED_SIGMA / 5e-3)

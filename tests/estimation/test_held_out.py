@@ -115,7 +115,7 @@ def test_without_priors_the_mean_is_the_formula_and_three_for_each_parameter_of_
 def test_halves_with_nothing_in_common_predict_nothing():
     rng = np.random.default_rng(6)
     sums = np.array([sums_of(*rows_of(rng, 40, [0, 1])), sums_of(*rows_of(rng, 40, [2, 3, 4]))])
-    problem = SimpleNamespace(tolerance=np.ones(5), held=np.zeros((0, 0)), layout=SimpleNamespace(size=5))
+    problem = SimpleNamespace(tolerance=np.ones(5), fixed_directions=np.zeros((0, 0)), layout=SimpleNamespace(size=5))
     assert predict(SimpleNamespace(problem=problem, sums=sums)) is None  # pyright: ignore
 
 

@@ -149,7 +149,9 @@ def track_spread(measurements: Measurements, rig: Rig) -> float:
     assert V is not None
     k = np.concatenate([b.columns for b in found.problem.layout.free if b.name == "intrinsics"])
     t = found.problem.tolerance
-    formal = t**2 * np.diag(restricted_inverse(found.outcome.information * t[:, None] * t, found.problem.held))
+    formal = t**2 * np.diag(
+        restricted_inverse(found.outcome.information * t[:, None] * t, found.problem.fixed_directions)
+    )
     return float(np.sqrt(np.mean(np.diag(V)[k] / formal[k])))
 
 

@@ -24,7 +24,7 @@ class OneNumber(StandIn):
     """A problem in one number y, with one keyframe that is left alone."""
 
     layout = make_layout([(*KEY, "vector", 1, True)])
-    n_keyframes, tolerance, held = 1, np.array([1e3]), NO_DIRECTIONS
+    n_keyframes, tolerance, fixed_directions = 1, np.array([1e3]), NO_DIRECTIONS
 
     def pieces(self):
         return make_pieces(1, 1)
@@ -88,7 +88,7 @@ class Saddle(OneNumber):
     """Residuals x - 1, y - 2 and LARGE + c x y / LARGE: curvatures 1 + c and 1 - c, where the squared slopes are 1."""
 
     layout = make_layout([(*KEY, "vector", 2, True)])
-    tolerance, held = np.array([1.0, 1.0]), NO_DIRECTIONS
+    tolerance, fixed_directions = np.array([1.0, 1.0]), NO_DIRECTIONS
 
     def __init__(self, c: float):
         self.c = c

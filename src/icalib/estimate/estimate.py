@@ -53,9 +53,9 @@ class MeasurementModel:
             noise |= model.first_noises(sensors, inputs.rig, inputs.measurements)
         return cls(noise, True)
 
-    def problem(self, inputs: Inputs, state: State, held: np.ndarray = NO_DIRECTIONS) -> Problem:
+    def problem(self, inputs: Inputs, state: State, fixed_directions: np.ndarray = NO_DIRECTIONS) -> Problem:
         """See `assemble`."""
-        return assemble(inputs, state, self.noise, held, self.coarse)
+        return assemble(inputs, state, self.noise, fixed_directions, self.coarse)
 
     def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> MeasurementModel:
         """As what a pass left behind, the `first` or another, shows it."""
@@ -87,7 +87,7 @@ def estimate(
     inputs: Inputs,
     state: State,
     on_step: Callable[[str, Step], None] = lambda *_: None,
-    held: np.ndarray = NO_DIRECTIONS,
+    fixed_directions: np.ndarray = NO_DIRECTIONS,
     on_visit: OnVisit = lambda *_: None,
     judged: MeasurementModel | None = None,
     maybe_rank_deficient: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
@@ -95,17 +95,25 @@ def estimate(
 ) -> Estimate:
     """All passes from an initial `state`; the final one alone if noise and outliers are `judged` already.
 
-    Directions of the calibration parameters in `held` (see Problem) are fixed. A pass stops early if the information of
-    the calibration parameters (B, B) may be rank deficient, as `maybe_rank_deficient` tells, because it would converge
-    slowly along an unobservable direction. Until the null space is known, and while directions are fixed, `guess` is a
-    prior, so that unobservable directions do not drift. A pass that ended with that prior counts as stopped early, too.
+    Directions of the calibration parameters in `fixed_directions` (see Problem) are fixed. A pass stops early if the
+    information of the calibration parameters (B, B) may be rank deficient, as `maybe_rank_deficient` tells, because it
+    would converge slowly along an unobservable direction. Until the null space is known, and while directions are
+    fixed, `guess` is a prior, so that unobservable directions do not drift. A pass that ended with that prior counts as
+    stopped early, too.
 
     Raises EstimationError where the data do not carry an estimate.
     """
     *early, final = pass_names(inputs)
     about = () if guess is None else guess_priors(inputs, guess)
     passes = _Passes(
-        inputs, held, on_step, on_visit, maybe_rank_deficient, state, judged or MeasurementModel.first(inputs), about
+        inputs,
+        fixed_directions,
+        on_step,
+        on_visit,
+        maybe_rank_deficient,
+        state,
+        judged or MeasurementModel.first(inputs),
+        about,
     )
     if judged is None:
         for name in early:
@@ -131,7 +139,7 @@ class _Passes:
     `about` the guess apply until every direction is observable and none is fixed."""
 
     inputs: Inputs
-    held: np.ndarray
+    fixed_directions: np.ndarray
     on_step: Callable[[str, Step], None]
     on_visit: OnVisit
     maybe_rank_deficient: Callable[[Problem, np.ndarray], bool]
@@ -182,12 +190,12 @@ class _Passes:
         return outcome, np.inf if is_open and outcome.stopped_early else way
 
     def _next(self, name: str) -> tuple[Problem, _Told]:
-        problem = _with_priors(self.judged.problem(self.inputs, self.state, self.held), self.about)
+        problem = _with_priors(self.judged.problem(self.inputs, self.state, self.fixed_directions), self.about)
         return problem, _Told(name, problem, self.on_step, self.on_visit, self.history)
 
     def _let_go(self, is_open: bool) -> tuple[Prior, ...]:
         """Priors that count no more."""
-        if is_open or self.held.size:
+        if is_open or self.fixed_directions.size:
             return ()
         gone, self.about = self.about, ()
         return gone

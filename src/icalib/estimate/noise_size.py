@@ -112,7 +112,9 @@ def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcom
     scaled = {
         s.name: model_of(s).scaled_noise(judged.noise[s.name], scales[s.name]) for s in rig.mounted if s.name in scales
     }
-    return minimise(replace(judged, noise={**judged.noise, **scaled}).problem(other, state, found.problem.held), state)
+    return minimise(
+        replace(judged, noise={**judged.noise, **scaled}).problem(other, state, found.problem.fixed_directions), state
+    )
 
 
 def _refitted_sizes(inputs: Inputs, outcome: Outcome) -> dict[str, float]:

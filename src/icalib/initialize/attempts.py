@@ -144,7 +144,11 @@ def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None
         return Parameter() if is_contradicted(sensor.spec(name), p.value, other) else p
 
     kept = with_groups(rig, agreeing)
-    if found.solution.held.size and _has_values(kept, "free") and (other := _converged_attempt(kept, make)) is not None:
+    if (
+        found.solution.fixed_directions.size
+        and _has_values(kept, "free")
+        and (other := _converged_attempt(kept, make)) is not None
+    ):
         found = other
     return replace(found, inputs=replace(found.inputs, asked=rig))
 

@@ -48,15 +48,16 @@ class Determined:
     """An estimate and what is known of its calibration parameters.
 
     data, noise (B, B): information of the data alone in tolerance units, without priors but those on nuisance
-    parameters and without what noise makes of it, and that; held (B, m): orthonormal directions in tolerance units,
-    those that are undetermined; shifts (m, B): how all moves with each independent error of the guess along them.
-    inflation: root of how many times priors on nuisance parameters count, see `estimate.evidence.inflation`.
+    parameters and without what noise makes of it, and that; fixed_directions (B, m): orthonormal directions in
+    tolerance units, those that are undetermined; shifts (m, B): how all moves with each independent error of the guess
+    along them. inflation: root of how many times priors on nuisance parameters count, see
+    `estimate.evidence.inflation`.
     """
 
     estimate: Estimate
     data: np.ndarray
     noise: np.ndarray
-    held: np.ndarray
+    fixed_directions: np.ndarray
     shifts: np.ndarray
     inflation: float = 1.0
 
@@ -65,7 +66,7 @@ class Determined:
         """(B, B), priors included: of the observable directions, and their sensitivity to the fixed ones."""
         t = self.estimate.problem.tolerance
         known = t[:, None] * self.estimate.outcome.information * t - self.noise
-        return t[:, None] * scatter(known, self.noise, self.held) * t + self.shifts.T @ self.shifts
+        return t[:, None] * scatter(known, self.noise, self.fixed_directions) * t + self.shifts.T @ self.shifts
 
     @property
     def prior_variance(self) -> np.ndarray:
@@ -73,22 +74,22 @@ class Determined:
         is no knowledge: errors lead back by the inverse of what is known, as in `scatter`."""
         problem, outcome = self.estimate.problem, self.estimate.outcome
         t = problem.tolerance
-        root = t[:, None] * restricted_root(t[:, None] * outcome.information * t - self.noise, self.held)
+        root = t[:, None] * restricted_root(t[:, None] * outcome.information * t - self.noise, self.fixed_directions)
         return variance_of_priors(root @ root.T, nuisance_priors(problem), outcome.state)
 
     @property
     def spread(self) -> np.ndarray:
         """(B,) standard deviations in tolerances that the data alone give."""
         t = self.estimate.problem.tolerance
-        alone = scatter(self.data, self.noise, self.held)
+        alone = scatter(self.data, self.noise, self.fixed_directions)
         return np.sqrt(np.diag(alone) + ((self.shifts / t) ** 2).sum(axis=0))
 
 
-def scatter(known: np.ndarray, noise: np.ndarray, held: np.ndarray) -> np.ndarray:
+def scatter(known: np.ndarray, noise: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
     """(B, B) covariance where J^T J is `known` + `noise`: J^T r scatters by all of it, but only what is known of it
     leads back (errors in variables; Fuller, Measurement Error Models, 1987, chapter 1). Noise only adds: where its few
     draws say otherwise, or curvature left less than nothing known, the variance is no less than without it."""
-    whitened = restricted_root(known, held)
+    whitened = restricted_root(known, fixed_directions)
     values, vectors = eigh(whitened.T @ noise @ whitened)
     root = whitened @ vectors * np.sqrt(1.0 + np.maximum(values, 0.0))
     return root @ root.T
@@ -112,14 +113,14 @@ def determine(
     search.weigh()
     search.balance()
     found, seen = search.found, search.seen
-    held, shifts = np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size))
-    if found.problem.held.size:
-        held = found.problem.held
+    fixed_directions, shifts = np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size))
+    if found.problem.fixed_directions.size:
+        fixed_directions = found.problem.fixed_directions
         # After a failed solve the sensitivity is of no use, and each of its solves might fail as well.
         worth = _is_worth_keeping(found.outcome)
         shifts = (owed_to_guess if worth else in_proportion)(inputs, found.outcome, seen.data)
     found = replace(found, outcome=replace(found.outcome, room=None))  # nothing is solved in it any more
-    return Determined(found, seen.data, seen.noise, held, shifts, search.inflation)
+    return Determined(found, seen.data, seen.noise, fixed_directions, shifts, search.inflation)
 
 
 @dataclass
@@ -149,30 +150,32 @@ class _Search:
         """Fixes the null space until it stays. Until then the guess has a prior, but not in the last estimate."""
         for k in range(MOST_ROUNDS):
             found, seen = self.found, self.seen
-            settled = _is_settled(seen.undetermined, found.problem.held, k >= LATE)
+            settled = _is_settled(seen.undetermined, found.problem.fixed_directions, k >= LATE)
             if settled and not found.outcome.stopped_early:
                 return
-            held = found.problem.held if settled and found.problem.held.size else seen.undetermined
+            fixed_directions = (
+                found.problem.fixed_directions if settled and found.problem.fixed_directions.size else seen.undetermined
+            )
             # A failed estimate is no start for the next one.
             state = found.outcome.state if _is_worth_keeping(found.outcome) else self.start
-            moving = astray(self.inputs, found.problem, state, self.guess, held, seen.asked)
+            moving = astray(self.inputs, found.problem, state, self.guess, fixed_directions, seen.asked)
             if moving.size:
-                state = _followed(found, moved_to_guess(found.problem, state, self.guess, moving), held)
+                state = _followed(found, moved_to_guess(found.problem, state, self.guess, moving), fixed_directions)
             del found
-            self._estimate(state, held, led=not settled and k + 1 < MOST_ROUNDS)
+            self._estimate(state, fixed_directions, led=not settled and k + 1 < MOST_ROUNDS)
 
     def weigh(self) -> None:
         """Moves the fixed directions to the guess, weighted by its prior uncertainty, and all other parameters with
         them."""
         for _ in range(MOST_ROUNDS):
             problem, state = self.found.problem, self.found.outcome.state
-            moving = astray(self.inputs, problem, state, self.guess, problem.held, self.seen.asked)
+            moving = astray(self.inputs, problem, state, self.guess, problem.fixed_directions, self.seen.asked)
             begin = moved_to_worth(self.inputs, problem, state, self.guess, moving)
             if begin is None:
                 return
-            begin, held = _followed(self.found, begin, problem.held), problem.held
+            begin, fixed_directions = _followed(self.found, begin, problem.fixed_directions), problem.fixed_directions
             del problem
-            self._estimate(begin, held, led=False)
+            self._estimate(begin, fixed_directions, led=False)
 
     def balance(self) -> None:
         """Weighs priors on nuisance parameters by how large errors of the measurements are."""
@@ -185,23 +188,23 @@ class _Search:
             self.found, self.inflation = replace(self.found, outcome=again), factor
             self.seen = judge(self.inputs, again, self.seen)
 
-    def _estimate(self, begin: State, held: np.ndarray, led: bool) -> None:
+    def _estimate(self, begin: State, fixed_directions: np.ndarray, led: bool) -> None:
         """The next estimate, `led` by the guess or not; noise and outliers as the last one judged them, but where it
         failed."""
         judged = self.found.judged if _is_worth_keeping(self.found.outcome) else None
         del self.found  # before the next one takes as much memory
         guess = self.guess if led else None
-        self.found = estimate(self.inputs, begin, self.on_step, held, self.on_visit, judged, guess=guess)
+        self.found = estimate(self.inputs, begin, self.on_step, fixed_directions, self.on_visit, judged, guess=guess)
         self.seen = judge(self.inputs, self.found.outcome, self.seen)
 
 
-def _followed(found: Estimate, moved: State, held: np.ndarray) -> State:
-    """All else where the measurements want it to follow what `moved` along `held` (B, m), while what `found` froze
-    stands: tracks, and weights of points on planes. Made anew beside where the trajectory belongs, these would be of a
-    state that fits nothing, and the next estimate might end anywhere."""
+def _followed(found: Estimate, moved: State, fixed_directions: np.ndarray) -> State:
+    """All else where the measurements want it to follow what `moved` along `fixed_directions` (B, m), while what
+    `found` froze stands: tracks, and weights of points on planes. Made anew beside where the trajectory belongs, these
+    would be of a state that fits nothing, and the next estimate might end anywhere."""
     if not _is_worth_keeping(found.outcome):
         return moved
-    problem, room = replace(found.problem, held=held), found.outcome.room
+    problem, room = replace(found.problem, fixed_directions=fixed_directions), found.outcome.room
     try:
         return minimise(problem, moved, tolerance=EARLY_DECREASE, share=EARLY_DECREASE_SHARE, room=room).state
     except EstimationError:
@@ -217,13 +220,13 @@ def _maybe_rank_deficient(problem: Problem, information: np.ndarray) -> bool:
     return essential_information(information, problem.tolerance, problem.layout) < RANK_DEFICIENT_BELOW
 
 
-def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
-    """Whether the fixed subspace `held` (B, m) equals the null space `undetermined` (B, n), both orthonormal. In `late`
-    rounds a superset is accepted, to avoid cycling."""
-    n, m = (d.shape[1] if d.size else 0 for d in (undetermined, held))
+def _is_settled(undetermined: np.ndarray, fixed_directions: np.ndarray, late: bool) -> bool:
+    """Whether the fixed subspace `fixed_directions` (B, m) equals the null space `undetermined` (B, n), both
+    orthonormal. In `late` rounds a superset is accepted, to avoid cycling."""
+    n, m = (d.shape[1] if d.size else 0 for d in (undetermined, fixed_directions))
     if n == 0 or n > m:
         return n == m or (n == 0 and late)
-    inside = np.linalg.svd(undetermined.T @ held, compute_uv=False).min() > ALIKE
+    inside = np.linalg.svd(undetermined.T @ fixed_directions, compute_uv=False).min() > ALIKE
     return bool(inside and (n == m or late))
 
 

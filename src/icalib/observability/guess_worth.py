@@ -52,25 +52,28 @@ def astray(
     return axes[:, (values < PULLED) | (np.abs(way) > FARTHEST * worth)]
 
 
-def moved_to_guess(problem: Problem, state: State, guess: State, held: np.ndarray) -> State:
-    """`state`, moved along the directions `held` (B, m) to where `guess` has them."""
+def moved_to_guess(problem: Problem, state: State, guess: State, fixed_directions: np.ndarray) -> State:
+    """`state`, moved along the directions `fixed_directions` (B, m) to where `guess` has them."""
     way = calib_difference(problem, guess, state) / problem.tolerance
-    return _moved(problem, state, held @ (held.T @ way))
+    return _moved(problem, state, fixed_directions @ (fixed_directions.T @ way))
 
 
-def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State, held: np.ndarray) -> State | None:
-    """`state`, reset along the directions `held` (B, m) to the prior mean of all parameters that they move, weighted by
-    their prior uncertainty; None where the rig file has no priors among them, or the state is there already.
+def moved_to_worth(
+    inputs: Inputs, problem: Problem, state: State, guess: State, fixed_directions: np.ndarray
+) -> State | None:
+    """`state`, reset along the directions `fixed_directions` (B, m) to the prior mean of all parameters that they move,
+    weighted by their prior uncertainty; None where the rig file has no priors among them, or the state is there
+    already.
 
     Where the data know only how two heights differ, and one was measured, `moved_to_guess` would leave both half-way.
     """
-    if not _is_weighed(inputs, held):
+    if not _is_weighed(inputs, fixed_directions):
         return None
     sigma, way = _weights(inputs, state), calib_difference(problem, guess, state)
     # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
     for block in _unguessed(inputs):
         way[block.columns] = 0.0
-    directions = problem.tolerance[:, None] * held
+    directions = problem.tolerance[:, None] * fixed_directions
     step = directions @ np.linalg.lstsq(directions / sigma[:, None], way / sigma, rcond=None)[0]
     if np.linalg.norm(step / sigma) < NEAR_GUESS:
         return None
@@ -109,8 +112,8 @@ def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     nobody believes."""
     problem = outcome.problem
     # Of so many like variances divide and conquer, NumPy's way, has failed to find the eigenvectors.
-    values, turn = eigh(_guess_covariance(inputs, problem, outcome.state, problem.held), driver="evr")
-    ways = problem.held @ turn
+    values, turn = eigh(_guess_covariance(inputs, problem, outcome.state, problem.fixed_directions), driver="evr")
+    ways = problem.fixed_directions @ turn
     width = np.sqrt(np.clip(values, 0.0, None))
     own = np.concatenate([np.arange(0), *(b.columns for b in problem.layout.free if inputs.is_sensor(b.sensor))])
     for k, way in enumerate(ways.T):
@@ -120,16 +123,16 @@ def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     return ways * width
 
 
-def _guess_covariance(inputs: Inputs, problem: Problem, state: State, held: np.ndarray) -> np.ndarray:
-    """(m, m) of the guess along directions `held` (B, m), in tolerance units: of an orthogonal projection, as
-    `moved_to_guess` makes it, or of a weighted one, as `moved_to_worth` does."""
-    if _is_weighed(inputs, held):
-        scaled = held * (problem.tolerance / _weights(inputs, state))[:, None]
+def _guess_covariance(inputs: Inputs, problem: Problem, state: State, fixed_directions: np.ndarray) -> np.ndarray:
+    """(m, m) of the guess along directions `fixed_directions` (B, m), in tolerance units: of an orthogonal projection,
+    as `moved_to_guess` makes it, or of a weighted one, as `moved_to_worth` does."""
+    if _is_weighed(inputs, fixed_directions):
+        scaled = fixed_directions * (problem.tolerance / _weights(inputs, state))[:, None]
         return np.linalg.inv(scaled.T @ scaled)
     sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
         sigma[block.columns] = np.minimum(sigma[block.columns], UNGUESSED_SIGMA)
-    scaled = held * (sigma / problem.tolerance)[:, None]
+    scaled = fixed_directions * (sigma / problem.tolerance)[:, None]
     return scaled.T @ scaled
 
 
@@ -155,10 +158,10 @@ def _answer(outcome: Outcome, way: np.ndarray) -> np.ndarray:
     return problem.tolerance * way
 
 
-def _is_weighed(inputs: Inputs, held: np.ndarray) -> bool:
-    """Whether the rig file has a prior on a parameter that the fixed directions `held` (B, m) move."""
+def _is_weighed(inputs: Inputs, fixed_directions: np.ndarray) -> bool:
+    """Whether the rig file has a prior on a parameter that the fixed directions `fixed_directions` (B, m) move."""
     own = np.concatenate([np.empty(0, dtype=np.int64), *(p.block.columns for p in given_priors(inputs))])
-    return bool(held.size and np.any(np.abs(held[own]) > MOVED_BY_HELD))
+    return bool(fixed_directions.size and np.any(np.abs(fixed_directions[own]) > MOVED_BY_HELD))
 
 
 def _weights(inputs: Inputs, state: State) -> np.ndarray:

@@ -54,8 +54,10 @@ class Relaxed:
         t, n = self.problem.tolerance, self.layout.size
         pull, known = self._priors_of(freed)
         fixed = np.eye(n)[:, self.fixed_columns(freed)]
-        held = np.hstack([fixed, self.problem.held]) if self.problem.held.size else fixed
-        root = restricted_root(t[:, None] * (self.solution.information - known) * t, held)
+        fixed_directions = (
+            np.hstack([fixed, self.problem.fixed_directions]) if self.problem.fixed_directions.size else fixed
+        )
+        root = restricted_root(t[:, None] * (self.solution.information - known) * t, fixed_directions)
         step = -root @ (root.T @ (t * (self.solution.gradient[:-1] - pull)))
         return t * step, t * np.sqrt((root**2).sum(axis=1))
 
@@ -79,13 +81,13 @@ def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
     if not found.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
         return None
     freed = freed_inputs(inputs)
-    held = _held_in(freed.layout, inputs.layout, found.problem.held)
+    fixed_directions = _held_in(freed.layout, inputs.layout, found.problem.fixed_directions)
     state = found.outcome.state
     try:
-        problem = found.judged.problem(freed, state, held)
+        problem = found.judged.problem(freed, state, fixed_directions)
         pieces, residuals = problem.pieces(), problem.residuals()
         problem.linearise(state, pieces, residuals, curved=True)
-        solution = solve(pieces, problem.n_keyframes, problem.tolerance, held=held)
+        solution = solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=fixed_directions)
     except EstimationError:
         return None
     return Relaxed(freed, problem, state, solution, residuals, inputs.layout, tuple(stated_keys(inputs, freed.layout)))
@@ -120,11 +122,11 @@ def _is_stated(parameter: Parameter) -> bool:
     return parameter.mode != "free" and parameter.value is not None
 
 
-def _held_in(layout: Layout, before: Layout, held: np.ndarray) -> np.ndarray:
+def _held_in(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> np.ndarray:
     """Directions of the calibration parameters of `before` in those of `layout`, which has more columns."""
-    if not held.size:
+    if not fixed_directions.size:
         return NO_DIRECTIONS
-    out = np.zeros((layout.size, held.shape[1]))
+    out = np.zeros((layout.size, fixed_directions.shape[1]))
     for block in before.free:
-        out[layout.block(*block.key).columns] = held[block.columns]
+        out[layout.block(*block.key).columns] = fixed_directions[block.columns]
     return out

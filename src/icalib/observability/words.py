@@ -45,7 +45,7 @@ def observe(
     one of its sensors. tracking: names of cameras without a target. axes: about which the rig hardly turned, in words,
     or empty.
     """
-    directions = sparse_basis(found.held)
+    directions = sparse_basis(found.fixed_directions)
     verdicts: list[Verdict] = []
     for is_null, spread in zip(in_null_space(directions), found.spread, strict=True):
         is_undetermined = is_null or not found.estimate.outcome.converged

@@ -144,7 +144,7 @@ class Factors:
 
     pieces: overwritten by their factors; done: per piece, see `_reduce`. shared (15, 15), shared_side (15, B + 1):
     factors of the shared keyframe, empty without one. information (B, B): of the calibration parameters, chain
-    marginalised. tolerance, held: see `calib_step`.
+    marginalised. tolerance, fixed_directions: see `calib_step`.
     """
 
     pieces: tuple[Piece, ...]
@@ -154,7 +154,7 @@ class Factors:
     shared_side: np.ndarray
     information: np.ndarray
     tolerance: np.ndarray
-    held: np.ndarray
+    fixed_directions: np.ndarray
 
     def back(self, calib: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
         """Back substitution of m right-hand sides: steps (K, 15, m) of the keyframes.
@@ -181,7 +181,7 @@ class Factors:
         m = free + still
         calib = np.zeros((len(self.tolerance) + 1, m))
         calib[:-1, :free] = calib_draws(
-            self.information, self.tolerance, self.held, rng.standard_normal((len(self.tolerance), free))
+            self.information, self.tolerance, self.fixed_directions, rng.standard_normal((len(self.tolerance), free))
         )
         chain = self.back(calib, [rng.standard_normal((n, m)) for n in self.rows()])
         return tuple(Draw(np.ascontiguousarray(chain[:, :, k]), calib[:-1, k].copy()) for k in range(m))
@@ -204,7 +204,7 @@ class Solution:
     @classmethod
     def of(cls, factors: Factors, gradient: np.ndarray) -> Solution:
         """The step, from the factors and the `gradient` (B + 1,) of the calibration parameters."""
-        calib, decrease = calib_step(factors.information, gradient[:-1], factors.tolerance, factors.held)
+        calib, decrease = calib_step(factors.information, gradient[:-1], factors.tolerance, factors.fixed_directions)
         white = [np.zeros((n, 1)) for n in factors.rows()]
         chain = factors.back(np.append(calib, 1.0)[:, None], white)[:, :, 0]
         return cls(np.ascontiguousarray(chain), calib, decrease - 0.5 * float(gradient[-1]), gradient, factors)
@@ -346,11 +346,11 @@ def solve(
     n_keyframes: int,
     tolerance: np.ndarray,
     damping: float = 0.0,
-    held: np.ndarray = NO_DIRECTIONS,
+    fixed_directions: np.ndarray = NO_DIRECTIONS,
 ) -> Solution:
     """Solves (H + damping diag(H)) step = -gradient; overwrites the pieces. Raises NotDefiniteError.
 
-    tolerance (B,); held (B, m): directions of the calibration parameters that are fixed, see `calib_step`.
+    tolerance (B,); fixed_directions (B, m): directions of the calibration parameters that are fixed, see `calib_step`.
     """
     keep = len(pieces) > 1
     n_calib = len(tolerance)
@@ -372,5 +372,5 @@ def solve(
         forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side
     information = rest[:n_calib, :n_calib]
-    factors = Factors(pieces, done, n_keyframes, shared, shared_side, information, tolerance, held)
+    factors = Factors(pieces, done, n_keyframes, shared, shared_side, information, tolerance, fixed_directions)
     return Solution.of(factors, rest[:, n_calib])

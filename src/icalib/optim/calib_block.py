@@ -15,26 +15,26 @@ NO_DIRECTIONS = np.zeros((0, 0))  # no direction is fixed
 
 
 def calib_step(
-    information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray, held: np.ndarray = NO_DIRECTIONS
+    information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray = NO_DIRECTIONS
 ) -> tuple[np.ndarray, float]:
     """Step (B,) of the calibration parameters and its predicted decrease of half the chi^2.
 
     information (B, B), gradient (B,): of half the chi^2, chain marginalised. Directions are eigenvectors of the
     information in units of `tolerance` (B,). Those below UNOBSERVABLE_BELOW are fixed, and so are the orthonormal
-    columns of `held` (B, m).
+    columns of `fixed_directions` (B, m).
     """
-    free, values, vectors = _directions(information, tolerance, held)
+    free, values, vectors = _directions(information, tolerance, fixed_directions)
     projected = vectors.T @ (free.T @ (tolerance * gradient))
     step = np.where(values > UNOBSERVABLE_BELOW, -projected / np.maximum(values, UNOBSERVABLE_BELOW), 0.0)
     return tolerance * (free @ (vectors @ step)), float(-0.5 * projected @ step)
 
 
 def _directions(
-    information: np.ndarray, tolerance: np.ndarray, held: np.ndarray
+    information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Free columns (B, n), orthogonal to `held`, and eigenvalues (n,) and eigenvectors (n, n) of the information within
-    them, in units of `tolerance`."""
-    free = complement(held, len(tolerance))
+    """Free columns (B, n), orthogonal to `fixed_directions`, and eigenvalues (n,) and eigenvectors (n, n) of the
+    information within them, in units of `tolerance`."""
+    free = complement(fixed_directions, len(tolerance))
     scaled = information * tolerance[:, None] * tolerance
     values, vectors = np.linalg.eigh(free.T @ scaled @ free)
     return free, values, vectors
@@ -51,31 +51,33 @@ def essential_information(information: np.ndarray, tolerance: np.ndarray, layout
     return least_information(information[np.ix_(own, own)], tolerance[own])
 
 
-def complement(held: np.ndarray, n: int) -> np.ndarray:
-    """Orthonormal basis (n, n - m) of the orthogonal complement of the columns of `held` (n, m)."""
-    if not held.size:
+def complement(fixed_directions: np.ndarray, n: int) -> np.ndarray:
+    """Orthonormal basis (n, n - m) of the orthogonal complement of the columns of `fixed_directions` (n, m)."""
+    if not fixed_directions.size:
         return np.eye(n)
-    full, _, _ = np.linalg.svd(held, full_matrices=True)
-    return full[:, held.shape[1] :]
+    full, _, _ = np.linalg.svd(fixed_directions, full_matrices=True)
+    return full[:, fixed_directions.shape[1] :]
 
 
-def restricted_root(information: np.ndarray, held: np.ndarray) -> np.ndarray:
+def restricted_root(information: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
     """Root A (B, n) of the `restricted_inverse` A A^T."""
-    free = complement(held, len(information))
+    free = complement(fixed_directions, len(information))
     values, vectors = np.linalg.eigh(free.T @ information @ free)
     return free @ vectors / np.sqrt(np.maximum(values, MIN_INFORMATION))
 
 
-def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Inverse (B, B) of the information within the directions that are free; both in tolerance units, `held` (B, m)
-    orthonormal."""
-    root = restricted_root(information, held)
+def restricted_inverse(information: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
+    """Inverse (B, B) of the information within the directions that are free; both in tolerance units,
+    `fixed_directions` (B, m) orthonormal."""
+    root = restricted_root(information, fixed_directions)
     return root @ root.T
 
 
-def calib_draws(information: np.ndarray, tolerance: np.ndarray, held: np.ndarray, white: np.ndarray) -> np.ndarray:
+def calib_draws(
+    information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray, white: np.ndarray
+) -> np.ndarray:
     """Draws (B, m) with the inverse information as covariance, from standard normal numbers `white` (B, m). Directions
     that `calib_step` fixes are zero."""
-    free, values, vectors = _directions(information, tolerance, held)
+    free, values, vectors = _directions(information, tolerance, fixed_directions)
     scaled = np.where(values > UNOBSERVABLE_BELOW, 1.0 / np.sqrt(np.maximum(values, UNOBSERVABLE_BELOW)), 0.0)
     return tolerance[:, None] * (free @ (vectors @ (scaled[:, None] * white[: len(values)])))

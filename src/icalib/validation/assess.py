@@ -77,7 +77,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         groups=groups,
         covariance=seen.covariance,
         covariance_names=names,
-        null_space=determined.held,
+        null_space=determined.fixed_directions,
         undetermined=seen.undetermined,
         fits=tuple(judged),
         residuals=by_key(_residuals(inputs, found, timeline)),
@@ -148,7 +148,7 @@ def _mode(inputs: Inputs, block: Block) -> str:
 def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visited:
     """A state of the solver, with values as in the result."""
     t = problem.tolerance
-    covariance = restricted_inverse(visit.information * t[:, None] * t, problem.held)
+    covariance = restricted_inverse(visit.information * t[:, None] * t, problem.fixed_directions)
     formal = t * np.sqrt(np.diag(covariance))
     free = [b for b in inputs.layout.free if b.name not in IN_THE_WORLD]
     values = {b.key: _raw_value(inputs, visit.state, b) for b in free}

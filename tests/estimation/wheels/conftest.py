@@ -248,7 +248,7 @@ class DriveProblem:
     poses: PoseFactor
     wheels: Any
     priors: tuple[Prior, ...] = ()
-    held: np.ndarray = field(default_factory=lambda: NO_DIRECTIONS)
+    fixed_directions: np.ndarray = field(default_factory=lambda: NO_DIRECTIONS)
 
     @property
     def n_keyframes(self):

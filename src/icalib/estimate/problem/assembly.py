@@ -136,7 +136,11 @@ def _hosts(rig: Rig) -> str:
 
 
 def assemble(
-    inputs: Inputs, state: State, noise: Mapping[str, Any], held: np.ndarray = NO_DIRECTIONS, coarse: bool = False
+    inputs: Inputs,
+    state: State,
+    noise: Mapping[str, Any],
+    fixed_directions: np.ndarray = NO_DIRECTIONS,
+    coarse: bool = False,
 ) -> Problem:
     """The problem at the keyframes of `state`, everything frozen that a pass freezes: assignment, preintegration,
     corrections of measurements that depend on the state.
@@ -146,7 +150,7 @@ def assemble(
     rig = inputs.rig
     factors = _measured(inputs, noise, pass_at(inputs, state, coarse))
     return Problem(
-        inputs.layout, keyed((_chain(inputs, state), *factors)), _priors(inputs), inputs.tolerance, held,
+        inputs.layout, keyed((_chain(inputs, state), *factors)), _priors(inputs), inputs.tolerance, fixed_directions,
         rig.has_target or rig.imu is None or (rig.assumes_motion and rig.moves_by_poses), not rig.assumes_motion,
     )  # fmt: skip
 

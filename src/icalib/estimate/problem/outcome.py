@@ -120,4 +120,4 @@ def posterior(problem: Problem, state: State) -> Draws:
     """Draws from the posterior at `state`. Raises NotDefiniteError."""
     pieces = problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
-    return Draws.of(solve(pieces, problem.n_keyframes, problem.tolerance, held=problem.held))
+    return Draws.of(solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions))

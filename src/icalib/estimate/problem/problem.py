@@ -50,7 +50,7 @@ class Problem:
     factors: dict[FactorKey, Factor]
     priors: tuple[Prior, ...]
     tolerance: np.ndarray  # (B,) what a user would call the same number; scales the calibration parameters
-    held: np.ndarray = field(
+    fixed_directions: np.ndarray = field(
         default_factory=lambda: NO_DIRECTIONS
     )  # (B, m) orthonormal directions of the calibration parameters, in tolerance units, that stay
     framed: bool = True  # a target says where the world's origin is; else nothing does, and it stays where it is

@@ -180,7 +180,7 @@ class _Descent:
         """Takes a step after which nothing that counts is left, as steps become less and less, and says how much; None
         where it is no such step. The sums at hand, of where it began, are those of the end for all but the last digits,
         so none is taken where something is known so badly that these count."""
-        if self.early or not (self.care.curved and self.free and self.steps) or self.problem.held.size:
+        if self.early or not (self.care.curved and self.free and self.steps) or self.problem.fixed_directions.size:
             return None
         before, now = self.steps[-1], solution.decrease
         left = now * now / before.predicted_decrease if before.accepted else np.inf
@@ -329,7 +329,9 @@ class _Descent:
         return self.problem.linearise(state, self.pieces, self.residuals, sums, curved)
 
     def _solve(self, damping: float) -> Solution:
-        return solve(self.pieces, self.problem.n_keyframes, self.problem.tolerance, damping, self.problem.held)
+        return solve(
+            self.pieces, self.problem.n_keyframes, self.problem.tolerance, damping, self.problem.fixed_directions
+        )
 
 
 def minimise(

@@ -75,7 +75,7 @@ def predict(parts: Segments) -> Prediction | None:
     """Predicts each half of the recording from the other. None if no direction of the calibration parameters is
     determined by both."""
     t, B = parts.problem.tolerance, parts.problem.layout.size
-    free = t[:, None] * complement(parts.problem.held, B)
+    free = t[:, None] * complement(parts.problem.fixed_directions, B)
     halves, shared, own = halves_of(parts.sums, free)
     if not shared.shape[1]:
         return None
@@ -187,13 +187,13 @@ class Shifts:
 
 def shifts(parts: Segments) -> Shifts:
     """The solution without each part, against that of all parts."""
-    t, held = parts.problem.tolerance, parts.problem.held
+    t, fixed_directions = parts.problem.tolerance, parts.problem.fixed_directions
     scale = np.append(t, 1.0)
     sums = parts.sums * scale[:, None] * scale
     total = sums.sum(axis=0) + _priors(parts) * scale[:, None] * scale
 
     def solved(S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        P = restricted_inverse(S[:-1, :-1], held)
+        P = restricted_inverse(S[:-1, :-1], fixed_directions)
         return -t * (P @ S[:-1, -1]), t**2 * np.diag(P)
 
     step, variance = solved(total)

@@ -73,7 +73,7 @@ def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
     optimum to itself (as the leverages in Bell and McCaffrey 2002). Of equal parts it is the formal variance.
     """
     t, n = parts.problem.tolerance, parts.count
-    inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.held)
+    inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.fixed_directions)
     known = parts.sums[:, :-1, :-1] * t[:, None] * t
     left = (known - known @ inverse @ known).sum(axis=0)
     return t**2 * n / (n - 1.0) * np.diag(inverse @ left @ inverse)
@@ -82,6 +82,6 @@ def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
 def spread_covariance(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
     """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B)."""
     t = problem.tolerance
-    inverse = restricted_inverse(outcome.information * t[:, None] * t, problem.held)
+    inverse = restricted_inverse(outcome.information * t[:, None] * t, problem.fixed_directions)
     half = t[:, None] * (inverse @ (t[:, None] * b.T))
     return half @ half.T

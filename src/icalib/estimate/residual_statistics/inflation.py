@@ -31,7 +31,7 @@ def noise_variance(problem: Problem, outcome: Outcome) -> np.ndarray:
     """(B,) the part of the formal variances of S^-1, the inverse of the information, that noise of the measurements
     contributes, and not errors of nuisance parameters."""
     t = problem.tolerance
-    inverse = t[:, None] * restricted_inverse(t[:, None] * outcome.information * t, problem.held) * t
+    inverse = t[:, None] * restricted_inverse(t[:, None] * outcome.information * t, problem.fixed_directions) * t
     whole = np.diag(inverse)
     return np.maximum(whole - variance_of_priors(inverse, nuisance_priors(problem), outcome.state), ROUNDING * whole)
 

@@ -89,7 +89,7 @@ class _Form:
     def of(cls, parts: Segments) -> _Form:
         t, B = parts.problem.tolerance, parts.problem.layout.size
         information = t[:, None] * parts.sums[:, :-1, :-1] * t
-        free = complement(parts.problem.held, B)
+        free = complement(parts.problem.fixed_directions, B)
         whole = free.T @ information.sum(axis=0) @ free
         values, vectors = np.linalg.eigh(whole)
         return cls(
@@ -113,7 +113,7 @@ class _Form:
 def heterogeneity(parts: Segments) -> float:
     """By how much chi^2 falls where each segment has calibration parameters of its own."""
     t = parts.problem.tolerance
-    free = complement(parts.problem.held, len(t))
+    free = complement(parts.problem.fixed_directions, len(t))
     total = 0.0
     for sums in parts.sums:
         S, b = free.T @ (t[:, None] * sums[:-1, :-1] * t) @ free, free.T @ (t * sums[:-1, -1])

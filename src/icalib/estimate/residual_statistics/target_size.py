@@ -76,4 +76,6 @@ def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Pro
 def _least_cost(problem: Problem, state: State, pieces: tuple[Piece, ...], scratch: Residuals) -> float:
     """Half the robust chi^2, the least over all parameters."""
     cost = problem.linearise(state, pieces, scratch, curved=True)
-    return cost - solve(pieces, problem.n_keyframes, problem.tolerance, held=problem.held).decrease
+    return (
+        cost - solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions).decrease
+    )
