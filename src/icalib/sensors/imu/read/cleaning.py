@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.data.measurements import ImuStream
-from icalib.sensors.imu.read.copies import copies, held
+from icalib.sensors.imu.read.copies import copies, new_values
 from icalib.sensors.imu.read.even_stamps import EvenStamps, even_stamps
 from icalib.sensors.imu.read.spikes import impossible, spikes, stuck
 
@@ -26,7 +26,7 @@ def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
     ordered = _some(imu, order)
     again = copies(ordered.stamps_ns, np.hstack([ordered.gyro, ordered.accel]))
     for values in (ordered.gyro, ordered.accel):
-        if not again.any() and held(values) is None:
+        if not again.any() and new_values(values) is None:
             again = copies(ordered.stamps_ns, values)
     if again.any():
         notes.stamps_ns = ordered.stamps_ns
@@ -59,7 +59,7 @@ def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]
     seconds, good = imu.seconds, np.ones(len(imu.stamps_ns), bool)
     found = []
     for kind, values in zip(_SENSORS, (imu.gyro, imu.accel), strict=True):
-        if (new := held(values)) is not None:
+        if (new := new_values(values)) is not None:
             values = _interpolated(seconds, values, new)
             notes.sentences += (
                 f"{what}: the {kind} has a new value in only {int(new.sum())} of {len(new)} readings and "
