@@ -220,7 +220,7 @@ def _add_products(product, tau, by_0, by_1, by_2):
 @njit(cache=True, nogil=True)
 def accumulate_scan(voxels, pose, xyz, tau, around, scale, H, g):
     """Fills the normal equations H (12, 12), g (12,) of the distances [m] of points xyz (n, 3) from the map, with the
-    weights of Geman and McClure. around: see `_planar_voxel_at`. Returns the numbers of points with a plane, and near."""
+    weights of Geman and McClure. around: see `_planar_voxel_at`. Returns numbers of points: with a plane, near it."""
     y, J, matched, near = np.empty(6), np.empty(7), 0, 0
     # Derivatives by rates are tau times those by the pose, so that sums of products by 1, tau and tau^2 are enough.
     product, by_0, by_1, by_2 = np.empty(N_PRODUCTS), np.zeros(N_PRODUCTS), np.zeros(N_PRODUCTS), np.zeros(N_PRODUCTS)
