@@ -18,7 +18,7 @@ from icalib.geometry.cameras.base import CameraModel
 SCENE_HUBER_PX = 2.0  # px; a few times the noise of detected corners
 # px, the error of a corner that the model cannot project. Without this cost, poses that look away would fit best.
 INVISIBLE_ERROR_PX = 8.0
-MIN_COST_DECREASE = 1e-4  # relative decrease of the cost at which the adjustment has converged
+SCENE_COST_TOLERANCE = 1e-4  # relative decrease of the cost at which the adjustment has converged
 FIRST_SCENE_DAMPING, MAX_SCENE_DAMPING = 1e-3, 1e6  # relative to the diagonal of the normal matrix
 POSE_RIDGE = 1e-9  # px^2, added to the diagonal of each pose block; keeps images with few corners regular
 
@@ -101,7 +101,7 @@ def bundle_adjust(views: SceneViews, state: SceneState, fixed_image: int, max_st
             if damping > MAX_SCENE_DAMPING:
                 break
             continue
-        has_converged = system.cost - after.cost < MIN_COST_DECREASE * system.cost
+        has_converged = system.cost - after.cost < SCENE_COST_TOLERANCE * system.cost
         state, system, damping = trial, after, 0.2 * damping
         if has_converged:
             break

@@ -115,35 +115,17 @@ def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarra
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_poses(
-    start,
-    point,
-    rays,
-    density,
-    good,
-    scene_points,
-    first_view,
-    body,
-    R_bc,
-    p_bc,
-    ok,
-    R_sb,
-    p_sb,
-    rotation,
-    position,
-    rms,
+    start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms
 ):
-    """Writes the pose of each image into rotation, position and rms (M, ...).
-
-    Of the poses of its views, composed with the poses R_sb, p_sb of the bodies, the one with the least error over all
-    corners is taken and refined on all corners. R_bc, p_bc, ok: (V, 2, ...) poses by view.
-    """
+    """Writes the poses of M images: rotation, position, rms. Candidates are the poses of the views, R_bc, p_bc, ok
+    (V, 2, ...), composed with R_sb, p_sb; the one with the least error over all corners is refined on all corners."""
     points, seen = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     R, t, trial_R, trial_t = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     R_sc, p_sc = np.empty((3, 3)), np.empty(3)
     for i in range(len(start) - 1):
         count = select_corners(start[i], start[i + 1], point, rays, density, good, scene_points, points, seen)
         best = NO_POSE_RMS_PX
-        for v in range(first_view[i], first_view[i + 1]):
+        for v in range(first[i], first[i + 1]):
             for side in range(R_bc.shape[1]):
                 if count < 4 or not ok[v, side]:
                     continue

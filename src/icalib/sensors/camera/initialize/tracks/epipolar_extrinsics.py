@@ -33,7 +33,7 @@ CORRELATED_RAYS = 30.0  # rays of a pair that wrong intrinsics bend alike; they 
 TRACK_ARM_SIGMA_M = 0.3  # m, the prior of the lever arm about zero; rigs are of this size
 LENS_SIGMA = 0.03  # rad, RMS over the rays, the prior of a step along one direction of the intrinsics
 MAX_LENS_SIGMAS = 3.0  # largest step along one direction, in standard deviations of its prior
-MIN_COVERED_SHARE = 0.5  # of the possible pairs; a short interval with little motion fits any extrinsics
+MIN_COVERED_PAIR_SHARE = 0.5  # of the possible pairs; a short interval with little motion fits any extrinsics
 MIN_POINT_RANGE_M = 0.2  # m; no scene is nearer to a camera
 CAUCHY_SIGMAS = 2.0  # standard deviations, the scale of Cauchy's loss
 AXIS_ANGLES = 24  # start rotations about the main axis, 15 deg apart
@@ -242,14 +242,6 @@ class _PairResiduals:
             camera = self.at.moved(x)
             return np.concatenate([self.errors(x) / sigma, camera.position / TRACK_ARM_SIGMA_M, camera.lens_step])
 
-        def robust(z: np.ndarray) -> np.ndarray:
-            """rho, rho', rho'' (3, n) of squared residuals z, as scipy asks for; priors keep their weight far away."""
-            s = z[: len(self.f)]
-            rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
-            rho[:, : len(s)] = np.log1p(s), 1.0 / (1.0 + s), -1.0 / (1.0 + s) ** 2
-            return rho
-
-        loss: Any = robust  # scipy's type stubs lack callable losses
         # Without bounds an infinite focal length fits best if the motion contradicts the tracks: all rays are parallel.
         limit, inside = np.append(np.full(len(free) - n, np.inf), np.full(n, MAX_LENS_SIGMAS)), 0.99 * MAX_LENS_SIGMAS
         present = np.append(np.zeros(len(free) - n), np.clip(self.at.lens_step, -inside, inside))
@@ -257,12 +249,27 @@ class _PairResiduals:
             residuals,
             np.zeros(len(free)),
             bounds=(-limit - present, limit - present),
-            loss=loss,
+            loss=_cauchy_of_first(len(self.f)),
             f_scale=CAUCHY_SIGMAS / np.sqrt(CORRELATED_RAYS),
             max_nfev=20,
             ftol=EPIPOLAR_COST_TOLERANCE,
         )
         return self.at.moved(step(result.x)), result
+
+
+def _cauchy_of_first(n: int) -> Any:
+    """The loss of `least_squares`: Cauchy's for the first n residuals, quadratic for the priors after them.
+
+    The type stubs of scipy lack callable losses.
+    """
+
+    def loss(z: np.ndarray) -> np.ndarray:
+        s = z[:n]
+        rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
+        rho[:, : len(s)] = np.log1p(s), 1.0 / (1.0 + s), -1.0 / (1.0 + s) ** 2
+        return rho
+
+    return loss
 
 
 def _after(poses: Poses, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -287,7 +294,7 @@ def extrinsics_on_motion(
     angles = np.linspace(0.0, 2.0 * np.pi, AXIS_ANGLES, endpoint=False)
     rotations = [np.eye(3)] if axis is None else [so3.exp(a * axis) for a in angles]
     sample = pairs.every(START_SUBSAMPLING)
-    least = MIN_COVERED_SHARE * _share_in_common(sample, motion) * len(sample.times)
+    least = MIN_COVERED_PAIR_SHARE * _share_in_common(sample, motion) * len(sample.times)
     at_starts = [_PairResiduals.of(sample, motion, start) for start in starts]
     covered = [s for s in at_starts if len(s.pairs.times) > least]
     tried = [replace(s, at=replace(s.at, rotation=R @ s.at.rotation)) for s in covered for R in rotations]
