@@ -1,1 +1,1 @@
-"""What every package may use: files, YAML with line numbers, optional packages, the compiler of kernels."""
+"""Utilities for all packages: files, YAML with line numbers, optional dependencies, compilation by numba."""

@@ -1,4 +1,4 @@
-"""`njit` for all kernels, with what keeps the first run short: it compiles all that later runs find on disk."""
+"""`njit`: numba's decorator, with settings for the compilation and disk cache of all kernels of icalib."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("NUMBA_OPT", "2")  # 3, numba's own, takes a sixth longer to compile; kernels are as fast with 2
+os.environ.setdefault("NUMBA_OPT", "2")  # numba's default, 3, compiles a sixth longer; kernels run no faster
 
 import numba  # noqa: E402
 from numba.core import event  # noqa: E402
@@ -18,7 +18,8 @@ from numba.core import event  # noqa: E402
 
 @cache
 def fingerprint(package: Path = Path(__file__).parents[1]) -> str:
-    """Hash of all files of `package` that have kernels, or the named tuples that kernels take."""
+    """Hex digest (BLAKE2b, 128 bits) of all source files of `package` that define kernels, or named tuples, which are
+    arguments of kernels."""
     found = hashlib.blake2b(digest_size=16)
     for file in sorted(package.rglob("*.py")):
         text = file.read_bytes()
@@ -28,18 +29,18 @@ def fingerprint(package: Path = Path(__file__).parents[1]) -> str:
 
 
 def njit(**options: Any) -> Any:
-    """numba.njit without an entry for callers in C, of which there are none, and whose cache on disk is not read after
-    any kernel has changed.
+    """numba.njit with `options`, without the wrapper for calls from C, and with a safer disk cache.
 
-    numba compares the file of a kernel with its cache, not the files of kernels that it calls. It also unpickles the
-    index of a cache before it compares, which fails where a class is there no more, as after an upgrade in place.
+    A change of any kernel invalidates the cache of all, by `fingerprint`. numba checks only the source file of the
+    kernel itself, not those of kernels that it calls. numba also unpickles the cache index before this check, which
+    fails after an upgrade that removed a class.
     """
-    make: Any = numba.njit  # its overloads do not know of this option
+    make: Any = numba.njit  # the type stubs of numba lack no_cfunc_wrapper
     decorator = make(no_cfunc_wrapper=True, **options)
 
     def compiled(function: Any) -> Any:
         dispatcher = decorator(function)
-        index = getattr(dispatcher._cache, "_cache_file", None)  # none without a cache
+        index = getattr(dispatcher._cache, "_cache_file", None)  # None if the options do not ask for a cache
         if index is not None:
             index._version = f"{index._version} {fingerprint()}"
         return dispatcher
@@ -48,12 +49,12 @@ def njit(**options: Any) -> Any:
 
 
 class _NoCollection(event.Listener):
-    """Holds the garbage collector while numba compiles: it makes objects by the million, nearly all of which stay, and
-    looking through them took a sixth of the time."""
+    """Disables the garbage collector while numba compiles. Compilation creates millions of objects, most of which stay,
+    and their collection took a sixth of the time."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._depth = 0  # compiling a kernel compiles those that it calls; threads may compile at once
+        self._depth = 0  # compilations in progress: they nest (kernels call kernels), and threads overlap
         self._enabled = False
 
     def on_start(self, event: Any) -> None:

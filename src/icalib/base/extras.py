@@ -1,4 +1,4 @@
-"""Packages that only some work needs: they are imported on use, and where one is missing a sentence says so."""
+"""Optional dependencies: imported at first use. A missing one raises RecordingError with the command to install it."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from icalib.errors import RecordingError
 
 
 def install(extra: str) -> str:
-    """The command that installs `extra`, in words."""
+    """Installation advice for a message; extra: name of an optional dependency group in pyproject.toml."""
     return f'pip install ".[{extra}]" in the checkout of icalib'
 
 
 def load_cv2() -> Any:
-    """OpenCV. Raises RecordingError where it is not installed."""
+    """The module cv2 of OpenCV. Raises RecordingError where it is not installed."""
     return _load("cv2", "images", "Images and tags need OpenCV")
 
 
 def load_typesys() -> Any:
-    """The message types of rosbags. Raises RecordingError where it is not installed."""
+    """The module rosbags.typesys, which deserializes ROS messages. Raises RecordingError where it is not installed."""
     return _load("rosbags.typesys", "bags", "Bags need the package rosbags")
 
 
 def load_lz4() -> Any:
-    """lz4's frame format. Raises RecordingError where it is not installed."""
+    """The module lz4.frame. Raises RecordingError where it is not installed."""
     return _load("lz4.frame", "bags", "Bags compressed by lz4 need the package lz4")
 
 
 def load_zstd() -> Any:
-    """zstd: the standard library's from Python 3.14 on. Raises RecordingError where it is not installed."""
+    """compression.zstd (Python 3.14 or later), else backports.zstd. Raises RecordingError if neither is installed."""
     try:
         return importlib.import_module("compression.zstd")
     except ImportError:
@@ -38,27 +38,27 @@ def load_zstd() -> Any:
 
 
 def load_distributed() -> Any:
-    """Dask's distributed. Raises RecordingError where it is not installed."""
+    """The module distributed of Dask. Raises RecordingError where it is not installed."""
     return _load("distributed", "montecarlo", "Many runs need Dask's package distributed")
 
 
 def load_dask() -> Any:
-    """Dask, whose settings distributed has. Raises RecordingError where it is not installed."""
+    """The module dask, which holds the settings of distributed. Raises RecordingError where it is not installed."""
     return _load("dask", "montecarlo", "Many runs need Dask's package distributed")
 
 
 def load_filelock() -> Any:
-    """filelock. Raises RecordingError where it is not installed."""
+    """The module filelock. Raises RecordingError where it is not installed."""
     return _load("filelock", "montecarlo", "Many runs need the package filelock")
 
 
 def load_matplotlib() -> Any:
-    """matplotlib's figures, drawn without a screen. Raises RecordingError where it is not installed."""
+    """The module matplotlib.figure, which draws without a display. Raises RecordingError where it is not installed."""
     return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")
 
 
 def load_rerun() -> Any:
-    """Rerun's SDK with its blueprints. Raises RecordingError where it is not installed."""
+    """The module rerun, with rerun.blueprint imported. Raises RecordingError where it is not installed."""
     _load("rerun.blueprint", "view", "The 3D view needs the package rerun-sdk")
     return importlib.import_module("rerun")
 

@@ -1,6 +1,6 @@
-"""Hashes of files, taken while they are read: large ones are not read a second time.
+"""sha256 of input files, computed while they are read, so that large files are not read twice.
 
-A reader shows what it reads to `hash_of(path)`; only what no reader read is read for the hash.
+A reader passes each block to `hash_of(path).saw`. `hexdigest` reads only the bytes after those that were passed.
 """
 
 from __future__ import annotations
@@ -11,20 +11,24 @@ import threading
 from pathlib import Path
 from typing import BinaryIO
 
-_NEAR = 1 << 20  # bytes between two blocks, such as headers and indices, that are read at once to go on
-_BLOCK = 1 << 14  # bytes read at once where nobody else does: memory stays that of the reader
-_MOST = 200_000  # files that are remembered, of which each takes 0.5 kB
+_NEAR = 1 << 20  # bytes: a gap up to this (headers, an index) between two blocks is read at once, to continue the hash
+_BLOCK = 1 << 14  # bytes per read of `FileHash` itself; small, so that it needs no noticeable memory
+_MOST = 200_000  # remembered hashes; each takes 0.5 kB
 
 
 class FileHash:
-    """sha256 of a file that is being read, mostly from front to back, perhaps several times."""
+    """sha256 of a file that a reader reads at the same time, mostly from front to back, perhaps several times."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._hash, self._at = path, hashlib.sha256(), 0
         self._beside: threading.Thread | None = None
 
     def saw(self, offset: int, content: bytes, file: BinaryIO | None = None) -> None:
-        """`content` was read at `offset`. What lies shortly before is read from `file`, whose position changes."""
+        """Add `content`, which was read at byte `offset`. Bytes hashed before are skipped.
+
+        A gap of up to 1 MiB before `offset` is read from `file`, whose position changes. After a larger gap, or without
+        `file`, `content` is ignored, and `hexdigest` reads it again.
+        """
         if file is not None and 0 < offset - self._at <= _NEAR:
             file.seek(self._at)
             self._add(file.read(offset - self._at))
@@ -32,13 +36,13 @@ class FileHash:
             self._add(memoryview(content)[self._at - offset :])
 
     def read_beside(self) -> None:
-        """Reads the file in a thread of its own, for readers that do not tell what they read."""
+        """Hash the file in a background thread, for readers that do not call `saw`."""
         if self._beside is None:
             self._beside = threading.Thread(target=self._read_on, daemon=True)
             self._beside.start()
 
     def hexdigest(self) -> str:
-        """Of the whole file: reads what was not seen. Raises OSError."""
+        """Hash of the whole file, in hexadecimal; reads the bytes that are not hashed yet. Raises OSError."""
         if self._beside is not None:
             self._beside.join()
         self._read_on()
@@ -59,7 +63,8 @@ _hashes: dict[tuple[str, int, int, int], FileHash] = {}
 
 
 def hash_of(path: Path) -> FileHash:
-    """The hash of the file as it is now; a file that was changed since has another. Raises OSError."""
+    """The hash of the file in its current state, shared by all readers. A changed file (other inode, size or
+    modification time) has a new one. Raises OSError."""
     about = path.stat()
     key = (str(path.absolute()), about.st_ino, about.st_size, about.st_mtime_ns)
     if key not in _hashes and len(_hashes) >= _MOST:
@@ -68,7 +73,7 @@ def hash_of(path: Path) -> FileHash:
 
 
 class HashedFile(io.FileIO):
-    """A file that is read, and hashed meanwhile."""
+    """A file opened for reading whose `read` also updates its hash (`hash_of`)."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

@@ -1,7 +1,7 @@
-"""How icalib knows a file that it wrote: the file ends in a seal, the sha256 of all that is before it.
+"""Recognizes files that icalib wrote: each ends in a seal, the sha256 of all bytes before it.
 
-A file whose seal is missing or does not fit is the user's, or was changed by the user, and is never replaced or
-deleted. The seal is a comment, or in JSON the last key.
+A file without a valid seal was written or changed by the user, and is never replaced or deleted. The seal is a comment,
+or in JSON the last key. Databases and Rerun files have no seal and are recognized by their header.
 """
 
 from __future__ import annotations
@@ -13,23 +13,26 @@ from pathlib import Path
 
 from icalib.errors import CalibrationError
 
-SEAL = "icalib_sha256"  # the last key of JSON
+SEAL = "icalib_sha256"  # key of the seal in JSON
 _COMMENT = re.compile(rb"(?:# |% |<!-- )icalib sha256 ([0-9a-f]{64})(?: -->)?\r?\n\Z")
 _LAST_KEY = re.compile(rb',\s*"icalib_sha256": "([0-9a-f]{64})"\n\}\]?\Z')
-_ARCHIVE = re.compile(rb"(?s:..)icalib sha256 ([0-9a-f]{64})\n\Z")  # the size of a zip file's comment, and the comment
+_ARCHIVE = re.compile(rb"(?s:..)icalib sha256 ([0-9a-f]{64})\n\Z")  # length (2 bytes) and text of a zip comment
 _ZIP = b"PK\x03\x04"
 _LONGEST_SEAL = 200  # bytes
 _DATABASE, _DATABASE_ID_AT = b"SQLite format 3\x00", 68
-DATABASE_ID = 0x49434C42  # "ICLB", the application id of databases that icalib writes
+DATABASE_ID = 0x49434C42  # "ICLB": SQLite application id of databases that icalib writes
 _RERUN = (b"RRF2", b"RRIO", b"RRIX")
-_RERUN_HEAD = 4096  # bytes, in which the name of the program stands
+_RERUN_HEAD = 4096  # bytes at the begin of a Rerun file that contain the name of the program
 
 
 def sealed(content: bytes) -> bytes:
-    """`content` with the seal: JSON (an object, or a list that ends with one), XML, HTML, PDF, PNG, npz, or
-    text whose comments begin with #."""
-    content = _COMMENT.sub(b"", content)  # of an input that is written again
-    if content.startswith(_ZIP):  # as numpy writes it, without a comment: its size, 0, stands at the end
+    """`content` with a seal at its end, in place of an earlier one.
+
+    content: npz, XML, HTML, PDF, JSON (an object, or a list that ends with one), or text whose comments begin with #.
+    A binary file that allows bytes after its end, such as PNG, gets the seal of a text.
+    """
+    content = _COMMENT.sub(b"", content)  # an earlier seal: the content comes from a file of icalib
+    if content.startswith(_ZIP):  # npz by numpy has no comment: its last 2 bytes are the length 0
         comment = f"icalib sha256 {hashlib.sha256(content[:-2]).hexdigest()}\n".encode()
         return content[:-2] + len(comment).to_bytes(2, "little") + comment
     head = content.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
@@ -46,7 +49,7 @@ def sealed(content: bytes) -> bytes:
 
 
 def sealed_texts(texts: dict[str, str]) -> dict[str, str]:
-    """The texts, by name, each with its seal; bytes that are no UTF-8 stay as they are (surrogateescape)."""
+    """`texts` (name -> content) with a seal each. Bytes that are not UTF-8 are preserved (surrogateescape)."""
     return {
         name: sealed(text.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
         for name, text in texts.items()
@@ -54,7 +57,10 @@ def sealed_texts(texts: dict[str, str]) -> dict[str, str]:
 
 
 def is_ours(path: Path) -> bool:
-    """Whether icalib wrote the file, and nobody changed it since. Raises OSError."""
+    """True if the file has a valid seal. A database or Rerun file is recognized by its header, even if changed since.
+
+    Raises OSError.
+    """
     if path.is_symlink() or not path.is_file():
         return False
     with path.open("rb") as file:
@@ -67,7 +73,8 @@ def is_ours(path: Path) -> bool:
 
 
 def refuse_foreign(paths: Iterable[Path], inputs: Iterable[Path] = (), advice: str = "choose another folder") -> None:
-    """Raises CalibrationError where one of `paths` exists and is not icalib's own, or is an input."""
+    """Raises CalibrationError if writing `paths` would overwrite one of `inputs`, or an existing file that `is_ours`
+    does not recognize. advice: end of the message."""
     given = {path.resolve() for path in inputs}
     for path in paths:
         try:

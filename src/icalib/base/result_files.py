@@ -1,8 +1,11 @@
-"""Writes a set of files into a folder so that, whatever happens, the folder holds one whole set, old or new.
+"""Atomic replacement of a set of result files: after a crash the folder holds the complete old or new set.
 
-The new set is written into a hidden folder inside the target, flushed, and that folder renamed to `.icalib-commit`:
-from here on the new set counts. Then file by file moves into place. After a crash in between, readers look into the
-commit folder first, and the next writer finishes the move. Files of others in the folder are left alone.
+1. The new files are written to a hidden subfolder and flushed.
+2. The subfolder is renamed to `.icalib-commit`. From here on the new set is valid.
+3. The files are moved one by one from `.icalib-commit` into the folder.
+
+After a crash during step 3, readers look into `.icalib-commit` first, and the next writer finishes the move. Files that
+icalib did not write stay unchanged.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from icalib.base.staging import staged
 from icalib.errors import CalibrationError
 
 COMMIT = ".icalib-commit"
-# Every name that icalib writes: a leftover of an earlier result beside a new one would be a silently wrong number.
+# All file names of a result. A new result deletes those that it does not write, so that no outdated file remains.
 OWN_FILES = (
     "calibration.yaml",
     "camchain-imucam.yaml",
@@ -32,9 +35,9 @@ OWN_FILES = (
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes `files` (name -> content) as one set; `folder` is made where absent.
+    """Replaces the result in `folder` by `files` (name -> content); creates `folder` if needed.
 
-    Raises CalibrationError naming the folder where it cannot be written; an earlier set is whole then.
+    Raises CalibrationError with the folder if it cannot be written; an earlier result is then still complete.
     """
     with _errors_named(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -49,7 +52,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def read_file(folder: Path, name: str) -> bytes:
-    """The file `name` of the set that counts. Raises CalibrationError where it is absent or cannot be read."""
+    """Content of the file `name` of the valid set. Raises CalibrationError if it is missing or cannot be read."""
     if not folder.is_dir():
         raise CalibrationError(f"{folder} is not a folder; give the folder that a calibration was written to.")
     committed = [] if _commit(folder) is None else [folder / COMMIT / name]
@@ -60,29 +63,29 @@ def read_file(folder: Path, name: str) -> bytes:
 
 
 def finish_writing(folder: Path) -> None:
-    """Moves into place what a writer that was killed left half-moved, so that other programs see it, too.
+    """Finishes the move of a writer that was killed (step 3), so that other programs see the new files, too.
 
-    Raises CalibrationError where the folder cannot be written.
+    Raises CalibrationError if the folder cannot be written.
     """
     with _errors_named(folder):
         _move_in(folder)
 
 
 def refuse_foreign_set(folder: Path, inputs: Iterable[Path] = ()) -> None:
-    """Raises CalibrationError where `folder` has a file under a name of a set that icalib did not write, that was
-    changed since, or that is one of `inputs`."""
+    """Raises CalibrationError if a result in `folder` would overwrite one of `inputs`, or a file that icalib did not
+    write or that was changed since."""
     commit = _commit(folder)
     names = set(OWN_FILES) | ({path.name for path in commit.iterdir()} if commit else set())
     refuse_foreign((folder / name for name in sorted(names)), inputs)
 
 
 def set_of(folder: Path) -> list[Path]:
-    """The files that a set in `folder` may have."""
+    """Paths of all files that a result in `folder` may have, whether they exist or not."""
     return [folder / name for name in OWN_FILES]
 
 
 def check_writable(folder: Path) -> None:
-    """Makes `folder` and tries to write in it, so that a long run does not fail at its end. Raises CalibrationError."""
+    """Creates `folder` and writes to it, so that a long run does not fail at its end. Raises CalibrationError."""
     with _errors_named(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with staged(folder):
@@ -97,7 +100,7 @@ def _write_through(path: Path, content: bytes) -> None:
 
 
 def _move_in(folder: Path) -> None:
-    """Moves what a commit folder holds into place."""
+    """Moves the files of `.icalib-commit`, if it exists, into `folder`."""
     commit = _commit(folder)
     if commit is not None:
         for path in sorted(commit.iterdir()):
@@ -106,7 +109,7 @@ def _move_in(folder: Path) -> None:
 
 
 def _commit(folder: Path) -> Path | None:
-    """The commit folder, where there is one. Raises CalibrationError where it is a link, which icalib never makes."""
+    """Path of `.icalib-commit`; None if absent. Raises CalibrationError if it is a link, which icalib never creates."""
     commit = folder / COMMIT
     if commit.is_symlink():
         raise CalibrationError(f"{commit} is a link, which icalib never writes; remove it.")

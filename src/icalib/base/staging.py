@@ -1,4 +1,4 @@
-"""Hidden folders to write in, beside what will be replaced; those that killed writers left behind are removed."""
+"""Hidden temporary folders in the output folder, for atomic replacement; removes those left by killed processes."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ PREFIX = ".icalib-staging-"
 
 @contextlib.contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """A new hidden folder in `folder`, which exists; removed at the end, with all that is still in it.
+    """Context manager: a new hidden folder in the existing `folder`, removed at exit with its content.
 
-    The writer holds a lock on it, which ends with the process. A folder without a lock is a leftover, and is removed.
-    Raises OSError.
+    The process locks the hidden folder; the lock ends with the process. Hidden folders without a lock are leftovers of
+    killed processes and are removed. Raises OSError.
     """
     with _locked(folder):
         _remove_leftovers(folder)
@@ -39,7 +39,7 @@ def _remove_leftovers(folder: Path) -> None:
     for old in folder.glob(f"{PREFIX}*"):
         if old.is_symlink() or not old.is_dir():
             continue
-        with contextlib.suppress(OSError):  # of another user
+        with contextlib.suppress(OSError):  # a folder of another user
             lock = _lock(old, wait=False)
             if lock is not None:
                 shutil.rmtree(old, ignore_errors=True)
@@ -56,7 +56,10 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _lock(folder: Path, wait: bool) -> int | None:
-    """A descriptor that holds the lock of `folder`; None where another process does, or there are no locks here."""
+    """Descriptor of the locked `folder`; None if another process has the lock, or the system has no flock.
+
+    wait: wait until the lock is free.
+    """
     if fcntl is None:
         return None
     handle = os.open(folder, os.O_RDONLY)

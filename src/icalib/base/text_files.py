@@ -1,4 +1,4 @@
-"""Text files that nobody sees half of."""
+"""Text and JSON files, written atomically: a reader never sees an incomplete file."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from icalib.errors import CalibrationError
 
 
 def printable(text: str) -> str:
-    """`text` as a file in UTF-8 can hold it. Names of files may have other bytes, which Python keeps as lone
-    surrogates; they become escapes such as \\udcfc, which JSON and YAML in quotes read back as the same name."""
+    """`text` that UTF-8 can encode: lone surrogates become escapes such as \\udcfc.
+
+    Python represents bytes of a file name that are not UTF-8 as lone surrogates. JSON and quoted YAML read the escapes
+    back as the same name.
+    """
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def json_text(plain: Any) -> str:
-    """`plain` as JSON, with null for numbers that are not finite, which JSON does not have."""
+    """`plain` (dicts, lists, numbers, text) as JSON. NaN and infinity become null, as JSON lacks them."""
     return json.dumps(_finite(plain), indent=1, ensure_ascii=False, allow_nan=False)
 
 
@@ -34,8 +37,8 @@ def _finite(value: Any) -> Any:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Writes `texts` (name -> content) into `folder`, which is made where absent: each file is the old one or the new
-    one whole, and none is touched before all are written. Raises CalibrationError where that is not possible."""
+    """Writes `texts` (name -> content) into `folder`, created if needed. Each file is replaced atomically, after all
+    new files were written to a temporary folder. Raises CalibrationError if the folder cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with staged(folder) as place:
@@ -50,11 +53,12 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def write_sealed(path: Path, text: str) -> None:
-    """Writes one text with its seal (`own_files`), as `write_texts` does."""
+    """Writes `text` with a seal (see `own_files`) to `path`, atomically. Raises CalibrationError as `write_texts`."""
     write_texts(path.parent, sealed_texts({path.name: text}))
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes the text as it is, bytes that are no UTF-8 included. Raises OSError."""
+    """Writes `text` in UTF-8, with unchanged line ends and without atomicity. Bytes that are not UTF-8 are preserved
+    (surrogateescape). Raises OSError."""
     with path.open("w", encoding="utf-8", errors="surrogateescape", newline="") as file:
         file.write(text)

@@ -1,4 +1,4 @@
-"""Compressed data and arrays, unpacked up to a limit in proportion to their size: a few bytes can claim terabytes."""
+"""Safe decompression: limits the unpacked size relative to the stored size, against decompression bombs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from icalib.base.file_hashes import HashedFile
 
-FREE_BYTES, RATIO = 16 << 20, 256  # sensors' data shrink to a tenth; images of one colour, and zeros, to less
+FREE_BYTES, RATIO = 16 << 20, 256  # sensor data shrink to a tenth; uniform images and zeros shrink more
 LIMIT_WORDS = f"{FREE_BYTES >> 20} MiB and {RATIO} times its size"
 _NOT_ARRAYS = (
     OSError,
@@ -37,34 +37,37 @@ _NOT_ARRAYS = (
 
 
 class TooLargeError(ValueError):
-    """What is unpacked is out of proportion to what is stored."""
+    """The unpacked data exceed the limit for their stored size (`most_bytes`)."""
 
     def __init__(self) -> None:
         super().__init__(f"it unpacks to more than {LIMIT_WORDS}")
 
 
 def most_bytes(stored: int) -> int:
-    """How many bytes `stored` bytes may unpack to."""
+    """Largest permitted size [bytes] after unpacking `stored` bytes."""
     return FREE_BYTES + RATIO * stored
 
 
 def unpacked(decompressor: Any, stored: bytes) -> bytes:
-    """`stored` by a decompressor of bz2, lz4 or zstd. Raises TooLargeError, and what the decompressor raises."""
+    """`stored`, unpacked by a decompressor of bz2, lz4 or zstd. Raises TooLargeError, and the decompressor's errors."""
     most = most_bytes(len(stored))
     return _within(decompressor.decompress(stored, max_length=most + 1), most)
 
 
 def gunzipped(stored: bytes) -> bytes:
-    """A gzip file's content. Raises TooLargeError, and what the module gzip raises."""
+    """`stored`, a gzip file, unpacked. Raises TooLargeError, and errors of the module gzip."""
     most = most_bytes(len(stored))
     with gzip.open(io.BytesIO(stored)) as file:
         return _within(file.read(most + 1), most)
 
 
 def copy_unpacked(packed: BinaryIO, out: BinaryIO, stored: int) -> None:
-    """Copies what `packed` unpacks from `stored` bytes. Raises TooLargeError, and what `packed` raises."""
+    """Copies the unpacked content of `packed`, a file that decompresses `stored` bytes, to `out`.
+
+    Raises TooLargeError, and errors of `packed`.
+    """
     left = most_bytes(stored)
-    while block := packed.read(1 << 16):  # small, since of a file that was cut off the last read is lost
+    while block := packed.read(1 << 16):  # small: the last block of a truncated file is lost
         left -= len(block)
         if left < 0:
             raise TooLargeError
@@ -72,9 +75,9 @@ def copy_unpacked(packed: BinaryIO, out: BinaryIO, stored: int) -> None:
 
 
 def load_arrays(source: Path | bytes, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, all or those of `names` that are there; nothing in it is executed.
+    """Arrays of an npz file by name, without pickle: all, or those of `names` that exist. source: path or content.
 
-    Raises OSError where the file cannot be read, ValueError with the reason where its content is something else.
+    Raises OSError if the file is not found, ValueError with the reason for any other failure.
     """
     in_memory = isinstance(source, bytes)
     stored = len(source) if in_memory else source.stat().st_size
@@ -91,7 +94,8 @@ def load_arrays(source: Path | bytes, names: Collection[str] | None = None) -> d
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Refused before any memory is asked for, where its header claims more than there is."""
+    """One array of an npz file. Raises ValueError for Python objects, and before memory is allocated if the size in the
+    header differs from the stored one."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     with archive.open(member) as file:
         version = np.lib.format.read_magic(file)

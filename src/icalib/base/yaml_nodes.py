@@ -1,4 +1,4 @@
-"""YAML values that know their file, line and field, so that every complaint can name them."""
+"""YAML values with their file, line and field, so that each error message can give them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import yaml
 from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
 
-MOST_WHOLE = 2**63 - 1  # what int64, the type of stamps, holds
-_LARGEST = 1e20  # nothing that is measured is larger, and powers of it are still finite
+MOST_WHOLE = 2**63 - 1  # largest int64, the type of timestamps
+_LARGEST = 1e20  # largest absolute number; small enough that its powers in later computations are finite
 _WHOLE = re.compile(r"[-+]?[0-9]{1,19}")
 
 # Former names of fields, for the error that names the new one.
@@ -34,14 +34,17 @@ RENAMED = {
 
 @dataclass(frozen=True)
 class YamlValue:
-    """One value of a YAML file. `field` is its place, for example "sensors.cam0.model"; "" is the whole file."""
+    """One value of a YAML file. field: path of its keys, such as "sensors.cam0.model"; "" is the whole file.
+
+    Methods that convert the value raise RigError if it has another type or is out of range.
+    """
 
     node: yaml.Node
     file: str
     field: str
 
     def fail(self, sentence: str) -> NoReturn:
-        """Raises RigError: `sentence` says what is wrong and what to do."""
+        """Raises RigError: file, line and field, then `sentence`, which says what is wrong and what to do."""
         place = f"{self.file}:{self.node.start_mark.line + 1}"
         raise RigError(f"{place}: {self.field}: {sentence}" if self.field else f"{place}: {sentence}")
 
@@ -54,7 +57,7 @@ class YamlValue:
         return isinstance(self.node, yaml.SequenceNode)
 
     def shown(self) -> str:
-        """The value in words, for a sentence."""
+        """The value for a message: its text up to 40 characters, "a mapping", "a list" or "empty"."""
         if not isinstance(self.node, yaml.ScalarNode):
             return "a mapping" if self.is_mapping else "a list"
         if self.node.tag == "tag:yaml.org,2002:null":
@@ -63,7 +66,7 @@ class YamlValue:
         return repr(text if len(text) <= 40 else text[:40] + "...")
 
     def entries(self) -> dict[str, YamlValue]:
-        """The mapping's values by key. Refuses anything else, and keys that are given twice."""
+        """Values of the mapping by key. Raises RigError if it is not a mapping, or has a key twice."""
         if not isinstance(self.node, yaml.MappingNode):
             self.fail(f"must be a mapping (name: value), but is {self.shown()}.")
         found: dict[str, YamlValue] = {}
@@ -78,7 +81,7 @@ class YamlValue:
         return found
 
     def record(self, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, YamlValue]:
-        """The mapping's values by key, where only these keys may stand and the required ones must."""
+        """Values of the mapping by key. Raises RigError for a missing `required` key, and for keys in neither list."""
         found, valid = self.entries(), required + optional
         for name, value in found.items():
             if name not in valid and RENAMED.get(name) in valid:
@@ -96,7 +99,7 @@ class YamlValue:
         return str(self.node.value)
 
     def choice(self, what: str, available: tuple[str, ...]) -> str:
-        """One of `available`; `what` names it in the sentence."""
+        """The text, one of `available`. what: noun for the error message."""
         text = self.text()
         if text not in available:
             self.fail(
@@ -110,7 +113,7 @@ class YamlValue:
         return str(self.node.value).lower() in ("true", "yes", "on")
 
     def number(self) -> float:
-        """A finite number. Read by Python, since YAML 1.1 takes 2e-5 (no decimal point) for text."""
+        """A finite number. Python parses it, since YAML 1.1 takes 2e-5 (no decimal point) for text."""
         plain = isinstance(self.node, yaml.ScalarNode) and self.node.style is None
         text = str(self.node.value) if plain else ""
         if text.lower().lstrip("+-") in (".nan", ".inf", "nan", "inf", "infinity"):
@@ -136,7 +139,7 @@ class YamlValue:
         return value
 
     def whole(self, least: int) -> int:
-        """A whole number that is at least `least`."""
+        """An integer from `least` to 2^63 - 1."""
         self.number()
         text = str(self.node.value)
         if not _WHOLE.fullmatch(text) or int(text) < least:
@@ -146,13 +149,13 @@ class YamlValue:
         return int(text)
 
     def items(self) -> list[YamlValue]:
-        """The list's values; their field names end in [i], from 0."""
+        """Values of the list; the field of each ends in [i], counted from 0."""
         if not isinstance(self.node, yaml.SequenceNode):
             self.fail(f"must be a list in brackets, but is {self.shown()}.")
         return [YamlValue(node, self.file, f"{self.field}[{i}]") for i, node in enumerate(self.node.value)]
 
     def vector(self, size: int) -> np.ndarray:
-        """(size,) float64. A single number will do where one is asked for."""
+        """(size,) float64, from a list of numbers. If size is 1, a number without a list is allowed."""
         if size == 1 and not self.is_list:
             return np.array([self.number()])
         numbers = self.items()
@@ -162,9 +165,9 @@ class YamlValue:
 
 
 def read_yaml(path: Path, kind: str = "rig file") -> YamlValue:
-    """The YAML file at `path`, composed but never constructed: nothing in it can run. kind: for sentences.
+    """Root value of the YAML file at `path`, parsed without running its tags. kind: noun for the file in messages.
 
-    Raises RigError where there is no such file, it cannot be read, is not YAML or is empty.
+    Raises RigError if the file does not exist, cannot be read, is not YAML or is empty.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -178,12 +181,12 @@ def read_yaml(path: Path, kind: str = "rig file") -> YamlValue:
 
 
 def parse_yaml(text: str, path: str, kind: str = "rig file") -> YamlValue:
-    """The YAML `text`, composed but never constructed; `path` names its place, `kind` what it is, in sentences.
+    """Root value of the YAML `text`, parsed without running its tags. path, kind: its name and a noun, for messages.
 
-    Raises RigError where it is not YAML or is empty.
+    Raises RigError if the text is not YAML or is empty.
     """
     try:
-        # OpenCV heads its files with a directive that YAML does not have.
+        # OpenCV writes `%YAML:1.0` in the first line, which is not a valid YAML directive.
         root = yaml.compose(re.sub(r"\A%YAML:1\.0", "#", text), Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -203,5 +206,5 @@ def _reason(error: Exception) -> str:
 
 
 def _new_values(former: str) -> str:
-    """What else changed with the name of a field."""
+    """Advice on renamed values of a renamed field, for its error message; mostly empty."""
     return ", and write interval-mean for mean, instantaneous for instant" if former == "meaning" else ""
