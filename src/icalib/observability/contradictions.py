@@ -1,8 +1,8 @@
 """Values of the rig file, fixed or with a prior, that the data contradict.
 
-Each is tested alone first (`relaxed`), which costs one linearisation. Those that stand out are then free together: what
-is right among them no longer stands out, and directions in which the data show only noise stay fixed. A value that is
-far off moves everything with it; then the calibration is made again without it.
+Each value is first tested alone by one Newton step (`relaxed`). Values that fail are then freed together, in one more
+Newton step in which unobservable directions stay fixed; a value that agrees there is dropped. If a value is far off,
+the whole calibration is repeated with all of them free instead.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from icalib.optim.calib_block import restricted_root
 from icalib.optim.state import Block, Key, State
 from icalib.rig import Parameter, ParameterSpec
 
-SIGMAS = 4.0
-FAR = 0.5  # times the prior uncertainty: 3 deg, 5 cm, 10 ms; a linear step that long does not end where it says
+SIGMAS = 4.0  # standard deviations of the difference that make a contradiction
+FAR = 0.5  # times the prior uncertainty (3 deg, 5 cm, 10 ms); a longer step is not linear, so the estimate is repeated
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A group `key` that the rig file states as `parameter` (mode fixed or prior), between raw stamps.
+    """A parameter group `key` whose stated value (`parameter`, fixed or with a prior) differs from the data.
 
-    off (n,): from the stated value to that of the data alone, rotations about the sensor's axes [rad]; sigma (n,): the
-    standard deviation of the latter; found: the latter. spec: the definition of the group.
+    found: the value from the data alone, of the shape of the stated value; time offsets are between raw stamps. off
+    (n,): found minus stated; for rotations the rotation vector from stated to found, about the sensor's axes [rad].
+    sigma (n,): standard deviation of `found`. spec: definition of the group.
     """
 
     key: Key
@@ -43,23 +44,24 @@ class Contradiction:
 
     @property
     def away(self) -> np.ndarray:
-        """(n,) how far off in standard deviations of both together."""
+        """(n,) difference in standard deviations of both values together."""
         stated = 0.0 if self.parameter.sigma is None else self.parameter.sigma
         return np.abs(self.off) / np.maximum(np.sqrt(self.sigma**2 + stated**2), 1e-300)
 
     @property
     def in_prior_sigmas(self) -> float:
-        """How far off it is at most, in standard deviations of an initial guess for which the rig file gives none."""
+        """Largest difference, in default standard deviations of an initial guess of this parameter."""
         return float(np.abs(self.off).max()) / self.spec.prior_sigma
 
     @property
     def worst(self) -> int:
-        """The entry that is farthest off."""
+        """Index of the entry that differs most, in standard deviations."""
         return int(np.argmax(self.away))
 
 
 def contradictions(inputs: Inputs, stated: Relaxed | None, factor: float) -> tuple[Contradiction, ...]:
-    """What is more than SIGMAS off. `stated`: see `relaxed`; factor: times which formal standard deviations count."""
+    """Stated values that differ from the data by more than SIGMAS. `stated`: see `relaxed`; factor: multiplies the
+    formal standard deviations."""
     if stated is None:
         return ()
     alone = [_shown(inputs, stated.state, stated.layout.block(*k), *stated.step([k]), factor) for k in stated.stated]
@@ -82,7 +84,8 @@ def _is_far(shown: Contradiction) -> bool:
 def _linear(
     inputs: Inputs, stated: Relaxed, standing_out: Sequence[Contradiction], factor: float
 ) -> Sequence[Contradiction]:
-    """One Newton step with all that stand out free, without directions that are unobservable from the data."""
+    """Contradictions after one Newton step in which all groups of `standing_out` are free, and unobservable directions
+    stay fixed."""
     keys, n = [c.key for c in standing_out], stated.layout.size
     columns = np.setdiff1d(np.arange(n), stated.fixed_columns(keys))
     outcome, gradient = stated.without(keys)
@@ -97,7 +100,8 @@ def _linear(
 
 
 def _estimated(inputs: Inputs, state: State, standing_out: Sequence[Contradiction]) -> Sequence[Contradiction]:
-    """From the calibration without what stands out; as they are where that fails."""
+    """Contradictions after a new estimate in which all groups of `standing_out` are free; `standing_out` itself if that
+    fails."""
     freed = freed_inputs(inputs, [c.key for c in standing_out])
     try:
         again = determine(freed, state, guess=state.values)
@@ -107,15 +111,15 @@ def _estimated(inputs: Inputs, state: State, standing_out: Sequence[Contradictio
 
 
 def contradicted_by(inputs: Inputs, without: Determined) -> tuple[Contradiction, ...]:
-    """What `inputs`, of the rig as it was given, state and an estimate `without` any of it contradicts, the farthest
-    off first."""
+    """Values stated in the rig file of `inputs` that contradict the estimate `without`, in which they are free. The
+    largest difference comes first."""
     layout = without.estimate.problem.layout
     found = _standing_out(_by(inputs, without, stated_keys(inputs, layout)))
     return tuple(sorted(found, key=lambda c: -c.in_prior_sigmas))
 
 
 def _by(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contradiction]:
-    """The groups `keys` beside an estimate in which they are free."""
+    """Differences between the stated values of the groups `keys` and an estimate in which these are free."""
     outcome, layout = without.estimate.outcome, without.estimate.problem.layout
     ratios = [f.chi2 / f.dof for f in fits(outcome.problem, outcome) if f.dof > np.sqrt(f.count)]
     factor = float(np.sqrt(max([1.0, *ratios])))
@@ -126,7 +130,8 @@ def _by(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contra
 def _shown(
     inputs: Inputs, state: State, block: Block, step: np.ndarray, sigma: np.ndarray, factor: float
 ) -> Contradiction:
-    """A stated group against where `step` (B,) leads from `state`."""
+    """The difference between the stated value of `block` and the value that `step` (B,) leads to from `state`. sigma
+    (B,): formal standard deviations, which `factor` multiplies."""
     sensor = (inputs.asked or inputs.rig).sensors[block.sensor]
     parameter: Parameter = getattr(sensor, block.name)
     assert parameter.value is not None

@@ -1,14 +1,14 @@
 """The null space of the data, and estimates in which it is fixed at the initial guess.
 
-Broad priors do not make an unobservable direction harmless. The solver wanders along it, and parameters that couple
-with it at second order come out wrong with a small standard deviation. So the null space is that of the information of
-the data alone, without the part that noise in the Jacobian makes. Its directions are reset to the guess and fixed there
-while all else is estimated again, until their number stays. The sensitivity of the other parameters to the guess along
-these directions is computed, and is part of the covariance (consider covariance).
+Broad priors do not make an unobservable direction harmless. The solver drifts along it, and parameters that couple with
+it at second order become wrong, with a small standard deviation. The null space is therefore that of the information of
+the data alone, without the information that noise in the Jacobian adds. Its directions are reset to the guess and fixed
+there, and everything else is estimated again until the null space no longer changes. The sensitivity of the other
+parameters to the guess along these directions is part of the covariance (consider covariance).
 
-Noise in the Jacobian can pull along an unobservable direction as hard as data would, and data can be hidden in it.
-The solver does not wander there, and a reset to the guess would cost chi^2. Such a direction is fixed where the
-measurements put it, unless that is farther from the guess than the prior uncertainty of the guess allows.
+Noise in the Jacobian can constrain an unobservable direction as strongly as data would, and can hide weak data. The
+solver does not drift along such a direction, and a reset to the guess would increase chi^2. The direction is fixed at
+its estimate, unless this is farther from the guess than the prior uncertainty of the guess allows.
 """
 
 from __future__ import annotations
@@ -35,23 +35,25 @@ from icalib.optim.calib_block import UNOBSERVABLE_BELOW, essential_information, 
 from icalib.optim.prior_factor import variance_of_priors, without_priors
 from icalib.optim.state import Key, State
 
-# A direction with a larger share of noise in its information counts as unobservable: all of it may be noise.
+# A direction may be unobservable only if less than this share of its information is left without noise in the Jacobian.
 SPURIOUS_SHARE = 0.5
-MOST_ROUNDS, LATE = 6, 4
+MOST_ROUNDS, LATE = 6, 4  # estimates of a search; the round from which a superset of the null space is accepted
 RANK_DEFICIENT_BELOW = 0.25  # information in tolerance units
-UNCHANGED = 0.1  # of the information: less than what a few draws of noise scatter by
-ALIKE = 0.7  # cosine of the largest angle between the fixed subspace and the one to be fixed
+# relative change of the information below which its noise is not drawn again: few draws scatter by more
+UNCHANGED = 0.1
+ALIKE = 0.7  # least cosine of the principal angles between two subspaces that count as equal
 
 
 @dataclass(frozen=True)
 class Determined:
-    """An estimate and what is known of its calibration parameters.
+    """An estimate and the observability of its calibration parameters.
 
-    data, noise (B, B): information of the data alone in tolerance units, without priors but those on nuisance
-    parameters and without what noise makes of it, and that; fixed_directions (B, m): orthonormal directions in
-    tolerance units, those that are undetermined; shifts (m, B): how all moves with each independent error of the guess
-    along them. inflation: root of how many times priors on nuisance parameters count, see
-    `estimate.evidence.inflation`.
+    data, noise (B, B): information of the data in tolerance units, and the part that noise in the Jacobian adds, which
+    `data` excludes. Priors on nuisance parameters are in `data`, other priors are not. fixed_directions (B, m):
+    orthonormal basis of the unobservable directions, in tolerance units. shifts (n, B): changes of all calibration
+    parameters, in their units, for independent errors of the guess of one standard deviation along the fixed
+    directions. inflation: factor by which standard deviations of priors on nuisance parameters were divided, see
+    `estimate.residual_statistics.inflation`.
     """
 
     estimate: Estimate
@@ -63,15 +65,16 @@ class Determined:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(B, B), priors included: of the observable directions, and their sensitivity to the fixed ones."""
+        """(B, B) with priors: covariance of the observable directions plus the consider covariance of the fixed
+        ones."""
         t = self.estimate.problem.tolerance
         known = t[:, None] * self.estimate.outcome.information * t - self.noise
         return t[:, None] * scatter(known, self.noise, self.fixed_directions) * t + self.shifts.T @ self.shifts
 
     @property
     def prior_variance(self) -> np.ndarray:
-        """(B,) what errors of nuisance parameters contribute to the diagonal of the covariance. Noise in the Jacobian
-        is no knowledge: errors lead back by the inverse of what is known, as in `scatter`."""
+        """(B,) contribution of the priors on nuisance parameters to the diagonal of the covariance. Information that
+        noise in the Jacobian adds is subtracted first, as in `scatter`."""
         problem, outcome = self.estimate.problem, self.estimate.outcome
         t = problem.tolerance
         root = t[:, None] * restricted_root(t[:, None] * outcome.information * t - self.noise, self.fixed_directions)
@@ -79,16 +82,21 @@ class Determined:
 
     @property
     def spread(self) -> np.ndarray:
-        """(B,) standard deviations in tolerances that the data alone give."""
+        """(B,) standard deviations in tolerances from the data and priors on nuisance parameters, consider covariance
+        included."""
         t = self.estimate.problem.tolerance
         alone = scatter(self.data, self.noise, self.fixed_directions)
         return np.sqrt(np.diag(alone) + ((self.shifts / t) ** 2).sum(axis=0))
 
 
 def scatter(known: np.ndarray, noise: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
-    """(B, B) covariance where J^T J is `known` + `noise`: J^T r scatters by all of it, but only what is known of it
-    leads back (errors in variables; Fuller, Measurement Error Models, 1987, chapter 1). Noise only adds: where its few
-    draws say otherwise, or curvature left less than nothing known, the variance is no less than without it."""
+    """(B, B) covariance in tolerance units if the information J^T J is `known` + `noise`, with zero variance along
+    `fixed_directions` (B, m).
+
+    J^T r scatters by all of J^T J, but the estimate responds by the inverse of `known` alone (errors in variables;
+    Fuller, Measurement Error Models, 1987, chapter 1). Negative eigenvalues of the noise, from few draws, are clipped:
+    noise never reduces the variance.
+    """
     whitened = restricted_root(known, fixed_directions)
     values, vectors = eigh(whitened.T @ noise @ whitened)
     root = whitened @ vectors * np.sqrt(1.0 + np.maximum(values, 0.0))
@@ -102,10 +110,12 @@ def determine(
     on_visit: OnVisit = lambda *_: None,
     guess: dict[Key, np.ndarray] | None = None,
 ) -> Determined:
-    """Estimates from `start`, again and again until what is undetermined stays so: at `guess`, or if there is none at
-    `start`, but where noise pulls hard and not far from there.
+    """Estimates the parameters, and fixes the null space of the data at `guess` (default: the values of `start`).
 
-    Raises EstimationError where the data do not carry an estimate.
+    The estimate is repeated from `start` until the null space no longer changes. Fixed directions are then weighted
+    with the priors of the rig file (`weigh`), and priors on nuisance parameters by the empirical errors (`balance`). A
+    direction that noise in the Jacobian constrains stays at its estimate if that is near the guess. Raises
+    EstimationError if the data allow no estimate.
     """
     wanted = replace(start, values=start.values | (guess or {}))
     search = _Search.begin(inputs, start, wanted, on_step, on_visit)
@@ -116,16 +126,18 @@ def determine(
     fixed_directions, shifts = np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size))
     if found.problem.fixed_directions.size:
         fixed_directions = found.problem.fixed_directions
-        # After a failed solve the sensitivity is of no use, and each of its solves might fail as well.
+        # After a failed solve, re-solving for the sensitivity might fail, too.
         worth = _is_worth_keeping(found.outcome)
         shifts = (owed_to_guess if worth else in_proportion)(inputs, found.outcome, seen.data)
-    found = replace(found, outcome=replace(found.outcome, room=None))  # nothing is solved in it any more
+    # free the workspace: nothing is solved in it any more
+    found = replace(found, outcome=replace(found.outcome, room=None))
     return Determined(found, seen.data, seen.noise, fixed_directions, shifts, search.inflation)
 
 
 @dataclass
 class _Search:
-    """For what is undetermined: the last estimate, `found`, and what is `seen` of it. The first began at `start`."""
+    """Search for the null space. `found` is the last estimate and `seen` its observability; the first estimate began at
+    `start`."""
 
     inputs: Inputs
     start: State
@@ -147,7 +159,8 @@ class _Search:
         return cls(inputs, start, guess, on_step, on_visit, found, judge(inputs, found.outcome))
 
     def settle(self) -> None:
-        """Fixes the null space until it stays. Until then the guess has a prior, but not in the last estimate."""
+        """Estimates again, with the null space fixed, until it no longer changes. The guess acts as a prior until then,
+        but not in the last estimate."""
         for k in range(MOST_ROUNDS):
             found, seen = self.found, self.seen
             settled = _is_settled(seen.undetermined, found.problem.fixed_directions, k >= LATE)
@@ -165,8 +178,8 @@ class _Search:
             self._estimate(state, fixed_directions, led=not settled and k + 1 < MOST_ROUNDS)
 
     def weigh(self) -> None:
-        """Moves the fixed directions to the guess, weighted by its prior uncertainty, and all other parameters with
-        them."""
+        """Resets the fixed directions to the mean of the priors that the rig file states, and re-solves all other
+        parameters."""
         for _ in range(MOST_ROUNDS):
             problem, state = self.found.problem, self.found.outcome.state
             moving = astray(self.inputs, problem, state, self.guess, problem.fixed_directions, self.seen.asked)
@@ -178,7 +191,8 @@ class _Search:
             self._estimate(begin, fixed_directions, led=False)
 
     def balance(self) -> None:
-        """Weighs priors on nuisance parameters by how large errors of the measurements are."""
+        """Re-solves with priors on nuisance parameters weighted by the empirical errors of the measurements
+        (`inflation`)."""
         outcome = self.found.outcome
         if not outcome.converged or (factor := inflation(self.inputs, outcome)) < MIN_INFLATION:
             return
@@ -189,8 +203,8 @@ class _Search:
             self.seen = judge(self.inputs, again, self.seen)
 
     def _estimate(self, begin: State, fixed_directions: np.ndarray, led: bool) -> None:
-        """The next estimate, `led` by the guess or not; noise and outliers as the last one judged them, but where it
-        failed."""
+        """Estimates again, with the guess as a prior if `led`. Noise and outliers are those of the last estimate,
+        unless it failed."""
         judged = self.found.judged if _is_worth_keeping(self.found.outcome) else None
         del self.found  # before the next one takes as much memory
         guess = self.guess if led else None
@@ -199,9 +213,12 @@ class _Search:
 
 
 def _followed(found: Estimate, moved: State, fixed_directions: np.ndarray) -> State:
-    """All else where the measurements want it to follow what `moved` along `fixed_directions` (B, m), while what
-    `found` froze stands: tracks, and weights of points on planes. Made anew beside where the trajectory belongs, these
-    would be of a state that fits nothing, and the next estimate might end anywhere."""
+    """`moved`, re-solved with `fixed_directions` (B, m) fixed, in the problem of `found`.
+
+    Frozen quantities of `found`, such as tracks and weights of points on planes, are kept. Computed at `moved`, before
+    the trajectory has adapted, they would fit no state, and the next estimate might diverge. Returns `moved` if the
+    solve fails.
+    """
     if not _is_worth_keeping(found.outcome):
         return moved
     problem, room = replace(found.problem, fixed_directions=fixed_directions), found.outcome.room
@@ -212,6 +229,7 @@ def _followed(found: Estimate, moved: State, fixed_directions: np.ndarray) -> St
 
 
 def _is_worth_keeping(outcome: Outcome) -> bool:
+    """Whether the solver converged or stopped early, so that its state can be used."""
     return outcome.converged or outcome.stopped_early
 
 
@@ -231,9 +249,12 @@ def _is_settled(undetermined: np.ndarray, fixed_directions: np.ndarray, late: bo
 
 
 class Judgement(NamedTuple):
-    """Of an estimate, in tolerance units: information of the `data` alone, with priors on nuisance parameters, and what
-    `noise` adds to it (B, B), and the directions (B, m) that are `undetermined`; asked (B, B): data, noise and the
-    model's own priors together. spurious: how the noise was found."""
+    """Observability of an estimate, in tolerance units.
+
+    data (B, B): information of the data and of priors on nuisance parameters, without `noise`. noise (B, B): the
+    information that noise in the Jacobian adds. asked (B, B): the information without the priors of the rig file, noise
+    included. undetermined (B, m): orthonormal basis of the unobservable directions. spurious: the draws behind `noise`.
+    """
 
     spurious: Spurious
     data: np.ndarray
@@ -245,12 +266,12 @@ class Judgement(NamedTuple):
 def judge(
     inputs: Inputs, outcome: Outcome, before: Judgement | None = None, columns: np.ndarray | None = None
 ) -> Judgement:
-    """Of `columns` (B,) of the calibration parameters, the others fixed; of all by default.
+    """Observability of the calibration parameters `columns` (default: all of them), the other ones fixed.
 
-    Parameters whose priors belong to the model (a target's shape, bloom) are unobservable only together with others.
-    Nuisance parameters never are: whether the motion determines all else is asked with these known, and how far all
-    else depends on them is in the covariance. What noise adds is not looked for again where there is about as much
-    information as in the judgement `before`."""
+    Parameters with a prior from the model (target shape, edge bloom) are unobservable only in combination with other
+    ones. Nuisance parameters never are: they count as known in this test, and the covariance holds the dependence on
+    them. Noise in the Jacobian is not drawn again if the information is about the same as in the judgement `before`.
+    """
     problem, information, state = outcome.problem, outcome.information, outcome.state
     columns = np.arange(len(information)) if columns is None else columns
     among, t = np.ix_(columns, columns), problem.tolerance[columns]
@@ -272,18 +293,19 @@ def judge(
 
 
 def _are_alike(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two informations (B, B) in tolerance units are about the same in every direction that they know."""
+    """Whether two information matrices (B, B), in tolerance units, agree to a relative UNCHANGED in every observable
+    direction."""
     nothing = UNOBSERVABLE_BELOW * np.eye(len(a))
     try:
         ratios = eigh(b + nothing, a + nothing, eigvals_only=True)
-    except LinAlgError:  # not definite: of a state far from its end
+    except LinAlgError:  # not positive definite: the state is far from the minimum
         return False
     return bool(np.abs(ratios - 1.0).max(initial=0.0) < UNCHANGED)
 
 
 class _ShownDirections(NamedTuple):
-    """Directions vectors (B, n) in tolerance units, of which the data show `nothing` (n,), or what may be `in_doubt`
-    (n,) noise in all of it."""
+    """Eigenvectors (B, n) of the information without noise, in tolerance units, with two flags each. nothing (n,):
+    unobservable. in_doubt (n,): noise in the Jacobian may account for all of the information."""
 
     vectors: np.ndarray
     nothing: np.ndarray
@@ -291,7 +313,8 @@ class _ShownDirections(NamedTuple):
 
 
 def _shown(asked: np.ndarray, tolerance: np.ndarray, is_essential: np.ndarray, spurious: Spurious) -> _ShownDirections:
-    """Of the information asked (B, B), in tolerance units, noise and all, on what `is_essential` (B,)."""
+    """Directions of the essential parameters `is_essential` (B,), classified by the information `asked` (B, B) in
+    tolerance units, which includes the noise `spurious`. tolerance: (B,)."""
     own = np.flatnonzero(is_essential)
     known = asked - tolerance[:, None] * spurious.mean * tolerance
     vectors = np.zeros((len(asked), len(own)))

@@ -1,7 +1,7 @@
-"""Where intrinsics that the rig file fixes would go if they were free: whether they are those of this camera.
+"""Tests whether intrinsics that the rig file fixes are those of this camera, by where they would go if free.
 
-The other parameters make up for much of what is wrong with a lens: with the intrinsics of the other camera of a stereo
-pair, 13 px apart, corners may fit to 0.4 px.
+Residuals alone do not show it, because the other parameters absorb much of a lens error. With the intrinsics of the
+other camera of a stereo pair, 13 px different, corners may fit to 0.4 px.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from icalib.rig import LENS
 
 @dataclass(frozen=True)
 class LensStep:
-    """Of a camera's fx, fy, cx, cy [px] from what the rig file fixes: where they would go, and its formal standard
-    deviation."""
+    """step (4,): change of fx, fy, cx, cy [px] from their fixed values to those of the data; std (4,): its formal
+    standard deviation [px]."""
 
     camera: str
     step: np.ndarray
@@ -26,8 +26,8 @@ class LensStep:
 
 
 def lens_steps(inputs: Inputs, stated: Relaxed | None) -> tuple[LensStep, ...]:
-    """Of all cameras whose intrinsics are fixed, with all of their lenses free; none where the data do not say where
-    these would go. `stated`: see `relaxed`."""
+    """Steps of all cameras whose intrinsics are fixed, with the fixed lens parameters of all of them free. Empty if
+    `stated` is None, see `relaxed`."""
     fixed = [c for c in inputs.rig.cameras if c.intrinsics.mode == "fixed"]
     if not fixed or stated is None:
         return ()

@@ -24,24 +24,25 @@ from icalib.optim.calib_block import UNOBSERVABLE_BELOW
 from icalib.optim.state import Block, State
 from icalib.sensors.sensor import ROTATION
 
-PULLED = 0.25  # information in tolerance units, noise and all
-FARTHEST = 2.0  # standard deviations of the guess
-MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
-MOSTLY = 0.5  # of the square of a direction
-NEAR_GUESS = 0.05  # of the prior uncertainty of the guess
-TOGETHER = 4  # ways in which errors of the guess come together: what one makes beyond the sum is little by chance
-HALVINGS = 4  # of a move along which nothing can be solved
+# information in tolerance units, noise in the Jacobian included; below it a direction is reset to the guess
+PULLED = 0.25
+FARTHEST = 2.0  # standard deviations of the guess; a direction farther from the guess is reset to it
+MOVED_BY_HELD = 0.1  # entry of a unit direction above which the direction moves that parameter
+MOSTLY = 0.5  # share of the squared length of a direction
+NEAR_GUESS = 0.05  # of the prior uncertainty of the guess; a shorter reset is skipped
+TOGETHER = 4  # random sign combinations of the errors of the guess, to sample how far their effects are not additive
+HALVINGS = 4  # most halvings of a move that is too long to be solved
 
 
 def astray(
     inputs: Inputs, problem: Problem, state: State, guess: State, open_: np.ndarray, asked: np.ndarray
 ) -> np.ndarray:
-    """(B, k) orthonormal directions in the span of `open_` (B, m) along which `state` is to move to `guess`: all but
-    those along which the measurements pull, be it by noise, to a place as near the guess as the truth may be.
+    """(B, k) orthonormal directions in the span of `open_` (B, m) along which `state` is to be reset to `guess`.
 
-    asked (B, B): information in tolerance units, with what noise adds to it. Noise pulls to where it shows least, such
-    as a lever arm of nothing; but where it hides what little the data know, a guess far from there would be paid for
-    by all that is well known.
+    A direction is left where it is if two things hold. Its information `asked` (B, B; tolerance units, noise in the
+    Jacobian included) exceeds PULLED, and `state` is within FARTHEST prior standard deviations of the guess. Noise in
+    the Jacobian biases towards values where it is smallest, such as a zero lever arm. But it can also hide weak data,
+    and a reset to a wrong guess would then distort well-known parameters.
     """
     if not open_.size:
         return open_
@@ -53,7 +54,7 @@ def astray(
 
 
 def moved_to_guess(problem: Problem, state: State, guess: State, fixed_directions: np.ndarray) -> State:
-    """`state`, moved along the directions `fixed_directions` (B, m) to where `guess` has them."""
+    """`state` with its components along `fixed_directions` (B, m) set to those of `guess` (orthogonal projection)."""
     way = calib_difference(problem, guess, state) / problem.tolerance
     return _moved(problem, state, fixed_directions @ (fixed_directions.T @ way))
 
@@ -61,16 +62,16 @@ def moved_to_guess(problem: Problem, state: State, guess: State, fixed_direction
 def moved_to_worth(
     inputs: Inputs, problem: Problem, state: State, guess: State, fixed_directions: np.ndarray
 ) -> State | None:
-    """`state`, reset along the directions `fixed_directions` (B, m) to the prior mean of all parameters that they move,
-    weighted by their prior uncertainty; None where the rig file has no priors among them, or the state is there
-    already.
+    """`state`, reset along `fixed_directions` (B, m) to the mean of the priors of all parameters in them, by weighted
+    least squares. None if the rig file has no prior on them, or if the state is there already.
 
-    Where the data know only how two heights differ, and one was measured, `moved_to_guess` would leave both half-way.
+    Example: the data show only the difference of two heights, and one height was measured. `moved_to_guess` would
+    change both heights by half.
     """
     if not _is_weighed(inputs, fixed_directions):
         return None
     sigma, way = _weights(inputs, state), calib_difference(problem, guess, state)
-    # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
+    # Parameters without a guess may move along, but their own difference from the guess must not cause a move.
     for block in _unguessed(inputs):
         way[block.columns] = 0.0
     directions = problem.tolerance[:, None] * fixed_directions
@@ -81,11 +82,12 @@ def moved_to_worth(
 
 
 def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(m + TOGETHER or fewer, B) how the calibration parameters move with each of m independent errors of the guess
-    along the fixed directions, one standard deviation each, and by how much more or less all of them move it
-    together.
+    """(n, B) changes of the calibration parameters, in their units, for errors of the guess along the m fixed
+    directions.
 
-    data (B, B): information of the data alone, in tolerance units. The room of `outcome` is used.
+    The first m rows are those of the independent errors, one standard deviation each. At most TOGETHER more rows hold
+    the deviation of random sign combinations from the sum. The outer products of all rows add up to the consider
+    covariance. data (B, B): information of the data alone, in tolerance units. Uses the workspace of `outcome`.
     """
     problem = outcome.problem
     ways = _ways(inputs, outcome, data)
@@ -93,25 +95,27 @@ def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndar
         return in_proportion(inputs, outcome, data)
     alone = np.array([_answer(outcome, way) for way in ways.T])
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (TOGETHER, ways.shape[1]))
-    # Of few errors the signs repeat: each combination is solved once.
+    # With few errors the sign combinations repeat: each is solved once and weighted by its count.
     own, times = np.unique(signs, axis=0, return_counts=True)
     beyond = np.array([_answer(outcome, ways @ s) - s @ alone for s in own])
     return np.vstack([alone, np.sqrt(times / TOGETHER)[:, None] * beyond])
 
 
 def in_proportion(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(m, B) as `owed_to_guess`, if only the fixed directions move."""
+    """(m, B) as `owed_to_guess`, but only the fixed directions themselves move: nothing is solved."""
     return outcome.problem.tolerance * _ways(inputs, outcome, data).T
 
 
 def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(B, m) in tolerance units: errors of the guess along fixed directions, independent, one standard deviation each.
+    """(B, m) independent errors of the guess along the fixed directions, one standard deviation each, in tolerance
+    units.
 
-    An error mostly of parameters that nobody guessed is no larger than the information `data` (B, B) allows: a board
-    turned against gravity by as much as it likes would be turned round and round, with a bias of the accelerometer that
-    nobody believes."""
+    Directions mostly of walls, boards and frames, which have no guess, are limited to the standard deviation that the
+    information `data` (B, B) allows. Unlimited, a board would be rotated by any angle against gravity, with an absurd
+    accelerometer bias.
+    """
     problem = outcome.problem
-    # Of so many like variances divide and conquer, NumPy's way, has failed to find the eigenvectors.
+    # NumPy's divide and conquer has failed on many nearly equal eigenvalues.
     values, turn = eigh(_guess_covariance(inputs, problem, outcome.state, problem.fixed_directions), driver="evr")
     ways = problem.fixed_directions @ turn
     width = np.sqrt(np.clip(values, 0.0, None))
@@ -124,8 +128,8 @@ def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
 
 
 def _guess_covariance(inputs: Inputs, problem: Problem, state: State, fixed_directions: np.ndarray) -> np.ndarray:
-    """(m, m) of the guess along directions `fixed_directions` (B, m), in tolerance units: of an orthogonal projection,
-    as `moved_to_guess` makes it, or of a weighted one, as `moved_to_worth` does."""
+    """(m, m) prior covariance of the guess along `fixed_directions` (B, m), in tolerance units: for the weighted reset
+    of `moved_to_worth` if the rig file has priors there, else for the orthogonal projection of `moved_to_guess`."""
     if _is_weighed(inputs, fixed_directions):
         scaled = fixed_directions * (problem.tolerance / _weights(inputs, state))[:, None]
         return np.linalg.inv(scaled.T @ scaled)
@@ -137,7 +141,7 @@ def _guess_covariance(inputs: Inputs, problem: Problem, state: State, fixed_dire
 
 
 def _leave_nothing(inputs: Inputs, problem: Problem, ways: np.ndarray) -> bool:
-    """Whether the guess alone leaves every parameter of every sensor open."""
+    """Whether errors of the guess alone make every parameter of every sensor unobservable."""
     owed = (ways**2).sum(axis=1)
     return all(
         (owed[b.columns] > 1.0 / UNOBSERVABLE_BELOW).all() for b in problem.layout.free if inputs.is_sensor(b.sensor)
@@ -145,8 +149,8 @@ def _leave_nothing(inputs: Inputs, problem: Problem, ways: np.ndarray) -> bool:
 
 
 def _answer(outcome: Outcome, way: np.ndarray) -> np.ndarray:
-    """(B,) shift of the calibration parameters when the guess moves along the fixed direction `way` (B,). If that is
-    too far for a solution, a shorter move is scaled up."""
+    """(B,) change of the calibration parameters, in their units, if the guess moves by `way` (B,; tolerance units)
+    along the fixed directions. If that move is too long to be solved, a shorter one is solved and scaled up."""
     problem, state = outcome.problem, outcome.state
     for k in range(HALVINGS):
         moved = _moved(problem, state, way / 2**k)
@@ -159,13 +163,14 @@ def _answer(outcome: Outcome, way: np.ndarray) -> np.ndarray:
 
 
 def _is_weighed(inputs: Inputs, fixed_directions: np.ndarray) -> bool:
-    """Whether the rig file has a prior on a parameter that the fixed directions `fixed_directions` (B, m) move."""
+    """Whether the rig file has a prior on a parameter that `fixed_directions` (B, m) move."""
     own = np.concatenate([np.empty(0, dtype=np.int64), *(p.block.columns for p in given_priors(inputs))])
     return bool(fixed_directions.size and np.any(np.abs(fixed_directions[own]) > MOVED_BY_HELD))
 
 
 def _weights(inputs: Inputs, state: State) -> np.ndarray:
-    """(B,) prior uncertainties of the guess; parameters that nobody guessed do not count, except rotations."""
+    """(B,) prior standard deviations of the guess, in parameter units. Rotations, tilts and normals of walls, boards
+    and frames get the default of a rotation."""
     sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
         if block.kind not in ("vector", "nuisance"):
@@ -174,7 +179,7 @@ def _weights(inputs: Inputs, state: State) -> np.ndarray:
 
 
 def _unguessed(inputs: Inputs) -> list[Block]:
-    """Of no sensor: walls, boards and frames, of which nobody guessed where they are."""
+    """Blocks that belong to no sensor: walls, boards and frames. They have no initial guess."""
     return [b for b in inputs.layout.free if not inputs.is_sensor(b.sensor)]
 
 
@@ -184,7 +189,7 @@ def _moved(problem: Problem, state: State, way: np.ndarray) -> State:
 
 
 def calib_difference(problem: Problem, a: State, b: State) -> np.ndarray:
-    """(B,) the step of the calibration parameters from `b` to `a`."""
+    """(B,) step of the calibration parameters that leads from `b` to `a`, in their units."""
     out = np.zeros(problem.layout.size)
     for block in problem.layout.free:
         x, y = a.values[block.key], b.values[block.key]

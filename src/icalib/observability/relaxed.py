@@ -1,7 +1,7 @@
-"""Normal equations at the solution in which everything is free that the rig file fixes, and priors can be taken off.
+"""Normal equations at the solution with all values free that the rig file fixes, and optionally without its priors.
 
-Score test (Lagrange multiplier test; Rao 1948): a constraint that the data contradict pulls at the solution. One
-Newton step without the constraint shows where the data alone have the parameter, and how well they know it.
+This is a score test (Lagrange multiplier test; Rao 1948). A constraint that the data contradict leaves a gradient at
+the solution. One Newton step without the constraint gives the value of the data alone and its standard deviation.
 """
 
 from __future__ import annotations
@@ -28,8 +28,12 @@ from icalib.rig import Parameter, Sensor
 
 @dataclass(frozen=True)
 class Relaxed:
-    """inputs, problem: with all `stated` groups in the layout; before: the layout of the estimate; gradient (B,) and
-    the solution's information (B, B) are of the calibration parameters at `state`."""
+    """The solution of an estimate, linearised again at `state` with the fixed values in the layout.
+
+    inputs, problem: with all groups `stated` as columns. solution: gradient (B,) and information (B, B) of the
+    calibration parameters at `state`. before: the layout of the estimate. stated: groups that the rig file fixes or
+    gives a prior.
+    """
 
     inputs: Inputs
     problem: Problem
@@ -44,13 +48,13 @@ class Relaxed:
         return self.problem.layout
 
     def fixed_columns(self, freed: Collection[Key]) -> np.ndarray:
-        """Columns that the estimate has fixed, but those of the groups `freed`."""
+        """Columns that were fixed in the estimate, except those of the groups `freed`."""
         fixed = [b for b in self.layout.free if not self.before.is_free(*b.key) and b.key not in freed]
         return np.concatenate([np.arange(0), *(b.columns for b in fixed)])
 
     def step(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
-        """Where the data alone send the calibration parameters, step (B,), with the groups `freed` neither fixed nor
-        with their priors, and all else as the rig file has it; and their standard deviations (B,)."""
+        """(B,) Newton step of the calibration parameters, and (B,) its standard deviations. The groups `freed` are free
+        and without their priors; all other values stay as the rig file states them."""
         t, n = self.problem.tolerance, self.layout.size
         pull, known = self._priors_of(freed)
         fixed = np.eye(n)[:, self.fixed_columns(freed)]
@@ -62,8 +66,8 @@ class Relaxed:
         return t * step, t * np.sqrt((root**2).sum(axis=1))
 
     def without(self, freed: Collection[Key]) -> tuple[Outcome, np.ndarray]:
-        """The solution without priors on the groups `freed`, as an outcome from which noise in the Jacobians is found;
-        and the gradient (B,) of the calibration parameters."""
+        """The outcome without the priors on the groups `freed`, from which noise in the Jacobian can be estimated, and
+        the gradient (B,) of the calibration parameters."""
         pull, known = self._priors_of(freed)
         problem = self.problem.without([p for p in self.problem.priors if p.block.key in freed])
         found = outcome_of(problem, self.state, 0.0, self.residuals, 0.0, [], self.solution)
@@ -76,8 +80,8 @@ class Relaxed:
 
 
 def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
-    """Of what the rig file fixes or gives a prior, at the end of `found`; None where it does not, the solver did not
-    end, or nothing can be solved there."""
+    """The solution `found` with the values free that the rig file fixes. None if the rig file fixes nothing and states
+    no prior, if the solver did not converge, or if the normal equations cannot be solved."""
     if not found.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
         return None
     freed = freed_inputs(inputs)
@@ -94,7 +98,7 @@ def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
 
 
 def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
-    """Groups that the rig file, as it was given, fixes or gives a prior, and that have columns in `layout`."""
+    """Groups that the original rig file fixes or gives a prior, and that have columns in `layout`."""
     asked, used = inputs.asked or inputs.rig, {s.name for s in inputs.rig.mounted}
     body = () if inputs.rig.imu is not None and not inputs.rig.assumes_motion else ("rotation", "translation")
     if inputs.rig.assumes_motion:
@@ -109,7 +113,8 @@ def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
 
 
 def freed_inputs(inputs: Inputs, keys: Collection[Key] | None = None) -> Inputs:
-    """`inputs` with what is fixed at a value free, and with `keys` only these, priors among them."""
+    """`inputs` with groups free that start at their stated values: all fixed ones, or with `keys` exactly these,
+    whether fixed or with a prior."""
 
     def freed(sensor: Sensor, name: str, p: Parameter) -> Parameter:
         wanted = p.mode == "fixed" if keys is None else (sensor.name, name) in keys
@@ -123,7 +128,8 @@ def _is_stated(parameter: Parameter) -> bool:
 
 
 def _held_in(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> np.ndarray:
-    """Directions of the calibration parameters of `before` in those of `layout`, which has more columns."""
+    """Directions of the calibration parameters of the layout `before`, as directions of `layout`, which has more
+    columns."""
     if not fixed_directions.size:
         return NO_DIRECTIONS
     out = np.zeros((layout.size, fixed_directions.shape[1]))

@@ -1,4 +1,4 @@
-"""What the data determine, in words: verdicts on parameters and on combinations of them."""
+"""Verdicts on parameters, and sentences on unobservable combinations of parameters."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from icalib.result import Verdict
 from icalib.result.verdict import by_size, in_null_space
 from icalib.rig import ParameterSpec
 
-NAMED = 0.2  # parts of a direction smaller than this are not named
-MOST_NAMED = 4  # of the largest
+NAMED = 0.2  # entry of a unit direction below which its parameter is not named
+MOST_NAMED = 4  # parameters of a direction that are named, those with the largest entries
 
 EVERY_AXIS = "every axis"
 
 
 @dataclass(frozen=True)
 class Observability:
-    """Covariance (B, B) formal; verdicts by calibration column; undetermined combinations as sentences.
+    """covariance (B, B): formal. verdicts: one for each column. undetermined: one sentence for each unobservable
+    direction.
 
     spread (B,): standard deviations in tolerances that the data alone give, consider covariance included.
     """
@@ -39,11 +40,11 @@ def observe(
     tracking: Collection[str] = (),
     axes: str = "",
 ) -> Observability:
-    """Verdicts by what the data alone say; undetermined throughout where the solver did not converge.
+    """Verdicts from the spread of the data alone; all are undetermined if the solver did not converge.
 
-    names: (B,) as in "cam0.translation.x". specs: (B,) the definitions of their groups. on_wheels: the rig drives on
-    one of its sensors. tracking: names of cameras without a target. axes: about which the rig hardly turned, in words,
-    or empty.
+    names (B,): such as "cam0.translation.x". specs (B,): definition of each column's group. on_wheels: the rig drives
+    on one of its sensors. tracking: names of cameras without a target. axes: text that names the axes about which the
+    rig hardly turned, or empty.
     """
     directions = sparse_basis(found.fixed_directions)
     verdicts: list[Verdict] = []
@@ -61,8 +62,8 @@ def observe(
 
 
 def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
-    """The same span as the orthonormal columns (B, m), turned so that each has few large entries (varimax, Kaiser
-    1958)."""
+    """(B, m) basis of the span of the orthonormal `directions` (B, m), rotated so that each column has few large
+    entries (varimax, Kaiser 1958)."""
     n, m = directions.shape if directions.size else (len(directions), 0)
     turn = np.eye(m)
     for _ in range(rounds if m > 1 else 0):
@@ -73,22 +74,23 @@ def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
 
 
 def _words_of(direction: np.ndarray, names: tuple[str, ...]) -> tuple[str, int]:
-    """The parameters that a direction (B,) moves most, in words, and the column of the first."""
+    """Text that names the parameters with the largest entries in `direction` (B,), and the column of the largest
+    one."""
     order = np.argsort(-np.abs(direction))
-    # By the rig, not by size: where all move alike, noise would decide which comes first.
+    # In the order of the columns, not by size: equal entries would be ordered by noise.
     parts = sorted(i for i in order[:MOST_NAMED] if abs(direction[i]) >= NAMED) or [order[0]]
     return " with ".join(_words(names[i]) for i in parts), int(order[0])
 
 
 def _missing_motion(spec: ParameterSpec, on_wheels: bool, without_target: bool) -> str:
-    """What would determine a parameter. A rig on wheels cannot turn about other axes; a camera without a target tracks
-    points of the scene."""
+    """Text on the motion that would make the parameter observable. It depends on two limits: a rig on wheels cannot
+    turn about every axis, and a camera without a target tracks points of the scene."""
     others = (spec.motion_without_target if without_target else "", spec.motion_on_wheels if on_wheels else "")
     return next(filter(None, others), spec.motion)
 
 
 def _words(name: str) -> str:
-    """A parameter's name as people say it; what is one number has no label of its own."""
+    """Readable form of a column's name. The label is left out if the parameter is a single number."""
     sensor, kind, label = name.rsplit(".", 2)
     own = kind if label == kind else f"{kind} {label}"
     return f"{sensor} {own.replace('_', ' ')}"
