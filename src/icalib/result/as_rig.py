@@ -1,4 +1,4 @@
-"""The rig of a result, with its values as fixed values, priors or guesses: the start of the next calibration."""
+"""Converts a result to a rig for the next calibration: the values become fixed values, priors or initial guesses."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ TREATMENTS: tuple[Treatment, ...] = ("fixed", "prior", "guess")
 
 
 def rig_of_result(c: Calibration, treatment: Treatment) -> tuple[Rig, tuple[str, ...]]:
-    """The rig of `c`, and a sentence for each group whose value could not be taken as asked.
+    """The rig of `c` with the values of the result, and a sentence for each group that could not be treated as asked.
 
-    fixed: everything that was estimated is fixed at its value. prior: it gets a prior of that mean and of the result's
-    standard deviation. guess: what the rig file left free starts at its value; its priors stay. What the rig file fixed
-    stays fixed. A value that the data did not determine never becomes fixed.
+    fixed: all estimated groups are fixed at their values. prior: all estimated groups get priors with their values as
+    means and the standard deviations of the result. guess: groups that were free in the rig file start at their values;
+    priors of the rig file stay. Groups that the rig file fixed stay fixed. A group with an undetermined component is
+    never fixed. Raises RigError if `treatment` is none of these.
     """
     if treatment not in TREATMENTS:
         raise RigError(f"values of a result become {', '.join(TREATMENTS)}, not {treatment!r}; use one of these.")
@@ -44,7 +45,7 @@ def rig_of_result(c: Calibration, treatment: Treatment) -> tuple[Rig, tuple[str,
 
 
 def rig_text(c: Calibration, treatment: Treatment) -> tuple[str, tuple[str, ...]]:
-    """`rig_of_result` as the text of a rig file, and its sentences, which are comments in it, too."""
+    """The rig of `rig_of_result` as text of a rig file, with the sentences as comments; and the sentences."""
     rig, sentences = rig_of_result(c, treatment)
     plain = rig_to_dict(rig)
     defaults = dataclasses.asdict(Settings())
@@ -57,11 +58,13 @@ def rig_text(c: Calibration, treatment: Treatment) -> tuple[str, tuple[str, ...]
 
 
 def _is_derived(sensor: Any, g: ParameterGroup) -> bool:
-    """Whether the group is no field of the sensor, such as the height of wheels over the ground."""
+    """Whether the group is not a field of the sensor in the rig file, such as the height of wheels over the ground."""
     return g.name not in {f.name for f in dataclasses.fields(sensor)}
 
 
 def _treated(g: ParameterGroup, old: Parameter, treatment: Treatment) -> tuple[Parameter, str]:
+    """The parameter for the new rig file, and a sentence if it is not treated as asked, else an empty string. `old`:
+    the parameter in the rig file."""
     if treatment == "guess":
         return (old if old.mode == "prior" else Parameter("free", g.value)), ""
     open_ = [label for label, v in zip(g.labels, g.verdict, strict=True) if v == "undetermined"]

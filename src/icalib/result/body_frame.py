@@ -1,4 +1,4 @@
-"""A result whose poses are relative to the body of the rig file, where that is another sensor than the reference."""
+"""Converts a result to poses relative to the sensor `body` of the rig file, if that is not the reference."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 _POSE = (ROTATION, TRANSLATION)
 _NAMES = tuple(spec.name for spec in _POSE)
-_SI = {"rotation_tolerance_deg": radians(1.0), "translation_tolerance_m": 1.0}  # of one unit of these settings
+_SI = {"rotation_tolerance_deg": radians(1.0), "translation_tolerance_m": 1.0}  # SI value of one unit of each setting
 
 
 def in_body_frame(c: Calibration) -> Calibration:
     """`c` with rotation and translation of every sensor as T_body_sensor; `c` itself if `body` is `reference`.
 
-    The body has the identity, fixed. An IMU that is not the body has a pose like all others. Covariance: J C J^T, to
+    The body gets the identity as a fixed pose. An IMU that is not the body gets a pose. The covariance is J C J^T, to
     first order. The empirical factor of a pose is the ratio of its standard deviations with and without the factors of
-    the groups that it comes from. The null space becomes span(J N); verdicts on poses follow from it and from the
-    standard deviations, as those of `c` do. Other groups stay as they are, and clocks stay relative to the reference.
+    the groups that it is computed from. The null space becomes span(J N). Verdicts on poses follow from the null space
+    and the standard deviations, as in `c`. All other groups are unchanged; time offsets stay relative to the reference.
     """
     if c.body == c.reference:
         return c
@@ -48,8 +48,8 @@ def in_body_frame(c: Calibration) -> Calibration:
 
 
 def _reframed(c: Calibration) -> Iterator[tuple[ParameterGroup, np.ndarray]]:
-    """Each group in the frame of the body, with its Jacobian (n, B) by the estimated parameters of `c`; first the pose
-    of the IMU."""
+    """Each group in the frame of the body, with its Jacobian (n, B) by the estimated parameters of `c`. The pose of the
+    IMU comes first."""
     sensors = (*(() if c.imu is None else (c.imu,)), *c.mounted)
     moved = {(name, g.name): (g, rows) for name in sensors for g, rows in _pose(c, name)}
     yield from (moved.pop((c.imu, name)) for name in _NAMES if c.imu is not None)
@@ -58,7 +58,8 @@ def _reframed(c: Calibration) -> Iterator[tuple[ParameterGroup, np.ndarray]]:
 
 
 def _pose(c: Calibration, sensor: str) -> Iterator[tuple[ParameterGroup, np.ndarray]]:
-    """Rotation and translation of T_body_sensor, with their Jacobians."""
+    """Rotation and translation of T_body_sensor as groups, with their Jacobians (3, B) by the estimated parameters of
+    `c`."""
     T, J = c.T_body_sensor(sensor), np.zeros((6, len(c.covariance)))
     if sensor != c.body:
         pair = [*pose_groups(c, c.body), *pose_groups(c, sensor)]
@@ -77,7 +78,7 @@ def _pose(c: Calibration, sensor: str) -> Iterator[tuple[ParameterGroup, np.ndar
 
 
 def _rows(c: Calibration, group: ParameterGroup | None) -> np.ndarray:
-    """(n, B) with 1 at the columns of the group; zeros where it is fixed, and (3, B) for what is exactly known."""
+    """(n, B) selection matrix of the columns of the group: zeros if the group is fixed, and (3, B) zeros for a None."""
     rows = np.zeros((3 if group is None else len(group.labels), len(c.covariance)))
     if group is not None and group.columns is not None:
         rows[np.arange(len(group.columns)), list(group.columns)] = 1.0
@@ -103,8 +104,8 @@ def _null_space(c: Calibration, J: np.ndarray, groups: Sequence[ParameterGroup])
 
 
 def _pose_tolerances(c: Calibration, groups: Sequence[ParameterGroup], size: int) -> np.ndarray:
-    """(size,) tolerances of the columns that are rotations and translations, SI; 1 of the others, which J leaves as
-    they are."""
+    """(size,) tolerances of the parameters in `groups`: of rotations [rad] and translations [m]. All other entries are
+    1, as J leaves these parameters unchanged."""
     found = np.ones(size)
     for spec in _POSE:
         columns = [k for g in groups if g.name == spec.name for k in g.columns or ()]
@@ -113,13 +114,14 @@ def _pose_tolerances(c: Calibration, groups: Sequence[ParameterGroup], size: int
 
 
 def _allowed(c: Calibration, setting: object) -> float:
-    """The tolerance of rotations [rad] or translations [m]; `setting`: its field in the settings."""
+    """Tolerance of rotations [rad] or translations [m], from the setting of this name."""
     assert isinstance(setting, str)
     return tolerance(c, setting) * _SI[setting]
 
 
 def _with_null_space(c: Calibration, group: ParameterGroup, null: np.ndarray) -> ParameterGroup:
-    """The group, undetermined where a pose of a sensor moves along the null space (B', m)."""
+    """The group with verdict undetermined on each component of a sensor's pose that lies in the null space (B', m). All
+    are undetermined if the solver did not converge."""
     if group.name not in _NAMES or group.columns is None or group.sensor not in c.rig["sensors"]:
         return group
     is_null = in_null_space(null)[list(group.columns)] | (not c.converged)

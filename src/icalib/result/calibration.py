@@ -27,10 +27,11 @@ Verdict = Literal["determined", "weak", "undetermined", "fixed"]
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """One estimated group of parameters of one sensor.
+    """One group of n parameters of one sensor, such as its rotation.
 
-    value: rotations (3, 3) R_imu_sensor, else (n,). std_formal, std: (n,), of rotations about the sensor's axes [rad];
-    std = std_formal * factor, zero if fixed. columns: of the group in the covariance, None if fixed.
+    value: (3, 3) R_imu_sensor of a rotation, else (n,). std_formal, std: (n,) standard deviations, zero if fixed; those
+    of a rotation are about the sensor's axes [rad]. std = std_formal * max(factor, 1). columns: (n,) indices of the
+    parameters in `Calibration.covariance`, None if fixed.
     """
 
     sensor: str  # "cam0", "imu0", "board0"
@@ -43,12 +44,12 @@ class ParameterGroup:
     verdict: tuple[Verdict, ...]
     mode: str  # free, fixed, prior
     columns: tuple[int, ...] | None = None
-    factor: np.ndarray | None = None  # (n,) empirical factor that scales std_formal
+    factor: np.ndarray | None = None  # (n,) empirical factor, of which only values above 1 scale std_formal
 
 
 @dataclass(frozen=True)
 class SensorFit:
-    """How well one kind of measurement is explained: chi^2 over post-fit degrees of freedom."""
+    """Goodness of fit of one kind of measurement: chi^2 over post-fit degrees of freedom."""
 
     sensor: str
     kind: str  # "corners", "gyroscope", "accelerometer", "bias walk", "points", "wheels", "lateral slip", ...
@@ -57,34 +58,34 @@ class SensorFit:
     chi2: float
     rms: float | None = None  # of the raw residual, in `unit`
     unit: str = ""
-    rejected: int = 0  # corners
+    rejected: int = 0  # number of rejected outliers among corners
 
     @property
     def chi2_per_dof(self) -> float | None:
-        """Near 1 if residuals are as large as the stated noise predicts. None without redundancy: dof are sampled, with
-        an error of about the square root of the count."""
+        """chi^2 per degree of freedom, near 1 if residuals are as large as the stated noise predicts. None if `dof` is
+        below sqrt(count), which is about the sampling error of `dof`."""
         return float(self.chi2 / self.dof) if self.dof > np.sqrt(self.count) else None
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """State of the IMU at the K keyframes. seconds since the first IMU stamp; world frame, z up, one for each
-    recording."""
+    """State of the reference frame (the IMU, if there is one) at the K keyframes, SI units. Each recording has a world
+    frame, z up. seconds: since the first stamp of the reference sensor."""
 
     seconds: np.ndarray  # (K,)
     rotation: np.ndarray  # (K, 3, 3) R_world_imu
-    position: np.ndarray  # (K, 3)
-    velocity: np.ndarray  # (K, 3)
-    gyro_bias: np.ndarray  # (K, 3)
-    accel_bias: np.ndarray  # (K, 3)
+    position: np.ndarray  # (K, 3) m
+    velocity: np.ndarray  # (K, 3) m/s
+    gyro_bias: np.ndarray  # (K, 3) rad/s
+    accel_bias: np.ndarray  # (K, 3) m/s^2
 
 
 @dataclass(frozen=True)
 class RecordingSpan:
-    """Start and end of one recording on the clock of this result, on which recordings follow one another.
+    """Start and end of one recording on the clock of the result, where recordings follow one another.
 
-    start, end: its first and its last measurement [s]; origin_ns: `start` as a raw stamp of the body's clock, which at
-    t seconds showed origin_ns + 1e9 (t - start).
+    start, end: times of the first and the last measurement [s]. origin_ns: raw stamp of the body's clock at `start`, so
+    that time t of the result is the raw stamp origin_ns + 1e9 (t - start).
     """
 
     name: str
@@ -106,8 +107,9 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Visited:
-    """A state from which the solver took a step: value and formal standard deviation of each estimated group (sensor,
-    name), as in `ParameterGroup`. The standard deviation of groups that are fixed at the initial guess is zero."""
+    """Value and formal standard deviation of each estimated group, by (sensor, name), at a state from which the solver
+    took a step. Units are those of `ParameterGroup`. The standard deviation is zero for groups that are fixed at the
+    initial guess."""
 
     stage: str
     values: dict[tuple[str, str], np.ndarray]
@@ -122,14 +124,14 @@ class Calibration:
     covariance: np.ndarray  # (B, B) formal covariance of all estimated parameters, SI, right perturbation
     covariance_names: tuple[str, ...]  # B names: "cam0.rotation.x", ...
     null_space: np.ndarray  # (B, m) unobservable directions, orthonormal in units of the tolerances
-    undetermined: tuple[str, ...]  # sentences: unobservable combinations, and the missing motion
+    undetermined: tuple[str, ...]  # one sentence each: unobservable combination and the missing motion
     fits: tuple[SensorFit, ...]
     residuals: dict[tuple[str, str], Residuals]  # (sensor, kind), such as ("cam0", "corners"); see `by_key`
     trajectory: Trajectory
     iterations: tuple[Iteration, ...]
     converged: bool
     status: str  # one sentence
-    warnings: tuple[str, ...]  # one sentence each: reasons for care
+    warnings: tuple[str, ...]  # one sentence each: reasons to use the result with care
     notes: tuple[str, ...]  # what was assumed, dropped, repaired
     rig: dict[str, Any] = field(default_factory=dict)  # the rig as plain data
     rates: dict[str, float] = field(default_factory=dict)  # sensor -> Hz, as recorded
@@ -137,49 +139,49 @@ class Calibration:
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)  # stage -> seconds
-    recordings: tuple[RecordingSpan, ...] = ()  # in order; arrays of seconds run through all of them
-    planes: tuple[Plane, ...] = ()  # that LiDARs see
-    cross_validation: CrossValidation | None = None  # None where the recording could not be split
-    wrong: tuple[str, ...] = ()  # those of `warnings` that show an error in the rig file
+    recordings: tuple[RecordingSpan, ...] = ()  # in order of time; arrays of seconds cover all of them
+    planes: tuple[Plane, ...] = ()  # planes of the scene that LiDAR points lie on
+    cross_validation: CrossValidation | None = None  # None if the recording could not be split
+    wrong: tuple[str, ...] = ()  # those of `warnings` that show an error in the rig file or the recording
 
     def residuals_of(self, *kinds: str) -> tuple[Any, ...]:
-        """The records of these kinds of measurement ("corners", "points", ...), kind by kind."""
+        """Residual records of these kinds of measurement ("corners", "points", ...), in the order of `kinds`."""
         return tuple(r for kind in kinds for r in self.residuals.values() if r.kind == kind)
 
     @property
     def image_residuals(self) -> tuple[ImageResiduals, ...]:
-        """Of cameras that saw anything: corners of a target, tracks of points of the scene, or both."""
+        """Residuals of each camera with measurements: of target corners, of tracked points, or of both."""
         return tuple(r for r in (*self.corner_residuals, *self.track_residuals) if len(r.uv))
 
     @property
     def corner_residuals(self) -> tuple[CornerResiduals, ...]:
-        """Of each camera that looks for a target."""
+        """Corner residuals of each camera that detects a target."""
         return self.residuals_of(CornerResiduals.kind)
 
     @property
     def track_residuals(self) -> tuple[TrackResiduals, ...]:
-        """Of each camera, where any tracks points."""
+        """Residuals of tracked points, one record for each camera; empty if no camera tracks points."""
         return self.residuals_of(TrackResiduals.kind)
 
     @property
     def imu_residuals(self) -> ImuResiduals:
-        """Of the IMU. Raises ValueError without one."""
+        """Residuals of the IMU. Raises ValueError without an IMU."""
         (found,) = self.residuals_of(ImuResiduals.kind)
         return found
 
     @property
     def lidar_residuals(self) -> tuple[Any, ...]:
-        """Of each LiDAR that sees planes."""
+        """Point-to-plane residuals of each LiDAR that observes planes."""
         return self.residuals_of("points")
 
     @property
     def wheel_residuals(self) -> tuple[RowResiduals, ...]:
-        """Of each set of wheels."""
+        """Residuals of the wheel increments, one record for each set of wheels."""
         return self.residuals_of("increments")
 
     @property
     def pose_residuals(self) -> tuple[RowResiduals, ...]:
-        """Of each pose sensor."""
+        """Residuals of each pose sensor."""
         return self.residuals_of("poses")
 
     @property
@@ -189,37 +191,39 @@ class Calibration:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on why it is not simply usable, the most important first; none where it is."""
+        """Sentences on why the verdict is not `usable`, the most important first; empty if it is."""
         return reasons(self)
 
     @cached_property
     def lens_projections_px(self) -> dict[str, float | None]:
-        """By camera: median standard deviation of the projection where it saw points [px], None where it has none."""
+        """By camera: median standard deviation of the projection over the image cells with observations [px]. None if
+        the lens is fixed, or its model has no ray in the image."""
         return lens_projections_px(self)
 
     @property
     def failure(self) -> str:
-        """A sentence where the solver did not converge, else empty."""
+        """A sentence that the solver did not converge and why; empty if it converged."""
         return "" if self.converged else f"the solver did not converge: {self.status}"
 
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
-        """(n,) which of `recordings` each instant of this result lies in."""
+        """(n,) index into `recordings` of the recording in which each of `seconds` (n,) lies, on the clock of the
+        result."""
         middles = [0.5 * (a.end + b.start) for a, b in pairwise(self.recordings)]
         return np.searchsorted(middles, seconds)
 
     def group(self, sensor: str, name: str) -> ParameterGroup:
-        """The group `name` of `sensor`. Raises KeyError naming what there is."""
+        """The group `name` of `sensor`. Raises KeyError, which lists the existing groups."""
         if (found := self.group_or_none(sensor, name)) is not None:
             return found
         raise KeyError(f"no {name} of {sensor}; there are {', '.join(f'{g.sensor}.{g.name}' for g in self.groups)}")
 
     def group_or_none(self, sensor: str, name: str) -> ParameterGroup | None:
-        """The group `name` of `sensor`; None where the sensor has none."""
+        """The group `name` of `sensor`; None if the sensor has no such group."""
         return next((g for g in self.groups if g.sensor == sensor and g.name == name), None)
 
     def T_imu_sensor(self, sensor: str) -> np.ndarray:
-        """4x4 pose of `sensor` in the imu frame; without an IMU in that of `reference`. A sensor without a rotation,
-        such as an antenna, has the axes of that frame."""
+        """4x4 pose of `sensor` in the IMU frame, or in the frame of `reference` if there is no IMU. A sensor without a
+        rotation, such as an antenna, gets the axes of that frame."""
         T = np.eye(4)
         if (rotation := self.group_or_none(sensor, "rotation")) is not None:
             T[:3, :3] = rotation.value
@@ -227,34 +231,35 @@ class Calibration:
         return T
 
     def T_body_sensor(self, sensor: str) -> np.ndarray:
-        """4x4 pose of any sensor in the frame of `body`."""
+        """4x4 pose of any sensor in the frame of the sensor `body`."""
         if sensor == self.body:
             return np.eye(4)
         return self.T_imu_sensor(sensor) if self.body == self.reference else self.T(self.body, sensor).T
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Names of the target's bodies where it has several, the one whose frame is the scene's first."""
+        """Names of the rigid bodies of a target that has several, otherwise empty. The first defines the scene
+        frame."""
         return tuple(g.sensor for g in self.groups if g.name == "rotation" and g.sensor not in self.rig["sensors"])
 
     def T_scene_body(self, body: str) -> np.ndarray:
-        """4x4 pose of a body of the target in the scene, the frame of the first of `bodies`."""
+        """4x4 pose of a rigid body of the target in the scene frame, which is the frame of the first of `bodies`."""
         return self.T_imu_sensor(body)
 
     @property
     def imu(self) -> str | None:
-        """Name of the IMU, if there is one."""
+        """Name of the IMU, or None."""
         return next(iter(self.of_type("imu")), None)
 
     @property
     def body(self) -> str:
-        """Name of the sensor in whose frame `T_body_sensor` gives poses: `body` of the rig file, or `reference`."""
+        """Name of the sensor relative to which `T_body_sensor` gives poses: `body` of the rig file, or `reference`."""
         return self.rig.get("body") or self.reference
 
     @property
     def reference(self) -> str:
-        """Name of the sensor whose frame the groups and the trajectory are in: the IMU, or without one the first
-        camera that sees a target, or the first pose sensor."""
+        """Name of the sensor in whose frame groups and trajectory are given. It is the IMU; without an IMU the first
+        camera if the rig has a target, else the first pose sensor."""
         if self.imu:
             return self.imu
         poses = self.of_type("pose")
@@ -262,51 +267,54 @@ class Calibration:
         return (*poses, *self.cameras)[0] if follow else (*self.cameras, *poses)[0]
 
     def of_type(self, kind: str) -> tuple[str, ...]:
-        """Names of the sensors of a type of the rig file ("imu", "camera", "lidar", ...), in the rig's order."""
+        """Names of the sensors of type `kind` in the rig file ("imu", "camera", "lidar", ...), in the order of the
+        rig."""
         return tuple(name for name, sensor in self.rig["sensors"].items() if sensor["type"] == kind)
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, in the rig's order."""
+        """Names of the cameras, in the order of the rig."""
         return self.of_type("camera")
 
     @property
     def lidars(self) -> tuple[str, ...]:
-        """Names of the LiDARs, in the rig's order."""
+        """Names of the LiDARs, in the order of the rig."""
         return self.of_type("lidar")
 
     @property
     def wheels(self) -> tuple[str, ...]:
-        """Names of the sets of wheels, in the rig's order."""
+        """Names of the sets of wheels, in the order of the rig."""
         return self.of_type("wheels")
 
     @property
     def pose_sensors(self) -> tuple[str, ...]:
-        """Names of the pose sensors, in the rig's order."""
+        """Names of the pose sensors, in the order of the rig."""
         return self.of_type("pose")
 
     @property
     def mounted(self) -> tuple[str, ...]:
-        """Names of all that have a pose on the body: all but the IMU, by kind in the order of `SENSOR_KINDS`."""
+        """Names of all sensors except the IMU, ordered by kind as in `SENSOR_KINDS`."""
         return tuple(name for kind in SENSOR_KINDS for name in self.of_type(kind) if name != self.imu)
 
     @property
     def on_body(self) -> tuple[str, ...]:
-        """Names of all sensors but `body`, by kind in the order of `SENSOR_KINDS`."""
+        """Names of all sensors except `body`, the IMU first, then ordered by kind as in `SENSOR_KINDS`."""
         return tuple(name for name in (*self.of_type("imu"), *self.mounted) if name != self.body)
 
     def value(self, sensor: str, name: str) -> np.ndarray:
-        """Value of the group `name` of `sensor`, SI: (3, 3) of a rotation R_imu_sensor, else (n,)."""
+        """Value of the group `name` of `sensor`, SI: (3, 3) R_imu_sensor of a rotation, else (n,)."""
         return self.group(sensor, name).value
 
     def std(self, sensor: str, name: str) -> np.ndarray:
-        """(n,) standard deviations of it, SI, empirical factors included; rotations about the sensor's axes [rad]."""
+        """(n,) standard deviations of the group `name` of `sensor`, SI, empirical factors included. Those of a rotation
+        are about the sensor's axes [rad]."""
         return self.group(sensor, name).std
 
     def T(self, frame: str, sensor: str) -> RelativePose:
         """T_frame_sensor, which takes coordinates of `sensor` to `frame`, with its (6, 6) covariance.
 
-        Either may be the IMU. As an array it is the 4x4 matrix. Raises KeyError naming the sensors there are.
+        `frame` or `sensor` may be the IMU. `np.asarray` of the returned pose is the 4x4 matrix. Raises KeyError, which
+        lists the sensors.
         """
         from icalib.result.relative import relative_pose
 
@@ -333,9 +341,10 @@ class Calibration:
         return summary_html(self)
 
     def save(self, folder: str | Path) -> None:
-        """Writes calibration.yaml, result.json and result.npz (docs/files.md) into `folder`, as one set.
+        """Write calibration.yaml, result.json and result.npz (docs/files.md) into `folder`, as one set.
 
-        Raises CalibrationError where the folder cannot be written, or has files of these names that are not icalib's.
+        Raises CalibrationError if the folder cannot be written, or contains files of these names that icalib did not
+        write.
         """
         from icalib.base.result_files import refuse_foreign_set, write_files
         from icalib.result.saving import calibration_files
@@ -345,5 +354,5 @@ class Calibration:
 
 
 def by_key(records: Iterable[Residuals]) -> dict[tuple[str, str], Residuals]:
-    """Records by sensor and kind, as in `Calibration.residuals`."""
+    """Residual records by (sensor, kind), as in `Calibration.residuals`."""
     return {(r.sensor, r.kind): r for r in records}

@@ -1,4 +1,5 @@
-"""Two-fold cross-validation of a calibration, and how far it shifts without each segment of the recording."""
+"""Two-fold cross-validation of a calibration, and its change if one segment of the recording is left out
+(jackknife)."""
 
 from __future__ import annotations
 
@@ -6,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SIGNIFICANT = 3.0  # standard deviations of what noise does: fewer are chance
+SIGNIFICANT = 3.0  # standard deviations of the statistic under pure noise; smaller deviations count as chance
 
 
 @dataclass(frozen=True)
 class PredictedFit:
-    """One kind of residual in half the recording: chi^2, and RMS in `unit` where it has one, with the calibration of
-    both halves (`inside`) and with that of the other half alone (`outside`), the motion at its best each time."""
+    """Fit of one kind of residual in one half (fold) of the recording, with the trajectory optimised each time. inside:
+    with the calibration from both halves. outside: with the calibration from the other half alone. chi2: chi^2; rms: in
+    `unit`, None for residuals without a unit."""
 
     sensor: str
     kind: str
@@ -26,12 +28,12 @@ class PredictedFit:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Two-fold cross-validation: every other of `segments` segments of the recording makes one half (fold).
+    """Two-fold cross-validation: the odd and the even ones of `segments` segments make the two halves (folds).
 
-    directions: of the calibration, that both halves determine. excess: chi^2 of both halves with the calibration of the
-    other half, minus that with the calibration of both. expected, spread: mean and standard deviation of `excess` for
-    noise of the stated sizes. shift (G, B): change of the calibration without each of the G segments [SI]; shift_sigma
-    (G, B): its formal standard deviation.
+    directions: number of directions of the calibration that both halves determine. excess: chi^2 of both halves, each
+    with the calibration of the other half, minus that with the calibration of both. expected, spread: mean and standard
+    deviation of `excess` for noise of the stated sizes. shift (G, B): change of the calibration without each of the G
+    segments [SI]; shift_sigma (G, B): its formal standard deviation.
     """
 
     segments: int
@@ -45,20 +47,21 @@ class CrossValidation:
 
     @property
     def factor(self) -> float:
-        """By which the formal standard deviations are too small, near 1 where noise is all there is."""
+        """Factor by which the formal standard deviations are too small; near 1 if noise of the stated sizes is the only
+        error."""
         return float(np.sqrt(max(self.excess, 0.0) / self.expected))
 
     @property
     def optimistic(self) -> bool:
-        """Whether the formal standard deviations are too small, chance aside."""
+        """Whether the formal standard deviations are significantly too small."""
         return self.excess > self.expected + SIGNIFICANT * self.spread
 
     @property
     def pessimistic(self) -> bool:
-        """Whether they are too large, chance aside."""
+        """Whether the formal standard deviations are significantly too large."""
         return self.excess < self.expected - SIGNIFICANT * self.spread
 
     @property
     def whitened(self) -> np.ndarray:
-        """(G, B) `shift` over `shift_sigma`: standard normal if noise is the only error; NaN where the sigma is 0."""
+        """(G, B) `shift` over `shift_sigma`: standard normal if noise is the only error; NaN if the sigma is 0."""
         return self.shift / np.where(self.shift_sigma > 0.0, self.shift_sigma, np.nan)

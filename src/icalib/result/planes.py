@@ -9,8 +9,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane that points of LiDARs lie on. World frame: unit normal (3,) and a point (3,) on it [m]; count: of points,
-    all LiDARs together."""
+    """A plane of the scene on which LiDAR points lie, in the world frame. normal: unit vector (3,); point: (3,) a point
+    on the plane [m]; count: number of points on it, over all LiDARs."""
 
     name: str
     normal: np.ndarray

@@ -1,14 +1,14 @@
 """Projection uncertainty of a camera over its image [px], from the covariance of its intrinsics and distortion.
 
-A large part of an error of the lens is a pose change: a shift of the principal point is a rotation. Extrinsics that
-were estimated with the lens absorb that part. The pose change r that best absorbs each error db over the image is
-therefore removed first, as mrcal does ("projection uncertainty", "implied rotation"; derived anew). With the covariance
-P of the lens:
+A lens error is in large part equivalent to a pose change: a shift of the principal point acts like a rotation.
+Extrinsics that were estimated together with the lens absorb that part. The pose change r that best absorbs each lens
+error db over the image is therefore removed first, as in mrcal ("projection uncertainty", "implied rotation"; derived
+anew). With the covariance P of the lens parameters b:
 
     r = K db,   K = -(sum Jr^T Jr)^-1 sum Jr^T Ji
     cov(q) = (Ji + Jr K) P (Ji + Jr K)^T
 
-Ji = d q / d b for a fixed point, and Jr = d q / d r at the same pixel. Sums run over a grid of pixels.
+Ji = d q / d b for a fixed point, and Jr = d q / d r at the same pixel q. Sums run over a grid of pixels.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from icalib.result.relative import joint_covariance
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration
 
-COLUMNS = 36  # cells across the image
-FEWEST_SEEN = 12  # cells: fewer do not determine the pose change, so that the whole image is used
+COLUMNS = 36  # cells of the grid across the width of the image
+FEWEST_SEEN = 12  # cells with observations; with fewer, the pose change is fitted over the whole image
 
 
 @dataclass(frozen=True)
 class ProjectionMap:
-    """Standard deviation, in its worst direction, of the projection of points at `range_m` [m] by `camera`. A rotation
-    is removed, and at finite ranges a translation as well.
+    """Projection uncertainty of `camera` for points at the distance `range_m` [m]. It is the standard deviation in the
+    worst direction of the image, after a rotation is removed, and at finite range a translation as well.
 
-    u (n,), v (m,): middles of cells of the image [px]; sigma (m, n) [px], NaN where the model has no ray; seen (m, n):
-    cells with corners or tracked points. The pose change is fitted over these, or over all if there are none.
+    u (n,), v (m,): centres of the grid cells [px]. sigma (m, n): standard deviations [px], NaN if the model has no ray.
+    seen (m, n) bool: cells with corners or tracked points. The pose change is fitted over the seen cells, or over all
+    cells if fewer than `FEWEST_SEEN` are seen.
     """
 
     camera: str
@@ -47,22 +48,22 @@ class ProjectionMap:
 
     @property
     def median_seen(self) -> float:
-        """px, over the cells that are seen; over the whole image where there are none."""
+        """Median sigma over the seen cells [px]; over the whole image if no cell is seen."""
         own = self.sigma[self.seen & np.isfinite(self.sigma)]
         return float(np.median(own)) if len(own) else float(np.nanmedian(self.sigma))
 
     @property
     def worst(self) -> tuple[float, float, float]:
-        """px: the largest sigma, and u and v of its cell."""
+        """The largest sigma, and u and v of its cell [px]."""
         row, column = np.unravel_index(int(np.nanargmax(self.sigma)), self.sigma.shape)
         return float(self.sigma[row, column]), float(self.u[column]), float(self.v[row])
 
 
 def projection_uncertainty(c: Calibration, camera: str, range_m: float = np.inf) -> ProjectionMap | None:
-    """The map of one camera, from the covariance of its intrinsics and distortion, empirical factors included.
+    """Projection uncertainty map of one camera, from the covariance of its lens with empirical factors.
 
-    None where the model has no ray in the whole image. Zero throughout where both are fixed by the rig file. Raises
-    KeyError where `camera` was not calibrated.
+    Returns None if the model has no ray anywhere in the image. The map is zero if the rig file fixes both intrinsics
+    and distortion. Raises KeyError if `camera` was not calibrated.
     """
     lens = [c.group(camera, "intrinsics"), c.group(camera, "distortion")]
     model, (width, height) = camera_model(c.rig["sensors"][camera]["model"]), c.rig["sensors"][camera]["resolution"]
@@ -86,10 +87,10 @@ def projection_std(
     seen: np.ndarray,
     range_m: float = np.inf,
 ) -> np.ndarray:
-    """(N,) px: standard deviation in the worst direction at pixels uv (N, 2), NaN where the model has no ray.
+    """(N,) standard deviation of the projection in the worst direction [px] at pixels uv (N, 2); NaN without a ray.
 
-    params (P,), covariance (P, P); the camera's motion is fitted over the pixels `seen` (N,), over all where these are
-    too few.
+    params (P,), covariance (P, P): intrinsics and distortion. range_m: distance of the points [m]. The absorbed pose
+    change is fitted over the pixels `seen` (N,) bool, or over all if fewer than `FEWEST_SEEN` are usable.
     """
     rays, valid = model.unproject(params, uv)
     points = rays * (range_m if np.isfinite(range_m) else 1.0)
@@ -106,7 +107,8 @@ def projection_std(
 
 
 def _moved_by(points: np.ndarray, near: bool) -> np.ndarray:
-    """(N, 3, 3): d points / d rotation; (N, 3, 6) of near ones, followed by translation in units of their distance."""
+    """(N, 3, 3) Jacobian d points / d rotation of points (N, 3). If `near`: (N, 3, 6), followed by the Jacobian by a
+    translation in units of each point's distance."""
     x, y, z = points.T
     zero = np.zeros_like(x)
     turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
@@ -117,8 +119,8 @@ def _moved_by(points: np.ndarray, near: bool) -> np.ndarray:
 
 
 def working_distance(c: Calibration, camera: str) -> float | None:
-    """m: median distance of `camera` from the target's first point while it saw the target, else from its tracked
-    points; None where it saw neither."""
+    """Median distance of `camera` from the first point of the target in images that show the target [m]. Without such
+    images, the median distance of its tracked points; None without either."""
     own = [r for r in c.corner_residuals if r.sensor == camera and len(r.uv)]
     if not own:
         return next((r.distance for r in c.track_residuals if r.sensor == camera), None)

@@ -1,4 +1,4 @@
-"""Inputs of a result: hashes of files, versions of programs."""
+"""Provenance of a result: hashes of its input files, and versions of the software."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LIBRARIES = ("numpy", "numba")
 
 
 def provenance(files: list[Path]) -> dict[str, str]:
-    """File name -> sha256 of its bytes."""
+    """SHA-256 of the content of each file, in hexadecimal, by path."""
     return {str(f): hash_of(f).hexdigest() for f in files}
 
 

@@ -1,4 +1,4 @@
-"""Parameters as text: degrees, millimetres, milliseconds, with digits down to the standard deviation."""
+"""Parameters as text in degrees, millimetres and milliseconds, rounded according to the standard deviation."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
 
 TURNS = ("roll", "pitch", "yaw")
-SHARPENED = 0.5  # of the standard deviation of a prior: below it the recording contributes most of what is known
+SHARPENED = 0.5  # posterior over prior standard deviation: below it, the data contribute most of the information
 
 
 @dataclass(frozen=True)
 class Row:
-    """One parameter, ready to be printed. std and formal are empty where the parameter is fixed."""
+    """Text of one parameter for a table. std and formal are empty if the parameter is fixed."""
 
     sensor: str
     name: str
@@ -36,8 +36,8 @@ class Row:
 
 
 def rows(calibration: Calibration) -> list[Row]:
-    """Every parameter of every sensor, in the order of the groups; poses are relative to the body. IMU intrinsics whose
-    prior the recording does not sharpen share one row; an ideal IMU has none."""
+    """Rows of all parameters of all sensors, in the order of the groups, with poses relative to the body. IMU
+    intrinsics that stay close to their prior share one row; an ideal IMU has none."""
     found = []
     for group in shown_groups(in_body_frame(calibration)):
         own = _rows_of(group)
@@ -50,7 +50,8 @@ def rows(calibration: Calibration) -> list[Row]:
 
 
 def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
-    """(n,) of IMU intrinsics, whether the standard deviation is below `SHARPENED` times the prior's; else True."""
+    """(n,) whether the data reduce the standard deviation of each IMU intrinsic below `SHARPENED` times that of its
+    prior. True for all other parameters."""
     given = calibration.rig.get("sensors", {}).get(group.sensor, {})
     prior = given.get("intrinsics") if given.get("type") == "imu" else None
     if group.name != "intrinsics" or not isinstance(prior, dict) or "sigma" not in prior:
@@ -59,7 +60,7 @@ def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
 
 
 def shown_groups(calibration: Calibration) -> list[ParameterGroup]:
-    """The groups without those that are fixed at zero, and without the rotation of the body relative to itself."""
+    """All groups except those fixed at zero, and except the identity rotation of the body or the reference."""
     still = [(name, "rotation") for name in (calibration.body, calibration.reference)]
     return [
         g
@@ -76,7 +77,7 @@ def rpy_deg(R: np.ndarray) -> np.ndarray:
 
 
 def shown(value: float, digits: int = 2) -> str:
-    """A positive number with `digits` significant digits, without an exponent where that is readable."""
+    """`value` with `digits` significant digits, without an exponent if it is in 1e-5 to 1e6."""
     if not isfinite(value):
         return "unknown" if np.isnan(value) else "infinite"
     if value == 0.0 or not 1e-5 <= abs(value) < 1e6:
@@ -85,17 +86,17 @@ def shown(value: float, digits: int = 2) -> str:
 
 
 def chi2_words(fit: SensorFit) -> str:
-    """Text of chi^2 over the post-fit degrees of freedom."""
+    """Text of chi^2 per post-fit degree of freedom."""
     return "n/a (no redundancy)" if fit.chi2_per_dof is None else shown(fit.chi2_per_dof, 3)
 
 
 def dof_words(fit: SensorFit) -> str:
-    """Text of the post-fit degrees of freedom. They are sampled, and may come out below zero."""
+    """Text of the post-fit degrees of freedom. They are estimated by sampling; negative estimates are shown as 0."""
     return f"{max(fit.dof, 0.0):.0f}"
 
 
 def rms_words(fit: SensorFit) -> str:
-    """Text of the RMS before whitening, with its unit; empty without one. Angles are small: mrad."""
+    """Text of the RMS of the raw residuals with its unit: mm for lengths, mrad for angles. Empty without an RMS."""
     if fit.rms is None:
         return ""
     unit, scale = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(fit.unit, (fit.unit, 1.0))
@@ -135,13 +136,13 @@ def _names(group: ParameterGroup) -> list[str]:
 def _values(group: ParameterGroup, scale: float) -> list[float | None]:
     if group.name == "rotation":
         return rpy_deg(group.value).tolist()
-    if group.value.ndim == 2:  # the board's tilt: only how well it is known is of interest
+    if group.value.ndim == 2:  # a rotation matrix, such as the board's tilt: only its standard deviation is shown
         return [None] * len(group.labels)
     return (scale * group.value).tolist()
 
 
 def _value_text(value: float | None, std: float) -> str:
-    """The value down to the second significant digit of its standard deviation."""
+    """The value, rounded to the second significant digit of its standard deviation."""
     if value is None:
         return ""
     if not isfinite(std) or std <= 0.0 or not 1e-9 < std < 1e3:

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RelativePose:
-    """T_frame_sensor (4, 4): p_frame = T p_sensor. covariance (6, 6): rotation [rad] about the sensor's axes (right
-    perturbation), translation [m] along the frame's, empirical factors included. As an array it is T."""
+    """T_frame_sensor, T (4, 4): p_frame = T p_sensor. covariance (6, 6), empirical factors included: rotation [rad]
+    about the sensor's axes (right perturbation), then translation [m] along the axes of `frame`. Converts to the array
+    T."""
 
     frame: str
     sensor: str
@@ -32,17 +33,19 @@ class RelativePose:
 
     @property
     def std(self) -> np.ndarray:
-        """(6,) rotation, translation."""
+        """(6,) standard deviations: rotation about the sensor's axes [rad], translation along the axes of `frame`
+        [m]."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def distance(self) -> float:
-        """m, between the origins of both: the baseline of a pair of cameras."""
+        """Distance between the origins of both sensors [m], such as the baseline of a stereo pair."""
         return float(np.linalg.norm(self.T[:3, 3]))
 
     @property
     def distance_std(self) -> float:
-        """m, to first order; the largest of any direction where both are at one place."""
+        """Standard deviation of `distance` [m], to first order. If the distance is zero: the largest standard deviation
+        of the translation over all directions."""
         covariance = self.covariance[3:, 3:]
         if self.distance == 0.0:
             return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
@@ -51,7 +54,7 @@ class RelativePose:
 
 
 def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
-    """Relative poses of all pairs of mounted sensors; of one kind only cameras are paired."""
+    """Relative poses of all pairs of cameras, and of all pairs of mounted sensors of different types."""
     kinds = {name: sensor["type"] for name, sensor in c.rig["sensors"].items()}
     pairs = list(combinations(c.cameras, 2))
     pairs += [(a, b) for a, b in combinations(c.mounted, 2) if kinds[a] != kinds[b]]
@@ -59,17 +62,18 @@ def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
 
 
 def relative_pose(c: Calibration, frame: str, sensor: str) -> RelativePose:
-    """Pose of `sensor` in the frame of another sensor; either may be the IMU. Raises KeyError naming what there is."""
+    """Pose of `sensor` in the frame of the sensor `frame`; either may be the IMU. Raises KeyError, which lists the
+    existing groups."""
     T = np.linalg.inv(_pose(c, frame)) @ _pose(c, sensor)
     J = relative_jacobian(c, frame, sensor)
     return RelativePose(frame, sensor, T, J @ _joint_covariance(c, frame, sensor) @ J.T)
 
 
 def relative_jacobian(c: Calibration, frame: str, sensor: str) -> np.ndarray:
-    """(6, 12) of T_frame_sensor by rotation and translation of both sensors.
+    """(6, 12) Jacobian of T_frame_sensor by rotation and translation of `frame`, then of `sensor`.
 
-    With T_imu_frame = (R, p), T_imu_sensor = (Q, q) and the relative pose (S, s) = (R^T Q, R^T (q - p)), perturbations
-    dR, dQ on the right, dp and dq give dS = dQ - S^T dR on the right and ds = R^T (dq - dp) + s x dR.
+    With T_imu_frame = (R, p), T_imu_sensor = (Q, q) and the relative pose (S, s) = (R^T Q, R^T (q - p)), right
+    perturbations dR, dQ and additive dp, dq give dS = dQ - S^T dR (right perturbation) and ds = R^T (dq - dp) + s x dR.
     """
     T_imu_frame = _pose(c, frame)
     T = np.linalg.inv(T_imu_frame) @ _pose(c, sensor)
@@ -82,7 +86,8 @@ def relative_jacobian(c: Calibration, frame: str, sensor: str) -> np.ndarray:
 
 
 def _joint_covariance(c: Calibration, *sensors: str) -> np.ndarray:
-    """(6 n, 6 n) of rotation and translation of each of n sensors, empirical factors included; 0 where fixed."""
+    """(6 n, 6 n) covariance of rotation and translation of each of n sensors, empirical factors included; zero if
+    fixed."""
     return joint_covariance(c, [g for sensor in sensors for g in pose_groups(c, sensor)], 3)
 
 
@@ -91,8 +96,8 @@ def _pose(c: Calibration, sensor: str) -> np.ndarray:
 
 
 def pose_groups(c: Calibration, sensor: str) -> tuple[ParameterGroup | None, ParameterGroup | None]:
-    """Rotation and translation of `sensor`; None of what is exactly known: of the IMU where poses are relative to it,
-    and the rotation of a sensor that has none."""
+    """Rotation and translation of `sensor`. None in place of a group that is exactly known: both of an IMU that is the
+    reference, and the rotation of a sensor without a rotation."""
     known = {g.name: g for g in c.groups if g.sensor == sensor}
     if sensor == c.imu and "rotation" not in known:
         return None, None
@@ -100,7 +105,7 @@ def pose_groups(c: Calibration, sensor: str) -> tuple[ParameterGroup | None, Par
 
 
 def joint_covariance(c: Calibration, groups: Sequence[ParameterGroup | None], none: int = 0) -> np.ndarray:
-    """(n, n) covariance of all entries of `groups`, one after the other, empirical factors included; 0 if fixed. A None
+    """(n, n) covariance of all entries of `groups`, in their order, empirical factors included; zero if fixed. A None
     in place of a group stands for `none` exactly known entries."""
     sizes = [none if g is None else len(g.labels) for g in groups]
     out, at, columns, scale = np.zeros((sum(sizes),) * 2), [], [], []

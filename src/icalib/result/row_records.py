@@ -1,4 +1,4 @@
-"""Residuals of a factor as a record that the result keeps."""
+"""Converts residuals of a factor of the estimator to a record in the result."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from icalib.result.timeline import Timeline
 from icalib.sensors.parameter_spec import AXES
 from icalib.sensors.records import RowResiduals
 
-CLIP = 4.0  # standard deviations: outliers must not make the correlation
+CLIP = 4.0  # standard deviations, so that outliers do not dominate the correlation
 
 
 def row_record(
     kind: str, rows: Sequence[ResidualRows], timeline: Timeline, labels: Mapping[str, tuple[str, ...]] | None = None
 ) -> RowResiduals:
-    """One record of all kinds of residuals of one factor, which have the same times. kind: of the record. labels: names
-    of the columns by kind of residual, by default the kind itself, with an axis if there are three."""
+    """One record of all residuals `rows` of one factor, which have the same times. kind: name of the record. labels:
+    names of the columns by kind of residual; the default is the kind, followed by the axis (or index) if there are
+    several columns."""
     names = {r.kind: _labels(r) for r in rows} | dict(labels or {})
     columns = [(label, r.unit) for r in rows for label in names[r.kind]]
     seconds = timeline.shown(rows[0].seconds, timeline.recording_of(rows[0].seconds))
@@ -42,6 +43,7 @@ def _labels(r: ResidualRows) -> tuple[str, ...]:
 
 
 def lag_one_correlation(whitened: np.ndarray) -> float:
-    """Correlation of rows (n, m) of standard normal numbers with the ones before, large ones clipped; 0 without any."""
+    """Lag-one autocorrelation of whitened residuals (n, m) over all columns, with values clipped at `CLIP`; 0 if n <
+    2."""
     clipped = np.clip(whitened, -CLIP, CLIP)
     return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))

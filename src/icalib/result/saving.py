@@ -1,4 +1,4 @@
-"""A `Calibration` as files, and back without losing a bit. The formats: docs/files.md."""
+"""Writes a `Calibration` to files and reads it back without loss of precision. File formats: docs/files.md."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
 
 
 def calibration_files(calibration: Calibration) -> dict[str, bytes]:
-    """calibration.yaml, result.json and result.npz by name."""
+    """Contents of calibration.yaml, result.json and result.npz, by file name."""
     arrays = _npz(calibration)
     return {
         "calibration.yaml": sealed(printable(calibration_yaml(calibration)).encode()),
@@ -53,9 +53,9 @@ def calibration_files(calibration: Calibration) -> dict[str, bytes]:
 
 
 def load_calibration(folder: str | Path) -> Calibration:
-    """The calibration that was saved in `folder`, exactly.
+    """The calibration that `Calibration.save` wrote to `folder`, bit for bit.
 
-    Raises CalibrationError, one sentence, where files are absent, malformed, truncated or not of one run.
+    Raises CalibrationError, one sentence, if files are absent, malformed, truncated or from different runs.
     """
     folder = Path(folder)
     plain = _read_json(folder)
@@ -70,6 +70,7 @@ def load_calibration(folder: str | Path) -> Calibration:
 
 
 def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
+    """Content of result.json. It includes the SHA-256 hash of the npz file `arrays`, which binds both files."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -177,13 +178,14 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
 
 
 def _residuals(plain: dict[str, Any], of: Callable[[type, str], dict[str, Any]]) -> Residuals:
-    """A record of the class that a kind of sensor has for this kind of measurement, by default `RowResiduals`."""
+    """The residual record of one sensor and kind. Its class is the one that a sensor kind lists in RECORDS, by default
+    `RowResiduals`. `of` returns the arrays of a class under a prefix."""
     own = {record.kind: record for kind in SENSOR_KINDS for record in getattr(facet(kind, "record"), "RECORDS", ())}
     fields = _tuples(plain)
     record = own.get(fields["kind"], RowResiduals)
     arrays = of(record, f"residuals/{fields['sensor']}/{fields['kind']}")
     if record is not RowResiduals:
-        del fields["kind"]  # of the class
+        del fields["kind"]  # a constant of the class, not an argument
     return record(**fields, **arrays)
 
 
@@ -210,7 +212,8 @@ def _group(plain: dict[str, Any]) -> ParameterGroup:
 
 
 def _check(c: Calibration) -> None:
-    """Raises ValueError if parts do not fit together."""
+    """Raise ValueError if the parts of the result are inconsistent: shapes, counts, column indices, names of
+    sensors."""
     n = len(c.covariance_names)
     for name in c.rig["sensors"]:
         if not NAME.fullmatch(name):

@@ -1,4 +1,4 @@
-"""Checks dtypes and shapes of the arrays of a result that was read from files, which others may have changed."""
+"""Checks dtypes and shapes of arrays of a result that was read from files, which may have been edited."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from icalib.result.calibration import Calibration, Trajectory
 from icalib.sensors.records import Shapes
 
-_WORDS = {"f": "decimal", "iu": "whole", "b": "boolean"}  # by values of numpy's dtype.kind
+_WORDS = {"f": "decimal", "iu": "whole", "b": "boolean"}  # by accepted values of numpy's dtype.kind
 _TRAJECTORY: Shapes = {
     "seconds": ("f", "n"),
     "rotation": ("f", "n", 3, 3),
@@ -21,9 +21,9 @@ _TRAJECTORY: Shapes = {
 
 
 def check_arrays(c: Calibration) -> None:
-    """Raises ValueError, naming the array, where one has another kind of numbers or does not fit the rest in shape.
+    """Raise ValueError, naming the array, if a dtype is wrong or a shape is inconsistent with the other arrays.
 
-    The shapes of the covariance and of the null space are not checked here.
+    Shapes of the covariance and of the null space are not checked here.
     """
     _check_kind("the covariance", c.covariance, "f")
     _check_kind("the null space", c.null_space, "f")
@@ -33,7 +33,7 @@ def check_arrays(c: Calibration) -> None:
 
 
 def _check(part: Any, what: str, shapes: Shapes) -> None:
-    """Checks one object, whose arrays must have these shapes."""
+    """Check the arrays of one object against `shapes`, in which equal names of axes are equal lengths."""
     lengths: dict[str, int] = {"labels": len(getattr(part, "labels", ()))}
     for name, (kind, *axes) in shapes.items():
         array = getattr(part, name)

@@ -1,4 +1,4 @@
-"""`calibration.yaml`: the result for people and for other programs, one short file."""
+"""Writes `calibration.yaml`: the result in one short file for people and other programs."""
 
 from __future__ import annotations
 
@@ -60,30 +60,30 @@ def calibration_yaml(calibration: Calibration) -> str:
 
 
 def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], str]:
-    """(group, label) -> key among the parameters of one sensor: the label, with its group where two share it, or where
-    it says nothing alone."""
+    """Keys of the parameters of one sensor in calibration.yaml, by (group, label). A key is the label, prefixed with
+    its group if the label is empty or not unique, or if the group has a singular name (`ONE`)."""
     count = Counter(label for g in groups for label in g.labels)
     own = {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
     return own | {(name, label): f"{ONE[name]}_{label}" for name, label in own if name in ONE}
 
 
 def pose_key(c: Calibration) -> str:
-    """T_imu_sensor, or T_cam0_sensor where the frame of cam0 is the body's."""
+    """Key of a sensor's pose: T_imu_sensor, or T_cam0_sensor if cam0 is the body."""
     return f"T_{body_name(c)}_sensor"
 
 
 def body_name(c: Calibration) -> str:
-    """How files name the frame that all poses are in: imu, or the sensor whose frame it is."""
+    """Name in files of the frame in which all poses are given: "imu", or the name of the sensor `body`."""
     return "imu" if c.body == c.imu else c.body
 
 
 def reference_name(c: Calibration) -> str:
-    """How files name the sensor whose clock is that of time offsets: imu, or `reference`."""
+    """Name in files of the sensor to whose clock time offsets refer: "imu", or the name of `reference`."""
     return "imu" if c.imu else c.reference
 
 
 def _sensor(c: Calibration, name: str) -> dict[str, Any]:
-    """The entry of a sensor of a result `in_body_frame`."""
+    """Entry of the sensor `name`. `c` is a result of `in_body_frame`."""
     kind, entry = c.rig["sensors"][name]["type"], _entry(c, name)
     if kind != "imu":
         return {"type": kind, pose_key(c): c.T_imu_sensor(name).tolist()} | entry
@@ -105,7 +105,7 @@ def _target(c: Calibration, name: str) -> dict[str, Any]:
 
 
 def _entry(c: Calibration, name: str) -> dict[str, Any]:
-    """time_offset, parameters, and std, verdict and empirical_factor with the same keys."""
+    """Entry of a sensor or target: time_offset and parameters; std, verdict and empirical_factor have the same keys."""
     groups = tuple(g for g in c.groups if g.sensor == name)
     own = [g for g in groups if g.name in MOUNTED_NAMES or g.value.ndim == 2]
     rest = tuple(g for g in groups if g.name not in MOUNTED_NAMES and g.value.ndim == 1)

@@ -1,4 +1,4 @@
-"""A calibration as text and as HTML, for Python's prompt and notebooks."""
+"""A calibration as text and as HTML, for the Python prompt and for notebooks."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from icalib.result.calibration import Calibration
 
 _HEAD = ("sensor", "parameter", "value", "std", "unit", "verdict")
-_RIGHT = (False, False, True, True, False, False)  # which columns are numbers
+_RIGHT = (False, False, True, True, False, False)  # alignment of the columns: numbers are right-aligned
 _COLOURS = {"undetermined": "#c62828", "weak": "#b26a00"}
 
 
 def one_line(c: Calibration) -> str:
-    """Sensors and verdict."""
+    """One line with the sensors, the verdict and the number of reasons."""
     sensors = ", ".join(c.rig["sensors"])
     count = len(c.reasons)
     why = f", {count} reason{'s' * (count > 1)}" if count else ""
@@ -35,7 +35,7 @@ def summary_text(c: Calibration) -> str:
 
 
 def summary_html(c: Calibration) -> str:
-    """The same as HTML."""
+    """The verdict with its reasons, and the table of `summary_text`, as HTML."""
     head = "".join(f"<th>{name}</th>" for name in _HEAD)
     body = "".join(f"<tr>{''.join(_html_cells(row))}</tr>" for row in _rows(c))
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in c.reasons)
@@ -46,7 +46,8 @@ def summary_html(c: Calibration) -> str:
 
 
 def _rows(c: Calibration) -> list[Row]:
-    """Rows of sensors. The poses of a target's many bodies are in calibration.yaml only."""
+    """Rows of the table. Poses of the rigid bodies of a target are left out, as they can be many; calibration.yaml has
+    them."""
     return [row for row in rows(c) if row.sensor not in c.bodies]
 
 

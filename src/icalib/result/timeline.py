@@ -1,4 +1,4 @@
-"""The clock of a result: recordings one after another with a second between them, whatever their own clocks show."""
+"""The clock of a result: recordings follow one another with a pause of `PAUSE_S` between them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ PAUSE_S = 1.0
 
 @dataclass(frozen=True)
 class Timeline:
-    """The recordings on the joined clock of the estimate and on the clock of the result. moved (n,): what to add to
-    times of the first to get those of the second [s], by recording."""
+    """Conversion from the joined clock of the estimator to the clock of the result. parts, spans: the n recordings on
+    the first and on the second. moved (n,): what to add to times of each recording [s]."""
 
     parts: tuple[Part, ...]
     spans: tuple[RecordingSpan, ...]
@@ -23,7 +23,8 @@ class Timeline:
 
     @classmethod
     def of(cls, parts: tuple[Part, ...], image_times: list[np.ndarray], body: str) -> Timeline:
-        """image_times: of each camera's images, on the joined clock. body: the sensor whose clock that is."""
+        """Timeline of recordings `parts`. image_times: times of each camera's images on the joined clock [s]. body:
+        name of the sensor that defines the joined clock."""
         spans, moved = [], np.zeros(len(parts))
         for k, part in enumerate(parts):
             first, last = _extent(part, image_times, body)
@@ -33,27 +34,29 @@ class Timeline:
         return cls(parts, tuple(spans), moved)
 
     def shown(self, seconds: np.ndarray, recording: np.ndarray) -> np.ndarray:
-        """(n,) times of the result from joined times (n,) of the recordings (n,) [s]."""
+        """(n,) times on the clock of the result, from times (n,) on the joined clock and recording indices (n,) [s]."""
         return seconds + self.moved[recording]
 
     def recordings_of(self, stream: str) -> np.ndarray:
-        """(N,) the recording of each stamp of a stream, given by its key."""
+        """(N,) index of the recording of each stamp of the stream with the key `stream`."""
         counts = [p.own[stream].stop - p.own[stream].start for p in self.parts]
         return np.repeat(np.arange(len(counts)), counts)
 
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
-        """(n,) the recording that each of the joined seconds lies in, at all of which the IMU was running."""
+        """(n,) index of the recording in which each of `seconds` (n,) on the joined clock lies. The body sensor must
+        have been running at these times."""
         return np.searchsorted([p.begin for p in self.parts[1:]], seconds, side="right")
 
     def words(self, second: float) -> str:
-        """Name of an instant of the joined clock in a sentence. The IMU must have been running."""
+        """Text for an instant on the joined clock [s]: seconds since the start of its recording, and the recording's
+        name if there are several. The body sensor must have been running."""
         k = int(self.recording_of(np.array(second)))
         own = f"{second - self.parts[k].begin:.3f} s"
         return own if len(self.parts) == 1 else f"{own} of {self.parts[k].name}"
 
 
 def _extent(part: Part, image_times: list[np.ndarray], body: str) -> tuple[float, float]:
-    """The first and the last instant of a recording at which anything was measured, on the joined clock."""
+    """Times of the first and the last measurement of a recording, on the joined clock [s]."""
     own = [part.own[c.key] for c in part.measurements.cameras]
     images = [t[rows] for t, rows in zip(image_times, own, strict=True)]
     if not images or part.measurements.imu is not None:  # else the clock is that of a camera

@@ -1,16 +1,16 @@
-"""Whether a result can be used, and why not. This module alone decides it.
+"""Verdict on a result: whether it can be used, and why not. No other module decides this.
 
-Console, report, calibration.yaml, result.json and the exit code of `--strict` show what it says. Four verdicts, the
-worst that applies:
+Console, report, calibration.yaml, result.json and the exit code of `--strict` show this verdict. It is the worst that
+applies of:
 
-not usable        the solver did not converge, or a check says that the rig file or the recording is wrong
-partly usable     the data leave components undetermined; all others can be used
-usable with care  a warning, or a component whose standard deviation exceeds its tolerance
-usable            none of these
+    not usable        the solver did not converge, or a check says that the rig file or the recording is wrong
+    partly usable     the data leave components undetermined; all other components can be used
+    usable with care  there is a warning, or a component whose standard deviation exceeds its tolerance
+    usable            none of these
 
-A lens is judged by its projection uncertainty where the camera saw points, and not by single coefficients: these trade
-with each other. Components with a prior that the data do not improve are as good as the prior says, which is no fault
-of the result. Nuisance parameters (edge bloom, board shape and tilt) do not count.
+A lens is judged by its projection uncertainty over the image regions with observations, not by single coefficients,
+which are strongly correlated. A component with a prior does not count: it is at least as good as its prior. Nuisance
+parameters (edge bloom, board shape and tilt) do not count.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ NEXT: dict[Usability, str] = {
 }
 AUXILIARY = tuple(spec.name for spec in ALL_SPECS if spec.is_auxiliary)
 WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
-UNDETERMINED = 10.0  # tolerances: a standard deviation above this says no more than a guess does
-NULL_SPACE_SHARE = 0.25  # squared length in the null space, tolerance units, beyond which a component is undetermined
-MOST_NAMED = 6  # components in one sentence
+UNDETERMINED = 10.0  # standard deviation in tolerances above which the estimate is no better than a guess
+NULL_SPACE_SHARE = 0.25  # squared norm of a component's unit vector in the null space; undetermined above it
+MOST_NAMED = 6  # components that one sentence names
 
 
 def usability(c: Calibration) -> Usability:
@@ -59,44 +59,44 @@ def usability(c: Calibration) -> Usability:
 
 
 def reasons(c: Calibration) -> tuple[str, ...]:
-    """Sentences on why the result is not simply usable, the most important first; none where it is."""
+    """Sentences on why the verdict is not `usable`, the most important first; empty if it is."""
     if not c.converged:
         return tuple(dict.fromkeys([*c.wrong, c.failure, *c.warnings]))
     counted = {v for g in c.groups for v in _counted(c, g)} & {"undetermined", "weak"}
-    # Standard deviations of a wrong model include its misfit: to record longer would not mend them.
+    # Standard deviations of a wrong model include its misfit, which a longer recording does not reduce.
     mended_first = bool(c.wrong)
     open_ones = [*c.undetermined, *(() if mended_first else _unexplained(c))] if counted else []
     weak = [] if mended_first else list(_weak(c))
     rest = [w for w in c.warnings if w not in c.wrong]
-    # Undetermined coefficients of a lens whose projection is known well enough are no more than a detail.
+    # Undetermined coefficients of a lens matter little if its projection is known well enough, so they come last.
     first, last = (open_ones, []) if "undetermined" in counted else ([], open_ones)
     return tuple(dict.fromkeys([*c.wrong, *first, *rest, *weak, *last]))
 
 
 def by_size(tolerances: float) -> Verdict:
-    """The verdict on a component whose standard deviation is so many times its tolerance."""
+    """Verdict on a component whose standard deviation is `tolerances` times its tolerance; NaN is undetermined."""
     return "undetermined" if not tolerances <= UNDETERMINED else "determined" if tolerances <= 1.0 else "weak"
 
 
 def in_null_space(directions: np.ndarray) -> np.ndarray:
-    """(B,) whether each component moves along the null space, whose orthonormal basis is `directions` (B, m), in
-    tolerance units."""
+    """(B,) bool: whether the unit vector of each component lies largely in the null space (see `NULL_SPACE_SHARE`).
+    directions (B, m): orthonormal basis of the null space, in tolerance units."""
     return (directions**2).sum(axis=1) > NULL_SPACE_SHARE
 
 
 def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
-    """The verdict that a group deserves as a whole."""
+    """The worst of the verdicts of a group; `fixed` if there are none."""
     return min((*verdicts, WORST_FIRST[-1]), key=WORST_FIRST.index)
 
 
 def lens_projections_px(c: Calibration) -> dict[str, float | None]:
-    """By camera, as `lens_projection_px`; a result keeps them, as each takes 20 ms and is asked for again and again."""
+    """`lens_projection_px` of every camera. `Calibration` caches it, as one camera takes about 20 ms."""
     return {camera: _lens_projection_px(c, camera) for camera in c.cameras}
 
 
 def lens_projection_px(c: Calibration, camera: str) -> float | None:
-    """Median standard deviation of the projection where `camera` saw points [px]; None where its lens is fixed, or has
-    no ray in the image."""
+    """Median standard deviation of the projection over the image cells in which `camera` has observations [px]. None if
+    its lens is fixed, or its model has no ray in the image."""
     return c.lens_projections_px[camera]
 
 
@@ -109,18 +109,20 @@ def _lens_projection_px(c: Calibration, camera: str) -> float | None:
 
 
 def lens_verdict(c: Calibration, camera: str) -> Verdict:
-    """By the projection uncertainty of the lens, against the tolerance in pixels of the rig file's settings."""
+    """Verdict on a lens: its projection uncertainty compared with `pixel_tolerance` of the settings."""
     sigma = lens_projection_px(c, camera)
     return "fixed" if sigma is None else by_size(sigma / tolerance(c, "pixel_tolerance"))
 
 
 def tolerance(c: Calibration, name: str) -> float:
-    """A tolerance of the rig file's settings, by the name of its field; the default if `c` has no settings."""
+    """The setting `name` of the rig file, a tolerance, in the unit of that field; the default if `c` has no
+    settings."""
     return float(c.settings.get(name, getattr(Settings, name)))
 
 
 def _counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
-    """Verdicts of a group that count for the whole; those of a lens as one."""
+    """Verdicts of a group that contribute to the verdict on the result; one verdict for a lens, none for nuisance
+    parameters."""
     if g.name in AUXILIARY:
         return ()
     if g.name in LENS and g.sensor in c.cameras:
@@ -129,7 +131,7 @@ def _counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
 
 
 def _unexplained(c: Calibration) -> Iterator[str]:
-    """A sentence on undetermined components where no direction is named."""
+    """A sentence on undetermined components, if no sentence names an unobservable direction."""
     names = [name for name, verdict in _components(c) if verdict == "undetermined"]
     if names and not c.undetermined:
         yield (
@@ -138,6 +140,7 @@ def _unexplained(c: Calibration) -> Iterator[str]:
 
 
 def _weak(c: Calibration) -> Iterator[str]:
+    """A sentence on weakly determined components, if there are any."""
     names = [name for name, verdict in _components(c) if verdict == "weak"]
     if names:
         yield (
@@ -147,7 +150,7 @@ def _weak(c: Calibration) -> Iterator[str]:
 
 
 def _more(c: Calibration) -> str:
-    """What makes standard deviations smaller, for this rig."""
+    """Advice for this rig: what to record so that standard deviations become smaller."""
     if any(SENSOR_TYPES[s["type"]].drives for s in c.rig["sensors"].values()):
         return "drive longer, with turns both ways, and brake and speed up"
     if c.imu is None and c.cameras:
@@ -160,7 +163,7 @@ def _more(c: Calibration) -> str:
 
 
 def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:
-    """Name with standard deviation, and verdict, of every component that counts."""
+    """Name with standard deviation, and verdict, of every component that contributes to the verdict on the result."""
     for g in c.groups:
         verdicts = _counted(c, g)
         if g.name in LENS and g.sensor in c.cameras:
