@@ -1,4 +1,4 @@
-"""What is calibrated: sensors and their parameters, target, settings."""
+"""The rig: definitions of its sensors, their parameters, the target and the settings of the estimator."""
 
 from icalib.rig.rig import (
     Rig,

@@ -1,4 +1,4 @@
-"""Whether the sensors of a rig can be calibrated together: something must determine the motion."""
+"""Checks that the sensors of a rig can be calibrated together: at least one must determine the motion of the rig."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from icalib.sensors.sensor import TARGET_FRAME, Lack, has_imu
 
 
 def lack_of(rig: Rig) -> Lack | None:
-    """The first reason why the sensors of the rig cannot be calibrated together; None without one."""
+    """The first reason why the sensors of the rig cannot be calibrated together; None if they can."""
     return next(_lacks(rig), None)
 
 
 def check_complete(rig: Rig) -> None:
-    """Raises RigError where sensors cannot be calibrated together."""
+    """Raises RigError if the sensors of the rig cannot be calibrated together (see `lack_of`)."""
     lack = lack_of(rig)
     if lack is None:
         return
@@ -46,14 +46,14 @@ def _lacks(rig: Rig) -> Iterator[Lack]:
 
 
 def _second_imu(rig: Rig) -> Iterator[Lack]:
-    """The only place that refuses a second IMU: the estimator integrates one."""
+    """Each IMU after the first: the estimator integrates only one. No other check refuses a second IMU."""
     first, *others = [s.name for s in rig.sensors.values() if s.is_inertial] or [""]
     for name in others:
         yield Lack(("sensors", name), f"is a second IMU beside {first}; keep one of them.")
 
 
 def _unknown_frames(rig: Rig) -> Iterator[Lack]:
-    """Sensors that share a frame which the rig does not have."""
+    """Sensors that report in the frame of another sensor or of the target, if that frame does not exist."""
     for sensor in rig.mounted:
         name, where = sensor.shared_frame, ("sensors", sensor.name, "frame")
         if name == TARGET_FRAME and len(rig.target.bodies) > 1:
@@ -74,7 +74,8 @@ def _no_motion(rig: Rig) -> str:
 
 
 def _clocks_without_reference(rig: Rig) -> Iterator[Lack]:
-    """Sensors whose clocks are said to restart, in a rig without an IMU, and that have no time offset."""
+    """Sensors with `clock_restarts` but without a time offset, for rigs without an IMU: all sensors of a rig with
+    cameras only, and the reference sensor."""
     for sensor in rig.mounted:
         if not sensor.clock_restarts:
             continue

@@ -1,4 +1,4 @@
-"""All types of sensors and all definitions of parameters, from the list of kinds."""
+"""Sensor classes by type, and the definitions of all parameters, collected from `SENSOR_KINDS` and `SCENE`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from icalib.sensors.sensor import Sensor
 
 SENSOR_TYPES: dict[str, type[Sensor]] = {kind: facet(kind, "spec").SENSOR for kind in SENSOR_KINDS}
 _OWN = (spec for kind in SENSOR_TYPES.values() for spec in kind.parameters)
-ALL_SPECS = tuple(dict.fromkeys((*_OWN, *SCENE)))  # each once
+ALL_SPECS = tuple(dict.fromkeys((*_OWN, *SCENE)))  # without duplicates
 
-# Of groups with a plural name, the name of one number: radius of radii.
+# Parameter groups with a plural name -> name of a single number, such as radii -> radius.
 ONE = {spec.name: spec.one for spec in ALL_SPECS if spec.one}

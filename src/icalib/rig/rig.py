@@ -21,14 +21,14 @@ from icalib.sensors.sensor import Sensor
 from icalib.sensors.wheels.spec import Wheels
 
 T = TypeVar("T", bound=Sensor)
-# Short names for all sensors of a type: properties of a rig, and fields of `Rig.with_`.
+# Names for all sensors of a type: properties of `Rig`, and keyword arguments of `Rig.with_`.
 _SHORT: dict[str, type[Sensor]] = {
     "imu": ImuSensor, "cameras": Camera, "lidars": Lidar, "wheels": Wheels, "poses": PoseSensor,
 }  # fmt: skip
 
 
 def by_name(*sensors: Sensor) -> dict[str, Sensor]:
-    """The sensors by name, as `Rig` takes them. Raises RigError for two of one name."""
+    """`sensors` by name, for `Rig.sensors`. Raises RigError if two have the same name."""
     found = {sensor.name: sensor for sensor in sensors}
     if len(found) < len(sensors):
         twice = next(s.name for k, s in enumerate(sensors) if s.name in {x.name for x in sensors[:k]})
@@ -38,12 +38,15 @@ def by_name(*sensors: Sensor) -> dict[str, Sensor]:
 
 @dataclass(frozen=True)
 class Rig:
-    """All sensors of a robot, what they see, and how they are calibrated.
+    """All sensors of a robot, the target that they see, and the settings of the estimator.
 
-    sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind. gravity: m/s^2. body:
-    name of the sensor in whose frame results give poses; empty: `reference`. The reference is the IMU, or without one
-    the first camera, or the first pose sensor if no camera sees a target. Cameras alone have no motion model: images of
-    the same stamp share a pose, and poses are independent. Any other rig without an IMU assumes smooth motion.
+    sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind. gravity: magnitude
+    [m/s^2]. path: the rig file, None if not read from one. body: name of the sensor in whose frame results give poses;
+    empty: `reference`.
+
+    The reference is the IMU, or without one the first sensor that determines the motion (`reference_without_imu`). A
+    rig with cameras only has no motion model: images with the same stamp share a pose, and poses are independent. Any
+    other rig without an IMU assumes smooth motion. Raises RigError if two sensors have the same name.
     """
 
     sensors: Mapping[str, Sensor]
@@ -59,17 +62,17 @@ class Rig:
         object.__setattr__(self, "sensors", {s.name: s for s in ordered})
 
     def of(self, kind: type[T]) -> tuple[T, ...]:
-        """All sensors of a type, in the order of the rig file."""
+        """All sensors of class `kind`, in the order of the rig file."""
         return tuple(s for s in self.sensors.values() if isinstance(s, kind))
 
     @property
     def mounted(self) -> tuple[Sensor, ...]:
-        """All sensors but the IMU: those that have a pose relative to it."""
+        """All sensors except the IMU; their extrinsics are relative to `reference`."""
         return tuple(s for s in self.sensors.values() if s is not self.imu)
 
     @property
     def imu(self) -> ImuSensor | None:
-        """The IMU that is integrated; None without one."""
+        """The IMU; None if the rig has none."""
         return next(iter(self.of(ImuSensor)), None)
 
     @property
@@ -90,59 +93,60 @@ class Rig:
 
     @property
     def has_target(self) -> bool:
-        """Whether there is a target. Without one all cameras have feature tracks."""
+        """True if there is a target. Without one, all cameras use feature tracks."""
         return len(self.target.bodies) > 0
 
     @property
     def blooms(self) -> bool:
-        """Whether edge bloom is estimated: the settings ask for it, and the target has edges that bloom."""
+        """True if edge bloom (dark edges shifted by blur and camera response) is estimated: `settings.bloom` is set and
+        the corners of the target are subject to it."""
         return self.settings.bloom and self.target.blooms
 
     @property
     def reference(self) -> str:
-        """Name of the sensor whose frame and clock the estimator uses: extrinsics of the rig are relative to it."""
+        """Name of the sensor whose frame and clock the estimator uses; extrinsics and time offsets refer to it."""
         return self.reference_without_imu if self.imu is None else self.imu.name
 
     @property
     def reference_without_imu(self) -> str:
-        """Name of the reference sensor of a rig without an IMU: the first that determines the motion alone, or
-        else the first that does beside an IMU."""
+        """Name of the reference sensor if the rig has no IMU: the first that determines the motion without an IMU,
+        else the first that would determine it together with one."""
         alone = (s for s in self.mounted if s.gives_motion_without_imu(self.has_target))
         return next(s.name for s in (*alone, *(s for s in self.mounted if s.gives_motion)))
 
     @property
     def moves_by_poses(self) -> bool:
-        """Whether a rig without an IMU takes its motion from the first pose sensor: no camera sees a target."""
+        """True if the first pose sensor defines the motion of a rig without an IMU: no camera sees a target."""
         return bool(self.poses) and not (self.cameras and self.has_target)
 
     @property
     def cameras_alone(self) -> bool:
-        """Whether there are cameras and no other sensor."""
+        """True if all sensors are cameras."""
         return len(self.cameras) == len(self.sensors)
 
     @property
     def assumes_motion(self) -> bool:
-        """Whether an assumption of smooth motion replaces the IMU."""
+        """True if the IMU is not a real sensor, but stands for an assumption of smooth motion."""
         return self.imu is not None and self.imu.assumed
 
     def only(self, *names: str, **fields: Any) -> Rig:
-        """The same rig with no other sensors than these, and with other `fields` of its own."""
+        """A copy with only the sensors `names`, and with the fields of `Rig` in `fields` replaced."""
         return dataclasses.replace(self, sensors={n: s for n, s in self.sensors.items() if n in names}, **fields)
 
     def without(self, *names: str, **fields: Any) -> Rig:
-        """The same rig without these sensors, and with other `fields` of its own."""
+        """A copy without the sensors `names`, and with the fields of `Rig` in `fields` replaced."""
         return self.only(*(n for n in self.sensors if n not in names), **fields)
 
     def with_sensors(self, *changed: Sensor, **fields: Any) -> Rig:
-        """The same rig with `changed` sensors in place of those of their names, or added, and with other `fields`."""
+        """A copy with `changed` sensors added, or in place of those of the same name, and other `fields` of `Rig`."""
         return dataclasses.replace(self, sensors={**self.sensors, **by_name(*changed)}, **fields)
 
     def with_(self, part: str = "", /, **fields: Any) -> Rig:
-        """The same rig with some `fields` changed: of the sensor called `part`, of "settings", or of the rig itself.
+        """A copy with some `fields` changed: those of the sensor named `part`, of "settings", or (default) of the rig.
 
         For example rig.with_("cam0", intrinsics=icalib.fixed([458, 457, 367, 248])). The fields imu, cameras, lidars,
-        wheels and poses of a rig stand for all sensors of their kind. Raises RigError where there is no such sensor or
-        field, or a value is of another kind.
+        wheels and poses of the rig replace all sensors of that type. Raises RigError if the sensor or field does not
+        exist, or the value has another type.
         """
         if not part:
             return self._with_own(fields)

@@ -1,4 +1,4 @@
-"""Parameters of the scene: the target, its bodies, planes, and the frames of absolute poses."""
+"""Definitions of the parameters of the scene: target, its bodies, planes, and frames of pose and position sensors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from math import radians
 from icalib.sensors.parameter_spec import AXES, ParameterSpec
 from icalib.sensors.sensor import ROTATION, TRANSLATION
 
-# Ratio of true lengths of the target to those in the rig file.
+# True length / length in the rig file, of all lengths of the target.
 SIZE = ParameterSpec("size", 1, "nuisance", "", ("size",), 1e-2, 0.1)
-# Deviation of a body from its design: see `model.bodies.shape_basis`.
+# Out-of-plane deviation of a body from its design, second order in x, y; basis: `model.bodies.shape_basis`.
 BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
-# Deviations in the plane by printing and mounting, to second order. A rotation, a shift and the scale are left out: the
-# first two belong to the pose of the board, and the scale to its size.
+# In-plane deviations by printing and mounting, to second order in x, y. Rotation and translation are omitted, as they
+# belong to the pose of the board, and the scale, as it belongs to the size of the target.
 IN_PLANE_LABELS = ("stretch", "shear", "x_xx", "y_xx", "x_xy", "y_xy", "x_yy", "y_yy")
 SHAPE_LABELS = BOW_LABELS + IN_PLANE_LABELS
 SHAPE = ParameterSpec(
@@ -28,8 +28,8 @@ SHAPE = ParameterSpec(
     by_images=True,
     motion="show the target from more sides and closer",
 )
-# The prior sigma of scene parameters is wide, as nobody guesses the vertical, walls or frames. A direction in which
-# they move with a sensor then keeps the prior uncertainty of the sensor.
+# Scene parameters have a wide prior sigma, as users give no guess of the vertical, walls or frames. An unobservable
+# direction that moves a sensor and the scene together thus has the prior uncertainty of the sensor.
 TILT = ParameterSpec(
     name="tilt",
     size=2,
@@ -43,16 +43,17 @@ TILT = ParameterSpec(
     motion="turn the rig through larger angles, so that gravity shows on every axis",
     motion_on_wheels="drive over ramps",
 )
-# Tolerances of planes and frames are wide: unobservable directions are named by the sensors that they belong to.
+# Wide tolerances, so that an unobservable direction is attributed to a sensor and not to a plane or frame.
 PLANE = ParameterSpec(
     "plane", 3, "plane", "", ("turn 1", "turn 2", "distance"), (radians(10.0), radians(10.0), 0.5), 10.0
 )
 FRAME_ROTATION = ParameterSpec("frame_rotation", 3, "rotation", "rad", AXES, radians(10.0), 10.0)
 FRAME_YAW = ParameterSpec("frame_yaw", 1, "vector", "rad", ("frame_yaw",), radians(10.0), 10.0)
 FRAME_TRANSLATION = ParameterSpec("frame_translation", 3, "vector", "m", AXES, 0.5, 10.0)
-# Slow offset of fixes in it, at one instant. Wide, as random walks of an hour may reach metres.
+# Slowly varying offset of position fixes in that frame, at one instant. The prior is wide: the random walk of an hour
+# may reach metres.
 FRAME_OFFSET = ParameterSpec("frame_offset", 3, "vector", "m", AXES, 0.5, 10.0)
-FRAME = (FRAME_ROTATION, FRAME_TRANSLATION)  # pose of a pose sensor's frame in the world
-LEVEL_FRAME = (FRAME_YAW, FRAME_TRANSLATION)  # the same of a frame that is as level as the world
-BODY = (ROTATION, TRANSLATION)  # pose of one of several bodies of a target in the scene
+FRAME = (FRAME_ROTATION, FRAME_TRANSLATION)  # pose of a pose sensor's static frame in the world frame
+LEVEL_FRAME = (FRAME_YAW, FRAME_TRANSLATION)  # the same for a frame whose z axis is vertical, as that of the world
+BODY = (ROTATION, TRANSLATION)  # pose of a body, if the target has several
 SCENE = (SIZE, TILT, SHAPE, PLANE, FRAME_YAW, FRAME_OFFSET, *FRAME, *BODY)

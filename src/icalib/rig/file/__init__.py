@@ -1,4 +1,4 @@
-"""rig.yaml -> Rig, and a Rig -> plain data that loads back. The format: docs/rig-file.md."""
+"""Rig files: reading, and conversion of a `Rig` to plain data for writing. The format: docs/rig-file.md."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from icalib.sensors.sensor import Lack, Sensor
 
 
 def load_rig(path: str | Path) -> Rig:
-    """Read a rig file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
+    """Read the rig file at `path`. Raises RigError with file, line and field, what is wrong and what to do."""
     file = Path(path)
     return dataclasses.replace(_rig(read_yaml(file)), path=file)
 
 
 def rig_from_dict(plain: dict[str, Any], source: str) -> Rig:
-    """The rig that `rig_to_dict` gave as `plain`; `source` names it in sentences. Raises RigError as `load_rig`."""
+    """The rig from the output of `rig_to_dict`. source: its name in messages. Raises RigError as `load_rig`."""
     return _rig(parse_yaml(yaml.safe_dump(plain, sort_keys=False), source))
 
 
@@ -54,7 +54,7 @@ def _sensor(name: str, value: YamlValue) -> Sensor:
 
 
 def _place(root: YamlValue, lack: Lack) -> YamlValue:
-    """The field that lacks something, or the last one above it that the file has."""
+    """The field that `lack` concerns; if the file does not have it, the innermost enclosing one."""
     for name in lack.where:
         fields = root.entries()
         if name not in fields:
@@ -64,9 +64,9 @@ def _place(root: YamlValue, lack: Lack) -> YamlValue:
 
 
 def load_target(path: str | Path) -> Target:
-    """Read a target: a YAML file with the fields of the rig file's `target`, or one that has a `target` or `targets`.
+    """Read a target from a YAML file: the fields of a target, or a file with the field `target` or `targets`.
 
-    Raises RigError, one sentence naming file, line, field, what is wrong and what to do.
+    Raises RigError with file, line and field, what is wrong and what to do.
     """
     root = read_yaml(Path(path))
     has_its_own_field = {"target", "targets"} & set(root.entries())
@@ -74,8 +74,10 @@ def load_target(path: str | Path) -> Target:
 
 
 def rig_to_dict(rig: Rig) -> dict[str, Any]:
-    """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig. An empty path, as of a
-    rig for arrays, is left out, and loads back as that of the rig file's default."""
+    """`rig` as dicts, lists, numbers and text. Written as YAML or JSON, it loads as the same rig.
+
+    Empty paths of sensors (a rig for measurements in memory) are omitted, and load as the default path.
+    """
     sensors = {name: sensor.plain() for name, sensor in rig.sensors.items()}
     sensors = {name: {k: v for k, v in s.items() if (k, v) != ("path", "")} for name, s in sensors.items()}
     key = "targets" if isinstance(rig.target, Scene) else "target"

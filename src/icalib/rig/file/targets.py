@@ -1,4 +1,4 @@
-"""Targets in a rig file: `target`, or several by name under `targets`."""
+"""Parses targets of a rig file: the field `target`, or several by name in the field `targets`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 from icalib.geometry.targets.families import family_name
 
-# type -> fields that must be there, and those that may
+# type -> required fields, optional fields
 _FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "aprilgrid": (("rows", "cols", "tag_size", "tag_spacing"), ("border_bits", "squares", "first_id", "family")),
     "charuco": (("squares_x", "squares_y", "square_size", "marker_size", "dictionary"), ("legacy", "inverted")),
@@ -19,15 +19,15 @@ _FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "circles": (("rows", "cols", "spacing", "diameter"), ("asymmetric",)),
     "markers": (("family", "size"), ("ids", "border_bits")),
 }
-_LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
+_LARGEST_TAG_M = 2.0  # a larger value is probably in millimetres
 _MOST_TAGS = 10_000
-_LARGEST_SIGMA = 0.2  # of a size that somebody measured; it is in per cent
+_LARGEST_SIGMA = 0.2  # relative; a larger value is probably in percent
 
 
 def target_or_targets(root: YamlValue) -> Target:
-    """What the file has under `target`, or under `targets`: all of them in one scene, the target itself if it is one.
+    """The target in the field `target` or `targets` of the file; several targets are combined into a `Scene`.
 
-    Raises RigError, one sentence naming file, line, field, what is wrong and what to do.
+    Raises RigError with file, line and field, what is wrong and what to do.
     """
     found = root.entries()
     if "target" not in found and "targets" not in found:
@@ -47,7 +47,7 @@ def target_or_targets(root: YamlValue) -> Target:
 
 
 def target_of(value: YamlValue) -> Target:
-    """One target from its fields. Raises RigError as `target_or_targets`."""
+    """One target from the mapping of its fields. Raises RigError as `target_or_targets`."""
     given = value.entries()
     if "type" not in given:
         value.fail(f"type is missing; add type: {', type: '.join(_FIELDS)}.")
