@@ -1,4 +1,4 @@
-"""From recordings to a calibration: this page is the algorithm."""
+"""The calibration pipeline: reading, initial guess, optimization, assessment of the result."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from icalib.rig.file import load_rig
 from icalib.sensors.camera.read import has_corners
 from icalib.validation import assess, stated_words, visited
 
-READING_SHARE, IMAGES_SHARE = 0.1, 0.8  # of the time, without images and with
-SHORTEST_S = 1.0  # of the IMU, below which nothing can be found; clocks need four seconds
-Progress = Callable[[str, float], None]  # what is being done, and how much of the whole is behind, 0 to 1
+READING_SHARE, IMAGES_SHARE = 0.1, 0.8  # of the total time, without and with image processing
+SHORTEST_S = 1.0  # shortest IMU stream that is accepted; time offsets need 4 s
+Progress = Callable[[str, float], None]  # called with the stage and the completed fraction, 0 to 1
 
 
 def calibrate(
@@ -45,11 +45,13 @@ def calibrate(
     start_s: float = 0.0,
     end_s: float = inf,
 ) -> Calibration:
-    """Calibrates every sensor of `rig` from `recording`, or jointly from several of the same rig.
+    """Calibrates all sensors of `rig` from `recording`, or jointly from several recordings of the same rig.
 
-    All may be paths. Of each recording the part from start_s to end_s after its start is used. Raises CalibrationError,
-    one sentence; where there are several recordings it names the one meant. Its `__notes__` say what was left out or
-    repaired before.
+    rig: a Rig, or the path of a rig file. recording: opened recordings, or paths. start_s, end_s: used part of each
+    recording, in seconds from its start. progress: called with the stage and the completed fraction.
+
+    Raises CalibrationError; if there are several recordings, the message names the one concerned. Its `__notes__` list
+    data that were rejected or repaired before.
     """
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
     check_complete(rig)
@@ -77,13 +79,14 @@ def measure(
     start_s: float = 0.0,
     end_s: float = inf,
 ) -> list[Measurements]:
-    """What each recording holds of the sensors of `rig`, for `calibrate_measurements`. Raises as `calibrate` does."""
+    """Reads and checks the data of all sensors of `rig`, one `Measurements` per recording, for
+    `calibrate_measurements`. Parameters and errors as `calibrate`."""
     check_complete(rig)
     return _measure_all(rig, open_all(recording, start_s, end_s), progress)
 
 
 def _reading_share(rig: Rig, opened: Mapping[str, Recording]) -> float:
-    """Of the time of a calibration, what reading takes."""
+    """Expected fraction of the calibration time that reading takes, for the progress display."""
     seeing = rig.cameras if rig.has_target else ()
     pictured = any(not has_corners(r, c) for r in opened.values() for c in seeing)
     return IMAGES_SHARE if pictured or any(c.tracks_images for c in rig.cameras) else READING_SHARE
@@ -104,7 +107,7 @@ def _measure_all(rig: Rig, opened: Mapping[str, Recording], progress: Progress) 
 
 
 def _measure(rig: Rig, recording: Recording, progress: Progress) -> Measurements:
-    """What the recording holds of each sensor; corners and feature tracks are found in images where it holds these."""
+    """The streams of all sensors. If a camera recorded images, its target corners or feature tracks are detected."""
     names = [c.name for c in rig.cameras]
     progress("reading", 0.0)
 
@@ -128,9 +131,11 @@ def calibrate_measurements(
     progress: Progress = lambda *_: None,
     on_visit: Callable[[Visited], None] | None = None,
 ) -> Calibration:
-    """As `calibrate`, from measurements in memory. Those without a name are called by their number. `on_visit` is told
-    of each state that the solver looked for a step from. Raises CalibrationError as `calibrate` does, and where
-    a sensor of the rig was not measured."""
+    """As `calibrate`, from measurements in memory. Measurements without a name are numbered.
+
+    on_visit: called with each state from which the solver computes a step. Raises CalibrationError as `calibrate`, and
+    if a sensor of the rig has no stream.
+    """
     given = [measurements] if isinstance(measurements, Measurements) else measurements
     if not given:
         raise RecordingError("no recording was given; give at least one.")
@@ -139,7 +144,7 @@ def calibrate_measurements(
     recordings = [without_jumps(rig, streams_of_rig(rig, m)) for m in recordings]
     for one in recordings:
         _refuse_short(one)
-    # The kernels have threads of their own; those of BLAS beside them double the time.
+    # Kernels run in several threads; additional BLAS threads would double the time.
     with threadpool_limits(limits=1, user_api="blas"):
         try:
             return _calibrate(rig, recordings, progress, on_visit)
@@ -185,7 +190,7 @@ def _calibrate(
 
 
 def _refuse_no_numbers(result: Calibration) -> None:
-    """Values of impossible size overflow somewhere; what comes of it must not pass for a result."""
+    """Raises EstimationError for an estimate that is not finite or a NaN sigma: implausible input values overflow."""
     for group in result.groups:
         if not np.isfinite(group.value).all() or np.isnan(group.std).any():
             raise EstimationError(
@@ -195,7 +200,7 @@ def _refuse_no_numbers(result: Calibration) -> None:
 
 
 class _Clock:
-    """Wall time by stage."""
+    """Stopwatch: wall time [s] of each stage."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
@@ -208,7 +213,7 @@ class _Clock:
 
 
 class _StepProgress:
-    """Progress of the solver: each step goes part of the way that is left."""
+    """Progress display of the solver. The number of steps is unknown: each adds 12 % of the distance left to 0.9."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress, self._done = progress, 0.1
