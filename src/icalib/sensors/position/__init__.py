@@ -1,1 +1,1 @@
-"""A sensor that gives its own position and no orientation: a GNSS antenna, a total station's prism, a UWB tag."""
+"""A sensor that measures its position and no orientation: a GNSS antenna, a total station's prism, a UWB tag."""

@@ -1,4 +1,4 @@
-"""What a result keeps and says of position sensors: residuals, noise, errors that last, and scales of time."""
+"""Position sensors in a result: residuals, notes on noise and time scales, warnings of correlated errors."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from icalib.sensors.position.spec import MESSAGES, PositionSensor
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.position.walk_factor import SLOW_OFFSET
 
-# Correlation of a residual with the one before, above which errors last, and the same in standard errors. White noise
-# leaves 0 or less. With 0.1 the standard deviations of a lever arm were 1.4 times too small.
+# Correlation of successive residuals above which a warning is given: its value, and its value in standard errors. White
+# noise leaves 0 or less. At 0.1 the standard deviations of a lever arm were 1.4 times too small.
 MIN_CORRELATION, MIN_CORRELATION_SIGMAS = 0.1, 3.0
-# Seconds by which clocks of satellite systems and of computers differ: GPS time is ahead of UTC by 18 s since 2017, and
-# behind TAI by 19 s. Source: IERS Bulletin C.
+# Differences between time scales [s]: GPS time is ahead of UTC by 18 s since 2017, and behind TAI by 19 s. Source: IERS
+# Bulletin C.
 SCALES = {18.0: "GPS time and UTC", 19.0: "TAI and GPS time", 37.0: "TAI and UTC"}
-SAME_SCALE_S = 0.5  # about one of them: receivers and drivers are not later than that
-# Axes of a levelled frame of GNSS; in others they are x, y and z.
+SAME_SCALE_S = 0.5  # largest distance of a time offset from one of SCALES: receivers and drivers have smaller delays
+# Names of the residuals' axes: x, y and z of the sensor's frame, which are east, north and up for GNSS.
 LABELS = {"horizontal": ("east", "north"), "vertical": ("up",)}
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
-    """Of each position sensor, along the axes of its frame."""
+    """Residuals of each position sensor, along the axes of its frame."""
     for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
         yield row_record("positions", factor.rows(rows, found.outcome.state), timeline, LABELS)
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """How many fixes are in use, their noise, and scales of time."""
+    """Sentences on the number of fixes in use, their noise, and time offsets that are differences of time scales."""
     del timeline
     for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
         sensor, stream = inputs.sensor(factor.name), inputs.stream(factor.name)
@@ -53,7 +53,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
 
 
 def _largest(factor: PositionFactor, rows: Whitened) -> float:
-    """The largest residual of an outlier [m]."""
+    """Norm [m] of the largest residual among the outliers; 0 if there is none."""
     return float(np.linalg.norm(factor.raw(rows)[~factor.used], axis=1).max(initial=0.0))
 
 
@@ -72,7 +72,7 @@ def _noise(sensor: PositionSensor, stream: PositionStream, noise: PositionNoise)
 
 
 def scale_of_time(name: str, offset: float) -> Iterator[str]:
-    """A sentence where a time offset [s] is that between two scales of time."""
+    """A sentence if the time offset [s] is about the difference between two time scales, see `SCALES`."""
     for seconds, scales in SCALES.items():
         if abs(abs(offset) - seconds) < SAME_SCALE_S:
             beyond = abs(offset) - seconds
@@ -83,7 +83,7 @@ def scale_of_time(name: str, offset: float) -> Iterator[str]:
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where errors of fixes last, so that they count for less than their number."""
+    """A sentence for each sensor whose successive residuals are correlated, so that its sigmas are too small."""
     for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
         whitened = rows.residual[factor.used]
         correlation = lag_one_correlation(whitened)
@@ -100,7 +100,7 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
 
 
 def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> str | None:
-    """A sentence where fixes are off by more than the rig file or the recording states."""
+    """A sentence if the residuals are larger than the stated noise predicts, else None."""
     del is_noise
     if excess(f) == 1.0:
         return None
@@ -114,6 +114,6 @@ def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def length(sensor: PositionSensor, rig: Rig) -> str | None:
-    """What shows how long a metre is."""
+    """The measurements of this sensor that make the metric scale observable, as words of a sentence."""
     del rig
     return f"the positions of {sensor.name}"

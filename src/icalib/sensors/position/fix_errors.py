@@ -1,14 +1,15 @@
-"""What residuals show of the errors of fixes.
+"""Outliers, bursts of wrong fixes, and a slow random walk, found in the residuals of fixes.
 
-Some fixes do not fit the trajectory: single ones, and bursts in which consecutive fixes are off by the same metres,
+Some fixes do not fit the trajectory. They are single, or they come in bursts: consecutive fixes with a common offset,
 as between buildings.
 
-The first pass bounds their influence by Huber's loss, which is convex. Each later pass rejects them by their residuals
-where it begins: least squares of the rest, the scale by the median (reweighted least squares; Rousseeuw and Leroy,
-Robust Regression and Outlier Detection, 1987, section 1.2). A rejected fix is tested again before each pass.
+The first pass bounds their influence by Huber's loss, which is convex. Each later pass begins by rejecting fixes with
+large residuals, and is a least-squares fit to the rest. The median of the residuals gives their scale (reweighted
+least squares; Rousseeuw and Leroy, Robust Regression and Outlier Detection, 1987, section 1.2). A rejected fix is
+tested again before each pass.
 
-A long burst pulls the trajectory to itself, so that its own residuals are small. But the IMU does not let the
-trajectory jump between neighbouring fixes: where the burst begins and ends, residuals step by its whole offset.
+A long burst pulls the trajectory towards it, so that its residuals are small. The IMU does not let the trajectory jump
+between neighbouring fixes. Residuals therefore step by the whole offset at the begin and at the end of the burst.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ from scipy.stats import chi2
 
 from icalib.sensors.position.read.outliers import MAX_GAP_STEPS, MIN_OUTLIER_M, MIN_STEP_M
 
-MIN_STEP_SIGMAS = 6.0  # a smaller step of the residuals may be noise: 1 of 10^8 is larger
-STRUCTURE_LAG_S = 1.0  # the trajectory absorbs most of errors that are much slower
+MIN_STEP_SIGMAS = 6.0  # of a step of the residuals: noise exceeds it in 1 of 10^8 steps
+STRUCTURE_LAG_S = 1.0  # longest lag: over longer ones the trajectory absorbs most of the slow errors
 
 
 def outliers_of(whitened: np.ndarray, raw: np.ndarray, deviations: float) -> np.ndarray:
-    """(n,) bool: fixes that are outliers by their residuals, whitened (n, 3) and raw (n, 3) m.
+    """(n,) bool: True for outliers, by the residuals of the fixes, whitened (n, 3) and raw (n, 3) m.
 
-    Horizontal and vertical residuals are compared with their own medians, so that the size of the noise need not be
-    known. The limit is what a standard normal number exceeds as rarely as `deviations`.
+    Horizontal and vertical residuals are scaled by the median of each group, so that the size of the noise need not be
+    known. deviations: limit in standard deviations of a normal variable. The limit on chi^2 has the same probability.
     """
     rare, found = 2.0 * ndtr(-deviations), np.zeros(len(whitened), dtype=bool)
     for columns, freedom in ((slice(0, 2), 2), (slice(2, 3), 1)):
@@ -39,10 +40,11 @@ def outliers_of(whitened: np.ndarray, raw: np.ndarray, deviations: float) -> np.
 
 
 def bursts_of(seconds: np.ndarray, raw: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(n,) bool: fixes at `seconds` (n,) that steps of the residuals separate from most others. raw, sigma (n, 3) m:
-    residuals, and their standard deviations up to a common factor.
+    """(n,) bool: True for fixes at `seconds` (n,) in bursts, which begin and end with a step of the residuals. raw,
+    sigma (n, 3) m: residuals, and their standard deviations up to a common factor.
 
-    The steps add up to the offset of each fix from the first. Between gaps, offsets near the median are right.
+    The sum of the steps gives the offset of each fix from the first one. Between two gaps, fixes with an offset more
+    than MIN_STEP_M from the median offset are in a burst.
     """
     wrong, dt = np.zeros(len(seconds), dtype=bool), np.diff(seconds)
     if not len(dt):
@@ -59,10 +61,11 @@ def bursts_of(seconds: np.ndarray, raw: np.ndarray, sigma: np.ndarray) -> np.nda
 
 
 def random_walk_of(seconds: np.ndarray, raw: np.ndarray) -> float:
-    """Density [m/sqrt(s)] of the random walk that residuals `raw` (n, 3) m at `seconds` (n,) have beside white noise;
-    NaN for those that do not count. It is too small by a fifth, as the trajectory absorbs some of a walk.
+    """Density q [m/sqrt(s)] of the random walk in residuals `raw` (n, 3) m at `seconds` (n,), beside white noise.
+    Residuals that are NaN are ignored. The result is too small by a fifth, as the trajectory absorbs some of a walk.
 
-    By the structure function D(h) = <(r(t + h) - r(t))^2> = 2 sigma^2 + q^2 h, between one fix and about a second.
+    q follows from the structure function D(h) = <(r(t + h) - r(t))^2> = 2 sigma^2 + q^2 h, at the lags h of one fix and
+    of STRUCTURE_LAG_S.
     """
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else STRUCTURE_LAG_S
     longer = max(2, round(STRUCTURE_LAG_S / step))
@@ -73,5 +76,5 @@ def random_walk_of(seconds: np.ndarray, raw: np.ndarray) -> float:
 
 
 def rms(x: np.ndarray) -> float:
-    """Root mean square of all of `x`; 0 of none."""
+    """Root mean square of all entries of `x`; 0 if `x` is empty."""
     return float(np.sqrt(np.mean(x**2))) if x.size else 0.0

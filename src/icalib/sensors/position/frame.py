@@ -1,6 +1,7 @@
-"""The static frame of a position sensor, as one recording has it: its own, or that of the target or another sensor.
+"""The static frame in which a position sensor reports, in one recording.
 
-The frame of the target has no position in the world: its origin is that of the world.
+It is a frame of this sensor, of another sensor, or of the target. The origin of the target's frame is that of the
+world, so that it has no position parameters.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from icalib.sensors.sensor import TARGET_FRAME
 
 
 def frame_owner(sensor: PositionSensor) -> str:
-    """Name of the sensor whose frame it reports in, or `TARGET_FRAME`."""
+    """Name of the sensor in whose frame `sensor` reports: its own name, another sensor's, or `TARGET_FRAME`."""
     return sensor.shared_frame or sensor.name
 
 
 @dataclass(frozen=True)
 class PositionFrame:
-    """rotation R_world_frame (3, 3), position p_world_frame (3,) m; keys: parameter blocks of the rotation, and of the
-    position where it is one."""
+    """Pose of the frame in one recording: rotation R_world_frame (3, 3), position p_world_frame (3,) m. keys: parameter
+    block of the rotation, then that of the position; the target's frame has the first only."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -35,7 +36,7 @@ class PositionFrame:
 
     @classmethod
     def of(cls, owner: str, recording: int, values: Mapping[Key, np.ndarray]) -> PositionFrame:
-        """The frame of `owner`, see `frame_owner`, in a recording, by the `values` of a state."""
+        """The frame of `owner` (see `frame_owner`) in a recording, from the `values` of a state."""
         if owner == TARGET_FRAME:
             key = in_recording(BOARD, recording), TILT.name
             return cls(values[key], np.zeros(3), (key,))
@@ -46,16 +47,16 @@ class PositionFrame:
         return cls(rotation, values[origin], (turn, origin))
 
     def columns(self, layout: Layout) -> np.ndarray:
-        """(c,) calibration columns of its parameters, -1 where they are fixed."""
+        """(c,) columns of the frame's parameters among the calibration parameters; -1 for fixed ones."""
         return np.concatenate([layout.columns(*key) for key in self.keys])
 
     def inward(self, position: np.ndarray) -> np.ndarray:
-        """(n, 3) m in the frame, of positions (n, 3) in the world."""
+        """(n, 3) m: world positions (n, 3) m, expressed in this frame."""
         return (position - self.position) @ self.rotation
 
     def jacobian(self, inside: np.ndarray) -> np.ndarray:
-        """(n, 3, c) of `inward`, whose value is `inside` (n, 3), by the parameters of the frame. A rotation moves on
-        the right, the tilt of the target on the left, about x and y of the world."""
+        """(n, 3, c) derivatives of `inward`, whose value is `inside` (n, 3), by the parameters of the frame. A rotation
+        is perturbed on the right; the tilt of the target on the left, about x and y of the world."""
         J = so3.hat_many(np.ascontiguousarray(inside))
         name = self.keys[0][1]
         if name == TILT.name:

@@ -1,4 +1,4 @@
-"""Position sensors in a recording: fixes of satellites, points, RTKLIB's solutions and tables."""
+"""Topics and tables of a recording that can be position sensors: NavSatFix, PointStamped, RTKLIB files, tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from icalib.tools.inspection.kinds import KindInspector
 
 
 class PositionInspector(KindInspector):
-    """A point may be anything, such as a goal that somebody clicked on."""
+    """See `KindInspector`. Drafts comment these sensors out: a point may be anything, such as a goal that somebody
+    clicked on."""
 
     sensor: ClassVar[type[Sensor]] = PositionSensor
     topic_kinds: ClassVar[tuple[str, ...]] = ("navsat", "point", "position")

@@ -1,4 +1,4 @@
-"""How a position sensor enters the problem: by its fixes, and by the frame in which it reports them."""
+"""Model of a position sensor in the estimation problem: its frame, slow offset, noise and factors."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from icalib.sensors.position.spec import LEVELLED, PositionSensor
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.position.walk_factor import OffsetWalkFactor, knot_entries
 
-FIRST_NOISE_M = 0.05  # of each axis where nothing is stated: between differential and carrier-phase fixes
-# m, or times the standard deviation of the weights: keeps the weights of fixes without any noise finite.
+FIRST_NOISE_M = 0.05  # of each axis if no noise is stated: between that of differential and of carrier-phase fixes
+# Smallest entry of `PositionNoise` (m, or a factor): keeps the weights of fixes without any noise finite.
 LEAST_NOISE = 1e-6
 
 
 class PositionModel(SensorModel[PositionSensor, PositionNoise]):
-    """Noise that is not stated is estimated by degrees of freedom, horizontal and vertical apart. The trajectory
-    absorbs some of it, so that the first estimate is a rough one, and there are two."""
+    """See `SensorModel`. Noise that is not stated is estimated as chi^2 over degrees of freedom, separately for
+    horizontal and vertical residuals. The trajectory absorbs some of the noise, so that two passes estimate it."""
 
     keyframes = "positions"
 
     def scene_entries(self, sensor: PositionSensor, rig: Rig, n_recordings: int) -> list[Entry]:
-        """The frame of its fixes in the world of each recording, unless it shares one: its yaw and origin where both
-        are levelled. Then the knots of their slow offset."""
+        """Entries of the sensor's frame in each recording, unless it shares a frame; then the knots of the slow offset.
+        A frame has yaw and origin if it and the world are levelled, else rotation and origin."""
         knots = knot_entries(sensor.name, n_recordings) if sensor.position_random_walk else []
         if not sensor.has_frame:
             return knots
@@ -42,11 +42,13 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
     def keyframe_times(
         self, sensor: PositionSensor, stream: PositionStream, values: dict[Key, np.ndarray], rig: Rig
     ) -> np.ndarray:
-        """None where the motion is assumed to be smooth: other sensors show it, and place keyframes densely enough."""
+        """Empty if the motion is assumed to be smooth: other sensors then place keyframes densely enough. Otherwise
+        see `SensorModel`."""
         return np.zeros(0) if rig.assumes_motion else super().keyframe_times(sensor, stream, values, rig)
 
     def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
-        """In metres if the rig file states a number, else 1: times the standard deviations of `weighted`."""
+        """The stated noise [m] if the rig file has a number; else 1, a factor on the standard deviations of
+        `weighted`."""
         size = sensor.position_noise
         first = 1.0 if size == "messages" or size is None else size
         return PositionNoise(first, first, settings.loss, settings.loss_scale)
@@ -69,21 +71,21 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
     def factors(
         self, sensor: PositionSensor, stream: PositionStream, noise: PositionNoise, at: Pass
     ) -> Iterator[PositionFactor | OffsetWalkFactor]:
-        """One of all fixes, outliers rejected by their residuals where the pass begins, and one of their slow
-        offset."""
+        """The factor of all fixes, and that of their slow offset if the rig file states one. Fixes whose residuals at
+        the begin of the pass are outliers are rejected."""
         assert at.motion is not None
         density, deviations = sensor.position_random_walk, at.rig.settings.outlier_std
         factor = PositionFactor.build(weighted(sensor, stream), at.motion, noise, at.layout, frame_owner(sensor))
         factor = factor.with_slow_offset(stream, density) if density else factor
-        # Where the first pass begins, the trajectory follows the fixes, and shows no outliers.
+        # The trajectory at the begin of the first pass follows the fixes, so that residuals show no outliers.
         yield factor if at.coarse or deviations <= 0.0 else factor.without_outliers(at.state, deviations)
         if density:
             yield OffsetWalkFactor.build(stream, at.motion, density, at.layout)
 
 
 def weighted(sensor: PositionSensor, stream: PositionStream) -> PositionStream:
-    """The stream with covariances as the noise is counted in: those of the recording, unless the rig file states the
-    noise. Without either FIRST_NOISE_M of each axis."""
+    """The stream with the covariances that `PositionNoise` multiplies. They are empty if the rig file states the noise
+    in metres; else those of the recording, or FIRST_NOISE_M of each axis if it has none."""
     n = len(stream.stamps_ns)
     if isinstance(sensor.position_noise, float):
         return replace(stream, covariance=np.zeros((0, 3, 3)))

@@ -1,11 +1,11 @@
-"""The factor of a position sensor: each fix at its own instant against the trajectory of the IMU.
+"""The factor of a position sensor: difference between the trajectory of the IMU and each fix.
 
     e = R_world_frame^T (p_world_imu + R_world_imu p_imu_sensor - p_world_frame) - p_frame_sensor
 
-at the instant of the fix on the IMU's clock. The trajectory is carried to that instant by the IMU's readings; fixes are
-never interpolated. Parameters: the sensor's blocks translation (p_imu_sensor) and time_offset; of its frame in each
-recording frame_yaw or frame_rotation, and frame_translation, or the tilt of the target: see `frame`. A slow offset of
-the fixes adds to e: see `walk_factor`.
+at the instant of the fix on the IMU's clock. The IMU's readings propagate the trajectory to that instant; fixes are
+never interpolated. Parameters: translation (p_imu_sensor) and time_offset of the sensor, and those of its frame in each
+recording. These are frame_yaw or frame_rotation with frame_translation, or the tilt of the target: see `frame`. A slow
+offset of the fixes adds to e: see `walk_factor`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from icalib.sensors.position.frame import PositionFrame
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.position.walk_factor import OffsetWalk
 
-# Fixes further from all keyframes are left out. The noise of an accelerometer of 0.01 m/s^2/sqrt(Hz), a poor one, moves
-# a position by 1 mm over this time; the row does not count it.
+# Fixes further from every keyframe are left out, because residuals neglect the propagated IMU noise. A poor
+# accelerometer, of 0.01 m/s^2/sqrt(Hz), adds 1 mm to a position over this time.
 NEAR_KEYFRAME_S = 0.3
 
 
@@ -40,9 +40,9 @@ KINDS = {"horizontal": slice(0, 2), "vertical": slice(2, 3)}
 
 @dataclass(frozen=True)
 class PositionNoise:
-    """Standard deviations of x and y (`horizontal`) and of z (`vertical`) of the frame: times those of the stream's
-    covariances, or in metres where it has none. loss: robust loss of each whitened row, and where it bends, in
-    standard deviations."""
+    """Noise of fixes along x and y (`horizontal`) and z (`vertical`) of the frame: factors on the standard deviations
+    of the stream's covariances, or standard deviations [m] if the stream has none. loss: robust loss of each whitened
+    row; loss_scale: residual at which it departs from the square, in standard deviations."""
 
     horizontal: float
     vertical: float
@@ -51,15 +51,15 @@ class PositionNoise:
 
     @property
     def sizes(self) -> np.ndarray:
-        """(3,) of each row."""
+        """(3,) horizontal, horizontal, vertical."""
         return np.array([self.horizontal, self.horizontal, self.vertical])
 
 
 @dataclass(frozen=True)
 class PositionFactor(RowFactor):
-    """n fixes of one sensor. frame: whose frame they are in, see `frame_owner`; keyframe (n,): of each, in order;
-    whitening (n, 3, 3): W with W^T W the inverse of the covariance [1/m]; used (n,) bool: without outliers; walk: the
-    slow offset of the fixes, None without any."""
+    """n fixes of one sensor. frame: owner of their frame, see `frame_owner`; keyframe (n,): number of the keyframe of
+    each fix, increasing; whitening (n, 3, 3): W [1/m] with W^T W the inverse of the covariance; used (n,) bool: False
+    for outliers; walk: the slow offset of the fixes, None without any."""
 
     units: ClassVar[Mapping[str, str]] = {"horizontal": "m", "vertical": "m"}
 
@@ -82,8 +82,8 @@ class PositionFactor(RowFactor):
     def build(
         cls, stream: PositionStream, motion: EstimatedMotion, noise: PositionNoise, layout: Layout, frame: str
     ) -> PositionFactor:
-        """The fixes near keyframes and outside gaps of the IMU; their keyframes stay while the solver runs. The
-        covariances of `stream` are the weights: see `model.weighted`."""
+        """The factor of the fixes near keyframes and outside gaps of the IMU. The keyframe of each fix does not change
+        while the solver runs. The covariances of `stream` give the weights, see `model.weighted`."""
         state, (k, keyframe) = motion.state, motion.near_keyframes(stream, NEAR_KEYFRAME_S)
         whitening, used = stream.root[k] / noise.sizes[:, None], np.ones(len(keyframe), dtype=bool)
         return cls(
@@ -92,13 +92,13 @@ class PositionFactor(RowFactor):
         )  # fmt: skip
 
     def with_slow_offset(self, stream: PositionStream, density: float) -> PositionFactor:
-        """The same with an offset that is a random walk of this density [m/sqrt(s)]; stream: with all fixes."""
+        """This factor with a slow offset, a random walk of `density` [m/sqrt(s)]; stream: all fixes of the sensor."""
         walk, root = OffsetWalk.of(stream, self.seconds, density, self.layout), np.linalg.inv(self.whitening)
         covariance = root @ root.transpose(0, 2, 1) + walk.bridge_variance[:, None, None] * np.eye(3)
         return replace(self, whitening=np.linalg.inv(np.linalg.cholesky(covariance)), walk=walk)
 
     def without_outliers(self, state: State, deviations: float) -> PositionFactor:
-        """The same without fixes whose residuals at `state` are outliers, alone or in bursts."""
+        """This factor with `used` False for fixes whose residuals at `state` are outliers, single or in bursts."""
         out = output_at(self, state)
         raw = self.raw(out)
         wrong = outliers_of(out.residual, raw, deviations) | bursts_of(self.seconds, raw, self.raw_sigma())
@@ -126,7 +126,7 @@ class PositionFactor(RowFactor):
         return np.linalg.solve(self.whitening, out.residual[:, :, None])[:, :, 0]
 
     def raw_sigma(self) -> np.ndarray:
-        """(n, 3) m in the frame's axes."""
+        """(n, 3) standard deviations of `raw` in the frame's axes [m]."""
         return np.sqrt((np.linalg.inv(self.whitening) ** 2).sum(axis=2))
 
     def count(self, out: Whitened, kind: str) -> int:
@@ -149,7 +149,7 @@ class PositionFactor(RowFactor):
         return sum(self._of_recording(k, own, state, into) for k, own in parts)
 
     def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
-        """Adds the fixes `own`, of one recording."""
+        """Adds the fixes `own`, all of one recording, to `into`; returns their cost."""
         frame, keyframe = PositionFrame.of(self.frame, recording, state.values), self.keyframe[own]
         kinematics = Kinematics.of(self)
         at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
@@ -158,8 +158,8 @@ class PositionFactor(RowFactor):
         return self._add(rows, own, rows.on_intervals(keyframe, self.n_keyframes), columns, into)
 
     def _rows(self, own: slice, frame: PositionFrame, at: SensorPose, state: State, jacobians: bool) -> Rows:
-        """Rows of residuals (n, 3) m of the fixes `own`, by the calibration parameters of the sensor's pose, then those
-        of the frame, then the knots before and after each."""
+        """Residuals (n, 3) m of the fixes `own`, with derivatives by the keyframes, then the calibration parameters of
+        the sensor's pose, of the frame, and of the knots before and after each fix."""
         inside, walk = frame.inward(at.position), self.walk
         residual = inside - self.position[own]
         if walk is not None:
@@ -171,7 +171,8 @@ class PositionFactor(RowFactor):
         return rows_at(residual, (J_pose,), (at,), np.concatenate(J_own, axis=2))
 
     def _add(self, rows: Rows, own: slice, interval: np.ndarray, columns: np.ndarray, into: Into) -> float:
-        """Adds the rows `own`, outliers with weight 0. columns: those that all rows share."""
+        """Adds the rows `own`, outliers with weight 0, to `into`; returns their cost. columns: calibration columns that
+        all rows share; interval: number of the keyframe interval of each row."""
         W, used, cost = self.whitening[own], self.used[own], 0.0
         weighted = np.where(used[:, None, None], W, 0.0)
         whole = [(slice(0, len(used)), np.zeros(0, dtype=np.int64))]

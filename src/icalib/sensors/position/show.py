@@ -1,4 +1,4 @@
-"""What the report shows of position sensors: residuals over time, and a map of where fixes are off."""
+"""Sections of the report on position sensors: residuals over time, and a map of fixes with large residuals."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _residuals_of_positions(c: Calibration) -> list[RowResiduals]:
 
 
 def _map(c: Calibration, r: RowResiduals) -> Figure:
-    """The antenna's trajectory in the world from above, and the places of outliers."""
+    """The antenna's trajectory in the world from above, with the fixes off by more than OUTLIER_SIGMA."""
     at = c.trajectory
     path = at.position + at.rotation @ c.value(r.sensor, "translation")
     keep = thin(len(path), MAX_PATH_POINTS)

@@ -1,4 +1,4 @@
-"""A simulated position sensor reports where its antenna or prism is in a frame of its own, and not how it is turned."""
+"""A simulated position sensor: positions of its antenna or prism in a static frame, without orientation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ _POINT = "geometry_msgs/msg/PointStamped"
 
 @dataclass(frozen=True, eq=False)
 class PositionTruth:
-    """seconds (N,) on the IMU's clock of each stamp; position (N, 3) m: what is reported, without noise."""
+    """True values of N fixes. seconds (N,): instants on the IMU's clock; position (N, 3) m: p_frame_sensor without
+    noise."""
 
     seconds: np.ndarray
     position: np.ndarray
@@ -31,15 +32,17 @@ class PositionTruth:
 
 @dataclass(frozen=True, eq=False)
 class SimPositions(SimSensor):
-    """One true sensor that reports its position in a frame that stands at T_world_frame.
+    """A simulated sensor that reports its position in the frame T_world_frame (4, 4). Errors of a fix are the sum of:
 
-    Errors of a fix: white ones of position_noise [m] on x and y and vertical_noise on z, by default the same; and a
-    slow one of drift_noise [m], a Gauss-Markov process of correlation time drift_time_s, as multipath makes it. A share
-    outliers of the fixes is off by up to outlier_m on each axis. random_walk [m/sqrt(s)]: a random walk of each axis
-    that starts at 0. A share bursts of the time, in stretches of burst_s on average, all fixes of a stretch are off by
-    the same vector of burst_m / 2 to burst_m, as behind a building that hides the direct signal.
-    shared_frame: what the rig file says of the frame where it is one of the target or of another sensor; T_world_frame
-    must then be its pose.
+    - white noise of position_noise [m] on x and y, and vertical_noise on z (None: position_noise);
+    - a Gauss-Markov process of standard deviation drift_noise [m] and correlation time drift_time_s, as by multipath;
+    - a random walk of each axis of density random_walk [m/sqrt(s)], which starts at 0;
+    - outliers: the fraction of single fixes with an error of up to outlier_m on each axis;
+    - bursts: the fraction of time in which all fixes share one offset of burst_m / 2 to burst_m in length, as behind a
+      building that hides the direct signal. A burst lasts burst_s on average.
+
+    shared_frame: name of the target or sensor whose frame this is, "" for a frame of this sensor. T_world_frame must
+    then be the pose of that frame.
     """
 
     sensor_type: ClassVar[str] = "position"
@@ -77,7 +80,7 @@ class SimPositions(SimSensor):
         return {"T_world_frame": self.T_world_frame.tolist()}
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
-        """Its positions within the readings of the IMU."""
+        """Fixes within the span of the IMU's readings, noisy if the scene is, and their true values."""
         stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
         R, p, _ = scene.trajectory.pose_at(seconds)
         seen = p + R @ self.T_imu_sensor[:3, 3]
@@ -88,7 +91,7 @@ class SimPositions(SimSensor):
         return Report(PositionStream(self.name, stamps, seen, np.zeros((0, 3, 3))), truth)
 
     def _errors(self, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(N, 3) m at the instants (N,)."""
+        """(N, 3) m: errors of the fixes at `seconds` (N,)."""
         vertical = self.position_noise if self.vertical_noise is None else self.vertical_noise
         error = rng.standard_normal((len(seconds), 3)) * [self.position_noise, self.position_noise, vertical]
         if self.drift_noise:
@@ -106,7 +109,8 @@ class SimPositions(SimSensor):
         return error + self._bursts(seconds, rng) if self.bursts else error
 
     def _bursts(self, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(N, 3) m: good stretches and bursts alternate; the durations of both are exponentially distributed."""
+        """(N, 3) m: offsets in bursts, 0 between them. The durations of bursts, and of the times between, are
+        exponentially distributed."""
         error, t = np.zeros((len(seconds), 3)), seconds[0]
         while t < seconds[-1]:
             begin = t + rng.exponential(self.burst_s * (1.0 - self.bursts) / self.bursts)
@@ -131,7 +135,7 @@ class SimPositions(SimSensor):
         write_table(folder / "positions.csv", "t [ns],x [m],y [m],z [m]", stream.stamps_ns, stream.position)
 
     def bag_topic(self, stream: PositionStream, offset_ns: int) -> BagTopic:
-        """PointStamped."""
+        """The fixes as PointStamped messages, received `offset_ns` after their stamps."""
         return BagTopic(f"/{self.name}/position", _POINT, _messages(stream, offset_ns))
 
 
@@ -148,6 +152,6 @@ def _messages(stream: PositionStream, offset_ns: int) -> Iterator[BagEvent]:
 
 
 def _message(bag: BagWriter, stamp_ns: int, frame: str, position: np.ndarray) -> Any:
-    """position (3,) [m] in `frame`."""
+    """PointStamped message; position (3,) m in `frame`."""
     point = bag.make("geometry_msgs/msg/Point", *position.tolist())
     return bag.make(_POINT, bag.header(stamp_ns, frame), point)

@@ -41,15 +41,15 @@ _FIELDS = ("path", "topic", "coordinates", "frame", "position_noise", "position_
 
 @dataclass(frozen=True)
 class PositionSensor(ClockedSensor):
-    """Something that gives its own position in a fixed frame, and no orientation. Its axes are those of the body.
+    """A sensor that measures its position in a static frame, and no orientation. Its axes are those of the body.
 
-    coordinates: of a table, metric or geodetic (latitude, longitude, height); None: told by its header. frame:
-    levelled, z points up, its yaw and origin in the world are estimated (GNSS, total station); tilted, its whole
-    rotation is (UWB anchors); else the name of a sensor, or target, whose frame it shares: nothing is estimated of it.
-    position_noise [m]: standard deviation of each axis; "messages": the covariances of the
-    recording as they are; None: estimated from the residuals, the covariances of the recording as weights.
-    position_random_walk [m/sqrt(s)]: density of a slow offset of the fixes, of each axis; 0: none. least_status: worse
-    fixes are left out.
+    coordinates: of a table, metric or geodetic (latitude, longitude, height); None: the header of the table shows it.
+    frame: "levelled", z points up, yaw and origin in the world are estimated (GNSS, total station); "tilted", rotation
+    and origin are estimated (UWB anchors); else the name of a sensor, or "target", whose frame this sensor shares.
+    position_noise [m]: standard deviation of each axis; "messages": the covariances of the recording, unchanged; None:
+    estimated from the residuals, with the covariances of the recording as relative weights.
+    position_random_walk [m/sqrt(s)]: density of a slow offset of the fixes on each axis; 0: none. least_status: fixes
+    of a worse status are left out.
     """
 
     sensor_type: ClassVar[str] = "position"

@@ -1,4 +1,4 @@
-"""What a position sensor measured."""
+"""Measurements of a position sensor."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from icalib.sensors.stream import Stream, check
 
 @dataclass(frozen=True)
 class PositionStream(Stream):
-    """Positions of one sensor in its own fixed frame.
+    """Positions of one sensor in its static frame.
 
     stamps_ns (N,) int64, strictly increasing; position (N, 3) p_frame_sensor [m]; covariance (N, 3, 3) m^2 in the
-    frame's axes, as the recording states it, (0, 3, 3) where it states none.
+    frame's axes as the recording states it, or (0, 3, 3) if it states none.
     """
 
     sensor_type: ClassVar[str] = "position"
@@ -30,13 +30,13 @@ class PositionStream(Stream):
         check(stated, f"{self.name}: covariance must have shape ({n}, 3, 3), or (0, 3, 3) without any.")
 
     def some(self, kept: np.ndarray) -> PositionStream:
-        """The fixes in `kept` (N,) bool."""
+        """The stream with the fixes for which `kept` (N,) bool is True."""
         covariance = self.covariance[kept] if len(self.covariance) else self.covariance
         return replace(self, stamps_ns=self.stamps_ns[kept], position=self.position[kept], covariance=covariance)
 
     @property
     def root(self) -> np.ndarray:
-        """(N, 3, 3) W with W^T W the inverse of the stated covariance [1/m]; the identity where none is stated."""
+        """(N, 3, 3) W [1/m] with W^T W the inverse of the stated covariance; the identity if none is stated."""
         if not len(self.covariance):
             return np.tile(np.eye(3), (len(self.stamps_ns), 1, 1))
         return np.linalg.inv(np.linalg.cholesky(self.covariance))

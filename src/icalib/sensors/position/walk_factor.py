@@ -1,14 +1,14 @@
-"""A slow offset of the fixes: a random walk of each axis of the frame, by its values at knots.
+"""A slow offset of the fixes: a random walk of each axis of the frame, represented by its values at knots.
 
     b(t) = (1 - a) b_j + a b_(j+1),  a = (t - t_j) / S,  b_0 = 0        between knots t_j, S apart
     r_j = (b_(j+1) - b_j) / (q sqrt(S))                                q: density of the walk [m/sqrt(s)]
 
-The increments between knots are exactly those of a random walk. Between two knots a walk is a Brownian bridge: its
-variance q^2 S a (1 - a) about the line is added to that of each fix, its correlation is neglected (the FITC
-approximation of Gaussian processes; Snelson and Ghahramani 2006). The origin of the frame takes up b_0.
+The increments between knots are exactly those of a random walk. Between two knots a walk is a Brownian bridge. Its
+variance q^2 S a (1 - a) about the line is added to that of each fix, and its correlation is neglected (the FITC
+approximation of Gaussian processes; Snelson and Ghahramani 2006). The origin of the frame absorbs b_0.
 
-The knots are calibration parameters. A chain in which each keyframe holds an offset of its own would be exact, but its
-blocks would be larger for every rig.
+The offsets at knots are calibration parameters. An offset in the state of each keyframe would be exact, but it would
+enlarge the blocks of every rig.
 """
 
 from __future__ import annotations
@@ -32,27 +32,28 @@ from icalib.optim.state import Entry, Key, Layout, State
 from icalib.rig.scene import FRAME_OFFSET
 from icalib.sensors.position.stream import PositionStream
 
-# Knots of all recordings together: each costs 3 calibration parameters, in an hour at 5 Hz 7 MB. Over 60 s they are
-# 1.3 s apart, over an hour 75 s.
+# Knots of all recordings together. Each adds 3 calibration parameters, which take 7 MB for an hour at 5 Hz. Knots are
+# 1.3 s apart in a recording of 60 s, 75 s in one of an hour.
 MAX_KNOTS = 48
 MIN_KNOTS = 4  # in each recording
 SLOW_OFFSET = "slow offset"
 
 
 def knot_keys(sensor: str, recording: int, n_recordings: int) -> list[Key]:
-    """Blocks of the offset at all knots of one recording but the first, where it is 0."""
+    """Keys of the offsets at the knots of one recording, without the first knot, where the offset is 0."""
     count = max(MIN_KNOTS, MAX_KNOTS // n_recordings)
     frame = frame_of(sensor, recording)
     return [(f"{frame} at knot {j}", FRAME_OFFSET.name) for j in range(1, 1 + count)]
 
 
 def knot_entries(sensor: str, n_recordings: int) -> list[Entry]:
-    """Of the layout: the knots of all recordings."""
+    """Entries of the layout for the knots of all recordings."""
     return [FRAME_OFFSET.entry(owner) for k in range(n_recordings) for owner, _ in knot_keys(sensor, k, n_recordings)]
 
 
 class _Segment(NamedTuple):
-    """Between two knots. duration [s]; left None: the first knot, where the offset is 0."""
+    """Time between two knots. begin: s since the first stamp; duration [s]; left, right: keys of the offsets at the
+    knots; left is None for the first knot, where the offset is 0."""
 
     recording: int
     begin: float
@@ -63,8 +64,8 @@ class _Segment(NamedTuple):
 
 @dataclass(frozen=True)
 class OffsetWalk:
-    """The offset of n fixes. density: q [m/sqrt(s)]; segment (n,): number of the segment of each, in order; share (n,):
-    a; segments: of all recordings, in order."""
+    """The slow offset of n fixes. density: q [m/sqrt(s)]; segments: of all recordings, in order of time; segment (n,):
+    number of the segment of each fix, increasing; share (n,): a in 0 to 1, the position of each fix in its segment."""
 
     density: float
     segments: tuple[_Segment, ...]
@@ -74,8 +75,8 @@ class OffsetWalk:
 
     @classmethod
     def of(cls, stream: PositionStream, at: np.ndarray, density: float, layout: Layout) -> OffsetWalk:
-        """At fixes of a stream, `at` (n,) s since its first stamp. Knots are at equal distances from the first fix of a
-        recording to its last."""
+        """The offset at instants `at` (n,), s since the first stamp of `stream`. Knots are equally spaced from the
+        first fix of a recording to its last."""
         n_recordings = len(stream.joins_ns) + 1
         firsts = np.searchsorted(stream.stamps_ns, stream.joins_ns)
         segments: list[_Segment] = []
@@ -92,25 +93,25 @@ class OffsetWalk:
 
     @cached_property
     def columns(self) -> np.ndarray:
-        """(s, 6) calibration columns of the knots before and after each segment, -1 for the first knot."""
+        """(s, 6) calibration columns of the knots at the begin and end of each segment, -1 for the first knot."""
         none = np.full(3, -1)
         pairs = ((s.left, s.right) for s in self.segments)
         rows = [[none if key is None else self.layout.columns(*key) for key in pair] for pair in pairs]
         return np.array(rows).reshape(-1, 6)
 
     def knots(self, state: State) -> np.ndarray:
-        """(s, 2, 3) m: the offset before and after each segment."""
+        """(s, 2, 3) m: the offsets at the begin and end of each segment."""
         zero, values = np.zeros(3), state.values
         return np.array([[zero if s.left is None else values[s.left], values[s.right]] for s in self.segments])
 
     @property
     def bridge_variance(self) -> np.ndarray:
-        """(n,) m^2 of each axis about the line between knots."""
+        """(n,) m^2: variance of the walk about the line between knots at each fix, the same for each axis."""
         durations = np.array([s.duration for s in self.segments])[self.segment]
         return self.density**2 * durations * self.share * (1.0 - self.share)
 
     def offsets(self, own: slice, state: State) -> np.ndarray:
-        """(n, 3) m of the fixes `own`."""
+        """(n, 3) m: offsets of the fixes `own`."""
         before, after = self.knots(state)[self.segment[own]].transpose(1, 0, 2)
         share = self.share[own, None]
         return (1.0 - share) * before + share * after
@@ -121,7 +122,8 @@ class OffsetWalk:
         return np.concatenate([(1.0 - share) * np.eye(3), share * np.eye(3)], axis=2)
 
     def stretches(self, own: slice) -> Iterator[tuple[slice, np.ndarray]]:
-        """Fixes of `own` that share a segment, counted from its first, and the columns of the segment."""
+        """For each segment with fixes of `own`: the slice of these fixes, relative to own.start, and the calibration
+        columns (6,) of the segment."""
         segment = self.segment[own]
         edges = [0, *(np.flatnonzero(np.diff(segment)) + 1).tolist(), len(segment)]
         for a, b in zip(edges[:-1], edges[1:], strict=True):
@@ -131,8 +133,9 @@ class OffsetWalk:
 
 @dataclass(frozen=True)
 class OffsetWalkFactor(RowFactor):
-    """The increments of the offset of one sensor, a row for each segment. seconds (s,): of the ends of segments, on the
-    sensor's clock; interval (s,): between keyframes, that each row is added to, in order."""
+    """Random-walk prior on the slow offset of one sensor: the increment over each of s segments. seconds (s,): ends of
+    the segments, on the sensor's clock since its first stamp; interval (s,): number of the keyframe interval to which
+    each row is added, increasing."""
 
     units: ClassVar[Mapping[str, str]] = {SLOW_OFFSET: "m"}
 
@@ -143,7 +146,8 @@ class OffsetWalkFactor(RowFactor):
 
     @classmethod
     def build(cls, stream: PositionStream, motion: EstimatedMotion, density: float, layout: Layout) -> OffsetWalkFactor:
-        """Rows belong to keyframes at the ends of their segments, so that parts of a recording have their own."""
+        """Each row belongs to the keyframe interval at the end of its segment, so that a part of a recording contains
+        the rows of its segments."""
         walk, state = OffsetWalk.of(stream, np.zeros(0), density, layout), motion.state
         seconds = np.array([s.begin + s.duration for s in walk.segments])
         recording = np.array([s.recording for s in walk.segments])
@@ -162,7 +166,7 @@ class OffsetWalkFactor(RowFactor):
         return {SLOW_OFFSET: slice(0, 3)}
 
     def with_imu(self, imu: ImuData) -> OffsetWalkFactor:
-        """The same: it does not depend on the motion."""
+        """This factor unchanged: it does not depend on the motion."""
         del imu
         return self
 
@@ -178,7 +182,7 @@ class OffsetWalkFactor(RowFactor):
 
     @property
     def sigma(self) -> np.ndarray:
-        """(s,) m of the increments."""
+        """(s,) standard deviations of the increments [m]."""
         return self.walk.density * np.sqrt([s.duration for s in self.walk.segments])
 
     def raw(self, out: Whitened) -> np.ndarray:
@@ -186,7 +190,7 @@ class OffsetWalkFactor(RowFactor):
         return out.residual * self.sigma[:, None]
 
     def raw_sigma(self) -> np.ndarray:
-        """(s, 3) m."""
+        """(s, 3) standard deviations of `raw` [m]."""
         return np.tile(self.sigma[:, None], (1, 3))
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:

@@ -1,4 +1,5 @@
-"""Initial guess of position sensors: a trajectory with the IMU alone, or extrinsics, clock and frame on a known one."""
+"""Initial guess of position sensors: the trajectory from fixes and IMU, or lever arm, time offset and frame on a known
+trajectory."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ GUESSED_GROUPS = ("translation", "time_offset")
 
 
 class PositionInitializer(Initializer[PositionSensor]):
-    """The first position sensor gives the motion where no other kind does; all others are placed on it."""
+    """See `Initializer`. The first position sensor gives the trajectory if no other kind of sensor does. Position
+    sensors on a known trajectory get lever arm, time offset and frame."""
 
     def motion_rank(self, rig: Rig) -> int | None:
         """See `Initializer`. Positions need an IMU for the attitude, and a frame of their own for the world."""
@@ -61,14 +63,14 @@ class PositionInitializer(Initializer[PositionSensor]):
         return inputs, state, state.values
 
     def cleaned(self, recording: Measurements) -> Measurements:
-        """Without single wrong fixes: they would enlarge the estimated noise. Files are cleaned when they are read,
-        measurements in memory are not."""
+        """The recording without single wrong fixes, which would enlarge the estimated noise. Files are cleaned when
+        they are read; this cleans measurements that were made in memory."""
         return recording.with_streams(
             *(s.some(~single_wrong(s.seconds, s.position)) for s in recording.of(PositionStream))
         )
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[PositionSensor]) -> Values:
-        """See `Initializer`. Sensors with a frame of their own come first, as others may share it."""
+        """See `Initializer`. Sensors with a frame come first, because sensors without one may share it."""
         out: Values = {}
         for sensor in sorted(sensors, key=lambda s: not s.has_frame):
             out |= _on_motion(inputs, replace(state, values=state.values | out), sensor)
@@ -76,7 +78,7 @@ class PositionInitializer(Initializer[PositionSensor]):
 
     @staticmethod
     def _own_frames(rig: Rig) -> list[PositionSensor]:
-        """The sensors whose frame is their own."""
+        """The sensors that share no frame of another sensor or of the target."""
         return [s for s in rig.of(PositionSensor) if s.has_frame]
 
 
@@ -84,7 +86,8 @@ INITIALIZER = PositionInitializer()
 
 
 def _state_of_one(inputs: Inputs, extrinsics: KnownExtrinsics | None) -> State:
-    """The state of one recording, in the frame of the fixes; extrinsics: those that another recording has given."""
+    """The state of one recording, with the frame of the fixes as world; extrinsics: found in another recording, or
+    None."""
     assert inputs.imu is not None
     sensor = inputs.rig.of(PositionSensor)[0]
     known = extrinsics or _known_extrinsics(inputs, sensor)
@@ -100,8 +103,8 @@ def _state_of_one(inputs: Inputs, extrinsics: KnownExtrinsics | None) -> State:
 
 
 def _on_motion(inputs: Inputs, state: State, sensor: PositionSensor) -> Values:
-    """Lever arm, time offset and frames of one sensor on the trajectory of `state`. Of several recordings the one with
-    most fixes gives the lever arm, and the time offset unless the clock restarts."""
+    """Lever arm, time offset and frames of one sensor on the trajectory of `state`. The recording with most fixes gives
+    the lever arm, and the time offset unless the clock restarts."""
     recordings = [single_recording(inputs, k) for k in range(len(inputs.parts))]
     best = fullest_recording(inputs, sensor.name)
     found: dict[int, PlacedSensor] = {}
@@ -139,12 +142,13 @@ def _fix(inputs: Inputs, sensor: PositionSensor) -> Fix:
 
 
 def _is_levelled(inputs: Inputs, sensor: PositionSensor) -> bool:
-    """Whether its frame turns against the world about the vertical alone."""
+    """Whether the rotation of the sensor's frame in the world is a yaw alone."""
     return (frame_of(sensor.name, 0), FRAME_YAW.name) in {b.key for b in inputs.layout.blocks}
 
 
 def _frames(inputs: Inputs, sensor: PositionSensor, found: Sequence[tuple[np.ndarray, np.ndarray]]) -> Values:
-    """Blocks of the sensor's own frame in each recording: R_world_frame, p_world_frame; and no offset of the fixes."""
+    """Values of the sensor's frame in each recording, and zeros for the slow offset of the fixes. found: R_world_frame
+    (3, 3) and p_world_frame (3,) m of each recording. A shared frame has no values here."""
     out: Values = {}
     if sensor.position_random_walk:
         out |= {key: np.zeros(3) for k in range(len(found)) for key in knot_keys(sensor.name, k, len(found))}

@@ -37,21 +37,23 @@ class Fix:
 
     @cached_property
     def run(self) -> np.ndarray:
-        """(N,) int, the same for fixes that no step of the solution separates: differences of these hold no step."""
+        """(N,) int: number of the run of each fix. A run ends where the solution steps, so that differences within a
+        run contain no step."""
         at, _ = steps(self.t, self.position)
         return np.cumsum(np.bincount(at, minlength=len(self.t)))
 
     @property
     def triples(self) -> Triples:
-        """Of fixes about a second apart, no step of the solution between them."""
+        """Triples of fixes about a second apart, without a step of the solution between them."""
         found = triples_of(self.t)
         return found.some(self.run[found.i] == self.run[found.k])
 
 
 @dataclass(frozen=True)
 class WindowUnknowns:
-    """R_wg (3, 3): attitude of the IMU at `reference` s on its clock, in the frame of the fixes; gyro_bias (3,) rad/s,
-    accel_bias (3,) m/s^2; arm (3,) m, the lever arm p_imu_sensor; offset: t_imu - t_sensor [s]."""
+    """Unknowns of a window of time. R_wg (3, 3): attitude of the IMU at `reference` s on its clock, in the frame of the
+    fixes; gyro_bias (3,) rad/s; accel_bias (3,) m/s^2; arm (3,): lever arm p_imu_sensor [m]; offset: t_imu - t_sensor
+    [s]."""
 
     reference: float
     R_wg: np.ndarray
@@ -86,8 +88,8 @@ class WindowUnknowns:
 
 @dataclass(frozen=True)
 class WindowFit:
-    """misfit: RMS of the residuals over the RMS of the second differences of the fixes; covariance (13, 13) of the
-    unknowns, scaled by the residuals."""
+    """Result of `fit_window`. misfit: RMS of the residuals over the RMS of the second differences of the fixes;
+    covariance (13, 13) of the unknowns, scaled by the residuals."""
 
     at: WindowUnknowns
     misfit: float

@@ -20,8 +20,8 @@ MAX_JERK_PEAKS = 6  # candidates
 PEAK_SPACING_S = 0.3  # s: closer peaks lead to the same offset once it is refined
 MIN_JERK_CORRELATION = 0.3  # of a candidate
 MIN_SIGNAL_RANGE = 1e-4  # m/s^2 or m/s: less is rounding
-# Fixes whose third difference is larger than all of the IMU by this ratio, and than this limit, are no motion: a long
-# lever arm adds its own where the rig turns.
+# Third differences of fixes are rejected above this ratio to the largest of the IMU, and above this limit. The ratio
+# leaves room for a long lever arm, which adds to them when the rig turns.
 MAX_JERK_RATIO, MIN_JERK_LIMIT_M_S2 = 1.5, 5.0
 
 
@@ -42,8 +42,8 @@ def varies(signal: np.ndarray, known: np.ndarray) -> bool:
 
 
 def _of_fixes(fix: Fix) -> tuple[np.ndarray, np.ndarray]:
-    """Norms (m,) of third differences of the fixes over DIFFERENCE_STEP_S [m/s^2] at SIGNAL_RATE_HZ from 0 s on, and
-    where they are known (m,)."""
+    """Norms (m,) of third differences of the fixes over DIFFERENCE_STEP_S [m/s^2], at SIGNAL_RATE_HZ from 0 s on; and
+    (m,) bool: which of them are known."""
     t = fix.t
     usual = float(np.median(np.diff(t)))
     step = max(DIFFERENCE_STEP_S, usual)

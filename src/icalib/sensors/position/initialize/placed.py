@@ -33,8 +33,9 @@ MAX_POSITION_MISFIT = 0.3  # median residual over the spread of the fixes: anoth
 
 
 class PlacedSensor(NamedTuple):
-    """arm: p_imu_sensor (3,) m; R_world_frame (3, 3), p_world_frame (3,) m; offset: t_imu - t_sensor, since the
-    first stamps [s]; misfit: median norm of the residuals over that of the fixes about their median."""
+    """Result of `place`. arm (3,): p_imu_sensor [m]; R_wf (3, 3): R_world_frame; p_wf (3,): p_world_frame [m]; offset:
+    t_imu - t_sensor [s], each since its first stamp; misfit: median norm of the residuals over the median distance of
+    the fixes from their median."""
 
     arm: np.ndarray
     R_wf: np.ndarray
@@ -45,8 +46,8 @@ class PlacedSensor(NamedTuple):
 
 @dataclass(frozen=True)
 class KnownPlace:
-    """What the rig file states of a sensor. levelled: the rotation of its frame in the world is about z; arm (3,) m and
-    offset [s] as in `PlacedSensor`, frame: a shared one; None where they are unknown."""
+    """Known values of a sensor. levelled: the rotation of its frame in the world is about z; arm (3,) m and offset [s]
+    as in `PlacedSensor`; frame: the shared frame. None stands for an unknown value."""
 
     levelled: bool
     arm: np.ndarray | None = None
@@ -55,7 +56,7 @@ class KnownPlace:
 
     @property
     def turns(self) -> int:
-        """Parameters of the frame's rotation."""
+        """Number of parameters of the frame's rotation."""
         return 1 if self.levelled else 3
 
 

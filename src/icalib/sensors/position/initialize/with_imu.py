@@ -29,9 +29,10 @@ from icalib.sensors.position.initialize.triples import IntegratedReadings, recor
 
 FIRST_HALF_WINDOW_S = 10.0  # a gyroscope bias of 0.5 deg/s turns 5 degrees in it, which Kabsch tolerates
 MAX_HALF_WINDOW_S = 60.0  # of the largest window: biases are modelled as constant in it
-# A misfit above the first is tried again with east and north swapped, and is a swap if the misfit falls by the second.
+# A misfit above the first leads to a second fit with east and north swapped. They were swapped if that misfit is less
+# than the second number times the first misfit.
 SUSPICIOUS_MISFIT, MIRRORED_RATIO = 0.15, 0.5
-MAX_ACCELERATION_MISFIT = 0.3  # share of the second differences: those of another motion leave 0.4 or more
+MAX_ACCELERATION_MISFIT = 0.3  # largest `WindowFit.misfit`: fixes of another motion have 0.4 or more
 MAX_OFFSETS_TRIED = 4  # candidates, by correlation
 # Standard deviations between neighbouring windows: gyroscope drift over a window, and changes of biases.
 NEXT_ROTATION_SIGMA_RAD, NEXT_GYRO_BIAS_SIGMA_RAD_S, NEXT_ACCEL_BIAS_SIGMA_M_S2 = 0.1, 5e-3, 0.1
@@ -43,7 +44,7 @@ VELOCITY_STEP_S = 0.25  # of central differences: noise of 2 cm makes 6 cm/s
 
 @dataclass(frozen=True)
 class MotionWindow:
-    """begin, end: of the fixes in it, on the IMU's clock [s]."""
+    """A span of time with constant biases. begin, end: on the IMU's clock [s]; at: its estimated unknowns."""
 
     begin: float
     end: float
@@ -52,7 +53,8 @@ class MotionWindow:
 
 @dataclass(frozen=True)
 class PositionMotion:
-    """windows: in order, without a gap; best: fit of the largest of them; fix: the fixes."""
+    """Trajectory of the IMU in the frame of the fixes. windows: in order of time, without gaps; best: fit of the first
+    window, whose lever arm and time offset hold for all; fix: the fixes."""
 
     imu: ImuData
     fix: Fix

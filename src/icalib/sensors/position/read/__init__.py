@@ -1,4 +1,4 @@
-"""Tables, solutions of RTKLIB and messages -> checked streams of positions."""
+"""Reads tables, solutions of RTKLIB and messages into checked streams of positions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.sensor import TableLayout
 
 NAVSAT, POINT = "navsat", "point"
-OWN, OTHERS = (NAVSAT, POINT), ("pose", "odometry")  # kinds of topics that have positions
+OWN, OTHERS = (NAVSAT, POINT), ("pose", "odometry")  # kinds of topics with positions alone, and with poses
 MESSAGES = (
     MessageType("sensor_msgs/msg/NavSatFix", NAVSAT),
     MessageType("geometry_msgs/msg/PointStamped", POINT),
@@ -69,7 +69,7 @@ def read(recording: Recording, sensors: Sequence[PositionSensor], reading: Readi
 
 
 def where(recording: Recording, sensor: PositionSensor) -> str:
-    """How a sentence names the place of the positions."""
+    """Path of the table, or place of the topic, with the sensor's positions, for messages."""
     if _is_table(recording, sensor):
         return str(recording.table(sensor, sensor.path))
     return recording.place(_topic(recording, sensor).name)
@@ -91,7 +91,7 @@ def _topic(recording: Recording, sensor: PositionSensor) -> TopicInfo:
 
 
 def _readings(recording: Recording, sensor: PositionSensor, what: str) -> Noted:
-    """Readings in metres, and notes."""
+    """Readings in metres, and notes; what: names the source in messages."""
     if not _is_table(recording, sensor):
         return _of_topic(recording, sensor, _topic(recording, sensor), what)
     path = recording.table(sensor, sensor.path)
@@ -133,7 +133,7 @@ def _of_solution(recording: Recording, sensor: PositionSensor, path: Path, what:
 
 
 def _levelled(written: PositionReadings) -> PositionReadings:
-    """Earth-centred positions, in metres east, north and up of the first."""
+    """Earth-centred positions, converted to metres east, north and up of the first one."""
     R = east_north_up(*latitude_longitude(written.position[0]))
     covariance = R @ written.covariance @ R.T if len(written.covariance) else written.covariance
     frame = LocalFrame(written.position[0], R, True)

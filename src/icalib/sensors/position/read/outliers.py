@@ -1,4 +1,5 @@
-"""Outliers: single fixes off the trajectory of their neighbours; and steps of the solution that last."""
+"""Outliers among fixes before estimation: single fixes off the path of their neighbours, and lasting steps of the
+receiver's solution."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from icalib.geometry.cubic import lagrange_weights
 MEDIAN_WINDOW_FIXES = 51  # of the moving median of distances, as motion and noise change
 MAX_MEDIAN_DISTANCES = 8.0  # an outlier is this many median distances off, some 10 standard deviations
 MIN_OUTLIER_M = 0.05  # smaller errors are no outliers, even among fixes without noise
-MAX_OUTLIER_SHARE = 0.1  # of all fixes: if there are more, none of them is a single one
+MAX_OUTLIER_SHARE = 0.1  # of all fixes: if more look like outliers, none of them is rejected
 MAX_GAP_STEPS = 2.5  # median intervals: a longer one is a gap, over which the motion may change
 # The cubic through two fixes on each side weighs a neighbour by 2/3. An outlier thus moves the distances of both its
 # neighbours by 2/3 of its size. A step that lasts moves that of one of them by its whole size.
@@ -48,7 +49,8 @@ def _from_cubic(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def steps(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (m,) of fixes before which p (n, 3) at t (n,) s steps, and by how much (m, 3) m, beyond the motion."""
+    """Steps of positions p (n, 3) m at t (n,) s that are not motion: numbers (m,) of the first fix after each, and the
+    step vectors (m, 3) m."""
     dt, moved = np.diff(t), np.diff(p, axis=0)
     if len(dt) < 5:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3))

@@ -17,15 +17,16 @@ MAX_DISTANCE_M = 20_000.0  # from the first fix: the vertical turns by 3 mrad, w
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """The frame of positions p (3,) that were recorded as origin + axes^T p. origin (3,) m; axes (3, 3)
-    R_local_recorded; on_earth: what was recorded is Earth-centred, or latitude, longitude and height."""
+    """A frame relative to the recorded coordinates: origin + axes^T p is the recorded position of p (3,) m. origin (3,)
+    m; axes (3, 3): R_local_recorded; on_earth: the recorded coordinates are Earth-centred, or latitude, longitude and
+    height."""
 
     origin: np.ndarray
     axes: np.ndarray
     on_earth: bool = False
 
     def moved(self, by: np.ndarray) -> LocalFrame:
-        """The same axes at `by` (3,) m in them."""
+        """This frame with its origin shifted by `by` (3,) m along its axes."""
         return replace(self, origin=self.origin + by @ self.axes)
 
 
@@ -43,7 +44,7 @@ class PositionReadings(RawReadings):
     frame: LocalFrame = AS_RECORDED
 
     def inside(self, what: str, frame: LocalFrame, owner: str) -> PositionReadings:
-        """In another frame, that of `owner`. Raises RecordingError where one of the two is on the Earth."""
+        """The readings in the frame of `owner`. Raises RecordingError if only one of the two frames is on the Earth."""
         if self.frame.on_earth != frame.on_earth:
             kind = "latitudes and longitudes" if self.frame.on_earth else "positions in metres"
             raise RecordingError(
@@ -72,8 +73,8 @@ def left_out(what: str, status: np.ndarray, good: np.ndarray, least: Status) -> 
 def from_geodetic(
     what: str, readings: PositionReadings, degrees: np.ndarray, good: np.ndarray
 ) -> tuple[PositionReadings, tuple[str, ...]]:
-    """The `good` (N,) ones of `readings` in metres east, north and up of the first, and a note. Covariances are in
-    these axes already. degrees (N, 3): latitude and longitude [deg], height over the WGS84 ellipsoid [m].
+    """Those of `readings` that are `good` (N,) bool, in metres east, north and up of the first, and a note. Covariances
+    are in these axes already. degrees (N, 3): latitude and longitude [deg], height over the WGS84 ellipsoid [m].
 
     Raises RecordingError where latitudes, longitudes or heights cannot be right.
     """
@@ -116,8 +117,8 @@ def _refuse_heights(what: str, degrees: np.ndarray, good: np.ndarray) -> None:
 
 
 def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings, tuple[str, ...]]:
-    """Positions in metres, and a note. If the origin of their frame is more than 100 m from the first one, they are
-    relative to this one, rounded to whole metres."""
+    """Readings in metres, and a note. If the first position is more than 100 m from the origin of the frame, the origin
+    moves to the first position, rounded to whole metres. Raises RecordingError if no position is finite."""
     p = readings.position
     finite = np.isfinite(p).all(axis=1)
     if not finite.any():
