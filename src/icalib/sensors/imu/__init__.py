@@ -1,1 +1,1 @@
-"""The factor of an IMU between two keyframes."""
+"""The IMU: rig-file fields, reading, checks, preintegrated factor and report."""

@@ -15,7 +15,8 @@ from icalib.sensors.imu.spec import INTRINSICS_LABELS, class_of_sigma
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[ImuResiduals]:
-    """The record of all intervals between keyframes, without those between recordings, which have no data."""
+    """The residuals of all intervals between keyframes; intervals between two recordings have no data and are
+    omitted."""
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
     chain, state = found.problem.chain, found.outcome.state
@@ -26,7 +27,7 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[I
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """Notes on noise, prior of the intrinsics and gaps; without an IMU on the assumption of smooth motion."""
+    """Notes on noise, the prior of the intrinsics and gaps; without an IMU, on the assumed smooth motion."""
     imu = inputs.imu
     if imu is None:
         return
@@ -64,5 +65,5 @@ def _intrinsics_words(imu: ImuSensor) -> str:
 
 
 def misfit(imu: ImuSensor, f: SensorFit, is_noise: bool) -> str | None:
-    """None: `validation` tests the noise of the IMU by itself, as all other sensors depend on it."""
+    """Always None: `validation` tests the noise of the IMU separately, as all other sensors depend on it."""
     return None

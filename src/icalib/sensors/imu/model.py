@@ -1,4 +1,4 @@
-"""The model of an IMU: its parameters are the intrinsics; the factor of its readings is in `residual`."""
+"""The sensor model of an IMU, whose only parameters are its intrinsics. Its factor is in `residual`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from icalib.rig import ImuNoise, ImuSensor, Settings
 
 
 class ImuModel(SensorModel[ImuSensor, ImuNoise]):
-    """The IMU is the reference of poses and clocks, so that it has neither extrinsics nor a time offset."""
+    """Sensor model of the IMU. Being the reference of poses and time, it has no extrinsics and no time offset."""
 
     def first_noise(self, sensor: ImuSensor, settings: Settings) -> ImuNoise:
-        """See `SensorModel`; the noise of the rig file."""
+        """See `SensorModel`; the noise in the rig file."""
         del settings
         return sensor.noise
 

@@ -28,11 +28,11 @@ class ImuResiduals:
     whitened: np.ndarray  # (K - 1, 15)
 
     def normalised(self) -> dict[str, np.ndarray]:
-        """Empty: the trajectory follows the IMU, so that residuals are smaller than their noise."""
+        """Empty: the trajectory fits the IMU closely, so that its residuals are smaller than its noise."""
         return {}
 
     def successive(self) -> dict[str, Successive]:
-        """Successive residuals by block; each interval follows the one before."""
+        """Pairs of residuals of successive intervals, for each block of `BLOCKS`."""
         return successive_rows(BLOCKS, self.whitened)
 
 

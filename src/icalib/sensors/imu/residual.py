@@ -1,4 +1,5 @@
-"""The IMU factor: readings between neighbouring keyframes, preintegrated once (the paper's (16)-(19)).
+"""The IMU factor: readings between neighbouring keyframes, preintegrated once per pass (equations (16)-(19) of the
+paper).
 
 Rows of an interval: rotation 3 [rad], velocity 3 [m/s], position 3 [m], change of gyroscope bias 3 [rad/s] and of
 accelerometer bias 3 [m/s^2]; see `ImuFactor`.
@@ -68,8 +69,8 @@ class Increments(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def _bias_correction(k, chain, increments, dx, change):
-    """Fills change (9,): of the increment of interval k, to first order in the changes of the biases and of the
-    intrinsics, dx (24 or 0,), since preintegration."""
+    """Fills change (9,), the first-order change of the increment of interval k since preintegration, from the changes
+    of the biases and of the intrinsics dx (24 or 0,)."""
     for i in range(9):
         change[i] = 0.0
         for j in range(6):
@@ -80,7 +81,8 @@ def _bias_correction(k, chain, increments, dx, change):
 
 @njit(cache=True, nogil=True, inline="always")
 def _state_change(k, chain):
-    """R_k^T R_k+1, and changes of velocity and position over interval k without gravity, in the axes of keyframe k."""
+    """R_k^T R_k+1 (3, 3), and the changes of velocity [m/s] and position [m] (3,) over interval k, without initial
+    velocity and gravity, in the axes of keyframe k."""
     R0, dt, g = chain.R[k], chain.seconds[k + 1] - chain.seconds[k], chain.gravity
     mv, mp, hv, hp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
@@ -178,10 +180,10 @@ class ImuFactor(RowFactor):
     """
 
     imu: ImuData
-    gravity: float
+    gravity: float  # [m/s^2]
     columns: np.ndarray  # (24,) calibration columns of the intrinsics, or (0,) where they are fixed
     increments: Increments
-    intrinsics0: np.ndarray
+    intrinsics0: np.ndarray  # (24,) at which the intervals were preintegrated
     starts: tuple[int, ...] = (0,)
 
     @property
@@ -211,12 +213,12 @@ class ImuFactor(RowFactor):
         return rows.size - (len(self.starts) - 1) * rows.shape[1]
 
     def times(self, state: State) -> np.ndarray:
-        """(K - 1,) s, of the keyframe at which each interval starts."""
+        """(K - 1,) time [s] of the keyframe at which each interval starts."""
         return state.seconds[:-1]
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Adds the broad prior on the biases at the first keyframes of recordings in `piece`, about those at the start
-        of the pass. Returns half its chi^2."""
+        """Adds the broad prior on the biases of the first keyframe of each recording in `piece`. Its mean is the biases
+        at the start of the pass. Returns half its chi^2."""
         own = [k for k in self.starts if piece.first <= k < piece.last]
         return sum(accumulate_bias_prior(state, piece, sums, self.increments.bias0[k], k) for k in own)
 

@@ -24,6 +24,6 @@ def sections(c: Calibration) -> Iterator[Section]:
 
 
 def curves(r: ImuResiduals) -> Iterator[ResidualCurve]:
-    """A curve of whitened residuals (n, 3) for each block of the record."""
+    """The curves of whitened residuals over time, for each block of three columns."""
     for b, block in enumerate(motion_figures.BLOCKS):
         yield ResidualCurve(block, r.seconds, r.whitened[:, 3 * b : 3 * b + 3], ("x", "y", "z"))

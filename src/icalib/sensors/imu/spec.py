@@ -1,4 +1,4 @@
-"""An IMU: its noise, its intrinsics, the classes of IMUs that give defaults, and its fields in the rig file."""
+"""An IMU in the rig file: its noise and intrinsics, and defaults for classes of IMUs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ImuNoise:
 
     @property
     def densities(self) -> np.ndarray:
-        """(4,) in the order of the fields."""
+        """(4,) gyro, gyro_walk, accel, accel_walk."""
         return np.array([self.gyro, self.gyro_walk, self.accel, self.accel_walk])
 
     def scaled(self, factor: float) -> ImuNoise:
@@ -53,7 +53,7 @@ class Imperfections:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(24,) in the order of `INTRINSICS_LABELS`: diagonal and lower triangle of two matrices, ..."""
+        """(24,) standard deviations in the order of `INTRINSICS_LABELS`."""
         lower = (0, 1, 0, 1, 1, 0)  # xx yx yy zx zy zz: 0 on the diagonal
         accel = [(self.accel_scale, self.accel_misalignment)[k] for k in lower]
         gyro = [(self.gyro_scale, self.gyro_misalignment)[k] for k in lower]
@@ -103,7 +103,7 @@ _LARGEST_TACTICAL_RATIO = 2.0
 
 
 def class_noise(name: str) -> ImuNoise:
-    """The noise of one of IMU_CLASSES; its source says that it is a default."""
+    """The default noise of one of IMU_CLASSES; `source` names the class."""
     article = "an" if name[0] in "aeiou" else "a"
     return ImuNoise(*_FIGURES[name], source=f"default for {article} {name} IMU")
 
@@ -114,8 +114,8 @@ def class_imperfections(name: str) -> Imperfections:
 
 
 def class_of_noise(noise: ImuNoise) -> str:
-    """The class of an IMU by its noise: the class whose default it is, or tactical if it is as small, or else
-    consumer."""
+    """The class of an IMU by its noise: the class whose default it is; otherwise tactical if the noise is as small,
+    else consumer."""
     own = next((name for name in IMU_CLASSES if class_noise(name).source == noise.source), None)
     if own is not None:
         return own
@@ -138,7 +138,7 @@ class TwoSources:
 
 AccelUnit = Literal["m/s^2", "g"]
 GyroUnit = Literal["rad/s", "deg/s"]
-BY_CLASS = Parameter("free")  # IMU intrinsics without a field in the rig file; told from `free()` by identity
+BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs from `free()` by identity only
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")
@@ -148,10 +148,10 @@ _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")
 class ImuSensor(Sensor):
     """An IMU.
 
-    Units and axes are those of the recorded readings; None: SI units (g is recognised), and the axes as they are.
-    assumed: an assumption of smooth motion in place of an IMU (see `initialize.assumed_motion`). intrinsics (24,): see
-    `motion.imu_model`. They always have a prior: by default that of the IMU's class about the ideal IMU; if they are
-    free, a broad one about the guess. Fixed without a value they are those of the ideal IMU.
+    Units and axes describe the recorded readings; None: SI units (g is recognised), and axes of the IMU frame.
+    assumed: no real IMU, but an assumption of smooth motion (see `initialize.assumed_motion`). intrinsics (24,): see
+    `motion.imu_model`. Their default prior is that of the IMU's class about the ideal IMU. Free intrinsics have a broad
+    prior about the initial guess. Intrinsics fixed without a value are those of the ideal IMU.
     """
 
     sensor_type: ClassVar[str] = "imu"
@@ -170,7 +170,7 @@ class ImuSensor(Sensor):
     accel_axes: Axes | None = None
     gyro_axes: Axes | None = None
     assumed: bool = False
-    pose_keyframes_s: float = 0.02  # interval of keyframes where poses alone determine the motion
+    pose_keyframes_s: float = 0.02  # interval between keyframes if the motion is determined by poses alone
     layout: TableLayout = PLAIN_TABLE
 
     def __post_init__(self) -> None:
@@ -239,8 +239,8 @@ def _plain_source(source: str | TwoSources) -> str | dict[str, str]:
 
 
 def _intrinsics(value: YamlValue) -> Parameter:
-    """24 numbers, zero for an ideal IMU. The name of a class stands for its prior about the ideal IMU, and `fixed` for
-    the ideal IMU."""
+    """The intrinsics (24,), zero for an ideal IMU. The name of a class stands for its prior about the ideal IMU;
+    `fixed` stands for the ideal IMU."""
     if value.is_mapping or value.is_list or value.text() == "free":
         return vector_parameter(value, N_INTRINSICS)
     name = value.choice("treatment of IMU intrinsics", ("free", "fixed", *IMU_CLASSES))

@@ -14,7 +14,8 @@ from icalib.sensors.stream import Stream, check
 class ImuStream(Stream):
     """Readings of one IMU.
 
-    stamps_ns (N,) int64, strictly increasing; gyro (N, 3) rad/s; accel (N, 3) m/s^2 (specific force), imu frame.
+    stamps_ns (N,) int64, strictly increasing; angular rate gyro (N, 3) [rad/s] and specific force accel (N, 3) [m/s^2]
+    in the IMU frame.
     """
 
     sensor_type: ClassVar[str] = "imu"

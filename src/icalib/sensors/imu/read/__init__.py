@@ -1,4 +1,4 @@
-"""Readings of an IMU: tables, topics -> a checked stream."""
+"""Reads an IMU from tables or topics into a checked `ImuStream`."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ TABLES = (TableFile("data.csv", "table of readings", "imu", _stamps, _is_one, IM
 
 
 def read(recording: Recording, sensors: Sequence[ImuSensor], reading: Reading) -> list[ReadStream]:
-    """The checked streams, and notes. Raises RecordingError as `read_imu`."""
+    """The checked stream of each IMU, with notes for the user. Raises RecordingError as `read_imu`."""
     return [read_imu(recording, sensor, reading.cut) for sensor in sensors]
 
 
 def read_imu(recording: Recording, sensor: ImuSensor, cut: Cut) -> tuple[ImuStream, tuple[str, ...]]:
-    """All good readings of the IMU in SI units, those of the part of its clock that `cut` keeps, and notes. Raises
+    """Valid readings of one IMU in SI units within the time range that `cut` keeps, and notes for the user. Raises
     RecordingError as `readings`, `one_stream` and `checked_imu`."""
     where = recording.where(sensor)
     what = f"{where} ({sensor.name})"
@@ -49,8 +49,8 @@ def read_imu(recording: Recording, sensor: ImuSensor, cut: Cut) -> tuple[ImuStre
 
 
 def readings(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
-    """All readings as they were written, or of the two sensors of an IMU where they report apart: stamps may still
-    repeat or run backwards.
+    """All readings as recorded, in the recorded units; stamps may still repeat or run backwards. `ImuHalves` if
+    gyroscope and accelerometer have separate topics or tables.
 
     Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read.
     """
@@ -59,7 +59,7 @@ def readings(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
 
 def _from_messages(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
     def rows(topic: str) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) stamps [ns] and (N, 6) rates and forces, by stamp."""
+        """Stamps (N,) [ns] and gyroscope and accelerometer readings (N, 6) of a topic, sorted by stamp."""
         found = [(stamp, values_of(message)) for stamp, message in recording.messages(topic, "imu")]
         stamps_ns = np.array([stamp for stamp, _ in found], np.int64)
         values = np.array([row for _, row in found], np.float64).reshape(-1, 6)
@@ -91,7 +91,7 @@ def _from_tables(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalv
 
 
 def where(recording: Recording, sensor: ImuSensor) -> str:
-    """How a sentence names the place of the readings."""
+    """Topics or table files of the IMU, as text for messages."""
     if recording.has_messages:
         topic = imu_source(str(recording.root), recording, recording.topics(), sensor)
         return recording.place(" and ".join(both(topic)) if isinstance(topic, TwoSources) else topic)

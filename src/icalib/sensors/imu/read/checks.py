@@ -1,4 +1,4 @@
-"""Is this an IMU's stream in rad/s, m/s^2 and nanoseconds?"""
+"""Checks that an IMU's stream is plausible in rad/s, m/s^2 and ns, and removes wrong readings."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from icalib.sensors.imu.read.cleaning import in_time, without_wrong
 from icalib.sensors.imu.read.table_kinds import RATE_HZ
 from icalib.sensors.imu.read.units import in_si, recognised_unit
 
-_SATURATED_RUN = 5
-# No sensor's range is narrower (125 deg/s, 2 g); below it, equal readings are coarse quantisation, not saturation.
+_SATURATED_RUN = 5  # equal readings in a row at the extreme of an axis
+# [rad/s], [m/s^2]. No sensor's range is narrower (125 deg/s, 2 g); equal readings below it are coarse quantisation.
 _NARROWEST_RANGE = {"gyroscope": 2.0, "accelerometer": 17.0}
 
 
 @dataclass(frozen=True)
 class Saturation:
-    """count readings in a row at `limit` [rad/s or m/s^2] from stamp_ns on; kind: gyroscope or accelerometer."""
+    """Run of `count` readings equal to `limit` [rad/s or m/s^2] from stamp_ns on; kind: gyroscope or accelerometer."""
 
     kind: str
     axis: str  # x, y or z
@@ -31,13 +31,13 @@ class Saturation:
 
 
 def checked_imu(imu: ImuStream, where: str, sensor: ImuSensor | None = None) -> tuple[ImuStream, tuple[str, ...]]:
-    """`imu` with strictly increasing stamps, in SI units, and notes on what was dropped, converted or looks saturated.
-    `sensor` says what units and axes the rig file gives the readings.
+    """`imu` with strictly increasing stamps in SI units; notes on dropped, converted and possibly saturated readings.
+    `sensor` has the units and axes of the readings as stated in the rig file; None: they are recognised.
 
-    Single wrong readings and copies are left out; uneven stamps of even readings are made even.
+    Outliers and copies of readings are dropped. Jittering stamps of evenly sampled readings are replaced by even ones.
 
-    Raises RecordingError naming `where` (the file) and the instant: too few readings, stamps out of order or repeated
-    with other values, a frozen sensor, other units of time, angular rate or acceleration.
+    Raises RecordingError that names `where` (the file) and the instant: too few readings, stamps out of order,
+    different readings at one stamp, a frozen sensor, or wrong units of time, angular rate or acceleration.
     """
     what = f"{where} ({imu.name})"
     if len(imu.stamps_ns) < 2:
@@ -70,7 +70,7 @@ def _saturation_notes(imu: ImuStream, what: str) -> tuple[str, ...]:
 
 
 def saturations(imu: ImuStream) -> tuple[Saturation, ...]:
-    """Where readings sit at the largest or smallest value of their axis, the longest run of each."""
+    """The longest run of readings at the largest and at the smallest value of each axis, if it looks saturated."""
     found: list[Saturation] = []
     for kind, values in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
         for axis, name in enumerate("xyz"):

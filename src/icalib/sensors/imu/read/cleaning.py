@@ -1,4 +1,4 @@
-"""Readings of an IMU without those that are wrong, at the instants at which they were measured; and notes on both."""
+"""Removes wrong readings of an IMU and corrects their stamps; notes tell the user about both."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from icalib.sensors.imu.read.copies import copies, new_values
 from icalib.sensors.imu.read.even_stamps import EvenStamps, even_stamps
 from icalib.sensors.imu.read.spikes import impossible, spikes, stuck
 
-_BEYOND = 1e12  # in any unit of any sensor; squares of what is below do not overflow
+_BEYOND = 1e12  # larger readings are invalid in any unit; squares of smaller ones do not overflow
 _SENSORS = ("gyroscope", "accelerometer")
 
 
 def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
-    """Finite readings in order where copies alone were out of it, none there twice under different stamps; at even
-    stamps where bursts or jitter hide these."""
+    """Finite readings without copies, and notes. If copies were found, the other readings are sorted by stamp.
+
+    Stamps in order that have bursts or jitter are replaced by even ones (`even_stamps`).
+    """
     notes = _Notes(what, imu.stamps_ns)
     finite = np.all(np.abs(np.hstack([imu.gyro, imu.accel])) < _BEYOND, axis=1)
     notes.left_out(~finite, f"are not finite, or beyond {_BEYOND:g},")
@@ -42,7 +44,7 @@ def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
 
 
 def _without_repeats(imu: ImuStream, notes: _Notes) -> ImuStream:
-    """Without readings that are there twice, under one stamp."""
+    """`imu` without readings that repeat the one before with the same stamp."""
     row = np.column_stack([np.diff(imu.stamps_ns), np.diff(imu.gyro, axis=0), np.diff(imu.accel, axis=0)])
     again = np.concatenate([[False], (row == 0).all(axis=1)])
     if again.any():
@@ -54,7 +56,7 @@ def _without_repeats(imu: ImuStream, notes: _Notes) -> ImuStream:
 
 
 def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
-    """Readings without single wrong ones; a sensor that a driver holds between its readings is interpolated."""
+    """`imu` without outliers, and notes. A slower sensor whose readings the driver repeats is interpolated instead."""
     notes = _Notes(what, imu.stamps_ns)
     seconds, good = imu.seconds, np.ones(len(imu.stamps_ns), bool)
     found = []
@@ -77,7 +79,7 @@ def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]
 
 
 class _Notes:
-    """Sentences on what was left out of readings at stamps_ns (N,)."""
+    """Collects sentences for the user about readings that were left out; stamps_ns (N,): stamps of all readings."""
 
     def __init__(self, what: str, stamps_ns: np.ndarray) -> None:
         self.sentences: tuple[str, ...] = ()
@@ -95,7 +97,7 @@ class _Notes:
 
 
 def _some(imu: ImuStream, which: np.ndarray) -> ImuStream:
-    """Those `which`: a mask, or indices in order."""
+    """The readings selected by `which`, a mask or indices."""
     return ImuStream(imu.name, imu.stamps_ns[which], imu.gyro[which], imu.accel[which])
 
 

@@ -1,4 +1,4 @@
-"""Readings of an IMU that a driver sent again under another stamp, or repeated until it had a new one."""
+"""Finds readings of an IMU that a driver sent twice with different stamps, or repeated until it had a new one."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ import numpy as np
 
 from icalib.data.stamps.clocks import usual_step
 
-_MAX_COPY_STEP = 0.75  # of the period: the step from a copy to its nearest neighbour is shorter
+_MAX_COPY_STEP = 0.75  # [periods]; the step from a copy to its nearest neighbour is shorter
 _MAX_DELAY_NS = 1_000_000_000  # between a reading and its copy
-_PERIOD_QUANTILE = 0.3  # quantile of the steps between readings without a copy that is one period: no step is shorter
-_MAX_UNEVENNESS_RATIO = 0.5  # as uneven: then these are the originals
-_MIN_SINGLE = 20  # readings without a copy that show the period
-_MIN_REPEATED_SHARE = 0.25  # of the readings, that a repeating driver repeats at least
-_MIN_REGULAR_SHARE = 0.9  # of the runs are as long as the usual one, but for one reading
+_PERIOD_QUANTILE = 0.3  # this quantile of the steps between readings without a copy is taken as the period
+_MAX_UNEVENNESS_RATIO = 0.5  # the later twins are the originals if their unevenness is below this share
+_MIN_SINGLE = 20  # readings without a copy from which the period is estimated
+_MIN_REPEATED_SHARE = 0.25  # of the readings are repeats if the driver repeats them
+_MIN_REGULAR_SHARE = 0.9  # of the runs of equal readings have the median length, give or take one reading
 
 
 def copies(stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(N,) bool: readings (N, m) with the values of another exactly that lie between the others' stamps (N,), in order.
+    """(N,) bool: readings (N, m) that are exact copies of another and closer than a period to a neighbour; stamps (N,)
+    [ns] must not decrease.
 
-    A driver stamps its copies all too early, or all too late: originals are those that keep the stamps more even, the
-    earlier ones where neither do.
+    All copies are assumed to be on the same side, before or after their originals. The originals are the later twins
+    if these are much more evenly spaced, otherwise the earlier ones.
     """
     bad = np.zeros(len(values), bool)
     if len(values) < 2 or np.diff(stamps_ns).min() >= _MAX_COPY_STEP * usual_step(stamps_ns):
@@ -40,8 +41,8 @@ def copies(stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def new_values(values: np.ndarray) -> np.ndarray | None:
-    """(N,) bool: readings (N, 3) that are new, where a driver repeats each several times, about equally often, until it
-    has the next; None where it does not."""
+    """(N,) bool: readings (N, 3) that differ from the one before. None unless the driver repeats each about equally
+    often until it has a new one."""
     new = np.concatenate([[True], (np.diff(values, axis=0) != 0.0).any(axis=1)])
     if (~new).mean() < _MIN_REPEATED_SHARE:
         return None
@@ -54,8 +55,8 @@ def new_values(values: np.ndarray) -> np.ndarray | None:
 
 
 def _twins(stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(n, 2) indices of two readings with the same values, at different stamps near each other. Values that three have
-    are those of a coarse sensor."""
+    """(n, 2) indices, the earlier first, of readings with equal values and different stamps less than _MAX_DELAY_NS
+    apart. Values that occur more than twice are excluded: they come from coarse quantisation."""
     order = np.lexsort((*values.T, np.zeros(len(values))))
     same = (np.diff(values[order], axis=0) == 0.0).all(axis=1)
     same &= ~(np.append(same[1:], False) | np.insert(same[:-1], 0, False))
@@ -65,7 +66,8 @@ def _twins(stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _uneven(known_ns: np.ndarray, stamps_ns: np.ndarray, period: float) -> np.ndarray:
-    """(n,) how far stamps (n,) are off whole periods from the nearest of the known ones, in order; in periods."""
+    """(n,) deviation [periods] of stamps (n,) from a whole number of periods, summed over the known stamp before and
+    the one after; known_ns is sorted."""
     after = np.clip(np.searchsorted(known_ns, stamps_ns), 1, len(known_ns) - 1)
     off = [np.abs(stamps_ns - known_ns[k]) / period for k in (after - 1, after)]
     return sum((np.abs(x - np.maximum(np.round(x), 1.0)) for x in off), np.zeros(len(stamps_ns)))

@@ -1,7 +1,7 @@
-"""Does gravity turn in the accelerometer as the gyroscope says? Told without any other sensor.
+"""Gravity in the accelerometer's readings, from the IMU alone: it checks units and axes of gyroscope and accelerometer.
 
-Seen from axes that the gyroscope keeps from turning, the specific force of a short window is gravity, which stands
-still, and accelerations, whose mean is small.
+The gyroscope rotates the specific force of a short window into axes that do not rotate. Gravity is constant there, and
+the mean of all other accelerations is small.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ import numpy as np
 from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
 
-WINDOW_S, _RATE_HZ = 2.0, 100.0  # over which gravity must stand still; how often it is looked at
-_MOST_WINDOWS = 64  # that show the size of gravity, spread over the recording
+WINDOW_S, _RATE_HZ = 2.0, 100.0  # length of a window, and sampling rate within it
+_MOST_WINDOWS = 64  # spread over the recording, from which the size of gravity is estimated
 
 
 def gravity_spread(imu: ImuStream, unit: float) -> float | None:
-    """RMS [m/s^2] of the specific force about its mean over two seconds, seen from axes that do not turn: small where
-    the rates, times `unit` [rad/s], turn as the IMU did. None for less than two seconds.
+    """RMS [m/s^2] of the specific force about its mean over two seconds, in axes that do not rotate.
+
+    It is small if the gyroscope's readings times `unit` are the true rates [rad/s]. None for less than two seconds.
     """
     level = _level_force(imu, unit)
     if level is None:
@@ -26,15 +27,18 @@ def gravity_spread(imu: ImuStream, unit: float) -> float | None:
 
 
 def gravity_size(imu: ImuStream, unit: float) -> np.ndarray | None:
-    """(n,) size of the mean specific force of windows of two seconds, seen from axes that do not turn: gravity, where
-    it is in the readings and the rates are in `unit` [rad/s]. None for less than two seconds."""
+    """(n,) norm of the mean specific force over windows of two seconds, in axes that do not rotate.
+
+    It is the size of gravity if the readings contain it and the gyroscope's readings times `unit` are the true rates
+    [rad/s]. None for less than two seconds.
+    """
     level = _level_force(imu, unit, _MOST_WINDOWS)
     return None if level is None else np.linalg.norm(level.mean(axis=1), axis=1)
 
 
 def _level_force(imu: ImuStream, unit: float, most: int | None = None) -> np.ndarray | None:
-    """(windows, n, 3) specific force in the axes of each window's first instant, of at most `most` windows; those
-    without readings are left out. None for less than one window."""
+    """Specific force (windows, n, 3) in the IMU axes of each window's first instant, for at most `most` windows.
+    Windows without readings are left out. None for a recording shorter than one window."""
     t = imu.seconds
     count = int(WINDOW_S * _RATE_HZ)
     own = np.unique((t[t < WINDOW_S * int(t[-1] / WINDOW_S)] / WINDOW_S).astype(np.int64))
@@ -43,7 +47,7 @@ def _level_force(imu: ImuStream, unit: float, most: int | None = None) -> np.nda
     if most is not None and len(own) > most:
         own = own[np.linspace(0, len(own) - 1, most).astype(int)]
     at = ((own * count)[:, None] + np.arange(count)).ravel() / _RATE_HZ
-    # Of the integral, so that no rotation is lost between the instants.
+    # The integral of the rates is interpolated, not the rates, so that no rotation between the instants is lost.
     angle = np.zeros((len(t), 3))
     angle[1:] = np.cumsum(0.5 * unit * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(t)[:, None], axis=0)
     turn, force = (

@@ -1,4 +1,4 @@
-"""An IMU whose gyroscope and accelerometer report apart, each at its own stamps: on two topics, or in two tables."""
+"""An IMU whose gyroscope and accelerometer have separate stamps, on two topics or in two tables."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from icalib.rig import ImuSensor, TwoSources
 from icalib.sensors.imu.read.table_kinds import RATE_HZ
 
 _LOOKED_AT = 50  # readings that tell which sensor a topic carries; a driver leaves the other at zero or NaN
-_LEAST_COMMON_S = 1.0
+_LEAST_COMMON_S = 1.0  # time in which both sensors ran
 
 
 @dataclass(frozen=True)
 class ImuHalf:
-    """stamps_ns (N,), values (N, 3) of the gyroscope or the accelerometer, as they were written."""
+    """Readings of the gyroscope or of the accelerometer as recorded: stamps_ns (N,), values (N, 3)."""
 
     name: str
     stamps_ns: np.ndarray
@@ -31,7 +31,7 @@ class ImuHalf:
 
 @dataclass(frozen=True)
 class ImuHalves:
-    """gyro_ns (N,), gyro (N, 3) rad/s, accel_ns (M,), accel (M, 3) m/s^2, as they were written."""
+    """Readings of both sensors as recorded, unchecked: gyro (N, 3) at gyro_ns (N,), accel (M, 3) at accel_ns (M,)."""
 
     name: str
     gyro_ns: np.ndarray
@@ -41,20 +41,20 @@ class ImuHalves:
 
 
 class HasImuMessages(Protocol):
-    """The part of a bag that is needed here."""
+    """A bag that yields the messages of a topic as (stamp [ns], message)."""
 
     def messages(self, topic: str, kind: str) -> Iterator[tuple[int, Any]]: ...
 
 
 def values_of(message: Any) -> tuple[float, float, float, float, float, float]:
-    """Rates and forces of a sensor_msgs/Imu."""
+    """Angular rates x, y, z and specific forces x, y, z of a sensor_msgs/Imu message."""
     w, f = message.angular_velocity, message.linear_acceleration
     return w.x, w.y, w.z, f.x, f.y, f.z
 
 
 def imu_source(where: str, bag: HasImuMessages, topics: Sequence[TopicInfo], sensor: ImuSensor) -> str | TwoSources:
-    """The topic of the IMU, or its two where one has the gyroscope's readings only and exactly one other has the
-    accelerometer's. Raises RecordingError as `choose_topic`."""
+    """The topic of the IMU, or its two topics if gyroscope and accelerometer are separate (`pair_of`). Raises
+    RecordingError as `choose_topic`."""
     if isinstance(sensor.topic, TwoSources):
         gyro, accel = (choose_topic(where, topics, sensor.name, t, "imu").name for t in both(sensor.topic))
         return TwoSources(gyro, accel)
@@ -66,8 +66,8 @@ def imu_source(where: str, bag: HasImuMessages, topics: Sequence[TopicInfo], sen
 
 
 def pair_of(bag: HasImuMessages, topics: Sequence[TopicInfo]) -> TwoSources | None:
-    """The topics of an IMU that reports on two, where exactly one topic has only a gyroscope's readings and exactly one
-    only an accelerometer's."""
+    """The two topics of an IMU if exactly one topic has only gyroscope readings and exactly one has only accelerometer
+    readings; otherwise None."""
     found = [t.name for t in topics if t.kind == "imu" and t.count]
     carried = {name: _carried(bag, name) for name in found} if len(found) > 1 else {}
     gyros, accels = ([name for name, what in carried.items() if what == half] for half in ("gyro", "accel"))
@@ -75,26 +75,30 @@ def pair_of(bag: HasImuMessages, topics: Sequence[TopicInfo]) -> TwoSources | No
 
 
 def both(pair: TwoSources) -> tuple[str, str]:
-    """The gyroscope's, and the accelerometer's."""
+    """The sources of gyroscope and accelerometer, in this order."""
     return pair.gyro, pair.accel
 
 
 def _carried(bag: HasImuMessages, topic: str) -> str:
-    """gyro, accel, or both."""
+    """`gyro`, `accel` or `both`: the sensors whose readings on this topic are not all zero or NaN; `both` if all
+    are."""
     rows = np.array([values_of(m) for _, m in islice(bag.messages(topic, "imu"), _LOOKED_AT)]).reshape(-1, 6)
     rates, forces = (bool((np.nan_to_num(x) != 0.0).any()) for x in (rows[:, :3], rows[:, 3:]))
     return "both" if rates == forces else "gyro" if rates else "accel"
 
 
 def one_stream(imu: ImuStream | ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
-    """The readings of both sensors together, and notes where they report apart. Raises RecordingError as they do then:
-    readings that are not finite or out of order, and sensors that hardly overlap."""
+    """The readings of both sensors in one stream, and notes if they had to be joined.
+
+    Raises RecordingError if a separate sensor has too few finite readings, if its stamps are out of order, or if the
+    two overlap too little in time.
+    """
     return (imu, ()) if isinstance(imu, ImuStream) else _joined(imu, what)
 
 
 def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
-    """One stream at the gyroscope's stamps, the accelerometer interpolated to these, where both were running; and
-    notes. Raises RecordingError as `kept_readings`, and where the two do not overlap."""
+    """One stream at the gyroscope's stamps within the time common to both, with the accelerometer interpolated
+    linearly; and notes. Raises RecordingError as `kept_readings`, and if the two overlap too little."""
     own = "export the IMU's own stamps"
     notes: tuple[str, ...] = ()
     streams = []

@@ -1,8 +1,8 @@
-"""Single readings of an IMU that are wrong: spikes, and values that a driver repeats instead of measuring.
+"""Outliers among the readings of an IMU: spikes, and values that a driver repeats instead of measuring.
 
-A reading is compared with the straight line between its neighbours, in units of the local spread of such differences
-(Hampel's identifier). What an IMU measures is band-limited by its own low-pass filter: a shock spreads over several
-readings, and its neighbours stand off, too. A spike leaves them in line once it is taken out.
+A reading is compared with the straight line between its neighbours, in units of the local spread of such deviations
+(Hampel's identifier). The low-pass filter of an IMU spreads a true shock over several readings, so that its neighbours
+deviate too. After a spike is removed its neighbours deviate no longer.
 """
 
 from __future__ import annotations
@@ -12,28 +12,28 @@ from itertools import combinations
 
 import numpy as np
 
-_MAX_DEVIATIONS = 10.0  # robust standard deviations off its neighbours; white noise comes as far once in 1e22 readings
-_MAX_NEIGHBOUR_DEVIATIONS = 5.0  # of the neighbours, once the spike is out
-_HALF_WINDOW = 10  # readings to each side that show the local spread
-_MAX_RUN = 3  # readings in a row that are single wrong ones by chance
-_MAX_COSINE = 0.5  # cosine between deviations of neighbours: a shock pushes one way, wrong readings in a row do not
-_MAX_OUTLIER_SHARE = 0.2  # of readings that stand off: then these are no single wrong ones
-_MAX_RELATIVE_FORCE = 100.0  # times the usual size of an accelerometer's readings: no sensor's range
-_MAX_RATE = 1e4  # in rad/s or deg/s
-_MAX_SQUARABLE = 1e150  # whose square is a number, too
-_MIN_REPEATS = 3  # repeats in a row
-_MIN_JUMP = 8.0  # usual steps by which a reading differs from the one before, after the sensor was stuck
+_MAX_DEVIATIONS = 10.0  # robust standard deviations from the line; white noise exceeds it once in 1e22 readings
+_MAX_NEIGHBOUR_DEVIATIONS = 5.0  # robust standard deviations of the neighbours after the spike is removed
+_HALF_WINDOW = 10  # readings to each side from which the local spread is estimated
+_MAX_RUN = 3  # spikes in a row that occur by chance
+_MAX_COSINE = 0.5  # cosine between the deviations of neighbours; neighbours in a shock deviate in the same direction
+_MAX_OUTLIER_SHARE = 0.2  # of all readings; if more deviate, none is taken for a spike
+_MAX_RELATIVE_FORCE = 100.0  # times the median norm of the accelerometer's readings; beyond any sensor's range
+_MAX_RATE = 1e4  # rad/s or deg/s; beyond any gyroscope's range
+_MAX_SQUARABLE = 1e150  # its square does not overflow
+_MIN_REPEATS = 3  # exact repeats in a row of a sensor that is stuck
+_MIN_JUMP = 8.0  # median steps around a stuck run; the first reading after the run changes by more
 _MAD_TO_SIGMA = 1.4826
 
 
 def spikes(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(N,) bool: which readings (N, 3) at seconds (N,) are single wrong ones."""
+    """(N,) bool: readings (N, 3) at seconds (N,) that are spikes."""
     bad = np.zeros(len(values), bool)
     if len(values) < 4 * _HALF_WINDOW:
         return bad
     flag = _stands_off(seconds, values, _MAX_DEVIATIONS)
-    flag[1:-1] |= flag[:-2] & flag[2:]  # two wrong ones to opposite sides leave the one between them in line
-    for _ in range(2):  # one found may have hidden another near it
+    flag[1:-1] |= flag[:-2] & flag[2:]  # a reading between two opposite spikes may lie on the line
+    for _ in range(2):  # a spike may hide another one near it
         good = np.flatnonzero(~bad)
         t, x = seconds[good], values[good]
         for run in _runs(flag[good]):
@@ -45,19 +45,19 @@ def spikes(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def impossible(values: np.ndarray, is_gyro: bool) -> np.ndarray:
-    """(N,) bool: readings (N, 3) beyond any sensor's range, or not finite."""
+    """(N,) bool: readings (N, 3) of a gyroscope or accelerometer that are not finite or beyond any sensor's range."""
     size = np.linalg.norm(squarable(np.where(np.isfinite(values), values, np.inf)), axis=1)
     limit = _MAX_RATE if is_gyro else _MAX_RELATIVE_FORCE * max(float(np.median(size)), 1e-9)
     return ~(size <= limit) | ~np.isfinite(values).all(axis=1)
 
 
 def squarable(values: np.ndarray) -> np.ndarray:
-    """The same, numbers whose squares would overflow made smaller: none of them is a measurement."""
+    """`values` clipped so that their squares do not overflow; no real measurement is affected."""
     return np.clip(values, -_MAX_SQUARABLE, _MAX_SQUARABLE)
 
 
 def stuck(values: np.ndarray) -> np.ndarray:
-    """(N,) bool: readings (N, 3) that repeat the one before exactly, several in a row, after which they jump."""
+    """(N,) bool: readings (N, 3) in a run of exact repeats that ends with a jump."""
     step = np.linalg.norm(np.diff(squarable(values), axis=0), axis=1)
     bad = np.zeros(len(values), bool)
     for begin, end in _runs(np.concatenate([[False], step == 0.0])):
@@ -72,9 +72,10 @@ def stuck(values: np.ndarray) -> np.ndarray:
 
 
 def _stands_off(seconds: np.ndarray, values: np.ndarray, far: float) -> np.ndarray:
-    """(N,) bool: further than `far` local standard deviations off the line between its neighbours, on some axis."""
+    """(N,) bool: readings that deviate from the line between their neighbours by more than `far` local standard
+    deviations on some axis. All False if too many readings do."""
     off = _off_line(seconds, values, np.arange(1, len(values) - 1), 1)
-    # Half the spread over all readings at least: where little moves the local one is small by chance.
+    # Lower bound: half the spread over all readings, as the local spread of a still sensor may be small by chance.
     least = _MAD_TO_SIGMA * 0.5 * np.median(off, axis=0) + _digit(values)
     some = np.flatnonzero((off > far * least).any(axis=1))
     window = np.clip(some[:, None] + np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1), 0, len(off) - 1)
@@ -85,13 +86,14 @@ def _stands_off(seconds: np.ndarray, values: np.ndarray, far: float) -> np.ndarr
 
 
 def _digit(values: np.ndarray) -> np.ndarray:
-    """(3,) the smallest step between readings (N, 3): the last digit of coarse ones."""
+    """(3,) smallest nonzero step between readings (N, 3) on each axis: the resolution of a quantised sensor."""
     step = np.abs(np.diff(values, axis=0))
     return np.where(step > 0.0, step, np.inf).min(axis=0, initial=1e300)
 
 
 def _off_line(seconds: np.ndarray, values: np.ndarray, at: np.ndarray, reach: int) -> np.ndarray:
-    """(n, 3) distance of readings `at` from the line between those `reach` before and after."""
+    """(n, 3) distance of the readings with indices `at` (n,) from the line between the readings `reach` before and
+    after."""
     before, after = at - reach, at + reach
     share = ((seconds[at] - seconds[before]) / np.maximum(seconds[after] - seconds[before], 1e-12))[:, None]
     return np.abs(values[at] - (1.0 - share) * values[before] - share * values[after])
@@ -104,8 +106,8 @@ def _runs(flag: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _within(run: tuple[int, int], n: int) -> Iterator[np.ndarray]:
-    """Indices of what may be wrong in a run of readings that stand off, as neighbours of a wrong one do, too: one, two
-    near each other, or three in a row."""
+    """Candidate sets of spike indices in a run of deviating readings, to which neighbours of a spike belong as well:
+    one reading, any two, or three in a row. n: number of all readings."""
     begin, end = run
     if end - begin > 2 * _MAX_RUN + 4:
         return
@@ -116,7 +118,8 @@ def _within(run: tuple[int, int], n: int) -> Iterator[np.ndarray]:
 
 
 def _is_wrong(seconds: np.ndarray, values: np.ndarray, own: np.ndarray) -> bool:
-    """Whether the readings `own` stand off, are no shock, and all around them are in line once they are out."""
+    """True if the readings with indices `own` deviate, do not look like a shock, and their neighbours fit the line
+    after their removal."""
     low, high = max(own[0] - 2 * _HALF_WINDOW, 0), min(own[-1] + 2 * _HALF_WINDOW + 1, len(values))
     others = np.setdiff1d(np.arange(low, high), own, assume_unique=True)
     t, x = seconds[others], values[others]

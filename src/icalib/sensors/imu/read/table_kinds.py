@@ -1,4 +1,4 @@
-"""Tables of an IMU, or of its two sensors: their columns, and what headers call these."""
+"""Columns of the table of an IMU, or of separate tables of its two sensors, and the header names they go by."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ IMU = TableKind(
     (STAMP, *vector_names(GYRO), *vector_names(ACCEL)),
     RATE_HZ,
 )
-# Of an IMU whose two sensors have a table each.
+# Separate tables of gyroscope and accelerometer.
 IMU_GYRO, IMU_ACCEL = (
     TableKind(
         IMU.integers,

@@ -1,4 +1,4 @@
-"""Readings of an IMU in SI units and one set of axes: as the rig file says, or as gravity shows."""
+"""Converts readings of an IMU to SI units and the IMU frame, as stated in the rig file or as gravity shows."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from icalib.sensors.imu.read.gravity_turns import WINDOW_S, gravity_size
 G_M_S2 = 9.80665
 DEGREE = np.pi / 180.0
 _FASTEST_RAD_S = 35.0  # 2000 deg/s, the widest range of common gyroscopes
-_GRAVITY_M_S2 = (5.0, 20.0)  # of the median |accel|
-_NEAR_ONE = (0.8, 1.25)  # of gravity in units of g: scales of accelerometers are off by less
-_STEADY = 0.75  # of the upper quartile of gravity over windows is the lower one at least; of accelerations about half
-_MISSING = 0.5  # of the readings' size; gravity below this share of it is not in them
+_GRAVITY_M_S2 = (5.0, 20.0)  # plausible range of the median |accel|
+_NEAR_ONE = (0.8, 1.25)  # range of gravity in units of g; scale errors of accelerometers are smaller
+_STEADY = 0.75  # smallest ratio of lower to upper quartile over windows: gravity; about 0.5: linear acceleration
+_MISSING = 0.5  # share of the median |accel|; a smaller gravity means that the readings contain none
 
 
 def in_si(imu: ImuStream, sensor: ImuSensor) -> ImuStream:
-    """The readings in the units and axes that the rig file says they are recorded in."""
+    """The readings in SI units and the IMU frame, converted from the units and axes that the rig file states."""
     accel = G_M_S2 * imu.accel if sensor.accel_unit == "g" else imu.accel
     gyro = DEGREE * imu.gyro if sensor.gyro_unit == "deg/s" else imu.gyro
     return replace(imu, gyro=in_axes(gyro, sensor.gyro_axes), accel=in_axes(accel, sensor.accel_axes))
 
 
 def recognised_unit(imu: ImuStream, what: str, sensor: ImuSensor | None) -> tuple[ImuStream, tuple[str, ...]]:
-    """The readings in m/s^2, and a note where gravity shows that they are in g.
+    """The readings with accelerations in m/s^2, and a note if gravity shows that they were in g.
 
-    Raises RecordingError where gravity is not in the readings, or they are in another unit, of angular rate too.
+    Raises RecordingError if the readings contain no gravity, or if the unit of acceleration or angular rate is wrong.
     """
     notes: tuple[str, ...] = ()
     median = float(np.median(np.linalg.norm(imu.accel, axis=1)))
@@ -63,7 +63,7 @@ def recognised_unit(imu: ImuStream, what: str, sensor: ImuSensor | None) -> tupl
 
 
 def _is_in_g(imu: ImuStream, median: float) -> bool:
-    """Whether gravity is about 1 in most windows: linear acceleration may have that size, but not all the time."""
+    """True if gravity is about 1 in most windows. median: median |accel|. Linear acceleration alone is less steady."""
     if not _NEAR_ONE[0] <= median <= 1.5 * _NEAR_ONE[1]:
         return False
     sizes = [np.linalg.norm(imu.accel, axis=1)] if imu.seconds[-1] < WINDOW_S else _gravity(imu)
@@ -72,8 +72,10 @@ def _is_in_g(imu: ImuStream, median: float) -> bool:
 
 
 def _lacks_gravity(imu: ImuStream, median: float) -> bool:
-    """Whether the readings are near zero, or their mean in windows is far below their size or another in each window,
-    whatever the rates are."""
+    """True if the readings are near zero, or their mean over windows is far below their size or varies between windows.
+
+    This must be so for every unit of the rates; median: median |accel|.
+    """
     if median >= _GRAVITY_M_S2[0] or imu.seconds[-1] < WINDOW_S:
         return False
     quartiles = (np.quantile(size, [0.25, 0.5, 0.75]) for size in _gravity(imu))
@@ -82,7 +84,7 @@ def _lacks_gravity(imu: ImuStream, median: float) -> bool:
 
 
 def _gravity(imu: ImuStream) -> list[np.ndarray]:
-    """What `gravity_size` sees with rates in rad/s, in deg/s, and none; empty for a recording too short."""
+    """`gravity_size` for rates in rad/s, for rates in deg/s and without rates; empty if the recording is too short."""
     return [size for unit in (1.0, DEGREE, 0.0) if (size := gravity_size(imu, unit)) is not None]
 
 
