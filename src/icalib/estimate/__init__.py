@@ -1,1 +1,1 @@
-"""From measurements to the most probable calibration: factors, problem, solver."""
+"""Maximum a posteriori estimate of calibration and trajectory: problem, solver, and the reweighting loop."""

@@ -23,42 +23,42 @@ from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior, without_priors
 from icalib.optim.state import State
 
-FIRST_PASS_PRIOR_WIDTH = 3.0  # times the prior uncertainty of the initial guess
-# An early pass stops where the next step would lower half the chi^2 by less, or by less than that share of it.
+FIRST_PASS_PRIOR_WIDTH = 3.0  # width of the priors of `first_pass`, over the prior uncertainty of the guess
+# An early pass stops if the predicted decrease of half the chi^2 is below the first, or below the second times it.
 EARLY_DECREASE, EARLY_DECREASE_SHARE = 0.5, 1e-6
-FIRST_DECREASE_SHARE = 1e-3  # the same of the first pass: noise and inliers that it freezes are farther off
-MAX_FINAL_REPEATS = 4  # of the final pass
-# ratio of the chi^2 at the start of a pass to that at its end, above which frozen weights are out of date
+FIRST_DECREASE_SHARE = 1e-3  # EARLY_DECREASE_SHARE of the first pass, whose noise and inliers are less accurate
+MAX_FINAL_REPEATS = 4  # repetitions of the final pass with weights frozen anew
+# chi^2 at the start of a pass over chi^2 at its end: above this ratio the weights frozen at the start are out of date
 STALE_CHI2_RATIO = 1.1
-# relative cost decrease over that of the pass before: above it passes alternate between two states
+# relative cost decrease over that of the pass before: above this ratio passes alternate between two states
 ALTERNATING_RATIO = 0.5
 
 
-OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its problem, and where the solver stood
+OnVisit = Callable[[str, Problem, Visit], None]  # called with the name of the pass, its problem, and the solver's visit
 
 
 @dataclass(frozen=True)
 class MeasurementModel:
-    """Noise and inliers of a pass. noise: by sensor, of the class that its kind has. coarse: nothing is known yet, so
-    the pass costs little, see `Pass`."""
+    """Noise and inliers of one pass. noise: by sensor name, of the noise class of the sensor's kind. coarse: True
+    before any residuals are known; the pass is then less accurate and cheaper, see `Pass`."""
 
     noise: Mapping[str, Any]
     coarse: bool = False
 
     @classmethod
     def first(cls, inputs: Inputs) -> MeasurementModel:
-        """Before any pass: what the rig file says, or what is usual, of all there is."""
+        """Model before any pass: noise as the rig file states it, else usual values."""
         noise = {}
         for model, sensors in by_kind(inputs.rig.mounted):
             noise |= model.first_noises(sensors, inputs.rig, inputs.measurements)
         return cls(noise, True)
 
     def problem(self, inputs: Inputs, state: State, fixed_directions: np.ndarray = NO_DIRECTIONS) -> Problem:
-        """See `assemble`."""
+        """Problem at `state`; fixed_directions (B, m) as in `assemble`."""
         return assemble(inputs, state, self.noise, fixed_directions, self.coarse)
 
     def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> MeasurementModel:
-        """As what a pass left behind, the `first` or another, shows it."""
+        """Model for the next pass, from the residuals of `outcome`. first: whether that pass was the first."""
         problem, residuals = outcome.problem, outcome.residuals
         end = PassEnd(
             inputs.rig, outcome.state, problem.factors, residuals, first, inputs.imu is None,
@@ -72,7 +72,8 @@ class MeasurementModel:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The last pass: where the solver ended, and what it was told of the noise."""
+    """Result of the last pass. judged: noise and inliers that the pass used. steps: of all passes, each with the name
+    of its pass."""
 
     outcome: Outcome
     judged: MeasurementModel
@@ -93,15 +94,17 @@ def estimate(
     maybe_rank_deficient: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
     guess: State | None = None,
 ) -> Estimate:
-    """All passes from an initial `state`; the final one alone if noise and outliers are `judged` already.
+    """Runs all passes from an initial `state`, and returns the last one. With known noise and inliers `judged`, runs
+    the final pass alone.
 
-    Directions of the calibration parameters in `fixed_directions` (see Problem) are fixed. A pass stops early if the
-    information of the calibration parameters (B, B) may be rank deficient, as `maybe_rank_deficient` tells, because it
-    would converge slowly along an unobservable direction. Until the null space is known, and while directions are
-    fixed, `guess` is a prior, so that unobservable directions do not drift. A pass that ended with that prior counts as
-    stopped early, too.
+    fixed_directions (B, m): directions of the calibration parameters that are fixed, see `Problem`. on_step, on_visit:
+    called with each step and each `Visit` of the solver. maybe_rank_deficient: gets a problem and the information (B,
+    B) of the calibration parameters. If it returns True, the pass stops early, because it would converge slowly along
+    an unobservable direction. guess: mean of priors that keep unobservable directions from drifting. They apply until
+    the null space is known, and while directions are fixed. A pass that ends with these priors counts as stopped early,
+    too.
 
-    Raises EstimationError where the data do not carry an estimate.
+    Raises EstimationError if the data do not suffice for an estimate.
     """
     *early, final = pass_names(inputs)
     about = () if guess is None else guess_priors(inputs, guess)
@@ -123,7 +126,7 @@ def estimate(
         passes.begin_at(state)
     way = np.inf
     for left in reversed(range(1 + MAX_FINAL_REPEATS)):
-        way_before = way if left else 0.0  # nearer than that is not to be had any more
+        way_before = way if left else 0.0  # 0: the last repetition runs to convergence, see `_is_far`
         outcome, way = passes.final(final, way_before)
         if not left or not _again(inputs, outcome, passes.judged, way, way_before):
             return Estimate(_without_priors(outcome, passes.about), passes.judged, tuple(passes.history))
@@ -135,8 +138,8 @@ def estimate(
 
 @dataclass
 class _Passes:
-    """Passes of one estimate. The next one begins at `state`, with the measurement model `judged` so far. Priors
-    `about` the guess apply until every direction is observable and none is fixed."""
+    """Passes of one estimate. state: start of the next pass. judged: its noise and inliers. about: priors about the
+    initial guess, in use until every direction is observable and none is fixed."""
 
     inputs: Inputs
     fixed_directions: np.ndarray
@@ -149,11 +152,11 @@ class _Passes:
     history: list[tuple[str, Step]] = field(default_factory=list)
 
     def begin_at(self, state: State) -> None:
-        """The next pass: of the same motion, at the keyframes that its clocks want."""
+        """Lets the next pass start at `state`, resampled at the keyframe times that its time offsets imply."""
         self.state = _on_own_keyframes(self.inputs, state)
 
     def early(self, name: str) -> None:
-        """One that leads near, and shows what is judged before the next."""
+        """Runs a pass with a wide tolerance, and updates noise and inliers from its residuals."""
         first = name == "first"
         problem, told = self._next(name)
         share = FIRST_DECREASE_SHARE if first else EARLY_DECREASE_SHARE
@@ -167,8 +170,13 @@ class _Passes:
         self.begin_at(outcome.state)
 
     def final(self, name: str, way_before: float) -> tuple[Outcome, float]:
-        """Solve the final pass. Returns the outcome and its relative cost decrease; `inf` if it stopped early because
-        the problem is rank deficient. The pass may also stop early to freeze its choices anew, or to drop priors."""
+        """Solves the final pass. Returns the outcome and its relative cost decrease; `inf` if it stopped early because
+        the problem is rank deficient.
+
+        way_before: relative cost decrease of the previous final pass. The pass also stops early if its frozen weights
+        are out of date, or while priors about the guess apply. Once every direction is observable, it drops these
+        priors and continues.
+        """
         problem, told = self._next(name)
 
         def leaves(way: float, information: np.ndarray) -> bool:
@@ -190,11 +198,13 @@ class _Passes:
         return outcome, np.inf if is_open and outcome.stopped_early else way
 
     def _next(self, name: str) -> tuple[Problem, _Told]:
+        """Problem of the next pass with the priors about the guess, and the recorder of its steps."""
         problem = _with_priors(self.judged.problem(self.inputs, self.state, self.fixed_directions), self.about)
         return problem, _Told(name, problem, self.on_step, self.on_visit, self.history)
 
     def _let_go(self, is_open: bool) -> tuple[Prior, ...]:
-        """Priors that count no more."""
+        """Drops the priors about the guess, unless directions are unobservable (`is_open`) or fixed. Returns the
+        dropped priors."""
         if is_open or self.fixed_directions.size:
             return ()
         gone, self.about = self.about, ()
@@ -203,8 +213,8 @@ class _Passes:
 
 @dataclass
 class _Told:
-    """Passes on what a pass tells of its way, keeps the steps in a `history` of all passes, and the calibration
-    parameters' last information (B, B)."""
+    """Recorder of one pass. Appends steps to the `history` of all passes, calls the callbacks, and keeps the latest
+    information (B, B) of the calibration parameters."""
 
     name: str
     problem: Problem
@@ -227,8 +237,8 @@ def _with_priors(problem: Problem, more: Sequence[Prior]) -> Problem:
 
 
 def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
-    """The outcome of a problem with `more` priors as one of the problem without, of which it is no more than half-way
-    to the end."""
+    """The outcome of a problem with the priors `more`, as one of the problem without them. If it had converged it
+    counts as stopped early, because the optimum without priors differs."""
     if not more:
         return outcome
     return replace(
@@ -240,28 +250,33 @@ def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
 
 
 def _again(inputs: Inputs, outcome: Outcome, judged: MeasurementModel, way: float, way_before: float) -> bool:
-    """Whether the last pass is to be made anew: what it froze, such as the weights of points on planes, is of a state
-    far from its end, but nearer than in the last pass before, or many measurements fit again that it rejected. way:
-    relative cost decrease, infinite if the pass stopped early because the problem is rank deficient."""
+    """True if the final pass must be repeated: its frozen quantities, such as weights of points on planes, are out of
+    date, or many rejected measurements fit again.
+
+    way, way_before: relative cost decrease of the last pass and of the pass before. `way` is infinite if the pass
+    stopped early because the problem is rank deficient.
+    """
     rebuilt = cache(lambda: judged.problem(inputs, _on_own_keyframes(inputs, outcome.state)).factors)
     used = outcome.problem.factors
     return _is_far(way, way_before) or any(m.uses_more(used, rebuilt) for m, _ in by_kind(inputs.sensors))
 
 
 def _is_far(way: float, way_before: float) -> bool:
+    """True if the frozen weights of a pass are out of date, and passes converge instead of alternating between two
+    states."""
     return STALE_CHI2_RATIO - 1.0 < way < ALTERNATING_RATIO * way_before
 
 
 def _on_own_keyframes(inputs: Inputs, state: State) -> State:
-    """The same motion, at the keyframes that its clocks want."""
+    """The same motion, resampled at the keyframe times that its time offsets imply."""
     return resample(state, keyframes_for(inputs, keyframe_times(inputs, state.values)), inputs)
 
 
 def first_pass(inputs: Inputs, state: State) -> State:
-    """The state after a first pass over all measurements from `state`, before outliers are rejected. Priors of a few
-    times the prior uncertainty keep the calibration near its guess, so that unobservable directions do not drift.
+    """State after a first pass over all measurements from `state`, before outliers are rejected. Priors about `state`,
+    FIRST_PASS_PRIOR_WIDTH times as wide as the prior uncertainty, keep unobservable directions from drifting.
 
-    Raises EstimationError where the data do not carry an estimate.
+    Raises EstimationError if the data do not suffice for an estimate.
     """
     problem = MeasurementModel.first(inputs).problem(inputs, state)
     problem = _with_priors(problem, guess_priors(inputs, state, FIRST_PASS_PRIOR_WIDTH))
@@ -269,6 +284,7 @@ def first_pass(inputs: Inputs, state: State) -> State:
 
 
 def pass_names(inputs: Inputs) -> tuple[str, ...]:
-    """The passes: keyframes and assignment are made anew once; estimates of noise and inliers take more."""
+    """Names of the passes in order. Between the first and the final pass there are up to two that estimate noise and
+    inliers, as many as the sensors need."""
     count = max((m.passes(own, inputs.rig, inputs.measurements) for m, own in by_kind(inputs.sensors)), default=0)
     return ("first", *("noise", "noise again")[:count], "final")

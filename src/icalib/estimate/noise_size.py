@@ -1,10 +1,10 @@
-"""Whether another size of the IMU's noise is all that its residuals ask for.
+"""Noise densities of the IMU that fit its residuals, and a test of whether other densities alone make them consistent.
 
 Variance components (Helmert 1924; Foerstner 1979): both densities, and the noise of `refitted` residuals such as
-corners, are scaled by the root of chi^2 over the degrees of freedom after the fit. The estimate is solved again, until
-the scales stay. If noise is all that was wrong, the residuals that are left are white and as large in every segment.
-After a fit, residuals r of white noise correlate: with a draw x from the posterior, E[r_i r_j] = -E[(J x)_i (J x)_j]
-for rows i and j of different intervals. What is left beside that is correlation that white noise does not have.
+corners, are multiplied by sqrt(chi^2 / degrees of freedom after the fit). The estimate is solved again until the scales
+converge. If only the noise sizes were wrong, the remaining residuals are white, and equally large in all segments. The
+fit itself correlates residuals of white noise: with a draw x from the posterior, E[r_i r_j] = -E[(J x)_i (J x)_j] for
+rows i and j of different intervals. Correlation beyond this is not that of white noise.
 """
 
 from __future__ import annotations
@@ -26,24 +26,27 @@ from icalib.rig import ImuNoise
 from icalib.sensors.imu.residual import ImuFactor
 
 MAX_NOISE_ROUNDS = 12  # the scales converge linearly
-MAX_LOG_SCALE_CHANGE = 0.05  # of a scale, in logarithms
-MIN_DOF_RATIO = 3.0  # times the root of the number of residuals, which is how far off sampled ones may be
-N_LAGS = 3  # intervals
-MAX_CORRELATION = 0.25  # correlation
-CHANCE_SIGMAS = 3.0  # standard deviations
-N_NOISE_SEGMENTS = 8
-MAX_VARIATION = 3.0  # times the mean square of the whole recording
-MAX_STATED_RATIO = 1.25  # times the stated density, or one over that: nobody states noise any better
-MAX_SCALE_STEP = 10.0  # of a scale in one round
-MIN_NOISE_SCALE = 0.02  # of the stated noise: a sensor with less has none, as in a simulation without noise
+MAX_LOG_SCALE_CHANGE = 0.05  # log of the change of a scale in one round, below which it has converged
+MIN_DOF_RATIO = 3.0  # least degrees of freedom over sqrt(number of residuals), their sampling error
+N_LAGS = 3  # intervals between keyframes: lags of the autocorrelation
+MAX_CORRELATION = 0.25  # autocorrelation of residuals that still counts as white
+CHANCE_SIGMAS = 3.0  # standard deviations that statistics may be off by chance
+N_NOISE_SEGMENTS = 8  # segments of the recording whose mean squares are compared
+MAX_VARIATION = 3.0  # mean square of a segment over that of the recording, or its inverse
+MAX_STATED_RATIO = 1.25  # fitted over stated density, or its inverse: rig files are no more accurate
+MAX_SCALE_STEP = 10.0  # largest factor by which a scale changes in one round
+MIN_NOISE_SCALE = 0.02  # of the stated noise: below it a sensor has no noise, as in a simulation without noise
 IMU_KINDS = ("gyroscope", "accelerometer")
 
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """noise: of the IMU, that fits; scales: of both densities over the stated ones; settled: whether the rounds found
-    them; correlation: of neighbouring residuals beyond what the fit makes, over what chance allows; variation: the
-    largest or smallest mean square of a segment, in logarithms, over what is allowed."""
+    """Fitted noise of the IMU. noise: fitted densities. scales: fitted over stated densities. settled: whether the
+    scales converged.
+
+    correlation: mean autocorrelation of the residuals beyond that caused by the fit, over the allowed one. variation:
+    largest absolute log ratio of a segment's mean square to that of the recording, over the allowed one.
+    """
 
     noise: ImuNoise
     scales: dict[str, float]
@@ -61,16 +64,19 @@ class NoiseFit:
 
     @property
     def explains(self) -> bool:
+        """Whether another noise size alone makes the residuals consistent with white, stationary noise."""
         return self.settled and self.is_white and self.is_constant
 
     @property
     def is_as_stated(self) -> bool:
-        """Whether the IMU's noise fits as it is, once that of the cameras does."""
+        """Whether the fitted densities agree with the stated ones, after the noise of the other sensors is fitted,
+        too."""
         return self.settled and all(abs(np.log(s)) < np.log(MAX_STATED_RATIO) for s in self.scales.values())
 
 
 def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
-    """None without an IMU, where an estimate with other noise fails, or where a sensor has next to no noise."""
+    """Noise of the IMU that fits the residuals of `found`. None without an IMU, if an estimate with other noise fails,
+    or if a scale is below MIN_NOISE_SCALE."""
     if inputs.rig.imu is None or inputs.rig.assumes_motion or not isinstance(found.problem.chain, ImuFactor):
         return None
     scales: dict[str, float] = dict.fromkeys([*IMU_KINDS, *_refitted_sizes(inputs, found.outcome)], 1.0)
@@ -96,6 +102,7 @@ def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
 
 
 def _scaled(inputs: Inputs, scales: dict[str, float]) -> ImuNoise:
+    """Stated noise of the IMU, densities and bias random walks multiplied by `scales`."""
     assert inputs.rig.imu is not None
     n, (gyro, accel) = inputs.rig.imu.noise, (scales[kind] for kind in IMU_KINDS)
     return replace(
@@ -104,7 +111,7 @@ def _scaled(inputs: Inputs, scales: dict[str, float]) -> ImuNoise:
 
 
 def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcome:
-    """The same estimate with noise scaled by `scales`."""
+    """Solution from the state of `found`, with noise standard deviations multiplied by `scales`."""
     assert inputs.rig.imu is not None
     rig = inputs.rig.with_sensors(replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
     other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
@@ -118,7 +125,8 @@ def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcom
 
 
 def _refitted_sizes(inputs: Inputs, outcome: Outcome) -> dict[str, float]:
-    """By sensor, the root of chi^2 over the number of its `refitted` residuals; the fit takes few of them."""
+    """By sensor, sqrt(chi^2 / n) of its n `refitted` residuals. The fit takes few of their degrees of freedom, which
+    are neglected."""
     sizes, factors = {}, outcome.problem.factors
     for sensor in inputs.sensors:
         key = sensor.name, model_of(sensor).refitted
@@ -129,7 +137,8 @@ def _refitted_sizes(inputs: Inputs, outcome: Outcome) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class _ImuDraws:
-    """Whitened residuals (K - 1, 15) of the IMU, and J x (K - 1, 15) of some draws x from the posterior."""
+    """Whitened residuals (K - 1, 15) of the IMU, and J x (K - 1, 15) for up to four draws x from the posterior. rows:
+    columns by kind of residual."""
 
     rows: dict[str, slice]
     residual: np.ndarray
@@ -148,20 +157,22 @@ class _ImuDraws:
         return cls(kinds, base, tuple(along))
 
     def _left(self, kind: str, rows: slice = slice(None)) -> tuple[int, float, float]:
-        """Number, degrees of freedom and chi^2 of the intervals `rows`."""
+        """Number, degrees of freedom after the fit, and chi^2 of the residuals of `kind` in the intervals `rows`."""
         r, columns = self.residual[rows, self.rows[kind]], self.rows[kind]
         spent = np.mean([(a[rows, columns] ** 2).sum() for a in self.along])
         return r.size, r.size - float(spent), float((r**2).sum())
 
     def size(self, kind: str) -> float:
-        """The root of chi^2 over the degrees of freedom, or a lower bound; 1 where these are too few to show more."""
+        """sqrt(chi^2 / degrees of freedom) of `kind`. With too few degrees of freedom it is a lower bound, at least
+        1."""
         count, dof, chi2 = self._left(kind)
         least = MIN_DOF_RATIO * np.sqrt(count)
         size = float(np.sqrt(chi2 / max(dof, least)))
         return size if dof > least else max(size, 1.0)
 
     def correlation(self, kind: str) -> float:
-        """Mean over N_LAGS, over what is allowed."""
+        """Absolute autocorrelation of `kind`, averaged over N_LAGS lags and corrected for the fit, over the allowed
+        one."""
         columns, (count, dof, chi2) = self.rows[kind], self._left(kind)
         total = 0.0
         for lag in range(1, N_LAGS + 1):
@@ -172,7 +183,8 @@ class _ImuDraws:
         return abs(total) / N_LAGS / dof / max(MAX_CORRELATION, CHANCE_SIGMAS * np.sqrt(count / N_LAGS) / dof)
 
     def variation(self, kind: str) -> float:
-        """The segment that departs most from the whole, in logarithms, over what is allowed."""
+        """Largest absolute log ratio of a segment's chi^2 per degree of freedom to that of the recording, over the
+        allowed one."""
         _, dof, chi2 = self._left(kind)
         worst, whole = 0.0, chi2 / max(dof, 1.0)
         for own in np.array_split(np.arange(len(self.residual)), N_NOISE_SEGMENTS):
@@ -184,7 +196,8 @@ class _ImuDraws:
 
 
 def are_noise(rows: np.ndarray) -> bool:
-    """Whether rows (n, m) of residuals, most of whose degrees of freedom the fit left, are white and constant."""
+    """Whether residuals, rows (n, m), are white and of constant variance. The fit must have taken few of their degrees
+    of freedom."""
     n, square = len(rows), float((rows**2).sum())
     if n < 2 * N_NOISE_SEGMENTS or square == 0.0:
         return False

@@ -1,1 +1,1 @@
-"""From rig and data to the problem, and from there to its solution."""
+"""The least-squares problem of one pass, from rig and data, and its solution."""

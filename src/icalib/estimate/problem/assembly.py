@@ -1,4 +1,4 @@
-"""From rig, measurements and a state to a `Problem`: one pass of the estimate."""
+"""Builds the `Problem` of one pass from rig, measurements and a state."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from icalib.sensors.sensor import TIME_OFFSET
 
 
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """All priors: those that belong to the model, those on nuisance parameters, and others that were given."""
+    """All priors: on the shapes of bodies, the default ones on auxiliary parameters, and `stated_priors`."""
     layout = inputs.layout
     priors = [
         Prior(layout.block(b, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M) for b in inputs.bodies.bending
@@ -42,12 +42,13 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
 
 
 def stated_priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """All priors except the default ones on auxiliary parameters."""
+    """Priors on nuisance parameters, and priors of the rig file on calibrated parameters."""
     return (*_nuisance_priors(inputs), *given_priors(inputs))
 
 
 def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """The priors on how imperfect sensors and targets are, whether the rig file gives them or they are the default."""
+    """Priors on nuisance parameters, the imperfections of sensors and targets: those of the rig file, else default
+    ones."""
     priors, one = [], np.ones(1)
     for block in inputs.layout.free:
         stated = inputs.stated(block)
@@ -59,7 +60,7 @@ def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
 
 
 def given_priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """The priors that the rig file gives on what is calibrated."""
+    """Priors of the rig file on calibrated parameters, which are not nuisance parameters."""
     priors = []
     for block in inputs.layout.free:
         stated = inputs.stated(block)
@@ -72,16 +73,17 @@ def given_priors(inputs: Inputs) -> tuple[Prior, ...]:
 
 
 def _given(block: Block, parameter: Parameter, shift: float = 0.0) -> list[Prior]:
+    """Prior of a block as the rig file states it, its mean moved by `shift`; empty if the file states none."""
     if parameter.mode != "prior" or parameter.value is None or parameter.sigma is None:
         return []
     value, sigma = parameter.value + shift, parameter.sigma
-    if block.name == TIME_OFFSET.name:  # of a clock that restarts, the prior of each
+    if block.name == TIME_OFFSET.name:  # a clock that restarts: the same prior in each recording
         value, sigma = np.broadcast_to(value, block.size), np.broadcast_to(sigma, block.size)
     return [Prior(block, value, sigma)]
 
 
 def keyframe_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
-    """Instants that keyframes are placed at, by sensor, seconds on the body's clock since its first stamp."""
+    """Times at which keyframes are wanted, one array per sensor [s, body's clock since its first stamp]."""
     return [
         model.keyframe_times(sensor, inputs.stream(sensor.name), values, inputs.rig)
         for model, sensors in _keyframe_sources(inputs.rig)
@@ -90,8 +92,8 @@ def keyframe_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.nda
 
 
 def _keyframe_sources(rig: Rig) -> list[tuple[SensorModel, list[Sensor]]]:
-    """The sensors of the first kind that places keyframes, and its model; of all kinds where the motion is an
-    assumption that poses show."""
+    """Models and sensors that place keyframes: the first kind that can. If the rig assumes its motion and poses measure
+    it, all kinds that can."""
     found = [
         (model, own[:1] if model.only_first_places_keyframes else own)
         for model, own in by_kind(rig.sensors.values())
@@ -101,8 +103,8 @@ def _keyframe_sources(rig: Rig) -> list[tuple[SensorModel, list[Sensor]]]:
 
 
 def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
-    """The same motion at other keyframes, by integrating the IMU from the nearest old one; without an IMU keyframes
-    stay."""
+    """The same motion at the times `keyframes`, by integrating the IMU from the nearest old keyframe. Without an IMU
+    the state is returned as it is."""
     if inputs.imu is None:
         return state
     near = assign_keyframes("inertial", state.seconds, keyframes, inputs.imu.forwards)
@@ -114,7 +116,8 @@ def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
 
 
 def keyframes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
-    """Keyframe times for images or scans at `times`. Raises EstimationError where clocks do not overlap."""
+    """Keyframe times [s] for images or scans at `times`, one array per sensor. Raises EstimationError if clocks do not
+    overlap."""
     settings = inputs.rig.settings
     if inputs.imu is None:
         return distinct(np.sort(np.concatenate(times)))
@@ -142,11 +145,12 @@ def assemble(
     fixed_directions: np.ndarray = NO_DIRECTIONS,
     coarse: bool = False,
 ) -> Problem:
-    """The problem at the keyframes of `state`, everything frozen that a pass freezes: assignment, preintegration,
-    corrections of measurements that depend on the state.
+    """The problem at the keyframes of `state`, with everything that a pass freezes: assignment to keyframes,
+    preintegration, and corrections of measurements that depend on the state.
 
-    noise: by sensor, of the class that its kind has; held: directions of the calibration parameters that are fixed, see
-    Problem; coarse: an early pass, see `Pass`."""
+    noise: by sensor, of the noise class of its kind. fixed_directions (B, m): directions of the calibration parameters
+    that are fixed, see `Problem`. coarse: an early pass, see `Pass`.
+    """
     rig = inputs.rig
     factors = _measured(inputs, noise, pass_at(inputs, state, coarse))
     return Problem(
@@ -156,14 +160,14 @@ def assemble(
 
 
 def motion_of(inputs: Inputs, state: State) -> EstimatedMotion:
-    """The IMU's motion as `state` has it."""
+    """Motion of the IMU between the keyframes of `state`."""
     assert inputs.imu is not None
     return EstimatedMotion(state, inputs.imu, inputs.rig.gravity, inputs.rig.settings.max_gap_s)
 
 
 def _measured(inputs: Inputs, noise: Mapping[str, Any], at: Pass) -> list[Factor]:
-    """The factors of all sensors, kind by kind. Those of what several sensors measure together are built beside the
-    others, in one thread of their own, because points of LiDARs already use the solver's threads."""
+    """Factors of all sensors, kind by kind. Joint factors of several sensors are built concurrently in one separate
+    thread, because LiDAR points already use the solver's threads."""
     found: list[tuple[list[Factor], Future[Sequence[Factor]]]] = []
     with ThreadPoolExecutor(1) as aside:
         for model, sensors in by_kind(inputs.sensors):
@@ -176,7 +180,7 @@ def _measured(inputs: Inputs, noise: Mapping[str, Any], at: Pass) -> list[Factor
 
 
 def pass_at(inputs: Inputs, state: State, coarse: bool = False) -> Pass:
-    """What factors are built from at `state`."""
+    """Data from which factors are built at `state`."""
     if inputs.imu is not None:
         motion, starts = motion_of(inputs, state), state.starts
     else:
@@ -196,7 +200,7 @@ def _chain(inputs: Inputs, state: State) -> ChainFactor:
 
 
 def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
-    """Values of all blocks: the guess, completed by what starts from zero."""
+    """Values of all blocks: the guess, completed by start values of parameters that are not guessed."""
     rig, values = inputs.rig, guess_values | {SIZE: np.ones(1)}
     for name in inputs.bodies.bending:
         values[name, "shape"] = np.zeros(len(SHAPE_LABELS))

@@ -1,4 +1,4 @@
-"""The groups of parameters of a rig's sensors, as the rig file treats them."""
+"""Iteration over, and replacement of, the parameter groups of the sensors of a rig."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from icalib.rig import Parameter, Rig, Sensor
 
 
 def groups_of(rig: Rig) -> Iterator[tuple[Sensor, str, Parameter]]:
-    """Each group of each sensor but the IMU, with its name."""
+    """Yields (sensor, name of the group, group) of all sensors but the IMU."""
     for sensor in rig.mounted:
         for name, value in vars(sensor).items():
             if isinstance(value, Parameter):
@@ -17,7 +17,7 @@ def groups_of(rig: Rig) -> Iterator[tuple[Sensor, str, Parameter]]:
 
 
 def with_groups(rig: Rig, treated: Callable[[Sensor, str, Parameter], Parameter]) -> Rig:
-    """The rig with every group as `treated` makes it from sensor, name and group."""
+    """The rig with each group replaced by `treated(sensor, name, group)`."""
     changed = {sensor.name: {} for sensor in rig.mounted}
     for sensor, name, group in groups_of(rig):
         changed[sensor.name][name] = treated(sensor, name, group)

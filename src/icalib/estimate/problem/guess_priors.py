@@ -1,6 +1,6 @@
-"""Prior uncertainty of the initial guess, and priors of that width.
+"""Prior uncertainty of the initial guess, and Gaussian priors about the guess.
 
-They keep unobservable directions near the guess while the solver runs.
+The priors keep unobservable directions near the guess while the solver runs.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from icalib.optim.state import State
 from icalib.rig import Camera
 from icalib.sensors.sensor import TRANSLATION
 
-COEFFICIENT_STEP = 1e-4  # of a coefficient, for a difference quotient
+COEFFICIENT_STEP = 1e-4  # step of a distortion coefficient, for a difference quotient
 
 
 def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
-    """(B,) standard deviations of the guess: stated ones, or the default ones. `state` has the lenses."""
+    """(B,) prior standard deviations of the guess: as the rig file states them, else default ones. state: supplies the
+    lens parameters."""
     sigma = np.zeros(inputs.layout.size)
     for b in inputs.layout.free:
         stated = inputs.stated(b)
@@ -36,8 +37,8 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
 
 
 def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prior, ...]:
-    """Priors about `guess` on all parameters of sensors for which the rig file gives none. Their standard deviation is
-    `times` that of `guess_sigma`."""
+    """Priors about `guess` on all estimated parameters of sensors for which the rig file states no prior. Their
+    standard deviation is `times` that of `guess_sigma`."""
     sigma = times * guess_sigma(inputs, guess)
     given = {p.block.key for p in stated_priors(inputs)}
     own = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.key not in given)
@@ -45,10 +46,10 @@ def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prio
 
 
 def _focal_sigma(camera: Camera, state: State, sigma: np.ndarray) -> float:
-    """px: how far fx may be off because the coefficients, of standard deviations `sigma`, are.
+    """Standard deviation of fx [px] due to errors of the distortion coefficients, with standard deviations `sigma`.
 
-    A guess knows the scale in the centre of the image. In some models this scale depends on a coefficient, too: it is
-    fx / (1 + xi) in the unified model. fx then follows the error of xi.
+    A guess gives the scale at the image centre. In some models this scale depends on a coefficient, too: it is fx / (1
+    + xi) in the unified model. An error of xi then changes fx.
     """
     model, fx = camera_model(camera.model), state.values[camera.name, "intrinsics"][0]
     lens = np.concatenate([state.values[camera.name, name] for name in ("intrinsics", "distortion")])

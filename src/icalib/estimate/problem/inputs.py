@@ -26,11 +26,11 @@ from icalib.sensors.camera.image_times import on_common_images
 
 @dataclass(frozen=True)
 class Inputs:
-    """All that stays the same from pass to pass.
+    """Inputs of an estimate that stay the same in all passes.
 
     bodies: bodies of the target in use. parts: the recordings that were joined to `measurements`. clouds: points on
-    planes; sensors that show planes take part only with these. guess: the state before points were associated with
-    planes. asked: the rig as the user gave it, if `rig` has more.
+    planes; sensors that measure planes are used only with them. guess: initial state, before points were associated
+    with planes. asked: the rig as the user gave it, if `rig` has more.
     """
 
     rig: Rig
@@ -45,49 +45,49 @@ class Inputs:
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:
-        """The mounted sensors that take part."""
+        """Mounted sensors that have parameters and factors."""
         return _taking_part(self.rig, self.clouds)
 
     @cached_property
     def owners(self) -> dict[str, Sensor]:
-        """All sensors that take part, by name, the IMU first."""
+        """All sensors that have parameters and factors, by name, the IMU first."""
         return {s.name: s for s in self.rig.sensors.values() if model_of(s).takes_part(s, self.clouds)}
 
     @cached_property
     def specs(self) -> dict[Key, ParameterSpec]:
-        """Definitions of the blocks of the layout."""
+        """Parameter definition of each block of the layout."""
         return specs_of(self.layout, self.owners.values())
 
     def stated(self, block: Block) -> Parameter | None:
-        """The field of the rig file for a block of a sensor; None for blocks of the scene."""
+        """Field of the rig file for a sensor's block; None for blocks of the scene."""
         owner = self.owners.get(block.sensor)
         return None if owner is None else getattr(owner, block.name)
 
     @property
     def tolerance(self) -> np.ndarray:
-        """(B,) of each calibration column."""
+        """(B,) tolerance of each calibration column, see `tolerance_of`."""
         return tolerance_of(self.layout, self.specs, self.rig.settings)
 
     def sensor(self, name: str) -> Any:
-        """The sensor `name`, of the class of its kind."""
+        """Sensor `name` of the rig, of the class of its kind."""
         return self.rig.sensors[name]
 
     def stream(self, name: str) -> Stream:
-        """The stream of the sensor `name`; of a camera that of corners."""
+        """Measurements of the sensor `name`; for a camera, its corners."""
         return self.measurements.streams[name]
 
     def clocks_of(self, sensor: Sensor) -> int:
-        """How many time offsets it has."""
+        """Number of time offsets of `sensor`: one, or one per recording if its clock restarts."""
         return clocks_of(sensor, len(self.parts))
 
     def is_sensor(self, name: str) -> bool:
-        """Whether `name` is a sensor's, not a body's of the target or a plane's."""
+        """Whether `name` is a sensor, and not a body of the target or a plane."""
         return name == self.rig.reference or name in [s.name for s in self.sensors]
 
     @property
     def motions(self) -> tuple[Part, ...]:
-        """The recordings, each with a chain and a board of its own; without an IMU all together, since then nothing
-        ties the instants of even one."""
+        """The recordings, each with its own chain and target attitude. Without an IMU a single part, because then no
+        instants are linked."""
         if self.imu is not None:
             return self.parts
         everything = {key: slice(0, len(s.stamps_ns)) for key, s in self.measurements.streams.items()}
@@ -95,7 +95,8 @@ class Inputs:
 
 
 def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | None = None) -> Inputs:
-    """Of one recording or several, joined; on the clock of `whole`, where these are some of its streams."""
+    """Inputs of one or several recordings, joined. whole: inputs whose clock shifts are used, if `recordings` are some
+    of their streams."""
     bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape, rig)
     shifts = None if whole is None else [part.shift_ns for part in whole.parts]
     joined, parts = join(rig, [on_common_images(rig, restrict(bodies, r)) for r in recordings], shifts)
@@ -104,19 +105,19 @@ def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | Non
 
 
 def with_clouds(inputs: Inputs, clouds: Clouds) -> Inputs:
-    """The same with points on planes."""
+    """The same inputs with points on planes, and planes in the layout."""
     layout = layout_for(inputs.rig, inputs.bodies, len(inputs.parts), clouds)
     return replace(inputs, layout=layout, clouds=clouds)
 
 
 def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds = NO_CLOUDS) -> Layout:
-    """The calibration parameters: IMU intrinsics, the scene and its bodies, then each sensor's parameters, and
-    planes."""
+    """Layout of the calibration parameters: IMU intrinsics, target, each sensor's parameters, frames in the scene,
+    poses of bodies, planes."""
     imu, sensors = rig.imu, _taking_part(rig, clouds)
     entries: list[Entry] = []
     if imu is not None:
         entries += model_of(imu).entries(imu, rig, n_recordings)
-    # Without an IMU the scene's frame is the world's, in all recordings.
+    # Without an IMU the frame of the target is the world frame of all recordings.
     levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():
         entries.append(TILT.entry(in_recording(BOARD, k), levelled))
@@ -129,9 +130,11 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
 
 
 def _taking_part(rig: Rig, clouds: Clouds) -> tuple[Sensor, ...]:
+    """Mounted sensors that have parameters and factors."""
     return tuple(s for s in rig.mounted if model_of(s).takes_part(s, clouds))
 
 
 def origin_difference(measurements: Measurements, stream: Stream) -> float:
-    """Seconds from the body's first stamp to the sensor's, each on its own clock: what a raw time offset lacks."""
+    """First stamp of the sensor minus that of the body [s], each on its own clock. Added to the time offset of raw
+    stamps, it gives the offset of times since these first stamps."""
     return (stream.origin_ns - measurements.origin_ns) * 1e-9

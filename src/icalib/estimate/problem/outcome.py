@@ -13,18 +13,18 @@ from icalib.optim.arrowhead import Draw, Piece, Solution, solve
 from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.state import State
 
-STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
-N_JOINT_DRAWS, N_CHAIN_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
-# Of few keyframes more free ones: the degrees of freedom that they show are off by sqrt(2 spent / draws), of few
-# residuals too much. So many keyframes times draws at most; doubled, they cost twice as much, and are off by 0.7 times
-# as much.
+STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation; converged if steps fail below it
+N_JOINT_DRAWS, N_CHAIN_DRAWS = 2, 3  # posterior draws: with calibration parameters, and of the chain alone
+# Upper bound of keyframes times `free` draws. Few keyframes need more: degrees of freedom used by the fit have an error
+# of sqrt(2 used / draws), too large for few residuals. Doubled, draws cost twice as much, for 0.7 times the error.
 DRAWS_TIMES_KEYFRAMES, MAX_JOINT_DRAWS = 640, 64
-N_MORE_CHAIN_DRAWS = 5  # for where these leave doubt; drawn later, so that the first stay what they are
+N_MORE_CHAIN_DRAWS = 5  # chain draws for unclear cases; drawn later, so that the first ones do not change
 
 
 @dataclass(frozen=True)
 class Step:
-    """One iteration: half the robust chi^2 before it, the decrease that the linear model promises, and its fate."""
+    """One iteration: half the robust chi^2 before it, the decrease that the linear model predicts, damping, and whether
+    it was accepted."""
 
     cost: float
     predicted_decrease: float
@@ -34,8 +34,8 @@ class Step:
 
 @dataclass(frozen=True)
 class Visit:
-    """Where the solver stood when it looked for a step: the state, and the calibration parameters' information (B, B)
-    there, the chain marginalised (damping included)."""
+    """A state at which the solver computed a step, and the information (B, B) of the calibration parameters there,
+    chain marginalised, damping included."""
 
     state: State
     information: np.ndarray
@@ -43,11 +43,13 @@ class Visit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
-    looked for where they were; information (B, B): of the calibration parameters at `state`, the chain marginalised, no
-    damping; empty, and no draws, where another pass follows. stopped_early: left before its end, because more seemed of
-    no use. room: the pieces that it was solved in, to be filled anew; None without features, of which alone the fronts
-    are kept."""
+    """End of a solve. problem: the solved problem, warm-started. cost: half the robust chi^2 at `state`. status: a
+    sentence about convergence.
+
+    information (B, B): of the calibration parameters at `state`, chain marginalised, undamped. It is empty, and draws
+    are None, if another pass follows. stopped_early: stopped before convergence, because more steps seemed useless.
+    room: the pieces of the solve, reusable as workspace; None without features.
+    """
 
     problem: Problem
     state: State
@@ -64,15 +66,15 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Draws:
-    """Steps drawn from the posterior: `free` ones, undetermined directions of the calibration parameters held, and
-    `still` ones, all of the calibration parameters held."""
+    """Steps drawn from the posterior. In `free` ones the calibration parameters vary, except along unobservable
+    directions. In `still` ones all calibration parameters are fixed."""
 
     free: tuple[Draw, ...]
     still: tuple[Draw, ...]
 
     @classmethod
     def of(cls, solution: Solution) -> Draws:
-        """From what was solved last, the pieces as the solve left them."""
+        """Draws from the latest `solution`, before its pieces are filled anew."""
         rng, factors = np.random.default_rng(0), solution.factors
         drawn = factors.draws(rng, N_JOINT_DRAWS, N_CHAIN_DRAWS) + factors.draws(rng, 0, N_MORE_CHAIN_DRAWS)
         more = min(DRAWS_TIMES_KEYFRAMES // len(solution.chain), MAX_JOINT_DRAWS) - N_JOINT_DRAWS
@@ -81,8 +83,8 @@ class Draws:
 
 
 def relative_decrease(steps: Sequence[Step], cost: float) -> float:
-    """From where the first of `steps` began to half a chi^2 of `cost`, as a share of that; nothing where that is
-    nothing, or there is no step."""
+    """Relative decrease of half the chi^2 from the start of `steps` to `cost`, (start - cost) / cost; 0 without steps
+    or if the cost is 0."""
     return steps[0].cost / cost - 1.0 if steps and cost > 0.0 else 0.0
 
 
@@ -95,9 +97,10 @@ def outcome_of(
     steps: list[Step],
     end: Solution | None = None,
 ) -> Outcome:
-    """The outcome at `state`. `left`: what half the chi^2 can still fall by; `end`: what was solved there."""
+    """The outcome at `state`. left: predicted further decrease of half the chi^2. end: the solution at `state`, None if
+    another pass follows."""
     converged, n = left < STALLED_DECREASE, len(steps)
-    # Half a chi^2 of d is a step of sqrt(2 d) standard deviations at most.
+    # A decrease d of half the chi^2 is a step of at most sqrt(2 d) standard deviations.
     share = max(100.0 * np.sqrt(2.0 * max(left, 0.0)), 1.0)
     status = (
         f"converged in {n} iteration{'s' * (n != 1)} of the last pass: the next step would move no parameter by more "

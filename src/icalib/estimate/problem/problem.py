@@ -1,4 +1,4 @@
-"""Where factors and solver meet: all measurements, as sums over the pieces of the chain (paper (15))."""
+"""The least-squares problem of one pass: sums of all factors and priors over the pieces of the chain (paper (15))."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from icalib.optim.state import Layout, State
 
 @runtime_checkable
 class ChainFactor(Factor, Protocol):
-    """What ties the keyframes together: an `ImuFactor`, or `IndependentKeyframes`. kinds: columns of its residuals by
-    name; starts: the first keyframe of each recording, which nothing ties to the one before."""
+    """Factor between successive keyframes: `ImuFactor`, or `IndependentKeyframes`, which links none. kinds: columns of
+    its residuals by kind. starts: first keyframe of each recording, not linked to the keyframe before it."""
 
     @property
     def n_keyframes(self) -> int: ...
@@ -32,29 +32,29 @@ class ChainFactor(Factor, Protocol):
     def kinds(self) -> dict[str, slice]: ...
 
     def output(self) -> Whitened:
-        """Rows (K - 1, 15), one an interval between keyframes."""
+        """Empty rows (K - 1, 15), one per interval between keyframes."""
         ...
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Adds what keeps the biases of those `starts` defined that lie in `piece`, its last keyframe aside; returns
-        half its chi^2."""
+        """Adds the prior on the biases at each of `starts` in `piece`, except at its last keyframe. Returns half its
+        chi^2."""
         ...
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Minimise half the sum of all squared, whitened, robust residuals over a `State`. factors: one of them is the
-    chain."""
+    """Least-squares problem: minimise half the robust chi^2 of all factors and priors over a `State`. factors: one of
+    them is the `ChainFactor`."""
 
     layout: Layout
     factors: dict[FactorKey, Factor]
     priors: tuple[Prior, ...]
-    tolerance: np.ndarray  # (B,) what a user would call the same number; scales the calibration parameters
+    tolerance: np.ndarray  # (B,) differences that do not matter to a user: units of the calibration columns
     fixed_directions: np.ndarray = field(
         default_factory=lambda: NO_DIRECTIONS
-    )  # (B, m) orthonormal directions of the calibration parameters, in tolerance units, that stay
-    framed: bool = True  # a target says where the world's origin is; else nothing does, and it stays where it is
-    levelled: bool = True  # gravity says which way is up
+    )  # (B, m) orthonormal directions of the calibration parameters, in tolerance units, that are fixed
+    framed: bool = True  # whether the world frame is defined, as by a target; else first keyframes are fixed
+    levelled: bool = True  # whether the direction of gravity is known
 
     @cached_property
     def chain(self) -> ChainFactor:
@@ -66,44 +66,48 @@ class Problem:
 
     @cached_property
     def ties_distant_keyframes(self) -> bool:
-        """Whether segments of the chain do not stand alone."""
+        """Whether a factor links keyframes that are not neighbours, so that segments of the chain are not
+        independent."""
         return any(f.ties_distant_keyframes for f in self.factors.values())
 
     def replacing(self, factors: Sequence[Factor]) -> Problem:
-        """The same problem with other `factors` of the same keys, or more of them."""
+        """The same problem with `factors` instead of those with the same keys; factors with new keys are added."""
         return replace(self, factors=self.factors | keyed(factors))
 
     def pieces(self, sums: bool = True) -> tuple[Piece, ...]:
-        """The chain in pieces; without `sums`, only residuals can be asked for."""
+        """Pieces of the chain, sums zero; without `sums`, for residuals only."""
         pieces = make_pieces(self.n_keyframes, self.layout.size if sums else None)
         return tuple(self.attach(p, len(pieces) > 1) for p in pieces) if sums else pieces
 
     def attach(self, piece: Piece, keep: bool = False) -> Piece:
-        """The piece with room for what factors eliminate; `keep`: another piece shares a keyframe with it."""
+        """The piece with workspace for parameters that factors eliminate; `keep`: it shares a keyframe with another
+        piece."""
         for factor in self.factors.values():
             piece = factor.attach(piece, keep)
         return piece
 
     def without(self, priors: Sequence[Prior]) -> Problem:
-        """The same problem, in which `priors` of it count no more."""
+        """The same problem without `priors`, which are compared by identity."""
         gone = {id(p) for p in priors}
         return replace(self, priors=tuple(p for p in self.priors if id(p) not in gone))
 
     def cut(self, state: State, keyframes: np.ndarray) -> Problem:
-        """The same problem with independent pieces between `keyframes` (n,): across one of these nothing but the chain
-        ties others."""
+        """The same problem with factors cut at `keyframes` (n,). Only the chain then links keyframes on both sides of a
+        cut."""
         ends = tuple(int(k) for k in keyframes)
         return self.replacing([f.cut(state, ends) for f in self.factors.values()])
 
     def marginal(self, sums_of: Callable[[int, int], Piece]) -> np.ndarray:
-        """Border (B + 1, B + 1) of `sums_of` from one keyframe to another, all keyframes eliminated: a segment at a
-        time, but where factors tie distant keyframes."""
+        """System (B + 1, B + 1) of the calibration parameters and their gradient, all keyframes eliminated. sums_of:
+        makes the sums between two keyframes. To bound memory, segments are eliminated in turn unless factors link
+        distant keyframes."""
         if self.ties_distant_keyframes:
             return marginalise(sums_of(0, self.n_keyframes - 1))
         return marginalise_in_segments(sums_of, self.n_keyframes)
 
     def sums_of(self, state: State, first: int, last: int) -> Piece:
-        """The sums between two keyframes alone, with the true curvature of robust losses; residuals are not kept."""
+        """Sums between keyframes `first` and `last`, with the true curvature of robust losses. Residuals are
+        discarded."""
         piece = self.attach(Piece.zeros(first, last, self.layout.size))
         for factor in self.factors.values():
             factor.accumulate(state, piece, factor.discarded_output(), curved=True)
@@ -114,21 +118,22 @@ class Problem:
         return piece
 
     def residuals(self) -> Residuals:
-        """Empty arrays for `linearise` to fill."""
+        """Empty arrays for `linearise` to fill, by factor."""
         return {key: factor.output() for key, factor in self.factors.items()}
 
     def reusable_output(self, at: Residuals) -> Residuals:
-        """`at`, to be filled once more, with new arrays where this problem's own are of another size."""
+        """Arrays `at` to be overwritten, with new ones for factors that need another size."""
         return {key: factor.reusable_output(at[key]) for key, factor in self.factors.items()}
 
     def warm_started(self, at: Residuals) -> Problem:
-        """The same problem, points of the scene first looked for where they were at `at`."""
+        """The same problem, which starts the search for eliminated points of the scene from those of `at`."""
         return self.replacing([factor.warm_started(at[key]) for key, factor in self.factors.items()])
 
     def linearise(
         self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:
-        """Fills `pieces` and `out` at `state`; returns half the robust chi^2. `curved`: see `Factor.accumulate`."""
+        """Fills `pieces` (if `sums`) and residuals `out` at `state`; returns half the robust chi^2. `curved`: see
+        `Factor.accumulate`."""
         return sum(in_parallel(lambda p: self._accumulate(state, p, out, sums, curved), pieces))
 
     def _accumulate(self, state: State, piece: Piece, out: Residuals, sums: bool, curved: bool) -> float:
@@ -142,7 +147,7 @@ class Problem:
         return cost
 
     def hold_frames(self, state: State, piece: Piece) -> None:
-        """Each recording's world stays where it is, if nothing says where that is."""
+        """Fixes the gauge freedom of each recording's world frame, unless the problem is `framed`."""
         for keyframe in self.chain.starts if not self.framed else ():
             if piece.first <= keyframe < piece.last:
                 hold_frame(state, piece, keyframe, self.levelled)
@@ -150,15 +155,16 @@ class Problem:
     def add_measurements(
         self, state: State, piece: Piece, out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:
-        """Adds all factors in `piece`; returns half their robust chi^2."""
+        """Adds all factors to `piece`; returns half their robust chi^2."""
         return sum(f.accumulate(state, piece, out[key], sums, curved) for key, f in self.factors.items())
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Adds the broad prior on the biases of recordings' first keyframes, about those that the pass started from."""
+        """Adds the broad prior on the biases at each recording's first keyframe, centred on their values at the start
+        of the pass. Returns half its chi^2."""
         return self.chain.accumulate_bias_prior(state, piece, sums)
 
     @staticmethod
     def narrow(piece: Piece, n_calib: int) -> Piece:
-        """A piece over the same chain blocks with `n_calib` calibration parameters of its own."""
+        """A piece that shares the chain blocks of `piece`, with new sums for `n_calib` calibration parameters."""
         own = Piece.zeros(piece.first, piece.last, n_calib)
         return Piece(piece.first, piece.last, piece.diagonal, piece.upper, own.side, own.calib)

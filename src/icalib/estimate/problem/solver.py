@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on the manifold. It knows a problem only by its sums."""
+"""Levenberg-Marquardt on the manifold."""
 
 from __future__ import annotations
 
@@ -19,31 +19,33 @@ from icalib.optim.prior_factor import Prior, sums_of_priors
 from icalib.optim.state import State
 
 MAX_ITERATIONS = 50
-# Half a chi^2 of 5e-4 is a step of 0.03 standard deviations at most, in any direction.
+# A decrease of half the chi^2 by 5e-4 is a step of at most 0.03 standard deviations, in any direction.
 CONVERGED_DECREASE = 5e-4
-ROUNDING_SHARE = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
-CURVED_BELOW_SHARE = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
-EARLY_STOP_DECREASE = 0.5  # of half the chi^2: where little more is gained, unobservable directions show
-MAX_STALLED_STEPS = 4  # steps this small that fail before the solver rests
-# of what a step costs too much, where its error is of second order: this much at most is left next
+ROUNDING_SHARE = 1e-11  # of the cost: rounding error of a sum of 1e6 squares
+CURVED_BELOW_SHARE = 1e-2  # of the cost: steps that predict less use the true curvature of the robust loss
+EARLY_STOP_DECREASE = 0.5  # of half the chi^2: below this predicted decrease, early stopping is considered
+MAX_STALLED_STEPS = 4  # failed steps with a predicted decrease below STALLED_DECREASE, before the solver ends
+# of the excess cost: second-order correction continues while each of its steps leaves at most this share
 MAX_CORRECTION_RATIO = 0.25
+# of half the chi^2; of the tolerance: predicted decrease, and error of the prediction, of a linear step at most
 MAX_LINEAR_DECREASE, MAX_LINEAR_MISMATCH = (
     1e3,
     0.1,
-)  # of half the chi^2; of an early pass's tolerance: how well a larger step may be foretold
-OVERSHOOT_GAIN = 0.5  # of what a step promises: one that gains or costs less than this is too long
-CORRECTION_DAMPING = 1e-6  # damping of a step that comes back: across a valley, not along it
-CREEPING_STEPS = 2  # steps, of the least of which the next one must promise less than half; with one, any bend would do
-RESTING_RATIO = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
-MIN_DAMPING = 1e-8
+)
+OVERSHOOT_GAIN = 0.5  # actual over predicted decrease: a step with a smaller absolute value overshoots
+CORRECTION_DAMPING = 1e-6  # of steps of the second-order correction: they move across a valley, not along it
+# Convergence is slow if a step predicts over half of the least of so many before. With 1, any nonlinearity would count.
+CREEPING_STEPS = 2
+RESTING_RATIO = 20.0  # times the tolerance of an early pass: a step that predicts less and fails ends the pass
+MIN_DAMPING = 1e-8  # first damping if the undamped normal equations are not positive definite
 SMALL_DECREASE = 0.5  # of half the chi^2: a step of one standard deviation, all parameters together
 NEGLIGIBLE_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations: too small to linearise again
 
 
 class _DampingSchedule(NamedTuple):
-    """Of damping: what it is at first; by what it grows with a failure, by its square with the next, ...; by what it
-    shrinks where one good step follows another; and below what there is none: the weak information of a planar drive
-    must not be swamped."""
+    """Damping schedule. first: least damping after a failed step. more: growth factor after a failure; its powers after
+    successive failures. less: smallest reduction factor after successive good steps. none: damping below it is set to
+    0, so that it does not swamp the weak information of a planar drive."""
 
     first: float
     more: float
@@ -52,16 +54,17 @@ class _DampingSchedule(NamedTuple):
 
 
 CAREFUL_DAMPING = _DampingSchedule(1e-6, 2.0, 0.1, 1e-10)
-EARLY_DAMPING = _DampingSchedule(1e-4, 8.0, 0.01, 2e-6)  # where a pass is only to lead near
-# Nielsen 1999, "Damping parameter in Marquardt's method": by what it shrinks after a failure
+EARLY_DAMPING = _DampingSchedule(1e-4, 8.0, 0.01, 2e-6)  # for a pass that need not converge
+# Nielsen 1999, "Damping parameter in Marquardt's method": smallest reduction factor of damping after a failure
 MIN_FACTOR_AFTER_FAILURE = 1.0 / 3.0
-MIN_GAIN_RATIO = 0.25  # of what a step promises: with less, damping does not shrink
+MIN_GAIN_RATIO = 0.25  # actual over predicted decrease: below it damping is not reduced
 
 
 @dataclass
 class _DampingControl:
-    """How steps are shortened: by damping, at its `pace`, and by weights alone in place of the true curvature of the
-    loss, which the sums have (`curved`) where a step promises less than `curved_below` of the cost."""
+    """Damping, and the curvature of the robust loss in the sums. pace: damping schedule. curved: whether the sums have
+    the true curvature, instead of weights alone. curved_below: share of the cost; steps with a smaller predicted
+    decrease use the true curvature."""
 
     pace: _DampingSchedule
     damping: float = 0.0
@@ -70,8 +73,8 @@ class _DampingControl:
     failures: int = 0  # since the last step that was taken
 
     def less(self, near: bool, gain: float) -> None:
-        """After a step that was taken, with its gain over the predicted one, to sums that have the true curvature where
-        `near`. Damping that a failed step asked for shrinks slowly: with much less the next step would fail, too."""
+        """Update after an accepted step. near: whether its sums have the true curvature. gain: actual over predicted
+        decrease. After a failure damping is reduced slowly, because with much less the next step would fail, too."""
         self.curved = near
         if gain > MIN_GAIN_RATIO:
             least = MIN_FACTOR_AFTER_FAILURE if self.failures else self.pace.less
@@ -80,7 +83,7 @@ class _DampingControl:
         self.damping = 0.0 if self.damping < self.pace.none else self.damping
 
     def more(self) -> None:
-        """After one that failed: too far out for the true curvature, so weights alone, and only then more damping."""
+        """Update after a failed step: first the true curvature is replaced by weights alone, then damping grows."""
         if self.curved:
             self.curved_below *= 0.1
         else:
@@ -91,8 +94,8 @@ class _DampingControl:
 
 @dataclass
 class _Descent:
-    """Where the solver stands: `cost` at `state`, of which `pieces` and `residuals` hold the sums; stalled: how many
-    small steps have failed."""
+    """State of the solver. cost: half the robust chi^2 at `state`; pieces and residuals: filled at `state`. stalled:
+    number of small steps that failed."""
 
     problem: Problem
     state: State
@@ -120,28 +123,29 @@ class _Descent:
         on_step: Callable[[Step], None],
         room: tuple[Piece, ...] | None = None,
     ) -> _Descent:
-        """At `state`, before any step."""
+        """The solver before its first step. room: pieces to be reused as workspace."""
         pieces, residuals = room or problem.pieces(), problem.residuals()
         cost = problem.linearise(state, pieces, residuals)
         return cls(problem, state, tolerance, share, on_step, pieces, residuals, cost)
 
     @property
     def early(self) -> bool:
-        """Whether another pass follows."""
+        """Whether another pass follows; then the tolerance is wide."""
         return self.tolerance > STALLED_DECREASE
 
     @property
     def enough(self) -> float:
-        """A decrease too small for a further step."""
+        """Decrease of half the chi^2 that is too small for a further step."""
         return max(self.tolerance, self.share * self.cost)
 
     @property
     def free(self) -> bool:
-        """Whether steps are not damped."""
+        """Whether steps are undamped."""
         return self.care.damping == 0.0
 
     def solution(self) -> Solution:
-        """Of the sums, with the least damping, from that in use up, that makes them definite."""
+        """Solves the normal equations. Damping is raised from its present value until they are positive definite.
+        Raises EstimationError."""
         if not np.isfinite(self.cost):
             raise EstimationError(
                 "the initial guess predicts no finite measurement; give a better guess in the rig file."
@@ -156,30 +160,33 @@ class _Descent:
                 self._linearise(self.state, curved=self.care.curved)
 
     def has_ended(self, solution: Solution) -> bool:
-        """Whether nothing that counts would change: the sums are those of the end already."""
+        """Whether the next step would change nothing but rounding errors, so that the present sums are final."""
         counts = min(ROUNDING_SHARE * self.cost, NEGLIGIBLE_DECREASE)
         return not self.early and self.care.curved and self.free and solution.decrease < counts
 
     def creeps(self, solution: Solution) -> bool:
-        """Whether steps have ceased to promise less and less: Gauss and Newton's do where the measurements determine
-        all, and wander where noise leads. One that failed is no step: the next promises about as much as it did. Nor is
-        a damped one: with less damping the next promises more."""
+        """Whether convergence is slow: the predicted decrease is more than half the least of the last undamped steps.
+        It shrinks quickly if the measurements determine all parameters, and not along directions that only noise
+        determines. Failed and damped steps are not compared, because the next step does not predict less after them."""
         before = [
             step.predicted_decrease for step in self.steps[-CREEPING_STEPS:] if step.accepted and step.damping == 0.0
         ]
         return len(before) == CREEPING_STEPS and solution.decrease > 0.5 * min(before)
 
     def let_go(self, priors: Sequence[Prior], solution: Solution) -> Solution:
-        """The solution where `priors` count no more: what they add to the calibration parameters is known, so nothing
-        is solved."""
+        """The solution without `priors`, which are dropped from the problem. Their information and gradient on the
+        calibration parameters are subtracted, so the chain is not eliminated again."""
         cost, gradient, information = sums_of_priors(priors, self.state, self.problem.layout.size)
         self.problem, self.cost = self.problem.without(priors), self.cost - cost
         return solution.less(information, gradient)
 
     def last_step(self, solution: Solution) -> float | None:
-        """Takes a step after which nothing that counts is left, as steps become less and less, and says how much; None
-        where it is no such step. The sums at hand, of where it began, are those of the end for all but the last digits,
-        so none is taken where something is known so badly that these count."""
+        """Takes a step after which the remaining decrease, extrapolated from the last two steps, is negligible. Returns
+        that remainder; None if there is no such step.
+
+        The sums are not computed again at the new state, because they change in their last digits only. So no such step
+        is taken if a parameter is known so badly that these digits matter.
+        """
         if self.early or not (self.care.curved and self.free and self.steps) or self.problem.fixed_directions.size:
             return None
         before, now = self.steps[-1], solution.decrease
@@ -201,12 +208,12 @@ class _Descent:
         return left
 
     def note(self, solution: Solution, taken: bool) -> None:
-        """Keeps a record of a step."""
+        """Records a step, and passes it to `on_step`."""
         self.steps.append(Step(self.cost, solution.decrease, self.care.damping, taken))
         self.on_step(self.steps[-1])
 
     def step(self, solution: Solution, second_order: bool) -> tuple[bool, bool]:
-        """Whether the step is taken, and whether it is the last one."""
+        """Tries a step. Returns whether it is accepted, and whether it is the last one."""
         near = solution.decrease < self.care.curved_below * self.cost
         if self._accelerated(solution, near):
             return True, False
@@ -219,8 +226,8 @@ class _Descent:
             there, cost = self._shortened(solution, there, cost, near)
         if second_order and sums and not (cost < self.cost or converged):
             there, cost = self._corrected(there, cost, near)
-        # At the bottom rounding decides whether the cost falls; a step that promises this little is taken anyway, but
-        # not where it goes far along what the data hardly tell, and the cost rises.
+        # At the optimum rounding decides whether the cost falls, so a last step is accepted anyway. If the cost rises
+        # by `enough` or more, the step went far along a weakly observable direction, and fails.
         taken = bool(cost < self.cost) or (converged and cost - self.cost < self.enough)
         self.note(solution, taken)
         if taken and there is whole and self.free:
@@ -234,7 +241,7 @@ class _Descent:
         return taken, converged
 
     def _accelerated(self, solution: Solution, curved: bool) -> bool:
-        """Takes an accelerated step where plain ones converge slowly, and says whether it did."""
+        """Tries an Anderson-accelerated step if plain ones converge slowly. Returns whether it is accepted."""
         if not self.free or solution.decrease < self.enough:
             return False
         best = self.accelerator.step(solution.chain, solution.calib, solution.decrease)
@@ -251,7 +258,8 @@ class _Descent:
         return True
 
     def tries_again(self, solution: Solution) -> bool:
-        """After a step that failed: with more care, unless nothing comes of it."""
+        """Prepares another attempt after a failed step, with more damping. Returns False if the solver should end
+        instead."""
         self.stalled += solution.decrease < STALLED_DECREASE
         if self.stalled > MAX_STALLED_STEPS or (self.early and solution.decrease < RESTING_RATIO * self.enough):
             return False
@@ -262,10 +270,10 @@ class _Descent:
         return True
 
     def end(self, on_visit: Callable[[Visit], None]) -> Outcome:
-        """The outcome here."""
+        """The outcome at the present state."""
         last = self.steps[-1]
         if self.early:
-            if not last.accepted:  # what was filled last is not that of `state`
+            if not last.accepted:  # residuals are those of the failed step
                 self._linearise(self.state, sums=False)
             return outcome_of(self.problem, self.state, self.cost, self.residuals, last.predicted_decrease, self.steps)
         if not (self.care.curved and last.accepted):
@@ -275,26 +283,27 @@ class _Descent:
         return self.outcome(solution)
 
     def outcome(self, end: Solution, left: float | None = None) -> Outcome:
-        """With what was solved here, or where this is the end of the last step, which leaves so much."""
+        """The outcome with the solution `end`. left: predicted further decrease of half the chi^2, by default that of
+        `end`."""
         left = end.decrease if left is None else left
         return outcome_of(self.problem, self.state, self.cost, self.residuals, left, self.steps, end)
 
     def _straight(self, solution: Solution, state: State, curved: bool) -> float | None:
-        """What a step to `state` costs, where an early pass may end with it although it is not small: it gains just
-        what the sums say, so that nothing bends on its way, and next to nothing is left behind it. Else None."""
+        """Cost at `state`, after a step that may end an early pass although its predicted decrease is not small. The
+        decrease equals the predicted one, so the problem is linear along the step. None for other steps."""
         if not (self.early and self.free and self.enough < solution.decrease < MAX_LINEAR_DECREASE):
             return None
-        if self.accelerator.slow(solution.decrease):  # something bends
+        if self.accelerator.slow(solution.decrease):  # slow convergence: the problem is not linear
             return None
         cost = self._linearise(state, sums=False, curved=curved)
         return cost if abs(self.cost - cost - solution.decrease) < MAX_LINEAR_MISMATCH * self.tolerance else None
 
     def _shortened(self, solution: Solution, state: State, cost: float, curved: bool) -> tuple[State, float]:
-        """Of a step to `state`, at `cost`, that overshoots, about half, to where a parabola has its least; and what
-        that costs.
+        """Line search: an overshooting step to `state`, at `cost`, is cut to about half, at the minimum of a parabola.
+        Returns the better state and its cost.
 
-        Where little is known, of wheels' clock in a steady turn for one, the sums may have but half of the true
-        curvature: then steps jump from one side of the least to the other.
+        The sums may have only half the true curvature of a weakly observable parameter, such as the time offset of
+        wheels in a steady turn. Steps then jump from one side of the minimum to the other.
         """
         gain = (self.cost - cost) / solution.decrease if solution.decrease > 0.0 else 1.0
         if not -OVERSHOOT_GAIN < gain < OVERSHOOT_GAIN:
@@ -346,16 +355,17 @@ def minimise(
     priors_to_drop: Callable[[float, np.ndarray], Sequence[Prior]] = lambda *_: (),
     room: tuple[Piece, ...] | None = None,
 ) -> Outcome:
-    """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
+    """Minimises `problem` from `state` until the predicted decrease of half the chi^2 is below `tolerance`, or below
+    `share` of it.
 
-    `on_visit` is told of each state that a step was looked for from, and of the last. Where the tolerance is wide
-    another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
-    `second_order`: steps may go as far as the next ones can make good, see `_Descent`. `leaves`: asked with
-    how far it has come, as a share of half the chi^2, and the calibration parameters' information (B, B), whether to
-    end when half the chi^2 can fall by less than EARLY_STOP_DECREASE, or a step not far from there fails, or steps
-    creep. `priors_to_drop`: asked before it, with the same, which priors are to count no more from where half the chi^2
-    can fall by less than EARLY_STOP_DECREASE. `room`: of an outcome of a problem with the same features, to be used
-    again.
+    on_step, on_visit: called with each step, and with each state at which a step is computed. A tolerance above
+    STALLED_DECREASE means that another pass follows: the outcome has no information and no draws. second_order: whether
+    steps that raise the cost are corrected, see `_Descent._corrected`.
+
+    leaves: whether to stop early, given the relative cost decrease so far and the information (B, B) of the calibration
+    parameters. It is asked if the predicted decrease is below EARLY_STOP_DECREASE, if a step near that fails, or if
+    convergence is slow. priors_to_drop: gets the same before `leaves`, if the predicted decrease is below
+    EARLY_STOP_DECREASE. room: pieces of an outcome with the same features, reused as workspace.
 
     Raises EstimationError if no step can be computed at all.
     """

@@ -1,4 +1,4 @@
-"""Definitions of the parameters in a layout, and what follows from them for each column."""
+"""Parameter definitions of the blocks of a layout, and the tolerance of each calibration column."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from icalib.rig import ParameterSpec, Sensor, Settings
 from icalib.rig.scene import SCENE
 from icalib.sensors.sensor import TIME_OFFSET
 
-UNGUESSED_SIGMA = 0.03  # rad or m: how well the start knows what nobody guessed, such as which way is up
-# prior uncertainty of a translation that nobody guessed: where the program took it to be
+UNGUESSED_SIGMA = 0.03  # rad or m: prior uncertainty of start values that nobody guessed, such as gravity's direction
+# prior uncertainty of a translation without a guess in the rig file, about the program's start value
 UNGUESSED_TRANSLATION_SIGMA_M = 0.5
 
 
 def specs_of(layout: Layout, sensors: Iterable[Sensor]) -> dict[Key, ParameterSpec]:
-    """The definition of each block: of one of the `sensors`, else of the scene."""
+    """Parameter definition of each block: from its sensor among `sensors`, else from the scene."""
     own = {sensor.name: {spec.name: spec for spec in sensor.specs()} for sensor in sensors}
     scene = {spec.name: spec for spec in SCENE}
     found = {b.key: own.get(b.sensor, scene)[b.name] for b in layout.blocks}
@@ -25,8 +25,8 @@ def specs_of(layout: Layout, sensors: Iterable[Sensor]) -> dict[Key, ParameterSp
 
 
 def tolerance_of(layout: Layout, specs: Mapping[Key, ParameterSpec], settings: Settings) -> np.ndarray:
-    """(B,) of each calibration column: standard deviations below are `determined`. Angles rad, lengths m, times s,
-    image quantities px."""
+    """(B,) tolerance of each calibration column: a parameter with a smaller standard deviation is `determined`. Units:
+    rad, m, s, and px for image quantities."""
     out = np.zeros(layout.size)
     for b in layout.free:
         tolerance = specs[b.key].tolerance

@@ -1,1 +1,1 @@
-"""How well the solution fits: noise, outliers, covariance from residuals."""
+"""Statistics of the residuals after a fit: noise, covariances and cross-validation."""

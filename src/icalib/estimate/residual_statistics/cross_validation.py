@@ -1,15 +1,18 @@
-"""Whether half a recording predicts the other half as well as its formal covariance says.
+"""Two-fold cross-validation: whether each half of a recording predicts the other as well as the formal covariance says.
 
-Near the optimum chi^2 of half h, its own keyframes at their best, is a quadratic form of the step d of the calibration
-parameters:
+With its keyframes optimised, chi^2 of half h is quadratic in the step d of the calibration parameters near the optimum.
+S_h is its information and b_h its gradient:
 
     chi^2_h(d) = c_h + 2 b_h . d + d^T S_h d
 
-With noise of the stated sizes cov(b_h) = S_h, the halves independent. The solution of the other half alone is
-d_o = -(S_o + Pi)^-1 (b_o + b_Pi), that of both d = -(S_h + S_o + Pi)^-1 (b_h + b_o + b_Pi), Pi the priors'. By how much
-chi^2_h(d_o) exceeds chi^2_h(d) is a quadratic form of these gradients, whose mean and variance follow from their
-covariance; without priors the mean is tr(S_h ((S_o)^-1 + (S_h + S_o)^-1)), three times the number of parameters where
-the halves know as much, for both halves together.
+For noise of the stated sizes cov(b_h) = S_h, and the halves are independent. Priors have the information Pi and the
+gradient b_Pi. The solutions of the other half and of both are
+
+    d_o = -(S_o + Pi)^-1 (b_o + b_Pi)        d = -(S_h + S_o + Pi)^-1 (b_h + b_o + b_Pi)
+
+The excess chi^2_h(d_o) - chi^2_h(d), summed over both halves, is a quadratic form of these gradients. Its mean and
+variance follow from their covariance. Without priors the mean is the sum over h of tr(S_h (S_o^-1 + (S_h + S_o)^-1)).
+This is three times the number of parameters if both halves have equal information.
 """
 
 from __future__ import annotations
@@ -24,23 +27,21 @@ from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Piece, chain_step_given_calib, in_parallel
 from icalib.optim.calib_block import UNOBSERVABLE_BELOW, complement, restricted_inverse
 
-MIN_SINGULAR_VALUE = 1e-6  # of a direction: shorter ones are rounding
-MAX_NONLINEAR_SHARE = 0.1  # of the excess: what it may be off by where the step of the other half is short enough
+MIN_SINGULAR_VALUE = 1e-6  # of the span of directions: smaller ones are rounding errors
+MAX_NONLINEAR_SHARE = 0.1  # of the excess: error of the quadratic form that still counts as linear
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """How well each half of the parts, every other one, is predicted by the other half.
+    """Result of the cross-validation. The even segments are one half, the odd ones the other.
 
-    directions: how many of the calibration parameters both halves know, the rest being found in each half for itself;
-    excess: by how much chi^2 is higher where they are the other half's than where they are those of both, by the
-    quadratic form above; expected, spread: mean and standard deviation of that form for noise of the stated sizes.
-    inside, outside: residuals with the solution of both, and with the other half's; linear: whether these rise as much
-    as the form says.
+    directions: number of directions of the calibration parameters that both halves determine; the rest is estimated in
+    each half. excess: of chi^2 by the quadratic form above. expected, spread: mean and standard deviation of that form
+    for noise of the stated sizes. inside, outside: residuals with the solution of both halves, and with the other
+    half's. linear: whether chi^2 of these residuals rises as the form predicts.
 
-    Measured residuals are no test statistic: a half that knows a plane or a mount to some tolerances only sends the
-    other one so far that residuals leave the quadratic form, by any amount, with nothing wrong. The form has the mean
-    and the spread that are stated.
+    The excess is not computed from residuals. If a half determines a plane or extrinsics only to some tolerances, the
+    residuals of the other half leave the quadratic range, without any fault.
     """
 
     directions: int
@@ -53,8 +54,8 @@ class Prediction:
 
 
 class Half(NamedTuple):
-    """A half's information (r, r) and gradient (r,) of what both halves know; what only it can know is found by
-    itself: `rest` (m, r + 1) gives its step from that of the others, and 1."""
+    """Information (r, r) and gradient (r,) of one half along the shared directions, its remaining directions
+    eliminated. `rest` (m, r + 1) times (shared step, 1) is the step along the remaining directions."""
 
     information: np.ndarray
     gradient: np.ndarray
@@ -62,8 +63,8 @@ class Half(NamedTuple):
 
 
 class Excess(NamedTuple):
-    """Of both halves together, for the gradients as they are, and for noise; steps (3, r): of the solution of the first
-    half, of the second, and of both."""
+    """Excess of both halves together; its mean and standard deviation for noise of the stated sizes. steps (3, r):
+    solutions of the first half, the second, and both."""
 
     value: float
     mean: float
@@ -72,8 +73,8 @@ class Excess(NamedTuple):
 
 
 def predict(parts: Segments) -> Prediction | None:
-    """Predicts each half of the recording from the other. None if no direction of the calibration parameters is
-    determined by both."""
+    """Cross-validates the halves of the recording. None if both halves determine no common direction of the calibration
+    parameters."""
     t, B = parts.problem.tolerance, parts.problem.layout.size
     free = t[:, None] * complement(parts.problem.fixed_directions, B)
     halves, shared, own = halves_of(parts.sums, free)
@@ -83,7 +84,7 @@ def predict(parts: Segments) -> Prediction | None:
     found = excess(halves[0], halves[1], prior)
     steps = []
     for h, half in enumerate(halves):
-        known = found.steps[[2, 1 - h]].T  # of both, of the other
+        known = found.steps[[2, 1 - h]].T  # solutions of both halves, of the other half
         rest = half.rest @ np.vstack([known, np.ones(2)])
         steps.append(free @ (shared @ known + own @ rest))
     costs, inside, outside = _evaluate(parts, steps)
@@ -93,8 +94,9 @@ def predict(parts: Segments) -> Prediction | None:
 
 
 def halves_of(sums: np.ndarray, free: np.ndarray) -> tuple[list[Half], np.ndarray, np.ndarray]:
-    """The two halves of parts with sums (G, B + 1, B + 1), every other one; and orthonormal columns (n, r) of what both
-    know, (n, n - r) of the rest, among the directions `free` (B, n), in tolerances."""
+    """The halves (even and odd segments) of `sums` (G, B + 1, B + 1). Also orthonormal columns (n, r) of the directions
+    that both determine, and (n, n - r) of the rest. Both are in the basis `free` (B, n), which is in tolerance
+    units."""
     both = [_within(sums[h::2].sum(axis=0), free) for h in range(2)]
     own = _unknown([information for information, _ in both])
     shared = complement(own, free.shape[1])
@@ -107,6 +109,7 @@ def _within(sums: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _priors(parts: Segments) -> np.ndarray:
+    """Information and gradient (B + 1, B + 1) of the priors on the calibration parameters."""
     piece = Piece.zeros(0, 0, parts.problem.layout.size)
     for prior in parts.problem.priors:
         prior.accumulate(parts.state, piece)
@@ -114,7 +117,8 @@ def _priors(parts: Segments) -> np.ndarray:
 
 
 def _unknown(information: list[np.ndarray]) -> np.ndarray:
-    """(n, m) orthonormal: directions that one half or the other does not know, in units of tolerances."""
+    """Orthonormal directions (n, m) that one half or the other does not determine. information: of each half, in
+    tolerance units."""
     found = []
     for own in information:
         values, vectors = np.linalg.eigh(own)
@@ -124,8 +128,8 @@ def _unknown(information: list[np.ndarray]) -> np.ndarray:
 
 
 def _half(information: np.ndarray, gradient: np.ndarray, shared: np.ndarray, own: np.ndarray) -> Half:
-    """What the directions `own` leave of the `shared` ones. They stay within some ten tolerances: of what a half does
-    not see it says nothing."""
+    """Eliminates the directions `own` from one half. An information of UNOBSERVABLE_BELOW limits their step to about
+    ten tolerances, because the half may not observe them at all."""
     S = information + UNOBSERVABLE_BELOW * own @ own.T
     both = np.concatenate([own.T @ S @ shared, (own.T @ gradient)[:, None]], axis=1)
     rest = -np.linalg.solve(own.T @ S @ own, both)
@@ -134,9 +138,10 @@ def _half(information: np.ndarray, gradient: np.ndarray, shared: np.ndarray, own
 
 
 def excess(first: Half, second: Half, prior: tuple[np.ndarray, np.ndarray]) -> Excess:
-    """chi^2 of each half at the solution of the other, less that at the solution of both; of both halves together."""
+    """chi^2 of each half at the solution of the other, less that at the solution of both, summed over the halves.
+    prior: information (r, r) and gradient (r,)."""
     r, Pi = len(first.gradient), prior[0]
-    pick = np.eye(3 * r).reshape(3, r, 3 * r)  # of the gradients of the first, the second, the priors
+    pick = np.eye(3 * r).reshape(3, r, 3 * r)  # selects the gradient of the first half, the second, the priors
     pairs = (
         (first.information, pick[0]),
         (second.information, pick[1]),
@@ -158,8 +163,9 @@ def excess(first: Half, second: Half, prior: tuple[np.ndarray, np.ndarray]) -> E
 
 
 def _evaluate(parts: Segments, steps: list[np.ndarray]) -> tuple[np.ndarray, Residuals, Residuals]:
-    """Half the chi^2 (2,) and the residuals at two steps of the calibration parameters of either half, steps (B, 2) of
-    both and of the other: the keyframes of each part follow, and nothing is linear but their step."""
+    """Half the chi^2 (2,) and the residuals, with the joint solution and with the other half's. steps: per half, (B, 2)
+    steps of the calibration parameters to these solutions. Keyframes take their optimal linear step; residuals are not
+    linearised."""
     problem, state = parts.problem, parts.state
     found, scratch = (problem.residuals(), problem.residuals()), problem.residuals()
 
@@ -178,15 +184,16 @@ def _evaluate(parts: Segments, steps: list[np.ndarray]) -> tuple[np.ndarray, Res
 
 @dataclass(frozen=True)
 class Shifts:
-    """Of the calibration parameters, without each of G parts: by how much the solution moves (G, B), and the standard
-    deviation (G, B) of that where noise is as stated: the variance without the part less that with it."""
+    """Change of the solution when one of G segments is left out. moved (G, B): change of each calibration parameter.
+    expected (G, B): its standard deviation for noise of the stated sizes, sqrt(variance without the segment - variance
+    with it)."""
 
     moved: np.ndarray
     expected: np.ndarray
 
 
 def shifts(parts: Segments) -> Shifts:
-    """The solution without each part, against that of all parts."""
+    """Change of the solution without each segment, against that of all segments."""
     t, fixed_directions = parts.problem.tolerance, parts.problem.fixed_directions
     scale = np.append(t, 1.0)
     sums = parts.sums * scale[:, None] * scale

@@ -1,4 +1,4 @@
-"""What the data themselves say of the formal standard deviations: post-fit degrees of freedom, and splits."""
+"""Degrees of freedom after the fit, and covariances from the scatter of segments."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from icalib.motion.factor import FitKey, RawSize, ResidualRows, Residuals, Squar
 from icalib.optim.arrowhead import Draw
 from icalib.optim.calib_block import restricted_inverse
 
-DRAW_STEP = 1e-3  # of a posterior sample: small enough to be linear
+DRAW_STEP = 1e-3  # of a posterior draw: step of difference quotients, small enough to be linear
 
 
 def fits(problem: Problem, outcome: Outcome) -> list[Fit]:
-    """chi^2 over post-fit degrees of freedom of every sensor.
+    """chi^2 and degrees of freedom after the fit, of each kind of residual of every sensor.
 
-    A draw x from the posterior has the covariance H^-1; then |J_s x|^2 has the mean tr(J_s H^-1 J_s^T), the parameters
-    that sensor s pays for. J x is taken by differences of the residuals themselves.
+    A draw x from the posterior has the covariance H^-1. So |J_s x|^2 has the mean tr(J_s H^-1 J_s^T), the degrees of
+    freedom that the fit takes from sensor s. J x is a difference quotient of the residuals.
     """
     spent: dict[FitKey, list[float]] = {}
     for draw in (outcome.draws or posterior(problem, outcome.state)).free:
@@ -30,12 +30,12 @@ def fits(problem: Problem, outcome: Outcome) -> list[Fit]:
 
 
 def chi2_by_kind(problem: Problem, at: Residuals) -> dict[FitKey, Squares]:
-    """Number and chi^2 of each kind of residual of each sensor, robust weights as they are."""
+    """Number and chi^2 of each kind of residual of each sensor, with the current robust weights."""
     return {kind: own for key, f in problem.factors.items() for kind, own in f.squares(at[key]).items()}
 
 
 def raw_sizes(problem: Problem, at: Residuals) -> dict[FitKey, RawSize]:
-    """RMS of each kind of residual as it was before whitening, its unit, and the number of outliers."""
+    """RMS of each kind of residual before whitening, its unit, and the number of outliers."""
     return {kind: own for key, f in problem.factors.items() for kind, own in f.sizes(at[key]).items()}
 
 
@@ -49,28 +49,29 @@ def rows_of(outcome: Outcome, sensor: str, kind: str) -> ResidualRows | None:
 
 
 def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[FitKey, float]:
-    """|J_s x|^2 of each sensor for one draw x."""
+    """|J_s x|^2 of each kind of residual of each sensor, for one draw x."""
     start, end = (outcome.state.retract(problem.layout, s * draw.chain, s * draw.calib) for s in (0.0, DRAW_STEP))
     along, at = StateDifference(start, end, DRAW_STEP), outcome.residuals
     return {kind: own for key, f in problem.factors.items() for kind, own in f.dof_used(at[key], along).items()}
 
 
 def split_covariance(outcome: Outcome, parts: Segments) -> np.ndarray:
-    """(B, B) covariance of the calibration parameters as the spread over `parts` of the recording shows it.
+    """(B, B) covariance of the calibration parameters from the scatter of segments.
 
-    Each part's own gradient b_g at the joint optimum (its chain marginalised) would be zero but for noise; their
-    spread through the joint information S gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block
-    jackknife to first order.
+    The gradient b_g of segment g at the joint optimum, its chain marginalised, would be zero but for noise. With the
+    joint information S, the scatter gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block jackknife to
+    first order.
     """
     b, n = parts.sums[:, :-1, -1], parts.count
     return n / (n - 1.0) * spread_covariance(parts.problem, outcome, b - b.mean(axis=0))
 
 
 def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
-    """(B,) variances that `split_covariance` has on average where noise is white.
+    """(B,) expected variances of `split_covariance` for white noise.
 
-    At the joint optimum the gradient of part g has the covariance S_g - S_g S^-1 S_g: a part that knows much pulls the
-    optimum to itself (as the leverages in Bell and McCaffrey 2002). Of equal parts it is the formal variance.
+    At the joint optimum the gradient of segment g has the covariance S_g - S_g S^-1 S_g, because a segment with much
+    information pulls the optimum towards itself (leverage; Bell and McCaffrey 2002). For equal segments these are the
+    formal variances.
     """
     t, n = parts.problem.tolerance, parts.count
     inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.fixed_directions)
@@ -80,7 +81,8 @@ def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
 
 
 def spread_covariance(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
-    """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B)."""
+    """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B) and the information S of `outcome`; zero along fixed
+    directions."""
     t = problem.tolerance
     inverse = restricted_inverse(outcome.information * t[:, None] * t, problem.fixed_directions)
     half = t[:, None] * (inverse @ (t[:, None] * b.T))

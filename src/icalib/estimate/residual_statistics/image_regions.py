@@ -1,8 +1,9 @@
-"""Covariances that allow for errors which correlate within clusters, such as a region of the image or of the target.
+"""Cluster-robust covariances, for errors that correlate within clusters such as a region of the image or of the target.
 
-A lens that the model cannot follow and a target that is not as drawn make the same errors in all parts of a recording,
-and splitting it in time does not see them. The gradient of a cluster would be zero but for noise. Measurements that are
-in none, such as those of the IMU, are one more cluster, unless the clusters are a sample (Liang and Zeger 1986).
+A lens that its model does not fit, or a target that is not as drawn, makes the same errors in all segments of a
+recording. The scatter over segments does not show them. The gradient of a cluster would be zero but for noise.
+Measurements in no cluster, such as those of the IMU, form one more cluster, unless the clusters are a sample (Liang and
+Zeger 1986).
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from icalib.optim.arrowhead import Piece
 
 @dataclass(frozen=True)
 class ClusterCovariances:
-    """(B, B) covariances that allow for correlated errors: of `places`, one for each kind of cluster such as image
-    cells; and of feature `tracks`, None where there are none."""
+    """Cluster-robust covariances (B, B). places: one for each kind of cluster, such as image cells. tracks: for groups
+    of feature tracks, None without tracks."""
 
     places: list[np.ndarray]
     tracks: np.ndarray | None
@@ -46,6 +47,7 @@ def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariance
 
 
 def _count(clusters: Mapping[FactorKey, Any]) -> int:
+    """Number of clusters."""
     arrays = [a for own in clusters.values() for a in (own if isinstance(own, list) else [own])]
     return 1 + max(int(a.max(initial=-1)) for a in arrays)
 
@@ -53,7 +55,7 @@ def _count(clusters: Mapping[FactorKey, Any]) -> int:
 def _cluster_gradients(
     problem: Problem, outcome: Outcome, kinds: Sequence[Mapping[FactorKey, Any]]
 ) -> list[np.ndarray]:
-    """Of each of `kinds` of clusters (clusters, B), the gradient of each cluster; chain and points are marginalised."""
+    """Gradient of each cluster, (clusters, B) for each of `kinds`; chain and points are marginalised."""
     counts = [_count(kind) for kind in kinds]
     B, state, at = problem.layout.size, outcome.state, problem.reusable_output(outcome.residuals)
     starts = B + np.cumsum([0, *counts])
@@ -70,7 +72,7 @@ def _cluster_gradients(
             piece = replace(piece, features=narrow.features.widened(int(starts[-1])))
         for kind, n, column in zip(kinds, counts, starts[:-1].tolist(), strict=True):
             for key, cluster in kind.items():
-                factor: Any = problem.factors[key]  # of those that have clusters
+                factor: Any = problem.factors[key]  # it has `accumulate_clusters`
                 factor.accumulate_clusters(state, piece, at[key], cluster, n, column)
         return piece
 

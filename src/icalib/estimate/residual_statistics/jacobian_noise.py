@@ -1,14 +1,16 @@
-"""How much of the information on calibration parameters is only noise in the Jacobians.
+"""Spurious information on the calibration parameters due to noise in the Jacobians (errors in variables).
 
-A Jacobian that is taken at a noisy trajectory and noisy readings shows motion that was not there: where the truth is no
-information at all, J^T J shows some, which grows with the square of the noise. What noise adds is measured by adding
-it once more: S(x + d) - S(x), its mean over draws +-d of the trajectory's own posterior and of the IMU's noise.
+Jacobians at a noisy trajectory and noisy readings contain motion that did not happen. Even along an unobservable
+direction J^T J then has information, which grows with the square of the noise. It is measured by adding noise once
+more: the mean of S(x + d) - S(x), with the information S and draws +-d from the posterior of the trajectory and from
+the IMU's noise.
 
-The posterior takes the readings between a keyframe and an image, a sweep or a stamp for true; yet their noise turns the
-trajectory, too. With a noisy IMU it may do so as much as all that the posterior knows of. So where a first draw shows
-that noise counts, the trajectory follows noisier readings as the solver would have it, and what the posterior has of
-their noise already is taken off: with u and v where all measurements, or the factors between keyframes alone, send it,
-S(x + d + u) - S(x + v), for draws are independent and what they add is quadratic.
+The posterior assumes that readings between a keyframe and an image, a sweep or a stamp are exact, yet their noise turns
+the trajectory, too. With a noisy IMU this may be as much as the whole posterior contains. So if a first draw shows that
+noise matters, the trajectory follows noisier readings as the solver would move it. Their noise that the posterior
+already contains is subtracted: S(x + d + u) - S(x + v). Here u is the step with noisier readings in all factors, v with
+those in the factors between keyframes alone. Draws are independent and their effect is quadratic, so differences are
+valid.
 """
 
 from __future__ import annotations
@@ -28,30 +30,29 @@ from icalib.optim.calib_block import DETERMINED_ABOVE, UNOBSERVABLE_BELOW, least
 from icalib.optim.state import State
 from icalib.sensors.imu.residual import ImuFactor
 
-# information in tolerance units: where all is known to a third of a tolerance, one pair will do
+# information in tolerance units: if all is known to a third of a tolerance, one pair of draws is enough
 CLEARLY_DETERMINED = 10.0
-# of the information: where all is determined and one side shows less, odd parts included, it will do
+# of the information: if all is determined and one sign of a draw shows less, odd terms included, it is enough
 NEGLIGIBLE_SHARE = 0.01
-SMALL_SHARE = 0.05  # of the information: where one pair finds less noise than this, it will do, too
-N_FIRST_DRAWS = 3  # draws at first
-CONFIDENCE = 0.999  # probability that noise adds no more than is allowed for
+SMALL_SHARE = 0.05  # of the information: if one pair of draws shows less, it is enough, too
+N_FIRST_DRAWS = 3  # draws before `enough` is asked
+CONFIDENCE = 0.999  # probability that spurious information is below its upper bound
 
 
 @dataclass(frozen=True)
 class Spurious:
-    """What noise adds to the calibration parameters' marginal information: of each draw, both signs together (n, B,
-    B)."""
+    """Spurious information on the calibration parameters. each (n, B, B): by draw."""
 
     each: np.ndarray
 
     @property
     def mean(self) -> np.ndarray:
-        """(B, B)"""
+        """(B, B) mean over the draws."""
         return self.each.mean(axis=0)
 
     def chance(self, directions: np.ndarray) -> np.ndarray:
-        """(m,) by how much more than the mean noise may have added in this one recording, along directions (B, m);
-        nothing where one draw was enough."""
+        """(m,) upper bound, above the mean, of spurious information in this one recording along directions (B, m). It
+        follows from Student's t with probability CONFIDENCE. Zero if one draw was enough."""
         n = len(self.each)
         if n == 1:
             return np.zeros(directions.shape[1])
@@ -65,10 +66,10 @@ def spurious_information(
     enough: Callable[[Spurious], bool] = lambda _: True,
     columns: np.ndarray | None = None,
 ) -> Spurious:
-    """What noise adds to the information on `columns` (B,) of the calibration parameters, by default all, the others
-    fixed; zeros where there is no IMU. Where it counts, a few draws, more where these are not `enough`.
+    """Spurious information on the calibration parameters with these `columns`, by default all; the others are fixed.
+    Zeros without an IMU. If noise matters, a few draws are made, and more if these are not `enough`.
 
-    Raises arrowhead.NotDefiniteError where the chain is not determined.
+    Raises arrowhead.NotDefiniteError if the chain is not determined.
     """
     columns = np.arange(problem.layout.size) if columns is None else columns
     among = np.ix_(columns, columns)
@@ -97,33 +98,34 @@ def spurious_information(
 
 @dataclass(frozen=True)
 class _Noise:
-    """What noise adds to the calibration parameters' information at an outcome, in the room of which it is found;
-    `among` columns (B,) alone, as numpy.ix_ gives them."""
+    """Evaluates spurious information at `outcome`, in its workspace. among: index of the columns, as numpy.ix_ returns
+    it."""
 
     problem: Problem
     outcome: Outcome
     among: tuple[np.ndarray, ...]
 
     def added(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
-        """(B, B) on average, where the trajectory is off by +-chain (K, 15), and the readings by as often that."""
+        """Spurious information (B, B) if the trajectory changes by chain (K, 15) and the readings by `readings`: mean
+        over both signs."""
         return 0.5 * (self.there(1.0, chain, readings) + self.there(-1.0, chain, readings))
 
     def there(self, sign: float, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
-        """(B, B), where the trajectory is off by `sign` times chain (K, 15), and the readings by as often that: noise,
-        and what is odd in it."""
+        """Change (B, B) of the information if trajectory and readings change by `sign` times chain (K, 15) and
+        `readings`. Terms that are odd in the noise are included."""
         there = self.outcome.state.retract(self.problem.layout, sign * chain, np.zeros(self.problem.layout.size))
         noisy = self.problem if readings is None else _with_noise(self.problem, there, sign * readings)
         return (_information(noisy, there, self.outcome.room) - self.outcome.information)[self.among]
 
     def followed(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
-        """(B, B), where the trajectory follows noise of the `readings` beside a draw `chain` (K, 15) of its posterior,
-        but that noise once."""
+        """Spurious information (B, B) if the trajectory follows the noise `readings`, in addition to a posterior draw
+        `chain` (K, 15). Noise that both contain is counted once."""
         everywhere = _with_noise(self.problem, self.outcome.state, readings)
         between_keyframes = self.problem.replacing([everywhere.chain])
         return self.added(chain + self._step(everywhere), readings) - self.added(self._step(between_keyframes), None)
 
     def _step(self, problem: Problem) -> np.ndarray:
-        """(K, 15) where the solver would move the chain alone."""
+        """Solver's step (K, 15) of the chain for `problem`, calibration parameters fixed."""
         pieces = self.outcome.room or problem.pieces()
         problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
         factors = solve(pieces, problem.n_keyframes, problem.tolerance).factors
@@ -132,7 +134,7 @@ class _Noise:
 
 
 def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:
-    """Of what is noise, in absolute value, in any direction that the solver moves along; both in tolerance units."""
+    """Largest ratio of |noise| to information over all observable directions; both in tolerance units."""
     values, vectors = np.linalg.eigh(information)
     known = values > UNOBSERVABLE_BELOW
     half = vectors[:, known] / np.sqrt(values[known])
@@ -140,6 +142,7 @@ def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:
 
 
 def _information(problem: Problem, state: State, room: tuple[Piece, ...] | None) -> np.ndarray:
+    """Information (B, B) on the calibration parameters at `state`, chain marginalised."""
     if room is None:
         n = problem.layout.size
         return problem.marginal(partial(problem.sums_of, state))[:n, :n]
@@ -148,14 +151,15 @@ def _information(problem: Problem, state: State, room: tuple[Piece, ...] | None)
 
 
 def _reading_noise(imu: ImuData, rng: np.random.Generator) -> np.ndarray:
-    """(N, 6) noise of the readings, rate and force, as their densities say; none more beside gaps."""
+    """(N, 6) random noise of rates and specific forces with the IMU's densities, not enlarged at gaps."""
     dt = np.median(np.diff(imu.seconds))
     density = np.repeat(np.sqrt(np.median(imu.variance[:, :2], axis=0)), 3)
     return density / np.sqrt(dt) * rng.standard_normal((len(imu.seconds), 6))
 
 
 def _with_noise(problem: Problem, state: State, readings: np.ndarray) -> Problem:
-    """The problem with noisier readings, everywhere, for the bias of `state`."""
+    """The problem with `readings` (N, 6) added to the IMU readings of all factors, which are preintegrated at the
+    biases of `state`."""
     assert isinstance(problem.chain, ImuFactor)
     old = problem.chain.imu
     imu = replace(old, gyro=old.gyro + readings[:, :3], accel=old.accel + readings[:, 3:])

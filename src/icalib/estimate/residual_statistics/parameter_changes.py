@@ -1,10 +1,11 @@
-"""Parameters that change during the recording: a clock that drifts or jumps, a mount that moved, a lens that refocused.
+"""Parameters that change during the recording: a clock that drifts or jumps, extrinsics that moved, a lens that
+refocused.
 
-Test of parameter constancy by score (Nyblom 1989; for a break, Chow 1960). The calibration parameters are constant in
-the estimate. Let those of one group be x + d e in segment g, with d_g its pattern over the segments: linear in time
-(drift), or 0 before and 1 after a boundary (step). Near the optimum chi^2 is a quadratic form of the common step and
-of e, made from the segments' sums, in which the chain is marginalised. One solve of that small form gives e, its
-covariance, and by how much chi^2 falls. What changes within a segment is not seen.
+Score test of parameter constancy (Nyblom 1989; for a break, Chow 1960). The estimate has constant calibration
+parameters. In the test those of one group are x + d_g e in segment g. The pattern d_g is linear in time (drift), or 0
+before and 1 after a boundary (step). Near the optimum chi^2 is a quadratic form of the common step and of e, made from
+the segments' sums, in which the chain is marginalised. One solve gives e, its covariance, and the decrease of chi^2.
+Changes within a segment are not detected.
 """
 
 from __future__ import annotations
@@ -21,17 +22,17 @@ from icalib.optim.state import Key
 from icalib.sensors.camera.spec import INTRINSICS
 from icalib.sensors.sensor import ROTATION, TIME_OFFSET, TRANSLATION
 
-# The groups that change together. Board, planes and IMU are what the others are measured by.
+# Groups that change together. Target, planes and IMU are the reference for the others, and are not tested.
 CHANGING_GROUPS = ((TIME_OFFSET.name,), (ROTATION.name, TRANSLATION.name), (INTRINSICS.name,))
-# information in tolerance units: 1000 tolerances; keeps the form definite where nothing is known
+# information in tolerance units (sigma of 1000 tolerances): keeps the form positive definite if unobservable
 RIDGE_INFORMATION = 1e-6
 
 
 @dataclass(frozen=True)
 class Change:
-    """key: sensor and the first of its groups that change; pattern; second: of the boundary of a step, else the middle
-    of the recording, on the joined clock; value, sigma (n,): the step, or the drift per second [SI]; gain: the fall of
-    chi^2; count: how many parameters."""
+    """Tested change of one group of parameters. key: sensor, and first parameter of the group. second: time of a step,
+    or middle of the recording for a drift [s, joined clock]. value, sigma (n,): the step, or the drift per second [SI,
+    or px]. gain: decrease of chi^2."""
 
     key: Key
     pattern: Literal["drift", "step"]
@@ -42,11 +43,12 @@ class Change:
 
     @property
     def count(self) -> int:
+        """Number of parameters in the group."""
         return len(self.value)
 
 
 def changes(parts: Segments, sensors: tuple[str, ...]) -> tuple[Change, ...]:
-    """The best pattern of each group of the `sensors`, the largest gain first."""
+    """The pattern with the largest gain for each group of `sensors`, sorted by decreasing gain."""
     found: dict[Key, Change] = {}
     form = _Form.of(parts)
     for change in _tested(parts, form, sensors):
@@ -57,6 +59,7 @@ def changes(parts: Segments, sensors: tuple[str, ...]) -> tuple[Change, ...]:
 
 
 def _tested(parts: Segments, form: _Form, sensors: tuple[str, ...]) -> Iterator[Change]:
+    """Yields the drift and all steps of each group of `sensors`."""
     ends = parts.state.seconds[parts.ends]
     middle = 0.5 * (ends[:-1] + ends[1:])
     centre = 0.5 * (ends[0] + ends[-1])
@@ -77,8 +80,8 @@ def _tested(parts: Segments, form: _Form, sensors: tuple[str, ...]) -> Iterator[
 
 @dataclass(frozen=True)
 class _Form:
-    """In tolerance units: information (G, B, B) and gradient (G, B) of the segments; root (B, n): of the inverse of
-    their sum, within what is not fixed."""
+    """Quadratic forms in tolerance units. information (G, B, B), gradient (G, B): of the segments. root (B, n): root A
+    of the inverse A A^T of the total information, without fixed directions."""
 
     tolerance: np.ndarray
     information: np.ndarray
@@ -99,7 +102,7 @@ class _Form:
     def change(
         self, key: Key, columns: np.ndarray, pattern: np.ndarray, kind: Literal["drift", "step"], second: float
     ) -> Change:
-        """The change of `columns` by `pattern` (G,), all others and a common step free."""
+        """The change of `columns` by `pattern` (G,), estimated together with a common step of all parameters."""
         own = self.information[:, columns]
         A = np.einsum("g,gij->ij", pattern**2, own[:, :, columns]) + RIDGE_INFORMATION * np.eye(len(columns))
         cross = np.einsum("g,gij->ij", pattern, own) @ self.root
@@ -111,7 +114,7 @@ class _Form:
 
 
 def heterogeneity(parts: Segments) -> float:
-    """By how much chi^2 falls where each segment has calibration parameters of its own."""
+    """Decrease of chi^2 if each segment has separate calibration parameters."""
     t = parts.problem.tolerance
     free = complement(parts.problem.fixed_directions, len(t))
     total = 0.0

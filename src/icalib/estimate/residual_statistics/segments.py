@@ -1,4 +1,4 @@
-"""Segments of a recording that stand alone: what each says of the calibration parameters, its own keyframes
+"""Independent segments of a recording: information and gradient of each on the calibration parameters, its keyframes
 eliminated."""
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from icalib.motion.independent_keyframes import IndependentKeyframes
 from icalib.optim.arrowhead import Piece, in_parallel, marginalise
 from icalib.optim.state import State
 
-MIN_SEGMENT_KEYFRAMES = 3  # between the ends of a part
-MIN_SEGMENTS_AT_REST = 4  # of poses at rest: the spread of fewer says little
-# Information [1/m^2, 1/rad^2] that holds the frame of each part in a world that nobody sees, where parts share planes
-# or the frame of a pose sensor: held firmly, each would seem to say where these are. Where they share nothing of the
-# world so little would be lost in rounding.
+MIN_SEGMENT_KEYFRAMES = 3  # between the ends of a segment
+MIN_SEGMENTS_AT_REST = 4  # of poses at rest: the scatter of fewer is not informative
+# Information [1/m^2, 1/rad^2] on the gauge of each segment, if segments share planes or the frame of a pose sensor.
+# With FRAME_INFORMATION each segment would seem to measure where these are. If segments share nothing in the world,
+# FRAME_INFORMATION is used, because so little would be lost in rounding.
 LOOSE_FRAME_INFORMATION = 1e-3
 
 
 @dataclass(frozen=True)
 class Segments:
-    """Of `problem`, in which tracks end where parts do, at `state`; ends (G + 1,): keyframes between which parts lie.
+    """Segments of `problem` at `state`; feature tracks are cut at their ends. ends (G + 1,): keyframes that bound the
+    segments.
 
-    sums (G, B + 1, B + 1): each part's information of the calibration parameters, its gradient in the last column.
+    sums (G, B + 1, B + 1): information of each segment on the calibration parameters, its gradient in the last column.
     """
 
     problem: Problem
@@ -38,8 +39,8 @@ class Segments:
 
     @classmethod
     def of(cls, problem: Problem, outcome: Outcome, count: int) -> Segments | None:
-        """About `count` parts of about one length, which several recordings share, at least one each. None where they
-        would be too short, or one does not stand alone."""
+        """About `count` segments of similar length, at least one per recording. None if they would be too short, or if
+        one cannot be solved alone."""
         count, fewest = _as_many_as_stand_alone(problem, count)
         if count < 2:
             return None
@@ -59,7 +60,7 @@ class Segments:
         return len(self.ends) - 1
 
     def piece(self, g: int, scratch: Residuals) -> Piece:
-        """All sums of part `g`, its keyframes not yet eliminated; fills `scratch` for its measurements."""
+        """Sums of segment `g`, its keyframes not yet eliminated; fills `scratch` with its residuals."""
         problem, state = self.problem, self.state
         first, last = (int(k) for k in self.ends[g : g + 2])
         piece = problem.attach(Piece.zeros(first, last, problem.layout.size))
@@ -68,11 +69,11 @@ class Segments:
         if not problem.framed:
             shared = any(b.name in IN_THE_WORLD for b in problem.layout.blocks)
             hold_frame(state, piece, first, problem.levelled, LOOSE_FRAME_INFORMATION if shared else FRAME_INFORMATION)
-        # A seam says nothing of the keyframe behind it, and that keyframe's own images are in the next part.
+        # Nothing links the first keyframe of a recording to the one before, and its images belong to the next segment.
         return piece.without_last() if last in problem.chain.starts else piece
 
     def cost(self, g: int, state: State, out: Residuals) -> float:
-        """Half the robust chi^2 of part `g` at `state`; fills `out` for its measurements."""
+        """Half the robust chi^2 of segment `g` at `state`; fills `out` with its residuals."""
         piece = Piece.bare(int(self.ends[g]), int(self.ends[g + 1]))
         return self.problem.add_measurements(state, piece, out, sums=False) + self.problem.add_bias_prior(
             state, piece, sums=False
@@ -80,9 +81,9 @@ class Segments:
 
 
 def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
-    """How many of `count` parts there may be, and how many keyframes each needs.
+    """Number of segments for the wanted `count`, and least number of keyframes in each.
 
-    Images that nothing ties to each other stand alone: where there are few, each but the last is a part.
+    Images that no factor links are independent: if there are few, each but the last is a segment.
     """
     if not isinstance(problem.chain, IndependentKeyframes):
         return min(count, (problem.n_keyframes - 1) // MIN_SEGMENT_KEYFRAMES), MIN_SEGMENT_KEYFRAMES
@@ -95,8 +96,8 @@ def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
 
 
 def segment_ends(starts: tuple[int, ...], n_keyframes: int, segments: int) -> np.ndarray:
-    """(segments + 1,) keyframes between which segments lie; each start of a recording is one. More segments where there
-    are more recordings."""
+    """(segments + 1,) keyframes that bound segments, among them the start of each recording. With more recordings than
+    `segments` there are more."""
     edges = np.array([*starts, n_keyframes - 1])
     counts = np.maximum(np.round(segments * np.diff(edges) / edges[-1]).astype(int), 1)
     pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]

@@ -1,9 +1,9 @@
-"""How large the target is to everything but the ruler that it was measured with: above all to the accelerometer.
+"""Size of the target according to all measurements but the ruler, above all those of the accelerometer.
 
-Cameras alone see a target of any size. Its size is no parameter of the estimate, because accelerometers know it to a
-few per cent only, a ruler to a tenth of one. As one more parameter, s, it would be where the least cost over all
-others, p(s), is least. All lengths that cameras see grow with the target, which costs the cameras nothing; p(s) is the
-cost there, less what one step takes off.
+Cameras alone cannot determine the size. It is not estimated, because accelerometers determine it to a few per cent
+only, a ruler to 0.1 %. Here it is the minimum of the profile cost p(s), the least cost over all other parameters for
+the relative size s. All lengths that cameras observe scale with the target, which leaves the cost of the cameras
+unchanged. p(s) is the cost after this scaling, less the decrease that one step predicts.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from icalib.optim.arrowhead import Piece, solve
 from icalib.optim.state import State
 from icalib.sensors.imu.residual import ImuFactor
 
-SIZE_STEP = 1e-3  # of the size: small against what bends p, large against rounding
-MAX_SIZE_SIGMA = 0.05  # a size that is known no better is not known
-MAX_SIZE_CHANGE = 5e-3  # what one step about the state is good for
+SIZE_STEP = 1e-3  # relative step of difference quotients: small enough for p to be quadratic, large against rounding
+MAX_SIZE_SIGMA = 0.05  # relative: with a larger standard deviation the size is unobservable
+MAX_SIZE_CHANGE = 5e-3  # relative: a larger change needs another round at a new state
 MAX_SIZE_ROUNDS = 3
-INNER_TOLERANCE = 0.5  # of half the chi^2, of the states in between
+INNER_TOLERANCE = 0.5  # of half the chi^2, for the state of the next round
 
 
 @dataclass(frozen=True)
 class TargetSize:
-    """True size over the one given, and its formal standard deviation."""
+    """Ratio of true to stated size, and its formal standard deviation."""
 
     ratio: float
     std: float
 
 
 def target_size(problem: Problem, state: State) -> TargetSize | None:
-    """By all that was measured, from where the solver ended; None where nothing but cameras shows a size, or there is
-    no target."""
+    """Size of the target, from the state at the end of the solver. None without a target or an IMU, or if the size is
+    unobservable."""
     seen = any(f.sees_target for f in of_type(problem.factors, TargetFactor))
     if not seen or not problem.framed or not isinstance(problem.chain, ImuFactor):
         return None
@@ -61,8 +61,8 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
 
 
 def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Problem, State]:
-    """The same problem with a target `size` times as large, and all that cameras see grown with it from where it was
-    `now`, but for lengths that are fixed."""
+    """The problem with a target `size` times the stated one, and the state with all lengths that cameras observe scaled
+    by size / now. Fixed lengths are not scaled."""
     factors, by = tuple(f.with_target_size(size) for f in of_type(problem.factors, TargetFactor)), size / now
     bodies = factors[0].bodies
     lengths = {(f.name, "translation") for f in factors} | {(b, "shape") for b in bodies.bending}
@@ -74,7 +74,8 @@ def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Pro
 
 
 def _least_cost(problem: Problem, state: State, pieces: tuple[Piece, ...], scratch: Residuals) -> float:
-    """Half the robust chi^2, the least over all parameters."""
+    """Half the robust chi^2 at `state`, less the decrease that one step of all parameters predicts. Overwrites `pieces`
+    and `scratch`."""
     cost = problem.linearise(state, pieces, scratch, curved=True)
     return (
         cost - solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions).decrease
