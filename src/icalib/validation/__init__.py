@@ -1,4 +1,4 @@
-"""From an estimate to a `Calibration`: standard deviations, empirical factors, verdicts, warnings."""
+"""Turns an estimate into a `Calibration`: standard deviations, empirical factors, verdicts and warnings."""
 
 from icalib.validation.assess import assess, visited
 from icalib.validation.stated import stated_words

@@ -1,4 +1,5 @@
-"""Possible causes of a wrong result, ranked: statements of the rig file, changes over the recording, other misfit."""
+"""All possible causes of a wrong result, ranked: wrong values in the rig file, changes over the recording, other
+misfit."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ SEEN = ("corners", "features")
 
 @dataclass(frozen=True)
 class AssessedEstimate:
-    """An estimate with its statistics. factor: the largest empirical one, which scales formal standard deviations."""
+    """An estimate with its statistics. factor: the largest empirical factor, which multiplies formal standard
+    deviations; parts: segments of the recording."""
 
     inputs: Inputs
     found: Estimate
@@ -45,17 +47,17 @@ class AssessedEstimate:
 
     @property
     def misfit_factor(self) -> float:
-        """Largest ratio of the residuals of a sensor to their stated noise; at least 1."""
+        """Largest ratio of a sensor's residuals to its stated noise; at least 1."""
         return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in self.fits)])))
 
 
 def all_causes(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
-    """All causes, the grave ones first, each by its gain; and notes on the size of the target. against: statements of
-    the rig file that the data contradict so strongly that other faults of the estimate may follow from them."""
+    """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target. against: values
+    of the rig file that the data contradict so strongly that other faults of the estimate may follow from them."""
     inputs, found = judged.inputs, judged.found
     stated, notes = _stated(judged, against)
     few = any(plane_warnings(inputs.rig, found.problem.factors))
-    # Residuals of points that lie on planes by chance mean nothing.
+    # With few points on planes, these lie there by chance, and their residuals mean nothing.
     fits = [f for f in judged.fits if (not against or f.kind in SEEN) and not (few and f.kind == ON_PLANES)]
     misfit = Misfit.of(fits)
     known = stated
@@ -67,6 +69,8 @@ def all_causes(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tu
 
 
 def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+    """Causes that are wrong values in the rig file: target size, scales, swapped cameras, intrinsics, camera models,
+    other values; and notes on the size."""
     inputs, factor = judged.inputs, judged.factor
     size = None if inputs.rig.assumes_motion else felt_size(judged.found, factor)
     wrong_size, notes = ((), ()) if against else size_words(inputs, size)
@@ -76,7 +80,7 @@ def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple
     lenses = () if certain else tuple(other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor))
     scale = max(factor, judged.misfit_factor)
     against = against or contradictions(inputs, stated, scale)
-    if certain:  # a wrong size moves lever arms by some of their length
+    if certain:  # a wrong size also changes lever arms
         against = tuple(c for c in against if c.in_prior_sigmas > 1.0)
     causes = [Cause(sentence, np.inf, True) for sentence in mixed_up(inputs.rig.cameras, judged.groups)]
     if size is not None:
@@ -87,7 +91,7 @@ def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple
     causes += [Cause(sentence, gain, True) for _, sentence, gain in lenses]
     causes += [Cause(sentence, gain) for sentence, gain in lens_warnings(inputs, judged.found)]
     said = {(camera, name) for camera, *_ in lenses for name in LENS}
-    # Sizes, such as those of wheels, that contradict another length are named with it.
+    # `scale_causes` has named the sizes already, such as wheel radii.
     sensors = inputs.rig.sensors.values() if scales else ()
     said |= {(s.name, name) for s in sensors for name in answer(s.sensor_type, "assess", "sizes", s) or ()}
     against = tuple(c for c in against if c.key not in said)
@@ -98,6 +102,8 @@ def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple
 def _contradicted(
     judged: AssessedEstimate, against: Sequence[Contradiction], scale: float, grave: bool, stated: Relaxed | None
 ) -> Iterator[Cause]:
+    """A cause for each contradicted value in `against`, then for absurd values. scale: factor on formal standard
+    deviations; grave: whether all of them are grave. stated: None if the gain is unknown, which counts as infinite."""
     for c in against:
         gain = np.inf if stated is None else float(((c.off / (c.sigma / scale)) ** 2).max())
         moves = stated is not None and _moves_others(judged, stated, c.key)
@@ -106,8 +112,8 @@ def _contradicted(
 
 
 def _moves_others(judged: AssessedEstimate, stated: Relaxed, key: Key) -> bool:
-    """Whether the stated value of the group `key` makes the result wrong: without it, another parameter of a sensor
-    moves by more than four printed standard deviations."""
+    """Whether the stated value of the group `key` distorts the result: without it, a parameter of another group moves
+    by more than SIGMAS printed standard deviations."""
     step, _ = stated.step([key])
     for g in judged.groups:
         if g.columns is None or (g.sensor, g.name) == key or g.name in AUXILIARY:

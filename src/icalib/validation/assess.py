@@ -1,4 +1,4 @@
-"""From an estimate to a `Calibration`: standard deviations, empirical factors, verdicts, warnings."""
+"""Turns an estimate into a `Calibration`: standard deviations, empirical factors, verdicts and warnings."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ from icalib.validation.notes import notes
 from icalib.validation.twin_lenses import twin_lens_notes
 from icalib.validation.variance_parts import ENOUGH_PARTS, VarianceParts, few_factor
 
-LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of it
+LARGE_BLOOM_PX = 0.8  # px; a warning above it: ink and overexposure shift edges by about a third of it
 
 
 def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()) -> Calibration:
-    """The result, with standard deviations, verdicts and warnings. against: statements of the rig file that the data
-    contradict so strongly that other faults of the estimate may follow from them."""
+    """The result of the estimate `determined`. against: values of the rig file that the data contradict so strongly
+    that other faults of the estimate may follow from them."""
     found = determined.estimate
     outcome, state = found.outcome, found.outcome.state
     seen, names = _observed(inputs, determined), _column_names(inputs)
@@ -99,7 +99,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
 
 
 def _observed(inputs: Inputs, determined: Determined) -> Observability:
-    """Covariance and verdicts by observability, with sentences on what is undetermined."""
+    """Formal covariance, verdicts, and sentences on unobservable combinations of parameters."""
     state = determined.estimate.outcome.state
     tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
     axes = hardly_turned(state.seconds, state.rotation, inputs.rig.reference)
@@ -108,6 +108,7 @@ def _observed(inputs: Inputs, determined: Determined) -> Observability:
 
 
 def _notes(assessed: AssessedEstimate) -> Iterator[str]:
+    """Notes on the recordings and sensors, on ambiguous lens parameters, and on wrong guesses."""
     inputs, found = assessed.inputs, assessed.found
     yield from notes(inputs, found, assessed.timeline)
     yield from twin_lens_notes(inputs, found, assessed.fits)
@@ -115,7 +116,7 @@ def _notes(assessed: AssessedEstimate) -> Iterator[str]:
 
 
 def _rates(inputs: Inputs) -> dict[str, float]:
-    """Hz of each sensor, from the median step of its stamps."""
+    """Rate [Hz] of each sensor, from the median interval of its stamps."""
     m = inputs.measurements
     streams = (m.streams[name] for name in inputs.rig.sensors if name in m.streams)
     own = (s for s in streams if len(s.stamps_ns) > 1 and not _is_assumed(inputs, s.name))
@@ -123,19 +124,22 @@ def _rates(inputs: Inputs) -> dict[str, float]:
 
 
 def _is_assumed(inputs: Inputs, name: str) -> bool:
-    """Whether `name` stands for the motion that is assumed in place of an IMU."""
+    """Whether `name` is the sensor that carries the assumed motion in place of an IMU."""
     return inputs.rig.assumes_motion and name == inputs.rig.reference
 
 
 def _column_names(inputs: Inputs) -> tuple[str, ...]:
+    """(B,) name of each calibration parameter, such as "cam0.translation.x"."""
     return tuple(f"{b.sensor}.{b.name}.{label}" for b in inputs.layout.free for label in inputs.specs[b.key].labels)
 
 
 def _column_specs(inputs: Inputs) -> tuple[ParameterSpec, ...]:
+    """(B,) definition of the group of each calibration parameter."""
     return tuple(spec for b in inputs.layout.free for spec in [inputs.specs[b.key]] * b.size)
 
 
 def _mode(inputs: Inputs, block: Block) -> str:
+    """The mode of a group in the result: fixed, prior or free."""
     if block.start is None:
         return "fixed"
     if block.is_nuisance:
@@ -146,7 +150,7 @@ def _mode(inputs: Inputs, block: Block) -> str:
 
 
 def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visited:
-    """A state of the solver, with values as in the result."""
+    """A state of the solver with its formal standard deviations. Values have the units of the result."""
     t = problem.tolerance
     covariance = restricted_inverse(visit.information * t[:, None] * t, problem.fixed_directions)
     formal = t * np.sqrt(np.diag(covariance))
@@ -156,7 +160,7 @@ def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visit
 
 
 def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
-    """The value as in the result: time offsets are between raw stamps."""
+    """The value of `block` as in the result: time offsets are between raw stamps, not between first stamps."""
     value = state.values[block.key]
     if block.name == "time_offset":
         return value - origin_difference(inputs.measurements, inputs.stream(block.sensor))
@@ -166,6 +170,7 @@ def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
 def _groups(
     inputs: Inputs, determined: Determined, seen: Observability, variances: VarianceParts
 ) -> tuple[ParameterGroup, ...]:
+    """The parameter groups of the result, fixed ones included. `variances` gives the empirical factors."""
     formal, found = np.sqrt(np.diag(seen.covariance)), determined.estimate
     overall = variances.pooled(calibration_columns(inputs))
     groups = []
@@ -203,8 +208,8 @@ def _groups(
 
 
 def _is_shown(inputs: Inputs, block: Block, spec: ParameterSpec) -> bool:
-    """Whether a group that is not estimated is of interest: the rig file can state it, and measurements depend on it,
-    unlike radii if wheels report poses."""
+    """Whether the result lists a group that is not estimated: the rig file can state it, and measurements depend on it.
+    Wheel radii, for example, have no effect if wheels report poses."""
     sensor = inputs.rig.sensors.get(block.sensor)
     if spec.is_auxiliary or sensor is None:
         return not spec.is_auxiliary
@@ -231,17 +236,19 @@ def few_parts_notes(inputs: Inputs, parts: Segments | None) -> Iterator[str]:
 
 
 def _sensor_fits(judged: Sequence[Fit], found: Estimate) -> list[SensorFit]:
+    """Fit statistics of each sensor and kind of residual, with the sizes of its raw residuals."""
     sizes = raw_sizes(found.problem, found.outcome.residuals)
     return [SensorFit(f.sensor, f.kind, f.count, f.dof, f.chi2, *sizes[f.sensor, f.kind]) for f in judged]
 
 
 def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:
+    """The trajectory at the keyframes, on the clock that the user sees."""
     seconds = timeline.shown(s.seconds, _node_recordings(inputs, s, timeline))
     return Trajectory(seconds, s.rotation, s.position, s.velocity, s.bias[:, :3], s.bias[:, 3:])
 
 
 def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.ndarray:
-    """(K,) the recording of each keyframe; without an IMU, that of the image or the pose at it."""
+    """(K,) index of the recording of each keyframe; without an IMU, that of the image or pose at the keyframe."""
     if inputs.imu is not None:
         return state.recording
     if not inputs.rig.cameras:
@@ -253,7 +260,7 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
 
 
 def _residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[Residuals]:
-    """Records of residuals by kind of sensor; by default all rows of all factors of a sensor."""
+    """Records of residuals for each sensor; a kind without records of a special form gives all rows of its factors."""
     outcome = found.outcome
     for kind in SENSOR_KINDS:
         own = facet(kind, "assess")
@@ -268,6 +275,7 @@ def _residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[
 
 
 def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...]) -> Iterator[str]:
+    """Warnings on convergence, measurements and sensors, and on bloom that no light explains."""
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
@@ -282,6 +290,6 @@ def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...
 
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
-    """(n,) empirical factors of the parameters of sensors, without edge bloom."""
+    """(n,) empirical factors of all estimated parameters of sensors, without edge bloom."""
     own = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
     return np.concatenate([np.ones(0), *(g.factor for g in own if g.factor is not None)])

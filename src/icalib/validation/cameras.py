@@ -1,4 +1,4 @@
-"""Cameras that are swapped, or that have the intrinsics of another."""
+"""Cameras that are swapped in the rig file, or that have the intrinsics of another camera."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 GIVEN = (ROTATION, TRANSLATION, INTRINSICS)
 FAR = 0.5  # prior standard deviations of initial guesses: 5 cm, 3 deg, 8 px
-MUCH_NEARER = 0.3  # ratio of distances
-OTHER_LENS, CLEARLY = 0.015, 3.0  # of the focal length; standard deviations
-NEARER = 0.5  # ratio of distances, of fx, fy, cx and cy
+MUCH_NEARER = 0.3  # ratio of the distances of swapped to unswapped values, below which cameras count as swapped
+OTHER_LENS, CLEARLY = 0.015, 3.0  # least change of an intrinsic parameter: relative to fx, and in standard deviations
+NEARER = 0.5  # ratio of the largest differences in fx, fy, cx, cy [px], below which another camera is named
 
 
 def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Iterator[str]:
-    """Sentences on pairs of cameras of which each has about the values that the rig file states for the other."""
+    """Sentences on pairs of cameras that seem to be swapped: the estimate of each is near the stated values of the
+    other."""
     found = {(g.sensor, g.name): g.value for g in groups}
     for a, b in combinations(cameras, 2):
         own = _away(a, found, a.name), _away(b, found, b.name)
@@ -35,8 +36,8 @@ def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Ite
 
 
 def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: float) -> Iterator[tuple[str, str, float]]:
-    """Cameras whose fixed intrinsics contradict the data: name, sentence, and the decrease of chi^2 without them.
-    factor: the largest empirical factor."""
+    """Cameras whose fixed intrinsics contradict the data: name, sentence, and gain in chi^2 if they are free. factor:
+    the largest empirical factor, which multiplies formal standard deviations."""
     given = {c.name: c.intrinsics.value for c in cameras}
     for found in steps:
         value = given[found.camera]
@@ -61,7 +62,8 @@ def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: flo
 
 
 def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -> float:
-    """Distance of camera `name` from the stated values of `camera`, in prior standard deviations of initial guesses."""
+    """Largest distance between the estimate of the camera `name` and the stated values of `camera`, in prior standard
+    deviations of a guess."""
     away = 0.0
     for spec in GIVEN:
         given, value = getattr(camera, spec.name).value, found.get((name, spec.name))

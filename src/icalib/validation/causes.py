@@ -1,8 +1,8 @@
-"""Possible causes, ranked by the part of the misfit that they explain.
+"""Possible causes of large residuals, ranked by the part of the misfit that they explain.
 
-Each cause is a test with a gain: the decrease of chi^2 if the cause is taken into account. Significant causes that
-explain nothing of the misfit are not named. If no cause explains the misfit, the message says so and lists the checks.
-Another noise density is advised only if `fitting_noise` shows that it explains all.
+A cause is tested by its gain: the decrease of chi^2 if the cause is modelled. A significant cause that explains hardly
+any of the misfit is not named. If no cause explains the misfit, the message says so and lists the checks. Another noise
+density is advised only if `fitting_noise` shows that it explains the misfit.
 """
 
 from __future__ import annotations
@@ -22,19 +22,22 @@ from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.timeline import Timeline
 from icalib.validation.disturbance import Disturbance, Lag, disturbance, lag_between_cameras
 
-# Share of the misfit: robust weights hide part of a gain; others than the cause gain below 0.01.
+# Share of the misfit that a cause must gain to explain it. Robust weights hide part of the gain; wrong causes gain less
+# than 0.01.
 EXPLAINS = 0.1
-# Of what separate parameters for each segment gain. In simulation one change reaches 0.36 to 0.99, less the farther it
-# is from a boundary; on EuRoC, where lens and board do not follow the model, the best change reaches 0.04.
+# Share that one change must gain of the gain by separate parameters for each segment. A simulated change gains 0.36 to
+# 0.99, less if it is far from a segment boundary. On EuRoC, where lens and board do not follow the model, the best
+# change gains 0.04.
 CHANGES = 0.25
-ALIKE = 0.8  # of the best gain: a change of this group explains as much, such as focal length for distance
-SIGNIFICANT = 25.0  # chi^2 for each parameter: five standard deviations, for the many boundaries that are tried
+ALIKE = 0.8  # share of the best gain above which another group is named, too, such as focal length for distance
+SIGNIFICANT = 25.0  # gain in chi^2 for each parameter: five standard deviations, because many boundaries are tried
 INERTIAL = ("gyroscope", "accelerometer")
 
 
 @dataclass(frozen=True)
 class Cause:
-    """sentence: the fault, and what to do; gain: the decrease of chi^2; grave: the result must not be used."""
+    """A possible cause. sentence: the fault, and what to do about it; gain: the decrease of chi^2 if it is modelled;
+    grave: whether the result must not be used."""
 
     sentence: str
     gain: float
@@ -43,48 +46,52 @@ class Cause:
 
 @dataclass(frozen=True)
 class Misfit:
-    """fits: those with residuals larger than the stated noise predicts; chi2: their sum beyond the degrees of
-    freedom."""
+    """Sensors whose residuals exceed the stated noise. fits: their statistics."""
 
     fits: tuple[SensorFit, ...]
 
     @classmethod
     def of(cls, judged: Iterable[SensorFit]) -> Misfit:
+        """The misfit of those in `judged` whose residuals exceed the stated noise."""
         return cls(tuple(f for f in judged if excess(f) > 1.0))
 
     @property
     def chi2(self) -> float:
+        """Sum of chi^2 beyond the degrees of freedom."""
         return sum(max(f.chi2 - f.dof, 0.0) for f in self.fits)
 
     @property
     def sensors(self) -> set[str]:
+        """Names of the sensors."""
         return {f.sensor for f in self.fits}
 
     @property
     def is_grave(self) -> bool:
+        """Whether the residuals of a sensor are so large that standard deviations mean nothing."""
         return any(excess(f) >= FAR_BEYOND for f in self.fits)
 
     @property
     def words(self) -> str:
+        """Text with the ratio of residuals to stated noise of each sensor, the largest first."""
         worst_first = sorted(self.fits, key=lambda f: -excess(f))
         return ", ".join(f"{f.kind} of {f.sensor} {times(f)}" for f in worst_first)
 
 
 def ranked(causes: Iterable[Cause]) -> list[Cause]:
-    """The largest gain first; equal ones as they come."""
+    """The causes by decreasing gain; equal gains keep their order."""
     return sorted(causes, key=lambda c: -c.gain)
 
 
 def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
-    """Whether one of them explains the misfit."""
+    """Whether one of the causes gains at least the share EXPLAINS of the misfit."""
     return any(c.gain >= EXPLAINS * misfit.chi2 for c in causes)
 
 
 def changing(
     inputs: Inputs, found: Estimate, parts: Segments | None, misfit: Misfit, scattering: bool, timeline: Timeline
 ) -> Iterator[Cause]:
-    """Causes that change over the recording, act at one time, or follow the image speed. scattering: segments scatter
-    more than noise predicts."""
+    """Causes that vary over the recording: cameras that are not exposed together, a disturbance at one time, or a
+    parameter that changes. scattering: whether estimates from segments scatter more than predicted."""
     lag = lag_between_cameras(inputs, found)
     if lag is not None:
         yield Cause(_lag_words(lag), lag.gain, True)
@@ -96,11 +103,12 @@ def changing(
         if shown and shown[0].gain > max(CHANGES * heterogeneity(parts), SIGNIFICANT * shown[0].count):
             alike = [c for c in shown if c.key[0] == shown[0].key[0] and c.gain > ALIKE * shown[0].gain]
             found_causes.append(Cause(_change_words(alike, parts, timeline), shown[0].gain, True))
-    yield from ranked(found_causes)[:1]  # a change leaves residuals where it is largest, which is no disturbance
+    # the best one only: a change also enlarges residuals at one time, like a disturbance
+    yield from ranked(found_causes)[:1]
 
 
 def noise_words(inputs: Inputs, noise: NoiseFit) -> str:
-    """That the stated noise is too small, or too large, and which noise fits."""
+    """A sentence that the stated noise is too small or too large, with the noise that fits."""
     assert inputs.rig.imu is not None
     size = "small" if max(noise.scales.values()) > 1.0 else "large"
     n, scales = noise.noise, ", ".join(f"{kind} {scale:.2g}x" for kind, scale in noise.scales.items())
@@ -113,7 +121,7 @@ def noise_words(inputs: Inputs, noise: NoiseFit) -> str:
 
 
 def unknown_words(misfit: Misfit, noise: NoiseFit | None) -> str:
-    """A sentence that the model is incomplete, with the checks that were made."""
+    """A sentence that the cause is unknown, with the checks that were made."""
     pattern = ""
     if noise is not None and not noise.is_white:
         pattern = ", and are no white noise"
@@ -129,6 +137,7 @@ def unknown_words(misfit: Misfit, noise: NoiseFit | None) -> str:
 
 
 def _lag_words(lag: Lag) -> str:
+    """A sentence that two cameras are not exposed together."""
     first, second = (lag.first, lag.second) if lag.seconds > 0.0 else (lag.second, lag.first)
     return (
         f"{first} and {second} are not exposed together: residuals follow the image speed, as if {second} were about "
@@ -138,6 +147,7 @@ def _lag_words(lag: Lag) -> str:
 
 
 def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
+    """A sentence on a disturbance at one time."""
     names = " and ".join(hit.sensors)
     part = "leave that part out"
     if len(timeline.parts) == 1:
@@ -149,7 +159,7 @@ def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
 
 
 def _change_words(alike: list[Change], parts: Segments, timeline: Timeline) -> str:
-    """Of the changes of one sensor that explain as much, the best first."""
+    """A sentence on a change of one sensor. alike: changes that explain about as much, the best first."""
     best, sensor = alike[0], alike[0].key[0]
     when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
     if best.key[1] == "time_offset":
@@ -164,6 +174,7 @@ def _change_words(alike: list[Change], parts: Segments, timeline: Timeline) -> s
 
 
 def _changed(c: Change, parts: Segments) -> str:
+    """Text with the size of a change of a lens or of extrinsics."""
     over = float(np.ptp(parts.state.seconds[parts.ends])) if c.pattern == "drift" else 1.0
     if c.key[1] == "intrinsics":
         return f"its lens by up to {over * np.abs(c.value).max():.2g} px"
@@ -172,6 +183,7 @@ def _changed(c: Change, parts: Segments) -> str:
 
 
 def _clock_words(c: Change, parts: Segments, when: str, timeline: Timeline) -> str:
+    """A sentence on a time offset that drifts or jumps."""
     if c.pattern == "drift":
         span = float(np.ptp(parts.state.seconds[parts.ends]))
         return (
@@ -186,14 +198,16 @@ def _clock_words(c: Change, parts: Segments, when: str, timeline: Timeline) -> s
 
 
 def _apart(c: Change, timeline: Timeline, words: str) -> str:
-    """How to use the recording before or after a step, which lies within a segment of its `second`."""
+    """`words`, with how to use one side of a step alone. Empty for a drift, and for several recordings. The step is
+    somewhere within the segments around `c.second`."""
     if c.pattern == "drift" or len(timeline.parts) > 1:
         return ""
     return f"{words} (--to or --from; stay clear of the change near {c.second:.1f} s)"
 
 
 def _sizes(parts: Segments, c: Change, over: float) -> tuple[float, float]:
-    """Angle [rad] and distance [m] of a change of rotation, translation, or both."""
+    """Angle [rad] and distance [m] of a change of rotation, translation or both. over: duration [s] of a drift, 1 for a
+    step."""
     layout, n = parts.problem.layout, 0
     sizes = {"rotation": 0.0, "translation": 0.0}
     for name in sizes:

@@ -1,4 +1,4 @@
-"""Two-fold cross-validation, as in the result."""
+"""Two-fold cross-validation, in the form of the result."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from icalib.result import CrossValidation, PredictedFit
 
 
 def cross_validation(parts: Segments | None, assumed: Collection[str]) -> CrossValidation | None:
-    """None if the recording cannot be split, or if no parameter is known to both halves. `assumed` sensors have no
-    fits; no sensor has if the solutions of the halves are too far apart to be linearised."""
+    """None if the recording cannot be split, or if no parameter is observable in both halves. Sensors in `assumed` get
+    no fits; no sensor does if the solutions of the halves are too far apart for a linearisation."""
     found = None if parts is None else predict(parts)
     if parts is None or found is None:
         return None
@@ -25,6 +25,7 @@ def cross_validation(parts: Segments | None, assumed: Collection[str]) -> CrossV
 
 
 def _fits(problem: Problem, found: Prediction) -> list[PredictedFit]:
+    """Size of the residuals of each sensor and kind, within a half and predicted by the other half."""
     inside, outside = (chi2_by_kind(problem, out) for out in (found.inside, found.outside))
     size, size_outside = (raw_sizes(problem, out) for out in (found.inside, found.outside))
     return [

@@ -1,4 +1,4 @@
-"""Misfit that comes at one time, or that follows the image speed of cameras which are not exposed together."""
+"""Misfit that is concentrated at one time, or that follows the image speed because cameras are not exposed together."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.factor import pairs_of
 from icalib.sensors.camera.corner_factor import CornerFactor
 
-BINS, WINDOW = 64, 3  # of the recording; a shock reaches a few keyframes beyond itself
+BINS, WINDOW = 64, 3  # bins of the recording, and bins of a window: a shock affects a few keyframes around it
 SHAKEN = ("gyroscope", "accelerometer", "corners")  # kinds of residuals that a knock on the rig enlarges
-AT_ONE_TIME = 0.5  # of the misfit
-LARGE = 3.0  # times the usual chi^2 of a window: the number of measurements varies, too
-FASTEST_GAP_S = 1.0  # between images, beyond which their difference says nothing of image speed
-FOLLOWS_SPEED = 0.25  # of the squared residuals, in each of both cameras
+AT_ONE_TIME = 0.5  # share of the misfit in one window
+LARGE = 3.0  # times the median chi^2 of a window; below it, the number of measurements may explain the difference
+FASTEST_GAP_S = 1.0  # s between images; over more, their difference does not show the image speed
+FOLLOWS_SPEED = 0.25  # least share of the squared residuals that the lag explains, in each of both cameras
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """start, end: of the window [s, joined clock]; share: of the misfit; gain: its chi^2 beyond that of a usual window;
-    sensors: those with large residuals in it."""
+    """A window with most of the misfit. start, end: [s, joined clock]; share: of the misfit; gain: its chi^2 beyond
+    that of a usual window; sensors: those with large residuals in it."""
 
     start: float
     end: float
@@ -33,8 +33,8 @@ class Disturbance:
 
 
 def disturbance(found: Estimate, misfit: float, misfits: Collection[str]) -> Disturbance | None:
-    """The window that holds most of a `misfit` (chi^2 beyond the degrees of freedom) of the sensors `misfits`; None
-    where it is spread out."""
+    """The window with most of the `misfit` (chi^2 beyond the degrees of freedom) of the sensors `misfits`. None if no
+    window has at least half of it."""
     state = found.outcome.state
     rows = {s: r for s, r in _chi2_over_time(found).items() if s in misfits}
     begin, end = float(state.seconds[0]), float(state.seconds[-1])
@@ -57,7 +57,7 @@ def disturbance(found: Estimate, misfit: float, misfits: Collection[str]) -> Dis
 
 
 def _chi2_over_time(found: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By sensor: seconds (n,) on the joined clock and chi^2 (n,), of the kinds `SHAKEN`."""
+    """By sensor: times (n,) s on the joined clock and chi^2 (n,) of residuals of the kinds SHAKEN."""
     outcome = found.outcome
     factors = outcome.problem.factors.items()
     rows = [r for key, f in factors for r in f.rows(outcome.residuals[key], outcome.state) if r.kind in SHAKEN]
@@ -69,8 +69,8 @@ def _chi2_over_time(found: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class Lag:
-    """`second` is exposed `seconds` after `first`, according to residuals that follow the image speed. share: of the
-    squared residuals that the lag explains; gain: decrease of chi^2."""
+    """Camera `second` is exposed `seconds` after camera `first`, according to residuals that follow the image speed.
+    share: of the squared residuals that the lag explains; gain: decrease of chi^2."""
 
     first: str
     second: str
@@ -80,7 +80,8 @@ class Lag:
 
 
 def lag_between_cameras(inputs: Inputs, found: Estimate) -> Lag | None:
-    """The lag between the first two cameras of a rig without an IMU, whose images count as simultaneous."""
+    """The lag between the first two cameras of a rig without an IMU, whose images are modelled as simultaneous. None if
+    it explains less than FOLLOWS_SPEED of the squared residuals of either camera."""
     cameras = pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)
     if inputs.rig.imu is not None or len(cameras) < 2:
         return None
@@ -92,7 +93,7 @@ def lag_between_cameras(inputs: Inputs, found: Estimate) -> Lag | None:
         square, along = float((r**2).sum()), float((r * v).sum())
         if not (known.any() and square > 0.0 and (v**2).sum() > 0.0):
             return None
-        # Predicted minus measured: what is measured later is farther along.
+        # Residuals are predicted minus measured. A late image shows points farther along their motion.
         coefficient = along / float((v**2).sum())
         weight = float((out.root[known].astype(np.float64) ** 2).mean())
         lags.append((-coefficient, along * coefficient / square, along * coefficient * weight))
@@ -105,7 +106,7 @@ def lag_between_cameras(inputs: Inputs, found: Estimate) -> Lag | None:
 def _image_velocity(
     image: np.ndarray, point: np.ndarray, uv: np.ndarray, seconds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity (N, 2) px/s of each corner from the images before and after; (N,) whether both show it."""
+    """Velocity (N, 2) px/s of each corner, from the images before and after, and (N,) whether both show the corner."""
     count = int(point.max(initial=-1)) + 1
     table = np.full((len(seconds), count, 2), np.nan)
     table[image, point] = uv

@@ -1,4 +1,4 @@
-"""Notes on guesses of the rig file that the data contradict, with what would explain them."""
+"""Notes on initial guesses of the rig file that the data contradict, with likely mistakes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from icalib.sensors.parameter_spec import shown_unit
 from icalib.validation.looks_like import looks_like
 from icalib.validation.stated import scaled
 
-GRID = 12  # rays of an image, each way
+GRID = 12  # rays along each side of an image
 
 
 def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[str]:
-    """One sentence for each group whose initial guess is farther from the result than its prior uncertainty."""
+    """One sentence for each initial guess that the estimate contradicts, see `is_contradicted`. For lenses it is one
+    whose projections are more than the prior uncertainty of the intrinsics off."""
     found = {(g.sensor, g.name): g for g in groups}
     for sensor, name, parameter in groups_of(inputs.asked or inputs.rig):
         group, guess = found.get((sensor.name, name)), parameter.value
@@ -39,7 +40,8 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
 
 
 def lens_off(camera: Camera, name: str, found: dict[tuple[str, str], ParameterGroup]) -> float:
-    """RMS [px] by which projections move if the group `name` of the estimated lens is replaced by its initial guess."""
+    """RMS shift [px] of projections over the image if the group `name` of the estimated lens is replaced by its
+    guess."""
     model, values = camera_model(camera.model), {own: found[camera.name, own].value for own in LENS}
     guess = np.concatenate(list((values | {name: getattr(camera, name).value}).values()))
     sides = [np.linspace(0.0, n - 1.0, GRID) for n in camera.resolution]
@@ -51,6 +53,7 @@ def lens_off(camera: Camera, name: str, found: dict[tuple[str, str], ParameterGr
 
 
 def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:
+    """A sentence with the guess and the estimate, or their difference for rotations and time offsets."""
     what = f"the guess of {group.name.replace('_', ' ')} of {group.sensor}"
     if group.name == "rotation":
         off = np.rad2deg(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ group.value))))

@@ -1,8 +1,8 @@
-"""Warns where the camera model of the rig file does not follow the lens, and names a model that does.
+"""Warns if the camera model of the rig file does not follow the lens, and names a model that does.
 
-Models are compared on test images. Each is fitted to every other image, with poses and board shape free. It is
-judged by the residuals in the images between, where only poses are fitted. All models are given the same corners, as
-the detector found them: a corner is left out only where no model explains it.
+Models are compared by cross-validation. Each model is fitted to half of the images, with poses and board shape free,
+and tested on the images between, in which only poses are fitted. All models use the same detected corners: a corner is
+rejected only if no model explains it.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 from icalib.sensors.camera.corner_noise import image_speed, residual_noise
 from icalib.sensors.camera.corner_outliers import rejected
 
-MOST_IMAGES = 40  # that are compared, half of them tested; the time is proportional to it
+MOST_IMAGES = 40  # images of a comparison, half of them for the test; the computing time is proportional
 FEWEST_IMAGES = 4  # in each half; with fewer no model is fitted
 FEWEST_CORNERS = 8  # in an image; its pose takes up six of their 16 coordinates
-BETTER = 0.9  # of the own model's RMS: another that leaves more is not named
-EQUAL = 1.1  # times the least RMS: of the models below it the one with fewest parameters is named
-SIGN_TEST_SIGMAS = 3.0  # of the number of images that another model fits better; by chance it is half of them
+BETTER = 0.9  # ratio of the RMS of another model to that of the camera's model, above which the other is not named
+EQUAL = 1.1  # times the least RMS: among the models below it, that with fewest parameters is named
+SIGN_TEST_SIGMAS = 3.0  # least deviation of the number of images that another model fits better from half of them
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """A model as adjusted to the `fitted` images, and what it leaves in the M `tested` images."""
+    """A camera model, adjusted to the `fitted` images, and its fit to the M `tested` images."""
 
     model: CameraModel
     fitted: Adjusted
@@ -44,30 +44,31 @@ class _Trial:
 
     @property
     def residuals(self) -> np.ndarray:
-        """(N, 2) px: those of all corners, of the fitted and then of the test images."""
+        """(N, 2) px: residuals of all corners, first of the fitted and then of the test images."""
         return np.concatenate([self.fitted.residual, self.tested.residual])
 
     @property
     def squared_error(self) -> np.ndarray:
-        """(M,) px^2: the sum over the used corners of each test image."""
+        """(M,) px^2: sum of squared residuals over the used corners of each test image."""
         seen, square = self.tested.seen, (self.tested.residual**2).sum(axis=1)
         return seen.sum_by_image(np.where(seen.used, square, 0.0))
 
     @property
     def corners(self) -> int:
-        """The number of used corners in all test images."""
+        """Number of used corners in all test images."""
         return int(self.tested.seen.used.sum())
 
     @property
     def rms(self) -> float:
-        """RMS of either component [px]."""
+        """RMS residual of one coordinate over the test images [px]."""
         return float(np.sqrt(0.5 * self.squared_error.sum() / self.corners))
 
 
 def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, float]]:
-    """A sentence for each camera whose estimated lens leaves a large misfit (`ResidualNoise`), and its chi^2.
+    """For each camera whose estimated lens leaves a large misfit (`ResidualNoise`): a sentence and the gain in chi^2.
 
-    It names a better model. Where none is clearly better, a sentence appears only if the misfit exceeds the noise.
+    The sentence names a model that is clearly better. If none is, a sentence appears only if the misfit exceeds the
+    noise.
     """
     state, streams = estimate.outcome.state, inputs.measurements.cameras
     pairs = pairs_of(estimate.problem.factors, estimate.outcome.residuals, CornerFactor)
@@ -104,10 +105,11 @@ def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, flo
 def compare_models(
     factor: CornerFactor, out: CornerOutput, state: State, settings: Settings
 ) -> tuple[_Trial | None, _Trial | None]:
-    """The camera's own model, and the plainest one that is clearly better. The factor's corners are the detector's.
+    """The camera's model, and the model with fewest parameters that is clearly better. `factor` has all detected
+    corners.
 
-    The first is None where there are too few images, or the own model cannot be fitted to them. The second is None
-    where no model is clearly better: by a tenth in RMS, and in more images than chance explains (sign test).
+    The first is None if there are too few images, or if the camera's model cannot be fitted to them. The second is None
+    if no model is clearly better: by a tenth in RMS, and in more images than chance explains (sign test).
     """
     halves = _halves(with_circle_centres(factor, state), out, state)
     if halves is None:
@@ -120,7 +122,8 @@ def compare_models(
     first = _found(_cross_validated(model, start, fitted, tested) for model, start in pairs)
     if not first:
         return None, None
-    # Corners that the own model rejects may be those that another explains.
+    # Corners that the camera's model rejects may fit another model, so outliers are those of the best model at each
+    # corner.
     residuals = np.array([fit.residuals for fit in first])
     nearest = np.argmin((residuals**2).sum(axis=2), axis=0)
     used = ~rejected(factor, rows, residuals[nearest, np.arange(len(rows))], settings)
@@ -130,27 +133,27 @@ def compare_models(
 
 
 def _found(fits: Iterable[_Trial | None]) -> list[_Trial]:
+    """The trials that succeeded."""
     return [fit for fit in fits if fit is not None]
 
 
 def _clearly_better(own: _Trial, others: list[_Trial]) -> _Trial | None:
-    """The plainest of the others that are about as good as the best, if it is clearly better than the own model."""
+    """Of the `others` whose RMS is within EQUAL of the best, the model with fewest parameters; None unless it is
+    clearly better than `own`."""
     if not others:
         return None
     least = min(o.rms for o in others)
     best = min((o for o in others if o.rms <= EQUAL * least), key=lambda o: len(o.model.parameter_names))
     better, n = int((best.squared_error < own.squared_error).sum()), len(own.squared_error)
-    # Sign test: `better` has mean n / 2 and standard deviation sqrt(n) / 2 if the models are equally good. The RMS
-    # alone may come from a few images.
+    # Sign test: if both models are equally good, `better` has mean n / 2 and standard deviation sqrt(n) / 2. RMS alone
+    # may depend on a few images.
     by_chance = better - 0.5 * n < 0.5 * SIGN_TEST_SIGMAS * np.sqrt(n)
     return best if best.rms < BETTER * own.rms and not by_chance else None
 
 
 def _cross_validated(model: CameraModel, params: np.ndarray, fitted: ImagePoints, tested: ImagePoints) -> _Trial | None:
-    """The model, adjusted from `params` (P,) to the images `fitted`, in the images `tested`.
-
-    None where an image does not determine its pose.
-    """
+    """The model, adjusted from `params` (P,) to the images `fitted` and tested on the images `tested`. None if an image
+    does not determine its pose."""
     with suppress(np.linalg.LinAlgError):
         fit = adjust(model, params, fitted)
         return _Trial(model, fit, adjust(model, fit.params, tested, fit.shape))
@@ -158,7 +161,8 @@ def _cross_validated(model: CameraModel, params: np.ndarray, fitted: ImagePoints
 
 
 def _again(fit: _Trial, used: np.ndarray) -> _Trial | None:
-    """The fit to the corners `used` (N,) bool of both halves, from where it is."""
+    """The trial, repeated from its parameters with the corners `used` (N,) bool: those of the fitted, then of the test
+    images."""
     n = len(fit.fitted.residual)
     fitted, tested = replace(fit.fitted.seen, used=used[:n]), replace(fit.tested.seen, used=used[n:])
     return _cross_validated(fit.model, fit.fitted.params, fitted, tested)
@@ -167,11 +171,11 @@ def _again(fit: _Trial, used: np.ndarray) -> _Trial | None:
 def _halves(
     factor: CornerFactor, out: CornerOutput, state: State
 ) -> tuple[np.ndarray, ImagePoints, ImagePoints] | None:
-    """At most `MOST_IMAGES` images, spread over the recording: every other one to be fitted, the rest tested.
+    """At most `MOST_IMAGES` images, spread over the recording: every other one for the fit, the rest for the test.
 
-    Returns the corners' rows (N,) int in the stream, and the points of both. All corners of the images are in them;
-    those of the estimate are used. Points are in the camera frame, by lens and poses of `state`; uv is corrected for
-    bloom. None where too few images have enough corners.
+    Returns the rows (N,) int of their corners in the stream, and the points of both halves. These contain all corners;
+    the corners that the estimate uses are marked as used. Points are in the camera frame, by the poses of `state`; uv
+    is corrected for edge bloom. None if too few images have enough corners.
     """
     stream, used = factor.stream, factor.keep & (out.root > 0.0)
     rich = np.flatnonzero(np.bincount(stream.image[used], minlength=len(stream.stamps_ns)) >= FEWEST_CORNERS)
@@ -194,8 +198,8 @@ def _halves(
 
 
 def _in_camera(factor: CornerFactor, state: State, images: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows (n,) int in the stream of all corners of the `images` (m,), their points (n, 3) [m] in the camera frame, and
-    R_camera_body (n, 3, 3) of each."""
+    """Rows (n,) int in the stream of all corners of the `images` (m,), their points (n, 3) m in the camera frame, and
+    R_camera_body (n, 3, 3) for each corner."""
     rows, points, rotations = [], [], []
     for own, X, R in factor.in_camera(state):
         wanted = np.isin(factor.stream.image[own], images)

@@ -11,9 +11,9 @@ from icalib.geometry.vectors import is_near
 from icalib.rig import Rig
 from icalib.sensors import answer
 
-NEAR_RAD = 0.15  # rad: largest error of a rotation that another frame explains
-NEARLY = 0.1  # of a number in another unit
-TURNS = [  # about right angles, and reflections
+NEAR_RAD = 0.15  # rad: largest difference between a rotation in another convention and the estimate
+NEARLY = 0.1  # relative difference between a value in another unit and the estimate
+TURNS = [  # all rotations by right angles, and reflections
     np.array(axes, dtype=np.float64)[list(order)]
     for order in permutations(range(3))
     for axes in (np.diag(signs) for signs in product((1.0, -1.0), repeat=3))
@@ -25,8 +25,8 @@ IMAGE_SIZES = (2.0, 0.5, 4.0, 0.25)
 def looks_like(
     rig: Rig, key: tuple[str, str], value: np.ndarray, found: np.ndarray, rotation: np.ndarray | None = None
 ) -> str:
-    """A sentence that begins with a space, or an empty one. value: of the rig file; found: by the data, with the
-    sensor's `rotation` (3, 3)."""
+    """A sentence that names the likely mistake and begins with a space, or an empty text. value: of the rig file;
+    found: estimate of the same group; rotation: estimated R_imu_sensor (3, 3), needed for an inverse translation."""
     name = key[1]
     if name == "rotation":
         return _frames(value, found)
@@ -49,6 +49,7 @@ def looks_like(
 
 
 def _frames(value: np.ndarray, found: np.ndarray) -> str:
+    """The sentence for a rotation that is inverted, or in a frame with other axes."""
     if _angle(value.T, found) < NEAR_RAD:
         return " It looks like the inverse, as in Kalibr's T_cam_imu: icalib wants R_imu_sensor."
     if min(_angle(value @ turn, found) for turn in TURNS if np.linalg.det(turn) > 0.0) < NEAR_RAD:
@@ -57,4 +58,5 @@ def _frames(value: np.ndarray, found: np.ndarray) -> str:
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle [rad] between the rotations a and b (3, 3)."""
     return float(np.linalg.norm(so3.log(np.ascontiguousarray(a.T @ b))))

@@ -1,4 +1,4 @@
-"""Sensors whose residuals contradict the stated noise."""
+"""Causes and warnings for residuals that differ from the stated noise."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from icalib.sensors import facet
 from icalib.sensors.camera.assess import rejected_words
 from icalib.validation.causes import INERTIAL, Cause, Misfit, noise_words, unknown_words
 
-SMALL_CHI2 = 0.5  # per post-fit degree of freedom: a warning below it
-LARGE_FACTOR = 3.0  # empirical factor: a warning above it
-BEYOND_FACTOR = 1.5  # times the largest factor: a cross-validation factor above this is a warning
+SMALL_CHI2 = 0.5  # chi^2 per post-fit degree of freedom; a warning below it
+LARGE_FACTOR = 3.0  # empirical factor; a warning above it
+BEYOND_FACTOR = 1.5  # times the largest empirical factor; a warning if the cross-validation factor is above it
 
 
 def misfit_causes(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], explained: bool) -> Iterator[Cause]:
-    """Sentences on the misfit itself. `explained`: a named cause explains it. If none does, the noise of the IMU may
-    differ from the stated one, or a field of the rig file is contradicted, or the cause is unknown."""
+    """Causes of the misfit: rejected outliers, the noise of the IMU, stated noise of other sensors, or unknown.
+    explained: whether a named cause explains the misfit; then one sentence states the residuals."""
     for f in judged:
         if sentence := rejected_words(f):
             yield Cause(sentence, 0.0)
@@ -40,8 +40,8 @@ def misfit_causes(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], 
 
 
 def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
-    """A sentence on residuals that contradict the rig file, by the kind of the sensor, or a general one. is_noise:
-    residuals are white and constant over the recording; only then another size of the noise is advised."""
+    """A sentence on residuals of one sensor that contradict the rig file; None if they do not. is_noise: whether they
+    are white and constant over the recording; only then a larger noise is advised."""
     sensor = rig.sensors.get(f.sensor)
     if sensor is None:
         return None
@@ -55,7 +55,8 @@ def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit: Misfit) -> Iterator[Cause]:
-    """Advice on the noise only where it is tested: white residuals, constant over the recording."""
+    """Causes for residuals of the IMU that are too large or too small. Another noise is advised only if the residuals,
+    weighted by it, are white and constant over the recording."""
     own = [f for f in judged if f.kind in INERTIAL]
     large, small = any(excess(f) > 1.0 for f in own), [f for f in own if _is_small(f)]
     if not (large or small) or inputs.rig.imu is None:
@@ -66,7 +67,7 @@ def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit
         return
     noise = fitting_noise(inputs, found) if found.outcome.converged else None
     if noise is not None and noise.is_as_stated and noise.explains:
-        return  # another sensor's noise makes the residuals of the IMU large, or small
+        return  # wrong noise of another sensor causes the misfit of the IMU
     if large and noise is not None and noise.explains:
         yield Cause(noise_words(inputs, noise), Misfit.of(own).chi2, Misfit.of(own).is_grave)
     elif large:
@@ -83,12 +84,14 @@ def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit
 
 
 def _loose_corners(inputs: Inputs, judged: Sequence[SensorFit]) -> list[SensorFit]:
-    """Corners whose stated noise is too large. The motion then follows the IMU, whose residuals are small, too."""
+    """Cameras whose stated corner noise is too large. The trajectory then follows the IMU, and its residuals become
+    small, too."""
     stated = {c.name for c in inputs.rig.cameras if c.corner_noise_px is not None}
     return [f for f in judged if f.kind == "corners" and f.sensor in stated and _is_small(f)]
 
 
 def _corners_words(corners: list[SensorFit]) -> str:
+    """A sentence that the stated corner noise is too large."""
     sizes = " and ".join(f"{f.sensor} {_times(f):.2g}x" for f in corners)
     return (
         f"residuals of corners are smaller than corner_noise predicts ({sizes}); standard deviations are too large. "
@@ -97,22 +100,24 @@ def _corners_words(corners: list[SensorFit]) -> str:
 
 
 def _times(f: SensorFit) -> float:
+    """Ratio of residuals to the stated noise."""
     return float(np.sqrt(max(f.chi2, 0.0) / f.dof))
 
 
 def _is_noise(found: Estimate, f: SensorFit) -> bool:
-    """Whether residuals are white and constant over the recording."""
+    """Whether the residuals of `f` are white and constant over the recording."""
     rows = rows_of(found.outcome, f.sensor, f.kind)
     return rows is not None and are_noise(rows.weighted)
 
 
 def _is_small(f: SensorFit) -> bool:
+    """Whether the residuals are much smaller than the stated noise predicts."""
     return dof_known(f) and f.chi2 / max(f.dof, 1.0) < SMALL_CHI2
 
 
 def scatter_warnings(factors: np.ndarray, split: bool, held: CrossValidation | None) -> Iterator[str]:
-    """Warnings on the scatter of segments. factors: empirical factors of the sensors' parameters; split: the recording
-    was cut into segments."""
+    """Warnings on the scatter of estimates from segments. factors (n,): empirical factors of the sensors' parameters;
+    split: whether the recording was cut into segments; held: result of the cross-validation."""
     if len(factors) and factors.max() > LARGE_FACTOR:
         yield (
             f"estimates from segments of the recording scatter {factors.max():.1f}x more than predicted; the printed "

@@ -1,4 +1,4 @@
-"""Notes: facts about a result besides its numbers, one sentence each."""
+"""Notes on recordings and sensors, one sentence each."""
 
 from __future__ import annotations
 

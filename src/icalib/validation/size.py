@@ -1,4 +1,4 @@
-"""The size of the target: stated by the rig file, and shown by the accelerometer."""
+"""The size of the target as the rig file states it, compared with the size by the accelerometer."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from icalib.result import ParameterGroup
 from icalib.sensors import answer
 from icalib.validation.causes import Cause
 
-WRONG = 0.02  # of the size: more than a ruler or a good accelerometer is off by
-BEYOND = 0.05  # accelerometers are off by 3 % at most
+WRONG = 0.02  # relative error of the size: larger than that of a ruler or a good accelerometer
+BEYOND = 0.05  # relative error of the size that no accelerometer explains: these are off by 3 % at most
 CLEARLY = 5.0  # standard deviations
-SCALE = "scale"  # of all lengths that a sensor reports; its prior is `scale_sigma`
+SCALE = "scale"  # name of the parameter that scales all lengths of a sensor, with the prior `scale_sigma`
 
 
 def felt_size(found: Estimate, factor: float) -> TargetSize | None:
-    """Size of the target by the accelerometer, with `factor` times its formal standard deviation. None if nothing shows
-    it, or if the solver did not converge."""
+    """Ratio of the target's true size, by the accelerometer, to the stated one. `factor` multiplies its formal standard
+    deviation. None if the size is unobservable, or if the solver did not converge."""
     if not found.outcome.converged:
         return None
     try:
         size = target_size(found.problem, found.outcome.state)
-    except EstimationError:  # a step to another size leaves the domain of the problem
+    except EstimationError:  # the problem cannot be solved at another size
         return None
     return None if size is None else TargetSize(size.ratio, factor * size.std)
 
 
 def is_certain(size: TargetSize | None) -> bool:
-    """Whether the size differs by more than any error of an accelerometer."""
+    """Whether the size differs from the stated one by more than any error of an accelerometer."""
     return size is not None and abs(size.ratio - 1.0) > max(BEYOND, CLEARLY * size.std)
 
 
 def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Warnings and notes."""
+    """Warnings, and notes, on the size of the target."""
     if size is None:
         return (), ()
     rig, digits = inputs.rig, max(2, 1 - int(np.floor(np.log10(size.std))))
@@ -57,15 +57,15 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...]
 
 
 def scale_notes(inputs: Inputs, size: TargetSize | None) -> Iterator[str]:
-    """A note if all lengths come from a single source."""
+    """A note if the scale of all lengths comes from a single source."""
     sources = scale_sources(inputs, size)
     if len(sources) == 1:
         yield f"every length comes from {sources[0]} alone: 1 % error there is 1 % in every length here."
 
 
 def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
-    """Sources of the metric scale, in words. size: of the target by the accelerometer, None if that does not show
-    it."""
+    """Texts that name the sources of the metric scale. size: of the target by the accelerometer, None if
+    unobservable."""
     rig = inputs.asked or inputs.rig
     target = rig.has_target and bool(rig.cameras)
     has_imu = rig.imu is not None and not rig.imu.assumed
@@ -78,8 +78,9 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
 
 
 def scale_causes(inputs: Inputs, groups: Sequence[ParameterGroup], size: TargetSize | None) -> Iterator[Cause]:
-    """Sizes of the target and scales of sensors that contradict one another. Each has a prior about 1, and differs from
-    it by less than the contradiction, as all of them give way."""
+    """A cause if the size of the target and the scales of sensors contradict each other. Each is a factor with a prior
+    about 1. The least-squares compromise moves all of them, so the contradiction is larger than any single
+    deviation."""
     sigmas = {SIZE: inputs.rig.target.size_sigma} if size is None else {}
     sensors = inputs.rig.sensors.values()
     sigmas |= {(s.name, SCALE): sigma for s in sensors if (sigma := getattr(s, "scale_sigma", 0.0)) > 0.0}

@@ -14,7 +14,7 @@ from icalib.validation.looks_like import looks_like
 
 
 def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequence[ParameterGroup]) -> Iterator[str]:
-    """Sentences on sensors with values that cannot be, where they contradict no stated value."""
+    """Sentences on sensors with impossible values, unless they contradict a stated value in `against`."""
     found = {(g.sensor, g.name): g for g in groups}
     named = {c.key[0] for c in against}
     for sensor in inputs.rig.sensors.values():
@@ -23,7 +23,8 @@ def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequ
 
 
 def stated_words(inputs: Inputs, c: Contradiction) -> str:
-    """A sentence with both values, their standard deviations, their distance, and a likely mistake."""
+    """A sentence on the contradiction `c`: both values, their standard deviations and distance, and a likely
+    mistake."""
     spec = inputs.specs[c.key]
     labels, (unit, scale) = spec.labels, spec.shown_unit
     stated, unit = c.parameter.sigma, f" {unit}" if unit else ""
@@ -48,7 +49,7 @@ def stated_words(inputs: Inputs, c: Contradiction) -> str:
 
 
 def scaled(values: np.ndarray, scale: float) -> str:
-    """Numbers in brackets, or one alone, to four digits."""
+    """Text of the numbers `values` times `scale`, to four digits, in brackets if there are several."""
     shown = [f"{scale * v:.4g}" for v in values]
     return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
 

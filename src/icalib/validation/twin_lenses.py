@@ -1,7 +1,7 @@
-"""Names a second set of parameters that describes the same lens.
+"""Finds a second set of parameters that describes the same lens.
 
-Some models reach the same image from two sets of parameters: double-sphere from different pairs of xi and alpha.
-Standard deviations describe the surroundings of one set, and say nothing of the other.
+Some models project alike with two sets of parameters: double-sphere has different pairs of xi and alpha. Standard
+deviations hold only near one set.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from icalib.result import SensorFit
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.residual import FeatureFactor
 
-MOST_POINTS = 400  # that lenses are compared at
-OTHER_FOCAL = 0.02  # of the focal length: sets that differ by less are one
-MOST_CHI2 = 16.0  # between two lenses, four standard deviations: noise causes less
+MOST_POINTS = 400  # image points at which two lenses are compared
+OTHER_FOCAL = 0.02  # relative difference of fx: sets that differ by less count as one
+MOST_CHI2 = 16.0  # sum over all observations of the squared difference over the noise: four standard deviations
 
 
 def twin_lens_notes(inputs: Inputs, found: Estimate, fits: Sequence[SensorFit]) -> Iterator[str]:
@@ -32,7 +32,7 @@ def twin_lens_notes(inputs: Inputs, found: Estimate, fits: Sequence[SensorFit]) 
         if camera.intrinsics.mode == "fixed" or camera.distortion.mode == "fixed" or fit is None or not fit.rms:
             continue
         lens, uv = factor.lens(found.outcome.state), _observed(found, factor)
-        # Half of the numbers of a fit are rows of u, and chi^2 sums over both coordinates.
+        # `count` counts both coordinates of each point; `rms` is that of one coordinate.
         limit = fit.rms * np.sqrt(MOST_CHI2 / max(0.5 * fit.count, 1.0))
         twin = twin_lens(factor.model, lens, uv, float(limit))
         if twin is not None:
@@ -44,8 +44,8 @@ def twin_lens_notes(inputs: Inputs, found: Estimate, fits: Sequence[SensorFit]) 
 
 
 def twin_lens(model: CameraModel, lens: np.ndarray, uv: np.ndarray, limit_px: float) -> np.ndarray | None:
-    """(P,) the nearest other set of parameters that projects the rays of uv (N, 2) px to within `limit_px` RMS of where
-    `lens` (P,) does; None where there is none."""
+    """(P,) the other set of parameters that projects most like `lens` (P,). None if all differ by more than `limit_px`
+    RMS [px] at uv (N, 2) px."""
     uv = uv[:: max(1, len(uv) // MOST_POINTS)]
     rays, valid = model.unproject(lens, uv)
     rays, uv, best = rays[valid], uv[valid], (limit_px, None)
@@ -64,7 +64,7 @@ def twin_lens(model: CameraModel, lens: np.ndarray, uv: np.ndarray, limit_px: fl
 
 
 def _observed(found: Estimate, factor: CornerFactor) -> np.ndarray:
-    """(N, 2) px: corners and tracked points of a camera."""
+    """(N, 2) px: detected corners and used tracked points of a camera."""
     features = of_type(found.problem.factors, FeatureFactor)
     pairs = [pair for f in features for pair in zip(f.streams, f.keep, strict=True)]
     own = [s.uv[k] for s, k in pairs if s.name == factor.name]

@@ -1,4 +1,4 @@
-"""What the formal variances of a result consist of, and empirical factors on each part."""
+"""Parts of the formal variances by their source, and empirical factors on each part."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from icalib.motion.factor import of_type
 from icalib.observability.determination import Determined
 from icalib.sensors.camera.features.residual import FeatureFactor
 
-ENOUGH_PARTS = 8  # segments; with more, t differs from the normal distribution by 8 % at most
+ENOUGH_PARTS = 8  # segments; with as many, Student's t differs from the normal distribution by 8 % at most
 
 
 class VarianceParts(NamedTuple):
-    """What contributes to the formal variances, and how much larger it is than the formal covariance says.
+    """Shares of the formal variances by source, and how much larger each part is in truth.
 
-    noise, prior (B,): shares that noise of the measurements and errors of nuisance parameters contribute; errors of the
-    initial guess along undetermined directions contribute the rest. ratio (B,): empirical over formal standard
-    deviation of the noise's part. weight: square root of how many times priors on nuisance parameters count.
+    noise, prior (B,): shares of the measurement noise and of errors of nuisance parameters; errors of the initial guess
+    along unobservable directions contribute the rest. ratio (B,): empirical over formal standard deviation of the noise
+    part. weight: factor on the standard deviation of the prior part, see `Determined.inflation`.
     """
 
     noise: np.ndarray
@@ -33,6 +33,7 @@ class VarianceParts(NamedTuple):
 
     @classmethod
     def of(cls, determined: Determined, parts: Segments | None) -> VarianceParts:
+        """The parts of the estimate `determined`. parts: segments, or None if the recording is not split."""
         found = determined.estimate
         whole, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
         prior = np.clip(determined.prior_variance, 0.0, whole - guess)
@@ -42,21 +43,22 @@ class VarianceParts(NamedTuple):
         return cls(np.maximum(1.0 - (guess + prior) / whole, 0.0), prior / whole, ratio, determined.inflation)
 
     def pooled(self, columns: np.ndarray) -> float:
-        """Root mean square of the ratio over the columns, weighted by how much the noise contributes to them."""
+        """Root mean square of the ratio over `columns`, weighted by the noise share of each."""
         weights = self.noise[columns]
         total = float(weights.sum())
         return float(np.sqrt(weights @ self.ratio[columns] ** 2 / total)) if total > 0.0 else 1.0
 
     def factor(self, columns: np.ndarray, overall: float) -> np.ndarray:
-        """(n,) of the standard deviations of a group: by its own ratio or the `overall` one."""
+        """(n,) empirical factors of the standard deviations of a group, by the larger of its pooled ratio and the
+        `overall` one."""
         own = max(1.0, self.pooled(columns), overall)
         noise, prior = self.noise[columns], self.prior[columns]
         return np.sqrt(own**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))
 
 
 def _empirical_variance(found: Estimate, parts: Segments | None, white: np.ndarray) -> np.ndarray:
-    """Variance (B,): the larger of the scatter over segments and over feature tracks, plus the excess of clustered over
-    `white` variance (B,) for image and target regions. Without segments and tracks: `white`."""
+    """(B,) variances: the larger of the scatter over segments and over feature tracks. The excess of cluster-robust
+    variances over `white` (B,) is added, for image and target regions. Returns `white` without segments and tracks."""
     if parts is None and not of_type(found.problem.factors, FeatureFactor):
         return white
     clusters = cluster_covariances(found.problem, found.outcome)
@@ -68,6 +70,6 @@ def _empirical_variance(found: Estimate, parts: Segments | None, white: np.ndarr
 
 
 def few_factor(parts: int) -> float:
-    """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within: Student's t
-    distribution with parts - 1 degrees of freedom."""
+    """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within: quantile of
+    Student's t with parts - 1 degrees of freedom."""
     return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0
