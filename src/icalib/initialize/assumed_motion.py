@@ -1,12 +1,12 @@
-"""Without an IMU, but with wheels or a pose sensor: smooth motion is assumed in its place.
+"""Assumes smooth motion in place of an IMU, for a rig with wheels or a pose sensor.
 
-The estimate gets an IMU that reads zero, without gravity. The biases at a keyframe are then minus the body's angular
-rate and minus its acceleration, in body axes. Their random walk is white noise on angular acceleration and on jerk: a
-motion prior that connects keyframes, and propagates poses to the instants of measurements. Its densities are estimated
-from the poses of the body. Nothing else is used twice.
+The estimate gets an IMU that reads zero, without gravity. Its biases at a keyframe are then minus the body's angular
+rate and minus its acceleration, in body axes. The random walk of the biases is white noise on angular acceleration and
+jerk: a motion prior that connects keyframes and propagates poses to the instants of measurements. Its densities are
+estimated from the poses of the body; nothing else is taken from the measurements twice.
 
-The body is the first camera, whose target is the world, or the first pose sensor, whose frame is. Cameras with feature
-tracks are aligned to the trajectory of the pose sensor.
+The body is the first camera or the first pose sensor. The world is the frame of the camera's target or of the pose
+sensor's poses. Cameras with feature tracks are aligned to the trajectory of the pose sensor.
 """
 
 from __future__ import annotations
@@ -51,8 +51,9 @@ from icalib.sensors.sensor import mounted
 
 ASSUMED_IMU = "assumed motion"  # name of the assumed IMU; it has a space, so no sensor has this name
 ASSUMED_IMU_STEP_S = 0.01  # s between its readings
-REGULARISING_STEP_S = 5e-3  # s: its white noise equals its random walk over this time, which keeps covariances regular
-DENSITY_LAG_S = 0.1  # s: changes of rate and acceleration over this lag show their densities
+# s: ratio of the assumed IMU's white noise density to its random walk density; keeps covariances regular
+REGULARISING_STEP_S = 5e-3
+DENSITY_LAG_S = 0.1  # s: lag over which changes of rate and acceleration are compared to estimate their densities
 MIN_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): floor for a body at rest
 MIN_KEYFRAME_SPACING_S = 0.02  # s between keyframes, as with an IMU
 
@@ -76,7 +77,7 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
-    """As `guess_with_assumed_motion`, with poses in the convention in which they are recorded."""
+    """As `guess_with_assumed_motion`, without trying other conventions of the poses."""
     motion = _BodyMotion.by(motion_kinds(rig)[0], rig, recordings)
     for kind in kinds_of(rig):
         if (still := kind.start_at_rest(rig, recordings, motion.body, motion.values)) is not None:
@@ -91,7 +92,7 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
                 f"{where}{rig.reference} has a pose at only {len(poses.seconds)} instants; record more."
             )
     paths = _smoothed(motion.body)
-    # The narrow window overestimates densities a little; a wide one would smooth away motion and underestimate them.
+    # A wide window would smooth away motion and underestimate the densities.
     body = _with_assumption(rig, recordings, _smoothed(motion.body, narrow=True))
     inputs = replace(inputs_for(body, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
     ideal = _with_ideal_readings(body, recordings, paths, inputs)
@@ -106,8 +107,8 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
 
 @dataclass(frozen=True)
 class _BodyMotion:
-    """body: poses of the body in each recording; values: parameters estimated with them; odometry: the sensor whose
-    dead reckoning gave the poses, if one did."""
+    """Poses of the body in each recording, and parameters `values` that were estimated with them. odometry: the sensor
+    whose dead reckoning gave the poses, or None."""
 
     body: list[BodyPoses]
     values: Values
@@ -115,7 +116,8 @@ class _BodyMotion:
 
     @classmethod
     def by(cls, source: Initializer[Any], rig: Rig, recordings: Sequence[Measurements]) -> _BodyMotion:
-        """Poses of the body by the sensors of `source`, which may not be the body itself."""
+        """Poses of the body by the sensors of `source`. If these are no cameras but the body is, the cameras are
+        aligned to them first."""
         paths, found = source.body_poses(rig, recordings)
         if initializer_of(rig.sensors[rig.reference]) is source:
             return cls(paths, found)

@@ -1,8 +1,8 @@
-"""The estimate. If it fails or fits poorly, others are tried: without guesses, and without the values that the rig file
-states.
+"""Estimates a rig, with fallbacks if the estimate fails or fits poorly: without guesses, then without any stated value.
 
-Guesses have no weight, so an estimate without them replaces one that they spoil. Fixed values and priors have weight.
-If they spoil the estimate, one without them shows which values contradict the data.
+Guesses have no weight in the estimate. If they lead to a wrong minimum, an estimate without them replaces the first.
+Fixed values and priors have weight. If they spoil the estimate, one without them shows which values contradict the
+data.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.memory import trim_heap
 from icalib.rig import LENS, Parameter, Rig, Sensor
 
-POOR_FIT_RATIO = 4.0  # RMS residual over stated noise of some kind of residuals
-CLEARLY_BETTER_RATIO = 0.5  # misfit of another estimate over that of the first, to replace it
+POOR_FIT_RATIO = 4.0  # RMS residual over stated noise, of any kind of residuals, above which fallbacks are tried
+CLEARLY_BETTER_RATIO = 0.5  # largest misfit of a fallback, relative to that of the first estimate, at which it is used
 OnVisit = Callable[[Inputs, str, Problem, Visit], None]
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """An estimate. against: values of the rig file that an estimate without them contradicts; error: why the estimate
-    with them failed, if it did."""
+    """An estimate of a rig. against: values of the rig file that contradict an estimate without them; error: why the
+    estimate with these values failed, or None."""
 
     inputs: Inputs
     solution: Determined
@@ -66,9 +66,13 @@ def attempt(
     on_step: Callable[[str, Step], None],
     on_visit: OnVisit,
 ) -> Attempt:
-    """The estimate of `rig`. If it fails or fits poorly, an estimate without guesses that fits clearly better; else the
-    first one, with the values that contradict it. lap, on_step, on_visit: progress of stages and solver. Raises
-    EstimationError if the data do not determine an estimate."""
+    """The estimate of `rig`, or a fallback. An estimate without guesses replaces one that fails or fits poorly, if it
+    fits clearly better. Otherwise the first estimate is returned, with the stated values that contradict the data. If
+    it failed, the estimate without any stated values takes its place.
+
+    lap, on_step, on_visit: progress of stages and solver. Raises EstimationError if the data do not determine an
+    estimate.
+    """
     make = partial(_make_attempt, recordings=recordings, lap=lap, on_step=on_step, on_visit=on_visit)
     try:
         with refusing_far_off():
@@ -130,7 +134,7 @@ def _make_attempt(
 
 
 def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
-    """The estimate without guesses. If parameters stay unobservable, one with the guesses that it does not contradict.
+    """The estimate without guesses. If parameters are unobservable then, guesses that agree with it are used after all.
     None if the rig has no guesses, or the estimate fails."""
     found = _without_values(rig, make, lambda p: p.mode == "free") if _has_values(rig, "free") else None
     if found is None:
@@ -154,8 +158,8 @@ def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None
 
 
 def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[[Parameter], bool]) -> Attempt | None:
-    """The estimate without the values that `dropped` selects. If it fails for cameras with feature tracks, their
-    intrinsics are kept as guesses, as not every motion shows them without one."""
+    """The estimate without the values that `dropped` selects. If it fails, and cameras have feature tracks only, their
+    intrinsics are kept as guesses, because not every motion makes them observable. None if it fails again."""
 
     def bare(lens: bool) -> Rig:
         return with_groups(
@@ -170,8 +174,8 @@ def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[
 
 
 def _contradicting_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
-    """The estimate without any value of the rig file, with the fixed values and priors that it contradicts. None if
-    there are no such values, it fails, or it contradicts none."""
+    """The estimate without any value of the rig file, with the fixed values and priors that contradict it. None if the
+    rig file has none, the estimate fails, or it contradicts none."""
     if not (_has_values(rig, "fixed") or _has_values(rig, "prior")):
         return None
     found = _without_values(rig, make, lambda p: True)

@@ -1,7 +1,6 @@
-"""Cameras with feature tracks, aligned to a trajectory by odometry, which takes the place of a pose sensor.
+"""Aligns cameras with feature tracks to a trajectory by odometry, which takes the place of a pose sensor.
 
-The first camera is the body. Its poses, and the extrinsics of all other sensors, follow from those relative to the
-odometry.
+The body is the first camera. Poses and extrinsics relative to the odometry are converted to this camera.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ def pose_streams(recordings: Sequence[Measurements], sensor: str, paths: Sequenc
 def camera_poses(
     rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses], values: Values
 ) -> list[BodyPoses]:
-    """Poses of the first camera, on its own clock, from trajectories `paths` of `sensor`. values: extrinsics of the
-    cameras relative to `sensor`."""
+    """Poses of the first camera, on its clock, from trajectories `paths` of `sensor`. values: extrinsics and time
+    offsets of the cameras relative to `sensor`."""
     first = rig.cameras[0].name
     R, p, offset = (values[first, name] for name in MOUNTED_NAMES)
     between = [(m.tracks[0].origin_ns - m.streams[sensor].origin_ns) * 1e-9 for m in recordings]
@@ -50,8 +49,9 @@ def camera_poses(
 
 
 def relative_to_first_camera(rig: Rig, sensor: str, values: Values) -> Values:
-    """Converts `values`, extrinsics of cameras relative to `sensor`, to extrinsics of all relative to the first camera.
-    Also returns the camera models, and the other parameters of `sensor` as the rig file gives them."""
+    """Extrinsics and time offsets of `sensor` and of the other cameras relative to the first camera. `values` has those
+    of the cameras relative to `sensor`. Also returns the intrinsics, and the other parameters of `sensor` as the rig
+    file gives them."""
     first, *others = rig.cameras
     R, p, offset = (values[first.name, name] for name in MOUNTED_NAMES)
     out = {key: value for key, value in values.items() if key[1] in ("intrinsics", "distortion")}
@@ -68,8 +68,8 @@ def relative_to_first_camera(rig: Rig, sensor: str, values: Values) -> Values:
 
 
 def with_stated_values(inputs: Inputs, sensor: str, found: Values) -> Values:
-    """`found`, completed by values of the rig file for cameras and `sensor` that it does not contradict. The height of
-    `sensor` is the stated one, as planar motion does not show it."""
+    """`found`, completed by values of the rig file for cameras and `sensor` that do not contradict it. The height of
+    `sensor` is taken from the rig file if stated, because planar motion does not show it."""
     out, rig = dict(found), inputs.rig
     for other in (*rig.cameras[1:], rig.sensors[sensor]):
         names = MOUNTED_NAMES if other.name != sensor else [spec.name for spec in other.specs()]

@@ -1,4 +1,4 @@
-"""Streams that were recorded at different times, by stamps that count from 1970."""
+"""Detects streams that were recorded at different times, by stamps in Unix time."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from contextlib import contextmanager
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 
-FIRST_UNIX_NS = 10**18  # September 2001; earlier stamps count from the start of a device
-HOUR_S = 3600.0  # clocks that are set by hand, or to another time zone, differ by whole hours
+FIRST_UNIX_NS = 10**18  # September 2001; earlier stamps are no Unix time and are not compared
+HOUR_S = 3600.0  # s between the streams, above which they count as recorded at different times
 
 
 @contextmanager
 def naming_recording_times(recordings: Sequence[Measurements]) -> Iterator[None]:
-    """An EstimationError raised within names two streams of a recording whose stamps lie hours apart, if there are
-    any: they do not show the same motion, because they were not recorded together."""
+    """A context in which an EstimationError is replaced by one that names two streams of a recording more than an hour
+    apart, if there are any. Such streams do not show the same motion."""
     try:
         yield
     except EstimationError as error:
@@ -26,8 +26,8 @@ def naming_recording_times(recordings: Sequence[Measurements]) -> Iterator[None]
 
 
 def furthest_apart(recording: Measurements) -> tuple[str, str, float] | None:
-    """Names of two sensors, and the seconds from the last stamp of the first to the first stamp of the second, where
-    that is more than an hour."""
+    """Names of two sensors, and the time [s] from the last stamp of the first to the first stamp of the second. None if
+    this is at most an hour for all pairs."""
     spans = [
         (int(s.stamps_ns[0]), int(s.stamps_ns[-1]), s.name)
         for s in recording.streams.values()

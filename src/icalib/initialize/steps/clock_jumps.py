@@ -14,16 +14,19 @@ from icalib.motion.imu_data import ImuData
 
 MIN_CLOCK_JUMP_S = 0.5  # s: shorter gaps are bridged by interpolation
 MIN_RATES_BESIDE_JUMP = 10  # rates on a side of the gap: with fewer the unexplained share is mostly noise
-MAX_MATCHING_UNEXPLAINED = 0.35  # unexplained share of the angular rate where both sensors turn alike
-MIN_DIFFERENT_UNEXPLAINED = 0.7  # where they do not
+MAX_MATCHING_UNEXPLAINED = 0.35  # largest unexplained share of the angular rate at which both sensors turn alike
+MIN_DIFFERENT_UNEXPLAINED = 0.7  # smallest unexplained share at which they do not
 UnexplainedShare = Callable[[SensorRates, float], float]
 
 
 @dataclass(frozen=True)
 class _ClockJump:
-    """A gap that may be a jump of a clock. whose: the sensor of this clock; size: length of the gap [s]; before, after:
-    ends of the rates before the gap and starts of those after it [s, clock of the rates], each by the time offset of
-    the other side; growth: change of the time offset over the gap [s]."""
+    """A gap that may be a jump of the clock of the sensor `whose`. size: length of the gap [s]; growth: change of the
+    time offset [s].
+
+    before: time of the jump [s, clock of the rates] if the present offset holds after it; after: the same if the
+    present offset holds before it.
+    """
 
     whose: str
     size: float

@@ -41,8 +41,8 @@ def largest_deviation(spec: ParameterSpec, guess: np.ndarray, found: np.ndarray)
 
 
 def merged_value(spec: ParameterSpec, parameter: Parameter, given: np.ndarray | None, found: np.ndarray) -> np.ndarray:
-    """Start value of a parameter: `given`, the value of the rig file in units of a state. It is `found` instead if the
-    rig file has no value, or only a guess that `found` contradicts."""
+    """Start value of a parameter: `given`, the value of the rig file in the form that a state has. It is `found`
+    instead if the rig file has no value, or only a guess that `found` contradicts."""
     if given is None or (parameter.mode == "free" and is_contradicted(spec, given, found)):
         return found
     return given

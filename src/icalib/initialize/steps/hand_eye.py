@@ -18,14 +18,14 @@ from icalib.geometry import so3
 from icalib.geometry.vectors import MEDIAN_NORM
 from icalib.motion.pose_rows import Extrinsics, Frame, absolute_residuals
 
-MAX_HAND_EYE_PAIRS = 2000  # pairs of instants between which motions are compared; more do not improve a start value
+MAX_HAND_EYE_PAIRS = 2000  # pairs of instants between which motions are compared; bounds the time
 # Singular values of the rotation vectors, second over first: below, the second axis may be noise
 SINGLE_AXIS_TURN_RATIO = 0.1
-HAND_EYE_CANDIDATES = 24  # start rotations about a single axis: 15 degrees apart, within the basin of Gauss-Newton
-MAX_HAND_EYE_ITERATIONS = 40  # it converges within ten from a good start
+HAND_EYE_CANDIDATES = 24  # start rotations about a single axis, 15 degrees apart
+MAX_HAND_EYE_ITERATIONS = 40  # at most; a smaller step than HAND_EYE_STEP_TOLERANCE ends it
 HAND_EYE_STEP_TOLERANCE = 1e-10  # rad, m: largest component of the last step
 MAX_HAND_EYE_STEP_RAD = 0.5  # rad: largest rotation of a step; the linearisation does not hold beyond
-# Prior standard deviations of the extrinsics about their start value: they keep what the poses do not show.
+# Prior standard deviations of the extrinsics about their start value: unobservable components stay there.
 EXTRINSICS_PRIOR_RAD = 3.0
 EXTRINSICS_PRIOR_M = 0.5
 MIN_RESIDUAL_SCALE = 1e-7  # rad, m: keeps weights finite for poses without noise
@@ -34,8 +34,8 @@ OUTLIER_SIGMAS = 6.0  # standard deviations: pairs with a larger residual are re
 MAX_OUTLIER_SHARE = 0.3  # of all pairs
 MAX_UNEXPLAINED_MOTION = 0.35  # unexplained share of the motion: above, the poses do not belong to one rigid body
 # Floors of the relative motion that residuals are compared with: a body at rest has none.
-MIN_COMPARED_TURN_RAD = 0.02
-MIN_COMPARED_DISPLACEMENT_M = 0.01
+MIN_COMPARED_TURN_RAD = 0.02  # rad
+MIN_COMPARED_DISPLACEMENT_M = 0.01  # m
 
 
 @dataclass(frozen=True)

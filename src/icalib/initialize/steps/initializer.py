@@ -33,39 +33,40 @@ BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = rang
 
 
 class Initializer(Generic[S]):
-    """What the initial guess asks of a kind of sensor. `sensors` are those of its kind, in the order of the rig
-    file."""
+    """The interface of one kind of sensor to the initial guess. `sensors` are those of this kind, in the order of the
+    rig file."""
 
-    asks_for_vertical = False  # aligned after the kinds whose frames show the vertical
-    hosts_keyframes = False  # keyframes are at its measurements even if another kind shows the motion
-    refined_alone = True  # its trajectory is refined even if no other sensor is aligned to it
-    moves_keyframes = False  # keyframes are set anew after the refinement, which has changed its time offset
+    asks_for_vertical = False  # whether its sensors are aligned last, because they need the vertical
+    hosts_keyframes = False  # whether keyframes are at its measurements even if another kind shows the motion
+    refined_alone = True  # whether its trajectory is refined even if no other sensor is aligned to it
+    moves_keyframes = False  # whether keyframes are placed again after the refinement, which changes its time offset
 
     def motion_rank(self, rig: Rig) -> int | None:
-        """Its rank among the kinds that show the motion of `rig`; the smallest is preferred. None if it does not show
-        the motion."""
+        """Rank of this kind among those that show the motion of `rig`; the smallest is preferred. None if it does not
+        show the motion."""
         del rig
         return None
 
     def sources(self, rig: Rig) -> tuple[str, ...]:
-        """Names of the sensors that show the motion; by default all of the kind."""
+        """Names of the sensors that show the motion; by default all sensors of this kind."""
         return tuple(s.name for s in rig.mounted if initializer_of(s) is self)
 
     def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
-        """The trajectory and the guess of its sensors, from these and the IMU. inputs: of `sources` alone. other:
-        returns the trajectory by the next kind in rank.
+        """A state with the trajectory and a guess of the sensors, from their measurements and the IMU's. inputs: of
+        `sources` and the IMU alone. other: returns inputs and trajectory by the next kind in rank.
 
         Raises EstimationError if the sensors do not show the motion.
         """
         raise NotImplementedError
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        """Refines its own `trajectory` by a solve, so that other sensors can be aligned to it. Returns inputs, state,
-        and the guess to which unobservable parameters are reset."""
+        """Refines the result of `trajectory` by a solve, so that other sensors can be aligned to it. Returns inputs,
+        state, and the guess to which unobservable parameters are reset."""
         raise NotImplementedError
 
     def adopted(self, whole: Inputs, own: Inputs) -> Inputs:
-        """`whole`, the inputs of all sensors, with the changes that `refined` made in its `own` inputs."""
+        """`whole`, the inputs of all sensors, with the changes that `refined` made in `own`, the inputs of
+        `sources`."""
         del own
         return whole
 
@@ -85,7 +86,8 @@ class Initializer(Generic[S]):
         return recording
 
     def vertical(self, state: State, sensor: S) -> np.ndarray | None:
-        """Unit vector (3,) in the world that points upwards, if the sensor's own frame is level; else None."""
+        """Unit vector (3,) in the world that points upwards, if the frame of the sensor's measurements is level; else
+        None."""
         del state, sensor
         return None
 
@@ -98,7 +100,7 @@ class Initializer(Generic[S]):
         raise NotImplementedError
 
     def check_moving(self, recording: Measurements) -> None:
-        """Raises EstimationError if its sensors measure too rarely to show a motion."""
+        """Raises EstimationError if sensors of this kind measure too rarely to show a motion."""
         del recording
 
     def start_at_rest(
@@ -111,20 +113,20 @@ class Initializer(Generic[S]):
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         """The largest spacing of keyframes [s] at which the error of the assumed motion is small against the noise of
-        its sensors."""
+        sensors of this kind."""
         del rig, recordings, motion
         return np.inf
 
     def rewritten(self, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
-        """Recordings in which measurements of `sources` are converted from another convention, each with the sentence
-        that names it. They are tried if other sensors contradict the motion."""
+        """Versions of the recordings in which measurements of `sources` are converted from another convention, each
+        with a sentence that names the convention. They are tried if other sensors contradict the motion."""
         del recordings
         return iter(())
 
     # Errors
 
     def explaining(self, inputs: Inputs) -> AbstractContextManager[None]:
-        """A context in which errors name what the sensors do not show, if these sensors give the motion."""
+        """A context in which errors name the parameters that these sensors do not show, if they give the motion."""
         del inputs
         return nullcontext()
 

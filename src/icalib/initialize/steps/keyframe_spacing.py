@@ -28,14 +28,14 @@ class SmoothMotion:
     jerking: float
 
     def spacing_for_poses(self, rotation_noise: float, position_noise: float) -> float:
-        """The largest spacing [s] for poses. The noise are standard deviations in rad and m."""
+        """The largest spacing [s] for poses with noise of these standard deviations [rad, m]."""
         return min(
             2.0 * (3.0 * (MAX_PROPAGATION_SHARE * rotation_noise / self.turning) ** 2) ** (1 / 3),
             2.0 * (20.0 * (MAX_PROPAGATION_SHARE * position_noise / self.jerking) ** 2) ** 0.2,
         )
 
     def spacing_for_increments(self, rotation_noise: float, position_noise: float) -> float:
-        """The largest spacing [s] for increments. The noise are densities in rad/sqrt(s) and m/sqrt(s)."""
+        """The largest spacing [s] for increments with noise of these densities [rad/sqrt(s), m/sqrt(s)]."""
         return min(
             sqrt(3.0) * MAX_PROPAGATION_SHARE * rotation_noise / self.turning,
             (20.0 * (MAX_PROPAGATION_SHARE * position_noise / self.jerking) ** 2) ** 0.25,

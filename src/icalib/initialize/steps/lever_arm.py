@@ -1,11 +1,11 @@
 """Gravity, lever arm and accelerometer bias, linear in a camera's positions and the accelerometer's readings.
 
-With D'' = R_board_imu f and the operator A[x] = (x_2 - x_1) / h_2 - (x_1 - x_0) / h_1 over three images,
+With the operator A[x] = (x_2 - x_1) / h_2 - (x_1 - x_0) / h_1 over three images at intervals h_1, h_2,
 
     A[p_board_cam] = A[R_board_imu] p_imu_cam + A[D_f] - A[D_R] b_a + g (h_1 + h_2) / 2
 
-where D_f and D_R are the double integrals of R_board_imu f and of R_board_imu. The operator removes velocities: it is a
-difference of mean velocities.
+D_f and D_R are the double integrals over time of R_board_imu f and of R_board_imu, with specific force f, accelerometer
+bias b_a, and gravity g in board axes. A is a difference of mean velocities, so velocities cancel.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from icalib.motion.imu_data import ImuData, clear_of
 TRIPLE_STEP_S = 0.12  # s between images of a triple: long against pose noise, short against the loss of the target
 READINGS_PER_BLOCK = 8192  # IMU readings whose rotations are computed at once: bounds the memory
 ACCEL_BIAS_PRIOR_M_S2 = 0.3  # m/s^2: prior standard deviation
-# On the residuals' size: rows share images, so the variance of a mean falls as if n were a quarter
+# Factor on the standard deviation of a row: rows share images, so their errors are correlated
 SHARED_IMAGE_FACTOR = 2.0
 MIN_ROW_SIGMA_M_S = 0.05  # m/s: floor of the standard deviation of a row
 TARGET_GRAVITY_TOLERANCE = 0.1  # relative error of gravity: more means wrong units or a wrong target size
@@ -54,7 +54,7 @@ class Triples(NamedTuple):
         return Triples(*(x[kept] for x in self))
 
     def second(self, x: np.ndarray) -> np.ndarray:
-        """A[x] (n, ...) of x (N, ...) at the instants: differences of its mean slopes, see the module's equation."""
+        """A[x] (n, ...) of x (N, ...) at the instants: difference of its mean slopes, see the module's equation."""
         flat, h1, h2 = x.reshape(len(x), -1), self.h1[:, None], self.h2[:, None]
         found = (flat[self.k] - flat[self.j]) / h2 - (flat[self.j] - flat[self.i]) / h1
         return found.reshape(-1, *x.shape[1:])
@@ -81,7 +81,8 @@ class LeverArm:
 
     @property
     def contradicts_camera(self) -> bool:
-        """Whether the accelerometer measured another motion than the camera. Noise alone leaves a share of 1."""
+        """Whether the accelerometer measured another motion than the camera. Noise alone leaves an unexplained share of
+        1."""
         return self.unexplained > MAX_UNEXPLAINED_ACCELERATION
 
 

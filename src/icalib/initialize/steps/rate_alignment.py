@@ -27,16 +27,16 @@ from icalib.initialize.steps.turned_angles import ChainedRates
 from icalib.motion.axes import other_axes
 from icalib.motion.imu_data import ImuData
 
-MAX_UNEXPLAINED_RATE = 0.35  # share of the angular rate; two independent motions leave about 1
-LONG_RATE_MEAN_S = 0.5  # s: duration of means that are compared if those over RATE_MEAN_S do not match
+MAX_UNEXPLAINED_RATE = 0.35  # unexplained share of the angular rate above which the motions differ
+LONG_RATE_MEAN_S = 0.5  # s: duration of the means that are compared if those over RATE_MEAN_S do not match
 OFFSET_AGREEMENT_S = 0.01  # s: time offsets that differ by less agree
 MAX_UNEXPLAINED_RATIO_OF_OTHER = 0.5  # unexplained rate at another offset over that at the present one, to replace it
 MIN_COMMON_RATE_SHARE = 0.3  # projection over norm of the sensor's rate: below, a ratio of rates says nothing
 STILL_RATE_RAD_S = 0.03  # rad/s: slower rotation is not distinguished from rest
-MAX_NOISE_RATIO_AT_REST = 1.5  # RMS of the rate over the noise of a gyroscope at rest
+MAX_NOISE_RATIO_AT_REST = 1.5  # RMS of the rate over the gyroscope's noise, below which means are compared instead
 _SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
 MIN_SECOND_AXIS_RATIO = 0.05  # spread of rates along the second axis over that along the first
-MAX_ALIGNMENT_ITERATIONS = 12  # of the alternation, which usually needs three
+MAX_ALIGNMENT_ITERATIONS = 12  # of Gauss-Newton and Kabsch in turns, at most
 DEG_PER_RAD = 180.0 / np.pi  # ratio of rates in deg/s to rates in rad/s
 
 
@@ -52,7 +52,7 @@ class RateAlignment:
     offset: float
     rotation: np.ndarray
     gyro_bias: np.ndarray
-    given: bool = False  # offset and rotation are the rig file's, and as good as these
+    given: bool = False  # whether offset and rotation are those of the rig file
 
 
 def align_rates(imu: ImuData, name: str, rates: SensorRates, given_offset: float | None) -> RateAlignment:
@@ -97,8 +97,8 @@ def _first_match(
 def _align_near(
     imu: ImuData, name: str, rates: SensorRates, offset: float, keep_offset: bool
 ) -> tuple[SensorRates, RateAlignment]:
-    """The alignment near one offset, and the rates. These are scaled to the gyroscope's if a wrong focal length made
-    them too large or too small."""
+    """The alignment near one offset, and the rates. If their norms differ from the gyroscope's by a quarter or more, as
+    by a wrong focal length, the rates are scaled."""
     if not covered(imu, rates, offset).any():
         raise no_overlap(imu, name)
     pair = _side_by_side(imu, rates, offset)
@@ -208,8 +208,8 @@ def _check_motion(imu: ImuData, name: str, rates: SensorRates) -> None:
 
 
 def kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R (3, 3) and bias (3,) with w_imu = R w_cam + bias (n, 3), weighted least squares: means are removed, then the
-    SVD of the covariance (Kabsch 1976)."""
+    """R (3, 3) and bias (3,) with w_imu = R w_cam + bias (n, 3), by weighted least squares: means are removed, and R
+    follows from the SVD of the covariance (Kabsch 1976)."""
     total = weight.sum()
     mi, mc = weight @ w_imu / total, weight @ w_cam / total
     U, _, Vt = np.linalg.svd(((w_imu - mi) * weight[:, None]).T @ (w_cam - mc))

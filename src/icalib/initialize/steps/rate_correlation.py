@@ -11,10 +11,10 @@ from icalib.initialize.steps.cross_correlation import CorrelationPeak, best_shif
 from icalib.initialize.steps.turned_angles import offsets_by_angle
 from icalib.motion.imu_data import ImuData
 
-CORRELATION_GRID_HZ = 100.0  # of the grid: offsets are found to 5 ms, and refined later
-MAX_RATE_STEP_S = 0.25  # s between neighbours that give an angular rate, unless the stream is slower:
-MAX_USUAL_STEPS = 1.5  # then the step is at most this many median steps,
-MAX_SLOW_STEP_S = 2.0  # and at most this many s; over longer steps the motion is lost
+CORRELATION_GRID_HZ = 100.0  # of the grid: offsets are found to 5 ms
+MAX_RATE_STEP_S = 0.25  # s: longest step between neighbours that gives an angular rate, unless the stream is slower
+MAX_USUAL_STEPS = 1.5  # median steps: longest step of a slower stream
+MAX_SLOW_STEP_S = 2.0  # s: longest step of any stream
 MIN_RATE_OVERLAP_S = 4.0  # s: a shorter overlap correlates by chance
 MIN_RATE_CORRELATION = 0.7  # of angular speeds that match
 MAX_OFFSET_PEAKS = 5  # peaks of the correlation that are tried
@@ -79,7 +79,7 @@ def likely_offsets(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
 
 
 def _offsets_of_slow_rates(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
-    """The same for long intervals, by rotation angles. Raises EstimationError if no offset matches."""
+    """As `likely_offsets`, for long intervals: by rotation angles. Raises EstimationError if no offset matches."""
     found = offsets_by_angle(imu, rates.start, rates.end, rates.rate)
     alike = [offset for offset, misfit in found if misfit < MAX_ANGLE_MISFIT]
     if not alike:

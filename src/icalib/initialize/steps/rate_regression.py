@@ -2,8 +2,8 @@
 
     w_imu = M w_cam + b
 
-M (3, 3) is free, so neither the rotation between both nor the focal length must be known, and b takes the bias. The
-offset is the shift with the largest logarithm of the likelihood ratio, -n/2 log(1 - R^2).
+M (3, 3) is free, so neither the rotation between both sensors nor the focal length must be known; b absorbs the
+gyroscope's bias. The offset is the shift with the largest logarithm of the likelihood ratio, -n/2 log(1 - R^2).
 """
 
 from __future__ import annotations
@@ -27,18 +27,16 @@ from icalib.initialize.steps.rate_correlation import (
 from icalib.motion.imu_data import ImuData, clear_of
 
 RATE_STEPS_S = (TRACK_RATE_STEP_S, 0.2, 0.1, 0.05)  # s between the two images of a rate
-MIN_STEP_PERIODS = 0.75  # of a step, in periods of the images
-# Log likelihood ratio of 3 x 3 coefficients: twice it is chi^2 with nine degrees of freedom. By chance some hundred
-# Shifts exceed it less than once in 1000 recordings.
+MIN_STEP_PERIODS = 0.75  # shortest step, in periods of the images
+# Logarithm of the likelihood ratio above which a match is significant. Without a match, twice the score is chi^2 with
+# nine degrees of freedom, for 3 x 3 coefficients; it exceeds 30 at a given shift with a probability of 4e-4.
 MIN_REGRESSION_SCORE = 15.0
-# Rates from the second choice of starts replace the first if their score is larger by this factor
+# Ratio of scores above which rates from the second choice of starts replace those from the first
 MIN_SCORE_RATIO = 1.3
 MIN_RATE_TO_NOISE = 3.0  # variation of rates over their noise: below, a match may not be significant
 GRID_POINTS_PER_INTERVAL = 10  # offsets are found to a twentieth of an interval
-# Of the mean square rate, added to each axis: rotation about one axis leaves the others singular
-REGULARISING_SPREAD = (
-    1e-3  # of the mean square, that rates count with about each axis: about one axis there may be none
-)
+# Share of the mean square rate that is added about each axis: without it, rotation about one axis is singular
+REGULARISING_SPREAD = 1e-3
 
 
 @dataclass(frozen=True)

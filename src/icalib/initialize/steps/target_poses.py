@@ -15,13 +15,13 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
 from icalib.initialize.steps.rate_correlation import SensorRates, max_rate_step
 
-MAX_POSE_CORNERS = 48  # corners of an image that are used; more do not improve an initial guess
-MIN_POSE_CORNERS = 6  # corners of a board: fewer are too often nearly collinear
+MAX_POSE_CORNERS = 48  # corners of an image that are used, at most; bounds the time
+MIN_POSE_CORNERS = 6  # corners of a board that give a pose; fewer may be nearly collinear
 MIN_RAY_COSINE = 0.15  # cosine of a ray to the optical axis: homographies need rays away from the image plane
 MAX_POSE_RMS_PX = 3.0  # px: poses with a larger RMS error are rejected
 POSE_HUBER_PX = 2.0  # px: width of Huber's loss
-POSE_ITERATIONS = 5  # of Gauss-Newton, which starts near the solution
-MIN_IMAGE_PAIRS = 20  # pairs of consecutive images: below, the median of differences is unreliable
+POSE_ITERATIONS = 5  # of Gauss-Newton
+MIN_IMAGE_PAIRS = 20  # pairs of consecutive images that angular rates need
 POSES_PER_BLOCK = 512  # poses computed at once: bounds the memory of rays and Jacobians
 
 
@@ -125,8 +125,8 @@ def _add_corner(X, iz, density, r0, r1, w, J, H, g):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def refine_pose(points, observed, R, t, rounds):
-    """Gauss-Newton on R_cam_board and t with Huber weights. points (n, 3) m: corners on the board; observed (n, 3):
-    x / z, y / z, and pixels per unit of these, which fall to a tenth towards the border of a fisheye.
+    """Gauss-Newton on R_cam_board and t with Huber weights. points (n, 3) m: corners on the board; observed (n, 3): x /
+    z, y / z, and pixels per unit of these.
 
     Returns the RMS error [px] before the last step, with errors capped at 4 POSE_HUBER_PX; points behind the camera
     count as this much. Returns 1e9 if singular, or if fewer than 4 points are in front of the camera.
@@ -206,7 +206,8 @@ def _mirrored_pose(centre, R, t):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, rotation, position, rms):
-    """Fills poses (n, 1 or 2, ...) of the images; with two, the mirrored solution is second."""
+    """Fills poses (n, 1 or 2, ...) and RMS errors [px] of the images. If there are two, the mirrored solution is
+    second."""
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
     points, observed = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     for i in range(len(start) - 1):

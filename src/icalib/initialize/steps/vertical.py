@@ -10,10 +10,8 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.initializer import initializer_of
 from icalib.optim.state import State
 
-# Between the vehicle's axis of rotation and z of a frame: a frame more than 45 degrees off is not level
-MIN_LEVEL_COSINE = (
-    0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
-)
+# Cosine between the vehicle's axis of rotation and z of a frame: a frame more than 45 degrees off is not level
+MIN_LEVEL_COSINE = 0.7
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,8 @@ def possible_verticals(inputs: Inputs, state: State) -> Verticals:
 
 
 def level_sensor(inputs: Inputs, state: State) -> str | None:
-    """The sensor whose frame is level and shows the upward direction, if there is no IMU."""
+    """The sensor whose level frame shows the upward direction, for a rig without an IMU. None if there is no such
+    sensor."""
     turns = state.bias[:, :3]  # of an assumed motion: minus the angular rate
     return _vertical_by_frames(inputs, state, np.linalg.svd(turns.T @ turns)[0][:, 0])[1]
 

@@ -1,7 +1,7 @@
-"""An IMU whose axes in the recording are not the true ones: inverted, permuted or left-handed.
+"""Detects an IMU whose recorded axes are not the true ones: inverted, permuted or left-handed.
 
-Each convention is tried if the readings do not fit the motion that cameras measured. It is named in an error if it fits
-far better.
+If the readings do not fit the motion that cameras measured, each convention is tried. An error names one that fits far
+better.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from icalib.motion.imu_data import ImuData
 from icalib.rig import Axes, ImuSensor
 
 UNCHANGED_AXES: Axes = ("x", "y", "z")
-MAX_GOOD_UNEXPLAINED = 0.4  # unexplained share of the acceleration: a convention that leaves less fits
-MAX_UNEXPLAINED_RATIO = 0.5  # over the share that the present convention leaves
-_UNIQUE_BEST_RATIO = 0.8  # best over second best share: above, both conventions fit alike and are named
+MAX_GOOD_UNEXPLAINED = 0.4  # unexplained share of the acceleration below which a convention fits
+# largest unexplained share of another convention, relative to that of the present one, at which it is named
+MAX_UNEXPLAINED_RATIO = 0.5
+_UNIQUE_BEST_RATIO = 0.8  # best over second best unexplained share, above which both conventions are named
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class AxisConvention:
         return replace(imu, gyro=_in_axes(imu.gyro, self.gyro), accel=_in_axes(imu.accel, self.accel))
 
     def fields(self, sensor: ImuSensor) -> str:
-        """The fields to set in the rig file, combined with those of `sensor` that it has already."""
+        """The fields to set in the rig file, if it has the axes of `sensor` so far."""
         found = []
         for name, given, own in (
             ("gyro_axes", sensor.gyro_axes, self.gyro),
@@ -107,7 +108,7 @@ def _in_axes(values: np.ndarray, axes: Axes) -> np.ndarray:
 
 
 def _composed(given: Axes, own: Axes) -> list[str]:
-    """The recorded columns that result from `own` axes of the columns in `given`."""
+    """The axes of the rig file that are equal to applying `given` first and then `own`."""
     columns = [(given["xyz".index(entry[-1])], entry.startswith("-")) for entry in own]
     return [f"{'-' if name.startswith('-') != turned else ''}{name[-1]}" for name, turned in columns]
 

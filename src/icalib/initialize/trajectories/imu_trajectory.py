@@ -1,9 +1,11 @@
 """Trajectory of the IMU, from the poses of a sensor on it and from the IMU's readings in between.
 
-Rotations come from the sensor, interpolated by the gyroscope. With known gravity and accelerometer bias, positions and
-velocities at the instants of the poses are linear least squares, each axis on its own:
+Rotations come from the sensor, interpolated by the gyroscope. With known gravity and accelerometer bias, positions p_k
+and velocities v_k at the poses k follow by linear least squares, independently for each axis, from
 
-    p_k+1 = p_k + v_k h + g h^2 / 2 + dp_k        v_k+1 = v_k + g h + dv_k        p_k as the sensor measures it
+    p_k+1 = p_k + v_k h + g h^2 / 2 + dp_k        v_k+1 = v_k + g h + dv_k        p_k = measured position
+
+with interval h, gravity g, and the double and single integrals dp_k, dv_k of the specific force in world axes.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from icalib.motion.imu_data import ImuData, clear_of
 SENSOR_POSITION_SIGMA_M = 0.02  # m: standard deviation of the sensor's positions
 IMU_DISPLACEMENT_SIGMA_M = 2e-3  # m: of a displacement by the IMU between two poses, without gap
 IMU_VELOCITY_SIGMA_M_S = 0.02  # m/s: of a change of velocity by the IMU between two poses, without gap
-IMU_GAP_SIGMA_FACTOR = 1e4  # on both of the IMU over a gap: practically no constraint
+IMU_GAP_SIGMA_FACTOR = 1e4  # factor on both standard deviations of the IMU over a gap: practically no constraint
 MAX_PROPAGATION_S = 1.0  # s: longer intervals between poses count as gaps
 
 

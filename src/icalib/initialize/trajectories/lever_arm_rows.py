@@ -1,17 +1,18 @@
 """Lever arm of a sensor with its own trajectory, and the part of its rotation that angular rates do not determine.
 
-`map` is the world frame of the sensor's trajectory. With a known trajectory of the IMU, and the sensor's displacement u
-from instant i to j in its axes at i (hand-eye equation, R and p of the IMU):
+`map` is the world frame of the sensor's trajectory. If the IMU's trajectory (R, p) is known, with the sensor's
+displacement u from instant i to j in sensor axes at i (hand-eye equation):
 
     (R_j - R_i) p_imu_sensor - R_i R_imu_sensor u = p_i - p_j
 
 With the IMU's readings alone, and A[x] = (x_2 - x_1) / h_2 - (x_1 - x_0) / h_1 over three poses, which removes
-velocities (as in `lever_arm`, whose board frame is the map here):
+velocities (symbols as in `lever_arm`, with `map` in place of the board frame):
 
     A[p_map_sensor] = A[R_map_imu] p_imu_sensor + A[D_f] - A[D_R] b_a + g (h_1 + h_2) / 2
 
 Both are also linear in a small rotation d of R_imu_sensor Exp(d). If the sensor turned about one axis, rates do not
-show d about it. These equations then start from the candidate rotation about this axis that fits best.
+show d about this axis. The solution then starts from the candidate rotation about the axis that fits these equations
+best.
 """
 
 from __future__ import annotations
@@ -38,13 +39,12 @@ SENSOR_RATE_SIGMA_RAD_S = 0.02  # rad/s: standard deviation of a rate of the sen
 DISPLACEMENT_SPANS_S = (0.5, 2.0)  # s between the two poses of a displacement
 MIN_TRIPLE_STEP_S = 0.1  # s between the poses of a triple
 MIN_LEVER_ARM_ROWS = 10  # equations of three components each
-# Spread of rates along the second axis over that along the first: below, it is noise
-SINGLE_AXIS_RATE_RATIO = (
-    0.1  # of the spread of rates about the first axis: below, turns about the second are lost in noise
-)
+# Spread of rates along the second principal axis over that along the first: below, the second is noise
+SINGLE_AXIS_RATE_RATIO = 0.1
 AXIS_TURN_CANDIDATES = 24  # start rotations about a single axis, 15 degrees apart
 LEVER_ARM_ITERATIONS = 5  # of Gauss-Newton on the rotation
-MIN_MIRRORED_SHARE = 1.4  # unexplained share: 2 in left-handed axes without noise, at most 1 in right-handed ones
+# unexplained share above which axes are left-handed: it is 2 there without noise, at most 1 in right-handed axes
+MIN_MIRRORED_SHARE = 1.4
 
 
 class LeverArmRows(NamedTuple):
@@ -56,14 +56,14 @@ class LeverArmRows(NamedTuple):
     motion: np.ndarray
 
 
-# Function of R_imu_sensor and of p_imu_sensor, which the derivative by d needs
+# Maps R_imu_sensor and p_imu_sensor to the rows linearised there
 LeverArmSystem = Callable[[np.ndarray, np.ndarray], LeverArmRows]
 
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """Prior of x (m,): mean and standard deviation, over the standard deviation of a row. information (3, 3): of d by
-    angular rates, in the same units."""
+    """Prior of x (m,). mean: in the units of x; sigma: standard deviation over that of a row; information (3, 3): of d
+    by angular rates, times the variance of a row."""
 
     mean: np.ndarray
     sigma: np.ndarray
