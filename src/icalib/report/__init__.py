@@ -1,4 +1,4 @@
-"""The calibration as a page to read, `report.html`, and as a table for the terminal."""
+"""The calibration as an HTML page, `report.html`, and as a table for the terminal."""
 
 from icalib.report.page import report_html
 

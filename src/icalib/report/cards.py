@@ -1,4 +1,4 @@
-"""A card for each sensor: value, standard deviation and verdict of every component, and how well its data fit."""
+"""One card for each sensor: value, standard deviation and verdict of every component, and its goodness of fit."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from icalib.rig import LENS
 
 
 def sensor_cards(c: Calibration) -> Html:
-    """Cards of all sensors with parameters or residuals, in the order of the rig file, but the IMU last."""
+    """Cards of all sensors with parameters or residuals, in the order of the rig file; the IMU comes last."""
     known = {g.sensor for g in shown_groups(in_body_frame(c))} | {f.sensor for f in c.fits}
     names = sorted((n for n in c.rig["sensors"] if n in known), key=lambda n: n == c.imu)
     return Html("".join(_card(c, name) for name in names))
 
 
 def camera_pairs(c: Calibration) -> Html:
-    """The baseline of every pair of cameras, and how well their relative rotation is known; empty for one camera."""
+    """Table of camera pairs: baseline, and standard deviation of the relative rotation. Empty for fewer than two
+    cameras."""
     found = [r for r in relative_poses(c) if {r.frame, r.sensor} <= set(c.cameras)]
     if not found:
         return Html("")
@@ -40,14 +41,15 @@ def camera_pairs(c: Calibration) -> Html:
 
 
 def _pair_verdict(c: Calibration, r: RelativePose) -> Verdict:
-    """Verdict by the largest standard deviation over the tolerance in the settings of the rig file."""
+    """Verdict on a relative pose, by its largest standard deviation in tolerances of the rig file's settings."""
     turn, move = np.deg2rad(tolerance(c, "rotation_tolerance_deg")), tolerance(c, "translation_tolerance_m")
     return by_size(float(max(r.std[:3].max() / turn, r.std[3:].max() / move)))
 
 
 def _card(c: Calibration, sensor: str) -> Html:
-    """One card. Red: a component is undetermined, residuals are far beyond the noise, or a reason names the sensor.
-    Amber: a component is weak, or residuals are large."""
+    """Card of one sensor. Red: a component is undetermined, residuals are at least `FAR_BEYOND` times the stated noise,
+    or an error in the rig file or recording names the sensor. Amber: a component is weak, or residuals exceed the
+    stated noise."""
     is_camera, own = sensor in c.cameras, [f for f in c.fits if f.sensor == sensor]
     groups = [g for g in shown_groups(in_body_frame(c)) if g.sensor == sensor and g.name not in AUXILIARY]
     judged: list[Verdict] = [v for g in groups if not (is_camera and g.name in LENS) for v in g.verdict]
@@ -70,7 +72,8 @@ def _card(c: Calibration, sensor: str) -> Html:
 
 
 def _components(c: Calibration, sensor: str, is_camera: bool) -> Html:
-    """One row a component; the coefficients of a lens as one."""
+    """Table with one row for each component. The coefficients of a lens share one row, which shows its projection
+    uncertainty."""
     hidden = {"fx", "fy", "cx", "cy", *_lens_labels(c, sensor)} if is_camera else set()
     hidden |= set(AUXILIARY)
     found = [r for r in rows(c) if r.sensor == sensor and r.name not in hidden]

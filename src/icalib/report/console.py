@@ -1,4 +1,4 @@
-"""The calibration as a table for the terminal."""
+"""The calibration as a table for the terminal, and one-line summaries."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "
 
 
 def table(calibration: Calibration) -> Table:
-    """One row for each parameter: sensor, name, value, standard deviation, unit, verdict."""
+    """Table with one row for each parameter: sensor, name, value, standard deviation, unit, verdict."""
     out = Table(title="Calibration", caption=_caption(calibration), caption_justify="left", title_justify="left")
     for header in ("sensor", "parameter", "value", "std", "unit", "verdict"):
         out.add_column(header, justify="right" if header in ("value", "std") else "left", no_wrap=True)
-    sensors = calibration.rig["sensors"]  # first, and the target's nuisance parameters last
+    sensors = calibration.rig["sensors"]  # sensors come first, parameters of the target last
     found = sorted(
         (r for r in rows(calibration) if r.sensor not in calibration.bodies),
         key=lambda r: r.sensor not in sensors,
@@ -38,7 +38,8 @@ def table(calibration: Calibration) -> Table:
 
 
 def bodies_words(calibration: Calibration) -> str:
-    """One line on the uncertainty of the poses of the target's bodies; empty for a single body."""
+    """One line on the largest standard deviations of the poses of the target's rigid bodies; empty for a single
+    body."""
     placed = calibration.bodies[1:]
     if not placed:
         return ""
@@ -51,7 +52,8 @@ def bodies_words(calibration: Calibration) -> str:
 
 
 def relative_words(calibration: Calibration) -> list[str]:
-    """One line for each pair of sensors: pose of the second relative to the first, and the baseline of two cameras."""
+    """One line for each pair of sensors: pose of the second in the frame of the first, with the baseline of two
+    cameras."""
     lines = []
     for r in relative_poses(calibration):
         turn, move = np.rad2deg(r.std[:3]), 1e3 * r.std[3:]

@@ -1,4 +1,4 @@
-"""Figures of segments: the result without each segment (jackknife), and the two-fold cross-validation."""
+"""Cross-validation in the report: the estimates without each segment (jackknife), and the two-fold cross-validation."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _PRINTED = "#fde2b3"
 
 
 def moved_without_parts(c: Calibration, held: CrossValidation) -> Figure:
-    """A row for each parameter, with a dot for each segment: the shift of the estimate without it, in formal standard
-    deviations. Grey: one standard deviation; orange: the same times the empirical factor."""
+    """One row for each parameter with one dot for each segment: shift of the estimate without the segment, in formal
+    standard deviations of that shift. Grey bar: one standard deviation; orange bar: one times the empirical factor."""
     groups = [g for g in shown_groups(c) if g.columns is not None]
     columns = np.array([k for g in groups for k in g.columns or ()], dtype=np.int64)
     names = [f"{g.sensor} {_name(g, label)}" for g in groups for label in g.labels]
@@ -41,17 +41,19 @@ def _name(g: ParameterGroup, label: str) -> str:
 
 
 def _bars(half: np.ndarray, row: np.ndarray, name: str, color: str, width: int) -> dict[str, Any]:
-    """A bar from -half to half in each row."""
+    """Trace of one bar in each row, from -half to half."""
     x = np.stack([-half, half, np.full_like(half, np.nan)], axis=1).ravel()
     return line(x, np.repeat(row, 3), name, color, line={"color": color, "width": width}, hoverinfo="skip")
 
 
 def _which(held: CrossValidation, names: list[str]) -> list[str]:
+    """Hover text of each dot: the parameter, and the segment that is left out."""
     return [f"{name}, without part {g + 1}" for g in range(held.segments) for name in names]
 
 
 def predicted_fits(held: CrossValidation) -> Html:
-    """RMS of each kind of residual in the half that was fitted, and predicted by the other half."""
+    """Table of the RMS of each kind of residual with the calibration from both halves, and from the other half
+    alone."""
     if not held.fits:
         return element("p", "Each half alone leaves parameters so loose that its residuals in the other mean nothing.")
     whitened, raw = "whitened RMS, took part", "RMS, took part"
@@ -80,7 +82,8 @@ def _raw(rms: float | None, unit: str) -> str:
 
 
 def words(c: Calibration, held: CrossValidation) -> list[str]:
-    """Sentences on the result, and on the factor by which formal standard deviations are too small."""
+    """Three sentences: the rise of chi^2 by cross-validation, the verdict on the formal standard deviations, and their
+    scale by the jackknife."""
     expected, spread = f"{held.expected:.0f}", f"{held.spread:.0f}"
     rise = (
         f"Predicted by the other half, chi^2 is {held.excess:.0f} higher than where both halves took part; noise of "
@@ -103,15 +106,17 @@ def words(c: Calibration, held: CrossValidation) -> list[str]:
 
 
 def _columns(c: Calibration) -> np.ndarray:
+    """Indices in the covariance of the groups of `_own`."""
     return np.array([k for g in _own(c) for k in g.columns or ()], dtype=np.int64)
 
 
 def _own(c: Calibration) -> list[ParameterGroup]:
-    """Estimated groups of sensors, without edge bloom."""
+    """Estimated groups of sensors except edge bloom."""
     return [g for g in c.groups if g.columns is not None and g.sensor in c.rig["sensors"] and g.name != "bloom"]
 
 
 def _printed(c: Calibration) -> str:
+    """Words for the range of empirical factors in the printed standard deviations."""
     factors = [float(g.factor.max()) for g in _own(c) if g.factor is not None]
     if not factors:
         return "none is printed."

@@ -12,13 +12,14 @@ from icalib.result.verdict import worst
 
 SIGMAS = 3.0
 VERDICT_COLORS = {"determined": "#15803d", "weak": "#d97706", "undetermined": "#dc2626"}
-_LARGEST = 0.4  # of the spread of the rig, up to which the best known ellipsoids are magnified
+_LARGEST = 0.4  # largest half size of determined ellipsoids when magnified, as a fraction of the rig's size
 
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """Position uncertainty of a sensor: axes (3, 3) of unit length in columns, imu frame; half_sizes (3,) [m], of
-    SIGMAS standard deviations, empirical factors included."""
+    """Uncertainty ellipsoid of a sensor's position in the imu frame. axes (3, 3): unit vectors of the principal axes as
+    columns. half_sizes (3,): half lengths of these axes [m], SIGMAS standard deviations with empirical factors.
+    verdict: the worst of the three components."""
 
     sensor: str
     verdict: str
@@ -27,7 +28,7 @@ class Ellipsoid:
 
 
 def ellipsoids(c: Calibration) -> list[Ellipsoid]:
-    """Ellipsoids of all estimated translations."""
+    """Uncertainty ellipsoids of all estimated translations."""
     found = []
     for name in c.mounted:
         group = c.group(name, "translation")
@@ -40,8 +41,8 @@ def ellipsoids(c: Calibration) -> list[Ellipsoid]:
 
 
 def magnification(c: Calibration) -> float:
-    """The largest power of ten by which all determined ellipsoids can be magnified and stay smaller than the rig. If
-    none is determined, the smallest one counts."""
+    """Largest power of ten, at least 1, by which all determined ellipsoids can be magnified and stay smaller than the
+    rig. If none is determined, the smallest ellipsoid is used."""
     sizes = [(e.verdict, float(e.half_sizes.max())) for e in ellipsoids(c)]
     shown = [size for verdict, size in sizes if verdict == "determined"] or [min((x for _, x in sizes), default=0.0)]
     if not 0.0 < max(shown) < np.inf:
@@ -50,7 +51,8 @@ def magnification(c: Calibration) -> float:
 
 
 def outline(e: Ellipsoid, factor: float) -> np.ndarray:
-    """Its three ellipses about where the sensor is, `factor` times as large, in the axes of the imu frame."""
+    """(n, 3) polylines [m]: three ellipses in the principal planes, centred at the origin, magnified by `factor`, with
+    the axes of the imu frame. Rows of NaN separate the ellipses."""
     x, y = rig_shapes.CIRCLE.T
     circles = [np.insert(np.stack([x, y], axis=1), k, 0.0, axis=1) for k in range(3)]
     return np.vstack([p for c in circles for p in (factor * (c * e.half_sizes) @ e.axes.T, rig_shapes.PEN_UP)])

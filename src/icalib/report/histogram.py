@@ -1,4 +1,4 @@
-"""Normalised residuals of all sensors."""
+"""Histogram of the normalised residuals of all sensors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import numpy as np
 from icalib.report.plot import COLORS, Figure, axis, figure, line
 from icalib.result import Calibration
 
-REACH = 6.0  # standard deviations
+REACH = 6.0  # range of the histogram on either side of zero, in standard deviations
 BINS = 96
 
 
 def normalised_histogram(c: Calibration) -> Figure:
-    """Residuals over their standard deviation against the normal density, logarithmic so that tails show."""
+    """Densities of residuals over their standard deviations, compared with the standard normal density. The logarithmic
+    axis shows the tails."""
     edges = np.linspace(-REACH, REACH, BINS + 1)
     x = 0.5 * (edges[1:] + edges[:-1])
     traces = []

@@ -1,4 +1,4 @@
-"""Residuals (predicted - measured) of one camera: corners or tracked points."""
+"""Figures of the residuals (predicted - measured) of one camera, for corners or tracked points."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 from icalib.report.plot import REJECTED, Figure, axis, dots, figure, line, numbers, thin
 from icalib.result import ImageResiduals, image_of, rms_of_images
 
-MOST_DOTS = 2500  # of each kind in one figure
+MOST_DOTS = 2500  # dots of each kind in one figure; more are thinned out
 BINS = 60
 CELL_PX = 40
 FEWEST_IN_CELL = 5
 
 
 def residual_plane(r: ImageResiduals) -> Figure:
-    """Density of the residuals (u, v), rejected ones that have any as crosses."""
+    """Two-dimensional histogram of the residuals (u, v) in use. Crosses mark rejected observations that have a
+    residual."""
     used = r.residual[r.used]
     reach = 1.3 * float(np.quantile(np.abs(used), 0.999)) if len(used) else 1.0
     edges = np.linspace(-reach, reach, BINS + 1)
@@ -47,7 +48,7 @@ def residual_plane(r: ImageResiduals) -> Figure:
 
 
 def residuals_over_time(r: ImageResiduals) -> Figure:
-    """Size of each residual, and the RMS of each image."""
+    """Length of each residual and RMS of each image over time [px]."""
     size = np.linalg.norm(r.residual, axis=1)
     used, gone = np.flatnonzero(r.used), np.flatnonzero(_measured(r))
     some, few = used[thin(len(used), MOST_DOTS)], gone[thin(len(gone), MOST_DOTS)]
@@ -67,7 +68,8 @@ def residuals_over_time(r: ImageResiduals) -> Figure:
 
 
 def residuals_over_image(r: ImageResiduals, resolution: tuple[int, int]) -> Figure:
-    """RMS in cells of the image, with the mean residual of each cell as an enlarged arrow."""
+    """RMS residual in cells of the image [px], with the mean residual of each cell as a magnified arrow. resolution:
+    width and height [px]."""
     width, height = resolution
     nx, ny = max(1, round(width / CELL_PX)), max(1, round(height / CELL_PX))
     x, y = np.clip(r.uv[r.used], 0, [width - 1, height - 1]).T
@@ -102,12 +104,13 @@ def residuals_over_image(r: ImageResiduals, resolution: tuple[int, int]) -> Figu
 
 
 def _measured(r: ImageResiduals) -> np.ndarray:
-    """(N,) bool: rejected, but with a residual."""
+    """(N,) bool: rejected observations that have a residual."""
     return r.rejected & np.isfinite(r.residual[:, 0])
 
 
 def _arrows(at: np.ndarray, mean: np.ndarray) -> list[dict[str, Any]]:
-    """Line pieces along the mean residual, the longest one cell long; a dot marks the foot."""
+    """Traces of arrows at the points `at` (n, 2) along the mean residuals (n, 2) [px]. The longest is one cell long; a
+    dot marks the start of each."""
     length = np.linalg.norm(mean, axis=1)
     longest = float(np.nanmax(length, initial=0.0))
     if longest == 0.0:

@@ -1,4 +1,4 @@
-"""Residuals of the IMU, the trajectory, and the convergence of the solver."""
+"""Figures of the IMU residuals, the trajectory, and the convergence of the solver."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")
 
 
 def imu_residuals(c: Calibration) -> Figure:
-    """Whitened residuals of the IMU factor; each should scatter like a standard normal number, or less."""
+    """Whitened residuals of the IMU factor over time: standard normal, or smaller where the trajectory absorbs
+    noise."""
     seconds, whitened = c.imu_residuals.seconds, c.imu_residuals.whitened
     keep = thin(len(seconds), MAX_PLOTTED_KEYFRAMES)
     return _panels(seconds[keep], [whitened[keep, 3 * b : 3 * b + 3] for b in range(5)], BLOCKS, 680)
@@ -54,7 +55,7 @@ def motion(c: Calibration) -> Figure:
 
 
 def trajectory(c: Calibration) -> Figure:
-    """Path of the IMU in the world, coloured by time, with the target at the origin."""
+    """Trajectory of the reference frame in the world frame, coloured by time, with the outlines of the target."""
     path = c.trajectory
     keep = thin(len(path.seconds), MAX_PLOTTED_KEYFRAMES)
     color = {"color": numbers(path.seconds[keep]), "colorscale": "Viridis", "width": 4}
@@ -72,7 +73,7 @@ def trajectory(c: Calibration) -> Figure:
 
 
 def _board(c: Calibration) -> list[dict]:
-    """Outlines of the target's bodies as they stand in each recording."""
+    """Outlines of the target's bodies in the world frame of each recording."""
     target, stands = target_from_plain(c.rig), rig_shapes.scene_in_worlds(c)
     if target is None or not stands:
         return []
@@ -82,25 +83,25 @@ def _board(c: Calibration) -> list[dict]:
 
 
 def _outline(c: Calibration, target: Target, body: int) -> np.ndarray:
-    """(6, 3) the rectangle about a body in the scene, the pen lifted behind it."""
+    """(6, 3) rectangle around a body in the scene frame [m]; the last row is NaN."""
     T = c.T_scene_body(target.bodies[body]) if c.bodies else np.eye(4)
     return rig_shapes.body_outline(target, body) @ T[:3, :3].T + T[:3, 3]
 
 
 def _seams(c: Calibration) -> np.ndarray:
-    """The last keyframe of each recording but the last one."""
+    """Indices of the last keyframe of each recording except the last recording."""
     return np.flatnonzero(np.diff(c.recording_of(c.trajectory.seconds)))
 
 
 def _lifted(c: Calibration, values: np.ndarray) -> np.ndarray:
-    """Values (K, 3) at the keyframes, NaN at the last of each recording, so that no line joins two recordings."""
+    """Copy of values (K, 3) at the keyframes with NaN at `_seams`, so that no line joins two recordings."""
     out = values.copy()
     out[_seams(c)] = np.nan
     return out
 
 
 def convergence(c: Calibration) -> Figure:
-    """Cost and predicted decrease at each step of the solver, stage by stage."""
+    """Cost and predicted decrease at each step of the solver, one colour for each stage. Crosses are rejected steps."""
     step = np.arange(1, len(c.iterations) + 1, dtype=float)
     traces = []
     for i, stage in enumerate(dict.fromkeys(s.stage for s in c.iterations)):
@@ -120,11 +121,12 @@ def convergence(c: Calibration) -> Figure:
 
 
 def _panels(t: np.ndarray, values: list[np.ndarray], titles: tuple[str, ...], height: int) -> Figure:
+    """Panels that have the same times (see `_mixed_panels`)."""
     return _mixed_panels([(t, v) for v in values], titles, height)
 
 
 def _mixed_panels(panels: list[tuple[np.ndarray, np.ndarray]], titles: tuple[str, ...], height: int) -> Figure:
-    """Three lines (x, y, z) in each of several panels one above the other."""
+    """Stacked panels with lines of x, y and z. panels: times (n,) and values (n, 3) of each; height [px]."""
     traces = [
         line(
             t,

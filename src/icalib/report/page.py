@@ -1,4 +1,5 @@
-"""`report.html`: one file that needs no network. The verdict comes first, the evidence after it."""
+"""`report.html`: one HTML file that needs no network. The verdict comes first, the supporting figures and tables after
+it."""
 
 from __future__ import annotations
 
@@ -59,6 +60,7 @@ def report_html(calibration: Calibration) -> str:
 
 
 def _ellipsoid_words(c: Calibration) -> str:
+    """Legend of the uncertainty ellipsoids; empty if no translation was estimated."""
     if not ellipsoids(c):
         return ""
     return (
@@ -68,7 +70,7 @@ def _ellipsoid_words(c: Calibration) -> str:
 
 
 def document(title: str, body: str, figures: dict[str, Figure]) -> str:
-    """One HTML file, plotly.js included, that draws each of the `figures` in the place with its id."""
+    """One HTML file, plotly.js included. Each of `figures` is drawn in the element of `body` whose id is its key."""
     return Template(resource("icalib.report", "frame.html")).substitute(
         title=tables.html(title),
         body=body,
@@ -79,7 +81,7 @@ def document(title: str, body: str, figures: dict[str, Figure]) -> str:
 
 
 def _figures(c: Calibration) -> dict[str, Figure]:
-    """Figures of the whole by the id of their places in the page."""
+    """Figures that are not about one kind of sensor, by the id of their HTML element."""
     found = {
         "rig": rig_figures.rig_picture(c),
         "histogram": normalised_histogram(c),
@@ -96,6 +98,7 @@ def _figures(c: Calibration) -> dict[str, Figure]:
 
 
 def _cross_validation_section(c: Calibration) -> Html:
+    """Sentences, table and place for the figure of the cross-validation."""
     held = c.cross_validation
     if held is None:
         return element("p", _NOT_HELD_OUT, "quiet")
@@ -109,11 +112,11 @@ def _cross_validation_section(c: Calibration) -> Html:
 
 
 def script_json(figures: dict[str, Figure]) -> str:
-    """JSON that cannot end the script element around it, whatever a sensor is called."""
+    """Figures as JSON for a script element. `<` is escaped, so that no sensor name can close the element."""
     text = json.dumps(figures, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c")
 
 
 def resource(package: str, name: str) -> str:
-    """Text of a file that came with a package."""
+    """Text of a resource file of a Python package."""
     return files(package).joinpath(name).read_text(encoding="utf-8")

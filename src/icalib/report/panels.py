@@ -1,16 +1,17 @@
-"""Residuals of rows over time, one panel for each column."""
+"""Figure of `RowResiduals` over time."""
 
 from __future__ import annotations
 
 from icalib.report.plot import COLORS, Figure, figure, line, stacked_axes, thin, y_of
 from icalib.result import RowResiduals
 
-MOST_ROWS = 2500  # in a figure
+MOST_ROWS = 2500  # rows in one figure; more are thinned out
 SHOWN_UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 
 
 def panels(r: RowResiduals) -> Figure:
-    """A panel for each column, which share the axis of time; radians and metres in thousandths."""
+    """Residuals over time, one panel for each column, with a common time axis. Units with rad and m are shown in mrad
+    and mm."""
     keep = thin(len(r.seconds), MOST_ROWS)
     shown = [SHOWN_UNITS.get(unit, (unit, 1.0)) for unit in r.units]
     traces = [

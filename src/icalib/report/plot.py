@@ -1,4 +1,4 @@
-"""Figures as plain data that plotly.js draws; the Python side of plotly is slow to load and not needed."""
+"""Figures as plain data that plotly.js draws. Plotly's Python package is slow to import and not needed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ REJECTED = "#dc2626"
 VIEW = {
     "aspectmode": "data",
     "camera": {"eye": {"x": 1.5, "y": 1.5, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.15}},
-}  # of scenes in space
-DIGITS = 5  # significant; more would only make the page larger
+}  # layout of 3D scenes
+DIGITS = 5  # significant digits of numbers in the page; more only make the file larger
 _GRID = {"gridcolor": "#e5e7eb", "zerolinecolor": "#cbd5e1", "linecolor": "#94a3b8"}
 
 
 def figure(traces: list[dict[str, Any]], height: int = 380, **layout: Any) -> Figure:
-    """Traces and a layout in the page's style; x, y: titles of the first axes."""
+    """A figure of `traces` in the style of the page. height [px]; layout: further entries of plotly's layout."""
     style: dict[str, Any] = {
         "height": height,
         "margin": {"l": 64, "r": 16, "t": 34, "b": 48},
@@ -33,7 +33,7 @@ def figure(traces: list[dict[str, Any]], height: int = 380, **layout: Any) -> Fi
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
-    """An axis with its title, in the page's style."""
+    """Plotly layout of an axis with its title, in the style of the page."""
     return _GRID | {"title": {"text": title}} | more
 
 
@@ -51,14 +51,14 @@ def dots(x: np.ndarray, y: np.ndarray, name: str, color: str, size: float = 3, *
 
 
 def path_3d(points: np.ndarray, name: str, color: str, **more: Any) -> dict[str, Any]:
-    """Lines in space through points (N, 3); a row of NaN lifts the pen."""
+    """A 3D line trace through points (N, 3); a row of NaN interrupts the line."""
     x, y, z = (numbers(points[:, i]) for i in range(3))
     style = {"type": "scatter3d", "mode": "lines", "line": {"color": color, "width": 4}, "hoverinfo": "name"}
     return style | {"x": x, "y": y, "z": z, "name": name} | more
 
 
 def stacked_axes(titles: list[str], gap: float = 0.045) -> dict[str, Any]:
-    """Layout of panels one above the other, sharing time; panel i has its traces on y-axis `y_of(i)`."""
+    """Layout of panels stacked vertically with a common time axis. Traces of panel i belong to the y-axis `y_of(i)`."""
     n = len(titles)
     panel = (1.0 - gap * (n - 1)) / n
     layout: dict[str, Any] = {"xaxis": axis("time [s]", anchor=y_of(n - 1))}
@@ -69,12 +69,13 @@ def stacked_axes(titles: list[str], gap: float = 0.045) -> dict[str, Any]:
 
 
 def y_of(panel: int) -> str:
-    """Plotly's name of the y-axis of a panel."""
+    """Plotly's name of the y-axis of panel number `panel`."""
     return "y" if panel == 0 else f"y{panel + 1}"
 
 
 def numbers(values: np.ndarray) -> list[Any]:
-    """Rounded to a few significant digits; None where not finite, since JSON knows no NaN."""
+    """Nested lists of `values`, rounded to `DIGITS` significant digits. Values that are not finite become None, as JSON
+    has no NaN."""
     values = np.asarray(values, dtype=np.float64)
     if values.ndim > 1:
         return [numbers(row) for row in values]
@@ -82,5 +83,5 @@ def numbers(values: np.ndarray) -> list[Any]:
 
 
 def thin(count: int, most: int) -> np.ndarray:
-    """Indices of at most `most` of `count` items, evenly spread."""
+    """Indices of at most `most` of `count` items, evenly spaced."""
     return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)

@@ -12,13 +12,13 @@ from icalib.result import Calibration, ImageResiduals, ProjectionMap, projection
 from icalib.result.quantities import shown
 
 MOST_DOTS = 1500
-WIDEST = 6.0  # of the scale of colours, in the median where points were: edges without data would take it all
-LEVELS = 9  # at least, of contours
-NOT_SEEN = 3.0  # times the median: a region where hardly anything was seen
+WIDEST = 6.0  # end of the colour scale, in medians over the seen cells, so that edges without data do not set it
+LEVELS = 9  # least number of contours
+NOT_SEEN = 3.0  # worst over median sigma, above which the page asks for observations near the worst pixel
 
 
 def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
-    """Maps at infinity and at the working distance; none if the rig file fixes the lens."""
+    """Projection uncertainty maps at infinity and at the working distance; empty if the rig file fixes the lens."""
     if all(c.group(camera, name).columns is None for name in ("intrinsics", "distortion")):
         return []
     ranges = [np.inf, *(x for x in [working_distance(c, camera)] if x is not None)]
@@ -27,7 +27,8 @@ def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
 
 
 def projection_figure(m: ProjectionMap, seen: Sequence[ImageResiduals], resolution: tuple[int, int]) -> Figure:
-    """Standard deviation over the image with its contours, and the points that the camera saw."""
+    """Standard deviation over the image with contours [px], and the observations `seen` of the camera. resolution:
+    width and height [px]."""
     width, height = resolution
     top = float(min(np.nanmax(m.sigma), WIDEST * m.median_seen))
     step = _round(top / LEVELS)
@@ -60,7 +61,7 @@ def projection_figure(m: ProjectionMap, seen: Sequence[ImageResiduals], resoluti
 
 
 def _round(step: float) -> float:
-    """The largest of 1, 2 or 5 times a power of ten that is not above a positive `step`; 1 of nothing."""
+    """Largest of 1, 2 or 5 times a power of ten that is not above `step`; 1 if `step` is not positive."""
     if not step > 0.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(step))
@@ -68,12 +69,12 @@ def _round(step: float) -> float:
 
 
 def title(m: ProjectionMap) -> str:
-    """What a map is of."""
+    """Title of a map: the distance of the points."""
     return "Points far away" if np.isinf(m.range_m) else f"Points {shown(m.range_m)} m away, like those it saw"
 
 
 def words(m: ProjectionMap) -> str:
-    """The median, the worst, and what they mean."""
+    """Text on a map: the median and the largest standard deviation, and what they mean."""
     size, u, v = m.worst
     where = "where it saw points" if m.seen.any() else "over the image"
     moved = "turned" if np.isinf(m.range_m) else "turned and moved"

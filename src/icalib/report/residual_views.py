@@ -1,4 +1,4 @@
-"""What the 3D view shows of residuals: curves over time, and points in space. Kinds of sensors give their own."""
+"""Data that the 3D view shows of residuals: curves over time, and points in space. Each kind of sensor defines them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from icalib.sensors.records import Residuals
 
 @dataclass(frozen=True, eq=False)
 class ResidualCurve:
-    """name: of what is left, "" where a sensor has one curve alone. seconds (n,); values (n, m) with m labels, in the
-    unit that the labels say, or whitened."""
+    """Curves over time. name: the kind of residual, "" if the sensor has only one. seconds (n,); values (n, m), one
+    column for each label, whitened or in the unit that the label names."""
 
     name: str
     seconds: np.ndarray
@@ -25,8 +25,8 @@ class ResidualCurve:
 
 @dataclass(frozen=True, eq=False)
 class ResidualCloud:
-    """Points (n, 3) [m] that a sensor measured, in the world at seconds (n,), and the size (n,) [m] of their
-    residuals."""
+    """Points (n, 3) [m] measured by a sensor, in the world frame, at seconds (n,). size (n,): absolute values of their
+    residuals [m]."""
 
     sensor: str
     seconds: np.ndarray
@@ -35,7 +35,8 @@ class ResidualCloud:
 
 
 def curves(c: Calibration, r: Residuals) -> Iterator[ResidualCurve]:
-    """Of one record of the result, as its kind of sensor shows it, or else each column of its rows."""
+    """Curves of one residual record as its kind of sensor defines them; by default one whitened curve for each column
+    of `RowResiduals`."""
     own = answer(c.rig["sensors"][r.sensor]["type"], "show", "curves", r)
     if own is not None:
         yield from own

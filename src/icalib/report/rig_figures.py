@@ -1,4 +1,4 @@
-"""The rig in space, and the correlation of its parameters."""
+"""Figures of the rig in 3D, and of the correlation of its parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icalib.result import Calibration
 
 
 def rig_picture(c: Calibration) -> Figure:
-    """Frames and shapes of all sensors in the imu frame, with ellipsoids of their position uncertainty."""
+    """Axes and shapes of all sensors in the imu frame [m], with magnified ellipsoids of their position uncertainty."""
     frames, spread = rig_shapes.frames(c), rig_shapes.spread(c)
     origins = np.array([T[:3, 3] for T in frames.values()])
     traces = [
@@ -42,6 +42,7 @@ def rig_picture(c: Calibration) -> Figure:
 
 
 def _axis_line(frames: dict[str, np.ndarray], i: int, length: float) -> np.ndarray:
+    """(n, 3) line of this length [m] along axis i of each frame."""
     pieces = [np.stack([T[:3, 3], T[:3, 3] + length * T[:3, i]]) for T in frames.values()]
     return np.concatenate([np.vstack([p, PEN_UP]) for p in pieces])
 
@@ -52,7 +53,7 @@ def _uncertainty(e: Ellipsoid, origin: np.ndarray, factor: float) -> dict[str, A
 
 
 def correlation(c: Calibration) -> Figure:
-    """Correlation coefficients of all estimated parameters but planes, formal covariance."""
+    """Correlation coefficients of all estimated parameters except scene planes, from the formal covariance."""
     planes = {p.name for p in c.planes}
     own = [i for i, name in enumerate(c.covariance_names) if name.rsplit(".", 2)[0] not in planes]
     covariance = c.covariance[np.ix_(own, own)]

@@ -8,43 +8,45 @@ from icalib.geometry.targets import Target
 from icalib.result import Calibration
 from icalib.sensors import SENSOR_KINDS, answer, facet
 
-PEN_UP = np.full((1, 3), np.nan)  # a row between two lines
+PEN_UP = np.full((1, 3), np.nan)  # separates two polylines: a row of NaN
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 41)
 CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], axis=1)
 _LEAST_SPREAD_M = 0.02
 
 
 def frames(c: Calibration) -> dict[str, np.ndarray]:
-    """T_imu_sensor (4, 4) of the body and of all that is mounted on it."""
+    """T_imu_sensor (4, 4) of the reference (identity) and of each mounted sensor, by name."""
     return {c.reference: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.mounted}
 
 
 def spread(c: Calibration) -> float:
-    """Largest distance of sensors along an axis of the imu frame [m], the scale of their shapes."""
+    """Size of the rig [m], which scales the drawn shapes: largest extent of the sensor origins along an axis of the imu
+    frame."""
     origins = np.array([T[:3, 3] for T in frames(c).values()])
     return max(float(np.ptp(np.vstack([origins, np.zeros(3)]), axis=0).max()), _LEAST_SPREAD_M)
 
 
 def shape(c: Calibration, name: str) -> np.ndarray | None:
-    """(n, 3) lines of a sensor in its own frame [m]; None where its kind has no shape."""
+    """(n, 3) polylines of a sensor's shape in the sensor frame [m]; None if its kind has no shape."""
     return answer(c.rig["sensors"][name]["type"], "show", "shape", c, name, spread(c))
 
 
 def legends(c: Calibration) -> list[str]:
-    """Explanations of the shapes of the kinds in the rig."""
+    """Explanations of the shapes of all kinds of sensors in the rig."""
     own = (getattr(facet(kind, "show"), "LEGEND", "") for kind in SENSOR_KINDS if c.of_type(kind))
     return [legend for legend in own if legend]
 
 
 def body_outline(target: Target, body: int) -> np.ndarray:
-    """(6, 3) the rectangle about a body of the target in its own frame, the pen lifted behind it."""
+    """(6, 3) bounding rectangle of a body of the target [m], closed, in the plane z = 0 of its frame. The last row is
+    NaN."""
     (x0, y0, _), (x, y, _) = (f(target.points[target.body == body], axis=0) for f in (np.min, np.max))
     corners = np.array([(x0, y0, 0.0), (x, y0, 0.0), (x, y, 0.0), (x0, y, 0.0), (x0, y0, 0.0)])
     return np.vstack([corners, PEN_UP])
 
 
 def scene_in_worlds(c: Calibration) -> list[tuple[str, np.ndarray]]:
-    """Name and R_world_scene (3, 3) of the target's scene in the world of each recording. Without an IMU the scene's
-    frame is the world's; none where the target was not seen."""
+    """Name of the target's scene and R_world_scene (3, 3), by recording. Without an IMU scene and world frame are
+    equal. Empty if there is an IMU and the target was never observed."""
     tilts = [(g.sensor, g.value) for g in c.groups if g.name == "tilt"]
     return tilts or ([("board0", np.eye(3))] if c.imu is None else [])

@@ -1,4 +1,4 @@
-"""Sections of the report about the residuals of one kind of sensor each."""
+"""Sections of the report, each about the residuals of one kind of sensor."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from icalib.sensors import SENSOR_KINDS, facet
 
 @dataclass(frozen=True)
 class Section:
-    """name: its anchor in the page; words: what it shows, in a paragraph; body: HTML with a place for each of the
-    `figures`, which are found there by their names."""
+    """One section of the report. name: its HTML id; words: introductory paragraph; body: HTML that contains an element
+    for each of `figures`, whose id is the key of the figure."""
 
     name: str
     title: str
@@ -25,13 +25,14 @@ class Section:
 
     @property
     def html(self) -> Html:
+        """The section as an HTML element."""
         content = [element("h2", self.title), element("p", self.words), self.body]
         return Html(f'<section id="{html(self.name)}">{html(content)}</section>')
 
 
 def sections(c: Calibration) -> list[Section]:
-    """Sections by kind of sensor in the order of `SENSOR_KINDS`, but the IMU last. A kind without sections of its own
-    gets the panels of its rows."""
+    """Sections of all kinds of sensors in the order of `SENSOR_KINDS`, with the IMU last. A kind without a `sections`
+    function gets those of `row_sections`."""
     found = []
     for kind in (*SENSOR_KINDS[1:], SENSOR_KINDS[0]):
         own = facet(kind, "show")
@@ -40,7 +41,8 @@ def sections(c: Calibration) -> list[Section]:
 
 
 def row_sections(c: Calibration, kind: str, name: str, title: str, words: str) -> Iterator[Section]:
-    """One section with the panels of all sensors of a type of the rig file; none if they have no rows."""
+    """One section with `panels` of each sensor of type `kind` that has `RowResiduals`; none if no sensor has any. name:
+    HTML id; words: added to the introduction."""
     own = [r for r in c.residuals.values() if isinstance(r, RowResiduals) and r.sensor in c.of_type(kind)]
     if own:
         figures = {f"{name}-{i}": panels(r) for i, r in enumerate(own)}
@@ -49,5 +51,5 @@ def row_sections(c: Calibration, kind: str, name: str, title: str, words: str) -
 
 
 def plot_place(name: str, css: str = "") -> Html:
-    """Where the figure `name` is drawn."""
+    """HTML element in which the figure `name` is drawn."""
     return Html(f'<div class="plot {css}" id="{html(name)}"></div>')

@@ -1,4 +1,4 @@
-"""Words and tables of the report. All text is escaped here, and only here."""
+"""Texts and tables of the report as HTML. Only this module escapes text."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TRUST: dict[Usability, str] = {
 
 
 class Html(str):
-    """Text that is HTML already."""
+    """Text that is already HTML, so that `html` does not escape it."""
 
 
 def element(tag: str, content: object, css: str = "") -> Html:
@@ -31,7 +31,7 @@ def element(tag: str, content: object, css: str = "") -> Html:
 
 
 def html(content: object) -> Html:
-    """`content` as HTML: itself where it is Html, joined where it is a list, else escaped."""
+    """`content` as HTML: unchanged if it is Html, its items joined if it is a list, otherwise escaped text."""
     if isinstance(content, Html):
         return content
     if isinstance(content, list):
@@ -40,7 +40,7 @@ def html(content: object) -> Html:
 
 
 def table(headers: Sequence[str], body: Iterable[Sequence[object]], numeric: Sequence[str] = ()) -> Html:
-    """A table; the columns named in `numeric` stand to the right."""
+    """HTML table; columns named in `numeric` are right-aligned."""
     css = ["number" if h in numeric else "" for h in headers]
     head = element("tr", [element("th", h, c) for h, c in zip(headers, css, strict=True)])
     lines = [element("tr", [element("td", x, c) for x, c in zip(row, css, strict=True)]) for row in body]
@@ -48,14 +48,14 @@ def table(headers: Sequence[str], body: Iterable[Sequence[object]], numeric: Seq
 
 
 def sentences(items: Sequence[str], css: str, nothing: str) -> Html:
-    """A list of sentences, or one that says that there is nothing."""
+    """HTML list of sentences, or the paragraph `nothing` if there are none. css: class of the list."""
     if not items:
         return element("p", nothing, "quiet")
     return element("ul", [element("li", item) for item in items], css)
 
 
 def reasons(c: Calibration) -> Html:
-    """Why the result is not simply usable, numbered, the most important first."""
+    """Numbered list of why the verdict is not `usable`, the most important reason first."""
     if not c.reasons:
         return element("p", "None: every check passed.", "quiet")
     grave = {c.failure, *c.wrong, *c.undetermined}
@@ -64,15 +64,17 @@ def reasons(c: Calibration) -> Html:
 
 
 def badge(verdict: str) -> Html:
+    """Coloured label of a verdict."""
     return element("span", verdict, f"badge {verdict}")
 
 
 def trust(c: Calibration) -> str:
-    """The class in page.css of the verdict on the whole."""
+    """CSS class, in page.css, of the verdict on the result."""
     return TRUST[c.verdict]
 
 
 def parameters(c: Calibration) -> Html:
+    """Table of all parameters except poses of the target's rigid bodies; sensors come first."""
     headers = ("sensor", "parameter", "value", "std", "unit", "formal std", "factor", "verdict")
     own = sorted((r for r in rows(c) if r.sensor not in c.bodies), key=lambda r: r.sensor not in c.rig["sensors"])
     body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in own]
@@ -80,7 +82,7 @@ def parameters(c: Calibration) -> Html:
 
 
 def bodies(c: Calibration) -> Html:
-    """Poses of the target's bodies; empty for a single body."""
+    """Table of the poses of the target's rigid bodies; empty for a single body."""
     if not c.bodies:
         return Html("")
     sizes = ("x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]", "std [mm]", "std [deg]")
@@ -99,7 +101,7 @@ def _body_row(c: Calibration, body: str) -> list[object]:
 
 
 def poses(c: Calibration) -> Html:
-    """T_body_sensor of each sensor, as a matrix to copy."""
+    """T_body_sensor of each sensor as a 4x4 matrix, as text to copy."""
     shown = c.mounted if c.body == c.reference else c.on_body
     return element("div", [_matrix(f"T_{c.body}_{name}", c.T_body_sensor(name)) for name in shown], "matrices")
 
@@ -110,7 +112,7 @@ def _matrix(name: str, T: np.ndarray) -> Html:
 
 
 def relative(c: Calibration) -> Html:
-    """Relative poses of all pairs of sensors; empty for a single sensor."""
+    """Table and matrices of the relative poses of all pairs in `relative_poses`; empty if there are none."""
     found = relative_poses(c)
     if not found:
         return Html("")
@@ -132,13 +134,14 @@ def relative(c: Calibration) -> Html:
 
 
 def fits(c: Calibration) -> Html:
+    """Table of the goodness of fit of each kind of measurement."""
     headers = ("sensor", "kind", "residuals", "post-fit dof", "chi2 / dof", "RMS", "rejected")
     body = [(f.sensor, f.kind, f.count, dof_words(f), chi2_words(f), rms_words(f), f.rejected or "") for f in c.fits]
     return table(headers, body, headers[2:])
 
 
 def facts(c: Calibration) -> Html:
-    """Settings, versions, timings, rates and input files."""
+    """Tables of settings, versions, wall times, sensor rates and input files."""
     names = ("setting", "value")
     parts: list[object] = []
     for title, found in (
@@ -153,7 +156,7 @@ def facts(c: Calibration) -> Html:
 
 
 def size_words(c: Calibration) -> str:
-    """One line on the amount of data in use."""
+    """One line on the amount of data used: recordings, duration, measurements of each kind, keyframes."""
     whole = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
     several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
     span = sum(r.end - r.start for r in c.recordings) if several else whole
