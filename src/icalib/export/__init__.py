@@ -1,1 +1,1 @@
-"""The calibration in the formats of other programs."""
+"""Exports a calibration to the formats of other programs."""

@@ -1,4 +1,4 @@
-"""Autoware: `sensor_kit_calibration.yaml`, and `sensors_calibration.yaml` where wheels show the vehicle's base_link."""
+"""Export to Autoware: `sensor_kit_calibration.yaml`, and `sensors_calibration.yaml` if wheels define base_link."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ from icalib.export.common import (
 from icalib.result import Calibration
 
 KIT = "sensor_kit_base_link"
-# Axes of a camera's body frame (x forward, y left, z up; REP 103) in its optical frame (z forward, x right, y down).
+# R_optical_link: from a camera's link frame (x forward, y left, z up; REP 103) to its optical frame (z forward, x
+# right, y down).
 _OPTICAL_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 def autoware(c: Calibration, frames: Mapping[str, str]) -> Export:
-    """Poses of all sensors but wheels on the sensor kit, whose frame is the body's. frames: sensor -> frame."""
+    """Poses of all sensors except wheels in the frame of the sensor kit, which is the body frame. frames: frame name by
+    sensor, for sensors whose frame has another name."""
     names = [name for name in (c.body, *c.on_body) if name not in c.wheels]
     away = [*own_parameters(c), *imu_intrinsics(c), *time_offsets(c, c.mounted), *c.wheels[1:]]
     sentences = no_place_for("Autoware", [*away, *(f"the lens of {camera}" for camera in c.cameras)])
@@ -43,7 +45,8 @@ def autoware(c: Calibration, frames: Mapping[str, str]) -> Export:
 
 
 def _vehicle(c: Calibration, wheels: str, sentences: tuple[str, ...]) -> str:
-    """The kit on base_link, which lies on the ground below the axle that is not steered."""
+    """Pose of the sensor kit in base_link, which is on the ground below the unsteered axle, one wheel radius down.
+    Without a wheel radius, base_link is at the axle."""
     radius = [g.value.mean() for g in c.groups if g.sensor == wheels and g.name in ("radii", "radius")]
     T = inverse(c.T_body_sensor(wheels))
     T[2, 3] += radius[0] if radius else 0.0
@@ -60,10 +63,12 @@ def _vehicle(c: Calibration, wheels: str, sentences: tuple[str, ...]) -> str:
 
 
 def _frame(c: Calibration, name: str) -> str:
+    """Default frame name of a sensor, by its type."""
     return f"{name}/camera_link" if name in c.cameras else f"{name}_link" if name == c.imu else f"{name}_base_link"
 
 
 def _pose(c: Calibration, name: str) -> np.ndarray:
+    """4x4 T_body_sensor; for a camera the pose of its link frame instead of the optical frame."""
     T = np.array(c.T_body_sensor(name))
     if name in c.cameras:
         T[:3, :3] = T[:3, :3] @ _OPTICAL_BODY

@@ -1,4 +1,4 @@
-"""COLMAP: `cameras.txt`, `rigs.txt` and `rig_config.json`."""
+"""Export to COLMAP: `cameras.txt`, `rigs.txt` and `rig_config.json`."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ from icalib.export.common import (
 )
 from icalib.result import Calibration
 
-# COLMAP's name of a camera model of ours, and how many coefficients it has; those that we do not have are 0.
+# Name in COLMAP of each icalib camera model, and its number of coefficients; those without a counterpart are 0.
 _MODELS = {
     "pinhole-radtan": ("OPENCV", 4),
     "pinhole-radtan5": ("FULL_OPENCV", 8),
     "pinhole-rational": ("FULL_OPENCV", 8),
     "pinhole-equidistant": ("OPENCV_FISHEYE", 4),
 }
-_CORNER = 0.5  # px: COLMAP's (0, 0) is the corner of the top-left pixel, ours its centre
+_CORNER = 0.5  # px: (0, 0) is the corner of the top-left pixel in COLMAP, and its centre in icalib
 
 
 def colmap(c: Calibration) -> Export:
-    """Raises CalibrationError without a camera. Cameras are numbered from 1, in the rig's order."""
+    """COLMAP files of all cameras, numbered from 1 in the order of the rig; the first is the rig frame. Raises
+    CalibrationError without a camera."""
     need(c.cameras, "camera", "COLMAP")
     lenses = [lens_of(c, name, "COLMAP", tuple(_MODELS)) for name in c.cameras]
     imu = [] if c.imu is None else [c.imu]

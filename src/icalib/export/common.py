@@ -1,4 +1,5 @@
-"""What the formats share: how an export is handed over, rotations in other programs' terms, and what cannot be said."""
+"""Shared parts of the export formats: the `Export` record, lens conversion, rotations, and sentences on omitted
+values."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ from icalib.sensors.sensor import MOUNTED_NAMES
 
 @dataclass(frozen=True)
 class Export:
-    """files: name -> text. sentences: what the format cannot hold, and what to know of the values."""
+    """files: text of each file by name. sentences: what the format cannot represent, and caveats on the values."""
 
     files: dict[str, str]
     sentences: tuple[str, ...]
@@ -29,7 +30,8 @@ class Export:
 
 @dataclass(frozen=True)
 class CameraParameters:
-    """A camera's model with fx, fy, cx, cy [px] and distortion; sentence: where they are a fit to another model."""
+    """Lens of a camera in a model that the other program knows: intrinsics fx, fy, cx, cy [px], distortion, and
+    resolution (width, height) [px]. sentence: the error of the conversion if the model was converted, else empty."""
 
     model: str
     intrinsics: list[float]
@@ -39,8 +41,8 @@ class CameraParameters:
 
 
 def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> CameraParameters:
-    """The lens of camera `name` in one of the models that `program` has (`held`): its own, or the last that can follow
-    it, pinhole-radtan for narrow lenses and pinhole-equidistant for wide ones."""
+    """Lens of camera `name` in a model that `program` supports. If its model is not in `held`, it is fitted by
+    pinhole-radtan for pinhole models and by pinhole-equidistant for all others."""
     sensor = c.rig["sensors"][name]
     model, (width, height) = sensor["model"], (int(side) for side in sensor["resolution"])
     params = np.concatenate([c.group(name, "intrinsics").value, c.group(name, "distortion").value])
@@ -57,7 +59,7 @@ def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> Cam
 
 
 def need_imu(c: Calibration, program: str) -> str:
-    """Name of the IMU. Raises CalibrationError where there is none."""
+    """Name of the IMU. Raises CalibrationError without an IMU."""
     if c.imu is None:
         raise CalibrationError(
             f"{program} needs an IMU, and this calibration has none; export to kalibr, camera-info, ros2-static, urdf "
@@ -67,13 +69,13 @@ def need_imu(c: Calibration, program: str) -> str:
 
 
 def need(names: Sequence[str], kind: str, program: str) -> None:
-    """Raises CalibrationError where there is no sensor of the kind that `program` is for."""
+    """Raise CalibrationError if `names`, the sensors of a kind that `program` requires, is empty."""
     if not names:
         raise CalibrationError(f"this calibration has no {kind}, so there is nothing to export to {program}.")
 
 
 def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
-    """A sentence for each of the sensors `names` with parameters that the data did not determine."""
+    """A sentence for each of the sensors `names` that has undetermined parameters."""
     found = []
     for name in names:
         open_ = [
@@ -89,24 +91,25 @@ def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def guessed_poses(c: Calibration) -> tuple[str, ...]:
-    """`guesses` of all sensors, in files whose poses are relative to the body."""
+    """`guesses` of all sensors, for files with poses relative to the body."""
     return guesses(in_body_frame(c), tuple(dict.fromkeys((*c.mounted, *c.on_body))))
 
 
 def others(c: Calibration, *taken: str) -> list[str]:
-    """Names of all mounted sensors but those that a format has taken."""
+    """Names of all mounted sensors except `taken`, those that a format covers."""
     return [name for name in c.mounted if name not in taken]
 
 
 def no_place_for(program: str, things: Sequence[str]) -> tuple[str, ...]:
-    """One sentence for what a format cannot hold; none where there is nothing."""
+    """One sentence that lists `things`, which the format of `program` cannot represent; none if the list is empty."""
     if not things:
         return ()
     return (f"{program} has no place for {', '.join(things)}; see calibration.yaml.",)
 
 
 def time_offset(c: Calibration, name: str) -> float:
-    """Seconds. Raises CalibrationError where the sensor's clock restarts: what it will be next time nobody knows."""
+    """Time offset of sensor `name` [s]. Raises CalibrationError if its clock restarts, because each recording then has
+    a different offset."""
     if restarts(c, name):
         raise CalibrationError(
             f"the clock of {name} restarts, so each recording has its own time offset, but this format needs "
@@ -116,12 +119,12 @@ def time_offset(c: Calibration, name: str) -> float:
 
 
 def restarts(c: Calibration, name: str) -> bool:
-    """Whether the sensor's clock restarts: each recording has a time offset of its own."""
+    """Whether the clock of the sensor restarts, so that each recording has a separate time offset."""
     return len(c.group(name, "time_offset").value) > 1
 
 
 def time_offsets(c: Calibration, names: Sequence[str]) -> list[str]:
-    """Words for the time offsets of sensors that have one other than zero."""
+    """Words for the nonzero time offsets among the sensors `names`."""
     found = {g.sensor: g.value for g in c.groups if g.name == "time_offset" and g.value.any()}
     return [_time_offset_words(name, found[name]) for name in names if name in found]
 
@@ -133,7 +136,8 @@ def _time_offset_words(name: str, value: np.ndarray) -> str:
 
 
 def own_parameters(c: Calibration) -> list[str]:
-    """What mounted sensors other than cameras have beside pose and clock, as "radii and baseline of wheel0"."""
+    """Words for parameters of mounted sensors other than cameras, beyond pose and time offset, such as "radii and
+    baseline of wheel0"."""
     found = []
     for name in others(c, *c.cameras):
         specs = SENSOR_TYPES[c.rig["sensors"][name]["type"]].parameters
@@ -145,19 +149,20 @@ def own_parameters(c: Calibration) -> list[str]:
 
 
 def imu_intrinsics(c: Calibration) -> list[str]:
-    """Words for the IMU's scale and misalignment, where they were estimated or given."""
+    """Words for scale and misalignment of the IMU, if any value is nonzero."""
     found = any((g.sensor, g.name) == (c.imu, "intrinsics") and g.value.any() for g in c.groups)
     return [f"scale and misalignment of {c.imu}"] if found else []
 
 
 def topic(c: Calibration, name: str, default: str) -> str:
-    """The topic of a sensor, as the rig file has it; the default for an IMU on two topics, which others read as one."""
+    """ROS topic of a sensor in the rig file. `default` if there is none, or if an IMU has two topics, which other
+    programs read as one."""
     given = c.rig["sensors"][name].get("topic")
     return given if isinstance(given, str) else default
 
 
 def inverse(T: np.ndarray) -> np.ndarray:
-    """(4, 4) of a rigid transform."""
+    """(4, 4) inverse of a rigid transform."""
     out = np.eye(4)
     out[:3, :3] = T[:3, :3].T
     out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
@@ -165,16 +170,16 @@ def inverse(T: np.ndarray) -> np.ndarray:
 
 
 def rpy(R: np.ndarray) -> tuple[float, float, float]:
-    """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF; good at pitch = 90 deg, too: what yaw
-    leaves over is roll."""
+    """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF. Valid at pitch = +-90 deg, too, because
+    roll is computed from R after the yaw."""
     yaw = atan2(R[1, 0], R[0, 0])
     s, k = sin(yaw), cos(yaw)
     return atan2(s * R[0, 2] - k * R[1, 2], k * R[1, 1] - s * R[0, 1]), atan2(-R[2, 0], hypot(R[0, 0], R[1, 0])), yaw
 
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
-    """x, y, z, w of a rotation, w >= 0: the strongest eigenvector of a symmetric matrix (Bar-Itzhack 2000), which has
-    no special cases."""
+    """Unit quaternion x, y, z, w of a rotation matrix, w >= 0. It is the dominant eigenvector of a symmetric matrix
+    (Bar-Itzhack 2000), which needs no special cases."""
     K = np.zeros((4, 4))
     K[:3, :3] = R + R.T - np.trace(R) * np.eye(3)
     K[3, :3] = K[:3, 3] = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
@@ -185,15 +190,15 @@ def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def opencv_matrix(name: str, T: np.ndarray, kind: str = "d") -> list[str]:
-    """Lines of a 4x4 matrix as OpenCV reads it; kind: d (double) or f (float), as the program expects it."""
+    """Lines of a 4x4 matrix in OpenCV's YAML format. kind: element type, d (double) or f (float)."""
     rows = [", ".join(repr(float(x)) for x in row) for row in T]
     head = [f"{name}: !!opencv-matrix", "   rows: 4", "   cols: 4", f"   dt: {kind}"]
     return [*head, f"   data: [{rows[0]},", *(f"      {row}," for row in rows[1:3]), f"      {rows[3]}]"]
 
 
 def yaml_text(comments: Sequence[str], data: Mapping[str, Any], head: str = "") -> str:
-    """YAML with a comment a line above it; lists of numbers in one line, one line for each row of a matrix, indented as
-    OpenCV's reader wants it."""
+    """`head`, comment lines and YAML of `data`. Lists of numbers take one line, and so does each row of a matrix;
+    sequences are indented, as OpenCV's reader requires."""
     body = yaml.dump(
         dict(data), Dumper=_Indented, sort_keys=False, default_flow_style=None, width=100_000, allow_unicode=True
     )
@@ -201,5 +206,7 @@ def yaml_text(comments: Sequence[str], data: Mapping[str, Any], head: str = "") 
 
 
 class _Indented(yaml.SafeDumper):
+    """YAML dumper that indents sequences in mappings."""
+
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
         super().increase_indent(flow, False)

@@ -1,4 +1,4 @@
-"""Which formats there are, and a calibration in one of them."""
+"""Exports a calibration to a format by its name."""
 
 from __future__ import annotations
 
@@ -30,11 +30,12 @@ def export(
     existing_urdf: Path | None = None,
     joints: Mapping[str, str] | None = None,
 ) -> Export:
-    """`c` in the format `to`, one of FORMATS.
+    """Export `c` to the format `to`, one of FORMATS.
 
-    frames: sensor -> frame or link, where the two differ (one of FRAMED). existing_urdf: the file to be updated,
-    and joints: sensor -> joint of it to be set, by default the one above the sensor's link.
-    Raises CalibrationError where the format needs what is not there, or an option belongs to another format.
+    frames: frame or link name by sensor, for sensors whose frame has another name (formats in FRAMED). existing_urdf:
+    URDF file to update. joints: joint to change in that file by sensor, by default the one directly above the sensor's
+    link. Raises CalibrationError if the calibration lacks what the format requires, or an option belongs to another
+    format.
     """
     frames, joints = frames or {}, joints or {}
     _check(c, to, frames, joints, existing_urdf)
@@ -50,7 +51,7 @@ def export(
 
 
 def kalibr(c: Calibration) -> Export:
-    """Kalibr's camchain, and its imu.yaml where there is an IMU."""
+    """Kalibr's camchain if there are cameras, and imu.yaml if there is an IMU."""
     sentences = no_place_for("Kalibr", others(c, *c.cameras)) + guesses(c, c.cameras)
     said = "".join(f"# {sentence}\n" for sentence in sentences)
     files = {camchain_name(c): said + camchain(c)} if c.cameras else {}
@@ -62,6 +63,7 @@ def kalibr(c: Calibration) -> Export:
 def _check(
     c: Calibration, to: str, frames: Mapping[str, str], joints: Mapping[str, str], existing: Path | None
 ) -> None:
+    """Raise CalibrationError if the format is unknown, an option does not belong to it, or a sensor is unknown."""
     if to not in FORMATS:
         raise CalibrationError(f"there is no format {to}; available are {', '.join(FORMATS)}.")
     if frames and to not in FRAMED:

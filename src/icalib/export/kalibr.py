@@ -1,4 +1,4 @@
-"""Kalibr's files, so that whatever reads Kalibr's results reads ours.
+"""Kalibr's result files, for programs that read these.
 
 Formats: `camchain-imucam.yaml` and `imu.yaml` as kalibr_calibrate_imu_camera writes them (its wiki, "yaml formats").
 """
@@ -17,7 +17,8 @@ from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration, CornerResiduals, image_of
 
-# Our model -> Kalibr's camera and distortion model, and which of our distortion stand before its focal lengths.
+# icalib model -> Kalibr's camera and distortion model, and the number of leading icalib distortion coefficients that
+# Kalibr lists as intrinsics before the focal lengths.
 KALIBR_MODELS = {
     "pinhole-radtan": ("pinhole", "radtan", 0),
     "pinhole-equidistant": ("pinhole", "equidistant", 0),
@@ -25,17 +26,17 @@ KALIBR_MODELS = {
     "double-sphere": ("ds", "none", 2),
     "omni-radtan": ("omni", "radtan", 1),
 }
-SAME_INSTANT_S = 0.025  # images this close see the same scene
+SAME_INSTANT_S = 0.025  # images of two cameras at most this far apart count as simultaneous
 
 
 def camchain_name(calibration: Calibration) -> str:
-    """What Kalibr calls the file of `camchain`."""
+    """Kalibr's name of the file that `camchain` returns."""
     return "camchain.yaml" if calibration.imu is None else "camchain-imucam.yaml"
 
 
 def camchain(calibration: Calibration) -> str:
-    """Text of camchain-imucam.yaml, or of camchain.yaml without an IMU. Cameras are renamed cam0, cam1, ... in the
-    rig's order, as Kalibr wants them."""
+    """Text of camchain-imucam.yaml, or of camchain.yaml without an IMU. Cameras are named cam0, cam1, ... in the order
+    of the rig, as Kalibr requires."""
     c = calibration
     overlaps = cam_overlaps(c)
     data = {f"cam{i}": _camera(c, i, overlaps) for i in range(len(c.cameras))}
@@ -57,7 +58,7 @@ def camchain(calibration: Calibration) -> str:
 
 
 def imu_yaml(calibration: Calibration) -> str:
-    """Text of imu.yaml. Raises CalibrationError where there is no IMU or its rate is unknown."""
+    """Text of imu.yaml. Raises CalibrationError without an IMU, or if its rate is unknown."""
     c = calibration
     if c.imu is None:
         raise CalibrationError("the rig has no IMU, so there is no imu.yaml to write.")
@@ -99,7 +100,8 @@ def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
 
 
 def _lens(c: Calibration, index: int) -> tuple[dict[str, Any], str]:
-    """Kalibr's fields of the lens, and a sentence where they are a fit to a model of ours."""
+    """Kalibr's fields of a lens. The second value is a sentence on the error if Kalibr lacks the model and another was
+    fitted to it, else empty."""
     name = c.cameras[index]
     sensor = c.rig["sensors"][name]
     model = sensor["model"]
@@ -128,9 +130,9 @@ def _lens_fields(model: str, params: np.ndarray) -> dict[str, Any]:
 
 
 def _intrinsics(c: Calibration) -> dict[str, Any]:
-    """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f, where the IMU is not taken for ideal.
+    """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f; empty if the IMU is assumed ideal.
 
-    Our g-sensitivity acts on f in the accelerometer's axes (motion.imu_model), so A = A_ours C_gyro_i^T.
+    icalib's g-sensitivity applies to f in the axes of the accelerometer (motion.imu_model), so A = A_icalib C_gyro_i^T.
     """
     groups = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics")]
     if not groups or (groups[0].mode == "fixed" and not groups[0].value.any()):
@@ -149,14 +151,14 @@ def _intrinsics(c: Calibration) -> dict[str, Any]:
 
 
 def lower(x: np.ndarray) -> np.ndarray:
-    """(3, 3) identity plus a lower triangle given row by row."""
+    """(3, 3) identity plus a lower triangle, whose 6 entries x are given row by row."""
     M = np.eye(3)
     M[np.tril_indices(3)] += x
     return M
 
 
 def cam_overlaps(c: Calibration) -> np.ndarray:
-    """(n, n) bool: two cameras saw the same point of the target at the same instant."""
+    """(n, n) bool: whether two cameras observed the same target point in simultaneous images (`SAME_INSTANT_S`)."""
     seen = {r.sensor: r for r in c.corner_residuals}
     streams = [seen[name] for name in c.cameras]
     n = len(streams)
@@ -168,6 +170,7 @@ def cam_overlaps(c: Calibration) -> np.ndarray:
 
 
 def _overlap(a: CornerResiduals, b: CornerResiduals) -> bool:
+    """Whether one point of the target is in simultaneous images of both cameras."""
     if not len(a.seconds) or not len(b.seconds):
         return False
     after = np.clip(np.searchsorted(b.seconds, a.seconds), 1, max(len(b.seconds) - 1, 1)) % len(b.seconds)
@@ -181,10 +184,10 @@ def _overlap(a: CornerResiduals, b: CornerResiduals) -> bool:
 
 
 def _renamed(kind: str, names: tuple[str, ...]) -> list[str]:
-    """Comments that say which sensor a Kalibr name stands for, where the two differ."""
+    """Comments on which sensor each Kalibr name stands for, if the names differ."""
     return [f"# {kind}{i} is {name}." for i, name in enumerate(names) if name != f"{kind}{i}"]
 
 
 def _text(comments: list[str], data: dict[str, Any]) -> str:
-    """YAML laid out as Kalibr lays it out: keys sorted, a line for each row of a matrix."""
+    """YAML in Kalibr's layout: keys sorted, one line for each row of a matrix."""
     return "\n".join(comments) + "\n" + yaml.safe_dump(data, default_flow_style=None, width=100_000)

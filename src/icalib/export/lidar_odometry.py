@@ -1,4 +1,4 @@
-"""FAST-LIO, FAST-LIVO2 and LIO-SAM: the calibrated fields of their configurations."""
+"""Export to FAST-LIO, FAST-LIVO2 and LIO-SAM: the calibrated fields of their configurations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from icalib.export.common import (
 from icalib.result import Calibration
 
 _MERGE = "For {0}, by icalib: put these fields into its own configuration, which has others besides."
-# FAST-LIVO2's name of a camera model of ours, and of its coefficients.
+# Name in FAST-LIVO2 of each icalib camera model, and of its coefficients.
 _LENSES = {
     "pinhole-radtan": ("Pinhole", ("cam_d0", "cam_d1", "cam_d2", "cam_d3")),
     "pinhole-equidistant": ("EquidistantCamera", ("k1", "k2", "k3", "k4")),
@@ -31,7 +31,7 @@ _LENSES = {
 
 
 def fast_lio(c: Calibration) -> Export:
-    """A file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
+    """FAST-LIO: one file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "FAST-LIO")
     need(c.lidars, "LiDAR", "FAST-LIO")
     away = [*others(c, *c.lidars), *imu_intrinsics(c)]
@@ -52,7 +52,8 @@ def fast_lio(c: Calibration) -> Export:
 
 
 def fast_livo2(c: Calibration) -> Export:
-    """A file for each LiDAR, with the first camera. Raises CalibrationError without an IMU, a LiDAR or a camera."""
+    """FAST-LIVO2: one file for each LiDAR together with the first camera, and one for the lens of that camera. Raises
+    CalibrationError without an IMU, a LiDAR or a camera."""
     imu = need_imu(c, "FAST-LIVO2")
     need(c.lidars, "LiDAR", "FAST-LIVO2")
     need(c.cameras, "camera", "FAST-LIVO2")
@@ -88,7 +89,7 @@ def fast_livo2(c: Calibration) -> Export:
 
 
 def lio_sam(c: Calibration) -> Export:
-    """A file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
+    """LIO-SAM: one file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "LIO-SAM")
     need(c.lidars, "LiDAR", "LIO-SAM")
     away = [*others(c, *c.lidars), *imu_intrinsics(c), *time_offsets(c, c.lidars)]
@@ -120,7 +121,7 @@ def _extrinsics(c: Calibration, name: str) -> dict[str, Any]:
 
 
 def _vikit(lens: CameraParameters) -> dict[str, Any]:
-    """As rpg_vikit's camera loader reads it."""
+    """Fields of a lens as the camera loader of rpg_vikit reads them."""
     model, names = _LENSES[lens.model]
     width, height = lens.resolution
     fields = dict(zip(("cam_fx", "cam_fy", "cam_cx", "cam_cy"), lens.intrinsics, strict=True))

@@ -1,4 +1,4 @@
-"""MINS: the calibrated fields of its configuration."""
+"""Export to MINS: the calibrated fields of its configuration."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ _POSE = "T_imu_{0} takes coordinates in the {1} frame to the imu frame: p_imu = 
 
 
 def mins(c: Calibration) -> Export:
-    """A file for each kind of sensor. Raises CalibrationError without an IMU."""
+    """One file for each kind of sensor in the rig. Of wheels, only the first set with left and right radii is exported.
+    Raises CalibrationError without an IMU."""
     imu = need_imu(c, "MINS")
     lenses = {name: lens_of(c, name, "MINS", tuple(MODELS)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
@@ -54,7 +55,7 @@ def mins(c: Calibration) -> Export:
 
 
 def _imu(c: Calibration, imu: str) -> str:
-    """The file of the IMU: its noise."""
+    """File of the IMU with its noise densities."""
     noise = c.rig["sensors"][imu]["noise"]
     fields = {"accel_noise": "accel", "accel_bias": "accel_walk", "gyro_noise": "gyro", "gyro_bias": "gyro_walk"}
     data = {theirs: float(noise[ours]) for theirs, ours in fields.items()} | {"topic": topic(c, imu, f"/{imu}")}
@@ -62,7 +63,7 @@ def _imu(c: Calibration, imu: str) -> str:
 
 
 def _camera(c: Calibration, name: str, lens: CameraParameters) -> dict[str, Any]:
-    """The entry of a camera."""
+    """Entry of one camera."""
     return _placed(c, name, "cam") | {
         "intrinsics": lens.intrinsics,
         "distortion_coeffs": lens.distortion,
@@ -73,18 +74,23 @@ def _camera(c: Calibration, name: str, lens: CameraParameters) -> dict[str, Any]
 
 
 def _placed(c: Calibration, name: str, kind: str) -> dict[str, Any]:
+    """Time offset [s] and pose T_imu_sensor of one sensor."""
     offset = time_offset(c, name)
     return {"timeoffset": offset, f"T_imu_{kind}": c.T_imu_sensor(name).tolist()}
 
 
 def _antenna(c: Calibration, name: str) -> dict[str, Any]:
-    """MINS compares a fix at `time` with p_IinE + R_EtoI^T pGinI of the IMU at time + timeoffset, on the IMU's clock
-    (mins/src/update/gps/UpdaterGPS.cpp, `UpdaterGPS::update`): the lever arm and time offset of icalib."""
+    """Entry of one GPS antenna: lever arm, time offset and topic.
+
+    MINS compares a fix at `time` with p_IinE + R_EtoI^T pGinI of the IMU at time + timeoffset on the IMU's clock
+    (mins/src/update/gps/UpdaterGPS.cpp, `UpdaterGPS::update`). These are icalib's lever arm and time offset.
+    """
     arm = c.group(name, "translation").value.tolist()
     return {"timeoffset": time_offset(c, name), "pGinI": arm, "topic": topic(c, name, f"/{name}/fix")}
 
 
 def _said(kind: str, word: str, names: tuple[str, ...]) -> list[str]:
+    """Comments on the conventions of pose and time offset, and on which sensor each entry stands for."""
     other = [f"{kind}{i} is {name}." for i, name in enumerate(names) if name != f"{kind}{i}"]
     return [_POSE.format(kind, word), _TIME.format(kind), *other]
 

@@ -1,4 +1,4 @@
-"""Names of the formats, apart from what makes them, so that the command line knows them at once."""
+"""Names of the export formats. They are separate from the exporters, so that the command line imports them quickly."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ FORMATS = (
     "colmap",
     "json",
 )
-FRAMED = ("ros2-static", "urdf", "autoware")  # that name the sensors' frames
-ONE_FILE = ("ros2-static", "urdf", "json")  # where the path is that of a file, not of a folder
+FRAMED = ("ros2-static", "urdf", "autoware")  # formats that contain names of sensor frames
+ONE_FILE = ("ros2-static", "urdf", "json")  # formats whose output path is a file, not a folder

@@ -1,4 +1,4 @@
-"""OpenVINS: `kalibr_imucam_chain.yaml` and `kalibr_imu_chain.yaml`, as its configuration names them."""
+"""Export to OpenVINS: `kalibr_imucam_chain.yaml` and `kalibr_imu_chain.yaml`, the file names in its configuration."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ _OTHER_OFFSET_S = 1e-5
 
 
 def openvins(c: Calibration) -> Export:
-    """Raises CalibrationError without an IMU whose rate is known, or without a camera."""
+    """Files of all cameras and of the IMU. Raises CalibrationError without a camera, or without an IMU whose rate is
+    known."""
     imu = need_imu(c, "OpenVINS")
     need(c.cameras, "camera", "OpenVINS")
     if imu not in c.rates:
@@ -67,7 +68,7 @@ def openvins(c: Calibration) -> Export:
 
 
 def _offsets(c: Calibration) -> tuple[str, ...]:
-    """OpenVINS moves all images by the first camera's offset."""
+    """A sentence if time offsets of cameras differ, as OpenVINS applies that of the first camera to all images."""
     first = time_offset(c, c.cameras[0])
     others = {n: time_offset(c, n) - first for n in c.cameras[1:]}
     off = [f"{n} by {1e3 * d:+.3f} ms" for n, d in others.items() if abs(d) > _OTHER_OFFSET_S]
@@ -77,7 +78,8 @@ def _offsets(c: Calibration) -> tuple[str, ...]:
 
 
 def _imu(c: Calibration, imu: str) -> str:
-    """gyro = Tw R_IMUtoGYRO w + Tg f and accel = Ta R_IMUtoACC f, of rate w and force f in the imu frame."""
+    """File of the IMU. Its model is gyro = Tw R_IMUtoGYRO w + Tg f and accel = Ta R_IMUtoACC f, with rate w and
+    specific force f in the imu frame."""
     noise, x = c.rig["sensors"][imu]["noise"], np.zeros(24)
     found = [g.value for g in c.groups if (g.sensor, g.name) == (imu, "intrinsics") and len(g.value) == 24]
     x = found[0] if found else x

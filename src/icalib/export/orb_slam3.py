@@ -1,4 +1,4 @@
-"""ORB-SLAM3: the calibrated fields of its settings file, in the format of its version 1.0."""
+"""Export to ORB-SLAM3: the calibrated fields of its settings file, in format version 1.0."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from icalib.export.common import (
 from icalib.geometry.cameras import camera_model
 from icalib.result import Calibration
 
-# ORB-SLAM3's name of a camera model of ours; of a rig with two cameras both must have the same.
+# Name in ORB-SLAM3 of each icalib camera model. Both cameras of a stereo rig must have the same type.
 _TYPES = {
     "pinhole-radtan": "PinHole",
     "pinhole-radtan5": "PinHole",
@@ -31,9 +31,9 @@ _MOST = 2
 
 
 def orb_slam3(c: Calibration) -> Export:
-    """One file, for a stereo camera or a single one, with an IMU or without.
+    """The file orb_slam3.yaml for the first one or two cameras, with an IMU or without.
 
-    Raises CalibrationError without a camera, and where the rate of the IMU is not known.
+    Raises CalibrationError without a camera, or if the rate of the IMU is unknown.
     """
     need(c.cameras, "camera", "ORB-SLAM3")
     if c.imu is not None and c.imu not in c.rates:
@@ -58,7 +58,7 @@ def orb_slam3(c: Calibration) -> Export:
 
 
 def _alike(lenses: list[CameraParameters]) -> list[CameraParameters]:
-    """Those that one file can hold: of the first's type, and of its size."""
+    """Lenses that one file can represent: those with the camera type and resolution of the first."""
     first = lenses[0]
     return [x for x in lenses if (_TYPES[x.model], x.resolution) == (_TYPES[first.model], first.resolution)]
 
@@ -83,7 +83,8 @@ def _cameras(c: Calibration, names: tuple[str, ...], lenses: list[CameraParamete
 
 
 def _imu(c: Calibration, imu: str, first: str) -> list[str]:
-    """Extrinsics, and densities in continuous time, as ORB-SLAM3 multiplies them by the root of the rate itself."""
+    """Lines of the extrinsics T_imu_cam and the noise of the IMU. Noise densities are in continuous time, as ORB-SLAM3
+    multiplies them by the square root of the rate."""
     noise = c.rig["sensors"][imu]["noise"]
     fields = {"NoiseGyro": "gyro", "NoiseAcc": "accel", "GyroWalk": "gyro_walk", "AccWalk": "accel_walk"}
     return [

@@ -1,4 +1,4 @@
-"""The folder that a calibration leaves: everything derived from one result, written as one set."""
+"""Output folder of a calibration: all files that derive from one result, written as one set."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from icalib.result import Calibration, calibration_files
 
 
 def write_outputs(calibration: Calibration, folder: str | Path) -> None:
-    """Writes `output_files` into `folder`: all or none.
+    """Write `output_files` into `folder`: all or none.
 
-    Raises CalibrationError where it cannot be written, or has files under their names that icalib did not write.
+    Raises CalibrationError if `folder` cannot be written, or contains files of the same names that icalib did not
+    write.
     """
     refuse_foreign_set(Path(folder))
     write_files(Path(folder), output_files(calibration))
 
 
 def output_files(calibration: Calibration) -> dict[str, bytes]:
-    """The result, Kalibr's two files and the report, by name. Without a camera Kalibr has no camchain."""
+    """Contents of the result files, Kalibr's two files and the report, by name. There is no camchain without a camera,
+    and no imu.yaml without an IMU."""
     texts = {"report.html": report_html(calibration)}
     if calibration.cameras:
         texts[camchain_name(calibration)] = camchain(calibration)
@@ -33,10 +35,10 @@ def output_files(calibration: Calibration) -> dict[str, bytes]:
 
 
 def check_folder(folder: str | Path, inputs: Sequence[Path] = ()) -> None:
-    """Makes `folder` and tries to write in it, before the work starts.
+    """Create `folder` and check that it can be written, before the calibration starts.
 
-    Raises CalibrationError where that fails, and where a file in it that icalib did not write, or one of `inputs`,
-    would be overwritten.
+    Raises CalibrationError if it cannot, or if a file that icalib did not write, or one of `inputs`, would be
+    overwritten.
     """
     check_writable(Path(folder))
     refuse_foreign_set(Path(folder), inputs)

@@ -1,4 +1,4 @@
-"""Plain JSON: poses as matrices and quaternions, with standard deviations and verdicts."""
+"""Export to plain JSON: poses as matrices and quaternions, with standard deviations and verdicts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from icalib.result.summary import body_name, calibration_yaml, pose_key, referen
 
 
 def plain_json(c: Calibration) -> Export:
-    """calibration.json, with everything of calibration.yaml."""
+    """The file calibration.json: the content of calibration.yaml, with a quaternion and a translation for each
+    sensor."""
     body, key = body_name(c), pose_key(c)
     data: dict[str, Any] = {
         "conventions": {

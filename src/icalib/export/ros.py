@@ -1,4 +1,4 @@
-"""ROS 2: a launch file of static transforms, and CameraInfo as camera_info_manager reads it."""
+"""Export to ROS 2: a launch file of static transforms, and CameraInfo files for camera_info_manager."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def generate_launch_description():
 
 
 def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
-    """static_transforms.launch.py. frames: sensor -> frame, where the two differ."""
+    """The file static_transforms.launch.py. frames: frame name by sensor, for sensors whose frame has another name."""
     offsets, lenses = time_offsets(c, c.mounted), [f"the lens of {name}" for name in c.cameras]
     away = [*offsets, *lenses, *own_parameters(c), *imu_intrinsics(c)]
     sentences = no_place_for("tf", away) + guessed_poses(c)
@@ -79,7 +79,7 @@ def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
 
 
 def camera_info(c: Calibration) -> Export:
-    """A file for each camera. Raises CalibrationError without one."""
+    """CameraInfo: one file for each camera. Raises CalibrationError without a camera."""
     need(c.cameras, "camera", "CameraInfo")
     lenses = {name: lens_of(c, name, "CameraInfo", tuple(_DISTORTION)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)

@@ -1,4 +1,4 @@
-"""URDF: a robot of the sensors, or an existing file whose joints' origins are set."""
+"""Export to URDF: a new robot of the sensors, or an existing file in which origins of joints are replaced."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from icalib.export.common import (
 from icalib.export.urdf_tree import Joint, UrdfTree, read_urdf
 from icalib.result import Calibration
 
-_TOO_DEEP = 1e-12
+_TOO_DEEP = 1e-12  # m or rad: smaller values are written as 0
 
 
 def urdf(c: Calibration, frames: Mapping[str, str]) -> Export:
-    """sensors.urdf: the body's frame, and the sensors joined to it. frames: sensor -> link, where the two differ."""
+    """The file sensors.urdf: a link of the body, and one fixed joint to each sensor's link. frames: link name by
+    sensor, for sensors whose link has another name."""
     sentences = _left_out(c)
     body = frames.get(c.body, c.body)
     comments = [
@@ -52,12 +53,15 @@ def urdf(c: Calibration, frames: Mapping[str, str]) -> Export:
 
 
 def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: Mapping[str, str]) -> Export:
-    """The file at `path` with the origins of the joints right above the sensors' links set so that each link has its
-    calibrated pose from the body's. Nothing else changes. frames: sensor -> link, where the two differ; sensors without
-    a link are left out, and said. joints: sensor -> joint to be set instead, further up (an optical frame's camera).
+    """The file `path` with new origins of joints, so that each sensor's link has its calibrated pose in the body's
+    frame.
 
-    Raises CalibrationError where the body's link or a link of `frames` is not there, where a joint on the way moves,
-    and where the file would have to be computed (xacro).
+    The joint directly above each sensor's link is changed, and nothing else. frames: link name by sensor, if they
+    differ. joints: joint to change instead, by sensor, further up the tree (such as the camera joint above an optical
+    frame). Sensors without a link are omitted, and a sentence says so.
+
+    Raises CalibrationError if a link of the body or of `frames` does not exist, if a joint between body and sensor
+    moves, or if the origin is in a xacro macro or is not plain numbers.
     """
     tree = read_urdf(path)
     body = frames.get(c.body, c.body)
@@ -69,7 +73,7 @@ def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: 
     links = {name: frames.get(name, name) for name in sensors if frames.get(name, name) in tree.links}
     if not links:
         tree.check_link(sensors[0] if sensors else "a sensor", sensors[0] if sensors else "it")
-    # From the root downwards: a joint's new origin holds for all that is below.
+    # From the root downwards, because the new origin of a joint moves all links below it.
     for name in sorted(links, key=lambda sensor: len(tree.chain(links[sensor]))):
         tree = _set(tree, body, links[name], joints.get(name), c.T_body_sensor(name))
     absent = tuple(f"{path.name} has no link {n}, so {n} was left out." for n in sensors if n not in links)
@@ -78,7 +82,8 @@ def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: 
 
 
 def _set(tree: UrdfTree, body: str, link: str, named: str | None, T_body_link: np.ndarray) -> UrdfTree:
-    """The tree with the origin of the joint above `link`, or of the one `named` further up, set."""
+    """The tree with a new origin of the joint directly above `link`, or of the joint `named` above it. T_body_link (4,
+    4): the calibrated pose. Raises CalibrationError if that joint cannot be set."""
     chain = tree.chain(link)
     if not chain:
         raise tree.fail(f"{link} is the root, so no joint can be set for it; join it to {body} or below.")
@@ -100,6 +105,8 @@ def _set(tree: UrdfTree, body: str, link: str, named: str | None, T_body_link: n
 
 
 def _with_origin(tree: UrdfTree, joint: Joint, xyz: str, turn: str) -> UrdfTree:
+    """The tree with this origin in `joint`. An origin element is inserted if there is none, and byte offsets of all
+    joints are updated."""
     content = tree.content
     if joint.origin is None:
         begin = end = joint.start_end
@@ -127,7 +134,7 @@ def _with_origin(tree: UrdfTree, joint: Joint, xyz: str, turn: str) -> UrdfTree:
 
 
 def _attribute(tag: bytes, name: str, value: str) -> bytes:
-    """The start tag with the attribute set; all else as it was."""
+    """The start tag with the attribute `name` set to `value`; all other bytes are unchanged."""
     found = re.search(rb"""(?<=\s)%s\s*=\s*("[^"]*"|'[^']*')""" % name.encode(), tag)
     if found is None:
         return re.sub(rb"^<origin", f'<origin {name}="{value}"'.encode(), tag)
@@ -136,6 +143,7 @@ def _attribute(tag: bytes, name: str, value: str) -> bytes:
 
 
 def _left_out(c: Calibration) -> tuple[str, ...]:
+    """Sentences on calibrated values that URDF cannot represent."""
     away = time_offsets(c, c.mounted) + [f"the lens of {name}" for name in c.cameras]
     away += own_parameters(c) + imu_intrinsics(c)
     return no_place_for("URDF", away) + guessed_poses(c)

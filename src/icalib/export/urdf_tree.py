@@ -1,4 +1,4 @@
-"""The joints of a URDF or xacro file: who is whose child, where, and where that is written in the file."""
+"""Reads the joints of a URDF or xacro file: parent, child, origin, and the byte positions of the origin in the file."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ _ATTRIBUTES = ("xyz", "rpy")
 
 @dataclass
 class Joint:
-    """One joint. xyz [m], rpy [rad]: text of its origin, as written; in_macro: inside a xacro macro.
+    """One joint. xyz [m], rpy [rad]: text of the origin's attributes as in the file. in_macro: whether it is in a xacro
+    macro.
 
-    start_end: offset behind the joint's start tag [bytes]; origin: begin and end of its origin's start tag, None where
-    it has no origin.
+    start_end: byte offset just after the joint's start tag. origin: byte offsets of the begin and the end of the
+    origin's start tag, None without an origin.
     """
 
     name: str
@@ -35,7 +36,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class UrdfTree:
-    """What stands in the file `path`; content: its bytes. links: names of all links."""
+    """Links and joints of the URDF file `path`. content: bytes of the file; links: names of all links."""
 
     path: str
     content: bytes
@@ -43,10 +44,11 @@ class UrdfTree:
     joints: tuple[Joint, ...] = field(default=())
 
     def fail(self, sentence: str) -> CalibrationError:
+        """An error to raise, with the file name before `sentence`."""
         return CalibrationError(f"{self.path}: {sentence}")
 
     def above(self, link: str) -> Joint | None:
-        """The joint whose child is `link`; None for a root. Raises CalibrationError where there are several."""
+        """The joint whose child is `link`; None for a root. Raises CalibrationError if there are several."""
         found = [j for j in self.joints if j.child == link]
         if len(found) > 1:
             raise self.fail(
@@ -55,13 +57,13 @@ class UrdfTree:
         return found[0] if found else None
 
     def check_link(self, link: str, sensor: str) -> None:
-        """Raises CalibrationError where there is no such link."""
+        """Raise CalibrationError if there is no such link. sensor: its name, for the message."""
         if link not in self.links:
             named = ", ".join(self.links[:20]) + (", ..." if len(self.links) > 20 else "")
             raise self.fail(f"there is no link {link}; it has {named}; say which is {sensor}: --frame {sensor}=LINK.")
 
     def chain(self, link: str) -> list[Joint]:
-        """Joints from `link` up to its root. Raises CalibrationError where they go in a circle."""
+        """Joints from `link` up to the root. Raises CalibrationError if they form a cycle."""
         joints: list[Joint] = []
         joint = self.above(link)
         while joint is not None:
@@ -72,8 +74,8 @@ class UrdfTree:
         return joints
 
     def T(self, frame: str, link: str) -> np.ndarray:
-        """4x4, `link` seen from the link `frame`: p_frame = T p_link. Raises CalibrationError where they are not in one
-        tree, where a joint between can move, or where its origin is not plain numbers."""
+        """4x4 pose of `link` in the frame of the link `frame`: p_frame = T p_link. Raises CalibrationError if they are
+        in different trees, if a joint between them is not fixed, or if its origin is not plain numbers."""
         one, other = self.chain(frame), self.chain(link)
         roots = {(c[-1].parent if c else name) for c, name in ((one, frame), (other, link))}
         if len(roots) > 1:
@@ -83,12 +85,14 @@ class UrdfTree:
         return np.linalg.inv(up) @ down
 
     def is_fixed(self, frame: str, link: str) -> bool:
-        """Whether the two are in one tree and no joint between them moves."""
+        """Whether both links are in one tree with only fixed joints between them."""
         one, other = self.chain(frame), self.chain(link)
         joined = (one[-1].parent if one else frame) == (other[-1].parent if other else link)
         return joined and all(j.type == "fixed" for j in [*one, *other] if not (j in one and j in other))
 
     def _product(self, upwards: list[Joint]) -> np.ndarray:
+        """4x4 product of the origins of joints that are listed from child to root. Raises CalibrationError if one is
+        not fixed."""
         T = np.eye(4)
         for joint in upwards:
             if joint.type != "fixed":
@@ -97,7 +101,7 @@ class UrdfTree:
         return T
 
     def origin(self, joint: Joint) -> np.ndarray:
-        """4x4 T_parent_child. Raises CalibrationError where it is not plain numbers."""
+        """4x4 T_parent_child of a joint. Raises CalibrationError if the origin is not plain numbers."""
         x, y, z = self._numbers(joint, "xyz")
         roll, pitch, yaw = self._numbers(joint, "rpy")
         cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
@@ -122,7 +126,7 @@ class UrdfTree:
 
 
 def read_urdf(path: Path) -> UrdfTree:
-    """The file at `path`. Raises CalibrationError where it cannot be read, is not XML, or has no robot."""
+    """Parse the file `path`. Raises CalibrationError if it cannot be read, is not XML, or has no robot element."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -138,7 +142,7 @@ def read_urdf(path: Path) -> UrdfTree:
 
 
 class _Reader:
-    """Collects links and joints while expat goes through the bytes."""
+    """Collects links and joints while expat parses the file."""
 
     def __init__(self, content: bytes) -> None:
         self.content, self.root = content, ""
@@ -180,7 +184,7 @@ class _Reader:
 
 
 def tag_end(content: bytes, begin: int) -> int:
-    """Offset behind the start tag that begins at `begin`; > may stand inside quotes."""
+    """Byte offset just after the start tag that begins at `begin`. A `>` inside quotes does not end the tag."""
     found = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""").match(content, begin)
     assert found is not None, "expat has read a tag here"
     return found.end()

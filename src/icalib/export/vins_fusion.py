@@ -1,4 +1,4 @@
-"""VINS-Fusion: `vins.yaml`, and a file for each camera beside it."""
+"""Export to VINS-Fusion: `vins.yaml`, and one file for each camera."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ _MOST = 2
 
 
 def vins_fusion(c: Calibration) -> Export:
-    """Raises CalibrationError without an IMU whose rate is known, or without a camera."""
+    """Files for the IMU and the first one or two cameras. Raises CalibrationError without a camera, or without an IMU
+    whose rate is known."""
     imu = need_imu(c, "VINS-Fusion")
     need(c.cameras, "camera", "VINS-Fusion")
     if imu not in c.rates:
@@ -43,6 +44,7 @@ def vins_fusion(c: Calibration) -> Export:
 
 
 def _offset(c: Calibration, names: tuple[str, ...]) -> tuple[str, ...]:
+    """A sentence if the time offsets of the two cameras differ, as VINS-Fusion has only one."""
     offsets = [time_offset(c, name) for name in names]
     if len(names) < 2 or abs(offsets[1] - offsets[0]) < 1e-5:
         return ()
@@ -55,6 +57,7 @@ def _offset(c: Calibration, names: tuple[str, ...]) -> tuple[str, ...]:
 def _main(
     c: Calibration, imu: str, names: tuple[str, ...], lenses: list[CameraParameters], sentences: tuple[str, ...]
 ) -> str:
+    """Text of vins.yaml."""
     width, height = lenses[0].resolution
     lines = ["%YAML:1.0", "# For VINS-Fusion, by icalib: copy its other settings (feature tracking, solver) in here."]
     lines.append("# body_T_cam takes coordinates in the camera frame to the imu frame: p_imu = body_T_cam p_cam.")
@@ -73,8 +76,8 @@ def _main(
 
 
 def _noise(c: Calibration, imu: str) -> list[str]:
-    """Of one reading: VINS-Fusion integrates a step dt with the covariance (dt acc_n)^2, so acc_n = density sqrt(rate),
-    and likewise the walks."""
+    """Noise of single readings. VINS-Fusion integrates a step dt with the covariance (dt acc_n)^2, so acc_n = density *
+    sqrt(rate); likewise for the random walks."""
     noise, root = c.rig["sensors"][imu]["noise"], sqrt(c.rates[imu])
     names = {"acc_n": "accel", "gyr_n": "gyro", "acc_w": "accel_walk", "gyr_w": "gyro_walk"}
     head = f"# Of single readings: densities times the root of the rate, {c.rates[imu]:.6g} Hz; larger ones are usual."
@@ -82,7 +85,7 @@ def _noise(c: Calibration, imu: str) -> list[str]:
 
 
 def _camera(name: str, lens: CameraParameters) -> str:
-    """As camodocal's models write themselves."""
+    """File of one camera in the format of camodocal's camera models."""
     fx, fy, cx, cy = lens.intrinsics
     d = lens.distortion
     match lens.model:
