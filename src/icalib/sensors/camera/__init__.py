@@ -1,1 +1,1 @@
-"""Factors of cameras: corners of targets."""
+"""Cameras: reading, initial guess, factors and report of target corners and feature tracks."""

@@ -23,21 +23,23 @@ from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.sensors.camera.model import CameraNoise
 
-MAX_NAMED_IMAGES = 10  # in a sentence
-N_LATER_VIEWS = 10  # after which the noise of tracks is told once more
-POOR_CORNER_RMS_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images by half
-MANY_REJECTED_SHARE = 0.05  # of the corners or tracks of a camera
-FEW_ON_PLANES_SHARE = 0.1  # of the tracks: rough walls have as many where they should have two thirds
+MAX_NAMED_IMAGES = 10  # images that one sentence lists
+N_LATER_VIEWS = 10  # later views of a feature, for which a note states the track noise as well
+# RMS above which a warning is given: ten times the error of a detector, twice that of corners in blurred images.
+POOR_CORNER_RMS_PX = 1.0
+MANY_REJECTED_SHARE = 0.05  # of the corners or tracks of a camera, above which a warning is given
+# Share of tracks on planes below which a warning is given. Rough walls leave a tenth where two thirds are expected.
+FEW_ON_PLANES_SHARE = 0.1
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[CornerResiduals | TrackResiduals]:
-    """Residuals of the corners of each camera; then of the tracks of each, if there are any."""
+    """Yields the corner residuals of each camera, then the track residuals of each camera if there are tracks."""
     yield from _corner_residuals(found, timeline)
     yield from _track_residuals(found, timeline)
 
 
 def _corner_residuals(found: Estimate, timeline: Timeline) -> Iterator[CornerResiduals]:
-    """By camera; one that saw no target has images without corners."""
+    """Yields the corner residuals of each camera. A camera that saw no target has images without corners."""
     for i, (camera, corners) in enumerate(pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)):
         stream = camera.stream
         yield CornerResiduals(
@@ -53,7 +55,7 @@ def _corner_residuals(found: Estimate, timeline: Timeline) -> Iterator[CornerRes
 
 
 def _track_residuals(found: Estimate, timeline: Timeline) -> Iterator[TrackResiduals]:
-    """By camera, if there are tracks."""
+    """Yields the track residuals of each camera; nothing if there are no tracks."""
     pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
     if not pairs:
         return
@@ -76,7 +78,7 @@ def _track_residuals(found: Estimate, timeline: Timeline) -> Iterator[TrackResid
 
 
 def _seconds(found: Estimate, timeline: Timeline, index: int) -> np.ndarray:
-    """(M,) s: instants of the images of camera number `index`, as the result shows them."""
+    """(M,) instants [s] of the images of camera `index`, on the time axis of the result."""
     stream = of_type(found.problem.factors, CornerFactor)[index].stream
     return timeline.shown(instants(stream, found.outcome.state.values), timeline.recordings_of(stream.key))
 
@@ -109,7 +111,7 @@ def _outside_imu_notes(inputs: Inputs, found: Estimate, factors: Sequence[Corner
 def _corner_notes(
     camera: Camera, factor: CornerFactor, model: NoiseModel, late: np.ndarray, found: Estimate
 ) -> Iterator[str]:
-    """late (M,) bool: images that are rejected as a whole."""
+    """Sentences on noise, outliers and circle centres of one camera. late (M,) bool: images rejected as a whole."""
     if not len(factor.stream.uv):
         return
     yield f"{camera.name}: {_noise_words(model)}."
@@ -126,7 +128,8 @@ def _corner_notes(
 def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> str:
     """A sentence on the images that were rejected because they are not simultaneous; "" if there are none.
 
-    apart: by camera (M,) bool. The images at one keyframe are a set, which is named by its first image.
+    apart: for each camera (M,) bool, its rejected images. All images at one keyframe are a set; its first image names
+    the set.
     """
     first_of, names = {}, []
     for camera, late in zip(cameras, apart, strict=True):
@@ -145,7 +148,9 @@ def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> 
 
 
 def _rejected_words(keep: np.ndarray) -> str:
-    """`keep` (N,) bool: corners in use, of images that are not rejected as a whole."""
+    """A sentence on the number of outliers; "" if there are none.
+
+    keep (N,) bool: corners in use, without those of images that are rejected as a whole."""
     count = int((~keep).sum())
     if not count:
         return ""
@@ -157,6 +162,7 @@ def _rejected_words(keep: np.ndarray) -> str:
 
 
 def _noise_words(model: NoiseModel) -> str:
+    """Text that lists the terms of the corner noise."""
     words = f"corner noise {model.base:.3f} px"
     if model.misfit > 0.0:
         words += f", {model.misfit:.2g} px that the lens model does not follow"
@@ -168,6 +174,7 @@ def _noise_words(model: NoiseModel) -> str:
 
 
 def _feature_notes(found: Estimate) -> Iterator[str]:
+    """Sentences on the number of feature tracks, their planes and their noise; none without tracks."""
     pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
     if not pairs:
         return
@@ -193,12 +200,12 @@ def _feature_notes(found: Estimate) -> Iterator[str]:
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Sentences on tracked points that should lie on planes of LiDARs, and do not."""
+    """A sentence if `points_on_planes_m` is set, but no or few tracked points lie on planes of LiDARs."""
     yield from plane_warnings(inputs.rig, found.problem.factors)
 
 
 def plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[str]:
-    """A sentence if points should lie on planes, and none do, or so few that it may be chance."""
+    """A sentence if `points_on_planes_m` is set, but no tracked points lie on planes, or too few to exclude chance."""
     if rig.settings.points_on_planes_m == 0.0:
         return
     features = of_type(factors, FeatureFactor)
@@ -216,7 +223,7 @@ def plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[st
 
 
 def rejected_words(f: SensorFit) -> str | None:
-    """A sentence if many corners or tracks of a camera are rejected."""
+    """A sentence if many corners or tracks of a camera are rejected; else None. f: its fit of one kind of residual."""
     if f.kind not in ("corners", "features") or f.rejected <= MANY_REJECTED_SHARE * 0.5 * f.count:
         return None
     share = f.rejected / (f.rejected + 0.5 * f.count)
@@ -224,7 +231,8 @@ def rejected_words(f: SensorFit) -> str | None:
 
 
 def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> str | None:
-    """A sentence if residuals of corners or of points on planes exceed the stated noise, or any detector's."""
+    """A sentence if residuals are larger than the stated noise predicts, or corners fit worse than
+    `POOR_CORNER_RMS_PX`; else None. f: fit of corners or of points on planes."""
     if f.kind == ON_PLANES and excess(f) > 1.0:
         return (
             f"tracked points of {f.sensor} lie {times(f)} farther from planes of the LiDARs than points_on_planes_m "
@@ -248,7 +256,9 @@ def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def length(camera: Camera, rig: Rig) -> str | None:
-    """The source of the scale: a translation that the rig file states; None without one."""
+    """Text that names the camera's translation as the source of scale, if it is fixed or has a prior, and is not zero.
+
+    Else None, as for the reference camera."""
     p = camera.translation
     stated = camera.name != rig.reference and p.mode != "free" and p.value is not None and bool(np.any(p.value))
     return f"the stated translation of {camera.name}" if stated else None

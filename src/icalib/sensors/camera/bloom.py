@@ -1,4 +1,4 @@
-"""Bloom: where dark edges seem to move in the image, by the blur of the lens and the response of the camera."""
+"""Edge bloom: the apparent shift of dark edges in the image, caused by blur and by the response of the camera."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from icalib.sensors.camera.corner_factor import CornerFactor
 
 
 def with_bloom(factor: CornerFactor, state: State) -> CornerFactor:
-    """The factor with the image directions in which its corners bloom: towards the centres of their tags, by lens and
-    poses of `state`."""
+    """The factor with the image direction in which bloom shifts each corner: towards the centre of its tag, projected
+    with the lens and poses of `state`."""
     target = factor.bodies.target
     inwards = target.tag_centers - target.points
     params = factor.lens(state)
@@ -24,8 +24,9 @@ def with_bloom(factor: CornerFactor, state: State) -> CornerFactor:
 
 
 def bloom_direction(model: CameraModel, params: np.ndarray, X: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """(N, 2) unit image directions of vectors `towards` (N, 3) at points X (N, 3) m, both in the camera frame; zero
-    outside the range of the lens model. params (P,): of the model."""
+    """(N, 2) unit image directions of the vectors `towards` (N, 3) at points X (N, 3) m, both in the camera frame.
+
+    Zero for points outside the range of the lens model. params (P,): parameters of `model`."""
     _, valid, J, _ = model.project_with_jacobians(params, X)
     d = np.einsum("nij,nj->ni", J, towards)
     norm = np.linalg.norm(d, axis=1)

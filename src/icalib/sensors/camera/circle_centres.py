@@ -18,7 +18,8 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.optim.state import State
 from icalib.sensors.camera.corner_factor import CornerFactor
 
-N_CONTOUR_POINTS = 32  # of a circle; sums over a smooth contour converge faster than any power of their number
+# Sampled points of a circle. Sums over a smooth closed contour converge faster than any power of this number.
+N_CONTOUR_POINTS = 32
 ELLIPSE_ITERATIONS = 3  # Gauss-Newton steps from the affine image of the circle; convergence is quadratic
 CONTOUR_ANGLES = 2.0 * np.pi * np.arange(N_CONTOUR_POINTS) / N_CONTOUR_POINTS
 UNIT_CIRCLE = np.stack([np.cos(CONTOUR_ANGLES), np.sin(CONTOUR_ANGLES)], axis=1)
@@ -48,11 +49,11 @@ def centre_shifts(factor: CornerFactor, state: State) -> np.ndarray:
 def ellipse_shift(
     model: CameraModel, params: np.ndarray, X: np.ndarray, plane: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
-    """(n, 2) px, as `centre_shifts`.
+    """(n, 2) px: shift of the ellipse's centre from the projected centre of the circle; zero as in `centre_shifts`.
 
     X (n, 3) m: the centres in the camera frame; plane (n, 3, 2): two perpendicular unit vectors of the circle's plane
     in the camera frame; radius (n,) m, 0 for points that are no circles. The ellipse minimises the squared distance
-    from the projected circle, integrated over its arc length: the detector's pixels lie evenly along the edge, too.
+    from the projected circle, integrated over its arc length, because edge pixels are spread evenly along the edge.
     """
     uv, valid, J_point, _ = model.project_with_jacobians(params, X)
     rim = X[:, None] + radius[:, None, None] * np.einsum("nij,kj->nki", plane, UNIT_CIRCLE)

@@ -1,4 +1,4 @@
-"""Which bodies of the target are estimated: those that images connect."""
+"""Selects the bodies of a target whose poses are estimated: those that shared images connect."""
 
 from __future__ import annotations
 
@@ -20,10 +20,12 @@ MAX_NAMED_BODIES = 8  # in a sentence
 
 
 def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool, rig: Rig | None = None) -> Bodies:
-    """The bodies that images connect, directly or through others, in any recording; the one with most corners is the
-    reference. In a `rig` of cameras alone, simultaneous images of different cameras connect bodies, too.
+    """The bodies in use: the one with most corners, which is the reference, and all that images connect to it.
 
-    Raises EstimationError if no corner was seen, or if a camera saw only bodies that nothing connects to the others.
+    An image connects all bodies that it shows; connections through other bodies count. In a `rig` of cameras alone,
+    simultaneous images of different cameras connect bodies, too. bent: whether shapes of bodies are estimated.
+
+    Raises EstimationError if no corner was seen, or if a camera saw only bodies without connection to the reference.
     """
     streams = [c for m in recordings for c in m.cameras]
     n = len(target.bodies)
@@ -42,7 +44,7 @@ def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool
 
 
 def tied_by_images(bodies: Bodies, recordings: Sequence[Measurements]) -> list[tuple[int, ...]]:
-    """The bodies in use, in groups that images connect, directly or through others; the reference is in the first."""
+    """The bodies in use, grouped by connection through images. The first group has the reference."""
     together = _in_images(bodies.target.body, recordings, len(bodies.target.bodies))
     left, groups = list(bodies.used), []
     while left:
@@ -52,7 +54,9 @@ def tied_by_images(bodies: Bodies, recordings: Sequence[Measurements]) -> list[t
 
 
 def _tied_to(first: int, together: np.ndarray) -> tuple[int, ...]:
-    """`first`, and then in order all bodies connected to it; together (n, n): number of images that show two bodies."""
+    """Indices of the body `first`, then in increasing order of all bodies connected to it.
+
+    together (n, n): number of images that show both bodies of a pair."""
     reached = [first]
     for k in reached:
         reached += [int(j) for j in np.flatnonzero(together[k] >= MIN_SHARED_IMAGES) if j not in reached]
@@ -60,12 +64,16 @@ def _tied_to(first: int, together: np.ndarray) -> tuple[int, ...]:
 
 
 def _in_images(body: np.ndarray, recordings: Sequence[Measurements], n: int) -> np.ndarray:
-    """(n, n) number of images that show two bodies."""
+    """(n, n) number of images, of all recordings and cameras, that show both bodies of a pair.
+
+    body (n_points,): index of the body of each point."""
     return sum((_together(body, c, n) for m in recordings for c in m.cameras), np.zeros((n, n), dtype=np.int64))
 
 
 def _check_cameras(target: Target, streams: Sequence[CornerStream], used: Sequence[int], imu: bool) -> None:
-    """Raises EstimationError naming a camera that saw none of the bodies in use. imu: whether the rig has an IMU."""
+    """Raises EstimationError naming a camera that saw bodies, but none of those in use.
+
+    used: indices of these; imu: whether the rig has an IMU."""
     for name in dict.fromkeys(s.name for s in streams):
         seen = np.unique(np.concatenate([target.body[s.point] for s in streams if s.name == name]))
         if len(seen) and not np.isin(seen, used).any():
@@ -82,7 +90,7 @@ def _check_cameras(target: Target, streams: Sequence[CornerStream], used: Sequen
 
 
 def _together(body: np.ndarray, stream: CornerStream, n: int) -> np.ndarray:
-    """(n, n) number of images that show two bodies."""
+    """(n, n) number of images of `stream` that show both bodies of a pair."""
     pairs = np.unique(stream.image * n + body[stream.point])
     image, which = np.divmod(pairs, n)
     seen = np.zeros((len(stream.stamps_ns), n), dtype=np.float32)
@@ -91,7 +99,7 @@ def _together(body: np.ndarray, stream: CornerStream, n: int) -> np.ndarray:
 
 
 def _at_once(body: np.ndarray, rig: Rig, recording: Measurements, n: int) -> np.ndarray:
-    """(n, n) number of instants at which one camera sees one body, and another camera another body."""
+    """(n, n) number of instants at which one camera sees body i while another camera sees body j."""
     found, seen = np.zeros((n, n), dtype=np.int64), []
     for stream in recording.cameras:
         rows = np.zeros((len(stream.stamps_ns), n), dtype=np.int64)
@@ -105,7 +113,7 @@ def _at_once(body: np.ndarray, rig: Rig, recording: Measurements, n: int) -> np.
 
 
 def camera_times(rig: Rig, recording: Measurements, origin_ns: int) -> list[np.ndarray]:
-    """By camera (M,) s since `origin_ns`: instants of the images, by stated time offsets, or zero ones."""
+    """For each camera (M,) instants of its images [s since `origin_ns`], by the time offset of the rig file or zero."""
     given = [c.time_offset.value for c in rig.cameras]
     offsets_ns = [0 if v is None else round(float(v[0]) * 1e9) for v in given]
     pairs = zip(recording.cameras, offsets_ns, strict=True)
@@ -113,7 +121,7 @@ def camera_times(rig: Rig, recording: Measurements, origin_ns: int) -> list[np.n
 
 
 def taken_at_once(ta: np.ndarray, tb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the images at ta (n,) and tb (m,) s that two cameras took at the same instant."""
+    """Indices i and j (k,) of images at ta (n,) and tb (m,) s that are at most `MERGED_WITHIN_S` apart."""
     j = np.clip(np.searchsorted(tb, ta - MERGED_WITHIN_S), 0, len(tb) - 1)
     i = np.flatnonzero(np.abs(tb[j] - ta) <= MERGED_WITHIN_S)
     return i, j[i]
@@ -135,6 +143,7 @@ def without_bodies(target: Target, names: Sequence[str], recording: Measurements
 
 
 def _restricted(bodies: Bodies, stream: CornerStream) -> CornerStream:
+    """The corners of bodies in use, sorted by body in each image. Images without such corners are left out."""
     body = bodies.target.body[stream.point]
     order = np.lexsort((body, stream.image))
     order = order[np.isin(body[order], bodies.used)]

@@ -1,14 +1,14 @@
-"""Corners of a known target in the images of one camera (paper (20)-(22)).
+"""Corners of a known target in the images of one camera ("Corners" in docs/estimator.md).
 
     residual = K(X) + bloom * direction - uv
     X = R_cam_world (R_world_scene (R_scene_body P + p_scene_body) - p_world_cam)
 
-P is the target's point, displaced by the shape of its body. A view is one body in one image: all its corners share one
-pose. Their small Gram matrix, over the pose and the parameters of camera and body, is summed first; the Jacobians of
-the pose are applied once a view.
+K is the camera model, and P a point of the target, displaced by the shape of its body. A view is one body in one image,
+so that all its corners share one camera pose. The Gram matrix of a view, over this pose and the parameters of camera
+and body, is summed first. The Jacobians of the pose by the state are then applied once per view.
 
-The error that all corners of a view share is a sum of functions of the corner with coefficients ~ N(0, tau^2). It is
-marginalised view by view.
+Corners of a view may share an error: a sum of functions of the image position with coefficients ~ N(0, tau^2). These
+coefficients are marginalised view by view.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ from icalib.sensors.camera.corner_kernels import (
 from icalib.sensors.camera.corner_statistics import CORNERS, corner_squares, dof_used_by_corners, image_rows, rms_px
 from icalib.sensors.camera.corner_views import Views
 
-IMAGES_PER_BLOCK = 256  # for statistics: bounds the memory
-VIEWS_PER_BLOCK = 1024  # for poses and their Jacobians: bounds the memory
-VIEWS_PER_CHUNK = 64  # for projections: their arrays stay in the cache of the processor
+IMAGES_PER_BLOCK = 256  # images whose statistics are computed at once; bounds the memory
+VIEWS_PER_BLOCK = 1024  # views whose poses and Jacobians are computed at once; bounds the memory
+VIEWS_PER_CHUNK = 64  # views that are projected at once; their arrays fit into the processor's cache
 
 
 @dataclass(frozen=True)
 class CornerNoise:
-    """Noise of corners.
+    """Noise of the N corners of one camera.
 
-    sigma (N,) px per axis; tau (m,) px, standard deviations of the error that a view shares, along the functions
-    `field` (N, m) of the corner; loss: the robust loss, which bends at `loss_scale` sigma."""
+    sigma (N,) px per axis. tau (m,) px: standard deviations of the coefficients of the error that all corners of a view
+    share; field (N, m): its functions at each corner. loss: robust loss, with the threshold `loss_scale` in sigma."""
 
     sigma: np.ndarray
     tau: np.ndarray
@@ -71,8 +71,9 @@ class CornerNoise:
 class CornerOutput:
     """Residuals of N corners in V views.
 
-    residual (N, 2) px, predicted - measured, and root (N,) 1/px, square root of the robust weight over sigma, 0 if not
-    in use: in single precision, to save memory. shared (V, 2, m) px: coefficients of the common error."""
+    residual (N, 2) px: predicted - measured, without the common error. root (N,) 1/px: square root of the robust
+    weight, over sigma; 0 if not in use. Both are in single precision, to save memory. shared (V, 2, m) px:
+    coefficients of each view's common error, which adds to the prediction."""
 
     residual: np.ndarray
     root: np.ndarray
@@ -80,7 +81,7 @@ class CornerOutput:
 
     @classmethod
     def empty(cls, n: int, n_views: int, m: int, dtype: type = np.float32) -> CornerOutput:
-        """For n corners in `n_views` views with m coefficients of a common error."""
+        """Arrays for n corners in `n_views` views, with m coefficients of the common error per axis."""
         return cls(memory.mmap_zeros((n, 2), dtype), memory.mmap_zeros((n,), dtype), np.zeros((n_views, 2, m)))
 
 
@@ -88,9 +89,11 @@ class CornerOutput:
 class CornerFactor(FactorDefaults):
     """All corners of one camera, in M images.
 
-    times (M,) s: instants of the images without the time offset; keyframe (M,), increasing: index of the keyframe whose
-    pose each image depends on; keep (N,) bool: corners in use; direction (N, 2): unit image direction of the bloom,
-    (0, 2) without it; seams: first images of further recordings, each of which has a scene pose of its own."""
+    imu: readings between keyframes, None if all images are at keyframes; gravity [m/s^2]; scheme: interpolation of
+    poses between keyframes. times (M,) s: stamps on the camera's clock since its first stamp, without time offset.
+    keyframe (M,), increasing: index of the keyframe from which the pose of each image follows. keep (N,) bool: corners
+    in use. direction (N, 2): unit image direction of the bloom, (0, 2) without bloom. seams: first image of each
+    recording but the first; every recording has its own attitude of the scene."""
 
     stream: CornerStream
     model: CameraModel
@@ -117,7 +120,7 @@ class CornerFactor(FactorDefaults):
 
     @property
     def sees_target(self) -> bool:
-        """See `TargetFactor`."""
+        """Whether the camera has any corner of the target, see `TargetFactor`."""
         return len(self.stream.uv) > 0
 
     def with_target_size(self, size: float) -> CornerFactor:
@@ -129,7 +132,7 @@ class CornerFactor(FactorDefaults):
         return Views.of(self.stream, self.bodies.target.body)
 
     def parts(self, v0: int, v1: int) -> Iterator[tuple[int, int, int]]:
-        """Ranges of the views v0..v1 of one recording each, and the index of the recording."""
+        """Splits the range of views v0..v1 at recordings: first view, end and index of the recording of each part."""
         seams = np.searchsorted(self.views.image, (0, *self.seams, len(self.keyframe)))
         for k, (first, end) in enumerate(pairwise(seams)):
             a, b = max(v0, int(first)), min(v1, int(end))
@@ -137,7 +140,7 @@ class CornerFactor(FactorDefaults):
                 yield a, b, k
 
     def world_points(self, state: State, recording: int) -> np.ndarray:
-        """(n_points, 3) m: the target's points, shapes and size included, in the world of a recording."""
+        """(n_points, 3) m: points of the target, with shapes and size, in the world frame of one recording."""
         return self.bodies.points(state.values) @ _scene(state, recording).T
 
     @cached_property
@@ -145,15 +148,15 @@ class CornerFactor(FactorDefaults):
         return Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
 
     def imu_poses(self, state: State, i0: int, i1: int) -> Poses:
-        """Poses of the IMU at the instants of images i0..i1."""
+        """IMU poses in the world, with Jacobians, at the instants of images i0..i1."""
         return self.kinematics.imu_poses(self.times[i0:i1], self.keyframe[i0:i1], state)
 
     def poses(self, state: State, i0: int = 0, i1: int | None = None) -> SensorPose:
-        """Poses of the camera at the instants of images i0..i1."""
+        """Camera poses in the world, with Jacobians, at the instants of images i0..i1."""
         return SensorPose.at(self.kinematics, self.times[i0:i1], self.keyframe[i0:i1], state)
 
     def blocks(self) -> Iterator[tuple[int, int]]:
-        """Ranges of views v0..v1 of whole images, `IMAGES_PER_BLOCK` at a time."""
+        """Ranges of views v0..v1 that cover all images, in blocks of `IMAGES_PER_BLOCK` whole images."""
         image, n = self.views.image, len(self.keyframe)
         for first in range(0, n, IMAGES_PER_BLOCK):
             v0, v1 = np.searchsorted(image, [first, min(first + IMAGES_PER_BLOCK, n)])
@@ -161,11 +164,11 @@ class CornerFactor(FactorDefaults):
                 yield int(v0), int(v1)
 
     def corners_of(self, v0: int, v1: int) -> slice:
-        """The corners of views v0..v1."""
+        """The rows of the stream that are corners of views v0..v1."""
         return slice(int(self.views.start[v0]), int(self.views.start[v1]))
 
     def points_in_camera(self, state: State, v0: int, v1: int) -> tuple[np.ndarray, np.ndarray]:
-        """X (n, 3) m: point of each corner of views v0..v1 in the camera frame, and R_cam_body (v1 - v0, 3, 3)."""
+        """X (n, 3) m: points of the corners of views v0..v1 in the camera frame; R_cam_body (v1 - v0, 3, 3) by view."""
         image, body, start = self.views.image[v0:v1], self.views.body[v0:v1], self.views.start[v0 : v1 + 1]
         i0 = int(image[0])
         camera, R_sb = self.poses(state, i0, int(image[-1]) + 1), self.bodies.poses(state.values)[0]
@@ -179,32 +182,32 @@ class CornerFactor(FactorDefaults):
         return X, R_cb
 
     def in_camera(self, state: State) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """For each block: the slice of its corners, their points X (n, 3) m in the camera, and R_cam_body (n, 3, 3)."""
+        """For each block: slice of its corners, points X (n, 3) m in the camera frame, and R_cam_body (n, 3, 3)."""
         for v0, v1 in self.blocks():
             X, R_cam_body = self.points_in_camera(state, v0, v1)
             yield self.corners_of(v0, v1), X, R_cam_body[self.views.of_corners(v0, v1) - v0]
 
     def instants(self, state: State) -> np.ndarray:
-        """(M,) of the images, s on the body's clock since its first stamp."""
+        """(M,) instants of the images, s on the body's clock since its first stamp."""
         return self.times + offset_at(state, self.name, self.keyframe)
 
     def lens(self, state: State) -> np.ndarray:
-        """(P,) parameters of the camera model."""
+        """(P,) parameters of the camera model: intrinsics, then distortion."""
         return np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
 
     def residual(self, state: State, v0: int, v1: int) -> np.ndarray:
-        """(n, 2) px, predicted - measured, of the corners of views v0..v1."""
+        """(n, 2) px: predicted - measured for the corners of views v0..v1, without the common error."""
         own, (X, _) = self.corners_of(v0, v1), self.points_in_camera(state, v0, v1)
         params = self.lens(state)
         uv = self.model.project(params, X)[0] - self.stream.uv[own]
         return uv + state.values[self.name, "bloom"] * self.direction[own] if len(self.direction) else uv
 
     def output(self, dtype: type = np.float32) -> CornerOutput:
-        """Empty arrays for `accumulate` to fill. Its sums do not depend on `dtype`."""
+        """Arrays that `accumulate` fills, residuals and weights in `dtype`. Its sums do not depend on `dtype`."""
         return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau), dtype)
 
     def errors(self, out: CornerOutput) -> np.ndarray:
-        """(N, 2) px: the residuals with the common errors of their views, which `out.residual` lacks."""
+        """(N, 2) px: predicted - measured, with the common error of each view in the prediction."""
         error = np.empty((len(out.root), 2), np.float32)
         for v0, v1 in self.blocks():
             own = self.corners_of(v0, v1)
@@ -213,24 +216,26 @@ class CornerFactor(FactorDefaults):
         return error
 
     def chi2(self, out: CornerOutput) -> float:
-        """chi^2 of the corners with weight. Others may project anywhere: those of images without a pose to 1e20 px."""
+        """chi^2 of the corners with positive weight.
+
+        Others are excluded first: corners of images without a pose may project to 1e20 px."""
         used = out.root > 0.0
         return float(((self.errors(out)[used] * out.root[used, None]) ** 2).sum(dtype=np.float64))
 
     def discarded_output(self) -> None:
-        """None: arrays for all corners would be large beside those of a piece."""
+        """None, so that `accumulate` allocates arrays for each block only: arrays for all corners would be large."""
 
     def squares(self, out: CornerOutput) -> dict[FitKey, Squares]:
-        """See `Factor`: of the corners, and of each size of the error that an image shares."""
+        """See `Factor`: number and chi^2 of the corners, and of the coefficients of each common error."""
         return corner_squares(self, out) if len(self.stream.uv) else {}
 
     def sizes(self, out: CornerOutput) -> dict[FitKey, RawSize]:
-        """See `Factor`; common errors have the RMS of the corners."""
+        """See `Factor`: RMS of the corners, which is reported for common errors, too."""
         size = RawSize(rms_px(out.residual, out.root), "px", int((out.root == 0.0).sum()))
         return dict.fromkeys(self.squares(out), size)
 
     def rows(self, out: CornerOutput, state: State) -> list[ResidualRows]:
-        """See `Factor`: of the corners."""
+        """See `Factor`: the residuals of the corners, if there are any."""
         seconds = self.instants(state)[self.stream.image]
         rows = image_rows(self.name, CORNERS, seconds, out.residual, self.noise.sigma, out.root)
         return [rows] if len(seconds) else []
@@ -240,11 +245,13 @@ class CornerFactor(FactorDefaults):
         return dof_used_by_corners(self, out, along)
 
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
-        """The same factor with bloom along `direction` (N, 2)."""
+        """The same factor with the bloom directions `direction` (N, 2), unit vectors in the image."""
         return replace(self, direction=direction)
 
     def _columns(self, recording: int, body: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Calibration columns (n, c + d) of views of `body` (n,), see `ViewPoses`; indices of free lens parameters."""
+        """Calibration columns (n, c + d) of views of the bodies `body` (n,), as in `ViewPoses`.
+
+        Also returns the indices of the free lens parameters."""
         pose, shape = (columns[body] for columns in self.bodies.columns(self.layout))
         tilt = self.layout.columns(in_recording(BOARD, recording), "tilt")
         chained = np.concatenate([self.kinematics.columns(recording), tilt])
@@ -258,7 +265,7 @@ class CornerFactor(FactorDefaults):
     def accumulate(
         self, state: State, piece: Piece, out: CornerOutput | None, sums: bool = True, curved: bool = False
     ) -> float:
-        """See `Factor`: of the images whose keyframe is in `piece`. Residuals are not kept if `out` is None."""
+        """See `Factor`: adds the images whose keyframe is in `piece`. Residuals are not kept if `out` is None."""
         into, total = piece.sums(sums), 0.0
         for v0, v1, recording in self._blocks_of(piece):
             images, noise, direct, motion = self._arguments(state, v0, v1, recording, curved)
@@ -275,8 +282,9 @@ class CornerFactor(FactorDefaults):
     def accumulate_clusters(
         self, state: State, piece: Piece, at: CornerOutput, cluster: np.ndarray, n_clusters: int, column: int
     ) -> None:
-        """Adds the gradient of each cluster of corners to columns `column` and on of `piece`, with the weights of `at`.
-        cluster (N,): index of each corner's, below n_clusters."""
+        """Adds the gradient of each cluster of corners to the columns from `column` on of `piece`.
+
+        at: residuals and weights to use. cluster (N,): index of each corner's cluster, from 0 to n_clusters - 1."""
         into = piece.sums(True)
         for v0, v1, recording in self._blocks_of(piece):
             images, noise, direct, motion = self._arguments(state, v0, v1, recording, False)
@@ -289,7 +297,7 @@ class CornerFactor(FactorDefaults):
     def _arguments(
         self, state: State, v0: int, v1: int, recording: int, curved: bool
     ) -> tuple[ViewCorners, Noise, DirectParameters, ViewPoses]:
-        """Arguments of the kernels for views v0..v1, of one recording."""
+        """Arguments of the kernels for views v0..v1 of one recording. curved: use the true curvature of the loss."""
         image, body = self.views.image[v0:v1], self.views.body[v0:v1]
         columns, pars = self._columns(recording, body)
         s, n = self.stream, self.noise
@@ -306,7 +314,7 @@ class CornerFactor(FactorDefaults):
     def _motion(
         self, state: State, image: np.ndarray, body: np.ndarray, R_ws: np.ndarray, columns: np.ndarray
     ) -> ViewPoses:
-        """Poses in n views of `body` (n,), in images `image` (n,), in order; columns: see `ViewPoses`."""
+        """Camera and body poses of n views. image, body (n,): indices, sorted by image; columns: see `ViewPoses`."""
         i0 = int(image[0])
         camera = self.poses(state, i0, int(image[-1]) + 1)
         if not np.array_equal(image, np.arange(i0, i0 + len(camera.R_sensor_world))):
@@ -317,7 +325,7 @@ class CornerFactor(FactorDefaults):
     def _chunks(
         self, state: State, images: ViewCorners, motion: ViewPoses, recording: int, jacobians: bool
     ) -> Iterator[tuple[int, int, CornerProjection]]:
-        """Ranges a..b of `VIEWS_PER_CHUNK` views, and their projections."""
+        """Ranges a..b of at most `VIEWS_PER_CHUNK` views, and their projections, with Jacobians if wanted."""
         params = self.lens(state)
         world, start, camera = self.world_points(state, recording), images.start, motion.camera
         for a in range(0, len(images.keyframe), VIEWS_PER_CHUNK):
@@ -331,8 +339,9 @@ class CornerFactor(FactorDefaults):
                 yield a, b, CornerProjection(int(start[a]), X, uv, valid, np.zeros((0, 2, 3)), np.zeros((0, 2, 0)))
 
     def _blocks_of(self, piece: Piece) -> Iterator[tuple[int, int, int]]:
-        """Ranges of the views whose keyframe is in `piece`, and their recording. The last keyframe of a piece belongs
-        to the next one, except at the end of the chain."""
+        """Ranges of views whose keyframe is in `piece`, and the recording of each.
+
+        The last keyframe of a piece belongs to the next piece, except at the end of the chain."""
         stop = piece.last + 1 if piece.last == self.n_keyframes - 1 else piece.last
         images = np.searchsorted(self.keyframe, [piece.first, stop])
         v0, v1 = (int(v) for v in np.searchsorted(self.views.image, images))
@@ -341,5 +350,5 @@ class CornerFactor(FactorDefaults):
 
 
 def _scene(state: State, recording: int) -> np.ndarray:
-    """R_world_scene (3, 3)."""
+    """R_world_scene (3, 3) of a recording; both frames have the same origin."""
     return state.values[in_recording(BOARD, recording), "tilt"]

@@ -1,6 +1,6 @@
 """Compiled sums of the corner factor: from residuals and model Jacobians to the normal equations of a piece.
 
-ViewCorners are counted from the first one of the piece, corners from the first of the recording.
+Indices of views count from the first view of the kernel's arguments, indices of corners from the first of the stream.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ class ViewCorners(NamedTuple):
 class Noise(NamedTuple):
     """Noise of all corners, and the robust loss.
 
-    sigma (N,) px per axis; loss: number in `LOSSES`; scale: where it bends, in sigma; curved: whether the sums have its
-    true curvature; field (N, m): functions of the error that a view shares, with precision (m,) 1/px^2."""
+    sigma (N,) px per axis; loss: number in `LOSSES`; scale: its threshold in sigma; curved: whether the normal
+    equations have the true curvature of the loss. field (N, m): functions of the error that a view shares; precision
+    (m,) 1/px^2: prior information of its coefficients."""
 
     sigma: np.ndarray
     loss: int
@@ -44,10 +45,11 @@ class Noise(NamedTuple):
 
 
 class DirectParameters(NamedTuple):
-    """Parameters that move corners in the image without moving the camera.
+    """Parameters that act on the image directly, not through the pose of the camera: lens, bloom, shape of bodies.
 
-    pars: indices of the free parameters of the camera model; bloom [px] along direction (N, 2), (0, 2) without bloom;
-    basis (n_points, s, 3) m: displacement of points in the world by unit of the body's shape parameters."""
+    pars: indices of the free parameters of the camera model. bloom: shift [px] along direction (N, 2), which is (0, 2)
+    without bloom. basis (n_points, s, 3) m: displacement of points in the world per unit of each of the s shape and
+    size parameters of a body."""
 
     pars: np.ndarray
     bloom: float
@@ -58,9 +60,9 @@ class DirectParameters(NamedTuple):
 class ViewPoses(NamedTuple):
     """Poses of the camera and of the target in n views.
 
-    R_world_body (n, 3, 3) and p_world_body (n, 3) m: of each view's body; empty where the target is one body. columns
-    (n, c + d): calibration columns, -1 where fixed: c of the camera's pose, of the scene's tilt (2) and of the body's
-    pose (6, or 0 for one body); then d of `DirectParameters`."""
+    R_world_body (n, 3, 3), p_world_body (n, 3) m: pose of each view's body; empty if the target is one body. columns
+    (n, c + d): indices of calibration parameters, -1 where fixed. The first c are those of the camera's pose, the
+    scene's tilt (2) and the body's pose (6, or 0 for one body). The last d are those of `DirectParameters`."""
 
     camera: SensorPose
     R_world_scene: np.ndarray
@@ -70,10 +72,10 @@ class ViewPoses(NamedTuple):
 
 
 class CornerProjection(NamedTuple):
-    """The camera model at corners `first` and on.
+    """Projection of the n corners from number `first` on.
 
     X (n, 3) m: points in the camera frame; uv (n, 2) px; valid (n,) bool, within the range of the model; J_point
-    (n, 2, 3) px/m and J_params (n, 2, P): Jacobians of uv, empty where no sums are wanted."""
+    (n, 2, 3) px/m and J_params (n, 2, P): Jacobians of uv, empty if no normal equations are wanted."""
 
     first: int
     X: np.ndarray
@@ -84,10 +86,10 @@ class CornerProjection(NamedTuple):
 
 
 class CornerResidualArrays(NamedTuple):
-    """Arrays for residuals of corners `first` and on, in single precision.
+    """Output arrays for the corners from number `first` on.
 
-    residual (n, 2) px, predicted - measured; root (n,) 1/px, square root of the robust weight over sigma; shared
-    (n, 2, m) px: common error of each view."""
+    residual (n, 2) px: predicted - measured, without the common error; root (n,) 1/px: square root of the robust
+    weight, over sigma; shared (v, 2, m) px: coefficients of the common error of each of v views."""
 
     first: int
     residual: np.ndarray
@@ -97,7 +99,9 @@ class CornerResidualArrays(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def camera_points(i0, i1, start, point, R_cam_world, p_world_cam, world_points, X):
-    """Points of views i0..i1 in the camera frame, into X (n, 3) m; world_points (n_points, 3) m: the target's."""
+    """Writes the points of the corners of views i0..i1 in the camera frame into X (n, 3) m.
+
+    world_points (n_points, 3) m: points of the target in the world frame."""
     o = start[i0]
     for i in range(i0, i1):
         for n in range(start[i], start[i + 1]):
@@ -111,8 +115,9 @@ def camera_points(i0, i1, start, point, R_cam_world, p_world_cam, world_points, 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _gram(A, D, n, out):
-    """out (D, D) = A[:D, :n] A[:D, :n]^T. Blocks of 2 x 2 sums use each loaded number twice; the compiler may reorder
-    sums to vectorise them."""
+    """Writes the Gram matrix A[:D, :n] A[:D, :n]^T into out (D, D).
+
+    Blocks of 2 x 2 sums use each loaded number twice. The compiler may reorder sums to vectorise them."""
     for i in range(0, D, 2):
         i1 = min(i + 1, D - 1)
         for j in range(i, D, 2):
@@ -130,7 +135,9 @@ def _gram(A, D, n, out):
 
 @njit(cache=True, nogil=True, inline="always")
 def _predict_view(i, corners, noise, direct, projection, residual, root, kept):
-    """Residuals (n, 2), weights root (n,) and common error of view i. Returns half its robust chi^2."""
+    """Writes residual (n, 2) px and root (n,) 1/px of view i, and copies both with the common error into `kept`.
+
+    Returns half the robust chi^2 of the view."""
     n0, n1, o, f0 = corners.start[i], corners.start[i + 1], projection.first, corners.start[i] - kept.first
     ok = np.empty(n1 - n0, np.bool_)
     for k in range(n1 - n0):
@@ -151,7 +158,7 @@ def _predict_view(i, corners, noise, direct, projection, residual, root, kept):
 
 @njit(cache=True, nogil=True, inline="always")
 def _recall_view(i, corners, kept, residual, root):
-    """Residuals and weights of view i as `_predict_view` stored them."""
+    """Copies the residuals and weights of view i, which `_predict_view` stored in `kept`, into residual and root."""
     n0, f0 = corners.start[i], corners.start[i] - kept.first
     for k in range(corners.start[i + 1] - n0):
         root[k] = kept.root[f0 + k]
@@ -161,8 +168,9 @@ def _recall_view(i, corners, kept, residual, root):
 
 @njit(cache=True, nogil=True)
 def _fill_rows(i, corners, noise, direct, poses, projection, roots, error, J_rows):
-    """Weighted Jacobian of view i, transposed, into J_rows (D + 1, 2 n): by camera pose 6, free model parameters,
-    bloom, shape; the last row is the residual."""
+    """Writes the transposed weighted Jacobian of view i into J_rows (D + 1, 2 n).
+
+    Its rows: camera pose (6), free model parameters, bloom, shape and size of the body; last, the weighted error."""
     n0, n = corners.start[i], corners.start[i + 1] - corners.start[i]
     ns, n_pars, has_bloom = direct.basis.shape[1], len(direct.pars), len(direct.direction) > 0
     D = 6 + n_pars + has_bloom + ns
@@ -197,8 +205,9 @@ def _fill_rows(i, corners, noise, direct, poses, projection, roots, error, J_row
 
 @njit(cache=True, nogil=True)
 def _bend_rows(n0, n, noise, roots, error, D, J_rows):
-    """Scales rows of the n corners from n0 on where the loss bends: J_rows J_rows^T gets its true curvature, and the
-    gradient stays (Triggs et al. 2000)."""
+    """Rescales the columns of J_rows of corners beyond the threshold of the loss, for the n corners from n0 on.
+
+    J_rows J_rows^T then has the true curvature of the robust loss; the gradient is unchanged (Triggs et al. 2000)."""
     for k in range(n):
         if roots[k] > 0.0:
             sigma = noise.sigma[n0 + k]
@@ -209,11 +218,11 @@ def _bend_rows(n0, n, noise, roots, error, D, J_rows):
 
 
 class _Workspace(NamedTuple):
-    """Arrays for one view of at most n corners.
+    """Reused arrays for one view of at most n corners.
 
-    J_rows (D + 1, 2 n): weighted rows, see `_fill_rows`; G (D + 1, D + 1): their Gram matrix; residual and error (n, 2)
-    px, root (n,); J_imu (6, 6) and J_chain (6, w): camera pose by IMU pose, and by keyframes and calibration
-    parameters; F: see `add_gram`."""
+    J_rows (D + 1, 2 n): weighted Jacobian, see `_fill_rows`; G (D + 1, D + 1): its Gram matrix; residual (n, 2) px,
+    error (n, 2) px: with the common error; root (n,) 1/px. J_imu (6, 6), J_chain (6, w): Jacobians of the camera pose
+    by the IMU pose, and by keyframes and calibration parameters; F: see `add_gram`."""
 
     J_rows: np.ndarray
     G: np.ndarray
@@ -227,6 +236,7 @@ class _Workspace(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _workspace(corners, direct, poses):
+    """A `_Workspace` for the view with most corners."""
     most = 0
     for i in range(len(corners.start) - 1):
         most = max(most, corners.start[i + 1] - corners.start[i])
@@ -240,12 +250,13 @@ def _workspace(corners, direct, poses):
 
 @njit(cache=True, nogil=True)
 def _fill_chain(i, poses, J_imu, J_chain):
-    """Camera pose by keyframes and calibration parameters into J_chain (6, w), columns as in `ViewPoses.columns`."""
+    """Writes the Jacobian of the camera pose i into J_chain (6, w): by keyframes, then by the c `ViewPoses.columns`."""
     fill_chain(i, poses.camera, J_imu, J_chain)
     R_cam_world, p_world_cam = poses.camera.R_sensor_world[i], poses.camera.p_world_sensor[i]
     o = J_chain.shape[1] - (8 if len(poses.R_world_body) else 2)
     for r in range(3):
-        # Tilting the scene about world x (y) equals rotating the camera the other way about the scene's origin.
+        # Tilting the scene about world x (y) has the same effect as rotating the camera by the opposite angle about
+        # the scene's origin.
         J_chain[r, o], J_chain[r, o + 1] = -R_cam_world[r, 0], -R_cam_world[r, 1]
         J_chain[3 + r, o] = R_cam_world[r, 1] * p_world_cam[2] - R_cam_world[r, 2] * p_world_cam[1]
         J_chain[3 + r, o + 1] = R_cam_world[r, 2] * p_world_cam[0] - R_cam_world[r, 0] * p_world_cam[2]
@@ -255,8 +266,9 @@ def _fill_chain(i, poses, J_imu, J_chain):
 
 @njit(cache=True, nogil=True, inline="always")
 def _fill_body(i, poses, J_chain):
-    """Camera pose by body pose into the last 6 columns of J_chain. Moving the body by d equals moving the camera by the
-    inverse of d, rotation about the body's origin."""
+    """Writes the Jacobian of the camera pose by the body pose into the last 6 columns of J_chain.
+
+    Moving the body by d has the same effect as moving the camera by the inverse of d about the body's origin."""
     R_cam_world, R_world_body, o = poses.camera.R_sensor_world[i], poses.R_world_body[i], J_chain.shape[1] - 6
     away = so3.hat(poses.camera.p_world_sensor[i] - poses.p_world_body[i])
     for r in range(3):
@@ -270,9 +282,9 @@ def _fill_body(i, poses, J_chain):
 
 @njit(cache=True, nogil=True)
 def accumulate(i0, i1, corners, noise, direct, poses, projection, sums, kept):
-    """Residuals, weights and common errors of views i0..i1 into `kept`, and the normal equations where they are wanted.
+    """Writes residuals, weights and common errors of views i0..i1 into `kept`.
 
-    Returns half the robust chi^2.
+    Adds their normal equations to `sums`, unless its arrays are empty. Returns half the robust chi^2.
     """
     work, total = _workspace(corners, direct, poses), 0.0
     J_rows, G, J_chain, D, n_chain = work.J_rows, work.G, work.J_chain, len(work.G) - 1, chain_width(poses.camera)
@@ -295,8 +307,9 @@ def accumulate(i0, i1, corners, noise, direct, poses, projection, sums, kept):
 
 @njit(cache=True, nogil=True)
 def accumulate_clusters(i0, i1, cluster, n_clusters, column, corners, noise, direct, poses, projection, sums, kept):
-    """Gradients of views i0..i1 by cluster of corners, into columns `column` and on of side and calibration
-    parameters."""
+    """Adds the gradient of each cluster of corners in views i0..i1 to the columns from `column` on of `sums`.
+
+    cluster (N,): index of each corner's cluster, from 0 to n_clusters - 1. kept: residuals and weights to use."""
     work = _workspace(corners, direct, poses)
     J_rows, J_chain, D, n_chain = work.J_rows, work.J_chain, len(work.G) - 1, chain_width(poses.camera)
     G = np.empty((D, n_clusters))

@@ -1,4 +1,4 @@
-"""Misfit of the lens model: the part of the corner residuals that depends on the place in the image alone.
+"""Misfit of the lens model: the part of the corner residuals that is a function of the image position alone.
 
 The residuals of a camera are averaged over cells of the image, in groups of consecutive images. Without misfit the
 means of two groups are independent, with mean zero. So the mean product over pairs of different groups estimates the
@@ -14,19 +14,19 @@ import numpy as np
 
 from icalib.data.measurements import CornerStream
 
-# Columns and rows of the rectangle that holds all corners. Smaller cells resolve a finer misfit, with more noise each.
+# Columns and rows of cells in the bounding box of all corners. Smaller cells resolve finer misfit with more noise.
 MISFIT_CELLS = (12, 8)
-MAX_IMAGE_GROUPS = 200  # consecutive images of a video share errors, which must stay within a group
-MIN_GROUPS_IN_CELL = 3  # that have corners in it; other cells are left out
-SIGNIFICANT_STD = 5.0  # standard deviations under noise alone; a smaller misfit counts as none
+MAX_IMAGE_GROUPS = 200  # errors correlate between successive images, so groups must be long against the correlation
+MIN_GROUPS_IN_CELL = 3  # groups with corners in a cell, below which the cell is left out
+SIGNIFICANT_STD = 5.0  # standard deviations of the statistic under noise alone; a smaller misfit counts as zero
 
 
 @dataclass(frozen=True)
 class LensMisfit:
-    """rms [px]: of either component over all corners, 0 if it is not significant; field (N, 2) [px]: the mean residual
-    in each corner's cell, 0 where too few groups have corners in it.
+    """Misfit of one camera's lens model.
 
-    Residuals are predicted - measured, and so is the field.
+    rms [px]: RMS misfit per image axis over all corners, 0 if it is not significant. field (N, 2) [px]: mean residual,
+    predicted - measured, in the cell of each corner; 0 in cells with too few groups.
     """
 
     rms: float
@@ -34,9 +34,10 @@ class LensMisfit:
 
 
 def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) -> LensMisfit:
-    """The misfit of one camera, from the residuals (N, 2) [px] of the corners that are `used` (N,) bool.
+    """The misfit of one camera's lens model.
 
-    Zero where none is used, or the misfit is not significant.
+    residual (N, 2) [px]: predicted - measured; used (N,) bool: corners in use. The misfit is zero if it is not
+    significant, or no corner is in use.
     """
     nothing = LensMisfit(0.0, np.zeros((len(used), 2), np.float32))
     if not used.any():
@@ -51,8 +52,9 @@ def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) ->
     groups = (count > 0).sum(axis=0)
     enough = groups >= MIN_GROUPS_IN_CELL
     share = np.where(enough, count.sum(axis=0), 0.0)
-    # products[a, b]: over all cells, weighted by their corners, the products of the means of groups a and b, over the
-    # number of pairs. Without misfit those off the diagonal have mean zero; the diagonal holds the noise.
+    # products[a, b]: product of the means of groups a and b, summed over cells with their numbers of corners as
+    # weights, over the number of pairs. Without misfit, off-diagonal entries have mean zero. The diagonal, which holds
+    # the noise, is dropped.
     root = np.sqrt(share / max(share.sum(), 1.0) / np.maximum(groups * (groups - 1.0), 1.0))
     scaled = root[:, None] * means
     products = np.einsum("acx,bcx->ab", scaled, scaled, optimize=True)
@@ -65,13 +67,13 @@ def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) ->
 
 
 def _cells(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """(N,) int: the cell of each corner at uv (N, 2) px, in the rectangle that holds the `used` ones."""
+    """(N,) int: cell of each corner uv (N, 2) px, in a grid over the bounding box of the `used` corners."""
     column, row = (_strips(uv[:, k], used, MISFIT_CELLS[k]) for k in range(2))
     return row * np.int16(MISFIT_CELLS[0]) + column
 
 
 def _strips(x: np.ndarray, used: np.ndarray, count: int) -> np.ndarray:
-    """(N,) int16 from 0 to `count` - 1: where each x (N,) lies in the range of the `used` ones."""
+    """(N,) int16 from 0 to `count` - 1: number of the interval of x (N,), when `count` equal ones span the `used` x."""
     own = x[used]
     low, size = own.min(), np.ptp(own) + 1e-9
     return np.clip((x - low) / size * count, 0, count - 1).astype(np.int16)

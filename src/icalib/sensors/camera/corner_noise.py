@@ -1,15 +1,15 @@
 """Noise of corners, estimated from the residuals of a pass.
 
-    sigma_n^2 = (base s_n)^2 + (exposure v_i)^2 + misfit^2      of corner n of image i, v_i px/s: image speed (blur)
-    shared    ~ N(0, tau_k^2), u and v apart                    errors that all corners of an image share
+    sigma_n^2 = (base s_n)^2 + (exposure v_i)^2 + misfit^2      corner n of image i; v_i [px/s]: image speed (blur)
+    shared    ~ N(0, tau_k^2), independent in u and v           coefficients of the error that an image's corners share
 
-s_n is the detector's standard deviation of the corner over that of the median corner, 1 if it states none. Noise of
-single corners comes from medians, which outliers do not move. Sizes of shared errors come from their chi^2 over
-post-fit degrees of freedom, pass by pass (variance components; Foerstner 1979), because poses absorb most of them.
+s_n is the detector's standard deviation of the corner over that of the median corner, 1 if the detector states none.
+base and exposure come from medians, which are robust to outliers. tau comes from the chi^2 of the shared errors over
+post-fit degrees of freedom, pass by pass (variance components; Foerstner 1979), because poses absorb most of the error.
 
 The misfit is the error of the lens model. Near the border of the image it is many times its RMS, and a robust loss
-rejects corners there. Beside other sensors this is right: the border would bias their parameters. With cameras alone
-the lens should fit the whole image, so the robust loss is `WIDE_LOSS_FACTOR` times as wide where the misfit is large.
+down-weights corners there. With other sensors this is wanted, because the border would bias their parameters. With
+cameras alone the lens should fit the whole image, so a large misfit widens the robust loss by `WIDE_LOSS_FACTOR`.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ from icalib.rig import Camera, Settings
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.corner_misfit import LensMisfit, lens_misfit
 
-INITIAL_CORNER_NOISE_PX = 0.5  # per axis, in the first pass: of the order of a detector's error with a rough lens
-MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX = 1e-3, 5.0  # of tau: keep weights finite, and far errors out
-INITIAL_COMMON_ERROR_PX = 0.1  # of tau, in the first pass that has it
-N_COMMON_ERRORS = 1  # functions of the error that an image shares: a shift; 3 would be an affine field
+INITIAL_CORNER_NOISE_PX = 0.5  # per axis, in the first pass: typical residual with a rough lens
+MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX = 1e-3, 5.0  # limits of tau: for finite weights, and against divergence
+INITIAL_COMMON_ERROR_PX = 0.1  # tau in the first pass that models the common error
+N_COMMON_ERRORS = 1  # number of functions of the common error: 1 is a shift; 3 would be an affine field
 MIN_CORNER_NOISE_PX = 0.005  # per axis: no detector is better; keeps weights finite where corners are exact
-SPEED_BINS = 12  # of image speed, for the fit of blur
-MIN_CORNERS_IN_BIN = 50  # for their median variance to be known to a fifth
-LARGE_MISFIT_RATIO = 0.5  # of misfit to noise: a fifth of the variance
-# Factor on `loss_scale`. On stereo stills whose lenses leave 8 px near the border it takes the error of images that
-# were left out from 0.29 px to 0.27 px. No robust loss at all leaves 0.25 px, but moves the baseline by 0.15 mm more.
+SPEED_BINS = 12  # bins of image speed, to which the motion blur is fitted
+MIN_CORNERS_IN_BIN = 50  # with these the median variance has a relative error of a fifth
+LARGE_MISFIT_RATIO = 0.5  # misfit over base noise, above which the misfit is large: a fifth of the total variance
+# Factor on `loss_scale` if the misfit is large. In a test with stereo stills and 8 px of misfit near the border, it
+# lowers the error of validation images from 0.29 px to 0.27 px. Without robust loss the error is 0.25 px, but the
+# baseline changes by 0.15 mm more.
 WIDE_LOSS_FACTOR = 2.5
 
 
@@ -44,8 +45,9 @@ WIDE_LOSS_FACTOR = 2.5
 class NoiseModel:
     """Noise of the corners of one camera.
 
-    base [px]: of its median corner; exposure [s]; tau (m,) px, empty if images share no error; misfit [px] of the lens
-    model. wide_loss: the robust loss bends at `WIDE_LOSS_FACTOR` times the `loss_scale` of the rig file."""
+    base [px]: standard deviation of the median corner per axis; exposure [s]: blur per image speed; tau (m,) px:
+    standard deviations of the common error, empty if it is not modelled; misfit [px]: RMS error of the lens model.
+    wide_loss: the threshold of the robust loss is `WIDE_LOSS_FACTOR` times the `loss_scale` of the rig file."""
 
     base: float
     exposure: float = 0.0
@@ -56,7 +58,7 @@ class NoiseModel:
     def noise(
         self, stream: CornerStream, camera: Camera, settings: Settings, speed: np.ndarray | None = None
     ) -> CornerNoise:
-        """The noise of each corner of `stream`; speed (M,) px/s: of each image, no blur if None."""
+        """The noise of each corner of `stream`. speed (M,) px/s: image speed of each image; no motion blur if None."""
         blur = 0.0 if speed is None else self.exposure * speed[stream.image]
         sigma = np.hypot(np.hypot(self.base * stream.relative_sigma, blur), self.misfit)
         field = np.ones((len(stream.uv), len(self.tau)))
@@ -69,12 +71,12 @@ class NoiseModel:
 
 
 def first_noise(camera: Camera) -> NoiseModel:
-    """Noise of the first pass: stated in the rig file, or `INITIAL_CORNER_NOISE_PX`."""
+    """Corner noise of the first pass: the value of the rig file, or else `INITIAL_CORNER_NOISE_PX`."""
     return NoiseModel(camera.corner_noise_px or INITIAL_CORNER_NOISE_PX)
 
 
 def image_speed(factor: CornerFactor, state: State) -> np.ndarray:
-    """(M,) px/s: image speed, RMS over the corners in use of each image; 0 without any."""
+    """(M,) px/s: image speed of the target in each image, RMS over the corners in use; 0 without such corners."""
     square = np.empty(len(factor.stream.uv))
     for v0, v1 in factor.blocks():
         square[factor.corners_of(v0, v1)] = _squared_flow(factor, state, v0, v1)
@@ -82,7 +84,7 @@ def image_speed(factor: CornerFactor, state: State) -> np.ndarray:
 
 
 def _squared_flow(factor: CornerFactor, state: State, v0: int, v1: int) -> np.ndarray:
-    """(n,) squared speed in the image of the corners of views v0..v1."""
+    """(n,) (px/s)^2: squared image speed of each corner of views v0..v1."""
     X, _ = factor.points_in_camera(state, v0, v1)
     image = factor.views.image[v0:v1]
     poses = factor.imu_poses(state, int(image[0]), int(image[-1]) + 1)
@@ -96,7 +98,7 @@ def _squared_flow(factor: CornerFactor, state: State, v0: int, v1: int) -> np.nd
 
 
 def image_mean(stream: CornerStream, x: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    """(M,) mean of x (N,) over the kept corners of each image, 0 where there are none."""
+    """(M,) mean of x (N,) over the corners of each image that `keep` (N,) bool selects; 0 without such corners."""
     image, n = stream.image[keep], len(stream.stamps_ns)
     count = np.bincount(image, minlength=n)
     return np.bincount(image, x[keep], minlength=n) / np.maximum(count, 1)
@@ -104,8 +106,8 @@ def image_mean(stream: CornerStream, x: np.ndarray, keep: np.ndarray) -> np.ndar
 
 @dataclass(frozen=True)
 class ResidualNoise:
-    """Noise that the residuals of one camera show: base [px] and exposure [s] as in `NoiseModel`, and the misfit of the
-    lens model."""
+    """Noise estimated from the residuals of one camera: base [px] and exposure [s] as in `NoiseModel`; lens: misfit of
+    the lens model."""
 
     base: float
     exposure: float
@@ -113,14 +115,14 @@ class ResidualNoise:
 
     @property
     def lens_misfit_is_large(self) -> bool:
-        """Whether the robust loss is to be wide, and a warning to name another camera model."""
+        """Whether the misfit justifies a wide robust loss and a search for a better camera model."""
         return self.lens.rms > LARGE_MISFIT_RATIO * self.base
 
 
 def residual_noise(factor: CornerFactor, out: CornerOutput, settings: Settings, speed: np.ndarray) -> ResidualNoise:
-    """The noise and misfit that the residuals `out` of a pass show; speed (M,) px/s as of `image_speed`.
+    """Noise and misfit, estimated from the residuals `out` of a pass. speed (M,) px/s: result of `image_speed`.
 
-    Only corners in use count; there must be one.
+    Only corners in use are considered; at least one is needed.
     """
     stream, used = factor.stream, out.root > 0.0
     error = factor.errors(out)
@@ -142,10 +144,10 @@ def estimate_noise(
     speed: np.ndarray,
     tau: tuple[float, ...],
 ) -> tuple[NoiseModel, bool]:
-    """The noise that the residuals `out` of a pass show, with `tau` of its common errors, and whether the misfit of the
-    lens model is large. speed (M,) px/s as of `image_speed`.
+    """Noise of the next pass, estimated from the residuals `out`, and whether the misfit of the lens model is large.
 
-    Stated noise is kept. Raises EstimationError if the pass diverged so far that no corner is in front of the camera.
+    A base noise in the rig file is kept, with zero misfit. speed (M,) px/s: result of `image_speed`; tau: standard
+    deviations of the common error. Raises EstimationError if the pass diverged, so that no corner is in use.
     """
     if not (out.root > 0.0).any():
         raise EstimationError(
@@ -160,9 +162,9 @@ def estimate_noise(
 
 
 def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float, ...]:
-    """tau of the next pass: each times the square root of its chi^2 over post-fit degrees of freedom.
+    """tau (m,) px of the next pass: each times the square root of its chi^2 over post-fit degrees of freedom.
 
-    fits: those of one camera's common errors, in order.
+    fits: statistics of the camera's common errors, in the order of `tau`.
     """
     return tuple(
         float(np.clip(t * np.sqrt(f.chi2 / max(f.dof, 1.0)), MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX))
@@ -171,9 +173,10 @@ def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float,
 
 
 def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
-    """base [px] and exposure [s]: line through the median variances of bins of squared speed, weighted by variance.
+    """base [px] and exposure [s] from a line fitted to the median variances in bins of speed, variance over speed^2.
 
-    square (n,) px^2, squared errors, and speed (n,) px/s, both over the corners' relative standard deviations."""
+    The fit minimises relative errors. Exposure is 0 with fewer than three usable bins, or if the fit is not positive.
+    square (n,) px^2: squared residuals, over the squared `relative_sigma`; speed (n,) px/s, over `relative_sigma`."""
     edges = np.quantile(speed, np.linspace(0.0, 1.0, SPEED_BINS + 1))
     which = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, SPEED_BINS - 1)
     bins = [k for k in range(SPEED_BINS) if (which == k).sum() >= MIN_CORNERS_IN_BIN]

@@ -1,8 +1,8 @@
 """Rejects corners with large residuals, unless their neighbours in the image plane have similar ones.
 
-A lens that its model cannot follow makes large residuals near the border of the image. Neighbouring corners of all
-images have similar ones, and they decrease towards the middle. A gross outlier is isolated. A corner with a large
-residual is suspect. It is kept where a chain of neighbours with similar residuals leads from it to a corner that is
+Misfit of the lens model causes large residuals near the border of the image. They are similar for neighbouring corners
+of all images, and decrease towards the middle. A gross outlier has no similar neighbours. So a corner with a large
+residual is only suspect. It is kept if a chain of neighbours with similar residuals leads from it to a corner that is
 not suspect.
 """
 
@@ -17,20 +17,21 @@ from icalib.optim.medians import grouped_quantiles, largest_normal
 from icalib.rig import Settings
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
-N_NEIGHBOURS = 12  # nearest corners; with twice as many, small outliers near the border find similar ones by chance
-# Corners that are not suspect, among which neighbours are searched: one for every 4 x 4 px of 752 x 480. With fewer,
-# neighbours are farther away; more take time and memory.
+N_NEIGHBOURS = 12  # nearest corners; with 24, small outliers near the border have similar neighbours by chance
+# Corners without suspicion, among which neighbours are searched: one per 4 x 4 px of an image of 752 x 480 px. With
+# fewer, neighbours are farther away; with more, the search needs more time and memory.
 MAX_UNSUSPECT_CORNERS = 20_000
-CORNERS_PER_TAG = 4  # in one image they are no neighbours: all corners of a misidentified tag err alike
-SIMILAR_RATIO = 0.7  # largest distance of two similar residuals over their length; at 1 zero would be similar
+CORNERS_PER_TAG = 4  # corners of a tag in one image are no neighbours: a misidentified tag displaces all alike
+SIMILAR_RATIO = 0.7  # largest difference of similar residuals over the suspect's; at 1, zero would be similar
 
 
 def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:
     """(N,) bool: corners that are not rejected. Corners outside the range of the lens model are rejected, too.
 
-    A corner is suspect when its residual is larger than `outlier_min_px`, and larger than the mean of normal errors
-    plus `outlier_std` standard deviations. Both follow from the median of its image or that of all images, whichever is
-    larger (lengths of normal errors have Rayleigh's distribution). All are kept if `outlier_std` is 0.
+    A corner is suspect if its residual is longer than `outlier_min_px`, and longer than mean plus `outlier_std`
+    standard deviations of normal errors. Lengths of normal errors have a Rayleigh distribution. Its scale follows from
+    the median length of the image or of all images, whichever is larger. A suspect corner is rejected if it is
+    `isolated`, or if the loss is `none`. All corners are kept if `outlier_std` is 0.
     """
     if settings.outlier_std <= 0.0:
         return np.ones(len(out.root), dtype=bool)
@@ -41,10 +42,10 @@ def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.n
 
 
 def rejected(factor: CornerFactor, rows: np.ndarray, residual: np.ndarray, settings: Settings) -> np.ndarray:
-    """(n,) bool: the corners `rows` (n,) int of the stream that their residuals (n, 2) [px] reject, as of `inliers`."""
+    """(n,) bool: outliers among the corners `rows` (n,) of the stream, with residuals (n, 2) [px]; see `inliers`."""
     if settings.outlier_std <= 0.0:
         return np.zeros(len(rows), dtype=bool)
-    # In double precision: where the IMU has a gap, poses may project points to 1e20 px, whose squares overflow.
+    # Double precision: in gaps of the IMU, poses may project points to 1e20 px, and squares would overflow.
     residual = residual.astype(np.float64)
     stream, size = factor.stream, np.linalg.norm(residual, axis=1)
     image = stream.image[rows]
@@ -53,7 +54,7 @@ def rejected(factor: CornerFactor, rows: np.ndarray, residual: np.ndarray, setti
         usual = np.maximum(usual, np.median(size))
     limit = np.maximum(largest_normal(settings.outlier_std, 0.5) * usual, settings.outlier_min_px)
     suspect = size > limit[image]
-    if settings.loss == "none" or not suspect.any():  # the influence of a kept corner would not be bounded
+    if settings.loss == "none" or not suspect.any():  # without robust loss, an outlier has unbounded influence
         return suspect
     some, number = _with_neighbours(suspect), factor.bodies.target.tag_number
     tag = image[some] * (1 + number.max(initial=0)) + number[stream.point[rows[some]]]
@@ -62,17 +63,17 @@ def rejected(factor: CornerFactor, rows: np.ndarray, residual: np.ndarray, setti
 
 
 def _with_neighbours(suspect: np.ndarray) -> np.ndarray:
-    """(n,) int, in order: all `suspect` (N,) corners, and of the others MAX_UNSUSPECT_CORNERS at most, evenly drawn."""
+    """(n,) sorted indices of all corners that are `suspect` (N,) bool, and of every k-th other corner, at most
+    MAX_UNSUSPECT_CORNERS."""
     others = np.flatnonzero(~suspect)
     return np.union1d(np.flatnonzero(suspect), others[:: 1 + len(others) // MAX_UNSUSPECT_CORNERS])
 
 
 def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.ndarray) -> np.ndarray:
-    """(N,) bool: the `suspect` (N,) corners that no chain of similar neighbours joins to one that is not suspect.
+    """(N,) bool: `suspect` (N,) corners without a chain of similar neighbours to a corner that is not suspect.
 
-    uv (N, 2) [px] and residual (N, 2) [px] are those of the corners of all images together. Corners with the same
-    number `tag` (N,) int, a tag in one image, are no neighbours: they share errors. Neighbours are the nearest in the
-    image plane.
+    uv, residual (N, 2) [px]: corners of all images together. tag (N,) int: a number for each tag in each image; corners
+    with the same number share errors, and are no neighbours. Neighbours are the nearest corners in the image plane.
     """
     own = np.flatnonzero(suspect)
     if not len(own):

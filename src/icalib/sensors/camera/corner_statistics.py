@@ -1,4 +1,4 @@
-"""Residual statistics of the corners of one camera, and the degrees of freedom that parameters take from them."""
+"""Residual statistics of the corners of one camera, and the degrees of freedom that the fit takes from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icalib.optim.arrowhead import in_parallel
 if TYPE_CHECKING:
     from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
-CORNERS = "corners"  # kind of their residuals
+CORNERS = "corners"  # kind of residual
 
 
 def corner_squares(camera: CornerFactor, out: CornerOutput) -> dict[FitKey, Squares]:
@@ -28,14 +28,16 @@ def corner_squares(camera: CornerFactor, out: CornerOutput) -> dict[FitKey, Squa
 def image_rows(
     sensor: str, kind: str, seconds: np.ndarray, residual: np.ndarray, sigma: np.ndarray, root: np.ndarray
 ) -> ResidualRows:
-    """Rows of residuals (n, 2) px. sigma (n,) px: per axis; root (n,) 1/px: square root of robust weight over sigma."""
+    """Residuals (n, 2) px of one sensor as `ResidualRows`.
+
+    seconds (n,) s; sigma (n,) px per axis; root (n,) 1/px: square root of the robust weight, over sigma."""
     two = residual.shape
     sigma, root = np.broadcast_to(sigma[:, None], two), np.broadcast_to((root * sigma)[:, None], two)
     return ResidualRows(sensor, kind, "px", seconds, residual, sigma, residual / sigma, root)
 
 
 def rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
-    """RMS of either component of residuals (N, 2) px that have weight, root (N,); None where none has."""
+    """RMS per axis of the residuals (N, 2) px with root (N,) > 0, the square root of the weight; None without any."""
     used = residual[root > 0.0]
     return float(np.sqrt(np.mean(used**2, dtype=np.float64))) if len(used) else None
 
@@ -49,7 +51,7 @@ def dof_used_by_corners(camera: CornerFactor, out: CornerOutput, along: StateDif
 def _dof_used_by_views(
     camera: CornerFactor, at: CornerOutput, step: StateDifference, views: tuple[int, int]
 ) -> dict[str, float]:
-    """|J x|^2 of views v0..v1 by kind of residual, as a mean over the posterior of their common errors given x."""
+    """|J x|^2 of the range `views` by kind of residual, for the step x; the mean over common errors given x."""
     own, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
     up, down = (camera.residual(state, *views) for state in (step.end, step.start))
     root, view = at.root[own], camera.views.of_corners(*views) - views[0]

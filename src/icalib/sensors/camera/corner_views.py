@@ -11,8 +11,9 @@ from icalib.data.measurements import CornerStream
 
 @dataclass(frozen=True)
 class Views:
-    """V views, each of one body of the target in one image: corners of view j are start[j]:start[j + 1]; image and body
-    (V,) are indices."""
+    """V views; a view is one body of the target in one image.
+
+    start (V + 1,): corners of view j are start[j]:start[j + 1]; image, body (V,): indices of its image and body."""
 
     start: np.ndarray
     image: np.ndarray
@@ -20,7 +21,9 @@ class Views:
 
     @classmethod
     def of(cls, stream: CornerStream, body: np.ndarray) -> Views:
-        """Views of a stream whose corners are sorted by body in each image; body (n_points,): of each point."""
+        """Views of a stream whose corners are sorted by body in each image.
+
+        body (n_points,): index of the body of each target point."""
         if not body.any():
             seen = np.flatnonzero(np.diff(stream.start))
             start = np.append(stream.start[seen], stream.start[-1])
@@ -32,5 +35,5 @@ class Views:
         return cls(np.append(first, len(own)).astype(np.int64), image[first], own[first])
 
     def of_corners(self, v0: int, v1: int) -> np.ndarray:
-        """(n,) the view that each corner of views v0..v1 belongs to."""
+        """(n,) index of the view of each corner of views v0..v1."""
         return np.repeat(np.arange(v0, v1), np.diff(self.start[v0 : v1 + 1]))

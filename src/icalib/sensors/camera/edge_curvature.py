@@ -1,13 +1,13 @@
 """Corrects corners for the curvature that the lens gives to the edges of squares and tags.
 
-A detector fits the two edges of a corner over some length, straight or with a free curvature (zero, if straight). It
-states the derivative of the corner by each edge's curvature, the gain [px^2]. Once lens and pose are known, so is the
-curvature:
+A detector fits the two edges of a corner over some length, as straight lines or with a free curvature. It states this
+fitted curvature (zero for straight lines) and the gain [px^2], the derivative of the corner by the curvature of each
+edge. The true curvature can be predicted once lens and pose are known:
 
     uv += gain (predicted curvature - fitted curvature)
 
-To first order that is the corner of a fit with known curvature. Without the correction straight edges in a distorted
-image give biased corners; the bias grows with the square of the fitted length.
+To first order, the result is the corner of a fit with known curvature. Without the correction, straight fits in a
+distorted image give biased corners; the bias grows with the square of the fitted length.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.optim.state import State
 from icalib.sensors.camera.corner_factor import CornerFactor
 
-# Image area of a unit area of the target at unit depth, over fx^2: 0 if the plane is edge-on. Below this value the
-# affine map to the image is not inverted, and the corner is not corrected.
+# Determinant of the affine map from target plane to image at unit depth, over fx^2: 0 if the plane is seen edge-on.
+# Below this value the map is not inverted, and the corner is not corrected.
 MIN_RELATIVE_AREA = 1e-6
 
 
 def with_bent_edges(factor: CornerFactor, state: State) -> CornerFactor:
-    """The factor with corrected corners, by lens and poses of `state`. Unchanged where the stream has no edges."""
+    """The factor with corrected corners, for lens and poses of `state`. Unchanged if the stream has no edges."""
     if not len(factor.stream.edges):
         return factor
     uv = factor.stream.uv.copy()
@@ -43,11 +43,11 @@ def with_bent_edges(factor: CornerFactor, state: State) -> CornerFactor:
 def predicted_curvature(
     model: CameraModel, params: np.ndarray, X: np.ndarray, plane: np.ndarray, piece: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) curvature [1 / px] in the image of a straight piece of the target, and (n,) bool whether it is known.
+    """(n,) image curvature [1 / px] of straight edge pieces on the target, and (n,) bool, whether it is known.
 
     X (n, 3) m: the corners in the camera frame; plane (n, 3, 2): the body's unit axes x and y in the camera frame;
-    piece (n, 2, 2) px: its two ends, relative to the corner. The sign is that of `CornerStream.edges`. Not known where
-    a point is outside the range of the lens model, or the plane is seen edge-on.
+    piece (n, 2, 2) px: its two ends, relative to the corner. The sign is that of `CornerStream.edges`. Unknown if a
+    point is outside the range of the lens model, or the plane is seen edge-on.
 
     The ends and the middle of the piece are mapped to the target by the affine map at the corner, and projected. The
     curvature is the component of their second difference across the chord, over a quarter of the chord's squared

@@ -1,8 +1,8 @@
-"""Rejects sets of images that count as simultaneous but are not: the rig moved in between, or one was exposed later.
+"""Rejects sets of images whose stamps are equal, but which were not exposed at the same time on a moving rig.
 
-Without an IMU, simultaneous images of several cameras share a keyframe, and so a pose of the rig. If the rig
-moved in between, no pose fits all of them, however well each image alone fits the target. The median residual of an
-image then is far above that of the camera's other images.
+Without an IMU, simultaneous images of several cameras share a keyframe, and so a pose of the rig. If the rig moved
+between their exposures, no pose fits all of them, even if each image alone fits the target. The median residual of an
+image is then far above that of the camera's other images.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from icalib.optim.medians import grouped_quantiles
 from icalib.rig import Settings
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
-MAX_MEDIAN_RATIO = 8.0  # of the median residual of an image to that of most images; blur and lenses reach a few
-MAX_REJECTED_SHARE = 0.2  # of the shared keyframes; if more do not fit, the cause is another, and none is rejected
+MAX_MEDIAN_RATIO = 8.0  # median residual of an image over that of the median image; blur and lens misfit reach a few
+MAX_REJECTED_SHARE = 0.2  # of the shared keyframes; if more do not fit, there is another cause, and none is rejected
 
 
 def not_simultaneous(
     cameras: Sequence[CornerFactor], outputs: Sequence[CornerOutput], settings: Settings
 ) -> list[np.ndarray]:
-    """For each camera (M,) bool: its images at keyframes that several cameras share and where an image does not fit.
+    """For each camera (M,) bool: its images at shared keyframes with an image that does not fit.
 
     An image does not fit if its median residual is above `outlier_min_px` and above `MAX_MEDIAN_RATIO` times that of
-    most images. All images of its keyframe are rejected: which of them was late is unknown.
+    the camera's median image. All images of its keyframe are rejected, because the late one is not known.
     """
     shared = _shared_keyframes(cameras)
     bad = np.zeros(len(shared), dtype=bool)
     for camera, out in zip(cameras, outputs, strict=True):
-        size = np.linalg.norm(camera.errors(out), axis=1)  # an image that is late errs in common
+        size = np.linalg.norm(camera.errors(out), axis=1)  # common errors of views included
         medians = grouped_quantiles(size, camera.stream.image, len(camera.keyframe), 0.5)
         own = shared[camera.keyframe] & np.isfinite(medians)
         if own.any():
@@ -42,7 +42,7 @@ def not_simultaneous(
 
 
 def _shared_keyframes(cameras: Sequence[CornerFactor]) -> np.ndarray:
-    """(K,) bool: keyframes with images of two or more cameras; K is one more than the last that has an image."""
+    """(K,) bool: keyframes with images of two or more cameras; keyframe K - 1 is the last one with an image."""
     count = np.zeros(1 + max(int(c.keyframe.max(initial=-1)) for c in cameras), dtype=np.int64)
     for camera in cameras:
         count[np.unique(camera.keyframe)] += 1

@@ -1,4 +1,4 @@
-"""Images of cameras: corners and tracks on the same images, their instants and keyframes, and which are used."""
+"""Images of cameras: a common list of images for corners and tracks, image instants, keyframes, and images in use."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _NONE = np.zeros(0, dtype=np.int64)
 
 
 def on_common_images(rig: Rig, recording: Measurements) -> Measurements:
-    """The recording with a stream of corners and one of tracks for each camera of `rig`, on the same images; either may
-    be empty. Without any tracks it stays as it is.
+    """The recording with a corner stream and a track stream for each camera of `rig`, both with the same images.
 
-    Raises EstimationError naming a camera that saw nothing, or tracks without an IMU and a target.
+    Either stream may have no observations. A recording without any tracks is returned unchanged. Raises
+    EstimationError if there are tracks without an IMU, or naming a camera with neither corners nor tracks.
     """
     if not recording.tracks:
         return recording
@@ -38,6 +38,8 @@ def on_common_images(rig: Rig, recording: Measurements) -> Measurements:
 
 
 def _together(name: str, corners: CornerStream | None, tracks: TrackStream | None) -> tuple[CornerStream, TrackStream]:
+    """Both streams of one camera on the union of their images; None counts as empty. Raises EstimationError if both are
+    empty."""
     streams = [s for s in (corners, tracks) if s is not None and len(s.uv)]
     if not streams:
         raise EstimationError(f"{name} has neither corners nor tracks; check its fields in the rig file.")
@@ -53,29 +55,30 @@ def _together(name: str, corners: CornerStream | None, tracks: TrackStream | Non
 
 
 def _start(stamps: np.ndarray, stream: CornerStream | TrackStream) -> np.ndarray:
-    """(M + 1,) the stream's groups among the images at `stamps` (M,), empty where it has none."""
+    """(M + 1,) start of the stream's rows of each image in `stamps` (M,) ns; images it lacks have no rows."""
     count = np.zeros(len(stamps), dtype=np.int64)
     count[np.searchsorted(stamps, stream.stamps_ns)] = np.diff(stream.start)
     return np.concatenate([[0], np.cumsum(count)])
 
 
 def image_times(measurements: Measurements, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
-    """By camera (M,) instants of the images, s on the body's clock since its first stamp."""
+    """For each camera (M,) instants of its images, s on the body's clock since its first stamp."""
     return [instants(c, values) for c in measurements.cameras]
 
 
 def keyframes_of(
     scheme: Scheme, state: State, times: np.ndarray, images: list[slice], imu: ImuData | None
 ) -> np.ndarray:
-    """(M,) index of the keyframe of each image, one of its own recording. times (M,) s: instants of the images;
-    images: those of each recording."""
+    """(M,) index of the keyframe from which the pose of each image follows, in the same recording.
+
+    times (M,) s: instants of the images; images: the range of images of each recording."""
     forwards, pairs = imu is not None and imu.forwards, zip(images, state.recordings, strict=True)
     return np.concatenate([assign_keyframes(scheme, state.seconds[k], times[i], forwards) + k.start for i, k in pairs])
 
 
 def are_used(imu: ImuData | None, times: np.ndarray, keyframes: np.ndarray, max_gap_s: float) -> np.ndarray:
-    """(M,) bool: images that take part: the IMU was running, with gaps of `max_gap_s` at most; without an IMU, those
-    taken at their keyframe. times (M,) s of the images, keyframes (M,) s of the keyframe of each."""
+    """(M,) bool: images in use. With an IMU, those within its recording, outside gaps longer than `max_gap_s`. Without
+    an IMU, those taken at their keyframe. times, keyframes (M,) s: instants of each image and of its keyframe."""
     if imu is None:
         return np.abs(times - keyframes) <= MERGED_WITHIN_S
     return usable(imu, times, max_gap_s)

@@ -1,4 +1,4 @@
-"""How a camera enters the problem: by corners of the target, and by feature tracks that several cameras may share."""
+"""Sensor model of cameras: parameters, noise and factors of target corners and of feature tracks."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ from icalib.sensors.camera.image_times import are_used, keyframes_of
 from icalib.sensors.camera.spec import BLOOM
 from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 
-NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions need no more
-COARSE_TRACK_S = 0.5  # longest track of an early pass: short ones cost little, and poses far from the truth fit them
-ENOUGH_USED = 0.8  # share of the observations of tracks that take part, above which no further pass is tried
-MORE_USED = 1.1  # ratio of observations that would take part to those that do, above which the pass is repeated
+NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # directions without bloom; single precision is enough for directions
+COARSE_TRACK_S = 0.5  # s, longest track of an early pass: short tracks are cheap, and rough poses still fit them
+ENOUGH_USED = 0.8  # share of track observations in use, above which no further pass is tried
+MORE_USED = 1.1  # observations usable at the end of a pass over those in use, above which the pass is repeated
 
 
 @dataclass(frozen=True)
 class CameraNoise:
     """Noise and inliers of one camera.
 
-    model: the size of its corners' errors; corners: the same for each corner. keep (N,) bool: corners in use; late (M,)
-    bool: images that are rejected because they are not simultaneous with others of their keyframe. tracks: of its
-    feature tracks; None where no camera has any.
+    model: parameters of the corner noise; corners: the noise of each corner by this model. keep (N,) bool: corners in
+    use. late (M,) bool: images that are rejected because they are not simultaneous with others of their keyframe.
+    tracks: noise and inliers of its feature tracks; None if no camera has any.
     """
 
     model: NoiseModel
@@ -63,30 +63,32 @@ class CameraNoise:
 
 
 class CameraSensorModel(SensorModel[Camera, CameraNoise]):
-    """Without an IMU images at one stamp are simultaneous, and the first camera that sees a target is the body."""
+    """Sensor model of cameras. Without an IMU, images with equal stamps are simultaneous."""
 
     keyframes = "images"
     refitted = CORNERS
 
     def is_estimated(self, sensor: Camera, spec: ParameterSpec, rig: Rig) -> bool:
-        """See `SensorModel`; bloom only where the target has edges that it moves."""
+        """See `SensorModel`. Bloom is estimated only if the target has edges that it shifts.
+
+        Without an IMU, time offsets and the extrinsics of the reference camera are not estimated."""
         if rig.imu is None and (spec == TIME_OFFSET or (sensor.name == rig.reference and spec in MOUNTED)):
             return False
         return sensor.is_estimated(spec) and (spec != BLOOM or rig.blooms)
 
     def start_value(self, sensor: Camera, spec: ParameterSpec, rig: Rig) -> np.ndarray | None:
-        """See `SensorModel`; no bloom where it is not modelled."""
+        """See `SensorModel`. Bloom that is not modelled is zero."""
         if spec == BLOOM and not rig.blooms:
             return np.zeros(BLOOM.size)
         return super().start_value(sensor, spec, rig)
 
     def scaled_noise(self, noise: CameraNoise, scale: float) -> CameraNoise:
-        """See `SensorModel`; that of the corners."""
+        """See `SensorModel`: scales sigma of the corners."""
         sigma = noise.corners.sigma
         return replace(noise, corners=replace(noise.corners, sigma=(scale * sigma).astype(sigma.dtype)))
 
     def first_noises(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> dict[str, CameraNoise]:
-        """Stated noise or a usual one, and all corners and observations of tracks."""
+        """For each camera the noise of the rig file or a default, with all corners and track observations in use."""
         noise, tracks = {}, {t.name: t for t in measurements.tracks}
         for camera, stream in zip(sensors, measurements.cameras, strict=True):
             model, keep = first_noise(camera), np.ones(len(stream.uv), dtype=bool)
@@ -98,7 +100,9 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
     def next_noises(
         self, sensors: Sequence[Camera], noise: Mapping[str, CameraNoise], end: PassEnd
     ) -> dict[str, CameraNoise]:
-        """Outliers and late images of the pass are rejected; noise that is not stated is estimated."""
+        """For each camera the noise of the next pass.
+
+        Rejects outliers and images that are not simultaneous. Estimates noise that the rig file does not state."""
         pairs, settings = pairs_of(end.factors, end.residuals, CornerFactor), end.rig.settings
         late, found = _late_images(pairs, end), _next_tracks(sensors, noise, end)
         estimated = _noise_is_estimated(sensors, [c.stream for c, _ in pairs], bool(of_tracks(end.factors)), settings)
@@ -111,8 +115,9 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
         return found
 
     def passes(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> int:
-        """One for noise, or for outliers of tracks, which show once the lens is known; two for errors that the corners
-        of an image share."""
+        """Passes needed to estimate noise and inliers: two with common errors of an image, else one, or zero.
+
+        Outliers of tracks need a pass even if all noise is stated, because they show only once the lens is known."""
         settings, tracked = rig.settings, bool(measurements.tracks)
         estimated = _noise_is_estimated(sensors, measurements.cameras, tracked, settings)
         if not (estimated or (tracked and settings.outlier_std > 0.0)):
@@ -120,37 +125,39 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
         return 2 if settings.common_error else 1
 
     def factors(self, sensor: Camera, stream: CornerStream, noise: CameraNoise, at: Pass) -> Iterator[CornerFactor]:
-        """One, of the corners of the target, of which there may be none."""
+        """Yields the corner factor of the camera, which may have no corners."""
         yield corner_factor(sensor, stream, noise, at)
 
     def still_factors(
         self, sensor: Camera, stream: CornerStream, noise: CameraNoise, at: Pass
     ) -> Iterator[CornerFactor]:
-        """As `factors`."""
+        """Yields the corner factor of the camera, as `factors` does."""
         yield corner_factor(sensor, stream, noise, at)
 
     def joint_factors(
         self, sensors: Sequence[Camera], factors: Sequence[Factor], noise: Mapping[str, CameraNoise], at: Pass
     ) -> tuple[FeatureFactor, ...]:
-        """One of all feature tracks, where there are any."""
+        """One factor of the feature tracks of all cameras; none without tracks."""
         cameras = tuple(f for f in factors if isinstance(f, CornerFactor))
         tracks = [own for s in sensors if (own := noise[s.name].tracks) is not None]
         return (feature_factor(cameras, tracks, at),) if tracks else ()
 
     def uses_more(self, used: Mapping[FactorKey, Factor], rebuilt: Callable[[], Mapping[FactorKey, Factor]]) -> bool:
-        """See `SensorModel`: of tracks whose points the first poses of the pass did not find, and its last ones do."""
+        """See `SensorModel`: whether the final poses of the pass locate many more track points than its first poses."""
         (now,) = of_tracks(used) or (None,)
         if now is None or now.n_used > ENOUGH_USED * sum(int(k.sum()) for k in now.keep):
             return False
         return any(f.n_used > MORE_USED * now.n_used for f in of_tracks(rebuilt()))
 
     def clusters(self, factors: Mapping[FactorKey, Factor]) -> Iterator[Clusters]:
-        """See `error_clusters`."""
+        """Clusters of corners and track observations whose errors may correlate, see `error_clusters`."""
         return error_clusters(of_type(factors, CornerFactor), of_tracks(factors))
 
 
 def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: Pass) -> CornerFactor:
-    """The corners of one camera with lens and poses of `at`. Early passes leave out corrections that need the lens."""
+    """The corner factor of one camera, with lens and poses of `at`.
+
+    Early (coarse) passes leave out the corrections of circle centres and edge curvature, which need a good lens."""
     rig, state, imu = at.rig, at.state, at.imu
     scheme = rig.settings.scheme if imu is not None else "inertial"
     times, images = instants(stream, state.values), [part.own[camera.name] for part in at.parts]
@@ -166,7 +173,9 @@ def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: 
 
 
 def feature_factor(cameras: tuple[CornerFactor, ...], selected: Sequence[TrackSelection], at: Pass) -> FeatureFactor:
-    """The feature tracks of all cameras, as far as the poses of `at` find their points; `selected`: by camera."""
+    """The factor of the feature tracks of all cameras whose points can be triangulated with the poses of `at`.
+
+    selected: noise and inliers of each camera's tracks."""
     settings, state = at.rig.settings, at.state
     streams = tuple(
         with_curved_patches(t, c.model, c.lens(state)) for t, c in zip(at.measurements.tracks, cameras, strict=True)
@@ -183,12 +192,12 @@ def feature_factor(cameras: tuple[CornerFactor, ...], selected: Sequence[TrackSe
 
 
 def of_tracks(factors: Mapping[FactorKey, Factor]) -> tuple[FeatureFactor, ...]:
-    """The factor of feature tracks; empty where there are none."""
+    """The factor of feature tracks in a tuple, which is empty without tracks."""
     return of_type(factors, FeatureFactor)
 
 
 def _surfaces(at: Pass) -> Surfaces | None:
-    """Planes that points of the scene lie on, where the rig file says that they do."""
+    """LiDAR planes that tracked points may lie on; None without planes, or if `points_on_planes_m` is 0."""
     clouds, noise, streams = at.clouds, at.rig.settings.points_on_planes_m, at.measurements.streams
     if not clouds.count or noise == 0.0:
         return None
@@ -199,8 +208,9 @@ def _surfaces(at: Pass) -> Surfaces | None:
 
 
 def _late_images(pairs: Sequence[tuple[CornerFactor, CornerOutput]], end: PassEnd) -> list[np.ndarray]:
-    """By camera (M,) bool: images that are not simultaneous with others of their keyframe. Tested in rigs of
-    cameras alone."""
+    """For each camera (M,) bool: images that are not simultaneous with others of their keyframe.
+
+    Tested only in rigs of cameras alone with two or more cameras; else all False."""
     settings = end.rig.settings
     if len(pairs) < 2 or not end.rig.cameras_alone or settings.outlier_std <= 0.0:
         return [np.zeros(len(c.keyframe), dtype=bool) for c, _ in pairs]
@@ -208,7 +218,7 @@ def _late_images(pairs: Sequence[tuple[CornerFactor, CornerOutput]], end: PassEn
 
 
 def _next_tracks(cameras: Sequence[Camera], noise: Mapping[str, CameraNoise], end: PassEnd) -> dict[str, CameraNoise]:
-    """The noise of each camera with the tracks of the next pass."""
+    """The present noise of each camera, with the track selection of the next pass."""
     found = {c.name: noise[c.name] for c in cameras}
     for factor, out in pairs_of(end.factors, end.residuals, FeatureFactor):
         now = [own for c in cameras if (own := noise[c.name].tracks) is not None]
@@ -221,7 +231,7 @@ def _next_tracks(cameras: Sequence[Camera], noise: Mapping[str, CameraNoise], en
 def _next_corner_noise(
     camera: Camera, factor: CornerFactor, out: CornerOutput, end: PassEnd
 ) -> tuple[NoiseModel, CornerNoise]:
-    """The noise of corners in the next pass, as the residuals of this one show it."""
+    """The corner noise of the next pass, estimated from the residuals `out` of this pass."""
     settings = end.rig.settings
     if not factor.sees_target:
         return first_noise(camera), factor.noise
@@ -238,7 +248,8 @@ def _next_corner_noise(
 def _noise_is_estimated(
     cameras: Sequence[Camera], streams: Sequence[CornerStream], tracked: bool, settings: Settings
 ) -> bool:
-    """Whether residuals show some of the noise of corners or tracks; streams: the corners of each camera."""
+    """Whether some noise of corners or tracks is estimated from residuals. streams: corners of each camera; tracked:
+    whether there are feature tracks."""
     cornered = [c for c, s in zip(cameras, streams, strict=True) if len(s.uv)]
     return (
         (bool(cornered) and (settings.blur_noise or settings.common_error))

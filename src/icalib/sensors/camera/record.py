@@ -1,4 +1,4 @@
-"""Residuals of images: corners of a target, and observations of tracked points of the scene."""
+"""Residuals of images, as a result stores them: target corners, and observations of tracked scene points."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _IMAGES: Shapes = {
 
 
 class _PointsInImages:
-    """Base of both records: residuals of points, image by image."""
+    """Base class of both records: residuals of N points, image by image."""
 
     kind: str
     start: np.ndarray
@@ -36,15 +36,17 @@ class _PointsInImages:
 
     @property
     def whitened(self) -> np.ndarray:
-        """(N, 2) residuals over their standard deviations; NaN where there is no residual."""
+        """(N, 2) residuals over their standard deviations; NaN for observations without a residual."""
         return self.residual / self.sigma[:, None]
 
     def normalised(self) -> dict[str, np.ndarray]:
-        """Whitened residuals in use, both coordinates together, by a title."""
+        """Whitened residuals in use, u and v in one array, keyed by the title of their plot."""
         return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
 
     def successive(self) -> dict[str, Successive]:
-        """Whitened residuals, and which pairs are of one corner or track in two consecutive images."""
+        """Whitened residuals in use by kind, ordered by point and image, with a flag for each successive pair.
+
+        The flag tells whether both residuals are of one point in two consecutive images."""
         image, point = image_of(self), self.point
         order = np.lexsort((image, point))
         order = order[self.used[order]]
@@ -54,7 +56,7 @@ class _PointsInImages:
 
 @dataclass(frozen=True)
 class CornerResiduals(_PointsInImages):
-    """Residuals (predicted - measured) of one camera's corners, in the recording's order; rejected ones stay."""
+    """Residuals (predicted - measured) of one camera's corners, in recorded order, rejected corners included."""
 
     kind: str = field(default="corners", init=False)
     shapes: ClassVar[Shapes] = _IMAGES
@@ -65,7 +67,7 @@ class CornerResiduals(_PointsInImages):
     point: np.ndarray  # (N,) index into the target's points
     uv: np.ndarray  # (N, 2) measured, px; corrected for edge curvature by the estimate where icalib detected them
     residual: np.ndarray  # (N, 2) px
-    sigma: np.ndarray  # (N,) px, standard deviation that the corner was given
+    sigma: np.ndarray  # (N,) px, standard deviation per axis assumed by the estimate
     rejected: np.ndarray  # (N,) bool
 
     @property
@@ -76,12 +78,11 @@ class CornerResiduals(_PointsInImages):
 
 @dataclass(frozen=True)
 class TrackResiduals(_PointsInImages):
-    """Residuals (predicted - measured) of tracked points in the images of one camera, in the recording's order, with
-    each point at its least-squares position.
+    """Residuals (predicted - measured) of tracked points in the images of one camera, in recorded order.
 
-    The residual is NaN where an observation is not used: it is rejected, or its track is too short, its point
-    uncertain, or its fit far worse than most. distance: m, median of the points in use from the camera; None without
-    any.
+    Each point is at its least-squares position. The residual is NaN if the observation is not used: it is rejected, or
+    its track is too short, its point uncertain, or its fit far worse than most. distance: median distance [m] of the
+    points from the camera; None without points.
     """
 
     kind: str = field(default="observations", init=False)
@@ -94,7 +95,7 @@ class TrackResiduals(_PointsInImages):
     point: np.ndarray  # (N,) number of the point of the scene, the same in all cameras
     uv: np.ndarray  # (N, 2) measured, px
     residual: np.ndarray  # (N, 2) float32 px
-    sigma: np.ndarray  # (N,) px, standard deviation that the observation was given
+    sigma: np.ndarray  # (N,) px, standard deviation per axis assumed by the estimate
     rejected: np.ndarray  # (N,) bool
 
     @property

@@ -31,7 +31,7 @@ _LENS_WORDS = (
 
 
 def sections(c: Calibration) -> Iterator[Section]:
-    """Residuals in images, if there are any, and the uncertainty of each lens."""
+    """Sections of the report: residuals in images, if there are any, and the projection uncertainty of each lens."""
     if c.image_residuals:
         figures, parts = {}, []
         for i, r in enumerate(c.image_residuals):
@@ -50,7 +50,7 @@ def sections(c: Calibration) -> Iterator[Section]:
 
 
 def _counts(r: ImageResiduals) -> str:
-    """Numbers of residuals in use, of rejected ones, and of those left out with their tracks."""
+    """Text with the numbers of residuals that are used, rejected, and left out with their tracks."""
     used, rejected = int(r.used.sum()), int(r.rejected.sum())
     left_out = len(r.uv) - used - rejected
     more = f", {left_out} left out with their tracks" if left_out else ""
@@ -58,8 +58,9 @@ def _counts(r: ImageResiduals) -> str:
 
 
 def _projection_section(c: Calibration) -> Section:
-    """Maps of projection uncertainty, as `projection-i-0` and `projection-i-1` of camera i; a sentence if its lens is
-    fixed."""
+    """Section with maps of projection uncertainty, named `projection-i-0` and `projection-i-1` for camera i.
+
+    A camera with a fixed lens has a sentence instead."""
     figures, parts = {}, []
     for i, name in enumerate(c.cameras):
         size, seen = c.rig["sensors"][name]["resolution"], [r for r in c.image_residuals if r.sensor == name]
@@ -75,14 +76,14 @@ def _projection_section(c: Calibration) -> Section:
 
 
 def curves(r: ImageResiduals) -> Iterator[ResidualCurve]:
-    """RMS [px] of each image with points in use."""
+    """Curve of the residual RMS [px] per image over time, for images with points in use."""
     rms = rms_of_images(r)
     some = np.isfinite(rms)
     yield ResidualCurve(r.kind, r.seconds[some], rms[some, None], (f"RMS of {r.kind} [px]",))
 
 
 def amounts(c: Calibration) -> Iterator[str]:
-    """Numbers of images, corners and observations."""
+    """Text with the numbers of images, corners and track observations."""
     if c.cameras:
         images = sum(len(r.seconds) for r in c.corner_residuals)
         counts = {kind: sum(len(r.uv) for r in c.image_residuals if r.kind == kind) for kind in _SEEN}
@@ -91,12 +92,14 @@ def amounts(c: Calibration) -> Iterator[str]:
 
 
 def shape(c: Calibration, name: str, spread: float) -> np.ndarray:
-    """The field of view of a camera, in its frame; spread: of the rig [m]."""
+    """Line vertices (n, 3) [m] of the camera's field of view, in its frame; spread: extent of the rig [m]."""
     return _frustum(c, name, 0.45 * spread)
 
 
 def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:
-    """Edges of the field of view to `depth`, in the camera's frame, without distortion, inside 60 deg of the axis."""
+    """Line vertices (n, 3) [m] of the pyramid of the field of view up to `depth` [m], in the camera frame.
+
+    Distortion is ignored, and each side is at most 60 deg from the axis."""
     fx, fy, cx, cy = c.group(name, "intrinsics").value
     width, height = c.rig["sensors"][name]["resolution"]
     u, v = np.array([0, width, width, 0]) - 0.5, np.array([0, 0, height, height]) - 0.5

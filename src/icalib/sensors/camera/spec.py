@@ -34,7 +34,7 @@ INTRINSICS = ParameterSpec(
     motion="show the target at different distances, tilted, and in every part of the image",
     motion_without_target="move so that near and far points of the scene cross the whole image",
 )
-# For polynomial models; `Camera.specs` adapts it to the camera's own model.
+# Distortion of polynomial models; `Camera.specs` adapts size, labels, tolerance and prior to the camera model.
 DISTORTION = ParameterSpec(
     name="distortion",
     size=4,
@@ -60,13 +60,15 @@ BLOOM = ParameterSpec(
     by_images=True,
     motion="show the target from more distances",
 )
-LENS = (INTRINSICS.name, DISTORTION.name)  # the groups of parameters of the camera model
+LENS = (INTRINSICS.name, DISTORTION.name)  # parameter groups of the camera model
 TRACK_IMAGES = "images"  # value of `tracks`: feature tracks are found in the images
 
 
 @dataclass(frozen=True)
 class Camera(MountedSensor):
-    """One camera. Intrinsics are (fx, fy, cx, cy) in pixels, distortion the model's coefficients."""
+    """One camera of the rig file. Intrinsics are (fx, fy, cx, cy) in pixels, distortion the coefficients of `model`.
+
+    path: table of corners; resolution: (width, height) px."""
 
     sensor_type: ClassVar[str] = "camera"
     noun: ClassVar[str] = "camera"
@@ -76,21 +78,21 @@ class Camera(MountedSensor):
     path: str
     model: str
     resolution: tuple[int, int]
-    corner_noise_px: float | None = None  # None: estimated from the residuals
+    corner_noise_px: float | None = None  # standard deviation per axis; None: estimated from residuals
     intrinsics: Parameter = Parameter()
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()
-    topic: str | None = None  # of its images; None: the one with the camera's name, or the only one
+    topic: str | None = None  # topic of its images; None: the topic with the camera's name, or the only image topic
     tracks: str | None = None  # path of a table of feature tracks, or TRACK_IMAGES
-    track_noise_px: float | None = None  # None: estimated from the residuals
-    layout: TableLayout = PLAIN_TABLE  # of its table of tracks, or else of corners
+    track_noise_px: float | None = None  # standard deviation per axis; None: estimated from residuals
+    layout: TableLayout = PLAIN_TABLE  # columns of its table of tracks, or of corners if it has no tracks
 
     def __post_init__(self) -> None:
-        known = self.model in CAMERA_MODELS  # an unknown model is refused where it is used
+        known = self.model in CAMERA_MODELS  # other code raises the error for an unknown model
         check_sizes(self, self.specs() if known else MOUNTED)
 
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """As in `Sensor`; labels, tolerance and prior of distortion follow from the camera model."""
+        """See `Sensor`. Size, labels, tolerance and prior of distortion follow from the camera model."""
         model = camera_model(self.model)
         names, scale = model.parameter_names[len(INTRINSICS.labels) :], model.distortion_scale
         assert isinstance(DISTORTION.tolerance, float)

@@ -1,4 +1,4 @@
-"""What a camera saw: corners of the target, and feature tracks."""
+"""Measurements of a camera: corners of the target, and feature tracks."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from icalib.sensors.stream import Stream, check, check_groups, which_image
 
-EDGE = 7  # columns that describe the fit of an edge, see `CornerStream`
+EDGE = 7  # number of columns that describe the fit of an edge, see `CornerStream`
 NO_EDGES = np.zeros((0, 2, EDGE), dtype=np.float32)
 NO_VIEWS = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class _ImageStream(Stream):
-    """Observations in images; those of image i are rows start[i]:start[i + 1]."""
+    """Observations in M images. start (M + 1,): the rows of image i are start[i]:start[i + 1]."""
 
     sensor_type: ClassVar[str] = "camera"
     start: np.ndarray
@@ -37,12 +37,12 @@ class CornerStream(_ImageStream):
     centre of the top-left pixel; sigma (N,) pixels, the detector's standard deviation of each corner per axis up to a
     factor common to all, (0,) if it states none.
 
-    edges (N, 2, EDGE) float32, (0, 2, EDGE) if it states none: the fits of the two edges that meet in each corner.
-    Columns: ends (2,) and (2,) px of the fitted piece, relative to the corner; gain (2,) px^2, derivative of the corner
-    by the curvature of the edge; fitted curvature [1 / px]. It is positive if the piece turns left on its way from the
-    first end to the second, with u to the right and v down.
+    edges (N, 2, EDGE) float32: fits of the two edges that meet in each corner; (0, 2, EDGE) if the detector states
+    none. Columns: first end (2,) and second end (2,) px of the fitted piece, relative to the corner; gain (2,) px^2,
+    derivative of the corner by the curvature of the edge; fitted curvature [1 / px]. The curvature is positive if the
+    piece turns left from the first end to the second, with u to the right and v down.
 
-    files: names of the files that images come from, by stamp, "" for those of no file; also of images without corners.
+    files: file name of each image by stamp, "" if it is from no file; images without corners may be included.
     """
 
     point: np.ndarray
@@ -64,7 +64,7 @@ class CornerStream(_ImageStream):
         check(fits, f"{self.name}: edges must have shape ({n}, 2, {EDGE}), not {self.edges.shape}.")
 
     def of_rows(self, rows: np.ndarray, stamps_ns: np.ndarray, count: np.ndarray) -> CornerStream:
-        """The corners of `rows` (indices or a mask), grouped into images at stamps_ns (M,) with count (M,) each."""
+        """The corners `rows` (indices or mask), grouped into images at stamps_ns (M,) with count (M,) corners each."""
         start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
         sigma, edges = (x[rows] if len(x) else x for x in (self.sigma, self.edges))
         point, uv, files = self.point[rows], self.uv[rows], self.files
@@ -77,12 +77,12 @@ class CornerStream(_ImageStream):
         return replace(super().joined(streams, shifts_ns), files=files)
 
     def which(self, stamp_ns: int) -> str:
-        """Name of the image with this stamp in sentences: its file, or its stamp."""
+        """Text that names the image with this stamp in messages: its file, or else its stamp."""
         return which_image(self.files.get(stamp_ns, ""), stamp_ns)
 
     @property
     def relative_sigma(self) -> np.ndarray:
-        """(N,) standard deviation of each corner over that of the median corner; ones if the detector states none."""
+        """(N,) detector's standard deviation of each corner, over that of the median corner; ones if it states none."""
         return self.sigma / np.median(self.sigma) if len(self.sigma) else np.ones(len(self.uv))
 
 
@@ -112,12 +112,12 @@ class TrackStream(_ImageStream):
 
     @property
     def key(self) -> str:
-        """See `Stream`; not the name of the camera, which is the key of its corners."""
+        """See `Stream`: the camera's name with a suffix, because the name alone is the key of its corners."""
         return f"{self.name}/tracks"
 
     @classmethod
     def disjoint(cls, recordings: Sequence[Sequence[Any]]) -> Sequence[Sequence[Self]]:
-        """See `Stream`: features are renumbered, so that recordings share none; cameras of one recording still do."""
+        """See `Stream`: renumbers features, so that recordings share none; cameras of one recording still do."""
         numbered, first = [], 0
         for streams in recordings:
             least = min((int(t.feature.min(initial=0)) for t in streams), default=0)
@@ -127,13 +127,14 @@ class TrackStream(_ImageStream):
         return numbered
 
     def which(self, stamp_ns: int) -> str:
-        """Name of the image with this stamp in sentences: its file, or its stamp."""
+        """Text that names the image with this stamp in messages: its stamp."""
         return which_image("", stamp_ns)
 
 
 def shared_rows(start: np.ndarray, feature: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (n,) in image i and rows (n,) in image j of the features that both show; start (M + 1,), feature (N,) as in
-    `TrackStream`."""
+    """Rows (n,) of image i and rows (n,) of image j that observe the same features.
+
+    start (M + 1,), feature (N,): see `TrackStream`."""
     own, other = feature[start[i] : start[i + 1]], feature[start[j] : start[j + 1]]
     _, p, q = np.intersect1d(own, other, return_indices=True)
     return p + start[i], q + start[j]
