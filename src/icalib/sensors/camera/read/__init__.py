@@ -1,4 +1,4 @@
-"""Images, tables of corners and tables of feature tracks -> checked streams of cameras."""
+"""Reads images, tables of corners and tables of feature tracks into checked streams of cameras."""
 
 from __future__ import annotations
 
@@ -36,11 +36,13 @@ UNREAD = (
 
 
 def _corner_stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    """(M,) int64 ns: one stamp for each image of the corner table at `path`."""
     del layout
     return np.unique(read_table(path, CORNER_TABLE).integers[:, 0])
 
 
 def _track_stamps(path: Path, layout: TableLayout) -> np.ndarray:
+    """(M,) int64 ns: one stamp for each image of the track table at `path`."""
     del layout
     return read_track_stamps(path)
 
@@ -52,33 +54,34 @@ TABLES = (
 
 
 def read(recording: Recording, sensors: Sequence[Camera], reading: Reading) -> list[ReadStream]:
-    """Feature tracks of each camera that has some, and corners of each that sees the target, from its table or its
-    images; with notes. Raises RecordingError as the readers do, and if cameras share images."""
+    """Streams of feature tracks, then of corners, each with notes, from tables or images of the cameras.
+
+    Raises RecordingError if data are missing or cannot be read, or if two cameras share an image topic."""
     return _tracks(recording, sensors, reading) + _corners(recording, sensors, reading)
 
 
 def where(recording: Recording, camera: Camera) -> str:
-    """How a sentence names the place of the corners, or of the images."""
+    """Text that names the source of the camera's corners in messages: its table, or its image topic."""
     if has_corners(recording, camera):
         return str(recording.table(camera, camera.path))
     return recording.place(recording.image_topic(camera))
 
 
 def has_corners(recording: Recording, camera: Camera) -> bool:
-    """Whether there is a table of the camera's corners; otherwise they are detected in its images."""
-    # Without corners and images, the error names the missing table.
+    """Whether corners of the camera are read from a table; otherwise they are detected in its images."""
+    # Also true without table and images, so that the reader raises an error that names the missing table.
     return not recording.has_messages and (recording.find(camera.path) is not None or not recording.image_topics())
 
 
 def sees(recording: Recording, camera: Camera) -> bool:
-    """Whether there are images or corners of the camera."""
+    """Whether the recording has images, or a corner table of the camera."""
     return bool(recording.image_topics()) or (
         has_corners(recording, camera) and recording.find(camera.path) is not None
     )
 
 
 def corners(recording: Recording, camera: Camera, target: Target) -> CornerStream:
-    """All corners of the camera's table, grouped by image, images in order.
+    """All corners of the camera's table, grouped by image, in temporal order.
 
     Raises RecordingError naming file and line or instant where the data are missing or cannot be read, where images are
     out of order, where a corner appears twice in an image, and where it is not on the target.
@@ -101,7 +104,7 @@ def tracks(recording: Recording, camera: Camera) -> TrackStream:
 
 
 def image_topics(recording: Recording, cameras: Sequence[Camera]) -> dict[str, str]:
-    """Topic of the images, by camera name. Raises RecordingError if two cameras would share one."""
+    """Image topic by camera name. Raises RecordingError if two cameras would share a topic."""
     chosen: dict[str, str] = {}
     for camera in cameras:
         topic = recording.image_topic(camera)
@@ -115,6 +118,8 @@ def image_topics(recording: Recording, cameras: Sequence[Camera]) -> dict[str, s
 
 
 def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadStream]:
+    """Track streams of the cameras with tracks, each with notes. Features of images are numbered above those of tables,
+    so that they share none."""
     pictured = [c for c in cameras if c.tracks_images]
     tables = {c.name: tracks(recording, c) for c in cameras if c.tracks is not None and not c.tracks_images}
     image_topics(recording, pictured)
@@ -127,6 +132,7 @@ def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -
 
 
 def _corners(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadStream]:
+    """Checked corner streams of the cameras that may see the target, each with notes; none without a target."""
     target = reading.rig.target
     seeing = [c for c in cameras if reading.rig.has_target and (c.tracks is None or sees(recording, c))]
     pictured = [c for c in seeing if not has_corners(recording, c)]

@@ -1,4 +1,4 @@
-"""CameraInfo messages of ROS: what a driver states about its camera."""
+"""CameraInfo messages of ROS: resolution and intrinsics that a camera driver states."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from icalib.data.messages.streams import HasMessages
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """What a driver states: resolution (width, height) px; distortion model, by its name in ROS, with its coefficients;
-    K (3, 3) px."""
+    """Intrinsics that a driver states.
+
+    resolution: (width, height) px; model: ROS name of the distortion model; distortion (n,): its coefficients; K (3, 3)
+    px: camera matrix."""
 
     resolution: tuple[int, int]
     model: str
@@ -21,7 +23,7 @@ class CameraInfo:
 
 
 def read_camera_info(bag: HasMessages, topic: str) -> CameraInfo:
-    """The first CameraInfo of `topic`. Raises RecordingError as `BagRecording.messages`."""
+    """The first CameraInfo message of `topic`. Raises RecordingError as `BagRecording.messages` does."""
     _, m = next(bag.messages(topic, "camera info"))
     d, k = (m.D, m.K) if hasattr(m, "K") else (m.d, m.k)  # ROS 1, ROS 2
     return CameraInfo((m.width, m.height), m.distortion_model, np.array(d), np.array(k).reshape(3, 3))

@@ -1,4 +1,4 @@
-"""Checks of corners and tracks against the resolution of their camera, and of stamps and counts."""
+"""Checks corners and tracks: image bounds, order and rate of stamps, and number of corners per image."""
 
 from __future__ import annotations
 
@@ -8,20 +8,19 @@ from icalib.data.measurements import CornerStream, TrackStream
 from icalib.data.stamps.clocks import rate_sentence
 from icalib.errors import RecordingError
 
-IMAGE_RATE_HZ = (1e-3, 1000.0)  # slowest and fastest that a camera takes images
-_MIN_IMAGE_CORNERS = 4  # fewer do not determine a pose
-_CORNER_MARGIN_PX = 1.0  # outside the image, which corner refinement may reach
-_MAX_OUTSIDE_SHARE = 0.1  # share of all points: more are of a camera with another resolution
+IMAGE_RATE_HZ = (1e-3, 1000.0)  # plausible range of image rates
+_MIN_IMAGE_CORNERS = 4  # corners of an image; fewer do not determine a pose
+_CORNER_MARGIN_PX = 1.0  # accepted distance outside the image, which corner refinement may cause
+_MAX_OUTSIDE_SHARE = 0.1  # of all points; more points outside mean that the stated resolution is wrong
 
 
 def checked_corners(
     corners: CornerStream, where: str, resolution: tuple[int, int]
 ) -> tuple[CornerStream, tuple[str, ...]]:
-    """`corners` without single ones outside the image of `resolution` (width, height) px, and without images of fewer
-    than four; and notes on these.
+    """The corners inside the image of `resolution` (width, height) px, in images with four or more; notes on others.
 
-    Raises RecordingError naming `where` (the file) and the instant: no usable images, many corners outside the image,
-    images at an impossible rate.
+    Raises RecordingError naming `where` (the file or topic) if there are no usable images, many corners are outside the
+    image, or the image rate is impossible.
     """
     what = f"{where} ({corners.name})"
     if len(corners.stamps_ns) == 0:
@@ -35,7 +34,7 @@ def checked_corners(
 
 
 def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tuple[CornerStream, tuple[str, ...]]:
-    """The corners inside the image, and a note on the others. Raises RecordingError if there are many others."""
+    """The corners inside the image, and a note on corners outside. Raises RecordingError if many are outside."""
     inside = in_image(corners.uv, resolution, _CORNER_MARGIN_PX)
     if inside.all():
         return corners, ()
@@ -46,7 +45,7 @@ def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tu
 
 
 def image_starts(what: str, stamps_ns: np.ndarray) -> np.ndarray:
-    """(M + 1,) first row of each image, and the number of rows; stamps_ns (N,) of the rows.
+    """(M + 1,) first row of each image, then the number of rows N. stamps_ns (N,): stamp of each row.
 
     Raises RecordingError naming `what` and the instant if images are out of order."""
     step = np.diff(stamps_ns)
@@ -60,16 +59,16 @@ def image_starts(what: str, stamps_ns: np.ndarray) -> np.ndarray:
 
 
 def in_image(uv: np.ndarray, resolution: tuple[int, int], margin_px: float) -> np.ndarray:
-    """(N,) bool: points uv (N, 2) px in the image, or at most margin_px outside."""
+    """(N,) bool: points uv (N, 2) px that are inside the image of (width, height) px, or at most margin_px outside."""
     return np.logical_and.reduce((uv >= -0.5 - margin_px) & (uv <= np.array(resolution) - 0.5 + margin_px), axis=1)
 
 
 def outside_note(
     stream: CornerStream | TrackStream, inside: np.ndarray, thing: str, what: str, resolution: tuple[int, int]
 ) -> str:
-    """A note on points that are not `inside` (N,) the image; `thing` names the first.
+    """A note on points that are not `inside` (N,) bool the image, at least one. `thing`: text that names the first.
 
-    Raises RecordingError if there are many."""
+    Raises RecordingError if many points are outside."""
     first, count = int(np.argmin(inside)), int((~inside).sum())
     (u, v), (width, height) = stream.uv[first], resolution
     which = stream.which(int(stream.stamps_ns[stream.image[first]]))
@@ -81,6 +80,7 @@ def outside_note(
 
 
 def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream, tuple[str, ...]]:
+    """The images with enough corners for a pose, and a note on others. Raises RecordingError if none has enough."""
     count = np.diff(corners.start)
     keep = count >= _MIN_IMAGE_CORNERS
     if keep.all():

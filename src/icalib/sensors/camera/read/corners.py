@@ -1,4 +1,4 @@
-"""Rows of corners -> one camera's stream, grouped by image."""
+"""Groups the rows of a corner table into the corner stream of one camera, image by image."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def group_corners(
     uv: np.ndarray,
     target: Target,
 ) -> CornerStream:
-    """Group the rows (stamps_ns, tag, corner (N,) int64; uv (N, 2) px) of one camera by image.
+    """The corner stream of one camera, from rows stamps_ns, tag, corner (N,) int64 and uv (N, 2) px.
 
     Raises RecordingError naming `source` and the instant: images out of order, a corner that the target does not have,
     or one that appears twice in an image.
@@ -45,6 +45,7 @@ def group_corners(
 
 
 def _point_index(source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np.ndarray, target: Target) -> np.ndarray:
+    """(N,) index of the target point of each row. Raises RecordingError naming the first unknown corner."""
     try:
         return target.point_index(tag, corner)
     except RecordingError:
@@ -56,7 +57,7 @@ def _point_index(source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np
 
 
 def _first_unknown(tag: np.ndarray, corner: np.ndarray, target: Target) -> int:
-    """Index of the first row that `target` refuses, by bisection: only `Target.point_index` knows its rules."""
+    """Index of the first row that `Target.point_index` refuses, found by bisection; there must be one."""
     known, refused = 0, len(tag)
     while refused - known > 1:
         middle = (known + refused) // 2
@@ -77,6 +78,7 @@ def _refuse_repeated(
     start: np.ndarray,
     n_points: int,
 ) -> None:
+    """Raises RecordingError naming the instant if a corner appears twice in an image."""
     image = np.repeat(np.arange(len(start) - 1), np.diff(start))
     key = image * n_points + point
     order = np.argsort(key, kind="stable")

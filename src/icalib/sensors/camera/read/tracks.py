@@ -1,4 +1,4 @@
-"""Rows of tracks -> one camera's stream, grouped by image and checked."""
+"""Reads a table of feature tracks into the checked track stream of one camera, grouped by image."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TRACK_TABLE = TableKind(
     (STAMP, (r"(feature|track|point|landmark)(_?id)?|id",), (r"u(_?px)?|x(_?px)?",), (r"v(_?px)?|y(_?px)?",)),
     IMAGE_RATE_HZ,
 )
-_TRACK_MARGIN_PX = 5.0  # outside the image, which trackers may reach by a few times their noise
+_TRACK_MARGIN_PX = 5.0  # accepted distance outside the image: a few times the noise of trackers
 
 
 def read_track_stamps(path: Path) -> np.ndarray:
@@ -32,11 +32,11 @@ def read_track_stamps(path: Path) -> np.ndarray:
 def read_tracks(
     name: str, path: Path, resolution: tuple[int, int], layout: TableLayout = PLAIN_TABLE, note: Note = ignore
 ) -> TrackStream:
-    """The table t [ns], feature, u, v [px] at `path`; `resolution` (width, height) px of the camera; `note` is called
-    with sentences on what was left out.
+    """Feature tracks from the table t [ns], feature, u, v [px] at `path`.
 
-    Raises RecordingError naming file and line or instant: a table that cannot be read, images out of order or at an
-    impossible rate, a feature that appears twice in an image, many outside of it, and tracks of one image only.
+    resolution: (width, height) px of the camera; note: called with a sentence on data that are left out. Raises
+    RecordingError naming file and line or instant if the table cannot be read, images are out of order or at an
+    impossible rate, a feature is twice in an image, many are outside the image, or no feature is in two images.
     """
     table = read_table(path, _TRACK_TABLE, layout)
     for sentence in table.notes:
@@ -55,7 +55,7 @@ def read_tracks(
 
 
 def _those(stream: TrackStream, kept: np.ndarray) -> TrackStream:
-    """The observations `kept` (N,) bool, without images that have none."""
+    """The observations that `kept` (N,) bool selects; images without such observations are left out."""
     count = np.bincount(stream.image[kept], minlength=len(stream.stamps_ns))
     seen = count > 0
     start = np.concatenate([[0], np.cumsum(count[seen])]).astype(np.int64)
@@ -63,6 +63,7 @@ def _those(stream: TrackStream, kept: np.ndarray) -> TrackStream:
 
 
 def _check(stream: TrackStream, what: str) -> None:
+    """Raises RecordingError for a repeated feature, an impossible image rate, or if no feature is in two images."""
     key = np.lexsort((stream.feature, stream.image))
     repeated = key[1:][(np.diff(stream.feature[key]) == 0) & (np.diff(stream.image[key]) == 0)]
     if len(repeated):
