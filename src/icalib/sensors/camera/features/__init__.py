@@ -1,1 +1,1 @@
-"""Factors of cameras: feature tracks, and planes that their points lie on."""
+"""Factor of feature tracks of all cameras, with points that may lie on planes of LiDARs."""

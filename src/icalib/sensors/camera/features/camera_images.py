@@ -13,15 +13,16 @@ from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.kernels import TrackObservations, TrackProjection, camera_points
 from icalib.sensors.camera.features.point_search import PointSearch, add_to_points, moving_points
 
-OBSERVATIONS_PER_CHUNK = 4096  # for projections: their arrays stay in the cache of the processor
+OBSERVATIONS_PER_CHUNK = 4096  # observations that are projected at once; their arrays fit into the processor's cache
 
 
 @dataclass(frozen=True)
 class CameraImages:
-    """Images `first` and on of one camera, whose index is `index`.
+    """The n images from number `first` on of one camera, whose index is `index`.
 
-    params (P,): of the camera model; poses: in the n images; columns (n, c + d): calibration columns of the pose, then
-    of the free parameters `pars` (d,) of the camera model, -1 where fixed."""
+    params (P,): parameters of the camera model; observed: observations of tracks; poses: camera poses. columns
+    (n, c + d): indices of calibration parameters, c of the pose, then d of the free lens parameters, -1 where fixed;
+    pars (d,): indices of the free lens parameters."""
 
     camera: CornerFactor
     index: int
@@ -33,7 +34,7 @@ class CameraImages:
     pars: np.ndarray
 
     def chunks(self) -> Iterator[tuple[CameraImages, slice]]:
-        """Parts of at most `OBSERVATIONS_PER_CHUNK` observations or one image, each with the slice of its images."""
+        """Splits the images at about every `OBSERVATIONS_PER_CHUNK` observations: parts, and slices of their images."""
         start = self.observed.start
         cuts = np.searchsorted(start, np.arange(start[0], start[-1], OBSERVATIONS_PER_CHUNK), side="left")
         cuts = np.unique([0, *cuts, len(start) - 1])
@@ -41,7 +42,7 @@ class CameraImages:
             yield self._part(a, b), slice(a, b)
 
     def _part(self, a: int, b: int) -> CameraImages:
-        """The same of images a..b."""
+        """The images a..b of these, counted from the first."""
         observed, own = self.observed, slice(a, b)
         observed = observed._replace(start=observed.start[a : b + 1], keyframe=observed.keyframe[own])
         return replace(
@@ -49,19 +50,23 @@ class CameraImages:
         )
 
     def in_camera(self, points: np.ndarray, track: int) -> np.ndarray:
-        """(n, 3) m: point of each observation in the camera. points (T, 3) m, in the world: tracks `track` and on."""
+        """(n, 3) m: the point of each observation in the camera frame.
+
+        points (T, 3) m: points of the tracks from number `track` on, in the world frame."""
         observed, at = self.observed, self.poses
         X = np.empty((int(observed.start[-1] - observed.start[0]), 3))
         camera_points(observed, track, at.R_sensor_world, at.p_world_sensor, points, X)
         return X
 
     def projection(self, X: np.ndarray) -> TrackProjection:
-        """Projection of the points X (n, 3) m of all observations, in the camera frame."""
+        """Projection, with Jacobians, of the points X (n, 3) m of all n observations, in the camera frame."""
         found = self.camera.model.project_with_jacobians(self.params, X)
         return TrackProjection(int(self.observed.start[0]), *found, self.pars)
 
     def add_to_points(self, track: int, loss: Loss, points: PointSearch) -> None:
-        """Adds observations of points that still move to their normal equations; `points`: tracks `track` and on."""
+        """Adds the observations of points that have not converged to their normal equations in `points`.
+
+        points: search for the points of the tracks from number `track` on."""
         for part, _ in self.chunks():
             observed, at = part.observed, part.poses
             most = int(observed.start[-1] - observed.start[0])

@@ -1,4 +1,4 @@
-"""Compiled gradients of clusters of track observations, by points, camera poses and camera models."""
+"""Compiled gradients of clusters of track observations: by points, camera poses and lens parameters."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from icalib.sensors.camera.features.kernels import weighted_rows
 
 @njit(cache=True, nogil=True)
 def accumulate_clusters(X, observed, base, poses, columns, projection, loss, cluster, n_clusters, column, sums, side):
-    """Gradient of each cluster of observations by one camera: into columns `column` and on of `sums`, and of side
-    (T, 3, columns) of their tracks. X (n, 3) m: points in the camera; cluster (N,): index for each observation."""
+    """Adds the gradient of each cluster of one camera's observations to the columns from `column` on.
+
+    Gradients by poses and calibration are added to `sums`, gradients by points to side (T, 3, columns). X (n, 3) m:
+    points in the camera frame; cluster (N,): index of the cluster of each observation, from 0 to n_clusters - 1."""
     n_d = len(projection.pars)
     J_rows, G, error, D = np.zeros((10 + n_d, 2)), np.empty((6 + n_d, n_clusters)), np.empty(2), 9 + n_d
     J_imu, J_chain = np.empty((6, 6)), np.empty((6, chain_width(poses) + columns.shape[1] - n_d))

@@ -1,8 +1,9 @@
 """Clusters of corners and of track observations whose errors may correlate: by image cell, target region, or track.
 
-A lens that its model does not follow, and a target that is not as drawn, make the same errors in all parts of a
-recording. A region of the image or of the target is then a cluster. Errors of one feature track correlate as well: all
-its views are aligned with the same first one. So groups of whole tracks are clusters, too (Liang and Zeger 1986).
+Misfit of the lens model, and deviations of the target from its stated shape, cause the same errors throughout a
+recording. So each region of the image or of the target is a cluster. Errors within a feature track correlate as well,
+because all its views are aligned with the first one. So groups of whole tracks are clusters, too. Clusters serve a
+cluster-robust covariance (Liang and Zeger 1986).
 """
 
 from __future__ import annotations
@@ -16,13 +17,15 @@ from icalib.motion.factor import FactorKey
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.residual import FeatureFactor
 
-IMAGE_CELLS = (4, 3)  # columns, rows
-TARGET_REGIONS = 3  # along each side of a body
-TRACK_GROUPS = 24  # their spread knows a variance to 1 / sqrt(12); twice as many, to 1 / sqrt(24) at twice the cost
+IMAGE_CELLS = (4, 3)  # columns and rows of the grid of image cells
+TARGET_REGIONS = 3  # number of regions along each side of a body
+TRACK_GROUPS = 24  # a variance from n groups has a relative error of sqrt(2 / n); the cost grows with n
 
 
 def error_clusters(cameras: tuple[CornerFactor, ...], features: tuple[FeatureFactor, ...]) -> Iterator[Clusters]:
-    """Image cells, regions of the target, corners of tags, and groups of feature tracks, as far as there are any."""
+    """Yields clusterings by image cell, by target region, by corner of a tag, and by group of feature tracks.
+
+    Clusterings of corners are left out if no camera sees a target, that of tracks if there are none."""
     cornered = any(c.sees_target for c in cameras)
     if cornered or features:
         yield Clusters(image_cells(cameras, features))
@@ -30,7 +33,7 @@ def error_clusters(cameras: tuple[CornerFactor, ...], features: tuple[FeatureFac
         yield Clusters({c.key: _target_regions(c) for c in cameras})
         yield Clusters({c.key: _tag_corners(c, k) for k, c in enumerate(cameras)})
     if features:
-        # By feature number, so that all views of one, by all cameras, are in one group; corners are in none.
+        # Groups by feature number have all views of a feature, by all cameras. Corners are in no group.
         groups = {f.key: [(s.feature % TRACK_GROUPS).astype(np.int32) for s in f.streams] for f in features}
         yield Clusters(groups, is_sample=True)
 
@@ -38,7 +41,7 @@ def error_clusters(cameras: tuple[CornerFactor, ...], features: tuple[FeatureFac
 def image_cells(
     cameras: tuple[CornerFactor, ...], features: tuple[FeatureFactor, ...]
 ) -> dict[FactorKey, np.ndarray | list[np.ndarray]]:
-    """Cells of the image of each camera. Corners, and observations of tracks by camera, are in the same cells."""
+    """Image cell of each corner, and of each track observation by camera; both share the cells of their camera."""
     clusters: dict[FactorKey, np.ndarray | list[np.ndarray]] = {}
     tracks: dict[FactorKey, list[np.ndarray]] = {f.key: [] for f in features}
     for index, camera in enumerate(cameras):
@@ -51,7 +54,9 @@ def image_cells(
 
 
 def _cells(uv: np.ndarray, index: int) -> np.ndarray:
-    """(N,) cell of camera number `index` for points uv (N, 2) px, in the rectangle that holds all of them."""
+    """(N,) index of the cell of each point uv (N, 2) px of camera `index`, in a grid over the bounding box of uv.
+
+    Cells of different cameras have different indices."""
     columns, rows = IMAGE_CELLS
     low, high = uv.min(axis=0, initial=np.inf), uv.max(axis=0, initial=-np.inf) + 1e-9
     x, y = (((uv[:, k] - low[k]) / (high - low)[k] * IMAGE_CELLS[k]).astype(np.int32) for k in range(2))
@@ -59,8 +64,9 @@ def _cells(uv: np.ndarray, index: int) -> np.ndarray:
 
 
 def _target_regions(camera: CornerFactor) -> np.ndarray:
-    """(N,) region of the target of each corner, the same for all cameras. Bodies that do not bend, such as single tags,
-    are one region."""
+    """(N,) index of the target region of each corner, the same for all cameras.
+
+    Bodies that do not bend, such as single tags, are one region."""
     target = camera.bodies.target
     region, count = np.zeros(len(target.points), dtype=np.int32), 0
     for k in camera.bodies.used:
@@ -75,7 +81,8 @@ def _target_regions(camera: CornerFactor) -> np.ndarray:
 
 
 def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
-    """(N,) which of its tag's four corners each corner is, for camera number `index`: detectors err on each in its own
-    way."""
+    """(N,) index of each corner among the four of its tag, plus 4 `index` for camera `index`.
+
+    Systematic errors of detectors differ between the four corners."""
     corner = camera.bodies.target.point_identity(camera.stream.point)[1]
     return 4 * index + (corner % 4).astype(np.int32)

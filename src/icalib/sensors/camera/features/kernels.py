@@ -1,7 +1,8 @@
 """Compiled sums of the feature factor: observations of tracks, and the normal equations of a piece.
 
-Images are those of one camera in a piece. Observations, tracks and pairs (a track with one of its images) are counted
-from the first one of the recording; `PieceStart` says where the piece begins. J_rows holds Jacobians transposed.
+Images are those of one camera in a piece. A pair is a track with one of its images. Indices of observations, tracks and
+pairs count from the first of all recordings; `PieceStart` has the first ones of the piece. J_rows are transposed
+Jacobians, with one column for each image axis.
 """
 
 from __future__ import annotations
@@ -18,15 +19,15 @@ from icalib.optim.robust_weights import correct_curvature, weight
 from icalib.optim.rows import add_gram
 from icalib.optim.state import KEYFRAME_DIM
 
-MIN_EIGENVALUE_RATIO = 1e-15  # to the largest eigenvalue: a smaller one counts as zero (rounding)
+MIN_EIGENVALUE_RATIO = 1e-15  # to the largest eigenvalue; a smaller eigenvalue is rounding noise, and counts as zero
 
 
 class TrackObservations(NamedTuple):
-    """Observations by one camera in n images.
+    """Observations of tracks by one camera in n images.
 
-    start (n + 1,): observations of image i are start[i]:start[i+1]; uv (N, 2) px; keep (N,) bool, in use; track (N,)
-    and pair (N,) indices, -1 where the track is left out; keyframe (n,), counted from the piece's first; sigma (N,) px
-    per axis."""
+    start (n + 1,): observations of image i are start[i]:start[i+1]; uv (N, 2) px; keep (N,) bool: observations in use;
+    track, pair (N,): indices, -1 if the track is left out; keyframe (n,): index counted from the first of the piece;
+    sigma (N,) px per axis."""
 
     start: np.ndarray
     uv: np.ndarray
@@ -38,17 +39,17 @@ class TrackObservations(NamedTuple):
 
 
 class PieceStart(NamedTuple):
-    """The first track and the first pair of a piece."""
+    """Indices of the first track and of the first pair of a piece."""
 
     track: int
     pair: int
 
 
 class TrackProjection(NamedTuple):
-    """The camera model at observations `first` and on.
+    """Projection of the n observations from number `first` on.
 
-    uv (n, 2) px; valid (n,) bool, within the range of the model; Jacobians of uv by the point in the camera J_point
-    (n, 2, 3) and by the model's parameters J_params (n, 2, P), of which `pars` (d,) are free."""
+    uv (n, 2) px; valid (n,) bool, within the range of the model; J_point (n, 2, 3) px/m, J_params (n, 2, P): Jacobians
+    of uv by the point in the camera frame and by the lens parameters; pars (d,): indices of the free parameters."""
 
     first: int
     uv: np.ndarray
@@ -60,8 +61,9 @@ class TrackProjection(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def camera_points(observed, t0, R_cam_world, p_world_cam, points, X):
-    """Point of each observation in the camera frame, into X (n, 3) m; (0, 0, 1) where the track is left out. points
-    (T, 3) m, in the world: those of tracks t0 and on."""
+    """Writes the point of each observation in the camera frame into X (n, 3) m; (0, 0, 1) if its track is left out.
+
+    points (T, 3) m: points of the tracks from number t0 on, in the world frame."""
     o = observed.start[0]
     for i in range(len(observed.start) - 1):
         for n in range(observed.start[i], observed.start[i + 1]):
@@ -74,7 +76,7 @@ def camera_points(observed, t0, R_cam_world, p_world_cam, points, X):
 
 @njit(cache=True, nogil=True)
 def in_camera(R_cam_world, p_world_cam, point, x):
-    """The world point (3,) m in the camera frame, into x (3,) m."""
+    """Transforms `point` (3,) m from the world frame to the camera frame, into x (3,) m."""
     a, b, c = point[0] - p_world_cam[0], point[1] - p_world_cam[1], point[2] - p_world_cam[2]
     for r in range(3):
         x[r] = R_cam_world[r, 0] * a + R_cam_world[r, 1] * b + R_cam_world[r, 2] * c
@@ -82,10 +84,11 @@ def in_camera(R_cam_world, p_world_cam, point, x):
 
 @njit(cache=True, nogil=True)
 def held_back(own, gradient):
-    """Twice the decrease of cost that points with normal equations own (T, 3, 3) and gradient (T, 3) still predict.
+    """Twice the decrease of cost that Gauss-Newton steps of the points would predict: sum of g^T A^-1 g over points.
 
-    It is above zero for points that the border of an image stops. The solver must not count it as the gain of a step.
-    Directions without information, as of a point at a camera's centre, predict no decrease.
+    own (T, 3, 3), gradient (T, 3): normal equations A and g of the points. The sum is above zero if the border of an
+    image stops a point before its minimum; the solver must not count this decrease as gain of a step. Directions
+    without information, as for a point at the camera's centre, add nothing.
     """
     A, values, vectors, total = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), 0.0
     for t in range(len(own)):
@@ -102,9 +105,11 @@ def held_back(own, gradient):
 
 @njit(cache=True, nogil=True)
 def weighted_rows(i, n, X, observed, projection, loss, R_cam_world, error, J_rows):
-    """Weighted rows of observation n of image i, transposed, into J_rows (6 + d + 3 + 1, 2): by camera pose, free
-    parameters and point, and the residual; error (2,) px. Returns root, square root of the weight over sigma [1/px], 0
-    where it is not in use, and half the robust chi^2."""
+    """Writes the transposed weighted Jacobian of observation n in image i into J_rows (6 + d + 3 + 1, 2).
+
+    Its rows: camera pose, free lens parameters, point; last, the weighted residual. Also writes error (2,) px,
+    predicted - measured. Returns root [1/px], the square root of the robust weight over sigma, and half the robust
+    chi^2; both are 0 if the observation is not in use."""
     c, D = n - projection.first, len(J_rows) - 1
     for r in range(2):
         error[r] = projection.uv[c, r] - observed.uv[n, r]
@@ -134,7 +139,7 @@ def weighted_rows(i, n, X, observed, projection, loss, R_cam_world, error, J_row
 
 @njit(cache=True, nogil=True)
 def _gram(rows, G):
-    """G = rows^T rows."""
+    """Writes the Gram matrix rows^T rows into G."""
     G[:] = 0.0
     subtract_gram(rows, G)
     for a in range(len(G)):
@@ -144,8 +149,10 @@ def _gram(rows, G):
 
 @njit(cache=True, nogil=True)
 def _add_feature(i, J_rows, pair, t, J_chain, n_chain, columns, features, by_pose):
-    """Adds rows J_rows of one observation, of image i, to the sums of its track t. J_chain (6, w): camera pose by
-    keyframes and calibration parameters; columns (n, c + d): of all images; by_pose (6,): workspace."""
+    """Adds one observation of image i, with Jacobian J_rows, to the sums of its track t in `features`.
+
+    J_chain (6, w): Jacobian of the camera pose by n_chain keyframe parameters and by calibration parameters; columns
+    (n, c + d): see `CameraImages`; by_pose (6,): workspace."""
     D, n_b, side, block = len(J_rows) - 1, features.side.shape[2] - 1, features.side[t], features.block[pair]
     n_c = J_chain.shape[1] - n_chain
     for a in range(3):
@@ -168,7 +175,9 @@ def _add_feature(i, J_rows, pair, t, J_chain, n_chain, columns, features, by_pos
 
 @njit(cache=True, nogil=True)
 def _fill_pose(i, poses, J_imu, J_chain, features):
-    """Camera pose i by keyframes and calibration parameters into J_chain (6, w); by keyframes into `features`, too."""
+    """Writes the Jacobian of camera pose i by keyframes and calibration parameters into J_chain (6, w).
+
+    Its keyframe columns are copied to `features`."""
     fill_chain(i, poses, J_imu, J_chain)
     for d in range(6):
         for j in range(KEYFRAME_DIM):
@@ -179,7 +188,7 @@ def _fill_pose(i, poses, J_imu, J_chain, features):
 
 @njit(cache=True, nogil=True)
 def _most_observations(observed):
-    """Largest number of observations in an image."""
+    """Number of observations in the image with most."""
     most = 0
     for i in range(len(observed.start) - 1):
         most = max(most, observed.start[i + 1] - observed.start[i])
@@ -188,10 +197,10 @@ def _most_observations(observed):
 
 @njit(cache=True, nogil=True)
 def accumulate(X, observed, base, poses, columns, projection, loss, sums, features, residual, root):
-    """Residual (N, 2) px and root (N,) of observations by one camera, and the normal equations where they are wanted.
+    """Writes residual (N, 2) px and root (N,) 1/px of the observations by one camera.
 
-    X (n, 3) m: their points in the camera; poses: of the camera; columns (n, c + d): see `CameraImages`. Returns half
-    the robust chi^2."""
+    Adds their normal equations to `sums` and `features`, unless the arrays of `sums` are empty. X (n, 3) m: points in
+    the camera frame; poses: camera poses; columns (n, c + d): see `CameraImages`. Returns half the robust chi^2."""
     n_d, n_chain, width = len(projection.pars), chain_width(poses), chain_width(poses) + columns.shape[1]
     J_rows, G, error = np.zeros((10 + n_d, 2)), np.empty((7 + n_d, 7 + n_d)), np.empty(2)
     by_pose, most = np.empty(6), _most_observations(observed)

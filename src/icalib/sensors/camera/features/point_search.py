@@ -1,6 +1,6 @@
-"""Compiled search for points of the scene, each where its cost is least, with poses and lenses fixed.
+"""Compiled search for the scene points of tracks that minimise their reprojection cost, with poses and lenses fixed.
 
-Observations, tracks and points are counted as in `kernels`.
+Indices of observations and tracks count as in `kernels`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from icalib.geometry.small import solve_definite
 from icalib.optim.robust_weights import weight
 from icalib.sensors.camera.features.kernels import in_camera
 
-MIN_COST_DECREASE = 1e-9  # of half the chi^2: a smaller step of a point is its last; from 1e-8 on gradients show it
-INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-6, 1e8  # of Levenberg-Marquardt, times the diagonal
-MAX_DISTANCE_M = 1e5  # of a point from its anchor camera; farther ones look the same
-AT_MAX_SHARE = 1.0 - 1e-6  # of MAX_DISTANCE_M, from which a point counts as being there
+MIN_COST_DECREASE = 1e-9  # of half the chi^2, below which a point has converged; from 1e-8 on, gradients are inexact
+INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-6, 1e8  # of Levenberg-Marquardt, relative to the diagonal
+MAX_DISTANCE_M = 1e5  # of a point from its anchor camera; farther points have no measurable parallax
+AT_MAX_SHARE = 1.0 - 1e-6  # of MAX_DISTANCE_M, above which a point counts as being at this limit
 
 
 class PointSearch(NamedTuple):
-    """Levenberg-Marquardt of T points, each on its own, poses and calibration fixed.
+    """State of independent Levenberg-Marquardt searches for T points, with poses and calibration fixed.
 
-    anchor (T, 3) m: position of the camera that each point moves with; xyz and trial (T, 3) m, in the world; cost and
-    trial_cost (T,): half the robust chi^2; A (T, 3, 3) and b (T, 3), trial_A and trial_b: normal equations; shown and
-    trial_shown (T,): number of valid observations; damping (T,); moves (T,) bool: not converged yet."""
+    anchor (T, 3) m: position of each point's anchor camera, from which inverse depth is counted. xyz, trial (T, 3) m:
+    accepted and trial points; all three in the world frame. cost, trial_cost (T,): half the robust chi^2; A (T, 3, 3)
+    and b (T, 3), trial_A and trial_b: normal equations; shown, trial_shown (T,): number of valid observations; damping
+    (T,); moves (T,) bool: not converged yet."""
 
     anchor: np.ndarray
     xyz: np.ndarray
@@ -45,8 +46,10 @@ class PointSearch(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def moving_points(observed, t0, R_cam_world, p_world_cam, points, image, which, X):
-    """Observations in use of points that still move. Returns their number m. Fills image (m,) and which (m,), indices
-    of image and observation, and X (m, 3) m, trial points in the camera frame."""
+    """Selects the m observations in use whose points have not converged, and returns m.
+
+    Writes the indices image (m,) and which (m,) of image and observation, and X (m, 3) m, the trial points in the
+    camera frame. t0: number of the first track in `points`."""
     m = 0
     for i in range(len(observed.start) - 1):
         for n in range(observed.start[i], observed.start[i + 1]):
@@ -59,8 +62,10 @@ def moving_points(observed, t0, R_cam_world, p_world_cam, points, image, which, 
 
 @njit(cache=True, nogil=True)
 def add_rays(observed, t0, R_cam_world, p_world_cam, rays, valid, A, b):
-    """Adds each ray (n, 3), a unit vector in the camera frame, to A (T, 3, 3) and b (T, 3) of its point: A P = b is the
-    point nearest to all rays (midpoint triangulation)."""
+    """Adds the rays (n, 3), unit vectors in the camera frame, to the equations A P = b of their points P.
+
+    The solution is the point nearest to all its rays (midpoint triangulation). A (T, 3, 3) and b (T, 3) m belong to the
+    tracks from number t0 on, in the world frame; valid (n,) bool: rays to use."""
     o, d = observed.start[0], np.empty(3)
     for i in range(len(observed.start) - 1):
         for n in range(observed.start[i], observed.start[i + 1]):
@@ -81,8 +86,10 @@ def add_rays(observed, t0, R_cam_world, p_world_cam, rays, valid, A, b):
 
 @njit(cache=True, nogil=True)
 def add_to_points(observed, t0, R_cam_world, image, which, uv, valid, J_point, loss, points):
-    """Adds observations `which` (m,) by one camera, of image (m,), to costs and normal equations of the trial points,
-    with the true curvature of the loss. uv (m, 2), valid (m,), J_point (m, 2, 3): the camera model at the trial."""
+    """Adds the observations `which` (m,), in images image (m,) of one camera, to the equations of the trial points.
+
+    Normal equations have the true curvature of the loss. uv (m, 2) px, valid (m,), J_point (m, 2, 3): projections of
+    the trial points, and their Jacobians by the point in the camera frame."""
     J, e = np.empty((2, 3)), np.empty(2)
     for m in range(len(which)):
         n, R = which[m], R_cam_world[image[m]]
@@ -110,9 +117,10 @@ def add_to_points(observed, t0, R_cam_world, image, which, uv, valid, J_point, l
 
 @njit(cache=True, nogil=True)
 def take_trials(points, start):
-    """One iteration of `PointSearch`: accepts trials that lower the cost (all at the `start`) and sets new ones.
+    """One iteration of `PointSearch`: accepts trials that lower the cost (all at the `start`) and sets new trials.
 
-    Returns how many points still move. A last step is taken untried: cost and sums stay those of its beginning."""
+    Returns the number of points that have not converged. The last step of a point is taken without evaluation; its cost
+    and normal equations stay those before this step."""
     M, d, axes, moving = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), 0
     for t in range(len(points.xyz)):
         if not points.moves[t]:
@@ -142,8 +150,9 @@ def take_trials(points, start):
 
 @njit(cache=True, nogil=True)
 def _take_trial(points, t, start):
-    """Accepts the trial of point t at the `start`, or where it lowers the cost. It must not lower the cost by leaving
-    an image, so the number of valid observations must not fall. The damping follows."""
+    """Accepts the trial of point t at the `start`, or if it does not raise the cost; then updates the damping.
+
+    A point could lower its cost by leaving an image, so the number of valid observations must not fall."""
     stays = points.trial_shown[t] >= points.shown[t]
     if start or (stays and points.trial_cost[t] <= points.cost[t]):
         points.shown[t] = points.trial_shown[t]
@@ -158,7 +167,7 @@ def _take_trial(points, t, start):
 
 @njit(cache=True, nogil=True)
 def _clear_trial(points, t):
-    """Sets the sums at the trial of point t to zero."""
+    """Sets cost, normal equations and number of observations of the trial of point t to zero."""
     for a in range(3):
         points.trial_b[t, a] = 0.0
         for k in range(3):
@@ -168,8 +177,9 @@ def _clear_trial(points, t):
 
 @njit(cache=True, nogil=True)
 def _ray_axes(anchor, point, axes):
-    """Three perpendicular unit vectors into the rows of axes (3, 3), the last from `anchor` to `point`. Returns their
-    distance [m]."""
+    """Writes three perpendicular unit vectors into the rows of axes (3, 3); the last points from `anchor` to `point`.
+
+    Returns the distance [m] of anchor and point."""
     x, y, z = point[0] - anchor[0], point[1] - anchor[1], point[2] - anchor[2]
     distance = max(np.sqrt(x * x + y * y + z * z), 1e-9)
     axes[2, 0], axes[2, 1], axes[2, 2] = x / distance, y / distance, z / distance
@@ -179,8 +189,10 @@ def _ray_axes(anchor, point, axes):
 
 @njit(cache=True, nogil=True)
 def _step(axes, A, b, damping, at_end, M, d):
-    """Damped Newton step into d (3,) m along `axes`, not farther out if the point is `at_end` of the range. False where
-    the normal equations A, b are not positive definite."""
+    """Writes a damped Newton step, in the coordinates of `axes`, into d (3,) m. False if A is not positive definite.
+
+    A (3, 3), b (3,): normal equations; M (3, 3): workspace. If the point is `at_end` of the range, it does not move
+    farther out."""
     for outwards in (True, False):
         _along(axes, A, b, M, d)
         for a in range(3):
@@ -196,7 +208,7 @@ def _step(axes, A, b, damping, at_end, M, d):
 
 @njit(cache=True, nogil=True)
 def _along(axes, A, b, M, d):
-    """Rotates normal equations: M = axes A axes^T, d = -axes b."""
+    """Rotates normal equations A, b into `axes`: writes M = axes A axes^T and d = -axes b."""
     for i in range(3):
         d[i] = 0.0
         for a in range(3):
@@ -210,8 +222,10 @@ def _along(axes, A, b, M, d):
 
 @njit(cache=True, nogil=True)
 def _move(anchor, axes, distance, d, point):
-    """Moves `point`, at `distance` [m] from `anchor`, by d (3,) m along `axes`, in inverse-depth coordinates (Civera et
-    al. 2008). The projection is nearly linear in direction and inverse distance, so no step leads behind the camera."""
+    """Writes the point at `distance` [m] from `anchor` along axes[2], after a step d (3,) m along `axes`, into `point`.
+
+    The step is made in direction and inverse distance (inverse depth; Civera et al. 2008), in which the projection is
+    nearly linear. So no step leads behind the camera."""
     nearness = max((1.0 - d[2] / distance) / distance, 1.0 / MAX_DISTANCE_M)
     size = 0.0
     for a in range(3):

@@ -1,10 +1,11 @@
-"""Feature tracks: points of the scene, of unknown position, that cameras observe (paper (20)-(22)).
+"""Factor of feature tracks: scene points of unknown position that cameras observe ("Features", docs/estimator.md).
 
     residual = K(R_cam_world (P - p_world_cam)) - uv
 
-Points are no part of the state. At every linearisation each point P moves to where its cost is least (variable
-projection; Golub and Pereyra 1973). Columns of points are eliminated with the keyframes that observe them
-(`optim/front.py`). Points on planes of the LiDARs have one more row each (`surfaces.py`).
+K is the camera model, and P the point in the world frame. Points are not part of the state. Every linearisation first
+moves each point to the minimum of its cost (variable projection; Golub and Pereyra 1973). Points are eliminated from
+the normal equations together with the keyframes that observe them (`optim/front.py`). Points on planes of LiDARs have
+an additional residual (`surfaces.py`).
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ from icalib.sensors.camera.features.surfaces import (
 )
 from icalib.sensors.camera.features.tracks import NO_TRACKS, ObservationTable, TrackNoise, Tracks
 
-MAX_POINT_STEPS = 20  # of Levenberg-Marquardt; most points converge in three
-MIN_POINT_INFORMATION = 1e-6  # 1/m^2: keeps the elimination of a point without observations defined, to 1 km
-MAX_TRACK_GAP_S = 1.0  # a feature that was out of sight for longer begins a new track
+MAX_POINT_STEPS = 20  # of Levenberg-Marquardt for a point; most points converge in three
+MIN_POINT_INFORMATION = 1e-6  # 1/m^2, a prior of 1 km: a point without observations stays invertible
+MAX_TRACK_GAP_S = 1.0  # a feature that is unobserved for longer begins a new track
 MAX_RELATIVE_SIGMA = 0.1  # standard deviation of a point over its distance, above which its track is left out
 MAX_RESIDUAL_RATIO = 10.0  # to the RMS residual of the median track, above which a track is left out
 
@@ -59,8 +60,9 @@ MAX_RESIDUAL_RATIO = 10.0  # to the RMS residual of the median track, above whic
 class FeatureFactor(FactorDefaults):
     """All feature tracks of all cameras.
 
-    cameras: their poses and models; by camera: streams, on the images of its corners; noise; keep (N,) bool,
-    observations in use; outliers (N,) bool, empty before any were found. seams: first keyframes of further recordings;
+    cameras: corner factors, which have the camera poses and models. For each camera: streams, with the same images as
+    its corners; noise; keep (N,) bool: observations in use; outliers (N,) bool, an empty tuple if not yet tested. loss,
+    loss_scale: robust loss and its threshold in sigma. seams: first keyframe of each recording but the first;
     surfaces: planes that points may lie on; on: the plane of each track."""
 
     cameras: tuple[CornerFactor, ...]
@@ -89,8 +91,9 @@ class FeatureFactor(FactorDefaults):
         seams: tuple[int, ...] = (),
         surfaces: Surfaces | None = None,
     ) -> FeatureFactor:
-        """The factor with tracks and initial points by the poses of `state`. Tracks end at keyframes `cuts`. loss: its
-        name, and where it bends, in sigma."""
+        """The factor, with tracks and initial points triangulated by the poses of `state`.
+
+        cuts: keyframes at which tracks end; loss: name of the robust loss, and its threshold in sigma."""
         factor = cls(cameras, streams, noise, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
         return factor.cut(state, cuts)
 
@@ -98,7 +101,7 @@ class FeatureFactor(FactorDefaults):
 
     @property
     def name(self) -> str:
-        """Of all cameras, because several may observe one track."""
+        """One name for all cameras, because several may observe one track."""
         return "cameras"
 
     @property
@@ -107,7 +110,7 @@ class FeatureFactor(FactorDefaults):
 
     @cached_property
     def sigmas(self) -> tuple[np.ndarray, ...]:
-        """By camera (N,) px: standard deviation of each observation per axis."""
+        """For each camera (N,) px: standard deviation of each observation per axis."""
         return tuple(noise.of(stream) for noise, stream in zip(self.noise, self.streams, strict=True))
 
     @property
@@ -116,12 +119,14 @@ class FeatureFactor(FactorDefaults):
 
     @property
     def n_used(self) -> int:
-        """Number of observations in tracks."""
+        """Number of observations that belong to a track."""
         return sum(int((t >= 0).sum()) for t in self.tracks.track)
 
     def cut(self, state: State, keyframes: tuple[int, ...]) -> FeatureFactor:
-        """The same features as tracks that end at `keyframes`. A track is left out if, with the poses of `state`, its
-        point is not in front of all its cameras, its distance is uncertain, or its residuals are far above most."""
+        """The same features, in tracks that end at `keyframes`, with points triangulated by the poses of `state`.
+
+        A track is left out if its point does not project into all its images, its distance is uncertain, or its
+        residuals are far larger than those of most tracks."""
         edges = np.unique([0, *keyframes, *self.seams, self.n_keyframes])
         table = self._table()
         label = table.in_order(table.labels(state.seconds, edges, MAX_TRACK_GAP_S))
@@ -134,8 +139,10 @@ class FeatureFactor(FactorDefaults):
         return replace(factor, tracks=replace(tracks, start=points[good]), on=on)
 
     def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray, OnPlanes]:
-        """Points by the poses of `state`: (T, 3) m in their anchor cameras; (T,) bool, whether each is certain enough;
-        and the planes that those lie on."""
+        """Triangulates all points with the poses of `state`.
+
+        Returns points (T, 3) m in the frames of their anchor cameras, (T,) bool, whether each point is good enough to
+        use, and the planes of the good points."""
         views, n = self._views(state, 0, self.n_keyframes), self.tracks.count
         A, b = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for view in views:
@@ -161,8 +168,9 @@ class FeatureFactor(FactorDefaults):
         return points, good, self.surfaces.under(found.xyz[good], found.A[good], recording)
 
     def coarse(self, state: State) -> FeatureFactor:
-        """The same tracks with noise as large as most residuals at `state`. In early passes with stated noise, the few
-        tracks that fit by chance would draw the lens away, and other tracks would be lost."""
+        """The same tracks with the noise of each camera raised to the median residual at `state`.
+
+        In early passes with the stated noise, the few tracks that fit by chance would dominate and bias the lens."""
         views = self._views(state, 0, self.n_keyframes)
         points = self._from_anchors(views, slice(0, self.tracks.count), self.tracks.start)
         noise = list(self.noise)
@@ -176,11 +184,11 @@ class FeatureFactor(FactorDefaults):
         return replace(self, noise=tuple(noise))
 
     def on_planes_of(self, camera: int) -> np.ndarray:
-        """Indices of tracks on planes whose anchor is camera number `camera`."""
+        """Indices of the tracks on planes that have camera number `camera` as their anchor."""
         return np.flatnonzero((self.on.plane >= 0) & (self.tracks.camera == camera))
 
     def output(self) -> FeatureOutput:
-        """Empty arrays for `accumulate` to fill."""
+        """Arrays that `accumulate` fills."""
         sizes = [len(s.uv) for s in self.streams]
         points = self.tracks.count
         return FeatureOutput(
@@ -193,16 +201,16 @@ class FeatureFactor(FactorDefaults):
         return replace(self, cameras=tuple(c.with_imu(imu) for c in self.cameras))
 
     def reusable_output(self, out: FeatureOutput) -> FeatureOutput:
-        """See `Factor`: a cut has other tracks."""
+        """See `Factor`: new arrays, because a cut changes the tracks."""
         del out
         return self.output()
 
     def warm_started(self, out: FeatureOutput) -> FeatureFactor:
-        """See `Factor`. From a distant start a point may stop early or in another minimum, and the cost would jump."""
+        """See `Factor`. From a distant start, a point may end in another minimum, and the cost would jump."""
         return replace(self, tracks=replace(self.tracks, start=out.points.copy()))
 
     def squares(self, out: FeatureOutput) -> dict[FitKey, Squares]:
-        """See `Factor`: of each camera's features, and of their points on planes."""
+        """See `Factor`: for the tracks of each camera, and for their points on planes."""
         return feature_squares(self, out)
 
     def sizes(self, out: FeatureOutput) -> dict[FitKey, RawSize]:
@@ -210,7 +218,7 @@ class FeatureFactor(FactorDefaults):
         return feature_sizes(self, out)
 
     def rows(self, out: FeatureOutput, state: State) -> list[ResidualRows]:
-        """See `Factor`: of each camera's features."""
+        """See `Factor`: residuals of the tracks of each camera."""
         return feature_rows(self, out, state)
 
     def dof_used(self, out: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
@@ -218,7 +226,7 @@ class FeatureFactor(FactorDefaults):
         return dof_used_by_features(self, out, along)
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
-        """See `Factor`: room for the tracks that the keyframes of the piece observe."""
+        """See `Factor`: adds workspace for the tracks that keyframes of the piece observe."""
         tracks, pairs = self._within(piece)
         images = self._images(piece.first, self._stop(piece))
         begins = np.cumsum([0] + [len(i) for i in images])[:-1] - np.array([i.start for i in images])
@@ -236,7 +244,7 @@ class FeatureFactor(FactorDefaults):
     def accumulate(
         self, state: State, piece: Piece, out: FeatureOutput, sums: bool = True, curved: bool = False
     ) -> float:
-        """See `Factor`: of the tracks that the keyframes of `piece` observe, the least cost over their points."""
+        """See `Factor`: adds the tracks that keyframes of `piece` observe, with points at their least cost."""
         tracks, pairs = self._within(piece)
         views, base = self._views(state, piece.first, self._stop(piece)), PieceStart(tracks.start, pairs.start)
         planes = self._planes(state)
@@ -269,8 +277,9 @@ class FeatureFactor(FactorDefaults):
     def accumulate_clusters(
         self, state: State, piece: Piece, at: FeatureOutput, cluster: list[np.ndarray], n_clusters: int, column: int
     ) -> None:
-        """Adds the gradient of each cluster of observations to columns `column` and on of `piece`, points as in `at`.
-        cluster: by camera (N,) index of each observation's, below n_clusters."""
+        """Adds the gradient of each cluster of observations to the columns from `column` on of `piece`.
+
+        at: has the points to use. cluster: for each camera (N,) cluster index of each observation, below n_clusters."""
         assert piece.features is not None
         tracks, pairs = self._within(piece)
         views, base = self._views(state, piece.first, self._stop(piece)), PieceStart(tracks.start, pairs.start)
@@ -285,14 +294,14 @@ class FeatureFactor(FactorDefaults):
                 )  # fmt: skip
 
     def _planes(self, state: State) -> Planes | None:
-        """The planes at `state`; None if no point lies on any."""
+        """The LiDAR planes with their values in `state`; None if no point lies on a plane."""
         if self.surfaces is None or not (self.on.plane >= 0).any():
             return None
         return Planes.of(self.surfaces.keys, state, self._of_planes)
 
     @cached_property
     def _of_planes(self) -> np.ndarray:
-        """(P, 3) calibration columns of each plane."""
+        """(P, 3) indices of calibration parameters of each plane, -1 where fixed."""
         keys = () if self.surfaces is None else self.surfaces.keys
         return np.array([self.layout.block(*key).columns for key in keys])
 
@@ -303,12 +312,13 @@ class FeatureFactor(FactorDefaults):
         return self.tracks.within(piece.first, self._stop(piece))
 
     def _stop(self, piece: Piece) -> int:
-        """End of the range of keyframes of `piece`. The last one belongs to the next piece, except at the end of the
-        chain."""
+        """End (exclusive) of the range of keyframes of `piece`.
+
+        Its last keyframe belongs to the next piece, except at the end of the chain."""
         return piece.last + 1 if piece.last == self.n_keyframes - 1 else piece.last
 
     def _images(self, first: int, stop: int) -> list[range]:
-        """By camera, the images of keyframes first..stop."""
+        """For each camera the range of its images at keyframes first..stop (exclusive)."""
         return [range(*(int(i) for i in np.searchsorted(c.keyframe, [first, stop]))) for c in self.cameras]
 
     def _table(self) -> ObservationTable:
@@ -322,7 +332,7 @@ class FeatureFactor(FactorDefaults):
         )
 
     def _views(self, state: State, first: int, stop: int) -> list[CameraImages]:
-        """By camera, its images of keyframes first..stop."""
+        """For each camera its images at keyframes first..stop (exclusive)."""
         return [self._view(state, i, images, first) for i, images in enumerate(self._images(first, stop))]
 
     def _view(self, state: State, index: int, images: range, first: int) -> CameraImages:
@@ -340,7 +350,9 @@ class FeatureFactor(FactorDefaults):
         return CameraImages(camera, index, i0, camera.lens(state), observed, camera.poses(state, i0, i1), columns, pars)
 
     def _descend(self, views: list[CameraImages], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> PointSearch:
-        """The points of `tracks` at their least cost, rows of `planes` included, from xyz (n, 3) m in the world on."""
+        """Searches the points of `tracks` that minimise the cost, from start values xyz (n, 3) m in the world frame.
+
+        planes: LiDAR planes, whose residuals are part of the cost; None without."""
         n, anchors = len(xyz), self._from_anchors(views, tracks, np.zeros_like(xyz))
         points = PointSearch(
             anchors, xyz, xyz.copy(), np.zeros(n), np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)),
@@ -357,7 +369,7 @@ class FeatureFactor(FactorDefaults):
         return points
 
     def _from_anchors(self, views: list[CameraImages], tracks: slice, points: np.ndarray) -> np.ndarray:
-        """(n, 3) m in the world: `points` (n, 3) m of `tracks` in the frames of their anchor cameras."""
+        """(n, 3) m in the world frame, from `points` (n, 3) m of `tracks` in the frames of their anchor cameras."""
         out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
             own = np.flatnonzero(camera == view.index)
@@ -367,7 +379,7 @@ class FeatureFactor(FactorDefaults):
         return out
 
     def _in_anchors(self, views: list[CameraImages], points: np.ndarray, tracks: slice) -> np.ndarray:
-        """(n, 3) m in the frames of their anchor cameras: `points` (n, 3) m of `tracks` in the world."""
+        """(n, 3) m in the frames of the anchor cameras, from `points` (n, 3) m of `tracks` in the world frame."""
         out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
             own = np.flatnonzero(camera == view.index)

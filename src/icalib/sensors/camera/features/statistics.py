@@ -1,4 +1,4 @@
-"""Residual statistics of feature tracks, with the degrees of freedom that points and parameters take."""
+"""Residual statistics of feature tracks, and the degrees of freedom that the fit of points and parameters takes."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ FEATURES = "features"  # kind of the residuals of tracks
 
 @dataclass(frozen=True)
 class FeatureOutput:
-    """Residuals of all tracks. By camera: residual (N, 2) px, predicted - measured, and root (N,) 1/px, square root of
-    the robust weight over sigma, 0 if not in use. points (T, 3) m in the frames of their anchor cameras; off: distances
-    from planes."""
+    """Residuals of all tracks.
+
+    For each camera: residual (N, 2) px, predicted - measured; root (N,) 1/px, square root of the robust weight over
+    sigma, 0 if not in use. points (T, 3) m, in the frames of their anchor cameras; off: their distances from planes."""
 
     residual: tuple[np.ndarray, ...]
     root: tuple[np.ndarray, ...]
@@ -31,7 +32,7 @@ class FeatureOutput:
 
 
 def feature_squares(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, Squares]:
-    """Number and chi^2 of each camera's features, and of its points on planes where there are any."""
+    """Number and chi^2 of the tracks of each camera, and of its points on planes if there are any."""
     found, off = {}, out.off
     for i, (camera, residual, root) in enumerate(zip(factor.cameras, out.residual, out.root, strict=True)):
         chi2 = float(((residual * root[:, None]) ** 2).sum())
@@ -43,8 +44,9 @@ def feature_squares(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, S
 
 
 def feature_sizes(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, RawSize]:
-    """RMS of the tracks of each camera and of its points on planes. Outliers count as rejected, observations of tracks
-    that are left out do not."""
+    """RMS of the tracks of each camera, and of its points on planes.
+
+    Outliers count as rejected, but observations of tracks that are left out do not."""
     found = {}
     for i, camera in enumerate(factor.cameras):
         rejected = int(factor.outliers[i].sum()) if factor.outliers else 0
@@ -66,8 +68,10 @@ def feature_rows(factor: FeatureFactor, out: FeatureOutput, state: State) -> lis
 
 
 def dof_used_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
-    """|J x|^2 of the tracks of each camera, points at their least cost. Each point takes three degrees of freedom: a
-    plane gives its share, the cameras the rest in proportion to their observations."""
+    """See `Factor.dof_used`: |J x|^2 of the tracks of each camera, with re-optimised points, plus the share of points.
+
+    Each point takes three degrees of freedom: its plane's share from the plane residual, the rest from the cameras in
+    proportion to their observations."""
     there, count = output_at(factor, along.end), np.zeros(factor.tracks.count)
     used = [root > 0.0 for root in at.root]
     for track, u in zip(factor.tracks.track, used, strict=True):
@@ -80,7 +84,7 @@ def dof_used_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateD
         spent[camera.name, FEATURES] = own + float(((slope * root[:, None])[u] ** 2).sum())
         if len(on := factor.on_planes_of(i)):
             slope = (there.off.residual - at.off.residual)[on] / along.share * at.off.root[on]
-            # Rows of one patch share the weight of one: chi^2 counts each by `weight`.
+            # All rows of one patch have the weight of one row together: chi^2 counts each row by `weight`.
             left, weight = 1.0 - at.off.share[on], factor.on.weight[on]
             own = float((1.0 - left * (left * weight + at.off.share[on])).sum())
             spent[camera.name, ON_PLANES] = own + float((slope**2).sum())

@@ -1,11 +1,11 @@
-"""Points of tracks on planes of the LiDARs. They constrain cameras against LiDARs where the motion does not.
+"""Tracked points on planes of LiDARs. They link cameras to LiDARs if the motion does not determine the extrinsics.
 
-A point P on the plane with normal n through q gives one row, with standard deviation `points_on_planes_m`:
+A point P on the plane with normal n through q has one residual, with standard deviation `points_on_planes_m`:
 
     residual = n . (P - q)
 
-Errors by relief of a surface do not average out over observations, nor over nearby points. So all points of one patch
-of a plane together have the weight of one.
+Relief of a surface causes errors that do not average out over observations, nor over nearby points. So all points of
+one patch of a plane together have the weight of a single point.
 """
 
 from __future__ import annotations
@@ -26,21 +26,25 @@ from icalib.optim.robust_weights import Loss, weight
 from icalib.optim.state import Key
 from icalib.sensors.camera.features.point_search import PointSearch
 
-ON_PLANES = "points on planes"  # kind of these residuals
-CELL_M = 0.25  # a plane ends where no LiDAR saw it, to a cell; smaller ones have gaps between the lines of few lasers
-PATCH_M = 1.0  # side of a patch, within which relief is much the same
-MAX_OFF_STD = 3.0  # standard deviations that a point on a plane may be off
-MAX_PLANE_DISTANCE_M = 0.5  # to points that may lie on a plane: so far cameras and LiDARs may be apart at first
-MAX_ACROSS_SIGMA_M = 0.1  # standard deviation across a plane, above which a point lies on none
-# Points that must agree on how far off a plane they are, and their least share of those that may lie on it.
+ON_PLANES = "points on planes"  # kind of residual
+# Side of a grid cell. Planes extend over cells in which a LiDAR has points. Smaller cells leave gaps between the scan
+# lines of LiDARs with few lasers.
+CELL_M = 0.25
+PATCH_M = 1.0  # side of a patch, within which errors by relief correlate
+MAX_OFF_STD = 3.0  # largest distance of a point from its plane, in standard deviations
+MAX_PLANE_DISTANCE_M = 0.5  # of candidate points from a plane: largest initial misalignment of cameras and LiDARs
+MAX_ACROSS_SIGMA_M = 0.1  # standard deviation of a point normal to the plane, above which it is no candidate
+# Number of candidate points that must agree on their distance from a plane, and their share of all its candidates.
 MIN_POINTS_ON_PLANE, MIN_SHARE_ON_PLANE = 20, 0.4
-MIN_COARSE_NOISE_M = 0.05  # least noise in early passes, whose poses are rough
-MAX_CELLS = 1 << 20  # from the origin of a plane to its end; bounds the codes of cells
+MIN_COARSE_NOISE_M = 0.05  # smallest noise in early passes, which have rough poses
+MAX_CELLS = 1 << 20  # largest distance from a plane's origin, in cells, so that cell codes fit into 64 bits
 
 
 class OnPlanes(NamedTuple):
-    """Planes of T tracks: plane (T,) index, -1 on none; sigma (T,) m: standard deviation of the row; weight (T,): one
-    over the number of points on the patch."""
+    """Planes of T tracks.
+
+    plane (T,): index, -1 if the point is on no plane; sigma (T,) m: standard deviation of its residual; weight (T,):
+    one over the number of points on the same patch."""
 
     plane: np.ndarray
     sigma: np.ndarray
@@ -58,8 +62,10 @@ NO_PLANES = OnPlanes.none(0)
 
 
 class PlaneDistances(NamedTuple):
-    """Distances of T points from their planes: residual (T,) m; root (T,) 1/m, square root of the robust weight over
-    sigma, 0 on no plane; share (T,): how many of the point's three degrees of freedom this row determines."""
+    """Distances of T points from their planes.
+
+    residual (T,) m; root (T,) 1/m: square root of the robust weight over sigma, 0 for points on no plane; share (T,),
+    0 to 1: degrees of freedom of the point, out of three, that the plane determines."""
 
     residual: np.ndarray
     root: np.ndarray
@@ -75,11 +81,11 @@ class PlaneDistances(NamedTuple):
 
 @dataclass(frozen=True)
 class Surfaces:
-    """The P planes of a pass, and where LiDARs observe them.
+    """The P planes of LiDARs in a pass, and the grid cells in which LiDARs observe them.
 
-    keys: of their values in a state; plane (P, 6): normal, and point [m], at the start of the pass; recording (P,):
-    index of the recording of each; cells: sorted codes of the observed cells, see `_codes`; noise [m]: standard
-    deviation of points on them."""
+    keys: keys of the planes in a state; plane (P, 6): unit normal, and a point of the plane [m], at the start of the
+    pass, in the world of its recording; recording (P,): index of this recording; cells: sorted codes of the observed
+    cells, see `_codes`; noise [m]: standard deviation of points normal to their plane."""
 
     keys: tuple[Key, ...]
     plane: np.ndarray
@@ -97,8 +103,10 @@ class Surfaces:
         noise: float,
         coarse: bool,
     ) -> Surfaces:
-        """plane (P, 6): normals and points of the planes; clouds: of each LiDAR points (n, 3) m in the world, and the
-        index (n,) of the plane that each lies on; coarse: an early pass, whose poses are rough."""
+        """The planes with the cells that the points of `clouds` observe, and all neighbours of these cells.
+
+        plane (P, 6): see `Surfaces`; clouds: for each LiDAR points (n, 3) m in the world, and the index (n,) of the
+        plane of each; noise [m]; coarse: whether this is an early pass with rough poses."""
         codes = [np.zeros(0, dtype=np.int64)]
         for xyz, of_points in clouds:
             codes.append(_with_neighbours(np.unique(_codes(plane, of_points.astype(np.int64), xyz))))
@@ -106,11 +114,12 @@ class Surfaces:
         return cls(keys, plane, recording, cells, max(noise, MIN_COARSE_NOISE_M) if coarse else noise)
 
     def under(self, points: np.ndarray, information: np.ndarray, recording: np.ndarray) -> OnPlanes:
-        """The plane of each of the points (n, 3) m, in the world of its `recording` (n,); none if it may lie on
-        several. information (n, 3, 3) 1/m^2: of the points.
+        """Associates the points (n, 3) m, in the world of their `recording` (n,), with planes; a point with several
+        possible planes gets none.
 
-        Unobservable directions may displace cameras against LiDARs. So the test is not whether a point is close to a
-        plane, but whether it is as far off as most points that may lie on it.
+        information (n, 3, 3) 1/m^2: inverse covariance of each point. Cameras may be displaced against LiDARs along
+        unobservable directions. So the test is not whether a point is close to a plane, but whether its distance
+        agrees with that of most candidates of the plane.
         """
         normal = self.plane[:, :3]
         off = points @ normal.T - np.einsum("pa,pa->p", normal, self.plane[:, 3:])
@@ -135,8 +144,10 @@ class Surfaces:
 
 
 def most_alike(off: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(n,) bool: entries of `off` (n,), with standard deviations `sigma` (n,), that agree on one value, the one that
-    most intervals of `MAX_OFF_STD` contain. None if these are few, or a small share of all."""
+    """(n,) bool: values `off` (n,), with standard deviations `sigma` (n,), that agree on one common value.
+
+    The common value is the one within `MAX_OFF_STD` sigma of most entries. All False if few entries, or a small share
+    of them, agree."""
     ends = np.concatenate([off - MAX_OFF_STD * sigma, off + MAX_OFF_STD * sigma])
     order = np.argsort(ends, kind="stable")
     count = np.cumsum(np.where(order < len(off), 1, -1))
@@ -148,7 +159,7 @@ def most_alike(off: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def _codes(plane: np.ndarray, which: np.ndarray, xyz: np.ndarray, size: float = CELL_M) -> np.ndarray:
-    """(n,) one integer for plane `which` (n,) and the cell of side `size` [m] that each point xyz (n, 3) m lies in."""
+    """(n,) integer code of plane `which` (n,) and its grid cell, of side `size` [m], of each point xyz (n, 3) m."""
     across = np.array([tangents(np.ascontiguousarray(v[:3])) for v in plane])
     cell = np.einsum("nta,na->nt", across[which], xyz - plane[which, 3:]) / size
     i, j = np.clip(np.floor(cell), 1 - MAX_CELLS, MAX_CELLS - 2).astype(np.int64).T + MAX_CELLS
@@ -156,15 +167,16 @@ def _codes(plane: np.ndarray, which: np.ndarray, xyz: np.ndarray, size: float = 
 
 
 def _with_neighbours(codes: np.ndarray) -> np.ndarray:
-    """Codes of cells and of the eight around each, because lines of few lasers are far apart."""
+    """Codes of cells and of their eight neighbours, because the scan lines of LiDARs with few lasers are far apart."""
     steps = [a * 2 * MAX_CELLS + b for a in (-1, 0, 1) for b in (-1, 0, 1)]
     return np.unique(np.concatenate([codes + s for s in steps]))
 
 
 @njit(cache=True, nogil=True)
 def add_planes_to_points(on, planes, loss, points):
-    """Adds the row of each point on a plane that still moves to its normal equations, with the true curvature of the
-    loss."""
+    """Adds the plane residual of each point that has not converged to its trial normal equations.
+
+    These have the true curvature of the loss. on: planes of the points; planes: their values."""
     for t in range(len(on.plane)):
         q = on.plane[t]
         if q < 0 or not points.moves[t]:
@@ -181,6 +193,7 @@ def add_planes_to_points(on, planes, loss, points):
 
 @njit(cache=True, nogil=True)
 def _distance(planes, q, point):
+    """Signed distance [m] of `point` (3,) m from plane q."""
     e = 0.0
     for a in range(3):
         e += planes.normal[q, a] * (point[a] - planes.point[q, a])
@@ -189,8 +202,10 @@ def _distance(planes, q, point):
 
 @njit(cache=True, nogil=True)
 def _accumulate(on, planes, loss, xyz, A, features, calib, out):
-    """Fills `out`, and adds the rows to the sums of the tracks and of the calibration parameters, where there are any.
-    A (T, 3, 3): normal equations of the points. Returns half the robust chi^2."""
+    """Writes residuals, weights and shares into `out`, and returns half the robust chi^2.
+
+    Adds normal equations to `features` and to calib (B + 1, B + 1), unless calib is empty. xyz (T, 3) m: points;
+    A (T, 3, 3) 1/m^2: their normal matrices."""
     total, M, d = 0.0, np.empty((3, 3)), np.empty(3)
     J_plane, wanted = np.empty(3), calib.shape[0] > 0
     for t in range(len(on.plane)):
@@ -214,7 +229,7 @@ def _accumulate(on, planes, loss, xyz, A, features, calib, out):
 
 @njit(cache=True, nogil=True)
 def _fill_J_plane(planes, q, point, J_plane):
-    """Distance of the point (3,) m from plane q by the plane's parameters, into J_plane (3,): two rotations, offset."""
+    """Writes the Jacobian of the point's distance by the parameters of plane q into J_plane (3,): two tilts, offset."""
     J_plane[0] = J_plane[1] = 0.0
     for a in range(3):
         J_plane[0] += planes.tangents[q, 0, a] * (point[a] - planes.point[q, a])
@@ -224,8 +239,10 @@ def _fill_J_plane(planes, q, point, J_plane):
 
 @njit(cache=True, nogil=True)
 def _add_row(t, J_point, J_plane, columns, along, weighted, features, calib):
-    """Adds the row of track t: derivatives J_point (3,), by its point, and J_plane (3,), by its plane with calibration
-    columns (3,), -1 where fixed. along: weight of the second derivative; weighted: weight times residual."""
+    """Adds the plane residual of track t to the normal equations.
+
+    J_point (3,), J_plane (3,): its Jacobians by point and plane; columns (3,): indices of the plane's calibration
+    parameters, -1 where fixed; along: weight of J^T J; weighted: weight times residual."""
     n_b = calib.shape[0] - 1
     for a in range(3):
         features.side[t, a, n_b] += weighted * J_point[a]
@@ -253,7 +270,8 @@ def add_points_on_planes(
     piece: Piece,
     out: PlaneDistances,
 ) -> float:
-    """Rows of points on planes, after `PointSearch`: residuals into `out`, and into the sums of `features` and of the
-    calibration parameters of `piece` where these are wanted. Returns half the robust chi^2."""
+    """Writes the plane residuals at the points found by `PointSearch` into `out`, and returns half the robust chi^2.
+
+    Adds their normal equations to `features` and to the calibration parameters of `piece`, unless features is empty."""
     calib = piece.calib if len(features.own) else np.zeros((0, 0))
     return _accumulate(on, planes, loss, points.xyz, points.A, features, calib, out)

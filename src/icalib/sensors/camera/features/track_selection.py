@@ -1,4 +1,4 @@
-"""Noise and outliers of feature tracks, from the residuals of a pass."""
+"""Noise and outliers of feature tracks, estimated from the residuals of a pass."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ from icalib.sensors.camera.image_times import are_used
 
 INITIAL_TRACK_NOISE_PX = 1.0  # per axis, in the first pass
 MIN_TRACK_NOISE_PX = 0.005  # per axis: no tracker is better; keeps weights finite
-# Share of the observations of an image that count as inliers. In the first pass a rough lens leaves large residuals at
-# the border, which are no outliers.
+# Quantile of the residuals of an image, from which the limit for outliers is scaled. In the first pass a rough lens
+# leaves large residuals at the border, which are no outliers, so the quantile is higher.
 INLIER_SHARE_FIRST, INLIER_SHARE = 0.9, 0.5
-MIN_GROUP_OBSERVATIONS = 50  # for their median variance to be known to a fifth
+MIN_GROUP_OBSERVATIONS = 50  # with these the median variance has a relative error of a fifth
 
 
 @dataclass(frozen=True)
 class TrackSelection:
-    """Noise and inliers of the feature tracks of one camera: keep (N,) bool, observations in use; outliers (N,) bool,
-    observations of tracks that are rejected because their residuals are large."""
+    """Noise and inliers of the feature tracks of one camera.
+
+    keep (N,) bool: observations in use; outliers (N,) bool: observations rejected because of large residuals."""
 
     noise: TrackNoise
     keep: np.ndarray
@@ -39,7 +40,7 @@ class TrackSelection:
 
     @classmethod
     def first(cls, camera: Camera, stream: TrackStream) -> TrackSelection:
-        """Before any pass: stated noise, or a pixel, and all observations."""
+        """The selection of the first pass: noise of the rig file or one pixel, and all observations in use."""
         none = np.zeros(len(stream.uv), dtype=bool)
         return cls(TrackNoise(camera.track_noise_px or INITIAL_TRACK_NOISE_PX), ~none, none)
 
@@ -53,13 +54,15 @@ def next_selections(
     settings: Settings,
     is_first: bool,
 ) -> list[TrackSelection]:
-    """By camera, for the next pass: noise as the residuals `out` at `state` show it, unless it is stated, and all
-    observations but the outliers after the first pass (`is_first`) or a later one."""
+    """For each camera the selection of the next pass: noise by the residuals `out`, unless stated, and inliers.
+
+    state: poses and lens at the end of this pass; now: selections of this pass; is_first: whether this was the first
+    pass, which has a laxer test."""
     noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(cameras))
     if settings.outlier_std <= 0.0:
         return [replace(own, noise=n) for own, n in zip(now, noise, strict=True)]
-    # All observations are tested again at the end of the pass: its first poses may have left out tracks that the last
-    # ones find, and its first lens may have made outliers of inlier observations.
+    # All observations are tested again with the final poses of the pass. Its first poses may have left out good tracks,
+    # and its first lens may have turned inliers into outliers.
     observed = observed_at_keyframes(factor.cameras, factor.streams, state, settings.max_gap_s)
     anew = replace(factor, noise=noise, keep=observed).cut(state, chain_cuts(factor.n_keyframes))
     left, share = output_at(anew, state), INLIER_SHARE_FIRST if is_first else INLIER_SHARE
@@ -70,14 +73,15 @@ def next_selections(
 def observed_at_keyframes(
     cameras: Sequence[CornerFactor], streams: Sequence[TrackStream], state: State, max_gap_s: float
 ) -> tuple[np.ndarray, ...]:
-    """By camera (N,) bool: observations of tracks in images that take part, see `are_used`."""
+    """For each camera (N,) bool: track observations in images that are in use, see `are_used`."""
     used = (are_used(c.imu, instants(c.stream, state.values), state.seconds[c.keyframe], max_gap_s) for c in cameras)
     return tuple(np.repeat(u, np.diff(stream.start)) for u, stream in zip(used, streams, strict=True))
 
 
 def _noise(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> TrackNoise:
-    """Stated noise, or by the median of squared residuals, which outliers do not move. Each point takes three
-    degrees of freedom."""
+    """Noise of the tracks of camera number `index`: stated, or else by the median of squared residuals.
+
+    The median is robust to outliers. It is corrected for three degrees of freedom per point."""
     used = [root > 0.0 for root in out.root]
     if camera.track_noise_px is not None:
         return TrackNoise(camera.track_noise_px)
@@ -94,10 +98,10 @@ def _noise(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int
 
 
 def variance_growth(square: np.ndarray, views: np.ndarray) -> float:
-    """Growth of the variance of observations with each view, over the variance of the first view; 0 if none.
+    """Increase of the variance of observations per view, relative to the variance of the first view; 0 if none.
 
-    square (n,) px^2: squared residuals; views (n,): earlier views of the feature. A line is fitted to the median
-    variances of groups of views, weighted by their numbers of observations.
+    square (n,) px^2: squared residuals; views (n,): number of earlier views of the feature. A line is fitted to the
+    median variances of groups of similar numbers of views, with weights by numbers of observations.
     """
     group = np.floor(np.log2(views + 1.0)).astype(int)
     rows = []
@@ -117,9 +121,9 @@ def _tested(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inliers (N,) bool and outliers (N,) bool among the observations in tracks of camera number `index`.
 
-    An outlier is `outlier_std` standard deviations above the mean residual of its image, and above `outlier_min_px`; or
-    the camera model does not project its point. Mean and standard deviation follow from the quantile `share` of the
-    image as those of normal errors, because a single outlier among few points would inflate sample moments.
+    An outlier has a residual more than `outlier_std` standard deviations above the mean of its image, and above
+    `outlier_min_px`; or the camera model does not project its point. Mean and standard deviation are those of normal
+    errors with the image's quantile `share`, because sample moments of few points are not robust to an outlier.
     """
     stream = factor.streams[index]
     used, in_track = out.root[index] > 0.0, factor.tracks.track[index] >= 0

@@ -1,8 +1,8 @@
-"""Tracks: which features the estimate uses, and where each begins and ends.
+"""Tracks: splits features into the tracks that the estimate uses.
 
-A feature becomes one track or several. A track ends where the chain is cut, between recordings, and where the feature
-was out of sight for long, because the cost of elimination grows with the length of tracks. Each track is a point of
-its own, of unknown position; only the constraint between the tracks of one feature is lost.
+A feature becomes one or several tracks. Tracks end where the chain of keyframes is cut, between recordings, and where
+the feature is unobserved for long, because the cost of elimination grows with the length of tracks. Each track is
+estimated as a separate point. Only the constraint that tracks of one feature are the same point is lost.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ import numpy as np
 
 from icalib.data.measurements import TrackStream
 
-MIN_TRACK_OBSERVATIONS = 3  # two observations fit almost any pose
+MIN_TRACK_OBSERVATIONS = 3  # two observations hardly constrain the poses
 
 
 @dataclass(frozen=True)
 class TrackNoise:
-    """Noise of the tracks of one camera: sigma [px] per axis of the first view of a feature, and the growth of its
-    variance with each later view n: sigma_n^2 = sigma^2 (1 + growth n)."""
+    """Noise of the tracks of one camera: sigma_n^2 = sigma^2 (1 + growth n), with n earlier views of the feature.
+
+    sigma [px]: standard deviation per axis of the first view; growth: relative increase of the variance per view."""
 
     sigma: float
     growth: float = 0.0
 
     def of(self, stream: TrackStream) -> np.ndarray:
-        """(N,) px: standard deviation of each observation per axis, the same for all if the tracker does not count
-        views."""
+        """(N,) px: standard deviation of each observation per axis; `sigma` for all if numbers of views are unknown."""
         if not len(stream.views):
             return np.full(len(stream.uv), self.sigma)
         return self.sigma * np.sqrt(1.0 + self.growth * stream.views)
@@ -36,11 +36,11 @@ class TrackNoise:
 class Tracks:
     """Tracks in the order of their first keyframes.
 
-    By camera: track (N,), index for each observation, -1 without one; pair (N,), index of its pair. A pair is a track
-    and one of its images: pair_track, pair_camera and pair_image (E,), in the order of keyframes. edges (S + 1,):
-    keyframes at which all tracks end; tracks_from and pairs_from (S + 1,): the first behind each edge. The anchor of a
-    track is the camera that observes it in the middle of its length: camera and image (T,); start (T, 3) m: initial
-    point, in the frame of the anchor."""
+    For each camera: track, pair (N,): index of the track and of the pair of each observation, -1 without a track. A
+    pair is a track with one of its images: pair_track, pair_camera, pair_image (E,) are its indices, in the order of
+    keyframes. edges (S + 1,): keyframes at which all tracks end; tracks_from, pairs_from (S + 1,): first track and pair
+    after each edge. The anchor of a track is the image in the middle of its observations: camera, image (T,). start
+    (T, 3) m: initial points, in the frames of the anchor cameras."""
 
     track: tuple[np.ndarray, ...]
     pair: tuple[np.ndarray, ...]
@@ -59,19 +59,21 @@ class Tracks:
         return len(self.start)
 
     def stretch_of(self) -> np.ndarray:
-        """(T,) the last edge before each track."""
+        """(T,) keyframe index of the last edge at or before the start of each track."""
         return self.edges[np.searchsorted(self.tracks_from, np.arange(self.count), side="right") - 1]
 
     def within(self, first: int, stop: int) -> tuple[slice, slice]:
-        """Slices of the tracks and pairs between keyframes first and stop, which must be edges."""
+        """Slices of the tracks and of the pairs between the keyframes `first` and `stop`, which must be edges."""
         a, b = np.searchsorted(self.edges, [first, stop])
         return slice(*self.tracks_from[[a, b]].tolist()), slice(*self.pairs_from[[a, b]].tolist())
 
 
 @dataclass(frozen=True)
 class ObservationTable:
-    """All N observations, camera by camera: feature, image of its camera, and keyframe (N,); used (N,) bool, whether
-    they may be in a track; counts: number of observations of each camera."""
+    """All N observations of all cameras, camera by camera.
+
+    feature, image, keyframe (N,): number of the feature, index of the image of its camera, index of the keyframe. used
+    (N,) bool: whether the observation may be in a track; counts: number of observations of each camera."""
 
     feature: np.ndarray
     image: np.ndarray
@@ -80,8 +82,10 @@ class ObservationTable:
     counts: tuple[int, ...]
 
     def labels(self, seconds: np.ndarray, edges: np.ndarray, longest_gap: float) -> np.ndarray:
-        """(N,) label of the track of each observation, -1 if not used. Tracks end at keyframes `edges`, and where a
-        feature was out of sight for `longest_gap` [s]; seconds (K,): of the keyframes."""
+        """(N,) label of the track of each observation, -1 if not used.
+
+        Tracks end at the keyframes `edges`, and where a feature is unobserved for longer than `longest_gap` [s].
+        seconds (K,): times of the keyframes."""
         at = np.flatnonzero(self.used)
         order = at[np.lexsort((self.keyframe[at], self.feature[at]))]
         feature, keyframe = self.feature[order], self.keyframe[order]
@@ -93,7 +97,7 @@ class ObservationTable:
         return out
 
     def in_order(self, label: np.ndarray) -> np.ndarray:
-        """(N,) labels numbered in the order of first keyframes; -1 for tracks with too few observations."""
+        """The labels (N,), renumbered in the order of first keyframes; -1 for tracks with too few observations."""
         seen = label >= 0
         n = int(label.max(initial=-1)) + 1
         first = np.full(n, np.iinfo(np.int64).max)
@@ -105,7 +109,7 @@ class ObservationTable:
         return number[label]
 
     def tracks(self, label: np.ndarray, edges: np.ndarray) -> Tracks:
-        """Tracks of labels that are in order, with all initial points at zero."""
+        """The tracks of labels (N,) as `in_order` returns them, with all initial points at zero."""
         seen, n = np.flatnonzero(label >= 0), int(label.max(initial=-1)) + 1
         pairs = seen[np.argsort(self.keyframe[seen], kind="stable")]
         pair = np.full(len(label), -1)
