@@ -1,1 +1,1 @@
-"""How a kind of sensor enters the problem: the base class of every `sensors/KIND/model.py`."""
+"""Interface between sensor kinds and the estimator: base class of every `sensors/KIND/model.py`, and its data."""

@@ -1,6 +1,7 @@
-"""The rigid bodies that a target consists of: their shapes, their poses in the scene, and where their points are.
+"""Rigid bodies of a target: shapes, poses in the scene, and points.
 
-The first body in use is the reference: its frame is the scene's, in which the others have poses that are estimated.
+The first body in use is the reference. Its frame is the frame of the scene, in which the poses of all other bodies are
+estimated.
 """
 
 from __future__ import annotations
@@ -16,18 +17,19 @@ from icalib.optim.state import Entry, Key, Layout
 from icalib.rig import scene
 from icalib.rig.scene import BOW_LABELS, IN_PLANE_LABELS, SHAPE_LABELS
 
-SIZE: Key = (BOARD, scene.SIZE.name)  # (1,) true lengths over those of the target as stated
-# Standard deviations of the prior: boards are flat to a few millimetres, and printed to about one.
+SIZE: Key = (BOARD, scene.SIZE.name)  # (1,) factor on the lengths of the target
+# Prior standard deviations: boards are flat to a few millimetres, and printed to about one.
 SHAPE_SIGMA_M = np.array([3e-3] * len(BOW_LABELS) + [1e-3] * len(IN_PLANE_LABELS))
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """The bodies of a target that are in use.
+    """Bodies of a target that are in use.
 
-    used: their indices, the reference first; left_out: bodies that were seen, but in too few images with others; bent:
-    whether their shapes are estimated; size: true lengths over those of the target; sized: whether a factor on `size`
-    is a parameter as well."""
+    used: indices of the bodies, the reference first. left_out: observed bodies that share too few images with others.
+    bent: whether shapes are estimated. size: true over stated lengths of the target. sized: whether a further factor on
+    `size` is estimated.
+    """
 
     target: Target
     used: tuple[int, ...]
@@ -47,36 +49,38 @@ class Bodies:
 
     @property
     def bending(self) -> tuple[str, ...]:
-        """Names of those whose shape is estimated."""
+        """Names of the bodies whose shape is estimated."""
         return tuple(self.target.bodies[k] for k in self.used if self.bent and self.target.bends[k])
 
     @cached_property
     def basis(self) -> np.ndarray:
-        """(n_points, s, 3) m: displacement of each point, in its body's frame, by unit of its shape parameters."""
+        """(n_points, s, 3) displacement [m] of each point in the frame of its body, per unit of each shape
+        parameter."""
         return shape_basis(self.target, self.bent)
 
     @cached_property
     def deformation(self) -> np.ndarray:
-        """(n_points, s or s + 1, 3) m: `basis`, then displacement by unit of the size, if that is a parameter."""
+        """(n_points, s or s + 1, 3) `basis` [m], followed by the displacement per unit of the size factor if that is
+        estimated."""
         grown = self.size * self.target.points[:, None, :]
         return np.concatenate([self.basis, grown], axis=1) if self.sized else self.basis
 
     def size_entries(self) -> list[Entry]:
-        """Entry of the size, which all bodies share, in a layout; empty if it is no parameter."""
+        """Layout entry of the size factor, which all bodies share; empty if it is not estimated."""
         return [scene.SIZE.entry(BOARD)] if self.sized and self.used else []
 
     def shape_entries(self) -> list[Entry]:
-        """Entries of the shapes of bending bodies in a layout."""
+        """Layout entries of the estimated shapes."""
         return [scene.SHAPE.entry(name) for name in self.bending]
 
     def pose_entries(self) -> list[Entry]:
-        """Entries of the poses in the scene in a layout, that of the reference fixed; empty for one body."""
+        """Layout entries of the poses of bodies in the scene, the reference fixed; empty for a single body."""
         names = self.names if self.several else ()
         return [spec.entry(name, name != self.names[0]) for name in names for spec in scene.BODY]
 
     def columns(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Calibration columns of all bodies of the target, -1 where there are none: of the pose (n, 6, or 0 if only one
-        is in use), and of shape and size (n, s or s + 1) as in `deformation`."""
+        """Calibration columns for all bodies of the target, -1 where not estimated. Pose (n, 6), or (n, 0) if only one
+        body is in use; shape and size (n, s or s + 1), in the order of `deformation`."""
         names, n = self.target.bodies, len(self.target.bodies)
         pose, shape = np.full((n, 6 if self.several else 0), -1), np.full((n, self.deformation.shape[1]), -1)
         for k in self.used if self.several else ():
@@ -89,8 +93,8 @@ class Bodies:
         return pose, shape
 
     def poses(self, values: dict[Key, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """R_scene_body (n, 3, 3) and p_scene_body (n, 3) of all the target's bodies; the identity where one has
-        none."""
+        """R_scene_body (n, 3, 3) and p_scene_body (n, 3) [m] of all bodies of the target; the identity for the
+        reference and bodies not in use."""
         n = len(self.target.bodies)
         R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for k in self.used[1:]:
@@ -99,7 +103,8 @@ class Bodies:
         return R, p
 
     def points(self, values: dict[Key, np.ndarray]) -> np.ndarray:
-        """(n_points, 3) the target's points in the scene, shapes included; of the stated size if `values` has none."""
+        """(n_points, 3) points of the target in the scene [m], shapes included. The size factor is 1 if `values` has
+        none."""
         size = self.size * values[SIZE][0] if self.sized and SIZE in values else self.size
         points, body = size * self.target.points, self.target.body
         if self.bending:
@@ -115,8 +120,8 @@ class Bodies:
 
 
 def shape_basis(target: Target, bent: bool) -> np.ndarray:
-    """(n_points, s, 3) displacement in the frame of each point's body by unit of the body's shape parameters [m]; zeros
-    for bodies that do not bend, s = 0 where none may."""
+    """(n_points, s, 3) displacement [m] in the frame of each point's body, per unit of each shape parameter. Zero for
+    bodies that do not bend; s = 0 if none bends or not `bent`."""
     if not (bent and target.bends.any()):
         return np.zeros((len(target.points), 0, 3))
     basis = np.zeros((len(target.points), len(SHAPE_LABELS), 3))
@@ -127,10 +132,10 @@ def shape_basis(target: Target, bent: bool) -> np.ndarray:
 
 
 def _basis_of_one(xy: np.ndarray) -> np.ndarray:
-    """(n, s, 3) of the body with points xy (n, 2).
+    """(n, s, 3) shape basis of a body with points xy (n, 2).
 
-    With x and y from -1 to 1 over it: the bow z = a x^2 + b x y + c y^2; stretch (x, -y) and shear (y, x); and x or y
-    moved by x^2, x y, y^2.
+    x and y are scaled to -1..1 over the body. Basis fields: bow z = x^2, x y, y^2; stretch (x, -y); shear (y, x);
+    in-plane displacement of x or y by x^2, x y, y^2.
     """
     low, high = xy.min(axis=0), xy.max(axis=0)
     x, y = ((xy - 0.5 * (low + high)) / (0.5 * (high - low))).T

@@ -1,4 +1,5 @@
-"""What the problem asks of a kind of sensor. `sensors/KIND/model.py` has an instance for its kind, called `MODEL`."""
+"""Interface of a kind of sensor for the estimator. `sensors/KIND/model.py` has an instance for its kind, called
+`MODEL`."""
 
 from __future__ import annotations
 
@@ -29,11 +30,12 @@ N = TypeVar("N")
 
 @dataclass(frozen=True)
 class Pass:
-    """The state, motion and layout at which factors are built for one outer iteration.
+    """Data from which factors are built for one outer iteration.
 
-    motion: of the IMU; None without one. starts: the first keyframe of each recording. coarse: an early pass, which
-    needs less accuracy and shall cost little. measurements: all recordings joined; parts: the recordings, each with a
-    chain of its own; a single one without an IMU. bodies: those of the target that are in use."""
+    motion: of the IMU; None without one. starts: first keyframe of each recording. coarse: an early pass, which needs
+    less accuracy and shall be cheap. measurements: all recordings joined. parts: the recordings, each with its own
+    chain; a single part without an IMU. bodies: bodies of the target in use.
+    """
 
     rig: Rig
     clouds: Clouds
@@ -56,8 +58,9 @@ class Pass:
 class Clusters:
     """Clusters of measurements whose errors may correlate.
 
-    of_factor: the cluster of each measurement, by factor and as its `accumulate_clusters` takes it. is_sample: whether
-    the clusters are a sample of all there could be, such as groups of feature tracks; else they are all there are.
+    of_factor: cluster of each measurement by factor, in the form that the factor's `accumulate_clusters` takes.
+    is_sample: True if the clusters are a sample of many possible ones, such as groups of feature tracks; False if they
+    are all, such as image cells.
     """
 
     of_factor: Mapping[FactorKey, Any]
@@ -65,12 +68,12 @@ class Clusters:
 
 
 class SensorModel(Generic[S, N]):
-    """How the sensors S of one kind enter the problem, with noise of the class N. The defaults are those of a sensor
-    with a pose and a clock, and with no factor.
+    """Interface of the sensors S of one kind for the estimator, with noise of the class N. The defaults fit a sensor
+    with a pose and a clock but no factor.
 
-    keyframes: what keyframes are placed at, as in "images of cam0"; empty where the kind places none.
-    only_first_places_keyframes: if the kind has several sensors, only the first places keyframes. refitted: the kind of
-    residuals whose noise is fitted again where another density of the IMU's noise is tried; empty where there is none.
+    keyframes: measurements at which keyframes are placed, as in "images of cam0"; empty if the kind places none.
+    only_first_places_keyframes: of several sensors, only the first places keyframes. refitted: kind of residuals whose
+    noise is fitted again when another noise density of the IMU is tried; empty if there is none.
     """
 
     keyframes: ClassVar[str] = ""
@@ -80,27 +83,28 @@ class SensorModel(Generic[S, N]):
     # Parameters
 
     def takes_part(self, sensor: S, clouds: Clouds) -> bool:
-        """Whether the sensor has parameters and factors. clouds: points of LiDARs on planes."""
+        """Whether the sensor has parameters and factors. clouds: LiDAR points on planes."""
         del sensor, clouds
         return True
 
     def is_estimated(self, sensor: S, spec: ParameterSpec, rig: Rig) -> bool:
-        """Whether one of the sensor's own groups of parameters is estimated."""
+        """Whether a parameter group of the sensor is estimated."""
         del rig
         return sensor.is_estimated(spec)
 
     def entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
-        """The sensor's own groups of parameters in the layout."""
+        """Layout entries of the sensor's parameter groups."""
         return own_entries(sensor, n_recordings, lambda spec: self.is_estimated(sensor, spec, rig))
 
     def scene_entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
-        """What the scene has because of this sensor, such as the frame that it reports in."""
+        """Layout entries of quantities of the scene that this sensor needs, such as the reference frame of its
+        poses."""
         del sensor, rig, n_recordings
         return []
 
     def start_value(self, sensor: S, spec: ParameterSpec, rig: Rig) -> np.ndarray | None:
-        """Start (spec.size,) of a nuisance or auxiliary group (bias, scale, shape): the stated value, or zero. None for
-        groups that the initial guess finds."""
+        """Start value (spec.size,) of a nuisance or auxiliary group (bias, scale, shape): the value of the rig file, or
+        zero. None for groups that the initial guess determines."""
         del rig
         if not (spec.manifold == "nuisance" or spec.is_auxiliary):
             return None
@@ -108,35 +112,35 @@ class SensorModel(Generic[S, N]):
         return np.zeros(spec.size) if stated is None else stated.copy()
 
     def keyframe_times(self, sensor: S, stream: Any, values: dict[Key, np.ndarray], rig: Rig) -> np.ndarray:
-        """(n,) instants at which the sensor wants keyframes, s on the body's clock since its first stamp."""
+        """(n,) times at which the sensor needs keyframes [s, body's clock since its first stamp]."""
         del sensor, rig
         return instants(stream, values)
 
     # Noise
 
     def first_noise(self, sensor: S, settings: Settings) -> N:
-        """The noise before any residuals are known: the stated, or a usual one."""
+        """Noise before any residuals are known: stated, or usual values."""
         raise NotImplementedError
 
     def next_noise(self, sensor: S, noise: N, found: ResidualStatistics) -> N:
-        """The noise that the residuals of a pass with `noise` show, as far as it is estimated."""
+        """Noise estimated from the residuals `found` of a pass with `noise`. Stated parts are unchanged."""
         del sensor, found
         return noise
 
     def noise_passes(self, sensor: S) -> int:
-        """How many passes the estimate of the noise takes; 0: all of it is stated."""
+        """Number of passes that the noise estimate needs; 0 if all noise is stated."""
         del sensor
         return 0
 
     def noise_is_estimated(self, sensor: S) -> bool:
-        """Whether the residuals show some of the noise."""
+        """Whether some of the noise is estimated from residuals."""
         return self.noise_passes(sensor) > 0
 
     def scaled_noise(self, noise: N, scale: float) -> N:
-        """The noise with standard deviations `scale` times as large, of kinds that have `refitted` residuals."""
+        """The noise with standard deviations multiplied by `scale`; only for kinds with `refitted` residuals."""
         raise NotImplementedError
 
-    # Noise and inliers of all sensors of the kind; a kind whose sensors share measurements overrides these
+    # Noise and inliers of all sensors of the kind; overridden by kinds whose sensors share measurements
 
     def first_noises(self, sensors: Sequence[S], rig: Rig, measurements: Measurements) -> dict[str, N]:
         """`first_noise` of each sensor."""
@@ -148,42 +152,45 @@ class SensorModel(Generic[S, N]):
         return {s.name: self.next_noise(s, noise[s.name], end.of(s.name)) for s in sensors}
 
     def passes(self, sensors: Sequence[S], rig: Rig, measurements: Measurements) -> int:
-        """How many passes the estimates of noise and inliers take."""
+        """Number of passes that the estimates of noise and inliers need."""
         del rig, measurements
         return max((self.noise_passes(s) for s in sensors), default=0)
 
     # Factors
 
     def factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
-        """The sensor's factors for a rig with an IMU, whose motion is `at.motion`."""
+        """Factors of the sensor in a rig with an IMU, whose motion is `at.motion`."""
         del sensor, stream, noise, at
         return ()
 
     def still_factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
-        """The sensor's factors for a rig without an IMU. Measurements are taken at keyframes; nothing links
-        keyframes."""
+        """Factors of the sensor in a rig without an IMU. Measurements are at keyframes, and keyframes are
+        independent."""
         del sensor, stream, noise, at
         return ()
 
     def joint_factors(
         self, sensors: Sequence[S], factors: Sequence[Factor], noise: Mapping[str, N], at: Pass
     ) -> Sequence[Factor]:
-        """Factors of what several sensors of the kind measure together; `factors`: those of each sensor."""
+        """Factors of measurements that several sensors of the kind make together. factors: those of the single
+        sensors."""
         del sensors, factors, noise, at
         return ()
 
     def uses_more(self, used: Mapping[FactorKey, Factor], rebuilt: Callable[[], Mapping[FactorKey, Factor]]) -> bool:
-        """Whether the factors of a pass, `rebuilt` at its end, would use many more measurements than it `used`."""
+        """Whether factors `rebuilt` at the end of a pass would use many more measurements than those `used` in it."""
         del used, rebuilt
         return False
 
     def clusters(self, factors: Mapping[FactorKey, Factor]) -> Iterator[Clusters]:
-        """Measurements whose errors may correlate, cluster by cluster; each item covers all of the kind's factors."""
+        """Yields each kind of clusters of measurements whose errors may correlate, over all factors of the sensor
+        kind."""
         del factors
         yield from ()
 
     def points_on_planes(self, sensor: S, stream: Any, at: Pass) -> tuple[np.ndarray, np.ndarray] | None:
-        """Some points (n, 3) m of the sensor in the world, and the plane (n,) of `at.clouds` that each lies on.
+        """Some points (n, 3) of the sensor in the world [m], and the index (n,) of the plane in `at.clouds` that each
+        lies on.
 
         None for sensors without points.
         """
@@ -197,7 +204,7 @@ def model_of(sensor: Sensor) -> SensorModel[Any, Any]:
 
 
 def by_kind(sensors: Iterable[Sensor]) -> Iterator[tuple[SensorModel[Any, Any], list[Sensor]]]:
-    """The models of the kinds that have any of `sensors`, in the order of `SENSOR_KINDS`, with their sensors."""
+    """(model, sensors) of each kind that occurs in `sensors`, in the order of `SENSOR_KINDS`."""
     every = list(sensors)
     for kind in SENSOR_KINDS:
         if own := [s for s in every if s.sensor_type == kind]:
@@ -218,7 +225,7 @@ def kind_model(kind: str) -> SensorModel[Any, Any]:
 def own_entries(
     sensor: Sensor, n_recordings: int = 1, is_estimated: Callable[[ParameterSpec], bool] | None = None
 ) -> list[Entry]:
-    """The parameters of a sensor; a clock that restarts has a time offset in each recording."""
+    """Layout entries of a sensor's parameters. A clock that restarts has a time offset in each recording."""
     n_clocks = clocks_of(sensor, n_recordings)
     specs = (spec.in_recordings(n_clocks) if spec == TIME_OFFSET else spec for spec in sensor.specs())
     free = is_estimated or sensor.is_estimated
@@ -226,5 +233,5 @@ def own_entries(
 
 
 def clocks_of(sensor: Sensor, n_recordings: int) -> int:
-    """How many time offsets a sensor has: one in each recording where its clock restarts."""
+    """Number of time offsets of a sensor: one, or one per recording if its clock restarts."""
     return n_recordings if sensor.clock_restarts else 1

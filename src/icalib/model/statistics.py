@@ -1,4 +1,4 @@
-"""What the residuals of a pass show of the noise of one sensor."""
+"""Residual statistics of a pass, from which the noise of each sensor is estimated."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from icalib.motion.factor import Factor, FactorKey, FitKey, Residuals, Squares
 from icalib.optim.state import State
 from icalib.rig import Rig
 
-LEAST_DOF_SHARE = 0.2  # of the residuals: where the motion absorbs more, too little is left to show their noise
-# Degrees of freedom off those of sensors at rest, of which there may be few: the mean of a variance that chi^2 shows,
-# its logarithm unknown before (Jeffreys' prior); standard deviations are then those of Student's t distribution.
+LEAST_DOF_SHARE = 0.2  # degrees of freedom over residuals: below it, the motion absorbs too much noise for an estimate
+# Subtracted from the degrees of freedom of sensors at rest, which may be few. This gives the posterior mean of the
+# variance under Jeffreys' prior; standard deviations are then those of Student's t distribution.
 FEW_DOF = 2.0
 
 
 @dataclass(frozen=True)
 class Fit:
-    """chi^2 of one kind of residual, their number, and the degrees of freedom that are left after the fit.
+    """chi^2 of one kind of residual, number of residuals, and degrees of freedom left after the fit.
 
     kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", "points on planes", or "common error 0", 1,
-    ... for the images' own.
+    ... for the errors that all corners of an image share.
     """
 
     sensor: str
@@ -33,8 +33,9 @@ class Fit:
 
 @dataclass(frozen=True)
 class ResidualStatistics:
-    """Of one sensor, by kind of residual. at_rest: without an IMU, so that nothing ties one keyframe to the next.
-    all_squares, all_fits: of all sensors; made when asked for, as degrees of freedom cost draws from the posterior."""
+    """Residual statistics of one sensor, by kind of residual. at_rest: True without an IMU, when keyframes are
+    independent. all_squares, all_fits: statistics of all sensors, computed on demand, because degrees of freedom need
+    posterior draws."""
 
     sensor: str
     at_rest: bool
@@ -43,26 +44,26 @@ class ResidualStatistics:
 
     @cached_property
     def squares(self) -> dict[str, Squares]:
-        """Number and chi^2 by kind, robust weights as they are."""
+        """Number and chi^2 by kind, with the current robust weights."""
         return {kind: own for (sensor, kind), own in self.all_squares().items() if sensor == self.sensor}
 
     @cached_property
     def fits(self) -> dict[str, Fit]:
-        """By kind, with the degrees of freedom after the fit."""
+        """Number, chi^2 and degrees of freedom after the fit, by kind."""
         return {f.kind: f for f in self.all_fits() if f.sensor == self.sensor}
 
     def variance_factors(self) -> dict[str, float]:
-        """chi^2 over degrees of freedom, by kind; without those kinds that have too few. It is 1 where the noise is as
-        large as assumed."""
+        """chi^2 over degrees of freedom by kind: 1 if the noise is as assumed. Kinds with too few degrees of freedom
+        are left out."""
         known = {kind: f for kind, f in self.fits.items() if f.dof > LEAST_DOF_SHARE * f.count}
         return {k: f.chi2 / (max(f.dof - FEW_DOF, 1.0) if self.at_rest else f.dof) for k, f in known.items()}
 
 
 @dataclass(frozen=True)
 class PassEnd:
-    """Where a pass ended: its factors, and their residuals at `state`.
+    """End of a pass: its factors, and their residuals at `state`.
 
-    is_first: whether it was the first pass. at_rest, all_squares, all_fits: as of `ResidualStatistics`.
+    is_first: whether it was the first pass. at_rest, all_squares, all_fits: see `ResidualStatistics`.
     """
 
     rig: Rig

@@ -1,4 +1,4 @@
-"""What a factor of points on the target has in common with others, whichever sensor sees them."""
+"""Interface of factors with points on the target, for any sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from icalib.motion.factor import Factor
 
 @runtime_checkable
 class TargetFactor(Factor, Protocol):
-    """A factor of points on `bodies` of the target. sees_target: whether it has any such point."""
+    """A factor with points on `bodies` of the target. sees_target: whether it has any such point."""
 
     @property
     def bodies(self) -> Bodies: ...
@@ -19,5 +19,5 @@ class TargetFactor(Factor, Protocol):
     def sees_target(self) -> bool: ...
 
     def with_target_size(self, size: float) -> Self:
-        """The same measurements, of a target with `size` times the stated lengths."""
+        """The same measurements, for a target with `size` times the stated lengths."""
         ...
