@@ -1,4 +1,4 @@
-"""Assessment of wheels in a result: residuals, warnings on the ground, and implausible sizes."""
+"""Assessment of wheels in a result: residuals, warnings about the ground and the vertical, implausible sizes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical s
     "wheel": ("wheel",),
     "steering": ("steering",),
 }
-# By kind of residual: its name in sentences, the field of the rig file with its noise, and the unit of that.
+# For each kind of residual: its name in messages, the noise field of the rig file, and the unit of that noise.
 _ROWS = {
     "wheels": ("wheel angles", "wheel_noise", "rad/sqrt(s)"),
     "wheel": ("wheel angles", "wheel_noise", "rad/sqrt(s)"),
@@ -37,15 +37,15 @@ _ROWS = {
     "lateral slip": ("lateral slip", "lateral_slip", "m/sqrt(s)"),
     "vertical slip": ("vertical slip", "vertical_slip", "m/sqrt(s)"),
 }
-UPRIGHT_COSINE = 0.5  # of 60 deg, the largest angle between the axis of an upright camera and the vertical
+UPRIGHT_COSINE = 0.5  # cosine of 60 deg, the largest angle between an axis of the camera and the vertical
 # Radius over baseline: 1/15 of a floor robot to 1 of a toy. Rates in rpm instead of rad/s turn 1/3 into 1/30.
 MIN_RADIUS_RATIO, MAX_RADIUS_RATIO = 1.0 / 25.0, 4.0
 RATE_UNIT_FACTORS = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
-UNIT_TOLERANCE = 0.1  # relative difference between a size and that in another unit
+UNIT_TOLERANCE = 0.1  # relative deviation of a size ratio from the factor of a wrong unit
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
-    """A record of each set of wheels with one row per interval between keyframes; the measured slip is 0."""
+    """The residuals of each set of wheels, one row per interval between keyframes; the measured slip is 0."""
     for key, factor in found.problem.factors.items():
         if isinstance(factor, IncrementFactor | RelativePoseFactor):
             rows = factor.rows(found.outcome.residuals[key], found.outcome.state)
@@ -63,7 +63,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Warnings if no LiDAR sees the ground of wheels, or if nothing shows the vertical."""
+    """Warnings if no LiDAR sees the ground of wheels, or if no sensor determines the vertical."""
     yield from ground_warnings(found)
     yield from _upwards_warnings(inputs, found)
 
@@ -79,8 +79,8 @@ def ground_warnings(found: Estimate) -> Iterator[str]:
 
 
 def _upwards_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """A warning with both possible verticals: with a pose sensor whose frame is not level, or if the first camera is
-    not upright for the vertical of the result."""
+    """A warning with both possible verticals if no sensor determines the sign of the vertical, and the assumption of an
+    upright camera does not apply: the motion comes from pose sensors, or the camera is not upright in the result."""
     for wheels, up in _without_vertical(inputs, found):
         if inputs.rig.moves_by_poses:
             x, y, z = up
@@ -96,8 +96,8 @@ def _upwards_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
 
 
 def _without_vertical(inputs: Inputs, found: Estimate) -> Iterator[tuple[str, np.ndarray]]:
-    """Names of wheels whose vertical neither the data nor the rig file determine up to its sign, with the z axis (3,)
-    of their frame in the axes of the body."""
+    """Names of wheels for which neither data nor rig file determine the sign of the vertical, with the z axis (3,) of
+    the wheel frame in the axes of the body."""
     values = found.outcome.state.values
     if not inputs.rig.assumes_motion or level_sensor(inputs, found.outcome.state) is not None:
         return
@@ -107,8 +107,8 @@ def _without_vertical(inputs: Inputs, found: Estimate) -> Iterator[tuple[str, np
 
 
 def _posture(up: np.ndarray) -> str | None:
-    """The posture of a camera in words, None if it is upright; up (3,): the vertical in its axes, x right, y down, z
-    ahead."""
+    """The posture of a camera as text for messages, None if it is upright. up (3,): the vertical in camera axes, x
+    right, y down, z forward."""
     _, down, ahead = up
     if down < -UPRIGHT_COSINE:
         return None
@@ -118,12 +118,12 @@ def _posture(up: np.ndarray) -> str | None:
 
 
 def _body(inputs: Inputs) -> str:
-    """Name of the body's sensor."""
+    """Name of the sensor whose frame is the body frame in a rig without an IMU."""
     return inputs.rig.reference_without_imu
 
 
 def _other_vertical(inputs: Inputs, name: str) -> str:
-    """What is wrong with the wheels `name` if the vertical has the other sign."""
+    """The mistake in the recording or rig file of the wheels `name` if the vertical has the other sign, as text."""
     wheels = next(w for w in inputs.rig.wheels if w.name == name)
     return REVERSED_YAW[wheels.kind]
 
@@ -150,7 +150,8 @@ def misfit(wheels: Wheels, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def length(wheels: Wheels, rig: Rig) -> str | None:
-    """What determines the scale, in words: wheels that report metres, or whose sizes are stated; else None."""
+    """Text on what determines the scale, if these wheels do: they report metres, or their sizes are stated; else
+    None."""
     known = wheels.measures == "poses" or getattr(wheels, wheels.drive_specs[0].name).mode != "free"
     return f"the stated sizes of {wheels.name}" if known else None
 
@@ -161,7 +162,7 @@ def sizes(wheels: Wheels) -> tuple[str, ...]:
 
 
 def absurd(wheels: Wheels, found: dict[tuple[str, str], ParameterGroup]) -> Iterator[str]:
-    """A sentence if radii and baseline are out of proportion, as for readings in another unit."""
+    """A sentence if the ratio of radius to baseline is implausible, as for readings in a wrong unit."""
     if wheels.kind != "pair":
         return
     radii, baseline = found.get((wheels.name, "radii")), found.get((wheels.name, "baseline"))

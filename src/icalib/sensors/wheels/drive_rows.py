@@ -1,16 +1,17 @@
-"""The rows of the increment factor, by kind of wheels.
+"""Residual rows of the increment factor for each kind of wheels.
 
-A row is g_X X + g_T T - measured, where X [m] is the displacement and T [rad] the rotation vector of the wheels' frame
-over an interval, in its own axes. The first two rows by kind, with the names of their residuals:
+A row is g_X X + g_T T - measured. X [m] is the displacement and T [rad] the rotation vector of the wheel frame over an
+interval, in its axes at the start. The first two rows of each kind, with names and units of their residuals:
 
     pair      (e_1 X -+ b/2 e_3 T) / r - angle             left, right                [rad]
     twist     e_1 X / s_v - distance,  e_3 T / s_w - yaw   speed, yaw                 [m], [rad]
     steered   e_1 X / r - angle                            wheel                      [rad]
               L cos(d) e_3 T - sin(d) e_1 X                steering                   [m]
 
-The steering row is the kinematic bicycle: the front axle, L ahead, moves along its wheels, which point to d = steering
-angle + offset. It is L e_3 T = tan(d) e_1 X times cos(d): a steep angle and standing still are no special cases, and
-the noise of the angle enters the derivative by L through cos(d) alone. cos and sin are means over the interval.
+b: baseline; r: radius; s_v, s_w: scales of speed and yaw rate; -+: left, right wheel. The steering row is the kinematic
+bicycle model: the front axle, a wheelbase L ahead, moves along its wheels, which point to d = steering angle + offset.
+The model L e_3 T = tan(d) e_1 X is multiplied by cos(d), so that it also holds for steep angles and standstill. The
+noise of the angle then enters the derivative by L through cos(d) alone. cos and sin are means over the interval.
 
 All kinds have the rows e_2 X and e_3 X, the lateral and the vertical slip [m].
 """
@@ -24,7 +25,7 @@ import numpy as np
 from icalib.rig import WheelKind
 
 N_DRIVE = 3  # largest number of parameters of a kind
-LEFT, RIGHT = -0.5, 0.5  # position of each wheel along y, in baselines, with the sign of e_3 T in its row
+LEFT, RIGHT = -0.5, 0.5  # factor of baseline * e_3 T in the row of each wheel
 Kinds = dict[str, slice]
 SLIP: Kinds = {"lateral slip": slice(2, 3), "vertical slip": slice(3, 4)}
 KINDS: dict[WheelKind, Kinds] = {
@@ -39,9 +40,9 @@ UNITS = {
 
 
 class Coefficients(NamedTuple):
-    """Coefficients of the rows in wheel axes, of each of k = n intervals or of one for all.
+    """Coefficients of the four rows in wheel axes, for each of k = n intervals, or for all of them (k = 1).
 
-    g_X, g_T (k, 4, 3); J_g_X, J_g_T (k, 4, 3, 3): their derivatives by the parameters of the drive, indexed by row,
+    g_X, g_T (k, 4, 3); J_g_X, J_g_T (k, 4, 3, 3): their derivatives by the drive parameters, indexed by interval, row,
     parameter and axis.
     """
 
@@ -52,9 +53,9 @@ class Coefficients(NamedTuple):
 
 
 def coefficients(kind: WheelKind, drive: np.ndarray, mean: np.ndarray) -> Coefficients:
-    """The coefficients at the parameters drive (3,), padded with zeros.
+    """The coefficients at the drive parameters `drive` (3,), padded with zeros.
 
-    mean (n, m - 1): means over each interval of the rates whose integrals are columns 1: of `integrals_of`.
+    mean (n, m - 1): means over each interval of the signals whose integrals are columns 1: of `integrals_of`.
     """
     c = _slip_rows(len(mean) if kind == "steered" else 1)
     {"pair": _pair, "twist": _twist, "steered": _steered}[kind](c, drive, mean)
@@ -62,7 +63,7 @@ def coefficients(kind: WheelKind, drive: np.ndarray, mean: np.ndarray) -> Coeffi
 
 
 def _slip_rows(k: int) -> Coefficients:
-    """Coefficients of k intervals that are zero but in the two slip rows."""
+    """Coefficients of k intervals with the two slip rows filled and zeros elsewhere."""
     c = Coefficients(np.zeros((k, 4, 3)), np.zeros((k, 4, 3)), np.zeros((k, 4, 3, 3)), np.zeros((k, 4, 3, 3)))
     c.g_X[:, 2, 1] = c.g_X[:, 3, 2] = 1.0
     return c
@@ -88,7 +89,7 @@ def _twist(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
 
 
 def _steered(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
-    """Fills the first two rows of a steered vehicle; mean (n, 2 or more): of cos and sin of the steering angle."""
+    """Fills the first two rows of a steered vehicle; mean (n, 2 or more): mean cos and sin of the steering angle."""
     r, base, offset = drive
     c.g_X[:, 0, 0], c.J_g_X[:, 0, 0, 0] = 1.0 / r, -1.0 / r**2
     cosine = mean[:, 0] * np.cos(offset) - mean[:, 1] * np.sin(offset)

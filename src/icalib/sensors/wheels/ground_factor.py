@@ -1,4 +1,4 @@
-"""The ground factor: at every keyframe the wheels' frame is parallel to a plane, its origin at a constant height.
+"""The ground factor: at every keyframe the wheel frame is parallel to a plane, with its origin at a constant height h.
 
 With n (3,) the upward normal of the plane, q a point on it, R_k = R_world_imu and p_k = p_world_imu at keyframe k,
 R = R_imu_wheel and p = p_imu_wheel, the rows of a keyframe are
@@ -8,8 +8,8 @@ R = R_imu_wheel and p = p_imu_wheel, the rows of a keyframe are
     (h - height) / sqrt(keyframes)           over height_sigma       the stated height [m]
 
 The first three have independent noise at each keyframe: suspension and an uneven floor. The last rows of all keyframes
-are together one measurement of h, whose error is constant. It is a measurement and not a prior, so that verdicts
-include it.
+together make up one measurement of h with a constant error. The stated height is a measurement and not a prior, so that
+the verdicts on observability include it.
 
 Plane `level`: n = e_3, q the origin of the world. Plane `floor`: in each recording the plane with most LiDAR points
 among those that are nearly level and below the IMU.
@@ -33,17 +33,17 @@ from icalib.optim.state import Key, Layout, State
 from icalib.rig import Ground
 from icalib.sensors.wheels.spec import GROUND_HEIGHT
 
-LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
-MIN_FLOOR_COSINE = np.cos(np.deg2rad(20.0))  # between the normal of a floor and the vertical: steeper than any ramp
-MIN_BELOW_M = 0.02  # of a floor below the mean position of the IMU: farther than planes are off by noise
+LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point of the plane z = 0 of the world
+MIN_FLOOR_COSINE = np.cos(np.deg2rad(20.0))  # between the normal of a floor and the vertical; no ramp is as steep
+MIN_BELOW_M = 0.02  # least distance of a floor below the mean position of the IMU; above the noise of plane positions
 TILT, HEIGHT = "ground tilt", "ground height"
-N_COLUMNS = 10  # of the calibration parameters: rotation 3, translation 3, height 1, plane 3
+N_COLUMNS = 10  # calibration columns of a row: rotation 3, translation 3, height 1, plane 3
 
 
 def floors(state: State, keys: tuple[Key, ...], points: np.ndarray, recording: np.ndarray) -> tuple[Key | None, ...]:
     """The key of the floor in each recording, None without one.
 
-    keys: of the P planes that LiDARs see; points (P,): number of points on each; recording (P,): to which each belongs.
+    keys: the P planes that LiDARs see; points (P,): LiDAR points on each; recording (P,): recording of each plane.
     """
     found = []
     for r, keyframes in enumerate(state.recordings):
@@ -55,15 +55,16 @@ def floors(state: State, keys: tuple[Key, ...], points: np.ndarray, recording: n
 
 
 def _is_floor(plane: np.ndarray, above: np.ndarray) -> bool:
-    """Whether the plane (6,), normal and point, is nearly level and below the point `above` (3,), all in the world."""
+    """True if the plane (6,), normal and point, is nearly level and below the point `above` (3,), all in the world
+    frame."""
     n = plane[:3] * np.sign(plane[2])
     return bool(n[2] > MIN_FLOOR_COSINE and n @ (above - plane[3:]) > MIN_BELOW_M)
 
 
 @dataclass(frozen=True)
 class GroundFactor(RowFactor):
-    """Four rows of the wheels `name` at n keyframes: tilt about x and y, height, stated height. Rows that `ground` does
-    not state have infinite sigma.
+    """Four rows of the wheels `name` at n keyframes: two tilts, height, stated height; see the module. Rows whose noise
+    `ground` does not state have infinite sigma.
 
     floor: the key of the plane in each recording; None for a level plane, or for a floor that no LiDAR sees.
     """
@@ -103,14 +104,14 @@ class GroundFactor(RowFactor):
 
     @property
     def sigma(self) -> np.ndarray:
-        """(4,) standard deviations of the rows [rad, rad, m, m], infinite for those that `ground` does not state."""
+        """(4,) standard deviations of the rows [rad, rad, m, m], infinite where `ground` states none."""
         tilt, height = self.ground.tilt_noise, self.ground.height_sigma
         bump = np.inf if height is None else self.ground.bump_noise
         once = np.inf if height is None else height * np.sqrt(len(self.keyframes))
         return np.array([*[np.inf if tilt is None else tilt] * 2, bump, once])
 
     def with_imu(self, imu: ImuData) -> GroundFactor:
-        """See `Factor`; rows at keyframes do not depend on readings."""
+        """See `Factor`; rows at keyframes do not depend on IMU readings."""
         del imu
         return self
 
@@ -123,7 +124,7 @@ class GroundFactor(RowFactor):
         return state.seconds[self.keyframes]
 
     def raw(self, out: Whitened) -> np.ndarray:
-        """(n, 4) residuals [rad, rad, m, m]; 0 in rows that `ground` does not state."""
+        """(n, 4) residuals [rad, rad, m, m]; 0 in rows with infinite sigma."""
         return out.residual * np.where(np.isfinite(self.sigma), self.sigma, 0.0)
 
     def raw_sigma(self) -> np.ndarray:

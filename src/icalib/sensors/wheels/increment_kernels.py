@@ -1,12 +1,13 @@
 """Compiled kernels of the increment factor: residuals and Jacobians of the motion between two instants.
 
-An increment is compared with a displacement X [m] and a rotation vector T [rad] in wheel axes. They follow from the
-motion of the IMU, with D the integral of R_world_imu^T v over the interval and Y = D + Theta x p_imu_wheel:
+An increment is compared with a displacement X [m] and a rotation vector T [rad] in wheel axes. Both follow from the
+motion of the IMU over the interval from s_0 to s_1. With D the integral of R_world_imu^T v over the interval and
+Y = D + Theta x p_imu_wheel:
 
     X = R_imu_wheel^T Y,  T = R_imu_wheel^T Theta,  Theta = Log(R_world_imu(s_0)^T R_world_imu(s_1))
 
-A row of the model is g_X X + g_T T = a_Y Y + a_T Theta. All rows share the Jacobians of (D, Theta), J (6, ...): rows 0
-to 2 are D, rows 3 to 5 Theta. J_calib (6, 1 + 24 or 0): by the time offset and the IMU intrinsics.
+A row of the model (`drive_rows`) is g_X X + g_T T = a_Y Y + a_T Theta. All rows share the Jacobians J (6, ...) of
+(D, Theta): rows 0 to 2 for D, rows 3 to 5 for Theta. J_calib (6, 1 + 24 or 0): by time offset and IMU intrinsics.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from icalib.sensors.wheels.drive_rows import N_DRIVE
 
 
 class WheelParameters(NamedTuple):
-    """R_imu_wheel (3, 3), p_imu_wheel (3,) m, drive (3,): the parameters of the kind, see `drive_rows`; of a pair left
-    radius, right radius and baseline [m]."""
+    """Extrinsics R = R_imu_wheel (3, 3), p = p_imu_wheel (3,) [m], and drive parameters drive (3,), see `drive_rows`;
+    for a pair left radius, right radius and baseline [m]."""
 
     R: np.ndarray
     p: np.ndarray
@@ -60,7 +61,7 @@ def _add(R, x, scale, sign, out):
 
 @njit(cache=True, nogil=True)
 def _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians):
-    """Theta (3,) between instants a and b. Adds its derivatives by the two keyframes to rows 3: of J_first and J_second
+    """Theta (3,) between samples a and b. Adds its derivatives by the two keyframes to rows 3: of J_first and J_second
     (6, 15), and those by time offset and IMU intrinsics to rows 3: of J_calib."""
     theta = so3.log(tmul3(samples.rotation[a], samples.rotation[b]))
     if not with_jacobians:
@@ -81,14 +82,14 @@ def _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians)
 
 @njit(cache=True, nogil=True)
 def _add_displacement(j, weight, samples, velocities, D, J_keyframe, J_calib, with_jacobians):
-    """Adds weight * R^T v of instant j to D (3,), and its derivatives to rows :3 of J_keyframe (6, 15) and J_calib."""
+    """Adds weight * R^T v of sample j to D (3,), and its derivatives to rows :3 of J_keyframe (6, 15) and J_calib."""
     R, u = samples.rotation[j], np.zeros(3)
     _add(R, samples.velocity[j], 1.0, -1, u)
     for i in range(3):
         D[i] += weight * u[i]
     if not with_jacobians:
         return
-    # d u / dt = u x rate + R^T acceleration: the IMU turns and accelerates.
+    # u = R^T v: du/dt = u x rate + R^T acceleration.
     turning = _cross(u, samples.rate[j])
     acceleration = np.zeros(3)
     _add(R, velocities.acceleration[j], 1.0, -1, acceleration)
@@ -108,8 +109,8 @@ def _add_displacement(j, weight, samples, velocities, D, J_keyframe, J_calib, wi
 
 @njit(cache=True, nogil=True)
 def _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows):
-    """Derivatives of row q of interval i by keyframes, R_imu_wheel, time offset and IMU intrinsics."""
-    # R <- R Exp(d) turns X and T by -d: dX = X x d, dT = T x d.
+    """Fills the derivatives of row q of interval i by keyframes, R_imu_wheel, time offset and IMU intrinsics."""
+    # R <- R Exp(d) rotates X and T by -d: dX = X x d, dT = T x d.
     x, t = _cross(gX, X), _cross(gT, T)
     for c in range(3):
         rows.J[i, q, KEYFRAME_PAIR_DIM + c] = x[c] + t[c]
@@ -136,7 +137,8 @@ def _to_imu_axes(wheels, gX, gT, aY, aT):
 
 @njit(cache=True, nogil=True)
 def _fill_drive(i, q, J_gX, J_gT, X, T, rows):
-    """Derivatives of row q of interval i by the parameters of the drive; J_gX, J_gT (3, 3): of its coefficients."""
+    """Fills the derivatives of row q of interval i by the drive parameters; J_gX, J_gT (3, 3): derivatives of the row's
+    coefficients, by parameter and axis."""
     for d in range(3):
         s = 0.0
         for k in range(3):
@@ -148,8 +150,8 @@ def _fill_drive(i, q, J_gX, J_gT, X, T, rows):
 def increment_rows(start, weights, samples, velocities, wheels, coefficients, measured, rows):
     """Fills the four rows of each of n increments, not whitened; see `drive_rows`.
 
-    start (n + 1,), weights (m,) s: see `Instants`; samples, velocities: the motion at these instants; measured (n, 4).
-    rows: without Jacobians if its J is empty.
+    start (n + 1,), weights (m,) s: see `Instants`; samples, velocities: the motion of the IMU at these m instants;
+    measured (n, 4). Jacobians are skipped if those of `rows` are empty.
     """
     with_jacobians = len(rows.J) > 0
     n_calib = 1 + samples.J_imu.shape[2]

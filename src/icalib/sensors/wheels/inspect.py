@@ -1,4 +1,4 @@
-"""Inspection of wheels in a recording: topics of joints and twists, and tables."""
+"""Inspection of a recording for wheels: topics of joints and twists, and tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icalib.tools.inspection.kinds import KindInspector
 
 
 class WheelInspector(KindInspector):
-    """Drafts a rig file for wheels. A topic of joints may belong to an arm, so that the draft asks."""
+    """Drafts the rig file entry of wheels. Joints may belong to an arm, so that the draft asks the user (`doubt`)."""
 
     sensor: ClassVar[type[Sensor]] = Wheels
     topic_kinds: ClassVar[tuple[str, ...]] = ("joints", "twist", "wheels")

@@ -9,15 +9,15 @@ import numpy as np
 from icalib.data.measurements import WheelStream
 
 Sampling = Literal["interval-mean", "instantaneous"]
-MAX_STEERING_RAD = 1.55  # 89 deg: at 90 deg the wheels point across the vehicle, and 1 / cos is infinite
+MAX_STEERING_RAD = 1.55  # 89 deg: limit of steering angles; 1 / cos is infinite at 90 deg
 
 
 def integrated(seconds: np.ndarray, rates: np.ndarray, sampling: Sampling) -> np.ndarray:
-    """(N, m) integrals since the first stamp of rates (N, m) at seconds (N,); of wheels [rad/s] the angles turned.
+    """Integrals (N, m) since the first stamp of rates (N, m) at seconds (N,).
 
-    sampling: "interval-mean": a rate is the mean over the interval that ends at its stamp, as drivers that difference
-    ticks publish it; "instantaneous": the value at its stamp (trapezoidal rule). The wrong one shifts time by half an
-    interval.
+    sampling "interval-mean": a rate is the mean over the interval that ends at its stamp, as computed from differences
+    of ticks. "instantaneous": a rate is the value at its stamp (trapezoidal rule). The wrong choice shifts time by half
+    an interval.
     """
     mean = rates[1:] if sampling == "interval-mean" else 0.5 * (rates[1:] + rates[:-1])
     integrals = np.zeros_like(rates, dtype=np.float64)
@@ -26,11 +26,11 @@ def integrated(seconds: np.ndarray, rates: np.ndarray, sampling: Sampling) -> np
 
 
 def integrals_of(stream: WheelStream) -> np.ndarray:
-    """What the increment factor needs of a stream: integrals since the first stamp, by kind.
+    """Integrals since the first stamp from which the increment factor takes its measurements, for each kind of wheels.
 
     pair (N, 2): angles that both wheels turned [rad]. twist (N, 2): distance [m], yaw [rad]. steered (N, 4): angle that
-    the driven wheel turned [rad], integrals of cos and sin of the steering angle [s], and of
-    (rate of the wheel / cos)^2 [rad^2/s], to which the variance of the steering row is proportional.
+    the driven wheel turned [rad], integrals of cos and sin of the steering angle [s], and the integral of
+    (rate of the wheel / cos)^2 [rad^2/s]. The variance of the steering row is proportional to the last.
     """
     whole = integrated(stream.seconds, stream.rate, stream.sampling)
     if stream.kind != "steered":

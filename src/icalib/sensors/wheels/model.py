@@ -1,4 +1,4 @@
-"""The factors of wheels: their readings, and the ground that they stand on."""
+"""The sensor model of wheels, with a factor for their readings and one for the ground."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, 
 
 
 class WheelModel(SensorModel[Wheels, WheelNoise]):
-    """The model of wheels; their noise is stated in the rig file."""
+    """Sensor model of wheels; their noise is stated in the rig file."""
 
     def first_noise(self, sensor: Wheels, settings: Settings) -> WheelNoise:
         """See `SensorModel`."""
@@ -29,7 +29,7 @@ class WheelModel(SensorModel[Wheels, WheelNoise]):
     def factors(
         self, sensor: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, at: Pass
     ) -> Iterator[Factor]:
-        """The factor of the readings, and that of the ground if the rig file states one."""
+        """The factor of the readings, and the ground factor if the rig file states a ground."""
         assert at.motion is not None
         yield wheel_factor(sensor, stream, noise, at.motion, at.layout)
         if sensor.ground is not None:
@@ -42,7 +42,7 @@ class WheelModel(SensorModel[Wheels, WheelNoise]):
 def wheel_factor(
     wheels: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, motion: EstimatedMotion, layout: Layout
 ) -> IncrementFactor | RelativePoseFactor:
-    """The factor of the readings, as the fields `measures` and `factor` of the rig file choose it."""
+    """The factor of the readings; the fields `measures` and `factor` of the rig file choose its type."""
     if isinstance(stream, WheelPoses):
         return RelativePoseFactor.of_poses(stream, motion.imu, motion.gravity, noise, layout, motion.state)
     own = wheels.name, stream.seconds, integrals_of(stream), motion.imu, motion.gravity, noise, layout, motion.state

@@ -1,7 +1,8 @@
-"""Relative planar poses of a differential drive, preintegrated from its wheel angles: z_W of the paper's (27).
+"""Relative planar poses of a differential drive, preintegrated from its wheel angles: z_W of equation (27) of the
+paper.
 
-Poses are in the wheels' frame at the first stamp of an interval. Rates are constant from stamp to stamp, so that each
-step is an arc, with d_l, d_r the angles that the wheels turn and psi the yaw before the step:
+Poses are in the wheel frame at the first stamp of an interval. Rates are assumed constant from stamp to stamp, so that
+each step is an arc. With d_l, d_r the angles that the wheels turn and psi the yaw before the step:
 
     dpsi = (r_r d_r - r_l d_l) / b    ds = (r_r d_r + r_l d_l) / 2
     (dx, dy) = ds sinc(dpsi / 2) (cos, sin)(psi + dpsi / 2)
@@ -23,8 +24,8 @@ from icalib.motion.stamp_intervals import StampIntervals
 class RelativePoses:
     """n relative planar poses (yaw, x, y) [rad, m, m].
 
-    z (n, 3) at the parameters drive0 (3,): left radius, right radius, baseline [m]; J_drive (n, 3, 3): its derivative
-    by them; W (n, 3, 3): whitens its error, W^T W is the inverse covariance.
+    z (n, 3): poses at the parameters drive0 (3,): left radius, right radius, baseline [m]. J_drive (n, 3, 3):
+    derivative of z by these parameters. W (n, 3, 3): whitens the error of z; W^T W is the inverse covariance.
     """
 
     z: np.ndarray
@@ -45,7 +46,8 @@ def _sinc(h):
 
 @njit(cache=True, nogil=True)
 def _arc(psi, turn, path, J_step):
-    """Step (dx, dy) of an arc; fills its Jacobian J_step (3, 2) of (yaw, x, y) by (turn, path)."""
+    """Step (dx, dy) [m] of an arc with the yaw psi [rad] at its start, the yaw change `turn` [rad] and the length
+    `path` [m]. Fills J_step (3, 2), the Jacobian of (yaw, x, y) by (turn, path)."""
     s, slope = _sinc(0.5 * turn)
     c, n = cos(psi + 0.5 * turn), sin(psi + 0.5 * turn)
     dx, dy = path * s * c, path * s * n
@@ -57,7 +59,8 @@ def _arc(psi, turn, path, J_step):
 
 @njit(cache=True, nogil=True)
 def _propagate(dx, dy, rows):
-    """Propagates rows (3, m), derivatives of (yaw, x, y), over the step (dx, dy): an error of yaw moves the end."""
+    """Propagates rows (3, m), derivatives of (yaw, x, y), over the step (dx, dy): an error of yaw moves the end
+    point."""
     for j in range(rows.shape[1]):
         rows[1, j] -= dy * rows[0, j]
         rows[2, j] += dx * rows[0, j]
@@ -65,8 +68,8 @@ def _propagate(dx, dy, rows):
 
 @njit(cache=True, nogil=True)
 def _integrate(first, last, seconds, angles, drive, wheel_noise, slip_noise, z, J, P):
-    """Fills the pose z (3,), its Jacobian J (3, 3) by the drive and its covariance P (3, 3) from stamp `first` to
-    `last`; noise densities in rad/sqrt(s) and m/sqrt(s)."""
+    """Fills the pose z (3,) from stamp `first` to `last`, its Jacobian J (3, 3) by the drive parameters and its
+    covariance P (3, 3); noise densities in rad/sqrt(s) and m/sqrt(s)."""
     z[:], J[:], P[:] = 0.0, 0.0, 0.0
     J_step, J_drive, J_angle = np.empty((3, 2)), np.zeros((2, 3)), np.empty((2, 2))
     r_l, r_r, b = drive
@@ -114,8 +117,9 @@ def preintegrated(
     """Relative poses over n intervals from wheel angles (N, 2) rad at stamps seconds (N,); drive (3,) m as in
     `RelativePoses`.
 
-    wheel_noise: density of each wheel's angle [rad/sqrt(s)]; slip_noise: of lateral slip [m/sqrt(s)]. Both must be
-    above zero: without slip the covariance of a short interval is singular, and that of a long one too small laterally.
+    wheel_noise: density of each wheel's angle [rad/sqrt(s)]; slip_noise: density of lateral slip [m/sqrt(s)]. Both must
+    be above zero: without slip the covariance of a short interval is singular, and the lateral variance of a long one
+    is too small.
     """
     n = len(intervals.keyframe)
     z, J, W = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 3))

@@ -1,8 +1,8 @@
-"""IMU noise in relative poses of wheels whose ends lie between keyframes.
+"""Propagated IMU noise in recorded relative poses of wheels whose end points lie between keyframes.
 
-The pose of each end is propagated by the IMU from its keyframe. Relative poses of (27) have hardly any lateral noise,
-as no wheel slips there: 0.01 mm, as much as 20 ms of propagation. The noise of a relative pose therefore includes that
-of the propagation.
+The pose of each end point is propagated by the IMU from its keyframe. The lateral noise of relative poses by equation
+(27) of the paper is tiny, as its model has no slip: 0.01 mm, as much as 20 ms of propagation. The noise of a relative
+pose therefore includes that of the propagation.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from icalib.motion.poses import Poses
 def propagation_noise(
     first: Poses, last: Poses, propagated: np.ndarray, wheels: Extrinsics, imu: ImuData
 ) -> np.ndarray:
-    """(n, 3, 3) covariance of yaw, x and y [rad, m, m] of n relative poses by the noise of the IMU.
+    """Covariance (n, 3, 3) of yaw, x and y [rad, m, m] of n relative poses due to the noise of the IMU.
 
-    first, last: poses of the IMU at the ends; propagated (n, 2): time from keyframe to first and to last end [s]. After
-    t seconds each angle has the variance g^2 t, each axis of position a^2 t^3 / 3, with the densities g and a of
-    gyroscope and accelerometer. Errors of the angles also turn the lever arm.
+    first, last: poses of the IMU at both ends; propagated (n, 2): propagation time [s] from keyframe to each end.
+    wheels: their extrinsics. With the noise densities g and a of gyroscope and accelerometer, the variance after t
+    seconds is g^2 t for each angle and a^2 t^3 / 3 for each axis of position. Errors of the angles also rotate the
+    lever arm.
     """
     R, p = wheels.R, wheels.p
     R_first_world = np.swapaxes(first.rotation, 1, 2)

@@ -8,16 +8,16 @@ import numpy as np
 
 from icalib.motion.stamp_intervals import StampIntervals
 
-# Length of a panel. The error of two Gauss points is u'''' h^5 / 4320: 0.01 mm for a vibration of 20 Hz and 3 m/s^2.
+# Largest length of a panel. The error of two Gauss points is u'''' h^5 / 4320: 0.01 mm for 20 Hz vibration of 3 m/s^2.
 PANEL_S = 0.025
 
 
 class Instants(NamedTuple):
-    """m instants of n intervals.
+    """The m instants at which the motion is evaluated for n intervals.
 
-    start (n + 1,): those of interval i are start[i]:start[i+1], its first end, the points of the quadrature, its last
-    end. times (m,) s on the wheels' clock; keyframe (m,): from which the motion is propagated; weight (m,) s, zero at
-    the ends.
+    start (n + 1,): interval i has the instants start[i]:start[i+1]: its begin, the quadrature points, its end. times
+    (m,) [s] on the wheels' clock; keyframe (m,): keyframe from which the motion is propagated; weight (m,) [s]:
+    quadrature weight, zero at begin and end.
     """
 
     start: np.ndarray
@@ -27,14 +27,14 @@ class Instants(NamedTuple):
 
 
 def quadrature(seconds: np.ndarray, intervals: StampIntervals, change: np.ndarray | None = None) -> Instants:
-    """Two Gauss points in each panel of at most PANEL_S; seconds (N,): the stamps.
+    """Instants with two Gauss points in each panel of at most PANEL_S; seconds (N,): the stamps of the wheels.
 
-    change (n,) s on the wheels' clock: instants up to it are propagated from the first keyframe of the interval, later
-    ones from the second; by default the middle.
+    change (n,) [s] on the wheels' clock: instants up to `change` are propagated from the first keyframe of the
+    interval, later ones from the second; by default the middle of the interval.
     """
     begin = seconds[intervals.first]
     length = seconds[intervals.last] - begin
-    panels = np.maximum(np.ceil(0.5 * length / PANEL_S - 1e-6), 1.0).astype(np.int64)  # of a half
+    panels = np.maximum(np.ceil(0.5 * length / PANEL_S - 1e-6), 1.0).astype(np.int64)  # in half an interval
     start = np.concatenate([[0], np.cumsum(2 + 4 * panels)])
     interval = np.repeat(np.arange(len(begin)), np.diff(start))
     at = np.arange(start[-1]) - start[interval] - 1

@@ -1,15 +1,15 @@
 """The two factors of wheels, between neighbouring keyframes.
 
 `IncrementFactor`, the default, compares the angles that the wheels turned, or integrals of speed and yaw rate. Lateral
-and vertical motion are noise of a slip density. `RelativePoseFactor` is the paper's (27)-(28), a planar pose integrated
-from a left and a right wheel.
+and vertical motion are modelled as slip noise. `RelativePoseFactor` compares a planar pose integrated from a left and a
+right wheel: equations (27)-(28) of the paper.
 
-Both use intervals between two stamps of the wheels' clock (`wheel_intervals`). The time offset moves these instants on
-the clock of the IMU, and with them the poses of the trajectory.
+Both use intervals between two stamps of the wheels' clock (`wheel_intervals`). The time offset shifts these stamps on
+the clock of the IMU, and so changes the poses of the trajectory that they are compared with.
 
-The wheels' frame has x forward, y to the left, z up; its origin is midway between the wheels of the axle that is not
-steered. The parameters are the blocks rotation (R_imu_wheel), translation (p_imu_wheel), time_offset, and those of the
-kind of wheels: of a pair radii (left, right) and baseline; see `drive_rows`.
+The wheel frame has x forward, y to the left, z up; its origin is midway between the wheels of the axle that is not
+steered. The parameter blocks are rotation (R_imu_wheel), translation (p_imu_wheel), time_offset, and those of the kind
+of wheels: for a pair radii (left, right) and baseline; see `drive_rows`.
 """
 
 from __future__ import annotations
@@ -57,18 +57,18 @@ class WheelNoise:
     vertical_slip: float = 5e-3  # m/sqrt(s)
     loss: str = "none"
     loss_scale: float = 2.5  # standard deviations
-    speed: float = 2e-3  # of the distance that a twist reports [m/sqrt(s)]
-    yaw: float = 1e-2  # of the yaw that a twist reports [rad/sqrt(s)]
+    speed: float = 2e-3  # of distance, for a twist [m/sqrt(s)]
+    yaw: float = 1e-2  # of yaw, for a twist [rad/sqrt(s)]
     steering: float = 1e-3  # of a steering angle [rad/sqrt(Hz)]
 
 
 @dataclass(frozen=True)
 class IncrementFactor(RowFactor):
-    """Increments over n intervals.
+    """Increments of wheel angles, distance or yaw over n intervals.
 
-    With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along the `inertial` scheme,
+    With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) (poses propagated by the IMU, scheme `inertial`),
     X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval of length dt are those
-    of `drive_rows`; of a pair, over their standard deviations
+    of `drive_rows`. For a pair the rows and their standard deviations are
 
         (e_1 X -+ b/2 e_3 T) / r - angle     over wheel sqrt(dt)            left, right
         e_2 X                                over lateral_slip sqrt(dt)
@@ -83,7 +83,7 @@ class IncrementFactor(RowFactor):
     name: str
     kind: WheelKind
     intervals: StampIntervals
-    measured: np.ndarray  # (n, 4): increments, of a pair angles [rad]; slip 0 m
+    measured: np.ndarray  # (n, 4): increments, for a pair angles [rad]; slip 0 m
     mean: np.ndarray  # (n, m - 1): see `coefficients`
     whitening: np.ndarray  # (n, 4, 4)
     instants: Instants
@@ -114,10 +114,10 @@ class IncrementFactor(RowFactor):
         kind: WheelKind = "pair",
         times: np.ndarray | None = None,
     ) -> IncrementFactor:
-        """Chooses intervals at the keyframes of `state`, and their noise.
+        """Chooses intervals between keyframes of `state`, and computes measurements and noise over these.
 
-        seconds (N,): stamps since the first, on the wheels' clock; integrals (N, m): see `integrals_of`, of a pair the
-        angles of both wheels [rad]. times (N,): the stamps on the IMU's clock; by default by the only time offset.
+        seconds (N,): stamps since the first, on the wheels' clock; integrals (N, m): see `integrals_of`, for a pair the
+        angles of both wheels [rad]. times (N,): stamps on the IMU's clock; default: seconds plus the only time offset.
         """
         found = wheel_intervals(name, seconds, imu, state, times)
         dt = seconds[found.last] - seconds[found.first]
@@ -149,7 +149,7 @@ class IncrementFactor(RowFactor):
         return _raw_sigma(self.whitening)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """Fills `out` for the intervals in `piece`, and adds them to its sums where `sums` are wanted.
+        """Fills `out` for the intervals in `piece`, and adds them to the normal equations of `piece` if `sums`.
 
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
         """
@@ -175,15 +175,16 @@ class IncrementFactor(RowFactor):
 
 @dataclass(frozen=True)
 class RelativePoseFactor(RowFactor):
-    """Relative planar poses of the wheels over n intervals, the paper's (27)-(28), whitened jointly:
+    """Relative planar poses of the wheels over n intervals, equations (27)-(28) of the paper, whitened jointly:
 
         e_3 Log(R_wheel(k)_wheel(k+1)) - yaw
         Lambda [R_wheel_imu R_imu(k)_world (p(k+1) + R_world_imu(k+1) p_imu_wheel - p(k)) + p_wheel_imu] - (x, y)
 
-    The measured pose depends on radii and baseline to first order about `RelativePoses.drive0`, so that each pass
-    builds the factor anew. Assumption: planar motion; on ramps it is consistent only for intervals up to 0.05 s. The
-    baseline scales the measured yaw with its noise. It is therefore too long by the share of that noise in yaw^2
-    (errors in variables), which grows as intervals become shorter.
+    Lambda takes x and y. The measured pose is linearised in radii and baseline about `RelativePoses.drive0`, so that
+    each pass builds the factor anew. Assumption: planar motion; on ramps it holds only for intervals up to 0.05 s.
+
+    The baseline scales a measured yaw that contains noise. Its estimate is therefore too long by the share of the noise
+    in the mean squared yaw (errors in variables), which grows as intervals become shorter.
     """
 
     kind: ClassVar[WheelKind] = "pair"
@@ -202,8 +203,8 @@ class RelativePoseFactor(RowFactor):
     def of_poses(
         cls, stream: WheelPoses, imu: ImuData, gravity: float, noise: WheelNoise, layout: Layout, state: State
     ) -> RelativePoseFactor:
-        """The factor of relative poses that were recorded as such; they do not depend on radii and baseline. Their
-        noise includes that of the IMU between keyframes and stamps."""
+        """The factor of recorded relative poses, which do not depend on radii and baseline. Their noise includes the
+        propagated IMU noise between keyframes and stamps."""
         times = instants(stream, state.values)
         found = pose_intervals(imu, state.seconds, state.starts, times)
         k, ends = found.first, [(found.keyframe, times[found.first]), (found.keyframe + 1, times[found.last])]
@@ -290,8 +291,8 @@ class RelativePoseFactor(RowFactor):
 def wheel_intervals(
     name: str, seconds: np.ndarray, imu: ImuData, state: State, times: np.ndarray | None = None
 ) -> StampIntervals:
-    """The intervals of the wheels `name` between stamps nearest to the keyframes of `state`; seconds, times: see
-    `IncrementFactor.build`."""
+    """The intervals of the wheels `name` between the stamps that are nearest to keyframes of `state`; seconds, times:
+    see `IncrementFactor.build`."""
     if times is not None:
         return choose_intervals(imu, state.seconds, state.starts, times)
     (offset,) = state.values[name, "time_offset"]
@@ -299,17 +300,17 @@ def wheel_intervals(
 
 
 def drive_of(name: str, state: State, kind: WheelKind = "pair") -> np.ndarray:
-    """(3,) parameters of the drive of the wheels `name` in the order of `rig.DRIVES`, padded with zeros; of a pair
-    left radius, right radius, baseline [m]."""
+    """Drive parameters (3,) of the wheels `name` in the order of `rig.DRIVES`, padded with zeros; for a pair left
+    radius, right radius, baseline [m]."""
     found = np.concatenate([state.values[name, group] for group in drive_names(kind)])
     return np.concatenate([found, np.zeros(N_DRIVE - len(found))])
 
 
 def _row_sigma(kind: WheelKind, noise: WheelNoise, dt: np.ndarray, whole: np.ndarray, drive: np.ndarray) -> np.ndarray:
-    """(n, 4) standard deviations of the rows of intervals of length dt (n,) s; whole (n, m): the integrals over them.
+    """Standard deviations (n, 4) of the rows of intervals of length dt (n,) [s]; whole (n, m): integrals over each.
 
-    The steering row has the lateral slip of the front wheels, and the lateral motion of the front axle by an error of
-    the steering angle: its speed is v / cos(angle).
+    The steering row has two sources of noise: the lateral slip of the front wheels, and the lateral motion of the front
+    axle, whose speed is v / cos(angle), due to an error of the steering angle.
     """
     first, second = {"pair": (noise.wheel, noise.wheel), "twist": (noise.speed, noise.yaw)}.get(
         kind, (noise.wheel, noise.lateral_slip)
@@ -328,8 +329,8 @@ def _wheel_parameters(name: str, state: State, kind: WheelKind) -> WheelParamete
 def _motion(
     factor: IncrementFactor, times: np.ndarray, keyframe: np.ndarray, state: State, jacobians: bool
 ) -> tuple[Poses, VelocityDerivatives]:
-    """Poses and velocities of the IMU at times (m,) on its clock, propagated from keyframe (m,); without `jacobians`
-    the velocities are empty, as nothing needs their derivatives."""
+    """Poses of the IMU at times (m,) on its clock, propagated from keyframe (m,), and the derivatives of its
+    velocities; the latter are empty without `jacobians`."""
     if not jacobians:
         return poses_without_jacobians(times, keyframe, state, factor.imu, factor.gravity), VelocityDerivatives.empty(
             0, 0
@@ -359,8 +360,8 @@ def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
 
 
 def _add(factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, state: State, into: Into) -> float:
-    """Adds the rows of the intervals `own` to the sums; returns half their robust chi^2. Calibration columns of the
-    rows: those of the pose, then those of the drive."""
+    """Adds the rows of the intervals `own` to the normal equations; returns half their robust chi^2. The calibration
+    columns of the rows are those of the pose, then those of the drive parameters."""
     cost, keyframe, layout = 0.0, factor.intervals.keyframe[own], factor.layout
     drive = layout.columns(factor.name, *drive_names(factor.kind))
     drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])

@@ -24,18 +24,19 @@ def sections(c: Calibration) -> Iterator[Section]:
 
 
 def amounts(c: Calibration) -> Iterator[str]:
-    """The number of intervals that were used, in words."""
+    """The number of intervals used, as text."""
     if c.wheel_residuals:
         yield f"{sum(len(r.seconds) for r in c.wheel_residuals)} stretches of wheel turns"
 
 
 def shape(c: Calibration, name: str, spread: float) -> np.ndarray:
-    """(n, 3) m, a polyline of the wheels in their own frame; see `axle`."""
+    """Polyline (n, 3) [m] of the wheels in the wheel frame; see `axle`."""
     return axle(c, name)
 
 
 def axle(c: Calibration, name: str) -> np.ndarray:
-    """(n, 3) m, a polyline of two discs and their axle, interrupted by NaN; empty for wheels without radii."""
+    """Polyline (n, 3) [m] of two discs and their axle in the wheel frame, interrupted by NaN; nothing is drawn for
+    wheels without radii."""
     known = {g.name: g.value for g in c.groups if g.sensor == name}
     if "radii" not in known:
         return PEN_UP

@@ -1,4 +1,5 @@
-"""Simulated wheels: rates of encoders, speed and yaw rate, a steering angle, or the paper's relative poses (27)."""
+"""Simulated wheels: wheel rates, speed and yaw rate, a steering angle, or relative poses by equation (27) of the
+paper."""
 
 from __future__ import annotations
 
@@ -23,11 +24,11 @@ from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, 
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
 _GAUSS = np.polynomial.legendre.leggauss(3)  # points and weights on [-1, 1]
-_MAX_STEERING_RAD = 1.3  # of front wheels; those of a car reach 0.7
-_SUBSTEPS = 12  # of an interval of (27), over which its noise is integrated
-_CHUNK = 100_000  # instants at a time: motion and its derivatives take 2 kB each
+_MAX_STEERING_RAD = 1.3  # largest angle of front wheels; those of a car reach 0.7
+_SUBSTEPS = 12  # panels of Simpson's rule per relative pose, by which its noise is integrated
+_CHUNK = 100_000  # instants evaluated at a time; motion and its derivatives take 2 kB per instant
 _KINDS: dict[str, WheelKind] = {"rates": "pair", "steering": "steered", "twist": "twist", "poses": "pair"}
-# Fields of a scenario file by what wheels report: required ones, then optional ones.
+# Required and optional fields of a scenario file for each value of `reports`.
 _FIELDS = {
     "rates": (("radii", "baseline"), ("noise", "slip", "allowed_slip", "poses_every")),
     "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
@@ -46,8 +47,8 @@ _JOINTS = {"pair": ["left_wheel", "right_wheel"], "steered": ["wheel", "steering
 
 @dataclass(frozen=True, eq=False)
 class WheelTruth:
-    """Readings without noise: seconds (N,) of the stamps on the IMU's clock; value (N, 2) as in `WheelStream`, or
-    relative poses (N - 1, 3)."""
+    """Readings without noise. seconds (N,): stamps on the IMU's clock; value (N, 2): `rate` of a `WheelStream`, or
+    relative poses (N - 1, 3) as in `WheelPoses`."""
 
     seconds: np.ndarray
     value: np.ndarray
@@ -59,13 +60,14 @@ class SimWheels(SimSensor):
     floor; x forward, z up.
 
     radii (left, right) [m], baseline [m]. noise: density of each wheel's rate [rad/s/sqrt(Hz)]. slip: density of
-    lateral slip [m/sqrt(s)], of poses only. allowed_slip: density of slip [m/sqrt(s)] that the rig file states;
-    simulated encoders have none, and the default of the rig file is that of real wheels.
+    simulated lateral slip [m/sqrt(s)], for poses only. allowed_slip: density of slip [m/sqrt(s)] that the rig file
+    states; None: the default of the rig file, which is that of real wheels.
 
-    reports, with v_x and w_z the velocity of the frame, sampled by `sampling` as in `WheelStream`:
-    rates: (v_x -+ baseline/2 w_z) / radius. twist: v_x and w_z over their scales. steering: v_x / radius of the driven
-    wheel, and the direction in which a point a wheelbase ahead moves, less steering_offset [rad]. poses: relative poses
-    of the paper's (27), one for every `poses_every` readings, with the noise of integrated readings.
+    reports: type of the readings, sampled by `sampling` as in `WheelStream`. v_x and w_z are speed and yaw rate of the
+    wheel frame. rates: (v_x -+ baseline/2 w_z) / radius, left and right. twist: v_x and w_z divided by `scales`.
+    steering: v_x / radius for the driven wheel, and the direction of motion of a point a wheelbase ahead, minus
+    steering_offset [rad]. poses: relative poses by equation (27) of the paper, one for every `poses_every` readings,
+    with the noise of integrated readings.
     """
 
     sensor_type: ClassVar[str] = "wheels"
@@ -113,7 +115,8 @@ class SimWheels(SimSensor):
         return {name: np.atleast_1d(np.array(getattr(self, name))) for name in drive_names(_KINDS[self.reports])}
 
     def drawn_values(self, rng: np.random.Generator, relative_error: float) -> dict[str, np.ndarray]:
-        """Lengths and scales by a factor, an angle by as many radians."""
+        """True values with random errors: relative_error times the value for lengths and scales, times 1 rad for an
+        angle."""
         drawn, off = {}, relative_error * rng.standard_normal(3)
         positive = {spec.name for spec in Wheels.parameters if spec.is_positive}
         for name, value in self.values().items():
@@ -125,7 +128,8 @@ class SimWheels(SimSensor):
         return {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in self.values().items()}
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
-        """Readings within those of the IMU. Raises RigError, too, where no front wheels can be steered so."""
+        """The simulated stream within the time of the IMU, and its truth. Raises RigError if there are too few
+        readings, or if the motion needs a steering angle beyond the range of front wheels."""
         rng = np.random.default_rng(seed)
         stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
         if self.reports == "poses":
@@ -141,7 +145,7 @@ class SimWheels(SimSensor):
         return Report(stream, WheelTruth(seconds[1:], true))
 
     def _densities(self) -> np.ndarray:
-        """(2,) noise densities of the two columns of readings."""
+        """Noise densities (2,) of the two columns of readings, per sqrt(Hz)."""
         densities = {"twist": [self.speed_noise, self.yaw_noise], "steering": [self.noise, self.steering_noise]}
         return np.array(densities.get(self.reports, [self.noise, self.noise]))
 
@@ -173,7 +177,7 @@ class SimWheels(SimSensor):
         write_table(folder / "poses.csv", header, stamps[:-1], stamps[1:], stream.pose, upper)
 
     def bag_topic(self, stream: WheelStream | WheelPoses, offset_ns: int) -> BagTopic | str:
-        """Messages JointState or TwistStamped; a sentence for relative poses, which have none."""
+        """Topic with JointState or TwistStamped messages; for relative poses a sentence, as they have no message."""
         if isinstance(stream, WheelPoses):
             return f"{self.name} reports relative poses, which no driver sends; they are not written."
         if stream.kind == "twist":
@@ -200,8 +204,8 @@ def _number(key: str, value: YamlValue) -> Any:
 
 
 def _joint_states(wheels: WheelStream, offset_ns: int) -> Iterator[BagEvent]:
-    """Messages of joints. Positions are angles since the first stamp if readings are means over intervals; else there
-    are none. A steering joint has a position and no velocity."""
+    """JointState messages. Positions are angles since the first stamp if readings are interval means, else missing. A
+    steering joint has a position and no velocity."""
     angles, rates = np.full(wheels.rate.shape, np.nan), wheels.rate.copy()
     if wheels.sampling == "interval-mean":
         turned = wheels.rate[1:] * np.diff(wheels.stamps_ns)[:, None] * 1e-9
@@ -231,13 +235,13 @@ def _twists(wheels: WheelStream, offset_ns: int) -> Iterator[BagEvent]:
 
 
 def _twist(bag: BagWriter, stamp_ns: int, frame: str, speed: float, yaw_rate: float) -> Any:
-    """A message TwistStamped of forward speed [m/s] and yaw rate [rad/s]."""
+    """A TwistStamped message with forward speed [m/s] and yaw rate [rad/s]."""
     linear, angular = (bag.make("geometry_msgs/msg/Vector3", *v) for v in ((speed, 0.0, 0.0), (0.0, 0.0, yaw_rate)))
     return bag.make(_TWIST, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Twist", linear, angular))
 
 
 def _true_readings(wheels: SimWheels, scene: SimScene, seconds: np.ndarray) -> np.ndarray:
-    """(N - 1, 2) readings without noise at all instants (N,) but the first, as in `WheelStream`."""
+    """Readings without noise (N - 1, 2), as in `WheelStream`, at all instants seconds (N,) except the first."""
     if wheels.sampling == "instantaneous":
         return reported(wheels, scene.trajectory, seconds[1:])
     true = _means(wheels, scene.trajectory, seconds, scene.imu_seconds)
@@ -247,7 +251,8 @@ def _true_readings(wheels: SimWheels, scene: SimScene, seconds: np.ndarray) -> n
 
 
 def reported(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> np.ndarray:
-    """(N, 2) instantaneous readings without noise, as in `WheelStream`, at seconds (N,) on the clock of the truth."""
+    """Instantaneous readings without noise (N, 2), as in `WheelStream`, at seconds (N,) on the clock of the
+    trajectory."""
     some = np.split(seconds, range(_CHUNK, len(seconds), _CHUNK))
     return np.concatenate([_reported(wheels, trajectory, s) for s in some])
 
@@ -266,8 +271,8 @@ def _reported(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray
 
 
 def _steering(wheels: SimWheels, ahead: np.ndarray, turning: np.ndarray) -> np.ndarray:
-    """(N,) steering angle [rad]: the direction in which a point a wheelbase ahead moves, with the speed v_x along x and
-    wheelbase * w_z along y. Raises RigError beyond the range of front wheels."""
+    """Measured steering angle (N,) [rad]: the direction of motion of a point a wheelbase ahead, whose velocity is v_x
+    along x and wheelbase * w_z along y, minus steering_offset. Raises RigError beyond the range of front wheels."""
     angle = np.arctan2(np.copysign(wheels.wheelbase, ahead) * turning, np.abs(ahead))
     if np.abs(angle).max() > _MAX_STEERING_RAD:
         raise RigError(
@@ -280,7 +285,7 @@ def _steering(wheels: SimWheels, ahead: np.ndarray, turning: np.ndarray) -> np.n
 def wheel_velocity(
     T_imu_wheel: np.ndarray, trajectory: TrueTrajectory, seconds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) velocity [m/s] and angular rate [rad/s] of the wheel frame in its own axes."""
+    """Velocity (N, 3) [m/s] and angular rate (N, 3) [rad/s] of the wheel frame in wheel axes at seconds (N,)."""
     rotation, _, velocity = trajectory.pose_at(seconds)
     rate = trajectory.rate_at(seconds)
     in_imu = np.einsum("nji,nj->ni", rotation, velocity) + np.cross(rate, T_imu_wheel[:3, 3])
@@ -288,8 +293,8 @@ def wheel_velocity(
 
 
 def _means(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray, imu_seconds: np.ndarray) -> np.ndarray:
-    """(N - 1, 2) mean readings between seconds (N,), by Gauss quadrature between these and imu_seconds, where rates may
-    jump."""
+    """Mean readings (N - 1, 2) between seconds (N,), by Gauss quadrature. Intervals are split at imu_seconds, where
+    rates may jump."""
     within = imu_seconds[(imu_seconds > seconds[0]) & (imu_seconds < seconds[-1])]
     cuts = np.union1d(seconds, within)
     width = np.diff(cuts)
@@ -301,9 +306,9 @@ def _means(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray, i
 
 
 def relative_poses(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K, 3) yaw, x, y between consecutive instants (K + 1,) by the paper's (27), without noise, and (K, 3, 3) the
-    covariance that integrating noisy readings would give them: yaw = e3 . Log(R_W(k)_W(k+1)), x and y of p_W(k)_W(k+1).
-    """
+    """Relative poses (K, 3) without noise between consecutive instants (K + 1,) by equation (27) of the paper:
+    yaw = e3 . Log(R_W(k)_W(k+1)) [rad], and x, y of p_W(k)_W(k+1) [m]. Also the covariance (K, 3, 3) that they would
+    have if they were integrated from noisy readings."""
     each = _CHUNK // (2 * _SUBSTEPS + 1)
     some = [seconds[k : k + each + 1] for k in range(0, len(seconds) - 1, each)]
     poses, covariances = zip(*(_relative_poses(wheels, trajectory, s) for s in some), strict=True)
@@ -322,13 +327,13 @@ def _relative_poses(
 
 
 def _drawn(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(K, 3) normal vectors of the covariances (K, 3, 3), which may be singular."""
+    """Random vectors (K, 3), normally distributed with the covariances (K, 3, 3), which may be singular."""
     size, axes = np.linalg.eigh(covariance)
     return (axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.standard_normal(size.shape))[..., None])[..., 0]
 
 
 def _frames(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R_world_wheel (N, 3, 3) and p_world_wheel (N, 3)."""
+    """R_world_wheel (N, 3, 3) and p_world_wheel (N, 3) [m] at seconds (N,)."""
     rotation, position, _ = trajectory.pose_at(seconds)
     return rotation @ wheels.T_imu_sensor[:3, :3], position + rotation @ wheels.T_imu_sensor[:3, 3]
 
@@ -342,10 +347,11 @@ def _rotation_vectors(rotation: np.ndarray) -> np.ndarray:
 
 
 def _covariance(wheels: SimWheels, yaw: np.ndarray, xy: np.ndarray, duration: np.ndarray) -> np.ndarray:
-    """(K, 3, 3) covariance of yaw, x, y: the noise of rates at each instant, propagated to the end of its interval.
+    """Covariance (K, 3, 3) of yaw, x, y: the noise of rates at each instant, propagated to the end of its interval.
 
-    yaw (K, M), xy (K, M, 2) along each interval, M odd, for Simpson's rule; duration (K,) s. An error of the yaw rate
-    rotates the rest of the path about the frame's position at that instant; one of the speed moves it along its x axis.
+    yaw (K, M), xy (K, M, 2): poses along each interval, M odd for Simpson's rule; duration (K,) [s]. An error of the
+    yaw rate rotates the rest of the path about the position of the frame at that instant. An error of the speed moves
+    the rest of the path along the x axis of the frame.
     """
     r_l, r_r = wheels.radii
     speeds = np.array([[-r_l, r_r], [0.5 * r_l * wheels.baseline, 0.5 * r_r * wheels.baseline]]) / wheels.baseline

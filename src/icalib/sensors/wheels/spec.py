@@ -1,4 +1,4 @@
-"""Wheels (how they drive and report, what they stand on, their sizes), and their fields in the rig file."""
+"""Wheels in the rig file: type of drive, readings, sizes, noise and ground."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ WheelMeasure = Literal["rates", "angles", "ticks", "poses", "twist"]
 WheelDrive = Literal["differential", "skid-steer", "ackermann"]
 RateUnit = Literal["rad/s", "deg/s", "rpm"]
 RATE_UNITS: dict[RateUnit, float] = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}  # in rad/s
-WheelKind = Literal["pair", "steered", "twist"]  # what the two columns of a `WheelStream` are
+WheelKind = Literal["pair", "steered", "twist"]  # meaning of the two columns of a `WheelStream`
 
-# The parameters of each kind of wheels, beside pose and clock.
+# Drive parameters of each kind of wheels: those besides extrinsics and time offset.
 DRIVES: dict[WheelKind, tuple[ParameterSpec, ...]] = {
     "pair": (
         ParameterSpec("radii", 2, "vector", "m", ("left", "right"), 1e-4, 0.01, True, "radius", motion="drive further"),
@@ -64,7 +64,7 @@ DRIVES: dict[WheelKind, tuple[ParameterSpec, ...]] = {
 
 
 def drive_names(kind: WheelKind) -> tuple[str, ...]:
-    """Names of the parameters of `DRIVES`."""
+    """Names of the drive parameters of a kind of wheels."""
     return tuple(spec.name for spec in DRIVES[kind])
 
 
@@ -77,9 +77,9 @@ GroundPlane = Literal["floor", "level"]
 class Ground:
     """The ground: the floor that LiDARs see, or the horizontal plane through the origin of the world.
 
-    tilt_noise: of the wheels' frame against the plane, per keyframe and axis; None: no constraint. height: of the
-    frame's origin over the plane, with height_sigma, a constant error; None: no constraint. bump_noise: of the height,
-    per keyframe.
+    tilt_noise: standard deviation of the tilt between wheel frame and plane, per keyframe and axis; None: the tilt is
+    not constrained. height: height of the frame's origin over the plane. height_sigma: standard deviation of its
+    constant error; None: the height is not constrained. bump_noise: standard deviation of the height per keyframe.
     """
 
     plane: GroundPlane
@@ -97,12 +97,12 @@ _NOISES = ("wheel_noise", "speed_noise", "yaw_noise", "steering_noise")
 _GROUND = ("tilt_noise", "height", "height_sigma", "bump_noise")
 _SLIP = ("lateral_slip", "vertical_slip")
 _TURNED = ("rates", "angles", "ticks")
-# Fields that go with some of `measures` only.
+# Fields that are valid for some values of `measures` only.
 _ONLY_OF: dict[str, tuple[str, ...]] = {
     "sampling": ("rates", "twist"), "counts_per_turn": ("ticks",), "counter_size": ("ticks",), "joints": _TURNED,
     "angle_range": ("angles",), "rate_unit": ("rates",), "signs": (*_TURNED, "twist"),
 }  # fmt: skip
-# Fields that go with some kinds of wheels only.
+# Fields that are valid for some kinds of wheels only.
 _ONLY_OF_KIND: dict[str, tuple[str, ...]] = {
     **{spec.name: (kind,) for kind, specs in DRIVES.items() for spec in specs},
     "wheel_noise": ("pair", "steered"), "speed_noise": ("twist",), "yaw_noise": ("twist",),
@@ -123,10 +123,10 @@ class Wheels(MountedSensor):
     """The odometry of one set of wheels. Frame: x forward, y to the left, z up; the origin is midway between the wheels
     of the axle that is not steered.
 
-    drive: differential, two driven wheels of one axle; skid-steer, both wheels of a side turn alike; ackermann, the
-    front wheels steer. measures: rates [rad/s], angles turned [rad], counts of encoders (ticks), relative planar poses
-    (tables only), or twist, forward speed [m/s] and yaw rate [rad/s]. sampling: of rates and twist; see `WheelStream`.
-    Noise densities: of each wheel's angle, of speed and yaw rate, of the steering angle, and of slip.
+    drive: differential (two driven wheels on one axle), skid-steer (both wheels of a side turn at the same rate) or
+    ackermann (the front wheels steer). measures: rates [rad/s], angles turned [rad], encoder counts (ticks), relative
+    planar poses (tables only), or twist: forward speed [m/s] and yaw rate [rad/s]. sampling: for rates and twist, see
+    `WheelStream`. Noise densities: angle of each wheel, speed, yaw rate, steering angle, lateral and vertical slip.
     """
 
     sensor_type: ClassVar[str] = "wheels"
@@ -141,39 +141,39 @@ class Wheels(MountedSensor):
     path: str
     drive: WheelDrive = "differential"
     radii: Parameter = Parameter()  # (2,) left, right [m]
-    baseline: Parameter = Parameter()  # (1,) between the wheels [m]; of skid-steer the effective one
+    baseline: Parameter = Parameter()  # (1,) distance between the wheels [m]; for skid-steer the effective distance
     radius: Parameter = Parameter()  # (1,) of the driven wheel of ackermann [m]
     wheelbase: Parameter = Parameter()  # (1,) from rear to front axle [m]
     steering_offset: Parameter = Parameter()  # (1,) added to the steering angle [rad]
     scales: Parameter = Parameter()  # (2,) factors of speed and yaw rate
-    wheel_noise: float = 0.03  # rad/sqrt(s): of rates at 70 Hz 0.25 rad/s each, as simulated wheels have it
+    wheel_noise: float = 0.03  # rad/sqrt(s): 0.25 rad/s for each rate at 70 Hz, the noise of simulated wheels
     speed_noise: float = 2e-3  # m/sqrt(s)
     yaw_noise: float = 1e-2  # rad/sqrt(s)
-    steering_noise: float = 1e-3  # rad/sqrt(Hz): of angles at 70 Hz half a degree each
+    steering_noise: float = 1e-3  # rad/sqrt(Hz): half a degree for each angle at 70 Hz
     lateral_slip: float = 5e-3  # m/sqrt(s)
     vertical_slip: float = 5e-3  # m/sqrt(s), off the ground
-    factor: WheelFactor = "increments"  # relative-poses: the paper's (27)
+    factor: WheelFactor = "increments"  # relative-poses: equation (27) of the paper
     measures: WheelMeasure = "rates"
     sampling: Literal["interval-mean", "instantaneous"] = "interval-mean"
-    counts_per_turn: float | None = None  # of ticks, for one turn of the wheel
-    signs: tuple[int, ...] | None = None  # 1 or -1 of each column of its table, or each joint; None: all 1
-    rate_unit: RateUnit = "rad/s"  # of rates
+    counts_per_turn: float | None = None  # ticks per turn of the wheel
+    signs: tuple[int, ...] | None = None  # 1 or -1 for each column of the table or each joint; None: all 1
+    rate_unit: RateUnit = "rad/s"  # unit of rates
     angle_range: float | None = None  # wrap-around of angles [rad]; None: none, or found from the data
     counter_size: int | None = None  # encoder wrap-around [ticks]; None: none
-    topic: str | None = None  # of its messages; None: the one with the wheels' name, or the only one
+    topic: str | None = None  # topic of the messages; None: the one with the name of the wheels, or the only one
     joints: tuple[str, ...] | None = None  # in JointState; None: found by "left" and "right" in the names
     ground: Ground | None = None
     layout: TableLayout = PLAIN_TABLE
 
     def __post_init__(self) -> None:
-        check_sizes(self, self.stated())  # the parameters of other drives, too
+        check_sizes(self, self.stated())  # also those of other drives
 
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """As in `Sensor`: those of the drive, and the height if it is estimated."""
+        """See `Sensor`: extrinsics, time offset, drive parameters, and the height if it is estimated."""
         return (*MOUNTED, *((GROUND_HEIGHT,) if self.knows_height else ()), *self.drive_specs)
 
     def is_estimated(self, spec: ParameterSpec) -> bool:
-        """As in `Sensor`; relative poses do not depend on the drive."""
+        """See `Sensor`; drive parameters are not estimated from relative poses, which do not depend on them."""
         return super().is_estimated(spec) and (self.measures != "poses" or spec not in self.drive_specs)
 
     @property
@@ -183,14 +183,14 @@ class Wheels(MountedSensor):
 
     @property
     def kind(self) -> WheelKind:
-        """The kind by which `DRIVES` gives the parameters."""
+        """The kind of wheels, key of `DRIVES`."""
         if self.measures == "twist":
             return "twist"
         return "steered" if self.drive == "ackermann" else "pair"
 
     @property
     def drive_specs(self) -> tuple[ParameterSpec, ...]:
-        """The parameters beside pose, clock and height."""
+        """The drive parameters: those besides extrinsics, time offset and height."""
         return DRIVES[self.kind]
 
     @property
@@ -262,7 +262,7 @@ class Wheels(MountedSensor):
 
 
 def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], bare: Wheels) -> None:
-    """Raises RigError if a field does not go with `measures` or `drive`, or is missing."""
+    """Raises RigError if a field is not valid for `measures` or `drive`, or is missing."""
     for name, measures in _ONLY_OF.items():
         if name in found and bare.measures not in measures:
             found[name].fail(

@@ -16,12 +16,13 @@ from icalib.sensors.stream import Stream, check
 class WheelStream(Stream):
     """Rates or velocities that wheels or the driver of a vehicle report.
 
-    stamps_ns (N,) int64, strictly increasing; rate (N, 2), by kind: "pair", rates of the left and the right wheel
-    [rad/s], positive forwards; "steered", rate of the driven wheel [rad/s] and steering angle [rad], positive to the
-    left; "twist", forward speed [m/s] and yaw rate [rad/s], positive to the left. sampling "interval-mean":
-    reading i is the mean over the period from stamp i-1 to stamp i, so rate x period is the angle turned (what a
-    difference of encoder counts gives; the first reading's period began one unknown stamp earlier). "instantaneous":
-    the rate at the stamp, as steering angles always are.
+    stamps_ns (N,) int64, strictly increasing. rate (N, 2) depends on `kind`. "pair": rates of the left and the right
+    wheel [rad/s], positive forwards. "steered": rate of the driven wheel [rad/s] and steering angle [rad], positive to
+    the left. "twist": forward speed [m/s] and yaw rate [rad/s], positive to the left.
+
+    sampling "interval-mean": reading i is the mean from stamp i-1 to stamp i, as computed from a difference of encoder
+    counts; the start of the first interval is unknown. "instantaneous": reading i is the value at stamp i. Steering
+    angles are always instantaneous.
     """
 
     sensor_type: ClassVar[str] = "wheels"
@@ -37,7 +38,8 @@ class WheelStream(Stream):
 
 @dataclass(frozen=True)
 class WheelPoses(Stream):
-    """Relative planar poses of the wheels' frame between consecutive stamps, z_W of the paper's (27).
+    """Relative planar poses of the wheels' frame between consecutive stamps, z_W of equation (27) of
+    the paper.
 
     stamps_ns (K + 1,) int64, strictly increasing; pose (K, 3): yaw [rad], x, y [m] of the frame at stamp k+1 in the
     frame at stamp k; covariance (K, 3, 3) of these.
@@ -56,7 +58,7 @@ class WheelPoses(Stream):
 
     @classmethod
     def joined(cls, streams: Sequence[Any], shifts_ns: Sequence[int] | None = None) -> Self:
-        """Raises RecordingError: there is no relative pose between two recordings."""
+        """Always raises RecordingError: there is no relative pose between two recordings."""
         del shifts_ns
         raise RecordingError(
             f"{streams[0].name} measures relative poses, and there is none between two recordings; give one "

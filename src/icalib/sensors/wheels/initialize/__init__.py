@@ -1,4 +1,4 @@
-"""Initial guess of wheels on a known trajectory, and a trajectory by wheels for rigs without an IMU."""
+"""Initial guess of wheels on a known trajectory, and the trajectory by dead reckoning for rigs without an IMU."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from icalib.sensors.wheels.initialize.planar_path import wheel_path
 
 
 class WheelInitializer(Initializer[Wheels]):
-    """Guesses wheels from the trajectory of other sensors. Without an IMU and other sensors, dead reckoning on a flat
-    floor gives the trajectory."""
+    """Guesses the parameters of wheels from the trajectory of other sensors. In rigs without an IMU and other sensors
+    that show the motion, the trajectory comes from dead reckoning on a flat floor."""
 
     asks_for_vertical = True
 

@@ -1,7 +1,7 @@
-"""Initial guess of wheels from a known motion: time offset by correlation, all else by linear least squares.
+"""Initial guess of wheels from a known motion: time offset by correlation, all other parameters by least squares.
 
-Assumption: the z axis of the wheels' frame is along `up`; roll, pitch and height are left to the estimate. In the
-horizontal plane the origin of the wheels, p_imu_wheel = l_1 e_1 + l_2 e_2, moves along e_1 only. With u (2,) the
+Assumption: the z axis of the wheel frame is along `up`; only the estimator solves for roll, pitch and height. In the
+horizontal plane the origin of the wheel frame, p_imu_wheel = l_1 e_1 + l_2 e_2, moves along e_1 only. With u (2,) the
 horizontal velocity of the IMU, w its rate about `up`, and theta' the rate of a wheel:
 
     e_2 u + l_1 w = 0                      no lateral slip
@@ -26,27 +26,27 @@ from icalib.motion.stamp_intervals import MAX_INTERVAL_S
 from icalib.rig import WheelKind, drive_names
 
 CORRELATION_HZ = 100.0  # grid of the correlation; Gauss-Newton refines its peak
-MIN_OVERLAP_S = 4.0  # of both recordings; a shorter one correlates by chance
-MIN_CORRELATION = 0.7  # of matching yaw rates: half of the variance; other recordings stay far below
-RATE_WINDOW_S = 0.1  # of a mean rate of the wheels: many ticks of an encoder
+MIN_OVERLAP_S = 4.0  # of IMU and wheel readings; shorter overlaps correlate by chance
+MIN_CORRELATION = 0.7  # of matching yaw rates: half of the variance; unrelated recordings stay far below
+RATE_WINDOW_S = 0.1  # over which rates of the wheels are averaged: many ticks of an encoder
 MIN_WINDOWS = 20  # several for each of the at most five unknowns
-MIN_YAW_RATE_RAD_S = 0.03  # RMS, and
-MIN_SPEED_M_S = 0.05  # RMS: less is noise of the motion
-STANDSTILL_RATIO = 0.02  # of the RMS rates of a wheel and of the faster one: less is a wheel that is not measured
+MIN_YAW_RATE_RAD_S = 0.03  # RMS; less is noise of the estimated motion
+MIN_SPEED_M_S = 0.05  # RMS; less is noise of the estimated motion
+STANDSTILL_RATIO = 0.02  # RMS rate of the slower wheel over that of the faster one; below, it does not turn
 RADIUS_RANGE_M = (0.005, 5.0)  # of any vehicle's wheel; beyond, the unit of the rates is wrong
-MAX_LATERAL_SLIP = 0.25  # share of the speed: more than wheels that skid in curves
+MAX_LATERAL_SLIP = 0.25  # share of the speed; wheels that skid in curves have less
 MIN_INDEPENDENCE = 0.02  # 1 - |cosine| of speed and yaw rate; below, baseline and lever arm are not separable
 MAX_REFINEMENTS = 8  # Gauss-Newton steps of the time offset or the steering offset
 OFFSET_STEP_S = 0.02  # largest step of the time offset: two samples of the grid
 CONVERGED_S = 1e-6  # step of the time offset: far below its tolerance of 1 ms
-SCALE_RANGE = 0.5, 2.0  # of a twist; beyond, its unit is wrong or it is of another vehicle
+SCALE_RANGE = 0.5, 2.0  # plausible scales of a twist; beyond, its unit is wrong or it is from another vehicle
 KMH, DEGREE = 1.0 / 3.6, np.pi / 180.0
 UNIT_TOLERANCE = 0.1  # relative difference between a scale and the factor of a unit that it is taken for
-MIN_RATE_VARIATION = 0.5  # standard deviation over mean of the yaw rate; of a constant rate any offset fits
+MIN_RATE_VARIATION = 0.5  # standard deviation over mean of the yaw rate; any offset fits a constant rate
 MAX_STEERING_OFFSET_RAD = 1.2  # beyond the range of any steering: another quantity was recorded
-REJECTION = 5.0  # median absolute residuals, beyond which a row is slip and is left out; 3.4 standard deviations
+REJECTION = 5.0  # median absolute residuals (3.4 standard deviations); rows with larger residuals are rejected as slip
 
-# Why wheels turn in the opposite direction to the IMU, and how to correct it, by kind.
+# For each kind of wheels: why their yaw rate may be opposite to that of the IMU, and how to correct it.
 REVERSED_YAW: dict[WheelKind, str] = {
     "pair": "its left and right wheels are swapped, or both count backwards; swap its columns or joints, or set signs "
     "to [-1, -1] in the rig file",
@@ -60,10 +60,10 @@ REVERSED_YAW: dict[WheelKind, str] = {
 
 @dataclass(frozen=True)
 class WheelRates:
-    """Mean rates (n, m) over windows from start to end (n,) s on the wheels' clock.
+    """Mean rates over n windows from start (n,) to end (n,) [s] on the wheels' clock.
 
-    rate: of the columns of `integrals_of`, by kind; of a pair the rates of left and right wheel [rad/s].
-    longest_step_s: the longest step between readings over which a window may reach.
+    rate (n, m): mean rates of the columns of `integrals_of`; for a pair the rates of left and right wheel [rad/s].
+    longest_step_s: the longest time between two readings that a window may bridge.
     """
 
     start: np.ndarray
@@ -74,7 +74,8 @@ class WheelRates:
 
     @property
     def turning(self) -> np.ndarray:
-        """(n, k) rates with the yaw rate as a linear combination; of steered wheels to first order in the offset."""
+        """Regressors (n, k) whose linear combination is the yaw rate; for steered wheels to first order in the
+        offset."""
         if self.kind == "pair":
             return self.rate
         if self.kind == "twist":
@@ -85,22 +86,22 @@ class WheelRates:
 
     @property
     def turn(self) -> np.ndarray:
-        """(n,) approximate yaw rate up to a positive factor."""
+        """Approximate yaw rate (n,), up to a positive factor."""
         return self.turning[:, -1] - (self.turning[:, 0] if self.kind == "pair" else 0.0)
 
 
 @dataclass(frozen=True)
 class DriveGuess:
-    """Extrinsics, with the lever arm horizontal; values: the groups of the kind of wheels, by name."""
+    """Extrinsics with a horizontal lever arm, and the values of the drive parameters by name."""
 
     extrinsics: Extrinsics
     values: dict[str, np.ndarray]
 
 
 def wheel_rates(name: str, seconds: np.ndarray, integrals: np.ndarray, kind: WheelKind = "pair") -> WheelRates:
-    """Mean rates over windows of about RATE_WINDOW_S, one from each of the stamps seconds (N,).
+    """Mean rates over windows of about RATE_WINDOW_S, one starting at each of the stamps seconds (N,).
 
-    integrals (N, m): see `integrals_of`. Raises EstimationError naming the wheels: too few windows, or no motion.
+    integrals (N, m): see `integrals_of`. Raises EstimationError if there are too few windows, or no motion.
     """
     a = np.arange(len(seconds))
     b = np.searchsorted(seconds, seconds + RATE_WINDOW_S - 1e-9)
@@ -121,7 +122,7 @@ def wheel_rates(name: str, seconds: np.ndarray, integrals: np.ndarray, kind: Whe
 
 
 def _check_turning(name: str, rate: np.ndarray, kind: WheelKind) -> None:
-    """Raises EstimationError if a wheel or the vehicle stands still according to mean rates (n, m)."""
+    """Raises EstimationError if a wheel or the vehicle stands still according to the mean rates (n, m)."""
     if kind != "pair":
         if not np.abs(rate[:, 0]).max() > 0.0:
             raise EstimationError(
@@ -140,9 +141,10 @@ def _check_turning(name: str, rate: np.ndarray, kind: WheelKind) -> None:
 
 
 def wheel_offset(imu: ImuData, up: np.ndarray, name: str, rates: WheelRates) -> float:
-    """Seconds to add to the clock of the wheels `name` to get that of the IMU, both since their first stamps.
+    """Time offset [s] to add to the clock of the wheels `name` to get the clock of the IMU, both since their first
+    stamp.
 
-    The yaw rate of the IMU, about `up` (3,) in its axes, is correlated with that of the wheels; Gauss-Newton refines
+    The yaw rate of the IMU about `up` (3,), in IMU axes, is correlated with that of the wheels; Gauss-Newton refines
     the peak. Raises EstimationError if they do not match at any offset.
     """
     axis = up / np.linalg.norm(up)
@@ -166,11 +168,11 @@ def wheel_offset(imu: ImuData, up: np.ndarray, name: str, rates: WheelRates) -> 
 def drive_guess(
     name: str, wheel_rate: np.ndarray, rate: np.ndarray, velocity: np.ndarray, up: np.ndarray, kind: WheelKind = "pair"
 ) -> DriveGuess:
-    """Extrinsics and sizes of the wheels `name`.
+    """Extrinsics and drive parameters of the wheels `name`.
 
-    wheel_rate (n, m): see `WheelRates`; rate [rad/s], without bias, and velocity [m/s] (n, 3): means of the IMU over
-    the same windows, in its axes; up (3,): the vertical in IMU axes. Raises EstimationError if the motion is too small
-    or of one arc only, or if left and right or signs are mixed up.
+    wheel_rate (n, m): see `WheelRates`. rate [rad/s], without bias, and velocity [m/s] (n, 3): means over the same
+    windows for the IMU, in IMU axes. up (3,): the vertical in IMU axes. Raises EstimationError if the motion is too
+    small or a single arc, or if columns are swapped or have wrong signs.
     """
     axis = up / np.linalg.norm(up)
     level = np.linalg.svd(axis[None])[2][1:]  # two horizontal axes
@@ -182,7 +184,7 @@ def drive_guess(
     _check_lateral_slip(name, u @ e2 + l1 * w, u)
     e1 = np.array([e2[1], -e2[0]])
     forwards = wheel_rate[:, :2].sum(axis=1) if kind == "pair" else wheel_rate[:, 0]
-    if _robust_fit(np.column_stack([u @ e1, w]), forwards)[0] < 0.0:  # e_1 points to where the wheels roll
+    if _robust_fit(np.column_stack([u @ e1, w]), forwards)[0] < 0.0:  # e_1 must point forwards
         e1, e2, l1 = -e1, -e2, -l1
     _check_independence(name, w, u @ e1)
     l2, values = {"pair": _pair, "twist": _twist, "steered": _steered}[kind](name, w, u @ e1, wheel_rate)
@@ -191,7 +193,8 @@ def drive_guess(
 
 
 def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
-    """l_2 [m], radii and baseline of a pair from w (n,), speed ahead (n,) of the IMU along e_1, and rates (n, 2)."""
+    """l_2 [m], radii and baseline of a pair. w (n,): yaw rate [rad/s]; ahead (n,): speed of the IMU along e_1 [m/s];
+    rate (n, 2): mean rates of the wheels."""
     left, right = (_robust_fit(np.column_stack([ahead, w]), rate[:, k]) for k in range(2))
     if left[0] <= 0.0 or right[0] <= 0.0:
         raise EstimationError(
@@ -208,9 +211,9 @@ def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tupl
 
 
 def _twist(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
-    """l_2 [m] and scales of a twist from w (n,), speed ahead (n,) of the IMU along e_1, speed and yaw rate (n, 2)."""
+    """l_2 [m] and scales of a twist. w, ahead: see `_pair`; rate (n, 2): mean speed and yaw rate of the twist."""
     along = _robust_fit(np.column_stack([ahead, w]), rate[:, 0])
-    # The constant is the bias of the gyroscope.
+    # The constant column absorbs the bias of the gyroscope.
     turned = _robust_fit(np.column_stack([w, np.ones(len(w))]), rate[:, 1])
     scales = 1.0 / np.array([along[0], turned[0]])
     for scale, unit, what, should in (
@@ -228,9 +231,10 @@ def _twist(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tup
 
 
 def _steered(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
-    """l_2 [m], radius, wheelbase and steering offset from w (n,), speed ahead (n,) along e_1, and rates (n, 3 or more).
+    """l_2 [m], radius, wheelbase and steering offset. w, ahead: see `_pair`; rate (n, 3 or more): mean rate of the
+    wheel, and mean cos and sin of the steering angle.
 
-    v sin(d) = L w cos(d) is linearised in the offset, and solved again about the result.
+    v sin(d) = L w cos(d) is linearised in the offset and solved repeatedly (Gauss-Newton).
     """
     turned = _robust_fit(np.column_stack([ahead, w]), rate[:, 0])
     radius = 1.0 / turned[:1]
@@ -265,7 +269,7 @@ def _check_radii(name: str, radii: np.ndarray) -> None:
 
 
 def _robust_fit(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(k,) least-squares solution x of A x = b, solved twice more without outliers, such as wheels that slipped."""
+    """Least-squares solution x (k,) of A x = b, solved twice more without outliers, such as readings during slip."""
     weight, x = np.ones(len(b)), np.zeros(A.shape[1])
     for _ in range(3):
         x = np.linalg.lstsq(A * weight[:, None], b * weight, rcond=None)[0]
@@ -275,8 +279,8 @@ def _robust_fit(A: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _no_slip(w: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
-    """e_2 (2,), a unit vector of either sign, and l_1 [m] with e_2 u + l_1 w = 0: total least squares, with w (n,)
-    scaled to the size of u (n, 2)."""
+    """Unit vector e_2 (2,) of either sign, and l_1 [m], that solve e_2 u + l_1 w = 0 by total least squares, with w
+    (n,) scaled to the norm of u (n, 2). Outliers are rejected."""
     scale = np.linalg.norm(u) / np.linalg.norm(w)
     rows, weight, x = np.column_stack([u, w * scale]), np.ones(len(w)), np.zeros(3)
     for _ in range(3):
@@ -288,7 +292,8 @@ def _no_slip(w: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
-    """Raises EstimationError if the vehicle hardly turned or moved."""
+    """Raises EstimationError if the vehicle hardly turned or moved. w (n,): yaw rate [rad/s]; u (n, 2): velocity
+    [m/s]."""
     turn, speed = np.sqrt(np.mean(w**2)), np.sqrt(np.mean((u**2).sum(axis=1)))
     if turn < MIN_YAW_RATE_RAD_S or speed < MIN_SPEED_M_S:
         raise EstimationError(
@@ -299,9 +304,9 @@ def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
 
 
 def _check_lateral_slip(name: str, slip: np.ndarray, velocity: np.ndarray) -> None:
-    """Raises MotionContradictedError if no point of the vehicle moves along one axis: it is no vehicle on wheels.
+    """Raises MotionContradictedError if no point of the vehicle moves along one axis only, as wheels force it to.
 
-    slip (n,) m/s: lateral speed for the best axis; velocity (n, 2) m/s.
+    slip (n,) [m/s]: lateral speed for the best axis; velocity (n, 2) [m/s].
     """
     share = float(np.sqrt(np.mean(slip**2) / np.mean((velocity**2).sum(axis=1))))
     if share > MAX_LATERAL_SLIP:

@@ -1,4 +1,4 @@
-"""Noise of wheels as densities of distance and yaw, before their sizes are known."""
+"""Noise densities of distance and yaw of wheels, before their sizes are known."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from icalib.rig import Wheels
 
 
 def wheel_noise(wheels: Wheels, streams: Sequence[object], paths: Sequence[SmoothTrajectory]) -> tuple[float, float]:
-    """Densities of distance [m/sqrt(s)] and yaw [rad/sqrt(s)]; zeros if unknown.
+    """Noise densities of distance [m/sqrt(s)] and yaw [rad/sqrt(s)]; zeros if unknown.
 
-    Radius and baseline of a pair are approximated by ratios of RMS speed and RMS rate of `paths` to those of the
-    wheels, which a time offset does not change.
+    Radius and radius over baseline of a pair are approximated by ratios of RMS values: speed and angular rate of the
+    trajectories `paths`, over those of the wheels. These ratios do not depend on the time offset.
     """
     if wheels.kind == "twist":
         return wheels.speed_noise, wheels.yaw_noise

@@ -1,4 +1,4 @@
-"""Initial guess of wheels on a known trajectory: time offset, extrinsics, sizes."""
+"""Initial guess of wheels on a known trajectory: time offset, extrinsics and drive parameters."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def wheel_values(inputs: Inputs, state: State, sensors: Sequence[Wheels]) -> dic
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
-    """As `wheel_values`, of one set of wheels. Values of the rig file stay unless the trajectory contradicts them."""
+    """As `wheel_values`, for one set of wheels. Values of the rig file are kept unless the trajectory contradicts
+    them."""
     names = [spec.name for spec in wheels.specs()]
     known = stated_values(inputs, wheels, names)
     if isinstance(stream, WheelPoses):
@@ -84,8 +85,8 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
 
 
 def _at_height_of(inputs: Inputs, state: State, stated: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """The lever arm `found` (3,), moved along the vertical to the height of `stated` (3,): the motion on a floor does
-    not determine heights."""
+    """The lever arm `found` (3,), moved along the vertical to the height of `stated` (3,), as motion on a floor does
+    not determine the height."""
     up = possible_verticals(inputs, state).candidates[0]
     up = up / np.linalg.norm(up)
     return found + up * (up @ (stated - found))
@@ -119,14 +120,14 @@ def _from_trajectory(
             f"{wheels.name}: {REVERSED_YAW[rates.kind]}. If z of the frame of {up.level_sensor} points down, write "
             f"level: false for {up.level_sensor} instead."
         )
-    # The motion of no vehicle: lateral slip in one direction is the cause, a reversed yaw in the other only follows.
+    # A contradicted motion is the cause; an error of reversed yaw with the opposite vertical only follows from it.
     raise next((error for error in (*failed, other) if isinstance(error, MotionContradictedError)), failed[0])
 
 
 def _attempt(
     inputs: Inputs, state: State, stream: WheelStream, rates: WheelRates, up: np.ndarray, offset: np.ndarray | None
 ) -> dict[Key, np.ndarray] | EstimationError:
-    """As `_from_rates`; the error instead of raising it."""
+    """As `_from_rates`, but returns the error instead of raising it."""
     try:
         return _from_rates(inputs, state, stream, rates, up, offset)
     except EstimationError as error:
@@ -136,7 +137,7 @@ def _attempt(
 def _from_rates(
     inputs: Inputs, state: State, stream: WheelStream, rates: WheelRates, up: np.ndarray, offset: np.ndarray | None
 ) -> dict[Key, np.ndarray]:
-    """Parameters of wheels that report rates; up (3,): the vertical in IMU axes. Raises EstimationError, see
+    """Parameters of wheels that report rates; up (3,): the vertical in IMU axes. Raises EstimationError as
     `drive_guess`."""
     assert inputs.imu is not None
     name = stream.name
@@ -153,7 +154,7 @@ def _from_rates(
 
 
 def _offset_alone(inputs: Inputs, name: str, up: np.ndarray, recording: int) -> float:
-    """Time offset [s] in one recording, between its own first stamps; up (3,): the vertical in IMU axes."""
+    """Time offset [s] in one recording, relative to the first stamps of it; up (3,): the vertical in IMU axes."""
     own = single_recording(inputs, recording)
     stream = own.stream(name)
     assert own.imu is not None and isinstance(stream, WheelStream)
@@ -167,7 +168,7 @@ def _from_relative_poses(
     assert inputs.imu is not None
     if offset is None:
         offset = np.array([poses_offset(inputs.imu, stream)])
-    times = stream.seconds + offset[0]  # relative poses are of one recording
+    times = stream.seconds + offset[0]  # relative poses come from a single recording
     inside, rate, velocity = _means(inputs, state, times[:-1], times[1:])
     found = extrinsics_guess(stream, inside, rate, velocity)
     values = mounted(found.R, found.p, offset)
@@ -179,13 +180,13 @@ def _means(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean motion of the IMU over intervals from start to end (m,) s on its clock, by Simpson's rule.
 
-    Returns a mask (m,) of the n intervals within the trajectory and outside gaps of the IMU, and over these the means
-    (n, 3) of rate [rad/s], without bias, and velocity [m/s], in IMU axes. Raises EstimationError if there are none.
+    Returns a mask (m,) of the n intervals within the trajectory and outside gaps of the IMU; and for these the means
+    (n, 3) of rate [rad/s], without bias, and velocity [m/s] in IMU axes. Raises EstimationError if there are none.
     """
     assert inputs.imu is not None
     motion = motion_of(inputs, state)
     inside = is_known(state.seconds, start) & is_known(state.seconds, end)
-    inside &= clear_of(inputs.imu.gaps, start, end)  # in which poses are extrapolated
+    inside &= clear_of(inputs.imu.gaps, start, end)  # poses in gaps are extrapolated
     if not inside.any():
         raise EstimationError(
             "no reading of the wheels falls within the recording of the other sensors; check the clocks, or "

@@ -13,7 +13,7 @@ from icalib.sensors.wheels.integrals import integrals_of
 
 
 def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:
-    """Poses of the wheels' frame at their stamps, relative to the first, in the plane z = 0.
+    """Poses of the wheel frame at the stamps, relative to the first pose, in the plane z = 0.
 
     Raises EstimationError if the rig file does not state the sizes of the wheels.
     """
@@ -30,7 +30,8 @@ def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:
 
 
 def _increments(wheels: Wheels, stream: WheelStream) -> tuple[np.ndarray, np.ndarray]:
-    """From each reading to the next: yaw (n,) rad, and displacement (n, 2) m in the frame at the former."""
+    """Yaw (n,) [rad] from each reading to the next, and displacement (n, 2) [m] in the wheel frame at the earlier
+    one."""
     turned = np.diff(integrals_of(stream), axis=0)
     if stream.kind == "pair":
         path = turned * _size(wheels, "radii")
@@ -48,7 +49,7 @@ def _increments(wheels: Wheels, stream: WheelStream) -> tuple[np.ndarray, np.nda
 
 
 def _size(wheels: Wheels, name: str) -> np.ndarray:
-    """The stated value of a parameter, or EstimationError."""
+    """The stated value of the parameter `name`. Raises EstimationError if the rig file has none."""
     value = getattr(wheels, name).value
     if value is None:
         raise EstimationError(

@@ -1,4 +1,4 @@
-"""Initial guess of wheels that report relative planar poses (the paper's (27)).
+"""Initial guess of wheels that report relative planar poses (equation (27) of the paper).
 
 The time offset follows from correlation, the extrinsics from linear least squares. Over a short interval, with u and w
 the velocity and rate of the IMU in its own axes, and r_k the columns of R_imu_wheel,
@@ -17,24 +17,25 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.pose_rows import Extrinsics
 
 CORRELATION_HZ = 100.0  # grid of the correlation; Gauss-Newton refines its peak
-MIN_EXPLAINED = 0.5  # share of the variance of the yaw rate that the gyroscope explains at the right offset
-MIN_SINGULAR_RATIO = 0.02  # to the largest singular value; directions below are motion by noise and are left out
+MIN_EXPLAINED = 0.5  # least share of the variance of the yaw rate that the gyroscope explains at the right offset
+MIN_SINGULAR_RATIO = 0.02  # relative to the largest singular value; smaller ones are noise and are truncated
 MAX_REFINEMENTS = 6  # Gauss-Newton steps of the time offset
 OFFSET_STEP_S = 0.02  # largest of these steps: two samples of the grid
-N_PEAKS = 30  # of the correlation that are compared by their own overlap
+N_PEAKS = 30  # peaks of the correlation that are compared by the data in their overlap
 
 
 def yaw_rates(stream: WheelPoses) -> tuple[np.ndarray, np.ndarray]:
-    """Middles of the intervals (K,) s on the clock of the stream, and mean yaw rates (K,) rad/s over them."""
+    """Midpoints (K,) [s] of the intervals on the clock of the stream, and mean yaw rates (K,) [rad/s] over the
+    intervals."""
     t = stream.seconds
     return 0.5 * (t[1:] + t[:-1]), stream.pose[:, 0] / np.diff(t)
 
 
 def poses_offset(imu: ImuData, stream: WheelPoses) -> float:
-    """Seconds to add to the clock of the wheels to get that of the IMU, both since their first stamps.
+    """Time offset [s] to add to the clock of the wheels to get the clock of the IMU, both since their first stamp.
 
-    At this offset a linear combination of the gyroscope's axes explains the yaw rate best. Raises EstimationError if it
-    explains less than MIN_EXPLAINED of its variance at every offset.
+    At this offset a linear combination of the gyroscope's axes explains the yaw rate best. Raises EstimationError if
+    less than MIN_EXPLAINED of its variance is explained.
     """
     middle, yaw = yaw_rates(stream)
     grid = np.arange(int(imu.seconds[-1] * CORRELATION_HZ) + 1) / CORRELATION_HZ
@@ -63,15 +64,15 @@ def poses_offset(imu: ImuData, stream: WheelPoses) -> float:
 
 
 def _at(t: np.ndarray, imu: ImuData, x: np.ndarray) -> np.ndarray:
-    """(n, 3) columns of x (N, 3), given at the stamps of the IMU, interpolated at t (n,) s."""
+    """x (N, 3), given at the stamps of the IMU, interpolated at t (n,) [s]; returns (n, 3)."""
     return np.stack([np.interp(t, imu.seconds, own) for own in x.T], axis=1)
 
 
 def extrinsics_guess(stream: WheelPoses, inside: np.ndarray, rate: np.ndarray, velocity: np.ndarray) -> Extrinsics:
     """Extrinsics of the wheels from relative poses and the motion of the IMU.
 
-    inside (K,): the intervals that are used, n; rate [rad/s], velocity [m/s] (n, 3): means over each of the IMU's, in
-    its axes.
+    inside (K,) bool: the n intervals that are used. rate [rad/s], velocity [m/s] (n, 3): means over each interval for
+    the IMU, in IMU axes.
     """
     pose, dt = stream.pose[inside], np.diff(stream.seconds)[inside]
     half = 0.5 * pose[:, 0]
@@ -86,17 +87,18 @@ def extrinsics_guess(stream: WheelPoses, inside: np.ndarray, rate: np.ndarray, v
 
 
 def _least_squares(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(k,) minimum-norm solution of A x = b, without weak directions, see MIN_SINGULAR_RATIO."""
+    """Minimum-norm solution x (k,) of A x = b with singular values below MIN_SINGULAR_RATIO truncated."""
     return np.linalg.lstsq(A, b, rcond=MIN_SINGULAR_RATIO)[0]
 
 
 def _cross(v: np.ndarray) -> np.ndarray:
-    """(3, 3) matrix of v x."""
+    """The cross-product matrix (3, 3) of v."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def _best_shift(gyro: np.ndarray, yaw: np.ndarray) -> tuple[float, float]:
-    """Offset [s] of yaw rates (m,) against gyro (3, n), both on the grid, and the share of their variance explained."""
+    """Offset [s] of yaw rates (m,) against gyro (3, n), both on the grid, and the explained share of the variance of
+    yaw rates."""
     n, m = gyro.shape[1], len(yaw)
     size = 1 << (n + m - 1).bit_length()
     product = np.fft.irfft(np.fft.rfft(gyro, size) * np.conj(np.fft.rfft(yaw, size)), size)
@@ -106,7 +108,8 @@ def _best_shift(gyro: np.ndarray, yaw: np.ndarray) -> tuple[float, float]:
     explained = np.einsum("kl,kl->l", c, np.linalg.pinv(gyro @ gyro.T / n, rcond=MIN_SINGULAR_RATIO) @ c) / count
     likely = np.where(count >= 0.5 * min(n, m), explained / (count * yaw.var()), 0.0)
     peaks = np.flatnonzero((likely[1:-1] >= likely[:-2]) & (likely[1:-1] >= likely[2:])) + 1
-    # The correlation uses the covariance of the gyroscope over all of the recording; peaks are compared by their own.
+    # The correlation uses the covariance of the gyroscope over the recording; peaks are compared by that of the
+    # overlap.
     best = max(peaks[np.argsort(-likely[peaks])[:N_PEAKS]], key=lambda k: _significance(gyro, yaw, int(lag[k])))
     return float(lag[best]) / CORRELATION_HZ, _explained(gyro, yaw, int(lag[best]))
 
@@ -120,11 +123,12 @@ def _explained(gyro: np.ndarray, yaw: np.ndarray, lag: int) -> float:
 
 
 def _significance(gyro: np.ndarray, yaw: np.ndarray, lag: int) -> float:
-    """The correlation at `lag` in standard deviations of chance (Fisher's z), which grow with the overlap."""
+    """The correlation at `lag` as Fisher's z times the square root of the overlap: significance in standard
+    deviations."""
     count = min(len(yaw), gyro.shape[1] - lag) - max(0, -lag)
     return float(np.arctanh(np.sqrt(np.clip(_explained(gyro, yaw, lag), 0.0, 0.999999))) * np.sqrt(count))
 
 
 def intervals_inside(imu: ImuData, stream: WheelPoses, offset: float) -> np.ndarray:
-    """(K,) whether an interval lies within the recording of the IMU and outside its gaps; offset [s]."""
+    """(K,) bool: the interval lies within the recording of the IMU and outside its gaps. offset: time offset [s]."""
     return imu.covers(stream.seconds[:-1] + offset, stream.seconds[1:] + offset)

@@ -1,4 +1,4 @@
-"""Readings of wheels, or velocities of a vehicle: tables, joints of a robot, odometry -> a checked stream."""
+"""Reads wheels, or velocities of a vehicle, from tables, joint states, odometry or twists into a checked stream."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ TABLES = tuple(TableFile(f"{m}.csv", f"table of {m}", "wheels", _stamps) for m i
 
 
 def read(recording: Recording, sensors: Sequence[Wheels], reading: Reading) -> list[ReadStream]:
-    """The checked streams, and notes. Raises RecordingError as `readings` and `checked_wheels`."""
+    """The checked stream of each set of wheels, with notes for the user. Raises RecordingError as `readings` and
+    `checked_wheels`."""
     found = []
     for sensor in sensors:
         where = recording.where(sensor)
@@ -54,7 +55,7 @@ def read(recording: Recording, sensors: Sequence[Wheels], reading: Reading) -> l
 
 
 def readings(recording: Recording, sensor: Wheels) -> WheelReadings | WheelPoses:
-    """All readings as they were written: stamps may still repeat or run backwards.
+    """All readings as recorded; stamps may still repeat or run backwards.
 
     Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read.
     """
@@ -74,13 +75,13 @@ def readings(recording: Recording, sensor: Wheels) -> WheelReadings | WheelPoses
 
 
 def where(recording: Recording, sensor: Wheels) -> str:
-    """How a sentence names the place of the readings."""
+    """Topic or table file of the readings, as text for messages."""
     if recording.has_messages:
         return recording.place(_topic(recording, sensor).name)
     return str(recording.table(sensor, sensor.path))
 
 
 def _topic(recording: Recording, sensor: Wheels) -> TopicInfo:
-    """Joints; of a twist its own, or that of an odometry."""
+    """The topic of the readings: joint states, or twist or odometry if the wheels measure a twist."""
     kinds = ("twist", "odometry") if sensor.measures == "twist" else ("joints",)
     return recording.topic(sensor.name, sensor.topic, *kinds)

@@ -1,4 +1,4 @@
-"""From what wheels measured to the rates at which they turn, or the vehicle moves, checked."""
+"""Converts readings of wheels to checked rates of the wheels or of the vehicle."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ from icalib.rig import RATE_UNITS, Wheels
 from icalib.sensors.wheels.read.outliers import apart, counter_of, range_of, second_order, set_back, without_wraps
 from icalib.sensors.wheels.read.raw_readings import RATE_HZ, WheelReadings
 
-_LEAST_HZ = 2.0  # the motion over longer periods is not followed by the estimate
-_FASTEST_RAD_S = 200.0  # a wheel of 0.1 m at 72 km/h; slow robots reach it in deg/s
+_LEAST_HZ = 2.0  # readings at a lower rate do not resolve the motion
+_FASTEST_RAD_S = 200.0  # a wheel of 0.1 m at 72 km/h; rates of slow robots in deg/s exceed it
 _FASTEST_M_S, _FASTEST_YAW_RAD_S = 70.0, 15.0  # 250 km/h; a robot that spins in place twice a second
-_STEEPEST_RAD = 1.4
-_ANY_VALUE = 1e18  # of rates, angles and counts of 64 bits: beyond, it is none
-_GAP_STEPS, _GAP_S = 5.0, 0.1  # a gap is longer than either
-_STUCK_S = 5.0
-_TURNING_RAD_S, _DRIVING_M_S, _STEERING_RAD = 0.5, 0.1, 0.05
+_STEEPEST_RAD = 1.4  # steering angle of front wheels
+_ANY_VALUE = 1e18  # larger rates, angles and counts are invalid
+_GAP_STEPS, _GAP_S = 5.0, 0.1  # a gap is longer than both: in median steps, in seconds
+_STUCK_S = 5.0  # a constant reading for longer is reported if the other column moves
+_TURNING_RAD_S, _DRIVING_M_S, _STEERING_RAD = 0.5, 0.1, 0.05  # larger values are no standstill, no straight drive
 
 
 def checked_wheels(
     read: WheelReadings | WheelPoses, wheels: Wheels, where: str
 ) -> tuple[WheelStream | WheelPoses, tuple[str, ...]]:
-    """What a `WheelStream` of their kind has, or their relative poses as they are, and notes on what was left out or
-    looks odd.
+    """The checked `WheelStream`, or the relative poses unchanged; and notes on what was left out or looks implausible.
 
-    Angles and ticks become the mean rates between their stamps, so that rate times period is what the wheel turned; the
-    first, whose period is unknown, is that of the second. Raises RecordingError naming `where` and the instant: too few
-    readings, mostly NaN, stamps out of order or repeated with other values, other units of time or rate.
+    Angles and ticks become mean rates between their stamps, so that rate times period is the angle turned. The first
+    rate, whose period is unknown, repeats the second. Raises RecordingError that names `where` and the instant: too few
+    readings, mostly NaN, stamps out of order, different readings at one stamp, wrong units of time or rate.
     """
     if isinstance(read, WheelPoses):
         return read, ()
@@ -62,7 +61,8 @@ def _some(read: WheelReadings, kept: np.ndarray) -> WheelReadings:
 
 
 def _finite(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
-    """Without the few readings that are not finite."""
+    """`read` without readings that are not finite, and a note. Raises RecordingError if most readings are not
+    finite."""
     good = np.logical_and.reduce(np.abs(read.value) < _ANY_VALUE, axis=1)
     if good.all():
         return read, ()
@@ -78,7 +78,7 @@ def _finite(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, .
 
 
 def _signed(read: WheelReadings, wheels: Wheels, what: str) -> WheelReadings:
-    """With the signs of the rig file, and rates in rad/s."""
+    """`read` with the signs of the rig file applied and rates in rad/s."""
     if wheels.signs is None and wheels.rate_unit == "rad/s":
         return read
     n, m = read.value.shape
@@ -90,19 +90,22 @@ def _signed(read: WheelReadings, wheels: Wheels, what: str) -> WheelReadings:
 
 
 def _turning(read: WheelReadings, wheels: Wheels) -> int:
-    """How many of the columns are wheels; those after them are steering angles."""
+    """Number of leading columns that are wheels; the columns after them are steering angles."""
     return read.value.shape[1] // (2 if wheels.kind == "steered" else 1)
 
 
 def _even_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
-    """Rates or velocities without single ones that stand apart."""
+    """Rates or velocities without outliers, and a note."""
     off, own = apart(read.value, read.seconds)
     return _some(read, ~np.logical_or.reduce(own, axis=1)), _apart_note(read, off, own, what)
 
 
 def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
-    """Rates (N, m) rad/s between the stamps of angles or ticks, steering angles as they are. Single wrong readings are
-    left out first; steps to another count after which it goes on, as of a counter that was set back, then."""
+    """Mean rates (N, m) [rad/s] between the stamps of angles or ticks, with steering angles unchanged; and notes.
+
+    Outliers among the angles are removed first. Jumps after which the angle continues from the new value, as of a
+    counter that was reset, are removed next.
+    """
     size, notes = _range(read, wheels, what)
     off, own = apart(_steps(read, wheels, size), read.seconds[1:])
     dt = np.diff(read.seconds)[:, None]
@@ -126,18 +129,20 @@ def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelRe
 
 
 def _steps(read: WheelReadings, wheels: Wheels, size: float | None) -> np.ndarray:
-    """(N - 1, m) rad/s between the stamps. Angles and ticks go on where they start anew after `size`."""
+    """Mean rates (N - 1, m) [rad/s] between the stamps; `size`: range after which angles or ticks wrap around, or
+    None."""
     turned = np.diff(read.value[:, : _turning(read, wheels)], axis=0)
     if size is not None:
         turned = without_wraps(turned, size)
     if wheels.measures == "ticks":
-        assert wheels.counts_per_turn is not None  # of every rig file
+        assert wheels.counts_per_turn is not None  # required by the rig file
         turned *= 2.0 * np.pi / wheels.counts_per_turn
     return turned / (np.diff(read.stamps_ns)[:, None] * 1e-9)
 
 
 def _range(read: WheelReadings, wheels: Wheels, what: str) -> tuple[float | None, tuple[str, ...]]:
-    """After how much angles or ticks start anew, by the rig file or as angles show it, and a note on the latter."""
+    """Range after which angles [rad] or ticks wrap around, from the rig file or recognised from angles, with a note on
+    the latter; None if they do not wrap around."""
     if wheels.measures == "ticks" or wheels.angle_range is not None:
         return (wheels.counter_size if wheels.measures == "ticks" else wheels.angle_range), ()
     size = range_of(read.value[:, : _turning(read, wheels)])
@@ -150,8 +155,8 @@ def _range(read: WheelReadings, wheels: Wheels, what: str) -> tuple[float | None
 
 
 def _refuse_counter(read: WheelReadings, wheels: Wheels, off: np.ndarray, what: str) -> None:
-    """Where steps off (N - 1, m) rad are as long as the range of a counter."""
-    assert wheels.counts_per_turn is not None  # of every rig file
+    """Raises RecordingError if jumps off (N - 1, m) [rad] are as long as the range of an encoder counter."""
+    assert wheels.counts_per_turn is not None  # required by the rig file
     size = counter_of(off * wheels.counts_per_turn / (2.0 * np.pi))
     if size is not None:
         raise RecordingError(
@@ -161,7 +166,7 @@ def _refuse_counter(read: WheelReadings, wheels: Wheels, off: np.ndarray, what: 
 
 
 def _apart_note(read: WheelReadings, off: np.ndarray, own: np.ndarray, what: str) -> tuple[str, ...]:
-    """On rates `own` (N, m) that are `off` (N, m) from their neighbours."""
+    """A note on outliers: own (N, m) marks them, off (N, m) are the deviations from their neighbours."""
     count = int(own.any(axis=1).sum())
     if not count:
         return ()
@@ -173,10 +178,10 @@ def _apart_note(read: WheelReadings, off: np.ndarray, own: np.ndarray, what: str
 
 
 def _combined(value: np.ndarray, wheels: Wheels) -> np.ndarray:
-    """(N, 2) of four columns: means of each side, or of the rear wheels and of the front ones.
+    """Four columns reduced to two (N, 2): the mean of each side, or the mean rear wheel and one equivalent front wheel.
 
-    Wheels that are steered about one point have cotangents of which the middle one is the mean; written with tangents,
-    so that straight ahead is nothing special.
+    Ackermann geometry: the cotangent of the equivalent angle is the mean of the cotangents of both front wheels. It is
+    computed from tangents, which are finite for driving straight ahead.
     """
     if value.shape[1] == 2:
         return value
@@ -215,7 +220,8 @@ def _refuse_units(rate: np.ndarray, wheels: Wheels, what: str) -> None:
 
 
 def _refuse_twist_units(rate: np.ndarray, what: str) -> None:
-    """What no vehicle does; units that a slow one hides show in the scales of the first guess."""
+    """Raises RecordingError for implausible speeds or yaw rates. The initial guess finds wrong units of slow
+    vehicles."""
     speed, yaw = np.percentile(np.abs(rate), 99, axis=0)
     if speed > _FASTEST_M_S:
         raise RecordingError(
@@ -239,7 +245,7 @@ def _gap_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
     )
 
 
-# What the columns of a stream are called, in which unit, and how much of the other one is not standing still.
+# For each column of a stream: its name, text on the other column, and the value above which the other one moves.
 _COLUMNS = {
     "pair": (
         ("the left wheel", "the right one turns; check its encoder", _TURNING_RAD_S),
@@ -258,14 +264,14 @@ _UNITS = {"pair": ("rad/s", "rad/s"), "steered": ("rad/s", "rad"), "twist": ("m/
 
 
 def _stuck_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
-    """Where one column reports the same for long while the other does not."""
+    """Notes on a column that stays constant for longer than _STUCK_S while the other one changes."""
     notes: list[str] = []
     for own, (name, but, moving) in enumerate(_COLUMNS[stream.kind]):
         other = 1 - own
         same = np.concatenate([[False], np.diff(stream.rate[:, own]) == 0])
         same &= np.abs(stream.rate[:, other]) > moving
         same &= np.concatenate([[False], np.diff(stream.rate[:, other]) != 0])
-        second, count = longest_run(same)  # of readings that are the one before
+        second, count = longest_run(same)  # run of readings equal to the one before
         begin = max(second - 1, 0)
         duration = (stream.stamps_ns[begin + count] - stream.stamps_ns[begin]) * 1e-9
         if duration > _STUCK_S:

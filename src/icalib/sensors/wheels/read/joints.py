@@ -1,4 +1,4 @@
-"""Joints of a robot, in arrays."""
+"""Joint states of a robot as arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from icalib.errors import RecordingError
 
 @dataclass(frozen=True)
 class JointStream:
-    """Joints by name: stamps_ns (N,) int64; position [rad or m], velocity, effort (N, names), NaN where not sent."""
+    """Joint states: stamps_ns (N,) int64; position [rad or m], velocity, effort (N, joints), NaN where not sent;
+    columns in the order of `names`."""
 
     names: tuple[str, ...]
     stamps_ns: np.ndarray
@@ -22,8 +23,8 @@ class JointStream:
 
 
 def read_joints(bag: HasMessages, topic: str) -> JointStream:
-    """All JointState of `topic`; a message may name some of the joints only. Raises RecordingError as
-    `BagRecording.messages`, and for an array that is not as long as the names."""
+    """All JointState messages of `topic`; a message may contain only some of the joints. Raises RecordingError as
+    `BagRecording.messages`, and for an array whose length differs from that of the names."""
     stamps_ns, found = all_messages(bag, topic, "joints")
     names = tuple(dict.fromkeys(name for m in found for name in m.name))
     column = {name: k for k, name in enumerate(names)}

@@ -1,37 +1,37 @@
-"""Outliers in readings of wheels, wrap-around of angles, and of encoder counters."""
+"""Outliers in readings of wheels, and wrap-around of angles and encoder counters."""
 
 from __future__ import annotations
 
 import numpy as np
 
 _HALF_WINDOW = 2  # readings on each side of the window of the median (Hampel identifier)
-_MAX_DEVIATIONS = 10.0  # of the median deviation, about 7 standard deviations, beyond which a reading is no noise
-_CHANGE_PERCENTILE = 95  # percentile of changes between readings, which one outlier in a hundred does not influence
-_MAX_CHANGES = 4.0  # of that change, beyond which a reading is no short motion
-_MAX_QUANTA = 10.0  # quantisation steps of the rates, beyond which a reading of a slow wheel is not a few ticks
-_MIN_RELATIVE_RATE = 1e-6  # of the largest rate: smaller deviations are rounding
+_MAX_DEVIATIONS = 10.0  # median deviations (about 7 standard deviations); noise stays below
+_CHANGE_PERCENTILE = 95  # percentile of changes between readings; robust against one outlier in a hundred
+_MAX_CHANGES = 4.0  # times the change at _CHANGE_PERCENTILE; brief true motions stay below
+_MAX_QUANTA = 10.0  # quantisation steps of the rates; readings of a slow wheel that are a few ticks stay below
+_MIN_RELATIVE_RATE = 1e-6  # of the 99th percentile of rates; smaller deviations are rounding errors
 _MAX_ANY_RATE = 1e3  # rad/s or m/s, beyond any vehicle
-_MAX_SPAN_S = 0.25  # between the neighbours of an outlier; in a longer time the motion may change as much
-_MAX_OUTLIER_SHARE = 0.1  # share of outliers; more are not single wrong readings
-_MAX_RATE_CHANGES = 2.0  # of the largest rate: the change from forwards to backwards
-_MAX_STEPS_BACK = 4  # steps within which the angle returns after wrong readings
-_MAX_REMAINDER = 0.2  # share of a step that may be left after its return
-_SIZE_TOLERANCE = 0.01  # relative, of a jump to the size of a counter
-_MIN_BITS, _MAX_BITS = 8, 32
+_MAX_SPAN_S = 0.25  # between the neighbours of an outlier; true motion may change as much in a longer time
+_MAX_OUTLIER_SHARE = 0.1  # if more readings deviate, none is taken for an outlier
+_MAX_RATE_CHANGES = 2.0  # times the 95th percentile of rates: the change from forwards to backwards
+_MAX_STEPS_BACK = 4  # steps within which the angle returns to its course after outliers
+_MAX_REMAINDER = 0.2  # of a jump; larger sums of the steps until the return are no return
+_SIZE_TOLERANCE = 0.01  # relative difference between a jump and the size of a counter
+_MIN_BITS, _MAX_BITS = 8, 32  # of an encoder counter
 _ANGLE_RANGES_RAD = (2.0 * np.pi, 4.0 * np.pi)  # after which joint angles wrap around
-_MAX_UNAMBIGUOUS_STEP = 0.4  # of the range; a larger step may be one in the other direction
+_MAX_UNAMBIGUOUS_STEP = 0.4  # of the range; a larger step may be a step in the other direction
 
 
 def apart(rate: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, m) how far rates (N, m) at seconds (N,) are from the median of their neighbours, and whether each is a single
-    one that stands apart."""
+    """Deviations (N, m) of rates (N, m) at seconds (N,) from the median of their neighbours, and a mask (N, m) of those
+    that are outliers."""
     padded = np.pad(rate, ((_HALF_WINDOW, _HALF_WINDOW), (0, 0)), mode="reflect")
     middle = np.median(np.stack([padded[k : k + len(rate)] for k in range(2 * _HALF_WINDOW + 1)]), axis=0)
     off = rate - middle
     brisk = np.percentile(np.abs(np.diff(rate, axis=0)), _CHANGE_PERCENTILE, axis=0)
     limit = np.maximum(_MAX_DEVIATIONS * np.median(np.abs(off), axis=0), _MAX_CHANGES * brisk)
     limit = np.maximum(limit, [_coarse(r, o) for r, o in zip(rate.T, off.T, strict=True)])
-    # At the ends the neighbours of one side stand in for both: a start is not one that stands apart.
+    # Readings at the ends have neighbours on one side only; a higher limit keeps a sudden start.
     ends = np.isin(np.arange(len(rate)), [0, 1, len(rate) - 2, len(rate) - 1])[:, None]
     own = np.abs(off) > np.where(ends, np.maximum(limit, _fastest(rate)), limit)
     span = np.diff(seconds, prepend=seconds[0])
@@ -42,26 +42,29 @@ def apart(rate: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _coarse(rate: np.ndarray, off: np.ndarray) -> float:
-    """How far rates (n,) of a slow wheel stand apart because they come in steps, as of single ticks."""
+    """Deviation that rates (n,) of a slow wheel reach by quantisation, as of single ticks; off (n,): their
+    deviations."""
     fast = min(float(np.percentile(np.abs(rate), 99)), _MAX_ANY_RATE)
     size = np.abs(off)[np.abs(off) > _MIN_RELATIVE_RATE * fast]
     return min(_MAX_QUANTA * float(np.percentile(size, 10)), 2.0 * fast) if len(size) else 0.0
 
 
 def set_back(rate: np.ndarray, off: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(N, m) which of the steps `own` of angles are longer than any motion: the angle was set to another. Shorter ones
-    are motion: what was turned is known, and stays."""
+    """Mask (N, m) of the outlying steps `own` of angles that no motion explains: the angle was reset. Shorter ones are
+    true motion and are kept. rate, off (N, m): rate of each step, and its deviation from its neighbours."""
     return own & (np.abs(off) > _fastest(rate))
 
 
 def _fastest(rate: np.ndarray) -> np.ndarray:
-    """(m,) more than motions with rates (N, m) change."""
+    """Largest change (m,) of rates (N, m) by true motion."""
     return _MAX_RATE_CHANGES * np.percentile(np.abs(rate), _CHANGE_PERCENTILE, axis=0)
 
 
 def second_order(off: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(N + 1,) the wrong ones of N + 1 angles whose steps (N, m) are `off` from those nearby, `own` (N, m) of them far:
-    steps away from the others' path and back."""
+    """Mask (N + 1,) of angles that are outliers: a jump leads away from the course of the angle and another one back.
+
+    off (N, m): deviations of the N steps between the angles from neighbouring steps; own (N, m): those that are large.
+    """
     wrong = np.zeros(len(off) + 1, dtype=bool)
     for column in range(off.shape[1]):
         steps = np.flatnonzero(own[:, column])
@@ -76,7 +79,8 @@ def second_order(off: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 
 def counter_of(off: np.ndarray) -> int | None:
-    """The size of a counter that starts anew, a power of two, if steps (n,) of it are off by just that."""
+    """Size of an encoder counter, a power of two, if a jump off (n,) [ticks] has that size (wrap-around); otherwise
+    None."""
     size = np.abs(off[off != 0.0])
     bits = np.round(np.log2(size))
     fits = (np.abs(size / 2.0**bits - 1.0) < _SIZE_TOLERANCE) & (bits >= _MIN_BITS) & (bits <= _MAX_BITS)
@@ -84,8 +88,10 @@ def counter_of(off: np.ndarray) -> int | None:
 
 
 def range_of(angles: np.ndarray) -> float | None:
-    """After how many radians angles (N, m) wrap, None where they do not or where that is not clear: all lie within a
-    range, some steps are longer than half of it, and without the range none is nearly as long as that."""
+    """Range [rad] after which angles (N, m) wrap around; None if they do not, or if it is ambiguous.
+
+    All angles must lie within the range, some steps must be longer than half of it, and unwrapped steps must be short.
+    """
     step = np.diff(angles, axis=0)
     for size in _ANGLE_RANGES_RAD:
         wraps = (np.abs(step) > 0.5 * size).any(axis=0)
@@ -99,5 +105,5 @@ def range_of(angles: np.ndarray) -> float | None:
 
 
 def without_wraps(step: np.ndarray, size: float) -> np.ndarray:
-    """Steps of angles or counts that start anew after `size`: the shorter way round."""
+    """Unwrapped steps of angles or counts that wrap around after `size`: the shorter of both directions."""
     return step - size * np.round(step / size)

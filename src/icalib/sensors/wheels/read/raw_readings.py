@@ -1,4 +1,4 @@
-"""What wheels measured, as it was written: tables of a folder, joints of a bag."""
+"""Reads recorded values of wheels, unconverted, from tables, twists or joint states."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ SIDES: dict[WheelDrive, tuple[str, ...]] = {
 }
 UNITS: dict[WheelMeasure, str] = {"rates": "rad/s", "angles": "rad", "ticks": "ticks"}
 TWIST = ("v [m/s]", "w [rad/s]")
-_LONGEST_STEP_S = 0.5  # over which a yaw rate is taken to last
-_MOST_PARTIAL = 0.1  # of messages with joints of the wheels, where some are missing: more are a driver's habit
-_ALIGNED, _SCATTERED = 0.9, 0.7  # of directions: how long their mean is, 1 where all are the same
+_LONGEST_STEP_S = 0.5  # longest time over which a yaw rate is integrated between two messages
+_MOST_PARTIAL = 0.1  # share of messages that lack some joints of the wheels; more are systematic
+_ALIGNED, _SCATTERED = 0.9, 0.7  # length of the mean of unit directions: 1 if all are the same
 RELATIVE_POSES = TableKind(
     ("from [ns]", "to [ns]"), ("yaw [rad]", "x [m]", "y [m]", "yaw yaw", "yaw x", "yaw y", "x x", "x y", "y y")
 )
-# What headers call the columns after the stamp.
+# Header names (regular expressions) of the columns after the stamp.
 _NAMES: dict[str, tuple[str, ...]] = {
     "left": (r"(.*_)?left(_.*)?|w?l",),
     "right": (r"(.*_)?right(_.*)?|w?r",),
@@ -49,15 +49,15 @@ _NAMES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class WheelReadings(RawReadings):
-    """value (N, m) in the unit of what the wheels measure: left and right; of skid-steer front and rear left, front and
-    rear right; of ackermann the driven wheel and the steering angle [rad], or two of each, left and right; of twist
-    forward speed and yaw rate."""
+    """Recorded values (N, m) in the recorded unit. Columns by drive: differential: left, right; skid-steer: front left,
+    rear left, front right, rear right; ackermann: driven wheel and steering angle [rad], or left and right of both. For
+    a twist: forward speed and yaw rate."""
 
     value: np.ndarray
 
 
 def value_columns(wheels: Wheels) -> tuple[str, ...]:
-    """Of its table, after the stamp."""
+    """Names with units of the columns of the table after the stamp."""
     if wheels.measures == "twist":
         return TWIST
     unit = UNITS[wheels.measures]
@@ -65,8 +65,8 @@ def value_columns(wheels: Wheels) -> tuple[str, ...]:
 
 
 def read_wheel_table(wheels: Wheels, path: Path, note: Note) -> WheelReadings | WheelPoses:
-    """The table at `path`; `note` is told what was left out. Raises RecordingError naming file and line where it cannot
-    be read, and the instant where relative poses do not follow one another."""
+    """The readings in the table at `path`; `note` is called with a sentence on rows that were left out. Raises
+    RecordingError naming file and line if it cannot be read, and the instant if relative poses are not consecutive."""
     if wheels.measures == "poses":
         table = read_table(path, RELATIVE_POSES, wheels.layout, note)
         return _relative_poses(wheels.name, path, table)
@@ -99,8 +99,8 @@ def _relative_poses(name: str, path: Path, table: Table) -> WheelPoses:
 
 
 def read_wheel_twists(wheels: Wheels, twists: TwistStream, what: str) -> WheelReadings:
-    """Forward speed and yaw rate. Raises RecordingError naming the topic (`what`) where velocities are in the axes of
-    the world."""
+    """Forward speed [m/s] and yaw rate [rad/s] of the twists. Raises RecordingError naming the topic (`what`) if linear
+    velocities are in the world frame."""
     if _in_the_world(twists):
         raise RecordingError(
             f"{what}: its linear velocity is in the world frame, not in the vehicle's. Use the poses of the "
@@ -112,8 +112,8 @@ def read_wheel_twists(wheels: Wheels, twists: TwistStream, what: str) -> WheelRe
 
 
 def _in_the_world(twists: TwistStream) -> bool:
-    """Whether velocities keep their direction once turned back by the yaw rate, and do not as they are. Directions are
-    doubled, so that forwards and backwards are one."""
+    """True if linear velocities keep their direction only after rotation by the integral of the negative yaw rate, so
+    that they are in the world frame. Angles are doubled, so that forwards and backwards are the same direction."""
     across, rate = twists.linear[:, 0] + 1j * twists.linear[:, 1], twists.angular[:, 2]
     step = np.clip(np.diff(twists.stamps_ns) * 1e-9, 0.0, _LONGEST_STEP_S)
     good = np.isfinite(across) & np.isfinite(rate)
@@ -127,9 +127,9 @@ def _in_the_world(twists: TwistStream) -> bool:
 
 
 def read_wheel_joints(wheels: Wheels, joints: JointStream, what: str) -> WheelReadings:
-    """The wheels' joints. Raises RecordingError naming the topic (`what`): relative poses, which joints do not have,
-    joints that are not there or not sent together, and what they do not say. Single messages where some are NaN stay,
-    to be left out with a note."""
+    """Readings of the joints of the wheels. Raises RecordingError naming the topic (`what`): the wheels measure
+    relative poses, joints are missing or sent separately, or they lack positions or velocities. A few messages with NaN
+    are kept here and left out later with a note."""
     if wheels.measures == "poses":
         raise RecordingError(
             f"{what}: a bag holds no relative planar poses; set another `measures` of {wheels.name} in the rig file."
@@ -162,8 +162,8 @@ def read_wheel_joints(wheels: Wheels, joints: JointStream, what: str) -> WheelRe
 
 
 def _refuse_zeros(wheels: Wheels, joints: JointStream, own: tuple[str, ...], what: str) -> None:
-    """Where velocities of the joints `own` are always 0 and positions are not, or the other way round: a driver fills
-    what it does not have."""
+    """Raises RecordingError if the quantity that is used of the joints `own`, velocity or position, is always 0 and the
+    other one is not: a driver fills missing values with 0."""
     turning = own[: len(own) // 2] if wheels.drive == "ackermann" else own
     column = [joints.names.index(name) for name in turning]
     velocity, position = (np.nan_to_num(x[:, column]).any() for x in (joints.velocity, joints.position))
@@ -176,7 +176,8 @@ def _refuse_zeros(wheels: Wheels, joints: JointStream, own: tuple[str, ...], wha
 
 
 def _own_joints(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str, ...]:
-    """The names of its joints, in the order of `WheelReadings`."""
+    """Names of the joints of the wheels, in the column order of `WheelReadings`. Raises RecordingError if they are not
+    found or ambiguous."""
     if wheels.joints is not None:
         missing = [name for name in wheels.joints if name not in names]
         if missing:
