@@ -14,22 +14,22 @@ import numpy as np
 
 # Number of earlier steps in use. Slow modes come in pairs: a parameter, and the motion that compensates it.
 MAX_EARLIER_STEPS = 3
-SLOW_DECREASE_RATIO = 0.1  # of the last predicted decrease: faster convergence needs no help
+SLOW_DECREASE_RATIO = 0.1  # predicted over last predicted decrease: below it, plain steps converge fast enough
 MIN_SINGULAR_RATIO = 1e-6  # relative singular value: below it, earlier steps are collinear
 MIN_ACCELERATED_GAIN = 0.5  # of the plain step's predicted decrease: an accelerated step must gain more
 
 
 @dataclass
 class Accelerator:
-    """The last undamped steps. moves: displacement to the next state; steps: Gauss-Newton step there; decrease:
-    predicted decrease of half the chi^2 by the last one."""
+    """History of the last undamped steps. moves: displacement to the next state; steps: Gauss-Newton step from the same
+    state; decrease: predicted decrease of half the chi^2 by the last step."""
 
     moves: list[np.ndarray] = field(default_factory=list)
     steps: list[np.ndarray] = field(default_factory=list)
     decrease: float = 0.0
 
     def slow(self, decrease: float) -> bool:
-        """True if plain steps converge slowly; the next one predicts a decrease of half the chi^2 by `decrease`."""
+        """True if plain steps converge slowly. decrease: predicted decrease of half the chi^2 by the next step."""
         return bool(self.moves) and decrease > SLOW_DECREASE_RATIO * self.decrease
 
     def step(self, chain: np.ndarray, calib: np.ndarray, decrease: float) -> tuple[np.ndarray, np.ndarray] | None:
@@ -45,8 +45,8 @@ class Accelerator:
         return best[: chain.size].reshape(chain.shape), best[chain.size :]
 
     def note(self, plain: tuple[np.ndarray, np.ndarray], taken: tuple[np.ndarray, np.ndarray], decrease: float) -> None:
-        """Records the `plain` step with its predicted `decrease`, and the step that was `taken` instead of it or is the
-        same."""
+        """Records the `plain` step, its predicted `decrease`, and the step `taken`: the plain or the accelerated
+        one."""
         self.steps.append(np.concatenate([x.ravel() for x in plain]))
         self.moves.append(np.concatenate([x.ravel() for x in taken]))
         self.steps, self.moves, self.decrease = (

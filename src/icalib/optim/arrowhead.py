@@ -40,12 +40,12 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(N_THREADS, thread_name_prefix="icalib")
 
 
-if hasattr(os, "register_at_fork"):  # its threads do not live on in a process that is forked
+if hasattr(os, "register_at_fork"):  # threads do not survive a fork
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def in_parallel(function: Callable[..., T], items: Iterable) -> list[T]:
-    """[function(item) for item in items], on two threads; kernels release the interpreter lock."""
+    """[function(item) for item in items], on N_THREADS threads; compiled kernels release the interpreter lock."""
     return list(_pool().map(function, items))
 
 
@@ -66,7 +66,8 @@ class Piece:
 
     diagonal (n, 15, 15); upper (n, 15, 15), keyframe k with k + 1; side (n, 15, B + 1), keyframe with calibration
     parameters, and its gradient in the last column; calib (B + 1, B + 1), the calibration parameters and their gradient
-    in the last column; features: those that are seen from these keyframes alone, which are eliminated with them.
+    in the last column. features: feature tracks seen from these keyframes only, which are eliminated with them; None
+    without any.
     """
 
     first: int
@@ -79,6 +80,7 @@ class Piece:
 
     @classmethod
     def zeros(cls, first: int, last: int, n_calib: int) -> Piece:
+        """A piece with all sums zero, for B = `n_calib` calibration parameters."""
         n = last - first + 1
         return cls(
             first,
@@ -96,6 +98,7 @@ class Piece:
         return cls(first, last, nothing, nothing, nothing, np.zeros((0, 0)))
 
     def clear(self) -> None:
+        """Sets all sums to zero."""
         for a in (self.diagonal, self.upper, self.side, self.calib):
             a[:] = 0.0
         if self.features is not None:

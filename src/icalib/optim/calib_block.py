@@ -1,5 +1,5 @@
-"""The marginal system of the calibration parameters: steps, draws and inverses in units of the tolerances. Unobservable
-directions are fixed."""
+"""Reduced normal equations of the calibration parameters, all keyframes eliminated: steps, draws and inverses in units
+of the tolerances. Unobservable directions are fixed."""
 
 from __future__ import annotations
 
@@ -60,15 +60,15 @@ def complement(fixed_directions: np.ndarray, n: int) -> np.ndarray:
 
 
 def restricted_root(information: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
-    """Root A (B, n) of the `restricted_inverse` A A^T."""
+    """Root A (B, n) of the `restricted_inverse` A A^T; arguments as there."""
     free = complement(fixed_directions, len(information))
     values, vectors = np.linalg.eigh(free.T @ information @ free)
     return free @ vectors / np.sqrt(np.maximum(values, MIN_INFORMATION))
 
 
 def restricted_inverse(information: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
-    """Inverse (B, B) of the information within the directions that are free; both in tolerance units,
-    `fixed_directions` (B, m) orthonormal."""
+    """Inverse (B, B) of `information` (B, B) within the directions orthogonal to the orthonormal `fixed_directions` (B,
+    m); all in tolerance units."""
     root = restricted_root(information, fixed_directions)
     return root @ root.T
 

@@ -19,8 +19,9 @@ from icalib.optim.state import KEYFRAME_DIM
 
 @dataclass(frozen=True)
 class PieceFeatures:
-    """Features of a `Piece`: their sums, the elimination plan, and the workspace of the factors. Each elimination
-    overwrites the factors of the one before: writing to freshly mapped memory would cost more than the elimination."""
+    """Features of a `Piece`: their sums, the elimination plan, and the workspace `room` of the factors. Each
+    elimination overwrites the last one's factors, because writing to freshly mapped memory would cost more than the
+    elimination."""
 
     sums: FeatureSums
     plan: Plan
@@ -28,6 +29,7 @@ class PieceFeatures:
 
     @classmethod
     def of(cls, sums: FeatureSums, plan: Plan) -> PieceFeatures:
+        """The features with a new workspace."""
         return cls(sums, plan, np.empty(_sizes(plan, sums.side.shape[2]).start[-1]))
 
     def widened(self, n_calib: int) -> PieceFeatures:

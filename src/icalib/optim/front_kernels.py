@@ -18,8 +18,9 @@ from icalib.optim.state import KEYFRAME_DIM, POSE_DIM
 
 
 class FrontChain(NamedTuple):
-    """Keyframes of the piece: diagonal, upper (n, 15, 15), side (n, 15, B + 1); direction; turn (n, 15, 15),
-    orthogonal, its columns the rotated dimensions; pose and next_pose (I, 6, 15), Jacobians of image poses by these."""
+    """Keyframes of the piece. diagonal, upper (n, 15, 15), side (n, 15, B + 1): sums; forwards: direction of the
+    elimination; turn (n, 15, 15): orthogonal, its columns are the rotated dimensions; pose and next_pose (I, 6, 15):
+    Jacobians of image poses by the rotated dimensions."""
 
     diagonal: np.ndarray
     upper: np.ndarray
@@ -43,8 +44,8 @@ class Sizes(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def step_factors(g, sizes, n_b, room):
-    """Views of the factors of step g: U of the keyframes, U of the dying features, coupled keyframes by these, rest
-    rows, and all other rows."""
+    """Views of the factors of step g in the workspace `room`: U (keyframes), Ud (dying features), D (coupled keyframe
+    rows by dying features), Wr (rest rows), Wc (coupled rows, then dying features)."""
     a, c, d, w = sizes.rest[g], sizes.coupled[g], sizes.dying[g], sizes.wide[g]
     o, p = sizes.start[g], a + c
     U = room[o : o + p * p].reshape(p, p)
@@ -142,7 +143,7 @@ def _join(g, plan, sums, n_b, front, carry, old_wide):
 
 @njit(cache=True, nogil=True)
 def _places(g, plan, rest, row):
-    """Fills row (K, 15): row index of each dimension of the step's keyframes, rest rows first."""
+    """Fills row (K, 15) with the row index of each dimension of the step's keyframes, rest rows first."""
     r, c = 0, rest
     for q in range(plan.keyframes.start[g], plan.keyframes.start[g + 1]):
         k = plan.keyframes.values[q]

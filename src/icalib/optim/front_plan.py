@@ -2,7 +2,7 @@
 
 Keyframes are eliminated in groups, from one end of the piece to the other. A feature that a single group sees is
 eliminated before that group. Any other feature joins the front with the first group that sees it and leaves with the
-last one, so the result is exact for tracks of any length. A larger group keeps more features out of the front, but has
+last one. So the result is exact for tracks of any length. A larger group keeps more features out of the front, but has
 fewer of them leave at its end.
 """
 
@@ -52,6 +52,7 @@ class FeatureSums(NamedTuple):
         n_calib: int,
         by_next: bool = False,
     ) -> FeatureSums:
+        """Sums of `n_tracks` features, all zero. by_next: whether poses also depend on the next keyframe."""
         pose = np.zeros((len(keyframe), POSE_DIM, KEYFRAME_DIM))
         return cls(
             np.zeros((n_tracks, 3, 3)),
@@ -65,6 +66,7 @@ class FeatureSums(NamedTuple):
         )
 
     def clear(self) -> None:
+        """Sets the terms of features to zero; the Jacobians of poses stay."""
         for a in (self.own, self.side, self.block):
             a[:] = 0.0
 
@@ -77,6 +79,7 @@ class Lists(NamedTuple):
 
     @classmethod
     def of(cls, lists: list[np.ndarray]) -> Lists:
+        """The lists, concatenated."""
         sizes = [len(x) for x in lists]
         values = np.concatenate([*lists, np.zeros(0, dtype=np.int64)]).astype(np.int64)
         return cls(np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), values)
@@ -128,6 +131,7 @@ class _Lives:
 
     @classmethod
     def of(cls, sums: FeatureSums, n_keyframes: int, forwards: bool, keep: bool, size: int, ends: np.ndarray) -> _Lives:
+        """Groups of at most `size` keyframes that do not extend across `ends`; other arguments as of `plan`."""
         order = np.arange(n_keyframes) if forwards else np.arange(n_keyframes)[::-1]
         pivots = order[:-1] if keep else order
         stretches = np.split(pivots, np.flatnonzero(np.diff(np.searchsorted(ends, pivots, side="right"))) + 1)
@@ -180,6 +184,7 @@ def plan(
 
 
 def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_keyframes: int, forwards: bool) -> Plan:
+    """The plan for the groups of `lives`."""
     groups, n = lives.groups, len(lives.groups)
     ends = np.cumsum([len(g) for g in groups])
     order = np.arange(n_keyframes) if forwards else np.arange(n_keyframes)[::-1]
@@ -216,7 +221,8 @@ def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_keyframes: i
 
 @dataclass(frozen=True)
 class _Slots:
-    """Moves, joining and leaving features of each step, and `at`: tracks in the order of the slots, of each step."""
+    """Slots in the front, by step, as in `Plan`: features that move, join (born) and leave (dying). at: feature in each
+    slot."""
 
     alive: np.ndarray
     leave: list[np.ndarray]

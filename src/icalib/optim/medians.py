@@ -14,14 +14,14 @@ def median_variance(square: np.ndarray) -> float:
 
 
 def largest_normal(deviations: float, share: float) -> float:
-    """Limit `deviations` standard deviations above the mean length of isotropic normal errors in the plane (Rayleigh
-    distribution), in units of the length that a `share` of them does not exceed."""
+    """Largest plausible length of isotropic normal errors in the plane (Rayleigh distribution): `deviations` standard
+    deviations above the mean length. The unit is the length that a `share` of the errors does not exceed."""
     mean, deviation = np.sqrt(np.pi / 2.0), np.sqrt(2.0 - np.pi / 2.0)
     return float((mean + deviations * deviation) / np.sqrt(-2.0 * np.log1p(-share)))
 
 
 def grouped_quantiles(x: np.ndarray, group: np.ndarray, count: int, share: float) -> np.ndarray:
-    """Quantile `share` of x (n,) within each `group` (n,) of 0..count - 1: (count,), inf for an empty group."""
+    """Quantiles (count,) at `share` of x (n,) within each `group` (n,) of 0..count - 1; inf for an empty group."""
     out = np.full(count, np.inf)
     ends = np.cumsum(np.bincount(group, minlength=count))
     for k, own in enumerate(np.split(x[np.argsort(group, kind="stable")], ends[:-1])):

@@ -1,4 +1,4 @@
-"""Planes of the scene as parameters, in arrays for kernels."""
+"""Planes of the scene as arrays for compiled kernels."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from icalib.optim.state import Key, State
 
 
 class Planes(NamedTuple):
-    """P planes: unit normal (P, 3), tangents (P, 2, 3), and foot point (P, 3) m, in the world; columns (P, 3) in the
-    calibration parameters, -1 where fixed."""
+    """P planes in the world: unit normal (P, 3), tangents (P, 2, 3) across it, and a point (P, 3) on each [m]. columns
+    (P, 3): calibration columns, -1 where fixed."""
 
     normal: np.ndarray
     tangents: np.ndarray

@@ -48,7 +48,8 @@ class Prior:
 
 
 def sums_of_priors(priors: Sequence[Prior], state: State, n_calib: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Half the chi^2 of `priors`, their gradient (B,) and information (B, B) on the calibration parameters."""
+    """Half the chi^2 of `priors` at `state`, and their gradient (B,) and information (B, B) on the calibration
+    parameters."""
     piece = Piece.zeros(0, 0, n_calib)
     cost = sum(p.accumulate(state, piece) for p in priors)
     return cost, piece.calib[:-1, -1], piece.calib[:-1, :-1]
@@ -60,8 +61,8 @@ def without_priors(information: np.ndarray, priors: Sequence[Prior], state: Stat
 
 
 def variance_of_priors(known: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
-    """Variances (B,) that errors of the prior means contribute to the diagonal of `covariance` (B, B): diag(C W C) with
-    the information W of `priors`. Measurement noise contributes the rest."""
+    """Variances (B,) that errors of the prior means contribute to the diagonal of the covariance `known` (B, B): diag(C
+    W C) with C = `known` and the information W of `priors`. Measurement noise contributes the rest."""
     information = sums_of_priors(priors, state, len(known))[2]
     return np.einsum("ij,jk,ki->i", known, information, known, optimize=True)
 

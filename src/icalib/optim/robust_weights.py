@@ -1,4 +1,5 @@
-"""Robust weights of the corners of one image, and the error that all its corners share, which is marginalised."""
+"""Robust weights of the corners of one image, and their common error, which all corners share and which is
+marginalised."""
 
 from __future__ import annotations
 
@@ -58,11 +59,13 @@ def _invert_small(M, out):
 
 @njit(cache=True, nogil=True, inline="always")
 def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
-    """Fills root (n,), square roots of the weights over sigma (n,) px, 0 unless `keep`, and shared (2, m), the image's
-    common error [px]. Returns the cost.
+    """Weights of the n corners of one image, and their common error. Fills root (n,): square roots of the weights over
+    sigma (n,) px, 0 unless `keep`. Fills shared (2, m): coefficients of the common error [px]. Returns half the robust
+    chi^2.
 
-    res (n, 2) px; f (n, m): functions of the common error; precision (m,): its prior information. Weights and common
-    error depend on each other, so a few rounds of reweighting minimise the cost over the common error.
+    res (n, 2) px; f (n, m): basis functions of the common error at each corner; precision (m,): prior information of
+    the coefficients. Weights and common error depend on each other, so a few rounds of reweighting minimise the cost
+    over the common error.
     """
     n, m = len(keep), f.shape[1]
     for k in range(m):
@@ -93,7 +96,7 @@ def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
 
 @njit(cache=True, nogil=True, inline="always")
 def _common_error(res, root, f, precision, M, inv, rhs, shared):
-    """Common error (2, m) at given weights: ridge regression of -res on the functions f."""
+    """Coefficients (2, m) of the common error at given weights: ridge regression of -res on the basis functions f."""
     m = f.shape[1]
     for a in range(m):
         rhs[0, a], rhs[1, a] = 0.0, 0.0
@@ -127,7 +130,7 @@ def whole_error(res, f, shared, error):
 @njit(cache=True, nogil=True)
 def correct_curvature(A, D, i, n, r, factor):
     """Triggs' correction of corner i: scales its Jacobian rows along the residual r by `factor`, and the residual by
-    its inverse. A (D + 1, 2 n): rows u, then v, in columns."""
+    its inverse. A (D + 1, 2 n): D Jacobian columns and the residual as rows; components u of all n corners, then v."""
     size = np.sqrt(r[0] * r[0] + r[1] * r[1])
     u, v = r[0] / size, r[1] / size
     for k in range(D + 1):
@@ -139,9 +142,10 @@ def correct_curvature(A, D, i, n, r, factor):
 
 @njit(cache=True, nogil=True, inline="always")
 def marginalise_shared(A, D, n, root, f, precision, G):
-    """Subtracts the Schur complement of the image's common error from the Gram matrix G (D + 1, D + 1).
+    """Subtracts the Schur complement of the image's common error from the Gram matrix G (D + 1, D + 1). A: as in
+    `correct_curvature`.
 
-    The gradient by the common error is zero, as the cost is minimal over it.
+    The gradient by the common error is zero, because the cost is minimal over it.
     """
     m = f.shape[1]
     M, inv = np.empty((m, m)), np.empty((m, m))

@@ -15,8 +15,8 @@ UInt = np.uint64
 
 
 class Rows(NamedTuple):
-    """n measurements of m rows: residual (n, m), predicted - measured, and J (n, m, 30 + c), by keyframe, next keyframe
-    and c calibration parameters. J has length 0 if Jacobians are not wanted."""
+    """n measurements of m rows. residual (n, m): predicted - measured. J (n, m, 30 + c): by keyframe, next keyframe and
+    c calibration parameters; of length 0 if Jacobians are not wanted."""
 
     residual: np.ndarray
     J: np.ndarray
@@ -42,8 +42,8 @@ class Rows(NamedTuple):
         return self.J[:, :, KEYFRAME_PAIR_DIM:]
 
     def on_intervals(self, keyframe: np.ndarray, n_keyframes: int) -> np.ndarray:
-        """Interval (n,) between keyframes that each measurement at `keyframe` (n,) is added to. Jacobians by the last
-        keyframe move to the columns of the next keyframe of the last interval."""
+        """Interval (n,) between keyframes to which each measurement at `keyframe` (n,) is added. Measurements at the
+        last keyframe go to the last interval: their Jacobians move to the columns of the next keyframe."""
         interval = np.minimum(keyframe, n_keyframes - 2)
         if len(self.J):
             last = keyframe > interval
@@ -123,11 +123,11 @@ def _add_calib(i, n, width, A, B, columns, calib, rest):
 
 @njit(cache=True, nogil=True)
 def add_gram(k, n_chain, G, T, columns, F, sums):
-    """Adds measurements that share a pose, from their Gram matrix by this pose.
+    """Adds measurements that depend on one pose, from the Gram matrix of their rows.
 
-    G (6 + d + 1, 6 + d + 1): by the pose, d further calibration parameters, and residual; the first 6 rows suffice if d
-    is 0. T (6, n_chain + c): Jacobian of the pose by keyframes and c calibration parameters. columns (c + d,): see
-    `add_product`. F (6, n_chain + c + d + 1): workspace.
+    G (6 + d + 1, 6 + d + 1): Gram matrix of the Jacobians by the pose and by d further calibration parameters, and of
+    the residual; the first 6 rows suffice if d is 0. T (6, n_chain + c): Jacobian of the pose by keyframes and c
+    calibration parameters. columns (c + d,): see `add_product`. F (6, n_chain + c + d + 1): workspace.
     """
     calib, width, n_d = sums.calib, T.shape[1], G.shape[1] - 7
     n_c, n_b = width - n_chain, calib.shape[0] - 1
@@ -200,8 +200,8 @@ def whiten(W, M, out):
 
 @njit(cache=True, nogil=True)
 def accumulate_rows(rows, keyframe, W, loss, columns, sums, residual, root):
-    """Whitens rows by W (n, m, m), weights them, and adds each to the interval that begins at its `keyframe` (n,),
-    unless the sums are empty.
+    """Whitens rows by W (n, m, m), weights them, and adds each to the interval that begins at its `keyframe` (n,).
+    Empty sums stay empty.
 
     columns (c,): calibration columns of rows.J, -1 where fixed. Fills residual and root (n, m): whitened residuals and
     square roots of their weights. Returns half the robust chi^2.

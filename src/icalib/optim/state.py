@@ -15,14 +15,14 @@ from icalib.geometry import planes, so3
 
 KEYFRAME_DIM = 15  # tangent dimensions of a keyframe
 POSE_DIM = 6  # of these, rotation and position
-Key = tuple[str, str]  # sensor, parameter
+Key = tuple[str, str]  # sensor (or body, plane, frame), name of the parameter
 Kind = Literal["vector", "nuisance", "rotation", "tilt", "plane"]
 Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it is estimated
 
 
 def in_recording(name: str, recording: int) -> str:
-    """First part of the key of a quantity that each recording has of its own, such as the attitude of the target;
-    `recording` counts from 0."""
+    """Key prefix of a quantity that each recording has separately, such as the attitude of the target; `recording`
+    counts from 0."""
     return name if recording == 0 else f"{name} in recording {recording + 1}"
 
 
@@ -64,10 +64,12 @@ class Layout:
 
     @property
     def size(self) -> int:
+        """B, the number of calibration columns."""
         return sum(b.size for b in self.blocks if b.start is not None)
 
     @property
     def free(self) -> tuple[Block, ...]:
+        """Blocks that are estimated."""
         return tuple(b for b in self.blocks if b.start is not None)
 
     @property
@@ -76,10 +78,11 @@ class Layout:
         return np.concatenate([np.arange(0), *(b.columns for b in self.free if not b.is_nuisance)])
 
     def block(self, sensor: str, name: str) -> Block:
+        """The block with this key. Raises StopIteration if there is none."""
         return next(b for b in self.blocks if b.key == (sensor, name))
 
     def has(self, sensor: str, name: str) -> bool:
-        """Whether there is such a block."""
+        """Whether there is a block with this key."""
         return any(b.key == (sensor, name) for b in self.blocks)
 
     def is_free(self, sensor: str, name: str) -> bool:
@@ -87,11 +90,12 @@ class Layout:
         return self.block(sensor, name).start is not None
 
     def columns(self, sensor: str, *names: str) -> np.ndarray:
+        """Calibration columns of the blocks `names` of `sensor`, in this order; -1 where fixed."""
         return np.concatenate([self.block(sensor, n).columns for n in names])
 
 
 def make_layout(entries: list[Entry]) -> Layout:
-    """Layout of the entries, in their order."""
+    """Layout of the entries in their order; estimated ones get consecutive calibration columns."""
     blocks, column = [], 0
     for sensor, name, kind, size, estimated in entries:
         blocks.append(Block(sensor, name, kind, size, column if estimated else None))
@@ -106,16 +110,17 @@ FIRST_KEYFRAME_WEIGHT = 1e-4
 
 @dataclass(frozen=True)
 class State:
-    """One estimate. seconds (K,): keyframe times on the IMU clock since its first stamp; world frame z up.
+    """One estimate of trajectory and calibration. seconds (K,): keyframe times on the IMU clock since its first stamp;
+    world frame z up.
 
     starts: first keyframe of each recording. Each recording has its own world frame, whose origin is the target's.
     """
 
     seconds: np.ndarray
     rotation: np.ndarray  # (K, 3, 3) R_world_imu
-    position: np.ndarray  # (K, 3)
-    velocity: np.ndarray  # (K, 3)
-    bias: np.ndarray  # (K, 6) gyroscope, accelerometer
+    position: np.ndarray  # (K, 3) p_world_imu [m]
+    velocity: np.ndarray  # (K, 3) world [m/s]
+    bias: np.ndarray  # (K, 6) gyroscope [rad/s], accelerometer [m/s^2]
     values: dict[Key, np.ndarray]
     starts: tuple[int, ...] = (0,)
 
