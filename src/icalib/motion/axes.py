@@ -1,4 +1,4 @@
-"""Axes about which a body rotated, and about which it hardly did, in words."""
+"""Sentences for messages: axes about which a body rotated, and about which it hardly did."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from icalib.geometry import so3
 
-# of the RMS rate about the strongest axis: the data say little of what rotation about the axis shows
+# RMS rate about an axis over that about the strongest one: below it, rotation about the axis is too weak
 WEAK_AXIS_RATIO = 0.1
 NAMED_AXIS_COSINE = 0.9  # component of a unit vector: above it, the direction is called by the axis' name
-MIN_KEYFRAMES_FOR_AXES = 2  # keyframes
+MIN_KEYFRAMES_FOR_AXES = 2  # keyframes with a rotation between them
 
 
 def hardly_turned(seconds: np.ndarray, rotation: np.ndarray, body: str) -> str:

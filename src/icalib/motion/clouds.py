@@ -17,14 +17,15 @@ MIN_PLANE_POINTS = 100  # points of a plane: with fewer, its normal is too uncer
 
 @dataclass(frozen=True)
 class Clouds:
-    """Plane of each LiDAR point. names (P,): of the planes, different from all sensor names; plane (N,) int32 by LiDAR:
-    index of each point's plane, -1 for none."""
+    """Index of the plane of each LiDAR point. names (P,): of the planes, different from all sensor names. plane: for
+    each LiDAR (N,) int32, plane of each point, -1 for none."""
 
     names: tuple[str, ...]
     plane: tuple[np.ndarray, ...]
 
     @property
     def count(self) -> int:
+        """P, the number of planes."""
         return len(self.names)
 
     @property
@@ -53,8 +54,8 @@ NO_CLOUDS = Clouds((), ())
 
 
 def joined_clouds(each: Sequence[Clouds]) -> Clouds:
-    """Associations of consecutive recordings as one. Each recording has its own world and planes: "plane 2.0" belongs
-    to the second recording."""
+    """Associations of consecutive recordings as one. Each recording has its own world and planes: "plane 2.0" is the
+    first plane of the second recording."""
     if len(each) == 1:
         return each[0]
     names = tuple(f"plane {r}.{own.removeprefix('plane ')}" for r, c in enumerate(each, 1) for own in c.names)
@@ -68,7 +69,7 @@ def joined_clouds(each: Sequence[Clouds]) -> Clouds:
 
 
 def known_planes(streams: Sequence[LidarStream]) -> Clouds:
-    """The association that the streams have, without planes of fewer than MIN_PLANE_POINTS points."""
+    """The association that the streams contain, without planes of fewer than MIN_PLANE_POINTS points."""
     most = max((int(s.plane.max(initial=-1)) for s in streams), default=-1) + 1
     count = sum((count_points(s.plane, most) for s in streams), np.zeros(most, dtype=np.int64))
     used = np.flatnonzero(count >= MIN_PLANE_POINTS)

@@ -12,9 +12,9 @@ from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
 from icalib.optim.state import State
 
-FactorKey = tuple[str, str]  # sensor, and what of it is measured
+FactorKey = tuple[str, str]  # sensor, and kind of measurement
 FitKey = tuple[str, str]  # sensor, and kind of its residuals
-Residuals = dict[FactorKey, Any]  # what each factor's `accumulate` left behind at a state
+Residuals = dict[FactorKey, Any]  # output of each factor's `accumulate` at a state
 T = TypeVar("T")
 
 
@@ -70,7 +70,7 @@ class StateDifference(NamedTuple):
 
 
 class Factor(Protocol):
-    """All measurements of one kind by one sensor. `accumulate` fills the factor's own class of arrays.
+    """All measurements of one kind by one sensor. `accumulate` fills arrays of a class that the factor chooses.
 
     is_sparse: one keyframe alone has too few rows to determine the calibration. ties_distant_keyframes: rows share
     eliminated parameters, such as points of the scene, so that segments of the chain are not independent.
@@ -100,15 +100,15 @@ class Factor(Protocol):
         ...
 
     def squares(self, out: Any) -> dict[FitKey, Squares]:
-        """Number and chi^2 of each kind of residual."""
+        """Number and chi^2 of each kind of residual, with the current robust weights."""
         ...
 
     def sizes(self, out: Any) -> dict[FitKey, RawSize]:
-        """RMS of each kind of residual."""
+        """RMS of each kind of residual before whitening, its unit, and the number of outliers."""
         ...
 
     def rows(self, out: Any, state: State) -> list[ResidualRows]:
-        """The residuals of each kind, `out` at `state`."""
+        """Residuals of each kind. out: output of `accumulate` at `state`."""
         ...
 
     def dof_used(self, out: Any, along: StateDifference) -> dict[FitKey, float]:
@@ -125,7 +125,7 @@ class Factor(Protocol):
         ...
 
     def reusable_output(self, out: Any) -> Any:
-        """`out`, of this factor or of the one that it was cut from, as arrays to be overwritten."""
+        """`out`, of this factor or of the one from which it was cut, as arrays to be overwritten."""
         ...
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
@@ -301,10 +301,10 @@ def keyed(factors: Iterable[Factor]) -> dict[FactorKey, Factor]:
 
 
 def of_type(things: Mapping[FactorKey, Any], wanted: type[T]) -> tuple[T, ...]:
-    """The factors, or their outputs, that are of one class, in order."""
+    """Factors (or outputs of factors) of the class `wanted`, in order."""
     return tuple(x for x in things.values() if isinstance(x, wanted))
 
 
 def pairs_of(factors: Mapping[FactorKey, Factor], outputs: Residuals, wanted: type[T]) -> list[tuple[T, Any]]:
-    """The factors of one class, each with its output."""
+    """Factors of the class `wanted`, each with its output."""
     return [(f, outputs[key]) for key, f in factors.items() if isinstance(f, wanted)]

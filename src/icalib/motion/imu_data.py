@@ -1,4 +1,4 @@
-"""IMU readings prepared for integration: seconds, noise per interval, gaps."""
+"""IMU readings prepared for integration: times, noise of each interval, gaps."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ MIN_GAP_S, MIN_GAP_PERIODS = 0.01, 3.0  # an interval longer than both, seconds 
 # Correlation time of rate and specific force within a gap. Their unknown variation there has their variance over the
 # recording.
 MOTION_CORRELATION_S = 0.1
-# with 20 Hz, jumping rates moved a time offset by a whole step; with 100 Hz, steady ones by 0.6 ms
+# see `_is_dense`: jumping rates at 20 Hz move a time offset by a whole step, steady rates at 100 Hz by 0.6 ms
 MAX_DENSE_PERIOD_S = 0.025
-WITHIN_INTERVAL_SHARE = 1e-4  # keeps the covariance of an interval without inner stamps definite
+# of the squared accelerometer density: keeps the covariance definite if no stamp lies between two keyframes
+WITHIN_INTERVAL_SHARE = 1e-4
 
 
 def clear_of(gaps: Iterable[tuple[float, float]], start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -34,10 +35,10 @@ class ImuData:
     """Readings on the IMU clock, seconds since its first stamp; gyro [rad/s], accel [m/s^2] (N, 3).
 
     variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and deviation of the
-    specific force from its mean within the interval; walk (2,): squared densities of the bias random walks. gaps:
-    (start, end) of intervals without readings. seams: (end, begin) of joined recordings, between which nothing is
-    known. forwards: biases of a keyframe hold until the next one, and motion is propagated forwards only. This is so if
-    the readings are an assumption on the motion, whose biases change a lot between keyframes.
+    specific force from its mean within the interval. walk (2,): squared densities of the bias random walks. gaps:
+    (start, end) of intervals without readings. seams: (end, begin) between joined recordings, where nothing is known.
+    forwards: True if biases of a keyframe apply until the next one, so that motion is propagated forwards only. This is
+    so if the readings are an assumption on the motion, whose biases change much between keyframes.
     """
 
     name: str
@@ -57,6 +58,8 @@ class ImuData:
 
     @classmethod
     def build(cls, stream: ImuStream, noise: ImuNoise, forwards: bool = False) -> ImuData:
+        """Readings of `stream`. In gaps, noise includes the spread of the motion over the recording, and the bias
+        random walk."""
         t = stream.seconds
         dt = np.diff(t)
         variance = np.tile([noise.gyro**2, noise.accel**2, WITHIN_INTERVAL_SHARE * noise.accel**2], (len(dt), 1))
@@ -82,8 +85,8 @@ class ImuData:
         return np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
 
     def turned_by_noise(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Standard deviation (n,) rad, about each axis, of the rotation that gyroscope noise adds from `begin` to `end`
-        (n,) s; negative backwards."""
+        """Standard deviation (n,) [rad, about each axis] of the rotation error from gyroscope noise between `begin` and
+        `end` (n,) [s]; negative if `end` is earlier."""
         dt = np.diff(self.seconds)
         variance = np.concatenate([[0.0], np.cumsum(self.variance[:, 0] * dt)])
         a, b = (np.interp(t, self.seconds, variance) for t in (begin, end))
@@ -98,14 +101,14 @@ def _period(seconds: np.ndarray) -> float:
 
 
 def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
-    """Readings of the rig's IMU; None if it has none."""
+    """Readings of the rig's IMU, real or assumed; None if it has none."""
     if rig.imu is None or measurements.imu is None:
         return None
     return ImuData.build(measurements.imu, rig.imu.noise, rig.assumes_motion and _is_dense(measurements))
 
 
 def _is_dense(measurements: Measurements) -> bool:
-    """True if the poses of the body, without an IMU, are so dense that rates may jump at keyframes."""
+    """True if poses, of a rig without an IMU, are so dense that rates may jump at keyframes."""
     return float(np.median(np.diff(measurements.body.seconds))) <= MAX_DENSE_PERIOD_S
 
 
@@ -115,7 +118,7 @@ def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> Im
     if len(found) < 2 or joined.imu is None:
         return found[0][1] if found else None
     seconds = joined.imu.seconds
-    # The interval of a seam is an interval like any other; no factor asks for it.
+    # The interval between two recordings has a variance, too, but no factor uses it.
     variance = np.concatenate([np.vstack([imu.variance, imu.variance[-1:]]) for _, imu in found])[:-1]
     gaps = tuple((a + p.begin, b + p.begin) for p, imu in found for a, b in imu.gaps)
     last = np.cumsum([len(imu.seconds) for _, imu in found])[:-1] - 1

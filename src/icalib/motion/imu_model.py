@@ -21,7 +21,7 @@ _LOWER_COLUMN = np.array([0, 0, 1, 0, 1, 2])
 
 @njit(cache=True, nogil=True)
 def _lower_inverse(m):
-    """Inverse of a lower triangular matrix (3, 3)."""
+    """Inverse (3, 3) of a lower triangular matrix (3, 3)."""
     inv = np.zeros((3, 3))
     for i in range(3):
         inv[i, i] = 1.0 / m[i, i]

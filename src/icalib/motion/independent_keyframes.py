@@ -11,15 +11,16 @@ from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece
 from icalib.optim.state import KEYFRAME_DIM, POSE_DIM, State
 
-# information [1/rad^2, 1/m^2]: keeps a keyframe defined whose corners were all rejected; steers nothing else
+# information [1/rad^2, 1/m^2]: keeps a keyframe without measurements positive definite; too weak for other effects
 WEAK_POSE_INFORMATION = 1e-9
 
 
 @dataclass(frozen=True)
 class IndependentKeyframes(RowFactor):
-    """Velocity and biases, which no measurement depends on, are fixed at their values."""
+    """Chain factor without measurements: a little information keeps each keyframe positive definite. Velocity and
+    biases, on which no measurement depends, are fixed."""
 
-    name: str  # of the body's sensor
+    name: str  # of the sensor that is the body frame
     n_keyframes: int
 
     @property
@@ -28,12 +29,12 @@ class IndependentKeyframes(RowFactor):
 
     @property
     def kinds(self) -> dict[str, slice]:
-        """Empty: there is no measurement."""
+        """Empty: the factor has no residuals."""
         return {}
 
     @property
     def starts(self) -> tuple[int, ...]:
-        """One chain for all recordings, as no term ties neighbours."""
+        """(0,): one chain for all recordings, because no term links neighbours."""
         return (0,)
 
     def with_imu(self, imu: ImuData) -> IndependentKeyframes:

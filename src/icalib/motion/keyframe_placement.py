@@ -1,4 +1,4 @@
-"""Placement of keyframes: at every distinct image instant, and evenly in between where these are sparse."""
+"""Placement of keyframes: at every distinct image instant, and evenly spaced between distant ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from icalib.motion.imu_data import ImuData, clear_of
 
 MERGED_WITHIN_S = 2e-3  # images closer in time share a keyframe
-SPACING_SLACK = 0.1  # of the spacing: jitter of stamps at the spacing's own rate adds no keyframes
+SPACING_SLACK = 0.1  # of the spacing: intervals longer by up to this get no keyframe, so that jitter adds none
 
 
 def place_keyframes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max_gap: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Compiled passes over the points of a LiDAR, tens of millions, and over the plane of each."""
+"""Compiled loops over LiDAR points (tens of millions) and the index of the plane of each."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-MAX_COARSE_POINTS = 3_000_000  # points of a LiDAR in a pass that may be coarse
-MAX_PLANE_POINTS_KEPT_WHOLE = 20_000  # points of a plane that is not thinned
+MAX_COARSE_POINTS = 3_000_000  # points of a LiDAR that a coarse pass uses, roughly
+MAX_PLANE_POINTS_KEPT_WHOLE = 20_000  # points of a plane: planes with fewer are not thinned
 
 
 @njit(cache=True, nogil=True)
@@ -32,7 +32,7 @@ def count_points(plane, n):
 
 @njit(cache=True, nogil=True)
 def _some(plane, step, count, out):
-    """Fills out (N,): plane of every step-th point and of all points of small planes, -1 for the others."""
+    """Fills out (N,): plane of every step-th point and of all points of small planes, -1 for all other points."""
     due = 0
     for i in range(len(plane)):
         q = plane[i]

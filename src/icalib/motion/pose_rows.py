@@ -1,4 +1,5 @@
-"""Residuals of poses that a sensor reports, with Jacobians by its own pose (`sensor_pose`) and by the reference frame.
+"""Residuals of poses that a sensor reports, with Jacobians by the pose of the sensor (`sensor_pose`) and by the
+reference frame.
 
 Rotation: e = Log(measured^T predicted). Position: predicted - measured, in the axes of the measurement. Rotations are
 perturbed on the right, so de = J_r^-1(e) d for a factor on the right of the prediction.
@@ -50,8 +51,8 @@ class PoseResiduals:
 def absolute_residuals(
     R: np.ndarray, p: np.ndarray, frame: Frame, rotation: np.ndarray, position: np.ndarray, jacobians: bool = True
 ) -> PoseResiduals:
-    """Residuals of measured poses R_frame_sensor `rotation` (n, 3, 3), p_frame_sensor `position` (n, 3), for predicted
-    poses R (n, 3, 3), p (n, 3) of the sensor in the world:
+    """Residuals of measured poses R_frame_sensor `rotation` (n, 3, 3), p_frame_sensor `position` (n, 3). R (n, 3, 3), p
+    (n, 3): predicted poses of the sensor in the world.
 
         Log(rotation^T R_world_frame^T R),  R_world_frame^T (p - p_world_frame) - position
     """
@@ -79,7 +80,7 @@ def relative_residuals(
     jacobians: bool = True,
 ) -> PoseResiduals:
     """Residuals of measured poses `rotation` (n, 3, 3), `position` (n, 3) of the sensor at the later instant relative
-    to the earlier, for predicted poses R[0], p[0] and R[1], p[1]:
+    to the earlier. R[0], p[0] and R[1], p[1]: predicted poses at both.
 
         Log(rotation^T Q), Q = R_0^T R_1,  R_0^T (p_1 - p_0) - position
     """
@@ -109,4 +110,5 @@ def right_jacobians_inverse(e: np.ndarray) -> np.ndarray:
 
 
 def _t(R: np.ndarray) -> np.ndarray:
+    """Transposed matrices (..., 3, 3)."""
     return np.swapaxes(R, -1, -2)

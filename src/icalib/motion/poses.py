@@ -1,10 +1,10 @@
-"""Pose of the IMU at a sensor's own instant: three schemes behind one function, `poses_at`.
+"""Pose of the IMU at the time of a measurement: three schemes behind one function, `poses_at`.
 
     inertial    IMU readings integrated from the nearest keyframe to t, forwards or backwards
     kinematic   constant angular rate and velocity from the nearest keyframe, paper (8)-(9)
     pose        between the two neighbouring keyframes, paper (10)-(12); position interpolated linearly
 
-A measurement keeps its keyframe while the solver runs; only its time moves with the time offset.
+A measurement stays assigned to its keyframe while the solver runs; only its time moves with the time offset.
 """
 
 from __future__ import annotations
@@ -74,6 +74,7 @@ class VelocityDerivatives(NamedTuple):
 
     @classmethod
     def empty(cls, n: int, n_imu: int) -> VelocityDerivatives:
+        """Arrays for n instants and `n_imu` intrinsics, Jacobians zero."""
         return cls(np.empty((n, 3)), np.zeros((n, 3, KEYFRAME_DIM)), np.zeros((n, 3, n_imu)))
 
 
@@ -103,7 +104,7 @@ def _velocity(i, R, run, force, g, at, moving):
 @njit(cache=True, nogil=True)
 def _fill_pose(i, dt, R, run, Jn, Jx):
     """Fills entry i of the pose Jacobians Jn (keyframe) and Jx (intrinsics) from increments `run` (see
-    `integration_step`), elapsed time dt, and the rotation R of the keyframe."""
+    `integration_step`). dt: elapsed time; R: rotation of the keyframe."""
     first = 0 * i  # not a literal: numba would compile the callees once more for a literal type
     _fill_start(i, first + 3, R, run, AT_J + 6 * J_STRIDE, Jn, Jx)
     _fill_turn(i, first + 3, R, run, AT_P, Jn)
@@ -142,7 +143,8 @@ def _fill_start(i, r, R, x, o, Jn, Jx):
 
 @njit(cache=True, nogil=True)
 def _inertial(ways, keyframes, readings, intrinsics, at, Jn, Jx, moving):
-    """Fills `at`, a `Moving`, and, unless they are empty, the Jacobians and `moving`."""
+    """The `inertial` scheme for the query `ways`: fills `at`, a `Moving`, and, unless they are empty, Jacobians and
+    `moving`."""
     width = 6 + Jx.shape[2] if len(Jn) else 0
     by, carried, run = correction(intrinsics), empty_prefix(), np.empty(RUN_SIZE)
     for i in ways.order:
@@ -160,6 +162,7 @@ def _inertial(ways, keyframes, readings, intrinsics, at, Jn, Jx, moving):
 def _kinematic(
     times, keyframe, first, keyframes, R, p, v, b, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx
 ):
+    """The `kinematic` scheme: fills poses, rates, velocities and Jacobians by keyframe (Jn) and IMU intrinsics (Jx)."""
     F, G, H = correction_matrices(intrinsics)
     n_x = Jx.shape[2]
     by, run = correction(intrinsics), np.zeros(RUN_SIZE)
@@ -198,6 +201,7 @@ def _kinematic(
 
 @njit(cache=True, nogil=True)
 def _between(times, keyframe, keyframes, R, p, out_R, out_p, rate, vel, Jn, Jm):
+    """The `pose` scheme: fills poses, rates, velocities and Jacobians by keyframe (Jn) and the next one (Jm)."""
     for i in range(len(times)):
         k = keyframe[i]
         span = keyframes[k + 1] - keyframes[k]
@@ -234,7 +238,8 @@ def poses_of_keyframes(keyframe: np.ndarray, state: State) -> Poses:
 def poses_at(
     scheme: Scheme, times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> Poses:
-    """IMU poses at `times` (n,) seconds on the IMU clock, each from its `keyframe` (see `assign_keyframes`)."""
+    """IMU poses at `times` (n,) seconds on the IMU clock, each from its `keyframe` (n,), see `assign_keyframes`.
+    gravity [m/s^2]; imu_free: whether IMU intrinsics are estimated."""
     n = len(times)
     if scheme == "inertial":
         return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
@@ -272,7 +277,8 @@ def poses_and_velocity_derivatives(
 
 
 def _empty(n: int, n_jacobians: int, imu_free: bool) -> Poses:
-    """Arrays for n `inertial` poses, with Jacobians of `n_jacobians` (n or 0) of them."""
+    """Arrays for n `inertial` poses; n_jacobians: n, or 0 for no Jacobians. imu_free: whether IMU intrinsics are
+    estimated."""
     J_imu = np.zeros((n_jacobians, 6, N_INTRINSICS if imu_free else 0))
     return Poses(*Moving.empty(n), np.zeros((n_jacobians, 6, KEYFRAME_DIM)), np.zeros((0, 6, KEYFRAME_DIM)), J_imu)
 
@@ -286,7 +292,8 @@ def _carried(
     gravity: float,
     moving: VelocityDerivatives,
 ) -> Poses:
-    """Fills `out` with the `inertial` poses, and `moving` unless it is empty; returns `out`."""
+    """Fills `out` with the `inertial` poses, and `moving` with derivatives of the velocity unless it is empty; returns
+    `out`."""
     ways, keyframes = propagation_query(state, times, keyframe, imu), keyframes_of(state, gravity)
     at = Moving(out.rotation, out.position, out.rate, out.velocity)
     intrinsics = state.values[imu.name, "intrinsics"]

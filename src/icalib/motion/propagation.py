@@ -14,7 +14,7 @@ from icalib.optim.state import State
 
 
 class Keyframes(NamedTuple):
-    """Keyframes of a `State` as arrays for kernels, and gravity [m/s^2]."""
+    """Keyframes of a `State` as arrays for compiled kernels, and gravity [m/s^2]."""
 
     seconds: np.ndarray
     rotation: np.ndarray
@@ -25,12 +25,13 @@ class Keyframes(NamedTuple):
 
 
 def keyframes_of(state: State, gravity: float) -> Keyframes:
+    """Keyframes of `state` as arrays; gravity [m/s^2]."""
     return Keyframes(state.seconds, state.rotation, state.position, state.velocity, state.bias, gravity)
 
 
 class PropagationQuery(NamedTuple):
-    """n instants to propagate to: times (n,) seconds on the IMU clock; keyframe (n,) to start from; first (n,),
-    interval of the readings at the start; order (n,), see `in_order_of_keyframes`."""
+    """n instants to propagate to. times (n,): seconds on the IMU clock; keyframe (n,): keyframe to start from; first
+    (n,): interval of the readings at the start; order (n,): see `in_order_of_keyframes`."""
 
     times: np.ndarray
     keyframe: np.ndarray
@@ -39,8 +40,8 @@ class PropagationQuery(NamedTuple):
 
 
 class Moving(NamedTuple):
-    """Pose and velocities of the IMU at n instants: R_world_imu (n, 3, 3), p_world_imu (n, 3) m, rate (n, 3) of the
-    body [rad/s], velocity (n, 3) in the world [m/s]."""
+    """Pose and velocity of the IMU at n instants: R_world_imu (n, 3, 3), p_world_imu (n, 3) [m], rate (n, 3) [rad/s,
+    IMU frame], velocity (n, 3) [m/s, world]."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -49,6 +50,7 @@ class Moving(NamedTuple):
 
     @classmethod
     def empty(cls, n: int) -> Moving:
+        """Uninitialised arrays for n instants."""
         return cls(np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)))
 
 
@@ -56,9 +58,9 @@ class Moving(NamedTuple):
 def integrate_from_keyframe(keyframe, t0, t1, first, bias, readings, by, carried, run, width):
     """As `integrate`, without covariance and into `run` (RUN_SIZE,).
 
-    `carried` (RUN_SIZE + 3,) is the integral over whole intervals from the same keyframe in the same direction, with an
-    identifier of both, the interval and the instant reached. It is extended to t1, so that many instants in the order
-    of `in_order_of_keyframes` cost little more than the last one.
+    `carried` (RUN_SIZE + 3,) is the integral over whole intervals from the same keyframe in the same direction. Its
+    last three elements are an identifier of both, the interval, and the instant reached. It is extended to t1, so that
+    many instants in the order of `in_order_of_keyframes` cost little more than the last one.
     """
     backwards = t1 < t0
     way = 2 * keyframe + backwards
@@ -99,8 +101,8 @@ def rotation_of(keyframes, k):
 
 @njit(cache=True, nogil=True)
 def place(i, seconds, k, keyframes, way, rate, out):
-    """Fills entry i of `out`, a `Moving`, from keyframe k, the elapsed `seconds`, and the increments `way` (see
-    `integration_step`)."""
+    """Fills entry i of `out`, a `Moving`, from keyframe k and the increments `way` (see `integration_step`). seconds:
+    elapsed time; rate (3,): body rate at the instant."""
     R, g = keyframes.rotation, keyframes.gravity
     for a in range(3):
         out.rate[i, a] = rate[a]

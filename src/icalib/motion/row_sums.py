@@ -1,4 +1,4 @@
-"""Accumulation of measurement rows between neighbouring keyframes in the normal equations."""
+"""Adds measurement rows between neighbouring keyframes to the normal equations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROWS_PER_CHUNK = 256
 
 
 class Into(NamedTuple):
-    """Target of an accumulation, with the arguments of `Factor.accumulate`."""
+    """Target of `add_rows`: the arguments of `Factor.accumulate`."""
 
     piece: Piece
     out: Whitened
@@ -26,7 +26,8 @@ class Into(NamedTuple):
 
 
 class RobustNoise(NamedTuple):
-    """Noise of rows: whitening (n, m, m); name and scale of the robust loss of each whitened row."""
+    """Noise of n measurements of m rows. whitening (n, m, m): lower triangular; name and scale of the robust loss of
+    each whitened row."""
 
     whitening: np.ndarray
     loss: str

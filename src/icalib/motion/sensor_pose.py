@@ -1,14 +1,14 @@
-"""Poses of a sensor at its own instants, and the chain rule from its pose to the parameters it depends on.
+"""Poses of a sensor at the times of its measurements, and the chain rule from a pose to the parameters it depends on.
 
     R_world_sensor = R_world_imu(t) R_imu_sensor        p_world_sensor = p_world_imu(t) + R_world_imu(t) p_imu_sensor
 
-t: the sensor's instant plus its time offset. Perturbations of a sensor's pose d = (d_R, d_p), 6, are along its own
-axes: R <- R Exp(d_R), p <- p + R d_p. A factor differentiates its residual by d, and `add_chain` gives the derivatives
-by
+Here t is the time of the measurement plus the time offset. Perturbations d = (d_R, d_p) of a sensor's pose, 6, are
+along the sensor's axes: R <- R Exp(d_R), p <- p + R d_p. A factor differentiates its residual by d, and `add_chain`
+gives the derivatives by
 
     keyframe 15 | next keyframe 15 | R_imu_sensor 3, p_imu_sensor 3, time offset 1, IMU intrinsics 24 or 0
 
-The last ones are calibration parameters, in this order (`Kinematics.columns`).
+The last four are calibration parameters, in this order (`Kinematics.columns`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ IDENTITY_6 = np.eye(6)  # Jacobian of a pose by itself
 
 
 class _Moving(Protocol):
-    """A factor of measurements by a sensor on the moving body."""
+    """Requirements of `Kinematics.of`: a factor of measurements by a sensor on the moving body."""
 
     @property
     def name(self) -> str: ...
@@ -86,7 +86,7 @@ class Kinematics:
 
 
 class SensorPose(NamedTuple):
-    """n poses of a sensor, and rate, velocity and Jacobians of the IMU as in `Poses`."""
+    """n poses of a sensor, and rate, velocity and Jacobians of the IMU pose as in `Poses`."""
 
     R_imu_sensor: np.ndarray
     p_imu_sensor: np.ndarray
@@ -122,7 +122,7 @@ class SensorPose(NamedTuple):
         return self.p_world_sensor
 
     def part(self, own: slice | np.ndarray) -> SensorPose:
-        """The poses `own`."""
+        """The poses with the indices `own`."""
         R_is, p_is, *each = self
         return SensorPose(R_is, p_is, *(x[own] if len(x) else x for x in each))
 
@@ -162,9 +162,9 @@ def fill_imu_pose(i, at, A):
 
 @njit(cache=True, nogil=True)
 def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
-    """Adds to T (m, w) the derivatives of m rows with Jacobians J_pose (m, 6) by pose i of the sensor, and J_imu_pose
-    (m, 6) by that of the IMU. Keyframe columns start at `first`, calibration columns at `calib`. Indices are unsigned,
-    see `add_product`."""
+    """Adds to T (m, w) the derivatives of m rows by the parameters of pose i. J_pose (m, 6): Jacobians of the rows by
+    the pose of the sensor; J_imu_pose (m, 6): by that of the IMU. Keyframe columns start at `first`, calibration
+    columns at `calib`. Indices are unsigned, see `add_product`."""
     R, rate, velocity, J_keyframe, J_next, J_imu = (
         at.R_imu_sensor,
         at.rate,

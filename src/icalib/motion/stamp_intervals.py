@@ -13,8 +13,8 @@ MAX_INTERVAL_S = 0.5  # the approximations within an interval hold up to this le
 
 @dataclass(frozen=True)
 class StampIntervals:
-    """n intervals between stamps `first` and `last` (n,) of a sensor. The first end belongs to `keyframe` (n,), sorted,
-    the last one to the next keyframe."""
+    """n intervals between stamps `first` and `last` (n,), indices of a sensor's stamps. The first stamp belongs to
+    `keyframe` (n,), sorted, the last one to the next keyframe."""
 
     first: np.ndarray
     last: np.ndarray

@@ -1,4 +1,5 @@
-"""Motion of the IMU as a state has it: keyframes of measurements, and poses and twists of a LiDAR."""
+"""Motion of the IMU between the keyframes of a state: nearest keyframes of measurements, poses and twists of a
+LiDAR."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from icalib.optim.state import State
 
 @dataclass(frozen=True)
 class EstimatedMotion:
-    """Motion of the IMU as a state has it. gravity [m/s^2]; IMU gaps up to max_gap_s are bridged."""
+    """Motion of the IMU between the keyframes of `state`. gravity [m/s^2]; IMU gaps up to max_gap_s are bridged."""
 
     state: State
     imu: ImuData
@@ -27,8 +28,8 @@ class EstimatedMotion:
     max_gap_s: float
 
     def near_keyframes(self, stream: Stream, within_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Indices (n,) of the stream's measurements within `within_s` of a keyframe and outside long gaps of the IMU,
-        sorted by keyframe; and these keyframes (n,)."""
+        """Measurements of `stream` within `within_s` of a keyframe and outside long gaps of the IMU: their indices
+        (n,), sorted by keyframe, and the keyframes (n,)."""
         times = instants(stream, self.state.values)
         keyframe = assign_keyframes("inertial", self.state.seconds, times, self.imu.forwards)
         near = np.abs(times - self.state.seconds[keyframe]) <= within_s
@@ -38,8 +39,8 @@ class EstimatedMotion:
 
 
 class Sweep(NamedTuple):
-    """Pose and twist of the LiDAR at bin centres: R_world_lidar, p_world_lidar [m], and rad/s and m/s in its own
-    axes."""
+    """Poses and twists of a LiDAR at n instants: R_world_lidar (n, 3, 3), p_world_lidar (n, 3) [m], rate [rad/s] and
+    velocity [m/s] (n, 3) in LiDAR axes."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -49,7 +50,8 @@ class Sweep(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _to_lidar(R_il, p_il, R, p, rate, velocity):
-    """Transforms pose, rate and velocity of the IMU to those of the LiDAR, in place; the twist in its own axes."""
+    """Transforms poses, rates and velocities of the IMU to those of the LiDAR, in place. R_il, p_il: T_imu_lidar. Rates
+    and velocities end in LiDAR axes."""
     for i in range(len(R)):
         w0, w1, w2 = rate[i, 0], rate[i, 1], rate[i, 2]
         lever = (w1 * p_il[2] - w2 * p_il[1], w2 * p_il[0] - w0 * p_il[2], w0 * p_il[1] - w1 * p_il[0])

@@ -17,8 +17,8 @@ RECORDING_MARGIN_S = 5.0  # a measurement may precede its stamp by as much; reco
 
 
 def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
-    """Times (n,) on the clock of the body, of the stream's own stamps or of other `seconds` (n,) since its first
-    stamp."""
+    """Times (n,) on the clock of the body. seconds (n,): times since the first stamp of the stream, by default those of
+    its stamps."""
     own, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
     if len(offset) == 1:
         return own + offset[0]
