@@ -242,10 +242,10 @@ def _slots(lives: _Lives, n_steps: int) -> _Slots:
         new = born.values[born.start[g] : born.start[g + 1]]
         stays = lives.last[here] >= g
         n = int(stays.sum()) + len(new)
-        fixed_directions = np.flatnonzero(stays)
+        kept = np.flatnonzero(stays)
         now = np.full(n, -1)
-        now[fixed_directions[fixed_directions < n]] = here[fixed_directions[fixed_directions < n]]
-        leave, holes = fixed_directions[fixed_directions >= n], np.flatnonzero(now < 0)
+        now[kept[kept < n]] = here[kept[kept < n]]
+        leave, holes = kept[kept >= n], np.flatnonzero(now < 0)
         now[holes] = np.concatenate([here[leave], new])
         out.alive[g] = n
         out.leave.append(leave)
