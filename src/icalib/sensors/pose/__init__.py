@@ -1,1 +1,1 @@
-"""Pose sensors: motion capture, or the odometry of another program."""
+"""Pose sensors: sensors that report poses, such as motion capture or the odometry of another program."""

@@ -16,14 +16,14 @@ from icalib.result.timeline import Timeline
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
 
-# Correlation of residuals with their successors. It is 0 for the noise assumed, and -0.5 for relative poses whose poses
-# have independent noise.
+# Lag-one autocorrelation of residuals: a warning is given above the first value (absolute poses), or below minus the
+# second (relative poses). It is 0 for the assumed noise, and -0.5 for differences of poses with independent noise.
 MAX_LAG_ONE_CORRELATION, MAX_LAG_ONE_ANTICORRELATION = 0.5, 0.35
 UNKNOWN_CAUSE = "they are no white noise, and the cause is unknown: check its clock and mount, and record again, slower"
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """Number of poses or steps used, and their noise."""
+    """One note for each pose sensor: number of poses (or relative poses) used, and their noise."""
     counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(found)}
     posing = [found.judged.noise[s.name] for s in inputs.rig.poses]
     for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, posing, strict=True):
@@ -33,25 +33,26 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
 
 
 def _pose_factors(found: Estimate) -> list[tuple[AbsolutePoseFactor | RelativePosesFactor, Whitened]]:
-    """All factors of poses, with their whitened residuals."""
+    """All factors of pose sensors, with their whitened residuals."""
     pairs = [(f, found.outcome.residuals[key]) for key, f in found.problem.factors.items()]
     return [(f, out) for f, out in pairs if isinstance(f, AbsolutePoseFactor | RelativePosesFactor)]
 
 
 def _noise(sensor: PoseSensor, noise: PoseNoise) -> str:
-    """Noise of both kinds with units and sources, for a sentence."""
+    """Words for the noise of rotation and position, with units and sources."""
     root = "" if sensor.kind == "absolute" else "/sqrt(s)"
     turn = f"{np.rad2deg(noise.rotation):.3g} deg{root} {_source(sensor.rotation_noise)}"
     return f"noise {turn}, {1e3 * noise.position:.3g} mm{root} {_source(sensor.position_noise)}"
 
 
 def _source(given: float | None) -> str:
-    """Where a noise comes from."""
+    """Words for the source of a noise: the rig file (`given`), or the residuals (None)."""
     return "as residuals show it" if given is None else "as the rig file has it"
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Warnings if residuals are correlated in time: filtered or drifting poses, or the wrong kind."""
+    """Warnings on residuals that are correlated in time: poses are filtered or drift, or the kind (absolute, relative)
+    is wrong."""
     kinds = {s.name: s.kind for s in inputs.rig.poses}
     for factor, rows in _pose_factors(found):
         for what, own in (("rotation", rows.residual[:, :3]), ("position", rows.residual[:, 3:])):
@@ -70,7 +71,8 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
 
 
 def misfit(sensor: PoseSensor, f: SensorFit, is_noise: bool) -> str | None:
-    """A sentence if residuals are larger than the stated noise predicts, else None."""
+    """A sentence if residuals are larger than the stated noise predicts, else None. is_noise: whether residuals are
+    white and constant over the recording, so that a larger stated noise is the remedy."""
     if excess(f) == 1.0:
         return None
     advice = "leave it out, and it is estimated" if is_noise else UNKNOWN_CAUSE
@@ -78,5 +80,5 @@ def misfit(sensor: PoseSensor, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def length(sensor: PoseSensor, rig: Rig) -> str | None:
-    """The source of the scale, for sentences."""
+    """Words for the source of the metric scale."""
     return f"the positions of {sensor.name}"

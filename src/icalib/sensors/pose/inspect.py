@@ -1,4 +1,5 @@
-"""Pose sensors in a recording: topics and tables of poses or odometry, frames of transforms, and their draft lines."""
+"""Finds pose sensors in a recording for `icalib inspect`: topics and tables of poses or odometry, and frames of
+transforms."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from icalib.tools.inspection.kinds import KindInspector
 
 
 class PoseInspector(KindInspector):
-    """Finds pose sensors. The draft comments them out, as poses may be computed from sensors of the same recording."""
+    """Finds pose sensors. The draft rig file comments them out, as their poses may be computed from sensors of the same
+    recording."""
 
     sensor: ClassVar[type[Sensor]] = PoseSensor
     topic_kinds: ClassVar[tuple[str, ...]] = ("pose", "odometry")
@@ -27,12 +29,14 @@ class PoseInspector(KindInspector):
     moves_alone: ClassVar[bool] = True
 
     def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
-        """Line of the kind. Without an IMU the first pose sensor gives the motion, so it must be absolute."""
+        """The `kind` line of the draft. Without an IMU the first pose sensor gives the trajectory, so it must be
+        absolute."""
         drifts = topic.kind == "odometry" or "odom" in topic.name
         yield f"kind: {'relative' if drifts and found.sources.imus else 'absolute'}"
 
     def more_lines(self, found: Inspection, shown: bool) -> Iterator[str]:
-        """Lines of a pose sensor from transforms: the two frames with most moving edges between them, if any moves."""
+        """Draft lines of a pose sensor from transforms, if any transform changes. Its frames are the ends of the chain
+        with most changing transforms."""
         shown = shown and not found.sources.of(PoseSensor.sensor_type)
         chain = _most_motion(found.frames)
         if not chain:
@@ -51,8 +55,8 @@ INSPECTOR = PoseInspector()
 
 
 def _most_motion(pairs: Sequence[FramePair]) -> list[FramePair]:
-    """Chain of frame pairs of one topic, from parent to child, with most moving pairs. It begins and ends with a moving
-    pair."""
+    """Chain of frame pairs of one topic, from parent to child, that contains most changing transforms. It begins and
+    ends with a changing one."""
     above = {(p.topic, p.child): p for p in pairs}
     best: list[FramePair] = []
     for last in pairs:

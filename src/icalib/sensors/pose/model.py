@@ -1,4 +1,4 @@
-"""How a pose sensor enters the problem: by a factor of its poses, and by the frame of absolute poses."""
+"""Estimation model of a pose sensor: the factor of its poses, their noise, and the frame of absolute poses."""
 
 from __future__ import annotations
 
@@ -15,20 +15,23 @@ from icalib.optim.state import Entry, Key
 from icalib.rig import ImuSensor, PoseSensor, Rig, Settings
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor
 
-# In the first pass, if the rig file states none: rad, m; of relative poses rad/sqrt(s), m/sqrt(s). Then estimated.
+# Noise in the first pass if the rig file states none, then it is estimated. Absolute poses: rad, m; relative poses:
+# rad/sqrt(s), m/sqrt(s).
 FIRST_ROTATION_NOISE, FIRST_POSITION_NOISE = 0.01, 0.02
-MIN_POSE_NOISE = 1e-6  # same units: keeps weights of simulated poses without noise finite
+MIN_POSE_NOISE = 1e-6  # lower bound in the same units, so that the weights of noise-free simulated poses stay finite
 
 
 class PoseModel(SensorModel[PoseSensor, PoseNoise]):
-    """Noise that the rig file does not state is estimated with post-fit degrees of freedom: if no other sensor gives
-    the motion, the trajectory absorbs most of the residuals. The first estimate is rough, so there are two."""
+    """Model of pose sensors. Noise that the rig file does not state is estimated with post-fit degrees of freedom. If
+    no other sensor determines the trajectory, it absorbs most residuals. The first noise estimate is rough, so that
+    there is a second."""
 
     keyframes = "poses"
     only_first_places_keyframes = True
 
     def scene_entries(self, sensor: PoseSensor, rig: Rig, n_recordings: int) -> list[Entry]:
-        """The frame of absolute poses. It is the world frame if this sensor alone gives the motion."""
+        """Parameters of the frame of absolute poses in each recording. The frame is fixed as the world frame if this
+        sensor alone gives the motion."""
         if sensor.kind != "absolute":
             return []
         is_reference = rig.moves_by_poses and sensor is rig.poses[0]
@@ -38,9 +41,9 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
     def keyframe_times(
         self, sensor: PoseSensor, stream: PoseStream, values: dict[Key, np.ndarray], rig: Rig
     ) -> np.ndarray:
-        """Instants of poses, at the keyframe spacing, seconds on the IMU's clock."""
+        """Times of poses at about the keyframe spacing, in seconds on the IMU's clock."""
         del sensor
-        imu = rig.imu or ImuSensor  # its default
+        imu = rig.imu or ImuSensor  # the default spacing without an IMU
         return instants(stream, values, spaced(stream.seconds, imu.pose_keyframes_s))
 
     def first_noise(self, sensor: PoseSensor, settings: Settings) -> PoseNoise:
@@ -60,7 +63,7 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
         return 2 if sensor.rotation_noise is None or sensor.position_noise is None else 0
 
     def factors(self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass) -> Iterator[PoseFactor]:
-        """One factor, of absolute or of relative poses."""
+        """One factor, of absolute or relative poses according to the sensor's kind."""
         assert at.motion is not None
         kind = AbsolutePoseFactor if sensor.kind == "absolute" else RelativePosesFactor
         yield kind.build(stream, at.motion, noise, at.layout)
@@ -68,13 +71,13 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
     def still_factors(
         self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass
     ) -> Iterator[AbsolutePoseFactor]:
-        """One factor, of the poses at keyframes."""
+        """One factor of the poses that were taken at keyframes, without an IMU."""
         yield AbsolutePoseFactor.at_keyframes(stream, at.state, at.starts, noise, at.layout)
 
 
 def estimated_noise(sensor: PoseSensor, noise: PoseNoise, variance_factors: dict[str, float]) -> PoseNoise:
-    """The noise, scaled by the square roots of variance_factors (by kind of residual) if it is not stated. A kind
-    without a factor keeps its noise."""
+    """Noise in which values that the rig file does not state are scaled by the square roots of variance_factors, by
+    kind of residual. Without a variance factor the value is unchanged."""
     rotation, position = (
         max(sigma * float(np.sqrt(variance_factors.get(kind, 1.0))), MIN_POSE_NOISE)
         for kind, sigma in (("rotation", noise.rotation), ("position", noise.position))
@@ -85,7 +88,7 @@ def estimated_noise(sensor: PoseSensor, noise: PoseNoise, variance_factors: dict
 
 
 def spaced(seconds: np.ndarray, spacing: float) -> np.ndarray:
-    """The first of `seconds` (n,), increasing, in each interval of `spacing` [s], and the last of all."""
+    """The first of `seconds` (n,), increasing, in each interval of length `spacing` [s]; and the last of all."""
     k = np.flatnonzero(np.diff(np.floor(seconds / spacing + 1e-6), prepend=-1.0))
     return seconds[np.append(k, len(seconds) - 1)] if k[-1] < len(seconds) - 1 else seconds[k]
 

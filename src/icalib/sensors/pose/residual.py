@@ -1,12 +1,12 @@
-"""Factors of reported poses, from motion capture or the odometry of another program.
+"""Factors of measured poses, from motion capture or the odometry of another program.
 
-`AbsolutePoseFactor`: each pose at its own instant, in a static frame of each recording.
-`RelativePosesFactor`: motion between two poses, about from keyframe to keyframe; the frame may drift.
+`AbsolutePoseFactor`: each pose at its measurement time, in a frame that is static in each recording.
+`RelativePosesFactor`: relative poses over intervals that are close to those between keyframes; the frame may drift.
 
-Parameters of the sensor are rotation, translation (R_imu_sensor, p_imu_sensor), time_offset, and scale (1,), true
-lengths over reported ones. The frame of each recording has frame_rotation and frame_translation (R_world_frame,
-p_world_frame). Residuals of positions are predicted / scale - reported. With scale * reported instead, the scale would
-multiply the noise, and the estimate would shrink it.
+Parameters of the sensor are rotation, translation (R_imu_sensor, p_imu_sensor), time_offset, and scale (1,), the ratio
+of true to measured lengths. The frame of each recording has frame_rotation and frame_translation (R_world_frame,
+p_world_frame). Position residuals are predicted / scale - measured. With predicted - scale * measured instead, scale
+would multiply the noise, and the estimated scale would be too small.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 
-# From the nearest keyframe to a pose; a pose farther off is left out, as the noise of propagation is not modelled.
+# Longest propagation from the nearest keyframe to a pose. Poses farther off are not used, as the noise of the
+# propagation is not modelled.
 MAX_POSE_PROPAGATION_S = 0.05
 POSE_KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
 POSE_UNITS = {"rotation": "rad", "position": "m"}
@@ -40,8 +41,8 @@ POSE_UNITS = {"rotation": "rad", "position": "m"}
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Noise of reported poses, for each axis: standard deviations of absolute poses [rad, m], or random-walk densities
-    of relative ones [rad/sqrt(s), m/sqrt(s)]. Robust loss of each whitened row, and its scale in standard
+    """Noise of measured poses on each axis: standard deviations of absolute poses [rad, m], or random-walk densities of
+    relative poses [rad/sqrt(s), m/sqrt(s)]. loss: robust loss of each whitened row; loss_scale: its scale in standard
     deviations."""
 
     rotation: float
@@ -51,8 +52,8 @@ class PoseNoise:
 
 
 class _PoseFactor(RowFactor):
-    """Common part of both factors: n measurements with three rows of rotation and three of position. name: of the
-    sensor."""
+    """Common base of both factors: n measurements with three rows of rotation and three of position each. name: name of
+    the sensor."""
 
     units: ClassVar[Mapping[str, str]] = POSE_UNITS
 
@@ -80,12 +81,12 @@ class _PoseFactor(RowFactor):
 
     @property
     def instants(self) -> np.ndarray:
-        """(n,) instants of the measurements, seconds on the sensor's clock since its first stamp."""
+        """(n,) times of the measurements [s], on the sensor's clock since its first stamp."""
         raise NotImplementedError
 
     @property
     def keyframes(self) -> np.ndarray:
-        """(n,) keyframe of each measurement, the first if there are two."""
+        """(n,) index of the keyframe of each measurement; the first of two for relative poses."""
         raise NotImplementedError
 
     def times(self, state: State) -> np.ndarray:
@@ -103,13 +104,14 @@ class _PoseFactor(RowFactor):
 
 @dataclass(frozen=True)
 class AbsolutePoseFactor(_PoseFactor):
-    """n poses of one sensor in its frame, see `absolute_residuals`. keyframe (n,), increasing: from which each is
-    propagated. imu: None if all poses were taken at keyframes that no IMU connects. gravity [m/s^2]."""
+    """n poses of one sensor in its frame, see `absolute_residuals`. keyframe (n,), increasing: index of the keyframe
+    from which each pose is propagated. imu: None if all poses were taken at keyframes that no IMU connects. gravity
+    [m/s^2]."""
 
     name: str
     seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
-    rotation: np.ndarray  # (n, 3, 3)
-    position: np.ndarray  # (n, 3)
+    rotation: np.ndarray  # (n, 3, 3) R_frame_sensor
+    position: np.ndarray  # (n, 3) p_frame_sensor [m]
     keyframe: np.ndarray
     starts: tuple[int, ...]  # the first keyframe of each recording
     n_keyframes: int
@@ -120,7 +122,7 @@ class AbsolutePoseFactor(_PoseFactor):
 
     @classmethod
     def build(cls, stream: PoseStream, motion: EstimatedMotion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
-        """The factor of the poses near keyframes, without those in IMU gaps that are not bridged."""
+        """Factor of the poses near keyframes. Poses in IMU gaps that are not bridged are not used."""
         state, (k, keyframe) = motion.state, motion.near_keyframes(stream, MAX_POSE_PROPAGATION_S)
         return cls(
             stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], keyframe, state.starts,
@@ -131,7 +133,8 @@ class AbsolutePoseFactor(_PoseFactor):
     def at_keyframes(
         cls, stream: PoseStream, state: State, starts: tuple[int, ...], noise: PoseNoise, layout: Layout
     ) -> AbsolutePoseFactor:
-        """The factor of the poses taken at keyframes, without an IMU. starts: the first keyframe of each recording."""
+        """Factor of the poses that were taken at keyframes, without an IMU. starts: index of the first keyframe of each
+        recording."""
         times = instants(stream, state.values)
         keyframe = np.searchsorted(0.5 * (state.seconds[1:] + state.seconds[:-1]), times)
         k = np.flatnonzero(np.abs(times - state.seconds[keyframe]) <= MERGED_WITHIN_S)
@@ -164,7 +167,7 @@ class AbsolutePoseFactor(_PoseFactor):
         return sum(self._add_recording(k, own, state, into) for k, own in parts)
 
     def _add_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
-        """Adds the poses `own` of one recording. Returns their cost."""
+        """Add the rows of the poses `own` of one recording. Returns their cost."""
         frame = frame_of(self.name, recording)
         v, keyframe, kinematics = state.values, self.keyframe[own], Kinematics.of(self)
         at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
@@ -185,14 +188,14 @@ class AbsolutePoseFactor(_PoseFactor):
 
 @dataclass(frozen=True)
 class RelativePosesFactor(_PoseFactor):
-    """n relative poses of one sensor, see `relative_residuals`, each between two stamps, about from keyframe to
-    keyframe. Their noise is a random walk: independent, with a variance that is proportional to the duration."""
+    """n relative poses of one sensor, see `relative_residuals`, each between two stamps close to two consecutive
+    keyframes. Their noise is a random walk: independent, with a variance proportional to the duration."""
 
     name: str
-    seconds: np.ndarray  # (N,) stamps since the first on the sensor's clock
+    seconds: np.ndarray  # (N,) since the first stamp on the sensor's clock
     intervals: StampIntervals
-    rotation: np.ndarray  # (n, 3, 3)
-    position: np.ndarray  # (n, 3)
+    rotation: np.ndarray  # (n, 3, 3) rotation from the first to the last pose, in axes of the first
+    position: np.ndarray  # (n, 3) displacement in axes of the sensor at the first pose [m]
     imu: ImuData
     gravity: float
     noise: PoseNoise
@@ -202,7 +205,8 @@ class RelativePosesFactor(_PoseFactor):
     def build(
         cls, stream: PoseStream, motion: EstimatedMotion, noise: PoseNoise, layout: Layout
     ) -> RelativePosesFactor:
-        """The factor with intervals between stamps, chosen by the time offset and the keyframes of `motion`."""
+        """Factor of the relative poses between stamps that are chosen by the time offset and the keyframes of
+        `motion`."""
         state, seconds = motion.state, stream.seconds
         times = instants(stream, state.values)
         found = choose_intervals(motion.imu, state.seconds, state.starts, times)
@@ -238,7 +242,7 @@ class RelativePosesFactor(_PoseFactor):
         return cost
 
     def _add_interval_rows(self, clock: int, own: slice, state: State, into: Into) -> float:
-        """Adds the relative poses `own`, which share the time offset number `clock`. Returns their cost."""
+        """Add the rows of the relative poses `own`, all with time offset number `clock`. Returns their cost."""
         first, last, keyframe = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.keyframe))
         kinematics = Kinematics.of(self)
         a = SensorPose.at(kinematics, self.seconds[first], keyframe, state, into.sums)
@@ -258,8 +262,8 @@ PoseFactor = AbsolutePoseFactor | RelativePosesFactor
 
 
 def _rows(found: PoseResiduals, ends: tuple[SensorPose, ...], factor: PoseFactor, state: State, own: slice) -> Rows:
-    """Rows of predicted / scale - reported, from residuals `found` of predicted - scale * reported. Their calibration
-    parameters are those of the poses at both ends, then frame and scale."""
+    """Rows of predicted / scale - measured, from residuals `found` of predicted - scale * measured. Their calibration
+    parameters are those of the poses at both `ends`, then frame and scale."""
     scale, reported = float(state.values[factor.name, "scale"][0]), factor.position[own]
     found.residual[:, 3:] /= scale
     n = len(found.J_frame)

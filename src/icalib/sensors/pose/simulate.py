@@ -1,4 +1,4 @@
-"""Simulated pose sensors: poses in a frame of the sensor, as of motion capture or an odometry."""
+"""Simulated pose sensors, such as motion capture or an odometry."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _POSE_MESSAGE = "geometry_msgs/msg/PoseStamped"
 
 @dataclass(frozen=True, eq=False)
 class PoseTruth:
-    """Reported poses without noise. seconds (N,): on the IMU's clock; rotation (N, 3, 3) R_frame_sensor, position (N,
-    3) p_frame_sensor [m]."""
+    """Poses without noise, as the sensor would report them. seconds (N,): on the IMU's clock; rotation (N, 3, 3)
+    R_frame_sensor; position (N, 3) p_frame_sensor [m]."""
 
     seconds: np.ndarray
     rotation: np.ndarray
@@ -34,11 +34,11 @@ class PoseTruth:
 
 @dataclass(frozen=True, eq=False)
 class SimPoses(SimSensor):
-    """True parameters of one sensor that reports T_frame_sensor, in a frame at T_world_frame.
+    """True parameters of one simulated sensor that reports T_frame_sensor. T_world_frame (4, 4): pose of its frame.
 
-    absolute: poses have independent noise, rotation_noise [rad] and position_noise [m] on each axis. relative: steps
-    from pose to pose have independent noise, [rad/sqrt(s)] and [m/sqrt(s)], which adds up to a drift. scale: true
-    lengths over reported ones.
+    absolute: poses have independent noise on each axis, rotation_noise [rad] and position_noise [m]. relative: steps
+    between successive poses have independent noise, [rad/sqrt(s)] and [m/sqrt(s)], so that poses drift. scale: ratio of
+    true to reported lengths.
     """
 
     sensor_type: ClassVar[str] = "pose"
@@ -70,7 +70,7 @@ class SimPoses(SimSensor):
         return {"kind": self.kind, "T_world_frame": self.T_world_frame.tolist(), "scale": self.scale}
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
-        """Poses while the IMU is running, and their truth."""
+        """Poses while the IMU is running, with noise if the scene is noisy; and the poses without noise."""
         stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
         R, p, _ = scene.trajectory.pose_at(seconds)
         T = np.tile(np.eye(4), (len(seconds), 1, 1))
@@ -102,7 +102,7 @@ SIMULATED = SimPoses
 
 
 def _messages(poses: PoseStream, offset_ns: int) -> Iterator[BagEvent]:
-    """A message for each pose, at its stamp."""
+    """One PoseStamped message for each pose, at its stamp."""
     frame = f"{poses.name}_frame"
     for stamp_ns, R, position in zip(poses.stamps_ns.tolist(), poses.rotation, poses.position, strict=True):
         yield (
@@ -112,14 +112,15 @@ def _messages(poses: PoseStream, offset_ns: int) -> Iterator[BagEvent]:
 
 
 def _message(bag: BagWriter, stamp_ns: int, frame: str, position: np.ndarray, R: np.ndarray) -> Any:
-    """PoseStamped with position (3,) [m] and rotation R (3, 3) of a sensor in `frame`."""
+    """PoseStamped of a sensor in the frame `frame`: position (3,) [m] and rotation R (3, 3)."""
     point = bag.make("geometry_msgs/msg/Point", *position.tolist())
     turn = bag.make("geometry_msgs/msg/Quaternion", *quaternion(R).tolist())
     return bag.make(_POSE_MESSAGE, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Pose", point, turn))
 
 
 def _with_white_noise(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poses (N, 4, 4) with independent noise: of rotations in axes of the sensor, of positions in axes of the frame."""
+    """Poses (N, 4, 4) with independent noise, for rotations about the axes of the sensor and for positions along the
+    axes of the frame."""
     out = seen.copy()
     for T in out:
         T[:3, :3] = T[:3, :3] @ rotation_from_vector(sensor.rotation_noise * rng.standard_normal(3))
@@ -128,7 +129,7 @@ def _with_white_noise(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generat
 
 
 def _with_drift(sensor: SimPoses, seen: np.ndarray, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poses (N, 4, 4) whose steps have independent noise, so that they drift."""
+    """Poses (N, 4, 4) that drift, as independent noise is added to the steps between successive poses."""
     out = seen.copy()
     for k in range(1, len(seen)):
         step, root = np.linalg.inv(seen[k - 1]) @ seen[k], np.sqrt(seconds[k] - seconds[k - 1])

@@ -26,18 +26,19 @@ from icalib.sensors.parameter_spec import ParameterSpec
 from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, Lack, MountedSensor, Sensor, TableLayout, has_imu
 
 PoseKind = Literal["absolute", "relative"]
-POSE_SCALE = ParameterSpec("scale", 1, "nuisance", "", ("scale",), 1e-2, 0.1)  # true lengths over reported ones
+POSE_SCALE = ParameterSpec("scale", 1, "nuisance", "", ("scale",), 1e-2, 0.1)  # ratio of true to reported lengths
 _FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted", "frames", "scale_sigma")
 _NOISE = ("rotation_noise", "position_noise")
 
 
 @dataclass(frozen=True)
 class PoseSensor(MountedSensor):
-    """A sensor of poses: motion capture, or the odometry of another program.
+    """A sensor that reports poses: motion capture, or the odometry of another program.
 
-    absolute: poses in a static frame, whose pose in the world is estimated; the noise is white, rad and m. relative:
-    the motion from each pose to the next is used; the noise is a random walk, rad/sqrt(s) and m/sqrt(s). level: z of
-    the static frame points up; used if neither IMU nor target shows the vertical and the motion does not contradict.
+    absolute: poses are in a static frame whose pose in the world is estimated; the noise is white [rad, m]. relative:
+    only the motion between successive poses is used; the noise is a random walk [rad/sqrt(s), m/sqrt(s)]. level: the z
+    axis of the static frame points up. It is used if neither IMU nor target gives the vertical, unless the motion
+    contradicts it.
     """
 
     sensor_type: ClassVar[str] = "pose"
@@ -47,19 +48,19 @@ class PoseSensor(MountedSensor):
 
     path: str
     kind: PoseKind = "absolute"
-    rotation_noise: float | None = None  # of each axis; None: estimated from the residuals
+    rotation_noise: float | None = None  # on each axis; None: estimated from the residuals (position_noise likewise)
     position_noise: float | None = None
     level: bool = True
-    position_axes: Axes | None = None  # recorded columns that are x, y, z in the axes of the rotations
-    topic: str | None = None  # of its poses; None: the topic with the sensor's name, or the only one
+    position_axes: Axes | None = None  # recorded columns, with signs, that are x, y, z in the frame of the rotations
+    topic: str | None = None  # topic of the poses; None: the topic with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
-    inverted: bool = False  # T_sensor_frame is recorded
-    frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: another topic
-    scale_sigma: float = 0.001  # prior sigma of scale, true lengths over reported ones; 0: exact
+    inverted: bool = False  # whether the recorded poses are T_sensor_frame instead of T_frame_sensor
+    frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: the topic contains poses
+    scale_sigma: float = 0.001  # prior standard deviation of scale; 0: scale is fixed at 1
 
     @property
     def scale(self) -> Parameter:
-        """True lengths over reported ones."""
+        """Ratio of true to reported lengths, with its prior."""
         one = np.ones(1)
         return Parameter("prior", one, self.scale_sigma * one) if self.scale_sigma > 0.0 else Parameter("fixed", one)
 
@@ -116,14 +117,14 @@ class PoseSensor(MountedSensor):
 
 
 def _scale_sigma(value: YamlValue) -> float:
-    """A share of all lengths. Raises RigError if it is not in [0, 1)."""
+    """The prior standard deviation of scale. Raises RigError if it is not in [0, 1)."""
     if not 0.0 <= (sigma := value.number()) < 1.0:
         value.fail(f"is a share of all lengths between 0 (exact) and 1, but is {sigma:g}; write 0.001 for 0.1 %.")
     return sigma
 
 
 def _frames(value: YamlValue) -> tuple[str, str]:
-    """Names of parent and child. Raises RigError if there are not two different ones."""
+    """Names of parent and child frame. Raises RigError if they are not two different names."""
     names = [entry.text() for entry in value.items()]
     if len(names) != 2 or names[0].lstrip("/") == names[1].lstrip("/"):
         value.fail("must name two frames, the parent and the child, as in [base_link, tool0]; correct it.")

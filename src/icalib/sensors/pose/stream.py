@@ -12,7 +12,7 @@ from icalib.sensors.stream import Stream, check, far_origin
 
 @dataclass(frozen=True)
 class PoseStream(Stream):
-    """Reported poses of a sensor, in a frame that is static or drifts slowly.
+    """Measured poses of a sensor, in a frame that is static or drifts slowly.
 
     stamps_ns (N,) int64: strictly increasing; rotation (N, 3, 3): R_frame_sensor; position (N, 3): p_frame_sensor [m].
     """
@@ -30,7 +30,8 @@ class PoseStream(Stream):
         check(shape == (n, 3), f"{self.name}: position must have shape ({n}, 3), not {shape}.")
 
     def near_origin(self) -> tuple[Self, tuple[str, ...]]:
-        """The stream with positions near the origin, and a note; as it is if they are near already."""
+        """The stream with positions relative to a point near them, and a note, if they are far from the frame's origin;
+        else the unchanged stream."""
         origin = far_origin(self.position)
         if origin is None:
             return self, ()

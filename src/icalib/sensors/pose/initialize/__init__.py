@@ -1,4 +1,4 @@
-"""Initial guess of pose sensors: a trajectory with the IMU, extrinsics, and the frame of absolute poses."""
+"""Initial guess from pose sensors: the IMU trajectory, extrinsics, and the frame of absolute poses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, state_fro
 
 
 class PoseInitializer(Initializer[PoseSensor]):
-    """The first pose sensor gives the trajectory if neither cameras nor LiDARs do. All others are aligned to it."""
+    """The first pose sensor gives the trajectory if neither cameras nor LiDARs give it. All other pose sensors are
+    aligned to the trajectory."""
 
     def motion_rank(self, rig: Rig) -> int | None:
         return BY_POSES if rig.poses else None
@@ -37,7 +38,7 @@ class PoseInitializer(Initializer[PoseSensor]):
         return state_from_poses(inputs)
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        """State after one pass of the estimate, with extrinsics aligned to the better trajectory."""
+        """State after one pass of the estimator, and extrinsics that are aligned to this improved trajectory."""
         sensors = inputs.rig.poses
         state = first_pass(inputs, replace(state, values=state.values | self.place(inputs, state, sensors)))
         state = replace(state, values=state.values | self.place(inputs, state, sensors))
@@ -61,7 +62,8 @@ class PoseInitializer(Initializer[PoseSensor]):
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], found: Values
     ) -> tuple[Inputs, State, Values] | None:
-        """Hand-eye calibration from pairs of poses, if the robot stood still at each; else None."""
+        """Initial guess by hand-eye calibration from pairs of poses, if the robot stood still at each pose; else
+        None."""
         if not is_stop_and_go(rig, recordings, body):
             return None
         return state_from_pairs(rig, recordings, body, found)
@@ -79,7 +81,8 @@ class PoseInitializer(Initializer[PoseSensor]):
     def explained(
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
     ) -> EstimationError | None:
-        """An error that advises kind: absolute, if relative poses fail and the same poses converge as absolute ones."""
+        """An error that recommends kind: absolute, if relative poses fail but the same poses converge as absolute ones;
+        else None."""
         del recordings
         first = rig.poses[0]
         if first.kind != "relative" or not converges(rig.with_sensors(replace(first, kind="absolute"))):

@@ -1,9 +1,8 @@
-"""Conventions of poses other than that of `PoseStream`.
+"""Detects poses in a convention other than that of `PoseStream`.
 
 These are inverted poses or rotations, left-handed axes, quaternions with w first, and positions and rotations in
-different frames.
-
-Each convention is tried if the poses do not fit the motion, and named in an error if the poses fit far better with it.
+different frames. Each convention is tried if the poses do not fit the motion. An error names the convention if the
+poses fit far better with it.
 """
 
 from __future__ import annotations
@@ -21,37 +20,37 @@ from icalib.errors import EstimationError
 from icalib.rig import Axes
 from icalib.sensors.pose.initialize.position_frame import axes_text
 
-Conversion = Callable[[PoseStream], PoseStream]  # from a convention to that of `PoseStream`
+Conversion = Callable[[PoseStream], PoseStream]  # converts poses from a convention to that of `PoseStream`
 T = TypeVar("T")
-MAX_UNEXPLAINED = 0.1  # share of the motion: poses with less have the right convention
-MAX_CONVERTED_RATIO = 0.5  # to that of the unconverted poses, of a convention that fits far better
+MAX_UNEXPLAINED = 0.1  # unexplained share of the motion, up to which the convention is taken to be right
+MAX_CONVERTED_RATIO = 0.5  # ratio of converted to original unexplained share, below which a convention fits far better
 
 
 def _inverse(x: PoseStream) -> PoseStream:
-    """Inverted poses."""
+    """The inverse of each pose."""
     back = np.ascontiguousarray(x.rotation.transpose(0, 2, 1))
     return replace(x, rotation=back, position=-np.einsum("nij,nj->ni", back, x.position))
 
 
 def _with_inverse_rotations(x: PoseStream) -> PoseStream:
-    """Poses with inverted rotations."""
+    """Poses with inverted rotations and unchanged positions."""
     return replace(x, rotation=np.ascontiguousarray(x.rotation.transpose(0, 2, 1)))
 
 
 def _with_y_reversed(x: PoseStream) -> PoseStream:
-    """Poses with reversed y axes of frame and sensor."""
+    """Poses with reversed y axes of both the frame and the sensor."""
     flip = np.array([1.0, -1.0, 1.0])
     return replace(x, rotation=flip[:, None] * x.rotation * flip, position=flip * x.position)
 
 
 def _with_axis_reversed(axis: int) -> Conversion:
-    """Reverses one axis of the positions."""
+    """A conversion that reverses one axis of the positions."""
     return lambda x: replace(x, position=x.position * np.where(np.arange(3) == axis, -1.0, 1.0))
 
 
 def _w_first(x: PoseStream) -> PoseStream:
-    """Poses whose quaternions w, x, y, z were read as x, y, z, w."""
-    w_x_y_z = Rotation.from_matrix(x.rotation).as_quat()  # as written; of either sign
+    """Corrects poses whose quaternions w, x, y, z were read as x, y, z, w."""
+    w_x_y_z = Rotation.from_matrix(x.rotation).as_quat()  # the recorded order; the sign does not matter
     return replace(x, rotation=Rotation.from_quat(w_x_y_z[:, [1, 2, 3, 0]]).as_matrix())
 
 
@@ -79,11 +78,11 @@ CONVENTIONS: tuple[tuple[str, Conversion], ...] = (
 
 
 def _with_axes(axes: Axes) -> Conversion:
-    """Exchanges axes of the positions."""
+    """A conversion that exchanges axes of the positions."""
     return lambda x: replace(x, position=in_axes(x.position, axes))
 
 
-# One convention for each direction of the vertical: a vehicle on a floor does not distinguish the others.
+# One convention for each direction of the vertical, as planar motion of a vehicle does not distinguish any more.
 POSITION_AXES: tuple[tuple[str, Conversion], ...] = tuple(
     (
         "have positions and rotations in different frames, for example one with z up and the other with y up; "
@@ -99,10 +98,11 @@ def with_checked_convention(
     place: Callable[[PoseStream], tuple[T, float]],
     rotation_of: Callable[[PoseStream], np.ndarray | None] = lambda stream: None,
 ) -> T:
-    """Result of `place` for the poses. place: returns its result, and the share of the motion that poses do not
-    explain. rotation_of: a candidate rotation (3, 3) of positions to the frame of rotations, or None.
+    """Result of `place` for the poses, after a check of their convention.
 
-    Raises EstimationError as `place` does, or if the poses fit far better with another convention.
+    place: returns its result, and the share of the motion that the poses do not explain. rotation_of: a candidate
+    rotation (3, 3) from the frame of positions to that of rotations, or None. Raises EstimationError as `place` does,
+    or if the poses fit far better with another convention.
     """
     found: T | None = None
     failed: EstimationError | None = None
@@ -129,7 +129,7 @@ def _refuse_two_frames(
     rotation_of: Callable[[PoseStream], np.ndarray | None],
     most: float,
 ) -> None:
-    """Raises EstimationError if poses with rotated positions leave less than `most` of the motion unexplained."""
+    """Raise EstimationError if rotating the positions reduces the unexplained share of the motion below `most`."""
     try:
         C = rotation_of(stream)
     except EstimationError:
@@ -150,7 +150,7 @@ def _refuse_two_frames(
 
 
 def _unexplained(place: Callable[[PoseStream], tuple[T, float]], stream: PoseStream) -> float:
-    """Share of the motion that the poses do not explain; infinite if `place` fails."""
+    """Share of the motion that the poses do not explain; infinite if `place` raises EstimationError."""
     try:
         return place(stream)[1]
     except EstimationError:

@@ -1,7 +1,7 @@
 """Initial extrinsics, time offset and frame of a pose sensor, and the IMU trajectory if no other sensor gives it.
 
-Time offset and rotation come from angular rates; the lever arm from linear least squares: against a known trajectory,
-or against the readings of the IMU.
+Time offset and rotation come from aligning angular rates. The lever arm comes from linear least squares with a known
+trajectory, or with the readings of the IMU.
 """
 
 from __future__ import annotations
@@ -56,15 +56,16 @@ from icalib.sensors.pose.initialize.conventions import with_checked_convention
 from icalib.sensors.pose.initialize.position_frame import rotation_of_positions
 from icalib.sensors.sensor import MOUNTED_NAMES
 
-MIN_POSE_RATE_HZ = 2.0  # of a moving sensor: angular rates are means between poses
-FIT_STEP_S = 0.4  # between the poses that test the fit: noise dominates the motion between successive poses
+MIN_POSE_RATE_HZ = 2.0  # lowest rate of a moving sensor, as angular rates are means between poses
+FIT_STEP_S = 0.4  # between poses that test the fit, as noise dominates the motion between successive poses
 MAX_GRAVITY_ERROR = (
-    0.5  # relative error of gravity by a wrong scale of positions; a larger one is a unit of the accelerometer
+    0.5  # relative error of gravity: up to it the scale of positions may be wrong, above it the accelerometer's unit is
 )
 
 
 def pose_values(inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> dict[Key, np.ndarray]:
-    """Initial parameters of `sensors` and of their frames, from the rig file, or given the trajectory in `state`.
+    """Initial parameters of `sensors` and of their frames, from the rig file, or by alignment to the trajectory in
+    `state`.
 
     Raises EstimationError if a recording does not determine them.
     """
@@ -84,8 +85,8 @@ def pose_values(inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> 
 
 
 def _aligned_values(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream) -> dict[Key, np.ndarray]:
-    """Extrinsics and time offsets of a sensor, given the trajectory in `state`. If its clock restarts between
-    recordings, the extrinsics are those of the recording with most poses."""
+    """Extrinsics and time offsets of a sensor, given the trajectory in `state`. If its clock restarts with each
+    recording, the extrinsics come from the recording with most poses."""
     assert inputs.imu is not None
     held = known_extrinsics(inputs, sensor)
     if not sensor.clock_restarts:
@@ -126,7 +127,7 @@ def state_from_poses(inputs: Inputs) -> State:
 
 
 def _single_state(inputs: Inputs, held: KnownExtrinsics | None) -> State:
-    """The initial state of one recording. held: extrinsics of the sensor from another recording."""
+    """The initial state of one recording. held: extrinsics of the sensor known from another recording, or None."""
     assert inputs.imu is not None
     sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
     known = held or known_extrinsics(inputs, sensor)
@@ -142,12 +143,12 @@ def _single_state(inputs: Inputs, held: KnownExtrinsics | None) -> State:
 
 
 def pose_rates(stream: PoseStream) -> SensorRates:
-    """Angular rates from pose to pose; see `trajectory_rates`."""
+    """Mean angular rates between successive poses; see `trajectory_rates`."""
     return trajectory_rates(stream.name, _trajectory(stream))
 
 
 def check_rate(stream: PoseStream) -> None:
-    """Raises EstimationError if poses are too rare for angular rates."""
+    """Raise EstimationError if the rate of poses is too low for angular rates."""
     rate = 1.0 / float(np.median(np.diff(stream.seconds)))
     if rate < MIN_POSE_RATE_HZ:
         often = f"{rate:.2g} pose{'' if round(rate, 1) == 1.0 else 's'} per second, but {MIN_POSE_RATE_HZ:g} are needed"
@@ -165,14 +166,14 @@ def _trajectory(stream: PoseStream) -> SensorTrajectory:
 
 
 def _aligned(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> tuple[RateAlignment, SensorRates]:
-    """Alignment of angular rates with the gyroscope, and the rates."""
+    """Alignment of the sensor's angular rates with the gyroscope, and these rates. held: known extrinsics."""
     rates = pose_rates(stream)
     return align_trajectory(imu, stream.name, rates, held), rates
 
 
 def _fit_to_imu(imu: ImuData, stream: PoseStream, gravity: float, held: KnownExtrinsics) -> tuple[TrajectoryFit, float]:
-    """Extrinsics and IMU trajectory from poses and IMU, and the unexplained share of the motion. Raises EstimationError
-    if they contradict, or the poses are too few."""
+    """Extrinsics and IMU trajectory from poses and IMU, and the share of the motion that they do not explain. Raises
+    EstimationError if poses and IMU contradict each other, or poses are too few."""
     aligned, rates = _aligned(imu, stream, held)
     trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
     trajectory = trajectory.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
@@ -200,7 +201,7 @@ def _fit_to_imu(imu: ImuData, stream: PoseStream, gravity: float, held: KnownExt
 
 
 def _position_rotation_by_imu(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> np.ndarray | None:
-    """See `rotation_of_positions`, from the readings of the IMU."""
+    """`rotation_of_positions` with the readings of the IMU as reference."""
     aligned, _ = _aligned(imu, stream, held)
     trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
     trajectory = trajectory.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
@@ -216,7 +217,7 @@ def _position_rotation_by_imu(imu: ImuData, stream: PoseStream, held: KnownExtri
 def _position_rotation_on_trajectory(
     imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics
 ) -> np.ndarray | None:
-    """See `rotation_of_positions`, from the trajectory `known`."""
+    """`rotation_of_positions` with the trajectory `known` as reference."""
     aligned, _ = _aligned(imu, stream, held)
     trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
     trajectory = trajectory.only((t >= known.seconds[0]) & (t <= known.seconds[-1]))
@@ -232,8 +233,8 @@ def _position_rotation_on_trajectory(
 def _check_scale(
     imu: ImuData, name: str, trajectory: SensorTrajectory, aligned: RateAlignment, found: TrajectoryFit
 ) -> None:
-    """Raises EstimationError if the accelerometer contradicts the scale of positions, which is estimated with the lever
-    arm; see `scale_by_accelerometer`."""
+    """Raise EstimationError if the accelerometer contradicts the scale of positions. The scale is estimated together
+    with the lever arm; see `scale_by_accelerometer`."""
     gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), trajectory.seconds + aligned.offset
 
     def rows_at(position: np.ndarray) -> LeverArmRows:
@@ -254,14 +255,15 @@ def _check_scale(
 def _fit_to_trajectory(
     imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics
 ) -> tuple[ExtrinsicsGuess, float]:
-    """See `extrinsics_on_trajectory`."""
+    """`extrinsics_on_trajectory` for a stream of poses."""
     return extrinsics_on_trajectory(imu, stream.name, _trajectory(stream), known, held)
 
 
 def _frames(
     imu: ImuData, sensor: PoseSensor, stream: PoseStream, known: State, values: dict[Key, np.ndarray]
 ) -> dict[Key, np.ndarray]:
-    """Frame of absolute poses in the world of each recording: mean rotation (chordal), median origin over all poses."""
+    """Pose of the frame of absolute poses in the world, by recording: chordal mean of the rotations and median of the
+    origins over all poses. Raises EstimationError without poses in a recording."""
     out: dict[Key, np.ndarray] = {}
     R_is, p_is, _ = (values[sensor.name, name] for name in MOUNTED_NAMES)
     t = instants(stream, values)
@@ -279,6 +281,6 @@ def _frames(
 
 
 def _keyframes(state: State, own: slice) -> State:
-    """The state with the keyframes `own` alone."""
+    """The state with only the keyframes `own`, as one recording."""
     columns = {name: getattr(state, name)[own] for name in ("seconds", "rotation", "position", "velocity", "bias")}
     return replace(state, **columns, starts=(0,))

@@ -1,4 +1,4 @@
-"""Initial noise of poses, before any estimate."""
+"""Initial noise of poses, before any estimation."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from icalib.data.measurements import PoseStream
 from icalib.geometry import so3
 from icalib.initialize.steps.smooth_trajectory import smooth_trajectory
 
-MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute value
+MAD_TO_SIGMA = 1.4826  # ratio of the standard deviation of normal noise to its median absolute value
 
 
 def pose_noise(streams: Sequence[PoseStream]) -> tuple[float, float]:
-    """Standard deviations of rotation [rad] and position [m] about a smooth trajectory, of the noisiest axis."""
+    """Standard deviations of rotation [rad] and position [m] from a smooth trajectory, each for the noisiest axis."""
     rotations, offsets = [], []
     for s in streams:
         smooth = smooth_trajectory(s.seconds, s.rotation, s.position, s.seconds, narrow=True)

@@ -1,4 +1,4 @@
-"""Pairs of poses of two sensors that were taken at the same stop of a robot."""
+"""Matches poses of two sensors that were taken at the same stop of a robot."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from icalib.data.checks.stops import moved
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.motion.keyframe_placement import MERGED_WITHIN_S
 
-MAX_CLOCK_OFFSET_S = 0.2  # between the clocks: a sensor must be at rest for so long before and after an instant
-MAX_REST_GAP_S = 2.0  # between the poses that show whether a sensor is at rest
-MAX_REST_MOTION = 0.03  # between these poses, as a share of the median motion between random poses
-MAX_STOP_SHARE = 0.2  # of the time between stops: stamps nearer than this belong to one stop
-MIN_STOP_INTERVAL_S = 1.0  # median step between poses that were taken at stops only
+MAX_CLOCK_OFFSET_S = 0.2  # largest clock offset; a sensor must be at rest this long before and after an instant
+MAX_REST_GAP_S = 2.0  # longest gap between the two poses that decide whether a sensor is at rest
+MAX_REST_MOTION = 0.03  # largest motion between these poses, as a share of the median motion between random poses
+MAX_STOP_SHARE = 0.2  # share of the time between stops; stamps closer than this belong to the same stop
+MIN_STOP_INTERVAL_S = 1.0  # least median step between poses of a sensor that measures at stops only
 N_MOTION_SAMPLES = 500  # pairs of random poses
 
 
 def matched_poses(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n,) of poses of the body, increasing, and (n,) of poses of the sensor that form pairs, both on one
+    """Indices (n,) of poses of the body, increasing, and indices (n,) of the matching poses of the sensor, on one
     clock.
 
-    Pairs have the same stamps. If most poses have no such partner: pairs around which the sensor with more poses is at
-    rest, or mutually nearest poses if both sensors have poses at stops only.
+    A match has the same stamps. If most poses have no such match, there are two cases. If both sensors have poses at
+    stops only, mutually nearest poses match. Otherwise they match if the sensor with more poses is at rest around them.
     """
     i, k = _mutually_nearest(body, sensor)
     apart = np.abs(body.seconds[i] - sensor.seconds[k])
@@ -39,7 +39,7 @@ def matched_poses(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, np.nd
 
 
 def _mutually_nearest(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n,) and (n,) of poses that are each other's nearest in time."""
+    """Indices (n,) of poses of the body and (n,) of the sensor that are mutually nearest in time."""
     k = np.searchsorted(0.5 * (sensor.seconds[1:] + sensor.seconds[:-1]), body.seconds)
     i = np.searchsorted(0.5 * (body.seconds[1:] + body.seconds[:-1]), sensor.seconds)
     own = np.flatnonzero(i[k] == np.arange(len(k)))
@@ -47,7 +47,7 @@ def _mutually_nearest(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, n
 
 
 def _is_at_rest(own: BodyPoses, seconds: np.ndarray) -> np.ndarray:
-    """(n,) whether a sensor is at rest at `seconds` (n,): its poses just outside +- MAX_CLOCK_OFFSET_S are at most
+    """(n,) whether a sensor is at rest at `seconds` (n,). Its poses just outside +- MAX_CLOCK_OFFSET_S must be at most
     MAX_REST_GAP_S apart and nearly equal."""
     last = len(own.seconds) - 1
     before = np.clip(np.searchsorted(own.seconds, seconds - MAX_CLOCK_OFFSET_S, side="right") - 1, 0, last)

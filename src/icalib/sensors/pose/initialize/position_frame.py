@@ -16,15 +16,16 @@ import numpy as np
 
 from icalib.initialize.trajectories.lever_arm_rows import LeverArmRows
 
-MAX_AXES_ERROR = 0.35  # largest difference of an entry: rotations within 20 deg of exchanged axes are taken for these
-MIN_POLAR_RATIO = 0.5  # smallest over largest singular value of M: 1 for a rotation
-MIN_FRAME_ROWS = 40  # three times the 13 regressors
+MAX_AXES_ERROR = 0.35  # largest entry of the difference from an exchange of axes: within 20 deg, C is replaced by it
+MIN_POLAR_RATIO = 0.5  # least ratio of smallest to largest singular value of M; 1 for a rotation
+MIN_FRAME_ROWS = 40  # least number of measurements, three times the 13 regressors
 IDENTITY = np.eye(3)
 
 
 def rotation_of_positions(rows: LeverArmRows, R_world_frame: np.ndarray = IDENTITY) -> np.ndarray | None:
-    """Estimated rotation C (3, 3) from the frame of positions to that of rotations; None if it is the identity, not a
-    rotation, or rows are few. R_world_frame (3, 3): rotation from the frame of rotations to the axes of the rows."""
+    """Estimated rotation C (3, 3) from the frame of positions to that of rotations. None if it is the identity, if the
+    regression does not give a rotation, or if there are few rows. R_world_frame (3, 3): rotation from the frame of
+    rotations to the axes of the rows."""
     from_imu, n = rows.motion - rows.b, len(rows.b)
     X = np.concatenate([from_imu, rows.A[:, :, 3:6].reshape(n, 9), rows.A[:, 0, 6:7]], axis=1)
     if n < MIN_FRAME_ROWS:
@@ -42,7 +43,7 @@ def rotation_of_positions(rows: LeverArmRows, R_world_frame: np.ndarray = IDENTI
 
 
 def nearest_axes(C: np.ndarray) -> np.ndarray:
-    """The nearest of the 24 rotations that exchange axes, if C (3, 3) is near one; else C."""
+    """The nearest of the 24 rotations that exchange axes, if C (3, 3) is close to one; otherwise C."""
     cube = [
         np.diag(signs)[list(order)]
         for order in permutations(range(3))
@@ -54,7 +55,7 @@ def nearest_axes(C: np.ndarray) -> np.ndarray:
 
 
 def axes_text(C: np.ndarray) -> str | None:
-    """C (3, 3) as `position_axes` in the rig file; None if it does not exchange axes."""
+    """C (3, 3) as `position_axes` in the rig file; None if it is not an exchange of axes."""
     if not np.allclose(np.abs(C).max(axis=1), 1.0):
         return None
     entries = [("-" if row.min() < -0.5 else "") + "xyz"[int(np.argmax(np.abs(row)))] for row in C]

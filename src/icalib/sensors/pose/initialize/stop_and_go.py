@@ -1,8 +1,9 @@
-"""Stop-and-go recordings: a robot stands still at each pose, and two sensors measure its pose there (hand-eye).
+"""Hand-eye calibration from stop-and-go recordings: a robot stands still at each pose, and two sensors measure it
+there.
 
-No motion is assumed between poses, so that time offsets cannot be estimated. Pairs of poses have the same stamps, or
-were taken while the robot stood still. The body is the sensor that gives the trajectory: the cameras that see a target,
-or the first pose sensor.
+No motion is assumed between poses, so that time offsets are unobservable. Pairs of poses have the same stamps, or were
+taken during the same stop. The body is the sensor that gives the trajectory: the cameras that observe a target, or the
+first pose sensor.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ from icalib.sensors.pose.initialize.conventions import with_checked_convention
 from icalib.sensors.pose.initialize.pose_pairs import matched_poses
 from icalib.sensors.sensor import MOUNTED_NAMES
 
-MIN_POSE_PAIRS = 3  # of one recording: two motions with different axes, the least for hand-eye
-NO_ROTATION_DEG = 1e-3  # median between poses of a sensor that reports no rotations; noise is larger
+MIN_POSE_PAIRS = 3  # pairs in one recording; hand-eye calibration needs two motions about different axes
+NO_ROTATION_DEG = 1e-3  # smaller median rotation between poses: the sensor reports no rotations (noise is larger)
 ADVICE = (
     "give both the same stamps where they belong together, stand still for half a second around each, or record while "
     "moving, at 10 Hz or more"
@@ -48,8 +49,8 @@ ADVICE = (
 
 
 def is_stop_and_go(rig: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses]) -> bool:
-    """Whether body or pose sensors stood still at all their poses, and the rig has no other sensors. shown: poses of
-    the body in each recording."""
+    """Whether the body or a pose sensor stood still at all its poses, and the rig has only cameras and pose sensors.
+    shown: poses of the body in each recording."""
     others = {s.sensor_type for s in rig.mounted} - {"camera", "pose"}
     if others or (rig.cameras and rig.moves_by_poses):
         return False
@@ -61,7 +62,8 @@ def state_from_pairs(
     rig: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], cameras: dict[Key, np.ndarray]
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     """Inputs, initial state and its values from pairs of poses. shown: poses of the body in each recording; cameras:
-    values of the cameras. Time offsets are those of the rig file, or 0. Raises EstimationError if pairs are too few."""
+    parameters of the cameras. Time offsets are those of the rig file, or 0. Raises EstimationError if pairs are too
+    few, or a pose sensor is relative."""
     relative = next((s for s in rig.poses if s.kind == "relative"), None)
     if relative is not None:
         raise EstimationError(
@@ -86,14 +88,14 @@ def state_from_pairs(
 
 
 def _with_known_clock(sensor: PoseSensor, is_body: bool) -> PoseSensor:
-    """The sensor with its time offset fixed; the body also with identity extrinsics."""
+    """The sensor with its time offset fixed; the body also gets the identity as fixed extrinsics."""
     offset = np.zeros(1) if sensor.time_offset.value is None else sensor.time_offset.value
     known = replace(sensor, time_offset=fixed(offset), clock_restarts=False)
     return replace(known, rotation=fixed(np.eye(3)), translation=fixed(np.zeros(3))) if is_body else known
 
 
 def _state(inputs: Inputs, shown: Sequence[BodyPoses], found: dict[Key, np.ndarray]) -> State:
-    """The state at rest, with the nearest pose of the body at each keyframe."""
+    """The state at rest: each keyframe has the nearest pose of the body and zero velocity."""
     values = start_values(inputs, found)
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     t = np.concatenate([own.seconds + part.begin for own, part in zip(shown, inputs.parts, strict=True)])
@@ -104,8 +106,8 @@ def _state(inputs: Inputs, shown: Sequence[BodyPoses], found: dict[Key, np.ndarr
 
 @dataclass(frozen=True)
 class _PairedPoses:
-    """Pairs of poses of body and sensor in one recording. stream: the paired poses of the sensor, with stamps of the
-    body; counts: numbers of all poses of body and sensor."""
+    """Paired poses of body and sensor in one recording. stream: the paired poses of the sensor with stamps of the body;
+    counts: total numbers of poses of body and sensor."""
 
     pairs: PosePairs
     stream: PoseStream
@@ -115,8 +117,8 @@ class _PairedPoses:
 def _with_extrinsics(
     rig: Rig, index: int, recordings: list[Measurements], shown: Sequence[BodyPoses]
 ) -> tuple[list[Measurements], dict[Key, np.ndarray]]:
-    """Recordings with paired inlier poses of the sensor number `index` alone; and values of its extrinsics and frames.
-    The recording with most pairs gives the extrinsics."""
+    """Recordings that keep only paired inlier poses of the sensor number `index`, and values of its extrinsics and
+    frames. The extrinsics come from the recording with most pairs."""
     sensor = rig.poses[index]
     paired = []
     for m, own in zip(recordings, shown, strict=True):
@@ -140,14 +142,14 @@ def _with_extrinsics(
 
 
 def _with_inliers(rig: Rig, sensor: PoseSensor, own: _PairedPoses, bad: np.ndarray, m: Measurements) -> Measurements:
-    """The recording with the paired poses of a sensor that are not `bad` (n,), and notes."""
+    """The recording with the paired poses of one sensor, except the outliers `bad` (n,) bool, and with notes."""
     good = np.flatnonzero(~bad)
     columns = {name: getattr(own.stream, name)[good] for name in ("stamps_ns", "rotation", "position")}
     return replace(m.with_streams(replace(own.stream, **columns)), notes=(*m.notes, *_notes(rig, sensor, own, bad, m)))
 
 
 def _notes(rig: Rig, sensor: PoseSensor, own: _PairedPoses, bad: np.ndarray, m: Measurements) -> list[str]:
-    """Notes on the pairs, and on rejected poses `bad` (n,)."""
+    """Notes on the number of pairs, and on the rejected poses `bad` (n,) bool."""
     n = len(own.stream.stamps_ns)
     words = [
         f"{n} poses of {sensor.name} were taken at rest, each together with one of the {own.counts[0]} of "
@@ -164,7 +166,7 @@ def _notes(rig: Rig, sensor: PoseSensor, own: _PairedPoses, bad: np.ndarray, m: 
 
 
 def _paired_poses(rig: Rig, sensor: PoseSensor, m: Measurements, stream: PoseStream, shown: BodyPoses) -> _PairedPoses:
-    """Pairs of poses in one recording. Raises EstimationError if they are too few."""
+    """Matching poses of body and sensor in one recording. Raises EstimationError if they are too few."""
     assert sensor.time_offset.value is not None
     offset = float(sensor.time_offset.value[0])
     seconds = (stream.stamps_ns - m.origin_ns) * 1e-9 + offset
@@ -183,7 +185,7 @@ def _paired_poses(rig: Rig, sensor: PoseSensor, m: Measurements, stream: PoseStr
 
 def _hand_eye(rig: Rig, sensor: PoseSensor, own: _PairedPoses) -> HandEye:
     """Hand-eye solution of one recording. Raises EstimationError if motions of body and sensor disagree, or agree only
-    in another convention of poses."""
+    with another convention of poses."""
     R, p = sensor.rotation.value, sensor.translation.value
     start = (
         None if R is None and p is None else Extrinsics(np.eye(3) if R is None else R, np.zeros(3) if p is None else p)

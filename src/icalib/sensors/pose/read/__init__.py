@@ -1,4 +1,4 @@
-"""Poses: tables, topics of poses or odometry, chains of transforms -> a checked stream."""
+"""Reads poses from tables, topics of poses or odometry, or chains of transforms, and checks them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
 
 
 def _is_one(path: Path) -> bool:
-    """Whether a `poses.csv` is a table of poses: other sensors have tables of that name."""
+    """Whether a file named `poses.csv` contains poses, as tables of other sensors may have this name."""
     return is_tum_text(path) or holds(path, POSE_TABLE)
 
 
@@ -65,7 +65,7 @@ TABLES = (
 
 
 def read(recording: Recording, sensors: Sequence[PoseSensor], reading: Reading) -> list[ReadStream]:
-    """The checked streams, and notes. Raises RecordingError as `readings` and `checked_poses`."""
+    """The checked streams, with notes. Raises RecordingError as `readings` and `checked_poses` do."""
     found = []
     for sensor in sensors:
         where = recording.where(sensor)
@@ -75,11 +75,11 @@ def read(recording: Recording, sensors: Sequence[PoseSensor], reading: Reading) 
 
 
 def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
-    """All poses as recorded, from a chain of transforms, a table (which may be beside a bag), or a topic. Stamps may
-    repeat or run backwards.
+    """All poses as recorded, from a chain of transforms, a table (which may be next to a bag), or a topic. Stamps may
+    repeat or decrease.
 
-    Raises RecordingError naming file and line, or topic, if the data are missing or cannot be read, and the instant of
-    an invalid rotation.
+    Raises RecordingError if the data are missing or cannot be read, naming file and line, or topic. It names the
+    instant of an invalid rotation.
     """
     if sensor.frames is not None:
         if not recording.has_messages:
@@ -98,7 +98,7 @@ def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
 
 
 def where(recording: Recording, sensor: PoseSensor) -> str:
-    """File or topic of the poses, for sentences."""
+    """Words for the file or topic of the poses."""
     if _is_table(recording, sensor):
         return str(recording.table(sensor, sensor.path))
     return recording.place(_topic(recording, sensor).name)
@@ -112,7 +112,7 @@ def _is_table(recording: Recording, sensor: PoseSensor) -> bool:
 
 
 def _topic(recording: Recording, sensor: PoseSensor) -> TopicInfo:
-    """Topic of poses, odometry, or transforms."""
+    """The topic of poses or odometry; the topic of transforms if the sensor has `frames`."""
     if sensor.frames is not None:
         return recording.topic(sensor.name, sensor.topic or DEFAULT_TOPIC, TRANSFORMS)
     refuse_without_frames(recording.root, recording.topics(), sensor)

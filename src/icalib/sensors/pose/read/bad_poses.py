@@ -1,7 +1,7 @@
-"""Bad poses: invalid ones, copies of earlier ones, and poses off the trajectory of the others.
+"""Detects bad poses: invalid poses, copies of earlier poses, and poses off the trajectory.
 
-Poses are cut into pieces at jumps. The trajectory is the chain of continuous pieces with most poses (dynamic
-programming). A chain may omit pieces, or keep a jump at a price.
+Poses are cut into pieces at jumps. The trajectory is the chain of continuous pieces with most poses, found by dynamic
+programming. A chain may omit pieces, or accept a jump at a cost.
 """
 
 from __future__ import annotations
@@ -13,22 +13,23 @@ import numpy as np
 
 from icalib.geometry import so3
 
-MAX_COORDINATE_M = 1e9  # larger ones are no positions on Earth, whose radius is 6e6 m
-# A step is a jump if it differs from its neighbours by more than each of these:
+MAX_COORDINATE_M = 1e9  # larger coordinates are invalid; the Earth's radius is 6e6 m
+# A step is a jump if its difference from neighbouring steps exceeds all three of these:
 _MIN_JUMP_M, _MIN_JUMP_RAD = 0.05, 0.05
-_MAX_ACCELERATION = 10.0  # m/s^2, rad/s^2, times the square of the step
-_JUMP_MEDIANS = 20.0  # medians of this difference over all steps
-_MIN_KEPT_SHARE = 0.1  # of all poses, as the price of a jump: so many poses are not omitted to avoid it
-_MAX_OMITTED_PIECES = 200  # in a row: bounds the time
-_MAX_COPY_AGE_S = 1.0  # between a pose and its copy
-_MIN_MOVING_SPEED = 0.2  # of the median speed; a slower sensor may stand still and repeat its pose
-_MIN_GAP_STEPS = 2.0  # median steps; over a longer step the motion may have changed
+_MAX_ACCELERATION = 10.0  # m/s^2, rad/s^2; multiplied by the squared median time step
+_JUMP_MEDIANS = 20.0  # in medians of this difference over all steps
+_MIN_KEPT_SHARE = 0.1  # cost of a jump in a chain, as a share of all poses: no more poses are omitted to avoid it
+_MAX_OMITTED_PIECES = 200  # largest number of consecutive omitted pieces; limits the computing time
+_MAX_COPY_AGE_S = 1.0  # longest time between a pose and its copy
+_MIN_MOVING_SPEED = 0.2  # share of the median speed; a slower sensor may be at rest and repeat its pose
+_MIN_GAP_STEPS = 2.0  # in median time steps; over a longer step the motion may have changed
 
 
 @dataclass(frozen=True)
 class ContinuousPoses:
-    """The trajectory among N poses. on (N,): its poses; jumps (M,): first pose after each jump; size_m, size_rad: of
-    the largest; lasting_m: sum of the jumps that stay in the trajectory; longest_s: longest gap by omitted poses."""
+    """The trajectory among N poses. on (N,) bool: whether a pose is on it; jumps (M,): index of the first pose after
+    each jump; size_m, size_rad: size of the largest jump; lasting_m: length of the sum of jumps that stay in the
+    trajectory [m]; longest_s: longest gap that omitted poses leave [s]."""
 
     on: np.ndarray
     jumps: np.ndarray
@@ -39,15 +40,15 @@ class ContinuousPoses:
 
 
 def are_poses(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(N,) whether rotations (N, 3, 3) and positions (N, 3) [m] are finite and plausible."""
+    """(N,) bool: whether rotations (N, 3, 3) and positions (N, 3) [m] are finite and plausible."""
     values = np.hstack([position, rotation.reshape(-1, 9)])
     return np.logical_and.reduce(np.abs(values) < MAX_COORDINATE_M, axis=1)
 
 
 def stale_copies(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(N,) whether a pose equals an earlier one in every digit while the sensor moves, as of a lost tracker, or a
-    driver that repeats its last pose. A sensor at rest without noise repeats its pose as well; the speed afterwards
-    decides."""
+    """(N,) bool: whether a pose equals an earlier one in every digit while the sensor moves. A lost tracker, or a
+    driver that repeats its last pose, causes such copies. A noise-free sensor at rest repeats its pose as well, so that
+    the speed afterwards decides."""
     before = _same_before(np.hstack([position, rotation.reshape(-1, 9)]))
     copy = (before >= 0) & (seconds - seconds[before] <= _MAX_COPY_AGE_S)
     own = np.flatnonzero(~copy)
@@ -57,7 +58,7 @@ def stale_copies(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
     for i in np.flatnonzero(copy).tolist():
         first[i] = first[before[i]]
     after = np.searchsorted(own, np.arange(len(seconds)), side="right")
-    # At the end no pose follows, so the step to the repeated pose decides.
+    # If no new pose follows, the step to the repeated pose decides.
     ends = after == len(own)
     a = np.where(ends, np.maximum(first - 1, 0), first)
     b = np.where(ends, first, own[np.minimum(after, len(own) - 1)])
@@ -70,7 +71,7 @@ def stale_copies(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
 
 
 def _same_before(rows: np.ndarray) -> np.ndarray:
-    """(N,) number of the last earlier row that equals each row (N, k) in every digit, -1 if there is none."""
+    """(N,) index of the last earlier row that equals each row (N, k) in every digit; -1 if there is none."""
     words = np.ascontiguousarray(rows).view(np.uint64)
     odd = np.random.default_rng(0).integers(1, 2**63, words.shape[1], dtype=np.uint64) * np.uint64(2) + np.uint64(1)
     key = (words * odd).sum(axis=1, dtype=np.uint64)
@@ -82,7 +83,7 @@ def _same_before(rows: np.ndarray) -> np.ndarray:
 
 
 def continuous_poses(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> ContinuousPoses:
-    """The trajectory of N poses at seconds (N,), and its jumps."""
+    """The trajectory and the jumps among N poses at seconds (N,)."""
     step, n = np.diff(seconds), len(seconds)
     way, turn = (
         _Steps.of(np.diff(position, axis=0), step, _MIN_JUMP_M),
@@ -122,9 +123,9 @@ def continuous_poses(seconds: np.ndarray, rotation: np.ndarray, position: np.nda
 
 @dataclass(frozen=True)
 class _Steps:
-    """Steps from pose to pose, of positions [m] or rotations [rad]. size (N - 1,): difference from the median of the
-    neighbouring steps; jump (N - 1,); limit: largest size without a jump; rate (N, 3): around each pose [1/s]; fastest:
-    largest rate without jumps; usual_s: median step."""
+    """Steps between successive poses, of positions [m] or rotations [rad]. size (N - 1,): difference from the median of
+    neighbouring steps; jump (N - 1,) bool; limit: largest size of a step that is not a jump; rate (N, 3): rate around
+    each pose [m/s, rad/s]; fastest: largest rate without jumps; usual_s: median time step [s]."""
 
     size: np.ndarray
     jump: np.ndarray
@@ -143,22 +144,22 @@ class _Steps:
         steady = np.flatnonzero(~jump & ~gap)
         fastest = float(np.linalg.norm(rate[steady], axis=1).max(initial=0.0))
         jump |= gap & (size > limit + 2.0 * fastest * step)
-        if len(steady):  # about a jump the rate is that of the steps before and after
+        if len(steady):  # at a jump, the rate is interpolated from the steps before and after
             rate = np.stack([np.interp(np.arange(len(rate)), steady, own) for own in rate[steady].T], axis=1)
         rate = _medians(np.concatenate([rate[:1], rate]))
         return cls(size, jump, limit, rate, fastest, usual)
 
     def left(self, dt: np.ndarray, change: np.ndarray, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Change (n, 3) from poses i to j over dt (n,) [s] less that at constant rate (n, 3), and whether it is a jump
-        (n,)."""
+        """Change (n, 3) between poses i and j, given with its duration dt (n,) [s], minus that of motion at constant
+        rate; and whether it is a jump (n,) bool."""
         left = change - 0.5 * (self.rate[i] + self.rate[j]) * dt[:, None]
         allowed = self.limit + self.fastest * np.maximum(dt - 1.5 * self.usual_s, 0.0)
         return left, np.linalg.norm(left, axis=1) > allowed
 
 
 def _longest_chain(cuts: np.ndarray, price: float, apart: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-    """Numbers (k,), increasing, of the pieces of the chain with most poses, less the `price` of each jump in it. Piece
-    k has the poses cuts[k]:cuts[k + 1]; apart: whether a jump lies between poses (n,) and (n,)."""
+    """Indices (k,), increasing, of the pieces in the best chain: most poses minus the `price` of each jump in it. Piece
+    k has the poses cuts[k]:cuts[k + 1]. apart: whether a jump lies between poses (n,) and (n,)."""
     m = len(cuts) - 1
     best, before = np.diff(cuts).astype(float), np.full(m, -1)
     for k in range(1, m):
@@ -175,17 +176,17 @@ def _longest_chain(cuts: np.ndarray, price: float, apart: Callable[[np.ndarray, 
 
 
 def _medians(steps: np.ndarray) -> np.ndarray:
-    """(n, 3) running medians of steps (n, 3) over 5 steps."""
+    """(n, 3) running medians of steps (n, 3) with a window of 5."""
     padded = np.pad(steps, ((2, 2), (0, 0)), mode="reflect")
     return np.median(np.stack([padded[k : k + len(steps)] for k in range(5)]), axis=0)
 
 
 def _rotation_steps(rotation: np.ndarray) -> np.ndarray:
-    """(N - 1, 3) rotation vectors from pose to pose, in axes of the sensor [rad]."""
+    """(N - 1, 3) rotation vectors between successive poses, in axes of the sensor [rad]."""
     return so3.log_many(np.ascontiguousarray(rotation[:-1].transpose(0, 2, 1) @ rotation[1:]))
 
 
 def _angles(rotation: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n,) angles [rad] between rotations number a (n,) and b (n,)."""
+    """(n,) rotation angles [rad] between poses with indices a (n,) and b (n,)."""
     turns = so3.log_many(np.ascontiguousarray(rotation[a].transpose(0, 2, 1) @ rotation[b]))
     return np.linalg.norm(turns, axis=1)

@@ -1,4 +1,4 @@
-"""Checks of poses: one moving sensor, in metres, in one static frame."""
+"""Checks of recorded poses: they must be of one moving sensor, in metres, in one static frame."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from icalib.sensors.pose.read.bad_poses import are_poses, continuous_poses, stal
 from icalib.sensors.pose.read.outliers import single_outliers
 from icalib.sensors.pose.read.pose_tables import POSE_RATE_HZ, PoseReadings
 
-_MAX_SPEED = 100.0  # m/s, median: a higher one is a wrong unit of length or time
-_MAX_INVALID_SHARE = 0.5  # of all poses; with more, the writer is wrong
-# Jumps return if they add up to less than the larger of: metres, share of the largest jump.
+_MAX_SPEED = 100.0  # m/s; a higher median speed means a wrong unit of length or time
+_MAX_INVALID_SHARE = 0.5  # share of all poses; with more, the writing program is faulty
+# Jumps cancel if the length of their sum is below the larger of these: metres, share of the largest jump.
 _MAX_LASTING_M, _MAX_LASTING_SHARE = 0.05, 0.5
-_MIN_TRAVEL_M, _MIN_TRAVEL_RAD = 0.02, 0.02  # largest displacement and rotation; less is a sensor at rest
+_MIN_TRAVEL_M, _MIN_TRAVEL_RAD = 0.02, 0.02  # a sensor with smaller largest displacement and rotation is at rest
 
 
 def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[PoseStream, tuple[str, ...]]:
-    """The poses with strictly increasing stamps, without single bad ones, and notes on what was left out or looks odd.
+    """The poses with strictly increasing stamps and without single bad poses, and notes on removed or suspicious data.
 
-    Raises RecordingError naming `where` and the instant: too few poses, mostly none, stamps out of order or repeated
-    with other values, other units of time or length, standing still, and of absolute poses a frame that jumps.
+    Raises RecordingError naming `where` and the instant if poses are too few or mostly invalid, or stamps are out of
+    order or repeated with other values. It is also raised for wrong units of time or length, a sensor at rest, or jumps
+    of the frame of absolute poses.
     """
     what = f"{where} ({read.name})"
     if len(read.stamps_ns) < 3:
@@ -37,10 +38,10 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     read = read.some(kept)
     copied, single, jumped = (), (), ()
     if not stands_still_between(read.seconds, read.rotation, read.position):
-        # The controller of a robot at rest repeats its pose in every digit.
+        # The controller of a robot at rest repeats its pose in every digit, which is not a stale copy.
         read, copied = _without_copies(read, what)
     if not stands_still_between(read.seconds, read.rotation, read.position):
-        # Steps between the stops of a robot are no jumps.
+        # The steps between stops of a robot are not jumps.
         read, single = _without_outliers(read, what)
         read, jumped = _on_trajectory(read, sensor, what)
     _refuse_stillness(read, what)
@@ -50,7 +51,7 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
 
 
 def _without_invalid(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    """Valid poses, and a note on the others. Raises RecordingError if most are invalid."""
+    """Valid poses, and a note on removed ones. Raises RecordingError if most are invalid."""
     good = are_poses(read.rotation, read.position)
     if good.all():
         return read, ()
@@ -67,7 +68,7 @@ def _without_invalid(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple
 
 
 def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    """Poses without stale copies, and a note."""
+    """Poses without stale copies, and a note if any was removed."""
     stale = stale_copies(read.seconds, read.rotation, read.position)
     if not stale.any():
         return read, ()
@@ -79,7 +80,7 @@ def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
 
 
 def _without_outliers(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    """Poses without single outliers, and a note."""
+    """Poses without single outliers, and a note if any was removed."""
     wrong = single_outliers(read.seconds, read.rotation, read.position)
     if not wrong.any():
         return read, ()
@@ -90,7 +91,7 @@ def _without_outliers(read: PoseReadings, what: str) -> tuple[PoseReadings, tupl
 
 
 def _on_trajectory(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    """Poses on the trajectory, and a note on jumps. Raises RecordingError if jumps of absolute poses do not return."""
+    """Poses on the trajectory, and a note on jumps. Raises RecordingError if jumps of absolute poses do not cancel."""
     path = continuous_poses(read.seconds, read.rotation, read.position)
     if not len(path.jumps):
         return read, ()
@@ -111,7 +112,7 @@ def _on_trajectory(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[P
 
 
 def _refuse_stillness(read: PoseReadings, what: str) -> None:
-    """Raises RecordingError if the sensor does not move."""
+    """Raise RecordingError if the sensor does not move."""
     far = np.linalg.norm(read.position - np.median(read.position, axis=0), axis=1).max()
     turned = _sizes(so3.log_many(np.ascontiguousarray(read.rotation[0].T @ read.rotation))).max()
     if far < _MIN_TRAVEL_M and turned < _MIN_TRAVEL_RAD:
@@ -122,7 +123,7 @@ def _refuse_stillness(read: PoseReadings, what: str) -> None:
 
 
 def _refuse_units(read: PoseReadings, what: str) -> None:
-    """Raises RecordingError if the speed is implausible."""
+    """Raise RecordingError if the speed is implausible."""
     step = np.diff(read.stamps_ns) * 1e-9
     speed = float(np.median(np.linalg.norm(np.diff(read.position, axis=0), axis=1) / step))
     if speed > _MAX_SPEED:

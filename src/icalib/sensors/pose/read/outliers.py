@@ -1,9 +1,10 @@
-"""Single outliers among poses (Hampel filter).
+"""Detects single outliers among poses (Hampel filter).
 
-The distance of a pose from a cubic through two poses on each side is compared with the running median of distances.
-An outlier bends the cubics of its neighbours as well. Poses with large distances are therefore candidates at first. In
-a second step candidates and their neighbours are compared with the cubic through other poses. A single outlier is far
-from it, and its neighbours are not. At a kink of the motion, as when a robot starts, all of them are.
+The distance of a pose from a cubic through two poses on each side is compared with the running median of such
+distances. An outlier distorts the cubics of its neighbours as well, so that poses with large distances are only
+candidates. Candidates and their neighbours are then compared with a cubic through other poses. A single outlier is far
+from this cubic, and its neighbours are close to it. Where the motion changes suddenly, such as at the start of a robot,
+all of them are far from it.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from scipy.ndimage import median_filter
 from icalib.geometry import so3
 from icalib.geometry.cubic import lagrange_weights
 
-_OUTLIER_MEDIANS = 6.0  # median distances: about 9 standard deviations, which noise does not reach
-_MEDIAN_WINDOW = 51  # poses: motion and noise change over a recording
-_MIN_OUTLIER = (1e-3, 1e-3)  # m, rad: for poses without noise
-# Neighbours of an outlier may be so far off: share of its distance, or of the limit.
+_OUTLIER_MEDIANS = 6.0  # in median distances: about 9 standard deviations, which noise does not reach
+_MEDIAN_WINDOW = 51  # window in poses, as motion and noise change over a recording
+_MIN_OUTLIER = (1e-3, 1e-3)  # m, rad; least distance of an outlier, for poses without noise
+# Largest distance of an outlier's neighbours, as a share of its distance, or of the limit.
 _MAX_NEIGHBOUR_DISTANCE, _MAX_NEIGHBOUR_LIMIT = 0.2, 0.5
-_MAX_CUBIC_STEPS = 12.0  # median steps from the first to the last of the four poses; over a gap a cubic is inaccurate
-_EVEN_VARIANCE = 1.0 + 34.0 / 36.0  # variance of a distance over that of a pose, if all five are evenly spaced
-_MAX_OUTLIERS = 0.1  # of all poses; more are no single outliers
+_MAX_CUBIC_STEPS = 12.0  # in median steps, from first to last of the four poses; longer cubics are inaccurate
+_EVEN_VARIANCE = 1.0 + 34.0 / 36.0  # ratio of the variances of a distance and of a pose, for five evenly spaced poses
+_MAX_OUTLIERS = 0.1  # share of all poses; if there are more, none is a single outlier
 
 
 def single_outliers(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(N,) whether each pose is a single outlier."""
+    """(N,) bool: whether each pose is a single outlier."""
     n = len(seconds)
     wrong = np.zeros(n, dtype=bool)
     if n < _MEDIAN_WINDOW:
@@ -50,8 +51,9 @@ def single_outliers(seconds: np.ndarray, rotation: np.ndarray, position: np.ndar
 def _distances(
     poses: tuple[np.ndarray, np.ndarray, np.ndarray], knots: np.ndarray, asked: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (n, 2) [m, rad] of the poses number `asked` (n,) from the cubic through the nearest two of `knots` (m,)
-    on each side, 0 if there are fewer; and the ratio (n,) of their noise to that of evenly spaced poses."""
+    """Distances (n, 2) [m, rad] of the poses with indices `asked` (n,) from a cubic through the two nearest of `knots`
+    (m,) on each side. The distance is 0 if there are fewer knots. The second value (n,) is the ratio of their noise to
+    that for evenly spaced poses."""
     t, R, p = poses
     left, right = np.searchsorted(knots, asked), np.searchsorted(knots, asked, side="right")
     found = (left >= 2) & (right <= len(knots) - 2)

@@ -1,4 +1,4 @@
-"""Poses of a sensor as recorded, and their readers from tables: CSV, and TUM text."""
+"""Recorded poses of a sensor, and their reader for tables: CSV and TUM text."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ POSE_TABLE = TableKind(
     ),
     POSE_RATE_HZ,
 )
-# The stamps alone, so that a row whose pose cannot be read keeps its position.
+# Only the stamps, so that a row whose pose cannot be read still counts as a row.
 _STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=POSE_RATE_HZ, more=True)
 _TUM_SUFFIXES = (".tum", ".txt")
-MAX_QUATERNION_ERROR = 1e-2  # of its length, as of rounded text
+MAX_QUATERNION_ERROR = 1e-2  # largest deviation of a quaternion's length from 1, as in rounded text
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class PoseReadings(RawReadings):
 
 
 def as_frame_sensor(read: PoseReadings, sensor: PoseSensor) -> PoseReadings:
-    """The poses as T_frame_sensor, converted if the rig file states inverted poses or other axes of positions."""
+    """The poses as T_frame_sensor. They are converted if the rig file states inverted poses or other axes of
+    positions."""
     if sensor.position_axes is not None:
         read = replace(read, position=in_axes(read.position, sensor.position_axes))
     if not sensor.inverted:
@@ -52,19 +53,21 @@ def as_frame_sensor(read: PoseReadings, sensor: PoseSensor) -> PoseReadings:
 
 
 def is_tum_text(path: Path) -> bool:
-    """Whether a file is TUM text by its name. Stamps are then seconds."""
+    """Whether a file is TUM text, by its suffix. Its stamps are in seconds."""
     return path.suffix.lower() in _TUM_SUFFIXES
 
 
 def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, note: Note = ignore) -> PoseReadings:
-    """The poses of the sensor `name` in the table at `path`: t [ns], x, y, z, qx, qy, qz, qw; stamps of a file .tum or
-    .txt are seconds. `note` is told what was left out. Rotations of quaternions that are none are NaN. Raises
-    RecordingError naming file and line, and where most quaternions are none."""
+    """The poses of the sensor `name` in the table at `path`, with columns t [ns], x, y, z, qx, qy, qz, qw.
+
+    Stamps of .tum and .txt files are in seconds. Rotations of invalid quaternions are NaN. `note` is called with a
+    sentence on omitted rows. Raises RecordingError naming file and line, or if most quaternions are invalid.
+    """
     kind = replace(POSE_TABLE, unit="s") if is_tum_text(path) else POSE_TABLE
     table = read_table(path, kind, layout, note)
     stamps_ns, values = table.integers[:, 0].copy(), table.decimals
     xyzw = values[:, 3:]
-    length = np.linalg.norm(np.clip(xyzw, -1e9, 1e9), axis=1)  # squares must not overflow
+    length = np.linalg.norm(np.clip(xyzw, -1e9, 1e9), axis=1)  # clipped so that squares do not overflow
     wrong = ~(np.abs(length - 1.0) < MAX_QUATERNION_ERROR)
     if 2 * wrong.sum() > len(wrong):
         i = int(np.argmax(wrong))
@@ -76,7 +79,7 @@ def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, not
 
 
 def stamps_by_row(table: Path, layout: TableLayout, note: Note) -> tuple[dict[int, int], int]:
-    """Stamps [ns] of readable rows, by row number from 0, and the number of all rows."""
+    """Stamps [ns] of readable rows by row number, from 0; and the number of all rows."""
     kind = replace(_STAMPS, unit="s") if is_tum_text(table) else _STAMPS
     stamps = 1 if split_kind(POSE_TABLE, layout.columns) is None else 2  # the first columns of a pose
     read = read_table(table, kind, replace(layout, columns=layout.columns[:stamps]), note)

@@ -1,4 +1,4 @@
-"""Poses of one frame in another from the transforms of a bag (/tf, /tf_static), along the tree of frames."""
+"""Poses of one frame in another from the transforms of a bag (/tf, /tf_static), composed along the tree of frames."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from icalib.geometry import so3
 from icalib.rig import PoseSensor
 from icalib.sensors.pose.read.pose_tables import MAX_QUATERNION_ERROR, PoseReadings
 
-TRANSFORMS = "transforms"  # kind of topics of transforms
+TRANSFORMS = "transforms"  # the kind of a topic that contains transforms
 DEFAULT_TOPIC = "/tf"
-MESSAGE_TYPE = "tf2_msgs/msg/TFMessage"  # tf/msg/tfMessage is the same by an older name
+MESSAGE_TYPE = "tf2_msgs/msg/TFMessage"  # tf/msg/tfMessage is an older name of this type
 MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"
 _STATIC = "_static"  # suffix of topics with static transforms
-_MAX_INTERPOLATED_PERIODS = 3.0  # of an edge; it is not interpolated over a longer gap
-_MAX_BACKWARDS_NS = 1_000_000_000  # of the stamps of an edge; more is a clock that was set back
-_MAX_LISTED_FRAMES = 30  # in a message
+_MAX_INTERPOLATED_PERIODS = 3.0  # in median periods of an edge; longer gaps are not interpolated
+_MAX_BACKWARDS_NS = 1_000_000_000  # largest decrease of an edge's stamps; with a larger one the clock was set back
+_MAX_LISTED_FRAMES = 30  # frames listed in one message
 Pair = tuple[str, str]  # parent, child
 
 
 class HasTopics(HasMessages, Protocol):
-    """The part of a bag that is needed here; see `BagRecording`."""
+    """The part of the `BagRecording` interface that is needed here."""
 
     def topics(self) -> tuple[TopicInfo, ...]: ...
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """T_parent_child: stamps_ns (N,) int64, strictly increasing; rotation (N, 3, 3); position (N, 3) m. static: from
-    a topic of static transforms, with one row."""
+    """T_parent_child over time. stamps_ns (N,) int64, strictly increasing; rotation (N, 3, 3); position (N, 3) [m].
+    static: from a topic of static transforms, with N = 1."""
 
     parent: str
     child: str
@@ -50,13 +50,13 @@ class Edge:
 
     @property
     def changes(self) -> bool:
-        """Whether the transform changes."""
+        """Whether the transform changes over time."""
         rows = np.hstack([self.position, self.rotation.reshape(-1, 9)])
         return bool((rows != rows[0]).any())
 
     @property
     def rate_hz(self) -> float | None:
-        """Rate of the median step between stamps; None if static or single."""
+        """Rate by the median step between stamps [Hz]; None if the edge is static or has one row."""
         if self.static or len(self.stamps_ns) < 2:
             return None
         return 1e9 / float(np.median(np.diff(self.stamps_ns)))
@@ -64,25 +64,26 @@ class Edge:
 
 @dataclass(frozen=True)
 class _TransformEdge:
-    """An edge of a chain. inverted: passed from child to parent."""
+    """An edge of a chain. inverted: whether the chain passes it from child to parent."""
 
     edge: Edge
     inverted: bool
 
 
 def transform_topics(topics: Sequence[TopicInfo], given: str = DEFAULT_TOPIC) -> list[TopicInfo]:
-    """The topic `given` of transforms and its static counterpart, without topics that have no messages."""
+    """The topic `given` of transforms and its static counterpart, as far as they have messages."""
     stem = given.strip("/").removesuffix(_STATIC)
     found = [t for t in topics if t.kind == TRANSFORMS and t.count]
     return [t for t in found if t.name.strip("/") in (stem, stem + _STATIC)]
 
 
 def read_transform_poses(bag: HasTopics, sensor: PoseSensor, note: Note) -> PoseReadings:
-    """T_parent_child of both `frames` of the sensor, at the stamps of the fastest edge between them that moves, the
-    last of several; what else moves is interpolated. `note` is told what was left out.
+    """T_parent_child between the two `frames` of the sensor, at the stamps of the most frequent changing edge between
+    them.
 
-    Raises RecordingError, one sentence: no such topic, no such frame, frames that are not connected, or nothing
-    between them that moves.
+    If several edges are as frequent, the last one counts. All other changing edges are interpolated. `note` is called
+    with a sentence on removed data. Raises RecordingError, one sentence, if topic or frames do not exist, the frames
+    are not connected, or no transform between them changes.
     """
     assert sensor.frames is not None
     topics, name = bag.topics(), sensor.topic or DEFAULT_TOPIC
@@ -102,8 +103,8 @@ def read_transform_poses(bag: HasTopics, sensor: PoseSensor, note: Note) -> Pose
 
 
 def refuse_without_frames(root: Path, topics: Sequence[TopicInfo], sensor: PoseSensor) -> None:
-    """Raises RecordingError where the sensor's topic holds transforms, or the bag holds no other poses, and `frames`
-    does not say which ones they are."""
+    """Raise RecordingError if `frames` is missing: the sensor's topic contains transforms, or the bag has transforms
+    but no other poses."""
     if sensor.topic is not None:
         wanted = any(t.name.strip("/") == sensor.topic.strip("/") and t.kind == TRANSFORMS for t in topics)
     else:
@@ -117,9 +118,10 @@ def refuse_without_frames(root: Path, topics: Sequence[TopicInfo], sensor: PoseS
 
 
 def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dict[Pair, Edge]:
-    """All edges of `topics` by parent and child; transforms that are sent again with the same stamp count once."""
+    """All edges of `topics` by parent and child. Transforms that are repeated with the same stamp count once."""
     found: dict[Pair, Edge] = {}
-    for topic in sorted(topics, key=lambda t: t.name.endswith(_STATIC)):  # moving transforms replace static ones
+    # Static topics are last, so that their transforms replace moving ones of the same two frames.
+    for topic in sorted(topics, key=lambda t: t.name.endswith(_STATIC)):
         static, where = topic.name.endswith(_STATIC), f"{bag.root} {topic.name}"
         received = _rows(bag, topic.name)
         if not static and (unstamped := sum(r.unstamped for r in received.values())):
@@ -135,8 +137,8 @@ def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dic
 
 @dataclass
 class _Rows:
-    """An edge as received. stamps_ns: receive time if a message has none; values: x, y, z, qx, qy, qz, qw of each;
-    unstamped: number of messages without stamp."""
+    """An edge as received. stamps_ns: receive time if a message has no stamp; values: x, y, z, qx, qy, qz, qw of each
+    transform; unstamped: number of transforms without stamp."""
 
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     values: array[float] = field(default_factory=lambda: array("d"))
@@ -158,8 +160,8 @@ def _rows(bag: HasMessages, topic: str) -> dict[Pair, _Rows]:
 
 
 def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, where: str, note: Note) -> Edge:
-    """The edge of rows (N, 7), without invalid and repeated ones. Raises RecordingError if most are invalid, or the
-    clock was set back."""
+    """The edge of rows (N, 7) x, y, z, qx, qy, qz, qw, without invalid and repeated ones. Raises RecordingError if most
+    are invalid, or the clock was set back."""
     shown = f"{pair[0]} -> {pair[1]}"
     with np.errstate(over="ignore", invalid="ignore"):
         good = np.isfinite(rows).all(axis=1) & (
@@ -176,7 +178,7 @@ def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, whe
             f"quaternion and were removed, the first at {stamps_ns[np.argmin(good)]} ns."
         )
     stamps_ns, rows = stamps_ns[good], rows[good]
-    if static:  # the last one is valid
+    if static:  # the last message replaces earlier ones
         stamps_ns, rows = stamps_ns[-1:], rows[-1:]
     else:
         _, first = np.unique(stamps_ns, return_index=True)
@@ -221,8 +223,8 @@ def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[
 
 
 def _along(steps: Sequence[_TransformEdge], sensor: PoseSensor, where: str, note: Note) -> PoseReadings:
-    """Poses composed along a chain, at the common stamps of its moving edges. Raises RecordingError if nothing
-    moves."""
+    """Poses composed along a chain, at the common stamps of its changing edges. Raises RecordingError if no transform
+    changes."""
     assert sensor.frames is not None
     what, shown = f"{where} ({sensor.name})", " -> ".join(sensor.frames)
     sent = [s.edge for s in steps if len(s.edge.stamps_ns) > 1]
@@ -245,7 +247,8 @@ def _along(steps: Sequence[_TransformEdge], sensor: PoseSensor, where: str, note
 
 
 def _common_stamps(moving: Sequence[Edge], what: str, shown: str, note: Note) -> np.ndarray:
-    """(N,) stamps of the moving edge with most transforms, the last of several, at which all others are known."""
+    """(N,) stamps of the changing edge with most transforms (the last of several) at which all other changing edges are
+    known."""
     stamps_ns = max(moving[::-1], key=lambda e: len(e.stamps_ns)).stamps_ns
     known = np.logical_and.reduce([_covered(edge, stamps_ns) for edge in moving])
     if not known.any():
@@ -262,7 +265,7 @@ def _common_stamps(moving: Sequence[Edge], what: str, shown: str, note: Note) ->
 
 
 def _covered(edge: Edge, stamps_ns: np.ndarray) -> np.ndarray:
-    """(N,) whether an edge is known at stamps (N,): at its own stamps, and between near ones."""
+    """(N,) whether an edge is known at stamps (N,): at the stamps of the edge, and between two that are close."""
     after = np.searchsorted(edge.stamps_ns, stamps_ns)
     last = len(edge.stamps_ns) - 1
     own = edge.stamps_ns[np.minimum(after, last)] == stamps_ns
@@ -272,7 +275,8 @@ def _covered(edge: Edge, stamps_ns: np.ndarray) -> np.ndarray:
 
 
 def _at(edge: Edge, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (N, 3, 3), along geodesics, and positions (N, 3), along lines, at stamps (N,) that are covered."""
+    """Rotations (N, 3, 3) and positions (N, 3) of an edge at stamps (N,), which must be covered. Interpolation is
+    geodesic for rotations and linear for positions."""
     i = np.clip(np.searchsorted(edge.stamps_ns, stamps_ns, side="right") - 1, 0, len(edge.stamps_ns) - 2)
     whole = (edge.stamps_ns[i + 1] - edge.stamps_ns[i]).astype(np.float64)
     share = ((stamps_ns - edge.stamps_ns[i]) / whole)[:, None]
