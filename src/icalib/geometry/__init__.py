@@ -1,1 +1,1 @@
-"""SO(3), camera models and targets."""
+"""Rotations, camera models, calibration targets and other geometry."""

@@ -1,6 +1,7 @@
-"""BLAS and LAPACK within compiled kernels, on blocks of row-major arrays, without the interpreter lock.
+"""BLAS and LAPACK for compiled kernels, on blocks of row-major arrays, without Python's global interpreter lock.
 
-A row-major matrix is the transpose of what BLAS takes it for, so upper triangles here are its lower ones.
+BLAS assumes column-major order and therefore reads the transpose of a row-major matrix. Upper triangles here are lower
+triangles for BLAS.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _TEXT, _INT, _REAL = types.CPointer(types.uint8), types.CPointer(types.int32), t
 
 
 def _external(module: str, name: str, *arguments: types.Type) -> Any:
-    """scipy's own `name`, known to the compiler by a name that a cached kernel finds again."""
+    """The function `name` of scipy's BLAS or LAPACK, under a symbol that cached kernels find again."""
     llvm.add_symbol(f"icalib_{name}", get_cython_function_address(f"scipy.linalg.cython_{module}", name))
     return types.ExternalFunction(f"icalib_{name}", types.void(*arguments))
 
@@ -31,18 +32,19 @@ _dpotrf = _external("lapack", "dpotrf", _TEXT, _INT, _REAL, _INT, _INT)
 
 @njit(cache=True, nogil=True)
 def _stride(A):
-    """Of rows, in numbers; a matrix of one row has any."""
+    """Distance between rows in numbers. A matrix with one row may have any stride, so that it is bounded from below."""
     return max(A.strides[0] // 8, A.shape[1], 1)
 
 
 @njit(cache=True, nogil=True)
 def _letters(a, b, c, d):
+    """ASCII codes of the option characters of a BLAS call."""
     return np.array([ord(a), ord(b), ord(c), ord(d)], dtype=np.uint8)
 
 
 @njit(cache=True, nogil=True)
 def subtract_gram(W, C):
-    """Upper triangle of C (n, n) <- C - W^T W, W (k, n)."""
+    """Upper triangle of C (n, n) <- C - W^T W, for W (k, n)."""
     k, n = W.shape
     if k == 0 or n == 0:
         return
@@ -64,7 +66,7 @@ def subtract_gram(W, C):
 
 @njit(cache=True, nogil=True)
 def subtract_product(A, B, C):
-    """C (m, n) <- C - A^T B, A (k, m), B (k, n)."""
+    """C (m, n) <- C - A^T B, for A (k, m) and B (k, n)."""
     k, m, n = A.shape[0], A.shape[1], B.shape[1]
     if k == 0 or m == 0 or n == 0:
         return
@@ -89,7 +91,8 @@ def subtract_product(A, B, C):
 
 @njit(cache=True, nogil=True)
 def factorise(A):
-    """Upper triangle of A (n, n) <- U, A = U^T U. False where A is not positive definite, or not finite."""
+    """Overwrite the upper triangle of A (n, n) with its Cholesky factor U, A = U^T U. False if A is not positive
+    definite or not finite."""
     n = len(A)
     if n == 0:
         return True
@@ -103,7 +106,7 @@ def factorise(A):
 
 @njit(cache=True, nogil=True)
 def solve_transposed(U, X):
-    """X (p, n) <- U^-T X, of U (p, p) its upper triangle."""
+    """X (p, n) <- U^-T X, for the upper triangle of U (p, p)."""
     p, n = X.shape
     if p == 0 or n == 0:
         return
@@ -126,7 +129,7 @@ def solve_transposed(U, X):
 
 @njit(cache=True, nogil=True)
 def solve_upper(U, x):
-    """x (p,) <- U^-1 x, of U (p, p) its upper triangle."""
+    """x (p,) <- U^-1 x, for the upper triangle of U (p, p)."""
     for i in range(len(x) - 1, -1, -1):
         s = x[i]
         for k in range(i + 1, len(x)):

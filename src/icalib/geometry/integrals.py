@@ -1,4 +1,4 @@
-"""Integrals of signals that are linear between their stamps."""
+"""Time integrals of signals that are linear between their stamps."""
 
 from __future__ import annotations
 
@@ -22,5 +22,5 @@ def twice_integrated(x: np.ndarray, once: np.ndarray, dt: np.ndarray) -> np.ndar
 
 
 def _along_first(dt: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """dt (n,) in a shape that multiplies x along its first axis."""
+    """dt (n,), reshaped so that it multiplies x along its first axis."""
     return dt.reshape(-1, *(1,) * (x.ndim - 1))

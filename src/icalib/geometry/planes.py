@@ -1,9 +1,11 @@
-"""Planes n . p = d, held as a unit normal n and a point on them: the point that they turn about when corrected.
+"""Planes n . p = d, parametrised by a unit normal n and a point on the plane, about which the plane rotates.
 
-A plane's tangent is (two angles that turn the normal towards `tangents`, distance moved along the normal). About its
-own centroid these three hardly correlate; about the world's origin a far wall's distance and angles are nearly one. The
-paper's closest point (d n) is singular for planes through the origin, and its residual (24) flips its sign when the
-plane lies behind the sensor.
+The three tangent parameters are two angles, which rotate the normal towards `tangents`, and a distance along the
+normal. With the centroid of its measurements as the point, these parameters hardly correlate. With the world's origin
+instead, distance and angles of a far wall would correlate almost perfectly.
+
+"The paper" below uses the closest point d n instead (equations as numbered in docs/estimator.md). It is singular for
+planes through the origin, and its residual (24) changes sign if the plane is behind the sensor.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from icalib.geometry import so3
 
 @njit(cache=True, nogil=True)
 def tangents(normal):
-    """(2, 3): two unit vectors across a unit normal (3,), right-handed with it (Duff et al. 2017)."""
+    """(2, 3) two unit vectors that form a right-handed frame with a unit normal (3,) as third axis (Duff et al.
+    2017)."""
     x, y, z = normal[0], normal[1], normal[2]
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)
@@ -30,12 +33,13 @@ def tangents(normal):
 
 
 def plane_of(normal: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """(6,) plane of a normal (3,) of any length and a point (3,) on it [m]."""
+    """Plane (6,) with a normal (3,) of any length and a point (3,) on the plane [m]."""
     return np.concatenate([normal / np.linalg.norm(normal), point])
 
 
 def moved(plane: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Plane (6,) corrected by d (3,): the normal's turn towards its two tangents [rad], then along it [m]."""
+    """Plane (6,) after a correction d (3,): rotation of the normal towards its two tangents [rad], then a shift along
+    it [m]."""
     normal, point = plane[:3], plane[3:]
     angle = sqrt(d[0] * d[0] + d[1] * d[1])
     towards = d[:2] @ tangents(np.ascontiguousarray(normal))
@@ -44,8 +48,8 @@ def moved(plane: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def moved_and_turned(plane: np.ndarray, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """As `moved`, to first order, in a world that turns by `turn` (3,) about its origin, exactly: d (3,) less what the
-    turn makes of it comes first."""
+    """Plane (6,) after a correction d (3,) and an exact rotation of the world by `turn` (3,) [rad] about its origin. d
+    includes the first-order effect of the rotation, which is subtracted first."""
     normal, point = plane[:3], plane[3:]
     across = tangents(np.ascontiguousarray(normal))
     own = d - np.append(across @ np.cross(turn, normal), normal @ np.cross(turn, point))
@@ -54,24 +58,25 @@ def moved_and_turned(plane: np.ndarray, d: np.ndarray, turn: np.ndarray) -> np.n
 
 
 def difference(to: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """(3,) d with `moved(plane, d)` the plane `to` (6,), to first order."""
+    """(3,) correction d for which `moved(plane, d)` is the plane `to` (6,), to first order."""
     across = tangents(np.ascontiguousarray(plane[:3]))
     return np.append(across @ to[:3], plane[:3] @ (to[3:] - plane[3:]))
 
 
 def closest_point(plane: np.ndarray) -> np.ndarray:
-    """(3,) the paper's p_pi = d n: the point of `plane` (6,) closest to the origin [m]."""
+    """(3,) point of `plane` (6,) closest to the origin [m], p_pi = d n in the paper."""
     return (plane[:3] @ plane[3:]) * plane[:3]
 
 
 def closest_point_residual(
     p_pi: np.ndarray, R_world_lidar: np.ndarray, p_world_lidar: np.ndarray, xyz: np.ndarray
 ) -> np.ndarray:
-    """(N,) the paper's (24) and (25) for a closest point (3,) in the world and points xyz (N, 3) in the sensor's frame.
+    """(N,) residuals (24) and (25) of the paper [m], of points xyz (N, 3) in the LiDAR frame. p_pi (3,): closest point
+    of the plane in the world frame.
 
-    It is n . p - d of each point if the sensor and the origin are on the same side of the plane, and the negative if
-    not. It is not defined for a plane through the origin or through the sensor. In (24) p_pi / |p_pi| stands for n:
-    with d_L < 0 that is -n.
+    The residual is n . p - d if sensor and origin are on the same side of the plane, and its negative otherwise. It is
+    undefined for a plane through the origin or the sensor. The reason is that (24) uses p_pi / |p_pi| as n, which is -n
+    if d_L < 0.
     """
     d = np.linalg.norm(p_pi)
     normal = p_pi / d

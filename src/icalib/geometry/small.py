@@ -1,4 +1,4 @@
-"""Linear algebra of small dense matrices for compiled code: no BLAS, no memory."""
+"""Linear algebra of small dense matrices for compiled code, without BLAS."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-SWEEPS = 12  # of rotations at most; five are usual
-# Loops throughout: array expressions compile ten times as slowly, and are no faster on matrices this small.
+SWEEPS = 12  # largest number of Jacobi sweeps; five are typical
+# All functions use loops, as array expressions take ten times as long to compile and are no faster at this size.
 
 
 @njit(cache=True, nogil=True)
 def mul3(a, b):
-    """a b of 3x3 matrices."""
+    """(3, 3) product a b."""
     out = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -24,7 +24,7 @@ def mul3(a, b):
 
 @njit(cache=True, nogil=True)
 def tmul3(a, b):
-    """a^T b of 3x3 matrices."""
+    """(3, 3) product a^T b."""
     out = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -34,7 +34,7 @@ def tmul3(a, b):
 
 @njit(cache=True, nogil=True)
 def cholesky(A):
-    """Lower Cholesky factor of A (n, n) in place of its lower triangle; False where A is not positive definite."""
+    """Overwrite the lower triangle of A (n, n) with its Cholesky factor. False if A is not positive definite."""
     n = A.shape[0]
     for j in range(n):
         d = A[j, j]
@@ -54,7 +54,8 @@ def cholesky(A):
 
 @njit(cache=True, nogil=True)
 def inverse_cholesky(P, W):
-    """W = L^-1 with P = L L^T (n, n), so that W r is white; overwrites P's lower triangle with L."""
+    """Fill W with L^-1, for P = L L^T (n, n), so that W r is white if P is the covariance of r. The lower triangle of P
+    is overwritten with L."""
     n = P.shape[0]
     for j in range(n):
         for i in range(j, n):
@@ -74,7 +75,7 @@ def inverse_cholesky(P, W):
 
 @njit(cache=True, nogil=True)
 def solve_definite(A, b):
-    """b (n,) <- A^-1 b, overwriting A with its Cholesky factor; False where A is not positive definite."""
+    """b (n,) <- A^-1 b; A is overwritten with its Cholesky factor. False if A is not positive definite."""
     if not cholesky(A):
         return False
     n = len(b)
@@ -91,8 +92,8 @@ def solve_definite(A, b):
 
 @njit(cache=True, nogil=True)
 def eigen3(A, values, vectors):
-    """Eigenvalues (3,), in increasing order, and -vectors, columns (3, 3), of a symmetric A (3, 3), which is
-    overwritten: Jacobi's rotations (Golub and Van Loan, Matrix Computations, 8.5)."""
+    """Fill eigenvalues (3,), in increasing order, and eigenvectors, the columns of (3, 3), of a symmetric A (3, 3),
+    which is overwritten. Jacobi's method (Golub and Van Loan, Matrix Computations, 8.5)."""
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0

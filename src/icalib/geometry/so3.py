@@ -1,7 +1,7 @@
-"""SO(3): exponential, logarithm and their Jacobians, compiled, right at every angle.
+"""SO(3): exponential, logarithm and their Jacobians, compiled, accurate at every angle.
 
-Rotations are perturbed on the right, R <- R Exp(phi). Formulas: Sola et al., "A micro Lie theory", appendix B, with
-Taylor series where the closed forms lose digits. `jacobian_coefficients` is the one place where they branch.
+Rotations are perturbed on the right, R <- R Exp(phi). Formulas: Sola et al., "A micro Lie theory", appendix B. Taylor
+series are used where the closed forms lose digits.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-# Below this angle squared, series in theta^2 are used. Four terms leave a relative error under 1e-16 at the border,
+# rad^2; below this squared angle, series in theta^2 are used. They have a relative error below 1e-16 at the limit,
 # where (theta - sin theta) / theta^3 still has 13 digits in closed form.
 SERIES_BELOW = 0.01
 _1_6, _1_12, _1_20, _1_24, _1_30, _1_42, _1_56 = (1.0 / n for n in (6.0, 12.0, 20.0, 24.0, 30.0, 42.0, 56.0))
@@ -21,7 +21,7 @@ _1_72, _1_90, _1_110, _1_132, _1_156, _1_182 = (1.0 / n for n in (72.0, 90.0, 11
 
 @njit(cache=True, nogil=True)
 def hat(v):
-    """(3,) -> (3, 3) with hat(v) w = v x w."""
+    """(3, 3) skew-symmetric matrix of v (3,), with hat(v) w = v x w."""
     m = np.zeros((3, 3))
     m[0, 1], m[0, 2] = -v[2], v[1]
     m[1, 0], m[1, 2] = v[2], -v[0]
@@ -31,8 +31,9 @@ def hat(v):
 
 @njit(cache=True, nogil=True)
 def jacobian_coefficients(x):
-    """With theta = sqrt(x): sin/theta, (1 - cos)/theta^2, (theta - sin)/theta^3, (theta^2/2 - 1 + cos)/theta^4."""
-    if x < SERIES_BELOW:  # products with reciprocals, which are known beforehand: divisions take ten times as long
+    """With theta = sqrt(x) [rad]: sin(theta) / theta, (1 - cos(theta)) / theta^2, (theta - sin(theta)) / theta^3,
+    (theta^2 / 2 - 1 + cos(theta)) / theta^4."""
+    if x < SERIES_BELOW:  # products with precomputed reciprocals, as divisions take ten times as long
         s0 = 1.0 - x * _1_6 * (1.0 - x * _1_20 * (1.0 - x * _1_42 * (1.0 - x * _1_72 * (1.0 - x * _1_110))))
         s1 = 0.5 * (1.0 - x * _1_12 * (1.0 - x * _1_30 * (1.0 - x * _1_56 * (1.0 - x * _1_90 * (1.0 - x * _1_132)))))
         s2 = _1_6 * (1.0 - x * _1_20 * (1.0 - x * _1_42 * (1.0 - x * _1_72 * (1.0 - x * _1_110 * (1.0 - x * _1_156)))))
@@ -66,14 +67,14 @@ def _polynomial(v, a, b):
 
 @njit(cache=True, nogil=True)
 def exp(phi):
-    """Rotation vector (3,) [rad] -> rotation matrix (3, 3)."""
+    """Rotation matrix (3, 3) of a rotation vector (3,) [rad]."""
     s0, s1, _, _ = jacobian_coefficients(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
     return _polynomial(phi, s0, s1)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _quaternion(R):
-    """Rotation matrix -> unit quaternion (w, x, y, z), w >= 0, through its largest component (Shepperd)."""
+    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix, by its largest component (Shepperd)."""
     q = np.empty(4)
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     i = 0 if R[0, 0] > R[1, 1] else 1
@@ -98,10 +99,10 @@ def _quaternion(R):
 
 @njit(cache=True, nogil=True)
 def log(R):
-    """Rotation matrix (3, 3) -> rotation vector (3,) [rad], angle in [0, pi]."""
+    """Rotation vector (3,) [rad] of a rotation matrix (3, 3), with an angle in [0, pi]."""
     q = _quaternion(R)
     s = sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    # 2 atan(s / w) / s; as s -> 0 the rotation vector is 2 v to within rounding.
+    # 2 atan(s / w) / s; its limit as s -> 0 is 2, up to rounding.
     scale = 2.0 * atan2(s, q[0]) / s if s > 1e-20 else 2.0
     phi = np.empty(3)
     for n in range(3):
@@ -111,21 +112,22 @@ def log(R):
 
 @njit(cache=True, nogil=True)
 def left_jacobian(phi):
-    """J_l with Exp(phi + d) = Exp(J_l d) Exp(phi) to first order; also the mean of Exp(s phi) over s in [0, 1]."""
+    """(3, 3) J_l with Exp(phi + d) = Exp(J_l d) Exp(phi) to first order. It is also the mean of Exp(s phi) over s in
+    [0, 1]."""
     _, s1, s2, _ = jacobian_coefficients(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
     return _polynomial(phi, s1, s2)
 
 
 @njit(cache=True, nogil=True)
 def right_jacobian(phi):
-    """J_r with Exp(phi + d) = Exp(phi) Exp(J_r d) to first order."""
+    """(3, 3) J_r with Exp(phi + d) = Exp(phi) Exp(J_r d) to first order."""
     _, s1, s2, _ = jacobian_coefficients(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
     return _polynomial(phi, -s1, s2)
 
 
 @njit(cache=True, nogil=True)
 def _inverse_coefficient(x):
-    """(1 - theta/2 cot(theta/2)) / theta^2."""
+    """(1 - theta / 2 cot(theta / 2)) / theta^2 with theta = sqrt(x) [rad]."""
     if x < SERIES_BELOW:
         return (1.0 + x / 60.0 * (1.0 + x / 42.0 * (1.0 + x / 40.0))) / 12.0
     half = 0.5 * sqrt(x)
@@ -145,7 +147,7 @@ def right_jacobian_inverse(phi):
 
 
 def hat_many(v: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) with hat(v) w = v x w, of v (..., 3)."""
+    """(..., 3, 3) skew-symmetric matrices of v (..., 3), with hat(v) w = v x w."""
     m = np.zeros((*v.shape, 3))
     m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return m - np.swapaxes(m, -1, -2)
@@ -153,7 +155,7 @@ def hat_many(v: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def exp_many(phi):
-    """(N, 3) -> (N, 3, 3)."""
+    """(N, 3, 3) rotation matrices of rotation vectors (N, 3) [rad]."""
     R = np.empty((len(phi), 3, 3))
     for i in range(len(phi)):
         one = exp(phi[i])
@@ -165,7 +167,7 @@ def exp_many(phi):
 
 @njit(cache=True, nogil=True)
 def log_many(R):
-    """(N, 3, 3) -> (N, 3)."""
+    """(N, 3) rotation vectors [rad] of rotation matrices (N, 3, 3)."""
     phi = np.empty((len(R), 3))
     for i in range(len(R)):
         one = log(R[i])
@@ -176,7 +178,7 @@ def log_many(R):
 
 @njit(cache=True, nogil=True)
 def chain(steps, out):
-    """out (N + 1, 3, 3): out[i + 1] = out[i] steps[i]; out[0] is given."""
+    """Fill out (N + 1, 3, 3) with products of rotations: out[i + 1] = out[i] steps[i]. out[0] is given."""
     for n in range(len(steps)):
         for i in range(3):
             for j in range(3):
@@ -187,13 +189,13 @@ def chain(steps, out):
 
 
 def closest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation R that is closest to `matrix` (3, 3) in the Frobenius norm: the R with a = R b in least squares,
-    where it is the sum of a b^T (Kabsch 1976)."""
+    """Rotation R (3, 3) closest to `matrix` (3, 3) in the Frobenius norm. If matrix is the sum of a b^T, it is the
+    least-squares solution of a = R b (Kabsch 1976)."""
     U, _, Vt = np.linalg.svd(matrix)
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
 
 def value_change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """(n,) what takes the value of a parameter to another, as standard deviations are stated: of rotations (3, 3) the
-    vector in the sensor's axes [rad], of vectors (n,) their difference."""
+    """(n,) change between two values of a parameter, in the form of its standard deviations: the rotation vector in the
+    sensor's axes [rad] for rotations (3, 3), the difference for vectors (n,)."""
     return log(np.ascontiguousarray(before.T @ after)) if after.ndim == 2 else after - before

@@ -27,7 +27,7 @@ CAMERA_MODELS: dict[str, CameraModel] = {
 
 
 def camera_model(name: str) -> CameraModel:
-    """The model called `name`. Raises CalibrationError with the available names if there is none."""
+    """The model of this name. Raises CalibrationError, which lists the available names, if there is none."""
     if name not in CAMERA_MODELS:
         raise CalibrationError(f"there is no camera model {name!r}; available are {', '.join(CAMERA_MODELS)}.")
     return CAMERA_MODELS[name]

@@ -1,4 +1,4 @@
-"""What the rest of the program knows of a camera model: this class and nothing else."""
+"""Interface of the camera models; all other packages use only this class."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 
 class CameraModel(ABC):
-    """A camera model: compiled functions over arrays of points. Parameters are (fx, fy, cx, cy, distortion ...).
+    """A camera model, with compiled functions over arrays of points. Parameters are (fx, fy, cx, cy, distortion ...).
 
-    `valid` marks points that the model can see (in front of the camera, where the model asks for it, and inside the
-    range where the image moves outwards as the ray turns away from the axis); what is computed for the others is finite
-    but meaningless. Parameters outside the model's domain see less, or nothing, but raise no error.
+    `valid` marks points that the model can project. They are within the monotonic range, where the image radius grows
+    with the angle to the axis, and in front of the camera if the model requires it. Values at invalid points are finite
+    but meaningless. Parameters outside the model's domain make points invalid and raise no error.
 
-    start_distortions: where to start when nothing is known of the lens; each is all that follows fx, fy, cx, cy.
-    distortion_scale: typical size of its coefficients, over that of a polynomial's; tolerances and guesses scale with
-    it.
+    start_distortions: initial distortions for an unknown lens; each contains all parameters after fx, fy, cx, cy.
+    distortion_scale: typical size of the coefficients relative to those of a polynomial model; tolerances and initial
+    guesses scale with it.
     """
 
     name: ClassVar[str]
@@ -27,18 +27,19 @@ class CameraModel(ABC):
 
     @abstractmethod
     def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (N, 3) in the camera frame [m] -> uv (N, 2) [px], valid (N,) bool."""
+        """Project points (N, 3) in the camera frame [m]. Returns uv (N, 2) [px] and valid (N,) bool."""
 
     @abstractmethod
     def project_with_jacobians(
         self, params: np.ndarray, points: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """uv and valid as `project`, then d uv / d point (N, 2, 3) and d uv / d params (N, 2, P)."""
+        """uv and valid as from `project`, then d uv / d point (N, 2, 3) [px/m] and d uv / d params (N, 2, P)."""
 
     def central_scale(self, params: np.ndarray) -> float:
-        """Pixels per radian in the image's centre, along u: not fx in every model."""
+        """Scale at the optical axis along u [px/rad]; it differs from fx in some models."""
         return float(self.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))[2][0, 0, 0])
 
     @abstractmethod
     def unproject(self, params: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """uv (N, 2) [px] -> unit rays (N, 3) in the camera frame, valid (N,) bool (inside the model's range)."""
+        """Rays of pixels uv (N, 2). Returns unit vectors (N, 3) in the camera frame, and valid (N,) bool (pixel in the
+        model's range)."""

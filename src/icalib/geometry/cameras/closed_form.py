@@ -1,4 +1,4 @@
-"""Camera models whose unprojection has a closed form: arrays in, compiled kernels, arrays out."""
+"""Base of camera models whose unprojection has a closed form."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import numpy as np
 
 from icalib.geometry.cameras.base import CameraModel
 
-MIN_DISTANCE = 1e-6  # m, below it a point has no direction
+MIN_DISTANCE = 1e-6  # m; closer points have no direction
 
 
 class ClosedForm(CameraModel):
-    """A model made of three kernels over contiguous float64 arrays, which fill what they are given last."""
+    """A camera model given by three compiled kernels over contiguous float64 arrays. Each kernel fills its output
+    arrays, which are its last arguments."""
 
     def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
@@ -49,7 +50,7 @@ class ClosedForm(CameraModel):
         j_point: np.ndarray,
         j_params: np.ndarray,
     ) -> None:
-        """The Jacobians come in filled with zeros, and stay so where a point is not valid."""
+        """Fill uv, valid and both Jacobians. The Jacobians are zero on entry and must stay zero at invalid points."""
 
     @abstractmethod
     def _fill_rays(self, params: np.ndarray, uv: np.ndarray, rays: np.ndarray, valid: np.ndarray) -> None: ...

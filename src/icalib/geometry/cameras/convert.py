@@ -1,4 +1,4 @@
-"""The same lens in another camera model, for programs that know only that one."""
+"""Converts a lens to another camera model, for programs that support only that model."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 from icalib.errors import CalibrationError
 from icalib.geometry.cameras.base import CameraModel
 
-_GRID = (48, 32)  # pixels across and down, the image's borders included
-_MAX_STEPS = 200  # ten are plenty, unless the best fit lies beyond the range of the model
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8  # of the normal equations with unit diagonal
-_SETTLED_PX = 1e-9
+_GRID = (48, 32)  # number of pixels across and down, including the image borders
+_MAX_STEPS = 200  # ten are enough, unless the best fit is outside the model's range
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8  # relative to a unit diagonal of the normal equations
+_SETTLED_PX = 1e-9  # iteration stops if a step moves no pixel further
 
 
 def fit_model(
@@ -18,14 +18,14 @@ def fit_model(
 ) -> tuple[np.ndarray, float, float]:
     """Parameters of `target` that project like `source` with `params`, by least squares in pixels over the image.
 
-    A grid of pixels of the image of `resolution` (width, height) [px] is unprojected by `source` (pixels outside its
-    range have no ray and are left out) and projected by `target`, starting at the source's fx, fy, cx, cy without
-    distortion. Damped Gauss-Newton; every step keeps all rays inside the range where the target's distortion is
-    monotonic, so if the best fit lies outside, the result is the best found at its edge.
+    A grid of pixels of the image of `resolution` (width, height) [px] is unprojected by `source` and projected by
+    `target`. Pixels without a ray are omitted. The fit starts with the fx, fy, cx, cy of the source and zero
+    distortion. Damped Gauss-Newton steps keep all rays in the monotonic range of the target; if the best fit is
+    outside, the result is at the edge.
 
-    Returns the parameters (P,), and the root mean square and the maximum over the grid of the distance [px] between
-    the two projections of a ray: judge them, a model that cannot follow the lens is fitted as well as it can be.
-    Raises CalibrationError where the source sees too little of the image, or the target cannot see a ray at all.
+    Returns the parameters (P,), and RMS and maximum over the grid of the distance between both projections [px]. Check
+    these, as a model that cannot represent the lens is fitted as well as possible. Raises CalibrationError if the
+    source has too few rays in the image, or the target cannot project one of them.
     """
     uv, rays = _rays(source, np.asarray(params, float), resolution)
     if 2 * len(uv) < len(target.parameter_names):
@@ -47,7 +47,7 @@ def fit_model(
 
 
 def _rays(source: CameraModel, params: np.ndarray, resolution: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) over the image and their rays (N, 3), where `source` has one."""
+    """Pixels (N, 2) of a grid over the image, and their rays (N, 3); pixels without a ray are omitted."""
     u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, count) for side, count in zip(resolution, _GRID, strict=True)))
     uv = np.stack([u.ravel(), v.ravel()], axis=1)
     rays, valid = source.unproject(params, uv)
@@ -57,8 +57,8 @@ def _rays(source: CameraModel, params: np.ndarray, resolution: tuple[int, int]) 
 def fit_rays(
     target: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray, settled_px: float = _SETTLED_PX
 ) -> np.ndarray:
-    """Parameters (P,) of `target` that project rays (N, 3) to uv (N, 2) [px]: Levenberg-Marquardt from `params` (P,),
-    which can see all rays. A step that moves no pixel further than `settled_px` is the last."""
+    """Parameters (P,) of `target` that project rays (N, 3) to uv (N, 2) [px], by Levenberg-Marquardt. All rays must be
+    valid for the initial `params` (P,). Iteration stops if a step moves no pixel further than `settled_px`."""
     damping = _LEAST_DAMPING
     for _ in range(_MAX_STEPS):
         projected, _, _, j_params = target.project_with_jacobians(params, rays)
@@ -72,7 +72,7 @@ def fit_rays(
             if valid.all() and np.sum((moved - uv) ** 2) < residual @ residual:
                 break
             damping *= 10.0
-            if damping > _MOST_DAMPING:  # the step is down to rounding: as good as it gets
+            if damping > _MOST_DAMPING:  # the step is below rounding: converged
                 return params
         params, damping = params + step, max(0.1 * damping, _LEAST_DAMPING)
         if np.abs(J @ step).max() < settled_px:

@@ -10,22 +10,25 @@ from icalib.geometry.cameras.eucm import unified_depth
 
 
 class DoubleSphere(ClosedForm):
-    """With d1 = sqrt(x^2 + y^2 + z^2), s = xi d1 + z and d2 = sqrt(x^2 + y^2 + s^2) (Usenko, Demmel and Cremers 2018,
-    eq. 40 to 42):
+    """Double sphere model (Usenko, Demmel and Cremers 2018, eq. 40 to 42).
 
+        d1 = sqrt(x^2 + y^2 + z^2),  s = xi d1 + z,  d2 = sqrt(x^2 + y^2 + s^2)
         u = fx x / (alpha d2 + (1 - alpha) s) + cx,  v = fy y / (alpha d2 + (1 - alpha) s) + cy
 
-    Parameters: fx, fy, cx, cy, xi, alpha, as in the paper; so the scale in the image's centre is fx / (1 + xi). Valid:
-    further than 1 um from the centre, d1 + xi z > 0, alpha d2 + (1 - alpha) s > 0 and alpha s + (1 - alpha) d2 > 0:
-    where the denominator is positive and the image still moves outwards. With xi = 0 that is the paper's range (eq. 43
-    to 45); with another xi its w2 is not exact, and admits points of negative depth at, say, xi = -0.5, alpha = 1 / 11.
-    The conditions carry the model beyond xi in (-1, 1) and alpha in [0, 1], so that an estimate may pass there. The
-    rest is projected to (0, 0) with zero Jacobians.
+    Parameters: fx, fy, cx, cy, xi, alpha, as in the paper, so that the scale at the optical axis is fx / (1 + xi). A
+    point is valid if it is farther than 1 um from the centre and
+
+        d1 + xi z > 0,  alpha d2 + (1 - alpha) s > 0,  alpha s + (1 - alpha) d2 > 0
+
+    Then the denominator is positive and the image radius grows with the angle. For xi = 0 this is the range in the
+    paper (eq. 43 to 45). For other xi the w2 of the paper is not exact: at xi = -0.5, alpha = 1 / 11, it admits points
+    of negative depth. The conditions extend the model beyond xi in (-1, 1) and alpha in [0, 1], so that an estimate may
+    pass there. Invalid points are projected to (0, 0) with zero Jacobians.
     """
 
     name = "double-sphere"
     parameter_names = ("fx", "fy", "cx", "cy", "xi", "alpha")
-    # For any lens there is a second, wrong valley with xi of the other sign; a start in each finds the right one.
+    # The cost has a second, wrong local minimum with xi of opposite sign; starts near both find the right one.
     start_distortions = ((-0.2, 0.5), (0.0, 0.5), (0.3, 0.7))
 
     def _fill_image(self, params, points, uv, valid) -> None:
@@ -40,7 +43,7 @@ class DoubleSphere(ClosedForm):
 
 @njit(cache=True, nogil=True)
 def _depth(xi, alpha, square, z):
-    """d1, s, d2, the denominator, and whether the point is valid; `square` is x^2 + y^2."""
+    """d1, s, d2, the denominator, and whether the point is valid. square: x^2 + y^2."""
     d1 = np.sqrt(square + z * z)
     s = xi * d1 + z
     d2 = np.sqrt(square + s * s)
@@ -73,7 +76,7 @@ def _project_with_jacobians(params, points, uv, valid, j_point, j_params):
             continue
         a, b = x / depth, y / depth
         uv[i, 0], uv[i, 1] = fx * a + params[2], fy * b + params[3]
-        by_s = alpha * s / d2 + 1.0 - alpha  # of the denominator, with d2 following s
+        by_s = alpha * s / d2 + 1.0 - alpha  # total derivative of the denominator by s, as d2 depends on s
         across = alpha / d2 + by_s * xi / d1
         depth_x, depth_y, depth_z = across * x, across * y, by_s * (xi * z / d1 + 1.0)
         # d2 - s without cancellation near the axis.
@@ -89,13 +92,13 @@ def _project_with_jacobians(params, points, uv, valid, j_point, j_params):
         j_params[i, 0, 5], j_params[i, 1, 5] = -u_scale * a * depth_alpha, -v_scale * b * depth_alpha
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
+@njit(cache=True, nogil=True, error_model="numpy")  # division by a zero focal length gives invalid rays, not an error
 def _unproject(params, uv, rays, valid):
     xi, alpha = params[4], params[5]
     for i in range(len(uv)):
         a, b = (uv[i, 0] - params[2]) / params[0], (uv[i, 1] - params[3]) / params[1]
         square = a * a + b * b
-        # From the second sphere (the paper's m_z), then along that ray to the first (eq. 46 to 52).
+        # First the ray from the second sphere (m_z in the paper), then its intersection with the first (eq. 46 to 52).
         s = unified_depth(alpha, 1.0, square)
         scale = (s * xi + np.sqrt(s * s + (1.0 - xi * xi) * square)) / (s * s + square)
         x, y, z = scale * a, scale * b, scale * s - xi

@@ -8,17 +8,19 @@ from icalib.base.compiled import njit
 from icalib.geometry.cameras import radial
 from icalib.geometry.cameras.base import CameraModel
 
-_MIN_DISTANCE = 1e-6  # m, below it a point has no direction
+_MIN_DISTANCE = 1e-6  # m; closer points have no direction
 
 
 class PinholeEquidistant(CameraModel):
-    """With r = sqrt(x^2 + y^2) and theta = atan2(r, z) (Kannala and Brandt 2006, eq. 6; odd powers only, first one 1):
+    """Kannala-Brandt model (Kannala and Brandt 2006, eq. 6, odd powers only, first coefficient 1).
 
+        r = sqrt(x^2 + y^2),  theta = atan2(r, z)
         theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
         u = fx theta_d x / r + cx,  v = fy theta_d y / r + cy
 
-    Valid: further than 1 um from the centre, and theta < pi and below the first zero of d theta_d / d theta; so points
-    beside and behind the camera (z <= 0) can be valid. The rest is projected to (0, 0) with zero Jacobians.
+    A point is valid if it is farther than 1 um from the centre, and theta is below pi and below the first zero of d
+    theta_d / d theta. Points beside and behind the camera (z <= 0) can therefore be valid. Invalid points are projected
+    to (0, 0) with zero Jacobians.
     """
 
     name = "pinhole-equidistant"
@@ -48,12 +50,13 @@ class PinholeEquidistant(CameraModel):
 
 
 def _theta_limit(params: np.ndarray) -> float:
+    """The angle to the optical axis [rad] below which theta_d grows with theta; at most pi."""
     return min(np.pi, radial.monotonic_limit(params[4:8]))
 
 
 @njit(cache=True, nogil=True)
 def _direction(x, y, z, limit):
-    """r, theta, theta / r and whether the point is valid; on the optical axis theta / r is its limit 1 / z."""
+    """r, theta, theta / r and whether the point is valid. On the optical axis theta / r is its limit 1 / z."""
     r = np.sqrt(x * x + y * y)
     theta = np.arctan2(r, z)
     valid = r + abs(z) > _MIN_DISTANCE and theta < limit
@@ -110,7 +113,7 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
             j_params[i, 0, 4 + k], j_params[i, 1, 4 + k] = power_x, power_y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
+@njit(cache=True, nogil=True, error_model="numpy")  # division by a zero focal length gives invalid rays, not an error
 def _unproject(params, uv, limit, rays, valid):
     max_distorted = radial.evaluate(params[4:8], limit)[0]
     for i in range(len(uv)):

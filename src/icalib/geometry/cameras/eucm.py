@@ -9,16 +9,19 @@ from icalib.geometry.cameras.closed_form import MIN_DISTANCE, ClosedForm
 
 
 class ExtendedUnified(ClosedForm):
-    """With d = sqrt(beta (x^2 + y^2) + z^2) (Khomutenko, Garcia and Martinet 2016, eq. 1 to 10):
+    """EUCM (Khomutenko, Garcia and Martinet 2016, eq. 1 to 10).
 
+        d = sqrt(beta (x^2 + y^2) + z^2)
         u = fx x / (alpha d + (1 - alpha) z) + cx,  v = fy y / (alpha d + (1 - alpha) z) + cy
 
-    Parameters: fx, fy, cx, cy, alpha, beta. Valid: further than 1 um from the centre, alpha d + (1 - alpha) z > 0, and
-    alpha z + (1 - alpha) d > 0, where the image still moves outwards as the ray turns away from the axis: for alpha in
-    [0, 1] and beta > 0 that is the paper's range, z > -d alpha / (1 - alpha) for alpha <= 1/2 and z > -d (1 - alpha) /
-    alpha above. The same two conditions carry the model beyond alpha = 0 and 1, so that an estimate may pass there;
-    with beta <= 0 only points in front, with a real d > 0, are valid. The rest is projected to (0, 0) with zero
-    Jacobians.
+    Parameters: fx, fy, cx, cy, alpha, beta. A point is valid if it is farther than 1 um from the centre and
+
+        alpha d + (1 - alpha) z > 0,  alpha z + (1 - alpha) d > 0
+
+    The second condition means that the image radius grows with the angle. For alpha in [0, 1] and beta > 0 this is the
+    range in the paper: z > -d alpha / (1 - alpha) for alpha <= 1/2, and z > -d (1 - alpha) / alpha above. Both
+    conditions extend the model beyond alpha = 0 and 1, so that an estimate may pass there. With beta <= 0 only points
+    in front, with real d > 0, are valid. Invalid points are projected to (0, 0) with zero Jacobians.
     """
 
     name = "eucm"
@@ -37,7 +40,7 @@ class ExtendedUnified(ClosedForm):
 
 @njit(cache=True, nogil=True)
 def _depth(alpha, beta, square, z):
-    """d, the denominator alpha d + (1 - alpha) z, and whether the point is valid; `square` is x^2 + y^2."""
+    """d, the denominator alpha d + (1 - alpha) z, and whether the point is valid. square: x^2 + y^2."""
     d_square = beta * square + z * z
     if not (d_square > 0.0 and (beta > 0.0 or z > 0.0) and square + z * z > MIN_DISTANCE * MIN_DISTANCE):
         return 1.0, 1.0, False
@@ -84,18 +87,18 @@ def _project_with_jacobians(params, points, uv, valid, j_point, j_params):
         j_params[i, 0, 5], j_params[i, 1, 5] = -u_scale * a * depth_beta, -v_scale * b * depth_beta
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # alpha = 1 at the edge: nothing is valid
+@njit(cache=True, nogil=True, error_model="numpy")  # division by zero gives invalid rays, not an error
 def unified_depth(alpha, beta, square):
-    """z of the ray (a, b, z) whose image is (a, b), a^2 + b^2 = `square` (Khomutenko et al., eq. 17); NaN where there
-    is none."""
+    """z of the ray (a, b, z) whose normalised image is (a, b), with a^2 + b^2 = `square` (Khomutenko et al., eq. 17).
+    NaN if there is no such ray."""
     root = np.sqrt(1.0 - (2.0 * alpha - 1.0) * beta * square)
-    # Two forms of the same root; each divides by zero where the other does not.
+    # Two forms of the same root, which divide by zero at different values of alpha.
     if 0.0 <= alpha <= 1.0:
         return (1.0 - alpha * alpha * beta * square) / (alpha * root + 1.0 - alpha)
     return (1.0 - alpha - alpha * root) / (1.0 - 2.0 * alpha)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
+@njit(cache=True, nogil=True, error_model="numpy")  # division by a zero focal length gives invalid rays, not an error
 def _unproject(params, uv, rays, valid):
     for i in range(len(uv)):
         a, b = (uv[i, 0] - params[2]) / params[0], (uv[i, 1] - params[3]) / params[1]

@@ -1,7 +1,7 @@
 """Bundle adjustment of one lens, the shape of the target and the poses of images, from a good initial guess.
 
-Levenberg-Marquardt; the poses are eliminated image by image (Schur complement). Points are kept in the camera frame: a
-pose changes by a small rotation and translation of its image's points.
+Levenberg-Marquardt. The poses are eliminated image by image (Schur complement). Points are stored in the camera frame:
+a pose change is a small rotation and translation of the points of its image.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
 from icalib.geometry.vectors import cross
 
-UNSEEN_PX = 20.0  # residual of a point outside the model's range; zero would reward a lens that sees fewer points
-MOST_ROUNDS = 40  # steps, accepted or not
-MOST_DAMPING = 1e8  # of the normal equations with unit diagonal; beyond it a step is down to rounding
-SETTLED = 1e-5  # relative decrease of the sum of squares in an accepted step, below which it is the last
-START_CORNERS = 1500  # about as many are used for initial parameters; the adjustment uses all
-START_PX = 0.01  # a step to initial parameters that moves no point further is the last: the adjustment goes on
+UNSEEN_PX = 20.0  # length of the residual of an invalid point; zero would favour lenses with fewer valid points
+MOST_ROUNDS = 40  # largest number of steps, accepted or rejected
+MOST_DAMPING = 1e8  # relative to a unit diagonal of the normal equations; beyond it steps are below rounding
+SETTLED = 1e-5  # relative decrease of the sum of squares in an accepted step, below which iteration stops
+START_CORNERS = 1500  # approximate number of points for initial parameters; the adjustment uses all
+START_PX = 0.01  # initial parameters are accurate enough if a step moves no point further
 
 
 @dataclass(frozen=True)
 class ImagePoints:
     """Points of the target in M images of one camera.
 
-    points (N, 3) [m]: in the camera frame, by an estimate; uv (N, 2) [px]: where they were measured. Those of image i
-    are start[i]:start[i + 1]; start (M + 1,) int, at least one point an image. basis (N, 3, s): derivative of the
-    points by the shape parameters, in the camera frame. The shape is relative to that of the estimate. used (N,) bool:
-    the points that are fitted.
+    points (N, 3) [m]: estimated position in the camera frame; uv (N, 2) [px]: measured position. Points of image i are
+    start[i]:start[i + 1]; start (M + 1,) int, with at least one point per image. basis (N, 3, s): derivative of the
+    points by the s shape parameters, in the camera frame. Shape parameters are relative to the initial shape. used (N,)
+    bool: points that are fitted.
     """
 
     points: np.ndarray
@@ -44,27 +44,27 @@ class ImagePoints:
 
     @property
     def image(self) -> np.ndarray:
-        """(N,) int: the image of each point."""
+        """(N,) int: index of the image of each point."""
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
     def moved(self, motion: np.ndarray, shape: np.ndarray) -> ImagePoints:
-        """The points after a change of `shape` (s,) and a motion (M, 6) of each image's points in the camera frame.
+        """The points after a change `shape` (s,) of the shape, and a motion (M, 6) of each image's points in the camera
+        frame.
 
-        A motion is a rotation vector [rad] and a translation [m].
+        A motion is a rotation vector [rad] followed by a translation [m].
         """
         R = so3.exp_many(np.ascontiguousarray(motion[:, :3]))[self.image]
         points = np.einsum("nij,nj->ni", R, self.points + self.basis @ shape) + motion[self.image, 3:]
         return ImagePoints(points, self.uv, self.start, R @ self.basis, self.used)
 
     def sum_by_image(self, values: np.ndarray) -> np.ndarray:
-        """(M, ...): the sum of values (N, ...) over the points of each image."""
+        """(M, ...) sums of values (N, ...) over the points of each image."""
         return np.add.reduceat(values, self.start[:-1], axis=0)
 
 
 class Adjusted(NamedTuple):
-    """A lens with `params` (P,) and what it leaves. shape (s,): the change of the target's shape; residual (N, 2) [px]:
-    of all points, used or not; seen: the points with that shape, where the fitted poses have them.
-    """
+    """Result of the adjustment. params (P,): lens; shape (s,): change of the target's shape; residual (N, 2) [px]: of
+    all points, used or not; seen: the points with the adjusted shape and poses."""
 
     params: np.ndarray
     shape: np.ndarray
@@ -75,11 +75,11 @@ class Adjusted(NamedTuple):
 def initial_parameters(
     model: CameraModel, other: CameraModel, params: np.ndarray, seen: ImagePoints
 ) -> np.ndarray | None:
-    """Parameters (P,) of `model` for a lens that is known as `other` with `params`: from the best of its starts.
+    """Initial parameters (P,) of `model` for a lens that is known in the model `other` as `params`.
 
-    They minimise the distance between projected and measured points, the points being fixed. A start that sees no more
-    than half of the points is left out; None if all do. fx and fy start so that the scale in the image's centre is that
-    of `other`.
+    They minimise the distance between projected and measured points, with the points fixed, from the best of the
+    model's `start_distortions`. A start for which at most half of the points are valid is omitted; None if all are. fx
+    and fy start with the scale of `other` at the optical axis.
     """
     few = np.flatnonzero(seen.used)[:: max(int(seen.used.sum()) // START_CORNERS, 1)]
     points, uv = seen.points[few], seen.uv[few]
@@ -95,11 +95,10 @@ def initial_parameters(
 
 
 def adjust(model: CameraModel, params: np.ndarray, seen: ImagePoints, fixed: np.ndarray | None = None) -> Adjusted:
-    """Minimises the squared residuals of the used points over parameters, shape and poses, from `params` (P,).
+    """Minimise the squared residuals of the used points over lens parameters, shape and poses, from `params` (P,).
 
-    With a `fixed` shape (s,) only the poses are fitted, and `params` and `fixed` are returned as they are.
-
-    Raises numpy.linalg.LinAlgError where the points of an image do not determine its pose.
+    With a `fixed` shape (s,) only the poses are fitted, and `params` and `fixed` are returned unchanged. Raises
+    numpy.linalg.LinAlgError if the points of an image do not determine its pose.
     """
     shape, n = np.zeros(seen.basis.shape[2]), len(params)
     if fixed is not None:
@@ -129,8 +128,8 @@ def _linearised(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (N, 2) [px], predicted - measured, and their Jacobian (N, 2, 6 + P + s).
 
-    Columns: rotation and translation of the image's points, in the camera frame; then, `with_lens`, parameters and
-    shape.
+    Columns: rotation and translation of the image's points in the camera frame; then lens parameters and shape, if
+    `with_lens`.
     """
     projected, valid, J_point, J_params = model.project_with_jacobians(params, seen.points)
     J_shared = (J_params, J_point @ seen.basis) if with_lens else ()
@@ -139,14 +138,14 @@ def _linearised(
 
 
 def _residual(uv: np.ndarray, projected: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """(N, 2) [px] projected - measured, `UNSEEN_PX` long where the model sees no point."""
+    """(N, 2) projected - measured [px]; of length `UNSEEN_PX` for invalid points."""
     return np.where(valid[:, None], projected - uv, np.sqrt(0.5) * UNSEEN_PX)
 
 
 def _step(residual: np.ndarray, J: np.ndarray, seen: ImagePoints, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Steps of the shared parameters, lens and shape (n,), and of the images' poses (M, 6), by the Schur complement.
+    """Steps of the shared parameters, lens and shape (n,), and of the poses (M, 6), by the Schur complement.
 
-    Both diagonals are damped, relative to themselves. J (N, 2, 6 + n) as `_linearised` gives it.
+    Both diagonals are damped relative to themselves. J (N, 2, 6 + n): Jacobian from `_linearised`.
     """
     rows = np.concatenate([J, residual[:, :, None]], axis=2)
     rows[~seen.used] = 0.0

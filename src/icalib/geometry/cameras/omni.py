@@ -1,4 +1,4 @@
-"""Omnidirectional camera of Mei with radial-tangential distortion, Kalibr's "omni" with "radtan"."""
+"""Mei's omnidirectional camera with radial-tangential distortion, Kalibr's "omni" with "radtan"."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ from icalib.geometry.cameras.radtan import distort, undistort
 
 
 class OmniRadtan(ClosedForm):
-    """A point on the unit sphere seen from xi behind its centre (Mei and Rives 2007, section II), then distorted as by
-    `pinhole-radtan`: with d = sqrt(x^2 + y^2 + z^2), a = x / (z + xi d), b = y / (z + xi d), s = a^2 + b^2,
+    """Unified model of Mei and Rives (2007, section II) with the distortion of `pinhole-radtan`.
 
+    A point is projected to the unit sphere, then from a centre at distance xi behind the sphere's centre, and
+    distorted:
+
+        d = sqrt(x^2 + y^2 + z^2),  a = x / (z + xi d),  b = y / (z + xi d),  s = a^2 + b^2
         u = fx (a (1 + k1 s + k2 s^2) + 2 p1 a b + p2 (s + 2 a^2)) + cx
         v = fy (b (1 + k1 s + k2 s^2) + p1 (s + 2 b^2) + 2 p2 a b) + cy
 
-    Parameters: fx, fy, cx, cy, xi, k1, k2, p1, p2; fx and fy are the paper's gamma, so the scale in the image's centre
-    is fx / (1 + xi). Valid: further than 1 um from the centre, z + xi d > 0 and d + xi z > 0, that is z > -d min(xi,
-    1 / xi), and sqrt(s) below the first zero of 1 + 3 k1 r^2 + 5 k2 r^4. The rest is projected to (0, 0) with zero
-    Jacobians.
+    Parameters: fx, fy, cx, cy, xi, k1, k2, p1, p2. fx and fy are gamma in the paper, so that the scale at the optical
+    axis is fx / (1 + xi). A point is valid if it is farther than 1 um from the centre, z + xi d > 0 and d + xi z > 0,
+    that is z > -d min(xi, 1 / xi). Also, sqrt(s) must be below the first zero of 1 + 3 k1 r^2 + 5 k2 r^4. Invalid
+    points are projected to (0, 0) with zero Jacobians.
     """
 
     name = "omni-radtan"
@@ -64,7 +67,7 @@ def _project(xi, lens, points, limit, uv, valid):
 
 @njit(cache=True, nogil=True)
 def _project_with_jacobians(xi, lens, points, limit, uv, valid, j_point, j_params):
-    """`lens`: the parameters of the pinhole-radtan camera behind the sphere."""
+    """lens: the parameters without xi, in the order of `pinhole-radtan`."""
     fx, fy = lens[0], lens[1]
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -74,7 +77,7 @@ def _project_with_jacobians(xi, lens, points, limit, uv, valid, j_point, j_param
             continue
         distorted_a, distorted_b, j_aa, j_ab, j_bb = distort(lens, 0.0, a, b)
         uv[i, 0], uv[i, 1] = fx * distorted_a + lens[2], fy * distorted_b + lens[3]
-        # (a, b) moves by (dx - a d_depth, dy - b d_depth) / depth.
+        # d (a, b) = (dx - a d_depth, dy - b d_depth) / depth.
         u_a, u_b, v_a, v_b = fx * j_aa / depth, fx * j_ab / depth, fy * j_ab / depth, fy * j_bb / depth
         u_depth, v_depth = -(u_a * a + u_b * b), -(v_a * a + v_b * b)
         depth_x, depth_y, depth_z = xi * x / d, xi * y / d, xi * z / d + 1.0
@@ -90,7 +93,7 @@ def _project_with_jacobians(xi, lens, points, limit, uv, valid, j_point, j_param
         j_params[i, 1, 7], j_params[i, 1, 8] = fy * (s + 2.0 * b * b), 2.0 * fy * a * b
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
+@njit(cache=True, nogil=True, error_model="numpy")  # division by a zero focal length gives invalid rays, not an error
 def _unproject(xi, lens, coefficients, uv, limit, rays, valid):
     for i in range(len(uv)):
         mx, my = (uv[i, 0] - lens[2]) / lens[0], (uv[i, 1] - lens[3]) / lens[1]
@@ -98,10 +101,10 @@ def _unproject(xi, lens, coefficients, uv, limit, rays, valid):
         if np.isfinite(mx) and np.isfinite(my):
             a, b, valid[i] = undistort(lens, coefficients, limit, mx, my)
         s = a * a + b * b
-        # The far of the two points where the ray from xi behind the centre meets the sphere.
+        # The farther intersection of the sphere with the ray from the projection centre, xi behind the sphere's centre.
         scale = (xi + np.sqrt(1.0 + (1.0 - xi * xi) * s)) / (s + 1.0)
         x, y, z = scale * a, scale * b, scale - xi
-        # NaN, where the ray misses the sphere, is not valid either.
+        # If the ray misses the sphere, the point is NaN and therefore invalid.
         valid[i] = valid[i] and _on_plane(xi, np.inf, x, y, z)[4]
         if not valid[i]:
             x, y, z = 0.0, 0.0, 1.0

@@ -8,22 +8,23 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-_MAX_ITERATIONS = 100  # bisection alone halves the bracket to rounding in 60
+_MAX_ITERATIONS = 100  # bisection alone reaches rounding in 60
 
 
 def monotonic_limit(coefficients: np.ndarray) -> float:
-    """The smallest r > 0 at which f'(r) = 1 + 3 k1 r^2 + 5 k2 r^4 + ... vanishes; inf if there is none.
+    """The smallest r > 0 at which f'(r) = 1 + 3 k1 r^2 + 5 k2 r^4 + ... is zero; inf if there is none.
 
-    Beyond it a point far outside the field of view folds back into the image. 0 if a coefficient is not finite.
+    Beyond this limit, points far outside the field of view would be projected into the image. Returns 0 if a
+    coefficient is not finite.
     """
     return _monotonic_limit(tuple(coefficients.tolist()))
 
 
-@lru_cache(maxsize=64)  # asked for chunk by chunk, with the same coefficients
+@lru_cache(maxsize=64)  # called once for each chunk of points, with the same coefficients
 def _monotonic_limit(coefficients: tuple[float, ...]) -> float:
     if not np.isfinite(coefficients).all():
         return 0.0
-    # In w = 1 / r^2 the polynomial is monic, so a vanishing leading coefficient needs no special case.
+    # The polynomial is monic in w = 1 / r^2, so that vanishing leading coefficients need no special case.
     odd = 2.0 * np.arange(len(coefficients)) + 3.0
     roots = np.roots(np.concatenate([[1.0], odd * coefficients]))
     inverse_squares = roots.real[(roots.imag == 0.0) & (roots.real > 0.0)]
@@ -44,7 +45,8 @@ def evaluate(coefficients, r):
 
 @njit(cache=True, nogil=True)
 def invert(coefficients, distorted, limit):
-    """r in [0, limit) with f(r) = distorted >= 0, to rounding; `limit` if there is none. Newton kept in a bracket."""
+    """r in [0, limit) with f(r) = distorted >= 0, to rounding, by Newton's method in a bracket; `limit` if there is no
+    solution."""
     low = 0.0
     high = limit
     if limit == np.inf:

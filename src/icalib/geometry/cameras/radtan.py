@@ -8,19 +8,20 @@ from icalib.base.compiled import njit
 from icalib.geometry.cameras import radial
 from icalib.geometry.cameras.base import CameraModel
 
-_MIN_DEPTH = 1e-6  # m
-_MAX_NEWTON_STEPS = 30
+_MIN_DEPTH = 1e-6  # m; points with smaller z are invalid
+_MAX_NEWTON_STEPS = 30  # of the unprojection; pixels that need more are invalid
 
 
 class RadialTangential(CameraModel):
-    """With a = x / z, b = y / z, s = a^2 + b^2 and d = 1 + k1 s + k2 s^2 + k3 s^3 (OpenCV, calib3d, "radial" and
-    "tangential"; k3 = 0 in a model without it):
+    """Brown-Conrady model (OpenCV, calib3d, "radial" and "tangential"), with k3 = 0 for four coefficients.
 
+        a = x / z,  b = y / z,  s = a^2 + b^2,  d = 1 + k1 s + k2 s^2 + k3 s^3
         u = fx (a d + 2 p1 a b + p2 (s + 2 a^2)) + cx
         v = fy (b d + p1 (s + 2 b^2) + 2 p2 a b) + cy
 
-    Parameters: fx, fy, cx, cy, k1, k2, p1, p2 and, where the model has it, k3. Valid: z > 1 um, and r = sqrt(s) below
-    the first zero of 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6. The rest is projected to (0, 0) with zero Jacobians.
+    Parameters: fx, fy, cx, cy, k1, k2, p1, p2 and, for five coefficients, k3. A point is valid if z > 1 um, and r =
+    sqrt(s) is below the first zero of 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6. Invalid points are projected to (0, 0) with
+    zero Jacobians.
     """
 
     def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -48,7 +49,7 @@ class RadialTangential(CameraModel):
 
 
 class PinholeRadtan(RadialTangential):
-    """Two radial coefficients: Kalibr's "radtan"."""
+    """Radial-tangential distortion with two radial coefficients: Kalibr's "radtan"."""
 
     name = "pinhole-radtan"
     parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -56,7 +57,7 @@ class PinholeRadtan(RadialTangential):
 
 
 def _radial_coefficients(params: np.ndarray) -> np.ndarray:
-    """(k1, k2) or (k1, k2, k3): OpenCV's order puts the tangential ones in between."""
+    """(k1, k2) or (k1, k2, k3). In OpenCV's order, p1 and p2 are between k2 and k3."""
     return np.concatenate([params[4:6], params[8:]])
 
 
@@ -67,10 +68,11 @@ def _third_coefficient(params):
 
 @njit(cache=True, nogil=True)
 def distort(params, k3, a, b):
-    """Distorted (a, b), d of it / d (a, b) as (aa, ab = ba, bb): the Jacobian of this distortion is symmetric."""
+    """Distorted (a, b), and their derivatives by (a, b) as aa, ab (= ba), bb; the Jacobian of this distortion is
+    symmetric."""
     k1, k2, p1, p2 = params[4], params[5], params[6], params[7]
     s = a * a + b * b
-    # Not Horner's order: its longer chain of dependent products costs the model without k3 8 % of its time.
+    # Not Horner's scheme: its longer chain of dependent products makes the model without k3 8 % slower.
     d = 1.0 + s * k1 + s * s * (k2 + s * k3)
     slope = 2.0 * k1 + s * (4.0 * k2 + s * (6.0 * k3))
     distorted_a = a * d + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a)
@@ -130,7 +132,8 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def newton_step(error_a, error_b, j_aa, j_ab, j_bb):
-    """Whether the symmetric Jacobian turns the plane over, or is singular; and what (a, b) is to be lessened by."""
+    """Whether the determinant of the symmetric Jacobian is not positive (singular, or orientation reversed); and the
+    Newton step to subtract from (a, b)."""
     determinant = j_aa * j_bb - j_ab * j_ab
     step_a = (j_bb * error_a - j_ab * error_b) / determinant
     step_b = (j_aa * error_b - j_ab * error_a) / determinant
@@ -139,9 +142,10 @@ def newton_step(error_a, error_b, j_aa, j_ab, j_bb):
 
 @njit(cache=True, nogil=True)
 def undistort(params, coefficients, limit, distorted_a, distorted_b):
-    """(a, b) and whether Newton converged inside the monotonic range; starts where the radial part alone would be."""
+    """Undistorted (a, b), and whether Newton's method converged in the monotonic range. It starts from the solution
+    without tangential distortion."""
     distorted_r = np.hypot(distorted_a, distorted_b)
-    # At the limit itself the radial slope is zero; 0.9 leaves room for tangential terms that reach slightly past it.
+    # The radial slope is zero at the limit; 0.9 leaves a margin for tangential terms that exceed it slightly.
     r = min(radial.invert(coefficients, distorted_r, limit), 0.9 * limit)
     scale = r / distorted_r if distorted_r > 0.0 else 1.0
     a, b = scale * distorted_a, scale * distorted_b
@@ -157,7 +161,7 @@ def undistort(params, coefficients, limit, distorted_a, distorted_b):
     return a, b, False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
+@njit(cache=True, nogil=True, error_model="numpy")  # division by a zero focal length gives invalid rays, not an error
 def _unproject(params, coefficients, uv, limit, rays, valid):
     for i in range(len(uv)):
         mx, my = (uv[i, 0] - params[2]) / params[0], (uv[i, 1] - params[3]) / params[1]

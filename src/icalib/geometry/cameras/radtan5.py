@@ -6,9 +6,10 @@ from icalib.geometry.cameras.radtan import RadialTangential
 
 
 class PinholeRadtan5(RadialTangential):
-    """A third radial coefficient, for lenses that two cannot follow into the corners of the image.
+    """Radial-tangential distortion with a third radial coefficient, for lenses that two do not describe in the image
+    corners.
 
-    k3 comes last, as in OpenCV's distCoeffs and ROS's CameraInfo.D.
+    k3 is the last parameter, as in OpenCV's distCoeffs and ROS's CameraInfo.D.
     """
 
     name = "pinhole-radtan5"

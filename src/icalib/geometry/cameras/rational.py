@@ -10,27 +10,27 @@ from icalib.base.compiled import njit
 from icalib.geometry.cameras.closed_form import ClosedForm
 from icalib.geometry.cameras.radtan import newton_step
 
-_MIN_DEPTH = 1e-6  # m; nearer points have no image
-_MAX_NEWTON_STEPS = 30  # of the unprojection; a point that needs more counts as not valid
-_MAX_ITERATIONS = 100  # of the radius; bisection alone halves the bracket to rounding in 60
+_MIN_DEPTH = 1e-6  # m; points with smaller z are invalid
+_MAX_NEWTON_STEPS = 30  # of the unprojection; pixels that need more are invalid
+_MAX_ITERATIONS = 100  # of the radius; bisection alone reaches rounding in 60
 
 
 class PinholeRational(ClosedForm):
-    """OpenCV's CALIB_RATIONAL_MODEL (calib3d). With a = x / z, b = y / z, s = a^2 + b^2 and
+    """OpenCV's CALIB_RATIONAL_MODEL (calib3d).
 
+        a = x / z,  b = y / z,  s = a^2 + b^2
         d = N / D = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)
-
         u = fx (a d + 2 p1 a b + p2 (s + 2 a^2)) + cx
         v = fy (b d + p1 (s + 2 b^2) + 2 p2 a b) + cy
 
-    Parameters, in OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6. A point is valid if z > 1 um, and
-    r = sqrt(s) is below the first extremum or pole of r d(r^2). Others are projected to (0, 0) with zero Jacobians.
+    Parameters, in OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6. A point is valid if z > 1 um, and r =
+    sqrt(s) is below the first extremum or pole of r d(r^2). Invalid points are projected to (0, 0) with zero Jacobians.
     """
 
     name = "pinhole-rational"
     parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     start_distortions = ((0.0,) * 8,)
-    # Numerator and denominator nearly cancel: two sets of coefficients that project alike to 0.01 px can differ by 1.
+    # Numerator and denominator nearly cancel: coefficients can differ by 1 while projections differ by 0.01 px only.
     distortion_scale = 10.0
 
     def _fill_image(self, params, points, uv, valid) -> None:
@@ -44,17 +44,17 @@ class PinholeRational(ClosedForm):
 
 
 def _limit(params: np.ndarray) -> float:
-    """`monotonic_limit` of the model's parameters (12,)."""
+    """`monotonic_limit` for parameters (12,) of the model."""
     return monotonic_limit(tuple(params[[4, 5, 8]].tolist()), tuple(params[9:].tolist()))
 
 
 @lru_cache(maxsize=64)  # called once for each chunk of points, with the same coefficients
 def monotonic_limit(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> float:
-    """The smallest r > 0 at which r N(r^2) / D(r^2) stops growing or has a pole; inf if there is none.
+    """The smallest r > 0 at which r N(r^2) / D(r^2) has an extremum or a pole; inf if there is none.
 
-    r = tan of the angle to the optical axis. numerator (n_1, n_2, ...): N(s) = 1 + n_1 s + n_2 s^2 + ...; denominator
-    likewise. The derivative is (N D + 2 s (N' D - N D')) / D^2 at s = r^2. Returns 0 if a coefficient, or one of the
-    derivative's numerator, is not finite.
+    r is the tangent of the angle to the optical axis. numerator (n_1, n_2, ...): N(s) = 1 + n_1 s + n_2 s^2 + ...;
+    denominator likewise. The derivative is (N D + 2 s (N' D - N D')) / D^2 at s = r^2. Returns 0 if a coefficient, also
+    of the derivative's numerator, is not finite.
     """
     N, D = np.array([1.0, *numerator]), np.array([1.0, *denominator])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -71,10 +71,11 @@ def _derivative(coefficients: np.ndarray) -> np.ndarray:
 
 
 def _smallest_root(coefficients: np.ndarray) -> float:
-    """The smallest positive root of 1 + c_1 s + c_2 s^2 + ..., coefficients (1, c_1, c_2, ...); inf if there is none.
+    """The smallest positive root of 1 + c_1 s + c_2 s^2 + ..., for coefficients (1, c_1, c_2, ...); inf if there is
+    none.
 
-    numpy.roots takes the highest power first, and so returns the roots in w = 1 / s. There the polynomial is monic, and
-    vanishing leading coefficients need no special case.
+    numpy.roots expects the highest power first, and therefore returns the roots in w = 1 / s. The polynomial is monic
+    in w, so that vanishing leading coefficients need no special case.
     """
     inverses = np.roots(coefficients)
     positive = inverses.real[(inverses.imag == 0.0) & (inverses.real > 0.0)]
@@ -94,7 +95,7 @@ def _radial(params, s):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distort(params, a, b):
-    """Distorted (a, b); its derivatives by (a, b) as aa, ab (= ba), bb; d = N / D; and 1 / D."""
+    """Distorted (a, b); their derivatives by (a, b) as aa, ab (= ba), bb; d = N / D; and 1 / D."""
     p1, p2 = params[6], params[7]
     s = a * a + b * b
     d, inverse, slope = _radial(params, s)
@@ -147,7 +148,7 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
         j_params[i, 1, 1], j_params[i, 1, 3] = distorted_b, 1.0
         j_params[i, 0, 6], j_params[i, 0, 7] = 2.0 * fx * a * b, fx * (s + 2.0 * a * a)
         j_params[i, 1, 6], j_params[i, 1, 7] = fy * (s + 2.0 * b * b), 2.0 * fy * a * b
-        by_u, by_v = fx * a * inverse, fy * b * inverse  # d (u, v) / d N; by D it is -d times that
+        by_u, by_v = fx * a * inverse, fy * b * inverse  # d (u, v) / d N; d (u, v) / d D is -d times this
         j_params[i, 0, 4], j_params[i, 0, 5], j_params[i, 0, 8] = by_u * s, by_u * s * s, by_u * s * s * s
         j_params[i, 1, 4], j_params[i, 1, 5], j_params[i, 1, 8] = by_v * s, by_v * s * s, by_v * s * s * s
         by_u, by_v = -d * by_u, -d * by_v
@@ -157,7 +158,8 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _undistorted_radius(params, distorted, limit):
-    """The r below `limit` with r d(r^2) = distorted; near the limit where there is none. Newton within a bracket."""
+    """The r below `limit` with r d(r^2) = distorted, by Newton's method in a bracket; close to the limit if there is no
+    solution."""
     low, high = 0.0, limit
     if limit == np.inf:
         high = 1.0 + distorted
@@ -182,12 +184,12 @@ def _undistorted_radius(params, distorted, limit):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _undistort(params, limit, distorted_a, distorted_b):
-    """The undistorted (a, b), and whether Newton converged to it inside the monotonic range.
+    """The undistorted (a, b), and whether Newton's method converged to a point in the monotonic range.
 
     It starts from the solution without tangential distortion.
     """
     distorted_r = np.hypot(distorted_a, distorted_b)
-    # At the limit itself the radial slope is zero; 0.9 leaves room for tangential terms that reach slightly past it.
+    # The radial slope is zero at the limit; 0.9 leaves a margin for tangential terms that exceed it slightly.
     r = min(_undistorted_radius(params, distorted_r, limit), 0.9 * limit)
     scale = r / distorted_r if distorted_r > 0.0 else 1.0
     a, b = scale * distorted_a, scale * distorted_b
@@ -202,7 +204,7 @@ def _undistort(params, limit, distorted_a, distorted_b):
     return a, b, False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
+@njit(cache=True, nogil=True, error_model="numpy")  # division by a zero focal length gives invalid rays, not an error
 def _unproject(params, uv, limit, rays, valid):
     for i in range(len(uv)):
         mx, my = (uv[i, 0] - params[2]) / params[0], (uv[i, 1] - params[3]) / params[1]

@@ -1,4 +1,4 @@
-"""Calibration targets: where their points are, in the board frame, and what identifies a point."""
+"""Calibration targets: positions of their points in the board frame, and identification of the points."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TARGETS: dict[str, type[Target]] = {
 
 
 def target_from_plain(rig: dict[str, Any]) -> Target | None:
-    """The target of a rig as plain data, back from `Target.plain`; None where there is none."""
+    """The target of a rig as plain data, the inverse of `Target.plain`; None if the rig has no target."""
     if "targets" in rig:
         return Scene(tuple(rig["targets"]), tuple(_one(fields) for fields in rig["targets"].values()))
     return _one(rig["target"]) if rig.get("target") else None

@@ -12,17 +12,17 @@ from icalib.errors import RecordingError
 from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.families import APRILGRID_FAMILY, TagSet, checked_family
 
-UNIT_TAG = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # corner 0 to 3
+UNIT_TAG = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # corners 0 to 3 of a tag of edge 1
 
 
 @dataclass(frozen=True)
 class AprilGrid(Target):
-    """Kalibr's AprilGrid: `rows` x `cols` tags of edge `tag_size` [m], gaps of `tag_spacing` * tag_size.
+    """Kalibr's AprilGrid: `rows` x `cols` tags with edge `tag_size` [m], with gaps of `tag_spacing` * tag_size.
 
-    Board frame: origin at corner 0 of the first tag, x along a row, y along a column, the tags in z = 0. Tag ids run
-    row-major from the bottom left, the first is `first_id`; corner 0 of a tag is at its bottom left, then
-    counterclockwise. border_bits: width of the tags' black border, 2 as Kalibr prints them, or 1; squares: black
-    squares fill the gaps between the tags' corners. Raises RigError where the family has too few tags.
+    Board frame: origin at corner 0 of the first tag, x along a row, y along a column, all tags in z = 0. Tag ids are
+    row-major from the bottom left and start with `first_id`. Corner 0 of a tag is at its bottom left; the others follow
+    counterclockwise. border_bits: width of the black border, 2 as in Kalibr, or 1. squares: whether black squares fill
+    the gaps between the corners of tags. Raises RigError if the family has too few tags.
     """
 
     type: ClassVar[str] = "aprilgrid"
@@ -43,7 +43,7 @@ class AprilGrid(Target):
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(4 * rows * cols, 3) corners in metres, corner c of tag i at index 4 i + c."""
+        """(4 * rows * cols, 3) corners [m]; corner c of tag number i has index 4 i + c."""
         pitch = self.tag_size * (1.0 + self.tag_spacing)
         row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
         origin = pitch * np.stack([col, row], axis=1)
@@ -52,7 +52,7 @@ class AprilGrid(Target):
 
     @cached_property
     def tag_centers(self) -> np.ndarray:
-        """(4 * rows * cols, 3) for each corner, the centre of its tag in metres."""
+        """(4 * rows * cols, 3) centre of the tag of each corner [m]."""
         centers = self.points.reshape(-1, 4, 3).mean(axis=1)
         return np.repeat(centers, 4, axis=0)
 
@@ -65,7 +65,7 @@ class AprilGrid(Target):
         return np.arange(len(self.points)) // 4
 
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        """(N,) index into `points`. Raises RecordingError for a tag or corner that this target does not have."""
+        """See `Target`. Raises RecordingError if the target has no such tag or corner."""
         tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
         first, last = self.first_id, self.first_id + self.rows * self.cols - 1
         bad = (tag_id < first) | (tag_id > last)
@@ -81,5 +81,5 @@ class AprilGrid(Target):
         return 4 * (tag_id - first) + corner
 
     def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) tag ids and corners of points."""
+        """See `Target`."""
         return self.first_id + index // 4, index % 4

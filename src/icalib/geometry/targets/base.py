@@ -1,4 +1,4 @@
-"""What the rest of the program knows of a target: this class and nothing else."""
+"""Interface of the calibration targets; all other packages use only this class."""
 
 from __future__ import annotations
 
@@ -13,71 +13,72 @@ from icalib.errors import RecordingError
 from icalib.geometry.targets.families import TagSet
 
 BOARD = "board0"
-# Of a printed size, relative: a ruler reads 0.2 mm of 100 mm, and printers and damp paper are off by as much.
+# Relative standard deviation of a printed size: a ruler is read to 0.2 mm in 100 mm, and printers and damp paper have
+# errors of the same size.
 SIZE_SIGMA = 0.002
 
 
 @dataclass(frozen=True)
 class Target(ABC):
-    """Points on flat, rigid bodies: one, unless said otherwise. The frame of a body: origin at its first point, x to
-    the right and y upwards on the sheet, so that z points out of the print towards whoever looks at it; all points
-    have z = 0.
+    """Known points on flat, rigid bodies; most targets have one body. A body's frame has its origin at its first point.
+    Its x axis points right and y up on the sheet, z out of the print. All points have z = 0.
 
-    A point is identified by the id of a tag and its corner, or by tag 0 and the number of the corner on targets whose
-    points belong to no tag. type: the name in rig files. blooms: the points are corners of tags, which bloom pulls
-    towards the tag's centre; where squares touch corner to corner it moves nothing. seldom: fields that `plain` leaves
-    out at their defaults.
+    A point is identified by a tag id and the number of a corner. On targets whose points are not corners of tags, the
+    tag id is 0. type: name in rig files. blooms: whether points are corners of tags, which edge bloom shifts towards
+    the tag's centre; it does not shift corners where squares touch diagonally. seldom: fields that `plain` omits if
+    they have their default values.
     """
 
     type: ClassVar[str]
     blooms: ClassVar[bool]
     seldom: ClassVar[tuple[str, ...]] = ()
 
-    size_sigma: float = field(default=SIZE_SIGMA, kw_only=True)  # of all its lengths, relative; 0: exact
+    size_sigma: float = field(default=SIZE_SIGMA, kw_only=True)  # relative, common to all lengths; 0: exact
 
     @cached_property
     @abstractmethod
     def points(self) -> np.ndarray:
-        """(n, 3) in metres, in the frame of the body that each belongs to."""
+        """(n, 3) points [m], each in the frame of its body."""
 
     @cached_property
     def tag_centers(self) -> np.ndarray:
-        """(n, 3) in metres: for each point the centre of its tag; the point itself where nothing blooms."""
+        """(n, 3) centre of the tag of each point [m]; the point itself if the target has no bloom."""
         return self.points
 
     @cached_property
     def radii(self) -> np.ndarray:
-        """(n,) in metres: of the circle whose centre each point is; 0 of points that are no circle's."""
+        """(n,) radius of the circle around each point [m]; 0 for points that are not centres of circles."""
         return np.zeros(len(self.points))
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
-        """Name of each rigid body. How several stand to each other is unknown, and estimated."""
+        """Name of each rigid body. The relative poses of several bodies are unknown, and estimated."""
         return (BOARD,)
 
     @cached_property
     def body(self) -> np.ndarray:
-        """(n,) int64: the body that each point belongs to."""
+        """(n,) int64: index of the body of each point."""
         return np.zeros(len(self.points), dtype=np.int64)
 
     @cached_property
     def tag_number(self) -> np.ndarray:
-        """(n,) int64: the same for all corners of one tag, which are found together; corners without a tag have a
-        number each."""
+        """(n,) int64: index that all corners of one tag share, as they are detected together. Each corner without a tag
+        has a different index."""
         return np.arange(len(self.points))
 
     @cached_property
     def bends(self) -> np.ndarray:
-        """(bodies,) bool: whether a body is large enough to bend."""
+        """(bodies,) bool: whether each body is large enough to bend."""
         return np.ones(len(self.bodies), dtype=bool)
 
     @property
     def tags(self) -> TagSet | None:
-        """The tags by which images tell this target from others, where it has any."""
+        """The tags that identify this target in images; None if it has no tags."""
         return None
 
     def plain(self) -> dict[str, Any]:
-        """Its fields as a rig file has them: text, numbers, lists; those that list nothing are left out."""
+        """Fields as in a rig file: text, numbers, lists. Empty lists are omitted, and so are `seldom` fields with
+        default values."""
         usual = {f.name: f.default for f in fields(self) if f.name in (*self.seldom, "size_sigma")}
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values = {name: value for name, value in values.items() if name not in usual or value != usual[name]}
@@ -86,25 +87,28 @@ class Target(ABC):
 
     @cached_property
     def turns(self) -> tuple[np.ndarray, ...]:
-        """Numbers (n,) of the points after each turn of the sheet that no image shows; the first is no turn."""
+        """Permutations (n,) of the point numbers by each rotation of the sheet that leaves its appearance unchanged.
+        The first is the identity."""
         return (np.arange(len(self.points)),)
 
     @property
     def symmetric(self) -> bool:
-        """Whether images show the target alike after some turn, so that they cannot tell its points apart."""
+        """Whether a rotation of the sheet leaves its appearance unchanged, so that images cannot identify its
+        points."""
         return len(self.turns) > 1
 
     @abstractmethod
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        """(N,) index into `points` of (N,) tags and corners. Raises RecordingError for one that the target lacks."""
+        """(N,) indices into `points`, from (N,) tag ids and (N,) corner numbers. Raises RecordingError if the target
+        has no such point."""
 
     @abstractmethod
     def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) tag ids and (N,) corners of (N,) indices into `points`."""
+        """(N,) tag ids and (N,) corner numbers of (N,) indices into `points`."""
 
 
 def untagged_index(tag_id: np.ndarray, corner: np.ndarray, n_points: int, sizes: str) -> np.ndarray:
-    """`point_index` of a target whose points belong to no tag; `sizes` are the fields to check in the rig file."""
+    """`point_index` for a target without tags. sizes: words for the fields to check in the rig file."""
     tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
     if (tag_id != 0).any():
         raise RecordingError(

@@ -15,13 +15,15 @@ from icalib.geometry.targets.families import TagSet, checked_family
 
 @dataclass(frozen=True)
 class Charuco(Target):
-    """OpenCV's ChArUco board of `squares_x` x `squares_y` squares of edge `square_size` [m], the one in the top left
-    corner black (OpenCV 4.6 and later), with tags of edge `marker_size` [m] of `dictionary` in the white ones, ids row
-    by row from the top. legacy: the layout of OpenCV before 4.6 and of calib.io, whose top left square is white where
-    squares_y is even. inverted: black and white are exchanged.
+    """OpenCV's ChArUco board: `squares_x` x `squares_y` squares with edge `square_size` [m], and a tag in each white
+    square.
 
-    Points are the inner corners, numbered as OpenCV does: row by row from the top left; point 0 is the origin, so y of
-    later rows is negative. Raises RigError where the sizes or the dictionary do not fit.
+    The top left square is black (OpenCV 4.6 and later). Tags have the edge `marker_size` [m] and are of `dictionary`,
+    with ids row by row from the top. legacy: the layout of OpenCV before 4.6 and of calib.io, whose top left square is
+    white if squares_y is even. inverted: black and white are exchanged.
+
+    Points are the inner corners, numbered as in OpenCV: row by row from the top left. Point 0 is the origin, so that y
+    of later rows is negative. Raises RigError if sizes or dictionary are not possible.
     """
 
     type: ClassVar[str] = "charuco"
@@ -56,7 +58,7 @@ class Charuco(Target):
 
     @cached_property
     def points(self) -> np.ndarray:
-        """((squares_x - 1) (squares_y - 1), 3) inner corners in metres."""
+        """((squares_x - 1) (squares_y - 1), 3) inner corners [m]."""
         row, col = np.divmod(np.arange((self.squares_x - 1) * (self.squares_y - 1)), self.squares_x - 1)
         return self.square_size * np.stack([col, -row, 0 * row], axis=1)
 

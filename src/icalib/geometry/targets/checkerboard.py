@@ -14,12 +14,12 @@ from icalib.geometry.targets.base import Target, untagged_index
 
 @dataclass(frozen=True)
 class Checkerboard(Target):
-    """`rows` x `cols` INNER corners between squares of edge `square_size` [m], the bottom left square black, as Kalibr
-    prints it; `inverted`: white. `upright`: of a board that looks the same after half a turn, all images show the
-    rows run to the right, within 90 degrees, or 45 where rows = cols.
+    """Checkerboard with `rows` x `cols` INNER corners between squares with edge `square_size` [m].
 
-    Points row by row from the bottom left, row r and column c at index r cols + c. Raises RigError for fewer than two
-    rows or columns.
+    The bottom left square is black, as in Kalibr, or white if `inverted`. upright: the rows run to the right in all
+    images, within 90 degrees, or 45 if rows = cols; this resolves the symmetry of a board. Points are ordered row by
+    row from the bottom left, with index r cols + c in row r and column c. Raises RigError for fewer than two rows or
+    columns.
     """
 
     type: ClassVar[str] = "checkerboard"
@@ -41,8 +41,8 @@ class Checkerboard(Target):
 
     @cached_property
     def turns(self) -> tuple[np.ndarray, ...]:
-        """Half a turn where it puts black on black, rows and cols both even or both odd; quarters where both are equal
-        and even. None where the board is `upright`."""
+        """See `Target.turns`. Half a turn if rows and cols are both even or both odd; also quarter turns if they are
+        equal and even. Only the identity if `upright`, or if one is even and the other odd."""
         number = np.arange(self.rows * self.cols).reshape(self.rows, self.cols)
         if self.upright or (self.rows + self.cols) % 2 == 1:
             return (number.ravel(),)
@@ -51,7 +51,7 @@ class Checkerboard(Target):
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(rows cols, 3) inner corners in metres."""
+        """(rows cols, 3) inner corners [m]."""
         row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
         return self.square_size * np.stack([col, row, 0 * row], axis=1)
 

@@ -14,13 +14,13 @@ from icalib.geometry.targets.base import Target, untagged_index
 
 @dataclass(frozen=True)
 class Circles(Target):
-    """`rows` x `cols` black circles of `diameter` [m] on white.
+    """`rows` x `cols` black circles with `diameter` [m] on white.
 
-    In a symmetric grid neighbouring centres are `spacing` [m] apart. If `asymmetric`, rows are one spacing apart, and
-    circles of a row two. Every other row, from the second on, is moved by one spacing to the right.
+    In a symmetric grid the centres of neighbours are `spacing` [m] apart. In an `asymmetric` grid, rows are one spacing
+    apart, and circles in a row two. Every second row is shifted by one spacing to the right.
 
-    Points are the centres, numbered row by row from the top left. Point 0 is the origin, and y is up: y of later rows
-    is negative. Raises RigError where circles would touch, or there are too few to be a grid.
+    Points are the centres, numbered row by row from the top left. Point 0 is the origin, and y points up, so that y of
+    later rows is negative. Raises RigError if circles would touch, or are too few.
     """
 
     type: ClassVar[str] = "circles"
@@ -56,10 +56,10 @@ class Circles(Target):
 
     @cached_property
     def turns(self) -> tuple[np.ndarray, ...]:
-        """Rotations that map the grid to itself, as `Target.turns`.
+        """See `Target.turns`.
 
-        Symmetric grids: half a turn, and quarter turns where rows = cols. Asymmetric ones: half a turn where rows are
-        even, none where they are odd.
+        Symmetric grids: half a turn, and quarter turns if rows = cols. Asymmetric grids: half a turn if rows are even,
+        otherwise only the identity.
         """
         number = np.arange(self.rows * self.cols).reshape(self.rows, self.cols)
         if self.asymmetric:

@@ -1,6 +1,6 @@
-"""Families of square tags by name: how many bits a side, how many tags, and the bits, which OpenCV knows.
+"""Families of square tags: names, bits along a side, numbers of tags, and the bits, which OpenCV provides.
 
-AprilTags are called as their authors do (tag36h11), others as OpenCV does, without DICT_ (4x4_50).
+AprilTag families have their original names (tag36h11), all others the names in OpenCV without DICT_ (4x4_50).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from icalib.base.extras import load_cv2
 from icalib.base.suggestion import suggestion
 from icalib.errors import RecordingError, RigError
 
-# name -> (bits along a side without the border, number of ids); `original` is that of the ArUco library.
+# name -> (bits along a side without the border, number of ids); aruco_original is the family of the ArUco library.
 FAMILIES = {
     **{f"{n}x{n}_{count}": (n, count) for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
     "aruco_original": (5, 1024),
@@ -33,24 +33,24 @@ _OPENCVS = {"aruco_original": "DICT_ARUCO_ORIGINAL", "aruco_mip_36h12": "DICT_AR
 
 @dataclass(frozen=True)
 class TagSet:
-    """Tags that are on a target: `ids` of `family`, with black borders of `border_bits` cells."""
+    """Tags on a target: `ids` of `family`, with black borders of `border_bits` cells."""
 
     family: str
     border_bits: int
     ids: tuple[int, ...]
 
     def shared_with(self, other: TagSet) -> list[int]:
-        """Ids under which either set has the same tag as the other."""
-        # Of OpenCV's families with the same number of bits, the larger ones begin with the smaller ones.
+        """Ids, in increasing order, whose tags are the same in both sets."""
+        # In OpenCV, larger families begin with the tags of smaller families with the same number of bits.
         kinds = [t.family.split("_")[0] if "x" in t.family else t.family for t in (self, other)]
         same = kinds[0] == kinds[1] and self.border_bits == other.border_bits
         return sorted(set(self.ids) & set(other.ids)) if same else []
 
 
 def family_name(text: str) -> str:
-    """The name in `FAMILIES` of a family that is called so by its authors, by ROS or by OpenCV, with DICT_ or without.
+    """The name in `FAMILIES` of a family named as by its authors, by ROS or by OpenCV, with or without DICT_.
 
-    Raises RigError where there is none.
+    Raises RigError if there is none.
     """
     name = text.lower().removeprefix("dict_")
     if april := _APRILTAG.fullmatch(name):
@@ -62,7 +62,7 @@ def family_name(text: str) -> str:
 
 
 def checked_family(text: str, ids: int) -> str:
-    """As `family_name`. Raises RigError also where the family has fewer than `ids` tags."""
+    """`family_name` of `text`. Raises RigError also if the family has fewer than `ids` tags."""
     family = family_name(text)
     if FAMILIES[family][1] < ids:
         raise RigError(f"needs {ids} tags, but {family} has {FAMILIES[family][1]}; choose a larger family.")
@@ -70,21 +70,22 @@ def checked_family(text: str, ids: int) -> str:
 
 
 def is_apriltag(family: str) -> bool:
-    """Whether OpenCV draws the tags of this family of `FAMILIES` upside down."""
+    """Whether a family of `FAMILIES` consists of AprilTags, which OpenCV draws rotated by 180 deg."""
     return family.startswith("tag")
 
 
 def is_available(family: str) -> bool:
-    """Whether the installed OpenCV has this family of `FAMILIES`; older ones lack some."""
+    """Whether the installed OpenCV has this family of `FAMILIES`; older versions lack some."""
     return hasattr(load_cv2().aruco, _opencvs_name(family))
 
 
 @lru_cache(maxsize=32)
 def opencv_bits(family: str) -> np.ndarray:
-    """(ids, n, n) bool, True where white: all tags of this family of `FAMILIES` as OpenCV draws them, alone and on its
-    boards; row 0 at the top, without the black border. AprilTags are rotated by 180 deg.
+    """(ids, n, n) bool, True if white: all tags of this family of `FAMILIES` as OpenCV draws them, without the black
+    border.
 
-    Raises RecordingError where OpenCV, which knows the bits, is not installed or does not know these.
+    Row 0 is at the top. AprilTags are rotated by 180 deg. Raises RecordingError if OpenCV, which provides the bits, is
+    not installed or lacks the family.
     """
     if not is_available(family):
         raise RecordingError(f"the installed OpenCV has no tags of {family}; update opencv-python-headless.")
@@ -98,10 +99,9 @@ def opencv_bits(family: str) -> np.ndarray:
 
 
 def tag_bits(family: str, tag_id: int) -> np.ndarray:
-    """(n, n) bool, True where white: the tag upright, as its authors draw it, Kalibr too; row 0 at the top, without its
-    black border.
+    """(n, n) bool, True if white: one tag, upright as its authors and Kalibr draw it, without the black border.
 
-    Raises as `opencv_bits`, and RigError where there is no such tag.
+    Row 0 is at the top. Raises as `opencv_bits`, and RigError if there is no such tag.
     """
     family = checked_family(family, tag_id + 1)
     bits = opencv_bits(family)[tag_id]
@@ -109,6 +109,7 @@ def tag_bits(family: str, tag_id: int) -> np.ndarray:
 
 
 def _opencvs_name(family: str) -> str:
+    """Name of the family's dictionary in OpenCV."""
     if is_apriltag(family):
         return f"DICT_APRILTAG_{family.removeprefix('tag')}"
     return _OPENCVS.get(family) or f"DICT_{family.upper()}"

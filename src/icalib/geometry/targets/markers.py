@@ -1,4 +1,4 @@
-"""Free tags of one family and size, stuck anywhere: each stands where it stands."""
+"""Separate tags of one family and size at unknown poses."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from icalib.geometry.targets.families import FAMILIES, TagSet, checked_family
 
 @dataclass(frozen=True)
 class Markers(Target):
-    """Tags of `family`, their black borders of edge `size` [m], with these `ids`, or any of the family if there are
-    none.
+    """Tags of `family` with these `ids`, or with all ids of the family if none are given. size: edge of the black
+    border [m].
 
-    Every tag is a body of its own. Corners as on an AprilGrid: 0 at the bottom left, then counterclockwise. Raises
-    RigError where the family lacks such a tag or an id is listed twice.
+    Each tag is a separate body. Corners are numbered as on an AprilGrid: 0 at the bottom left, then counterclockwise.
+    Raises RigError if the family lacks such a tag, or an id is listed twice.
     """
 
     type: ClassVar[str] = "markers"
@@ -43,7 +43,7 @@ class Markers(Target):
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(4 tags, 3) corners in metres, each in its tag's frame; corner c of known[i] at index 4 i + c."""
+        """(4 tags, 3) corners [m], each in the frame of its tag; corner c of tag known[i] has index 4 i + c."""
         corners = np.concatenate([self.size * UNIT_TAG, np.zeros((4, 1))], axis=1)
         return np.tile(corners, (len(self.known), 1))
 

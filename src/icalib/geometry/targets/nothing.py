@@ -1,4 +1,4 @@
-"""No target at all: cameras have feature tracks of the scene."""
+"""No target: cameras use feature tracks of the scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from icalib.geometry.targets.base import Target
 @final
 @dataclass(frozen=True)
 class NoTarget(Target):
-    """Nothing to see."""
+    """A target without points, for rigs without a target."""
 
     type: ClassVar[str] = "none"
     blooms: ClassVar[bool] = False

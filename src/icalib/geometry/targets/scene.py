@@ -17,11 +17,12 @@ from icalib.geometry.targets.circles import Circles
 
 @dataclass(frozen=True)
 class Scene(Target):
-    """Targets that stand still to each other, by name. How they stand is unknown, and estimated.
+    """Several targets, by name, that do not move relative to each other. Their relative poses are unknown, and
+    estimated.
 
-    Points are those of the first, then those of the second, and so on; bodies are called as their target, or as the
-    target and its body where it has several. Sizes err together, by the largest `size_sigma` of all. Raises RigError
-    where images cannot tell two of them apart.
+    Points are those of the first target, then of the second, and so on. A body is named after its target, or after
+    target and body if the target has several. All sizes share one relative error, with the largest `size_sigma` of all
+    targets. Raises RigError if images cannot distinguish two of the targets.
     """
 
     type: ClassVar[str] = "scene"
@@ -37,17 +38,17 @@ class Scene(Target):
                 raise RigError(f"images cannot tell {name} from {other_name}: {common}.")
 
     def plain(self) -> dict[str, Any]:
-        """What a rig file has under `targets`: the fields of each target by name."""
+        """The content of `targets` in a rig file: fields of each target by name."""
         return {name: target.plain() for name, target in zip(self.names, self.targets, strict=True)}
 
     @cached_property
     def first_points(self) -> np.ndarray:
-        """(targets + 1,) index of each target's first point, and the number of points."""
+        """(targets + 1,) index of the first point of each target, followed by the number of points."""
         return np.concatenate([[0], np.cumsum([len(t.points) for t in self.targets])]).astype(np.int64)
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(n, 3) in metres, in the frame of the body that each belongs to."""
+        """(n, 3) points [m], each in the frame of its body."""
         return np.concatenate([t.points for t in self.targets])
 
     @cached_property
@@ -82,7 +83,8 @@ class Scene(Target):
         return any(t.symmetric for t in self.targets)
 
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        """Raises RecordingError also where two targets have such a corner: a table cannot tell which one is meant."""
+        """See `Target`. Raises RecordingError also if two targets have such a corner, as a table does not say which is
+        meant."""
         tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
         index = np.full(len(tag_id), -1)
         owner = np.full(len(tag_id), -1)
@@ -113,7 +115,7 @@ class Scene(Target):
 
 
 def _in_common(one: Target, other: Target) -> str:
-    """By what images would take one for the other, and what to do; "" where nothing."""
+    """Why images cannot distinguish the two targets, and advice; empty if they can."""
     if one.tags and other.tags and (ids := one.tags.shared_with(other.tags)):
         advice = "give them other ids or families (first_id and family of an aprilgrid), or leave one out"
         return f"both have tag {ids[0]} of {one.tags.family}; {advice}"
@@ -126,7 +128,7 @@ def _in_common(one: Target, other: Target) -> str:
 
 
 def _rows_of(target: Target, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-    """(N,) bool: the rows that are points of `target`."""
+    """(N,) bool: whether each tag id and corner number is a point of `target`."""
     known = np.stack(target.point_identity(np.arange(len(target.points))), axis=1)
     base = 1 + int(max(known.max(), tag_id.max(initial=0), corner.max(initial=0)))
     return np.isin(tag_id * base + corner, known[:, 0] * base + known[:, 1]) & (tag_id >= 0) & (corner >= 0)

@@ -16,9 +16,10 @@ from icalib.geometry.targets.families import checked_family
 
 @dataclass(frozen=True)
 class Tag(Target):
-    """Tag `id` of `family` (any of the names that `family_name` knows), its black border of edge `size` [m].
+    """Tag `id` of `family` (any name that `family_name` accepts). size: edge of the black border [m].
 
-    Corners as on an AprilGrid: 0 at the bottom left, then counterclockwise. Raises RigError where there is no such tag.
+    Corners are numbered as on an AprilGrid: 0 at the bottom left, then counterclockwise. Raises RigError if there is no
+    such tag.
     """
 
     type: ClassVar[str] = "tag"
@@ -33,7 +34,7 @@ class Tag(Target):
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(4, 3) corners in metres."""
+        """(4, 3) corners [m]."""
         return np.concatenate([self.size * UNIT_TAG, np.zeros((4, 1))], axis=1)
 
     @cached_property
