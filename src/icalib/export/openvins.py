@@ -30,8 +30,7 @@ _OTHER_OFFSET_S = 1e-5
 
 
 def openvins(c: Calibration) -> Export:
-    """Files of all cameras and of the IMU. Raises CalibrationError without a camera, or without an IMU whose rate is
-    known."""
+    """Files of cameras and IMU. Raises CalibrationError without a camera, or without an IMU whose rate is known."""
     imu = need_imu(c, "OpenVINS")
     need(c.cameras, "camera", "OpenVINS")
     if imu not in c.rates:
@@ -78,8 +77,8 @@ def _offsets(c: Calibration) -> tuple[str, ...]:
 
 
 def _imu(c: Calibration, imu: str) -> str:
-    """File of the IMU. Its model is gyro = Tw R_IMUtoGYRO w + Tg f and accel = Ta R_IMUtoACC f, with rate w and
-    specific force f in the imu frame."""
+    """File of the IMU. w: rate, f: specific force, both in the imu frame; gyro = Tw R_IMUtoGYRO w + Tg f, accel = Ta
+    R_IMUtoACC f."""
     noise, x = c.rig["sensors"][imu]["noise"], np.zeros(24)
     found = [g.value for g in c.groups if (g.sensor, g.name) == (imu, "intrinsics") and len(g.value) == 24]
     x = found[0] if found else x

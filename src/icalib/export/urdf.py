@@ -60,8 +60,8 @@ def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: 
     differ. joints: joint to change instead, by sensor, further up the tree (such as the camera joint above an optical
     frame). Sensors without a link are omitted, and a sentence says so.
 
-    Raises CalibrationError if a link of the body or of `frames` does not exist, if a joint between body and sensor
-    moves, or if the origin is in a xacro macro or is not plain numbers.
+    Raises CalibrationError if a link of the body or of `frames` does not exist, or a joint between body and sensor
+    moves. It is also raised if the origin is in a xacro macro or is not plain numbers.
     """
     tree = read_urdf(path)
     body = frames.get(c.body, c.body)

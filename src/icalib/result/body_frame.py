@@ -24,8 +24,8 @@ def in_body_frame(c: Calibration) -> Calibration:
 
     The body gets the identity as a fixed pose. An IMU that is not the body gets a pose. The covariance is J C J^T, to
     first order. The empirical factor of a pose is the ratio of its standard deviations with and without the factors of
-    the groups that it is computed from. The null space becomes span(J N). Verdicts on poses follow from the null space
-    and the standard deviations, as in `c`. All other groups are unchanged; time offsets stay relative to the reference.
+    its source groups. The null space becomes span(J N). Verdicts on poses follow from the null space and the standard
+    deviations, as in `c`. All other groups are unchanged; time offsets stay relative to the reference.
     """
     if c.body == c.reference:
         return c

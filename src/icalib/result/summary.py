@@ -60,8 +60,8 @@ def calibration_yaml(calibration: Calibration) -> str:
 
 
 def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], str]:
-    """Keys of the parameters of one sensor in calibration.yaml, by (group, label). A key is the label, prefixed with
-    its group if the label is empty or not unique, or if the group has a singular name (`ONE`)."""
+    """Keys of the parameters of one sensor in calibration.yaml, by (group, label). A key is the label. It is prefixed
+    with the group if the label is empty or not unique, or the group has a singular name (`ONE`)."""
     count = Counter(label for g in groups for label in g.labels)
     own = {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
     return own | {(name, label): f"{ONE[name]}_{label}" for name, label in own if name in ONE}
