@@ -1,6 +1,6 @@
-"""Initial guess of cameras: intrinsics, distortion, extrinsics, time offsets, and the trajectory by their images.
+"""Initial guess of cameras: intrinsics, distortion, extrinsics, time offsets, and the trajectory from their images.
 
-Cameras see a target (`boards`) or have feature tracks (`tracks`).
+The guess comes from images of a target (`boards`) or from feature tracks (`tracks`).
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ class CameraInitializer(Initializer[Camera]):
     """
 
     hosts_keyframes = True
-    refined_alone = False  # the estimator begins with the same pass
+    refined_alone = False  # a refinement would repeat the first pass of the estimator
 
     def motion_rank(self, rig: Rig) -> int | None:
+        """See `Initializer`: `BY_TARGET` with a target, `BY_TRACKS` with an IMU but no target, else None."""
         if not rig.cameras:
             return None
         if rig.has_target:
@@ -44,9 +45,11 @@ class CameraInitializer(Initializer[Camera]):
         return None if rig.imu is None else BY_TRACKS
 
     def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
+        """See `Initializer`: the trajectory interpolated between camera poses, and the guess of all cameras."""
         return initial_state(inputs, *_guesses_by_recording(inputs, other))
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+        """See `Initializer`: refines the trajectory by the first pass of the estimator."""
         return inputs, first_pass(inputs, state), state.values
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Camera]) -> Values:
@@ -55,6 +58,7 @@ class CameraInitializer(Initializer[Camera]):
         return track_camera_values(inputs, state)
 
     def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
+        """See `Initializer`: poses of the body from the images of all cameras, without an IMU."""
         cameras_only = rig.only(*(c.name for c in rig.cameras))
         inputs = inputs_for(cameras_only, [m.only(*cameras_only.sensors) for m in recordings])
         (guess,) = initial_guesses(cameras_only, inputs.bodies, [m.measurements for m in inputs.motions])
@@ -69,7 +73,7 @@ class CameraInitializer(Initializer[Camera]):
     def explained(
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
     ) -> EstimationError | None:
-        """The error if feature tracks lack parallax, else None."""
+        """See `Initializer`: the error that feature tracks lack parallax, else None. None for rigs with a target."""
         del converges
         return None if rig.has_target else no_parallax(rig, recordings)
 
@@ -78,7 +82,8 @@ def _guesses_by_recording(inputs: Inputs, other: Callable[[], InputsWithMotion])
     """The initial guess of each recording.
 
     A rig that rotated about one axis only leaves the camera's rotation about that axis unobservable from angular rates.
-    The trajectory of `other` kinds of sensors then determines it by hand-eye calibration.
+    That rotation then comes from hand-eye calibration with the trajectory that `other` returns, of the next kind of
+    sensor. Raises OneAxisError if this fails, too; EstimationError if a recording gives no guess.
     """
     rig, recordings = inputs.rig, [m.measurements for m in inputs.motions]
     try:

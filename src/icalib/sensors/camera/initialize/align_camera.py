@@ -1,4 +1,4 @@
-"""Time offset and rotation of one camera relative to the IMU, from angular rates and the values of the rig file."""
+"""Time offset and rotation of one camera relative to the IMU, from angular rates and values of the rig file."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ from icalib.sensors.sensor import TIME_OFFSET
 
 
 def chosen_offset(camera: Camera, rates: SensorRates, imu: ImuData, given: float | None, found: RateAlignment) -> float:
-    """The time offset [s] to start from: `given`, the value of the rig file, or the estimate in `found`.
+    """The time offset [s] to start from: the value `given` by the rig file, or the estimate in `found`.
 
-    Both offsets are t_imu - t_camera, each clock counted from its first stamp. An initial guess that is far from the
-    estimate is replaced only if the angular rates contradict it, because slow motion hardly determines an offset.
+    Both are t_imu - t_camera, with each clock counted from its first stamp. A fixed value, or one with a prior, is
+    kept. An initial guess far from the estimate is replaced only if the angular `rates` of the camera contradict it,
+    because slow motion hardly determines an offset.
     """
     if given is None:
         return found.offset
@@ -49,8 +50,8 @@ def align_camera(
 ) -> RateAlignment:
     """Rotation, time offset and gyroscope bias of `camera` from its angular `rates` and those of the IMU.
 
-    Fixed values and priors of the rig file take precedence over the estimate. An initial guess of the rig file is used
-    if the motion does not determine the value. Raises EstimationError if neither determines it.
+    Values of the rig file that are fixed or have a prior take precedence over the estimate. An initial guess of the rig
+    file is used if the motion does not determine the value. Raises EstimationError if neither determines it.
     """
     found = _aligned_by_rates(camera, stream, rates, imu, measurements)
     offset, rotation = camera.time_offset.value, camera.rotation.value
@@ -69,10 +70,11 @@ def align_camera(
 def _aligned_by_rates(
     camera: Camera, stream: CornerStream, rates: SensorRates, imu: ImuData, measurements: Measurements
 ) -> RateAlignment:
-    """The alignment by angular rates, at the time offset of the rig file if that is known or no other fits.
+    """The alignment by angular rates.
 
-    If the rates do not determine the rotation either, that of the rig file is kept. Raises EstimationError if there is
-    none, or the rates contradict it.
+    It has the time offset of the rig file if that is fixed or has a prior, or if the rates do not determine one. If
+    they do not determine the rotation either, that of the rig file is used. Raises EstimationError if there is no such
+    value, or the rates contradict it.
     """
     given, known = camera.time_offset.value, known_value(camera.time_offset)
     rotation, on_wheels = camera.rotation.value, bool(measurements.wheels)

@@ -11,8 +11,8 @@ from icalib.geometry.targets.base import BOARD
 from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.optim.state import Key
 
-# s; images of several cameras that are closer were taken at the same instant. Clocks synchronised by hardware agree to
-# microseconds, and no camera takes images at 10 kHz.
+# s; images closer in time count as simultaneous. Clocks synchronised by hardware agree to microseconds, and no camera
+# takes images at 10 kHz.
 MIN_IMAGE_SPACING_S = 1e-4
 
 
@@ -23,7 +23,7 @@ class CameraGuess:
     params: (P,) intrinsics and distortion, in the order of the camera model.
     offset: t_body - t_camera [s], each clock counted from its first stamp.
     rotation, position: R_body_cam (3, 3) and p_body_cam (3,) [m].
-    poses: of the camera in the frame of the target, one for each image.
+    poses: T_target_cam of each image; T_world_cam for a guess from feature tracks.
     """
 
     params: np.ndarray
@@ -38,9 +38,9 @@ class Guess:
     """Initial guess of all cameras of a rig, for one recording.
 
     gyro_bias: (3,) [rad/s]; accel_bias: (3,) [m/s^2].
-    R_world_board: (3, 3) attitude of the target's frame; world z is up, and both frames have the same origin. Without
-    an IMU the two frames are the same.
-    scene: poses of the target's bodies in its frame by body and name, if it has several bodies.
+    R_world_board: (3, 3) attitude of the target; world z is up, and both frames have the same origin. The identity
+    without an IMU, and for a guess from feature tracks.
+    scene: poses T_target_body of the target's bodies as in a state, keyed by body and parameter; empty for one body.
     """
 
     cameras: dict[str, CameraGuess]
@@ -50,7 +50,7 @@ class Guess:
     scene: dict[Key, np.ndarray] = field(default_factory=dict)
 
     def values(self) -> dict[Key, np.ndarray]:
-        """The calibration parameters by sensor and name, as in a state."""
+        """The calibration parameters as in a state, keyed by sensor (or body) and parameter."""
         out: dict[Key, np.ndarray] = self.scene | {(BOARD, "tilt"): self.R_world_board}
         for name, c in self.cameras.items():
             out[name, "rotation"], out[name, "translation"] = c.rotation, c.position
@@ -63,10 +63,10 @@ class Guess:
         return np.tile(np.concatenate([self.gyro_bias, self.accel_bias]), (n, 1))
 
     def body_poses(self, measurements: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Poses of the body from the images of all cameras.
+        """Poses of the body in the world, from the images of all cameras that have a pose.
 
         Returns instants (n,) [s] on the body's clock, strictly increasing, R_world_body (n, 3, 3) and p_world_body
-        (n, 3) [m]. Images less than 0.1 ms after another one are left out.
+        (n, 3) [m]. Images at most `MIN_IMAGE_SPACING_S` after another one are left out.
         """
         times, rotations, positions = [], [], []
         for stream in measurements.cameras:
@@ -83,7 +83,7 @@ class Guess:
 
 
 def relative_offset(value: np.ndarray, stream: CornerStream | TrackStream, measurements: Measurements) -> float:
-    """The offset [s] between two clocks that count from their first stamp, for `value` (1,) [s] between raw stamps.
+    """Converts a time offset `value` (1,) [s] between raw stamps to one between clocks counted from first stamps.
 
     The clocks are those of `stream` and of the body, whose first stamp is `measurements.origin_ns`.
     """

@@ -1,4 +1,4 @@
-"""The state that the estimator starts from, by the initial guesses of cameras."""
+"""Start state of the estimator from the initial guesses of cameras."""
 
 from __future__ import annotations
 

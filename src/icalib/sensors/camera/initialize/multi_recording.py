@@ -1,4 +1,4 @@
-"""Initial guesses of several recordings: one recording gives the calibration, which is fixed for the others."""
+"""Initial guesses for several recordings: one of them determines the calibration, which is fixed for the others."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ from icalib.sensors.parameter import fixed
 
 
 def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
-    """The initial guess of each recording, all with the same calibration and the same scene.
+    """The initial guess of each recording, all with the same calibration and the same scene of bodies.
 
-    Raises EstimationError if a recording gives no guess, or if its time offsets differ from the others'. With several
-    recordings the message names the recording.
+    The calibration comes from the recording with most images that gives a guess. Raises EstimationError if a recording
+    gives no guess, if its time offsets differ from the others', or if bodies were moved. With several recordings and a
+    target, the message names the recording.
     """
     if not rig.has_target:
         return _guesses_from_tracks(rig, recordings)
@@ -58,10 +59,9 @@ def _guesses_from_tracks(rig: Rig, recordings: Sequence[Measurements]) -> tuple[
 
 
 def _first_successful(rig: Rig, scene: TargetScene, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
-    """Number and guess of the first of `recordings` that gives a guess of the whole calibration.
+    """Number and guess of the first of `recordings` that gives a guess.
 
-    `recordings` are pairs of number and recording, the one with most images first. If none gives a guess, the error of
-    that first one is raised.
+    recordings: pairs of number and recording. Raises the EstimationError of the first recording if none gives a guess.
     """
     failed: list[EstimationError] = []
     for k, recording in recordings:
@@ -73,7 +73,7 @@ def _first_successful(rig: Rig, scene: TargetScene, recordings: list[tuple[int, 
 
 
 def _guess_of(rig: Rig, scene: TargetScene, recording: Measurements) -> Guess:
-    """The guess of one recording. Errors name the recording."""
+    """The guess of one recording. Raises EstimationError with a message that names the recording."""
     try:
         return initial_guess(rig, recording, scene)
     except CalibrationError as error:
@@ -82,9 +82,9 @@ def _guess_of(rig: Rig, scene: TargetScene, recording: Measurements) -> Guess:
 
 
 def _with_fixed_calibration(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
-    """The rig with all camera parameters fixed at `guess`, which is that of `recording`.
+    """The rig with all camera parameters fixed at `guess`, the guess of `recording`.
 
-    Time offsets of clocks that restart stay free.
+    Time offsets of clocks that restart are not changed.
     """
 
     def camera(c: Camera, found: CameraGuess, origin_ns: int) -> Camera:
@@ -105,7 +105,7 @@ def _with_fixed_calibration(rig: Rig, guess: Guess, recording: Measurements) -> 
 def _check_clocks(rig: Rig, scene: TargetScene, guess: Guess, reference: Measurements, recording: Measurements) -> None:
     """Raises EstimationError if a camera's time offset in `recording` differs from that in `reference`.
 
-    `guess` is the guess of `reference`. Clocks that restart are not checked.
+    guess: the guess of `reference`. Clocks that restart are not checked, nor rigs without an IMU.
     """
     imu = imu_data(rig, recording)
     if imu is None:

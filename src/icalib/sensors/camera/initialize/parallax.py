@@ -1,4 +1,4 @@
-"""Detects feature tracks without parallax, from which no translation can be estimated."""
+"""Detects feature tracks without parallax, which leave the translation of cameras unobservable."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from icalib.rig import Rig
 from icalib.sensors.camera.initialize.tracks.from_tracks import start_intrinsics
 from icalib.sensors.camera.initialize.tracks.joint_alignment import SharedRays, shared_rays
 
-# Parallax over the median epipolar error. Noise alone gives up to 2.3: the parallax holds the errors of two rays in two
-# axes, the epipolar error those in one axis. Twice the value would refuse motion with usable parallax.
+# Parallax over the median epipolar error. Noise alone gives up to 2.3, because parallax contains the errors of both
+# rays in two axes, and the epipolar error those in one axis. Twice the value would refuse motion with usable parallax.
 MIN_PARALLAX_RATIO = 3.0
 
 
 def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError | None:
-    """The error if no camera in any recording has parallax beyond noise, else None.
+    """An EstimationError, not raised, if no camera in any recording has parallax beyond noise; else None.
 
-    The error names the camera with the largest ratio of parallax to noise. Returns None as well if a recording has no
-    IMU data, or if the intrinsics of a camera are not found.
+    It names the camera with the largest ratio of parallax to noise. Also None if a recording has no IMU data, or the
+    intrinsics of a camera are not found.
     """
     found: list[tuple[float, float, str]] = []
     for m in recordings:
@@ -55,8 +55,8 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
 def _parallax(pair: SharedRays) -> tuple[float, float]:
     """Parallax and epipolar error of two images, medians over their shared points [rad].
 
-    The parallax is the distance of unit rays after the best rotation; the epipolar error is the angle between a ray and
-    its epipolar plane.
+    The parallax is the distance between corresponding unit rays after the best rotation. The epipolar error is the
+    angle between a ray and its epipolar plane.
     """
     R, t = rotation_without_translation(pair.f, pair.h)
     parallax = float(np.median(np.linalg.norm(pair.f @ R.T - pair.h, axis=1)))

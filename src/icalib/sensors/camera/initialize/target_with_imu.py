@@ -1,7 +1,7 @@
-"""Initial guess of cameras that see a target, and of the IMU's biases and the attitude of the target.
+"""Initial guess of cameras that see a target, of the IMU's biases, and of the attitude of the target.
 
 Steps: intrinsics; camera poses; time offset and rotation by angular rates; gravity, accelerometer bias and lever arm by
-double-integrated accelerations. Values of the rig file are used at each step.
+double-integrated accelerations. Each step uses the values of the rig file.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from icalib.sensors.sensor import ROTATION
 
 __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
 
-# s, half the interval of the difference quotient for velocities. Two images at 25 Hz: over shorter intervals the noise
-# of poses dominates, over longer ones the acceleration.
+# s, half the interval of the central difference for velocities; the interval is two image periods at 25 Hz. Over
+# shorter intervals the noise of poses dominates, over longer ones the acceleration.
 VELOCITY_HALF_STEP_S = 0.04
 
 
 def initial_guess(rig: Rig, measurements: Measurements, scene: TargetScene | None = None) -> Guess:
     """The initial guess of one recording.
 
-    scene: poses of the target's bodies, if they are known. All streams then hold corners of these bodies only.
-    Raises EstimationError if the recording does not determine a guess.
+    scene: poses of the target's bodies, if known; streams must then have corners of these bodies only. If None, it is
+    estimated from this recording. Raises EstimationError if the recording does not determine a guess.
     """
     if scene is None:
         bodies = choose_bodies(rig.target, [measurements], bent=False, rig=rig)
@@ -71,8 +71,8 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: TargetScene | Non
 class _TargetViews:
     """Camera poses from images of the target, in one recording.
 
-    params: (P,) intrinsics and distortion of each camera; poses: of each camera in the frame of the target.
-    scene: poses of the target's bodies by body and name, as in a state.
+    params: (P,) intrinsics and distortion of each camera; poses: T_target_cam of the images of each camera. scene:
+    poses T_target_body of the bodies as in a state, keyed by body and parameter.
     """
 
     rig: Rig
@@ -103,9 +103,9 @@ class _TargetViews:
         return guess, arms[best].contradicts_camera
 
     def unexplained_acceleration(self, imu: ImuData) -> float:
-        """Share of the acceleration, by the camera with most poses, that the accelerometer does not explain.
+        """Share of the acceleration of the camera with most poses that the accelerometer readings do not explain.
 
-        Raises EstimationError if the two do not fit together at all.
+        Raises EstimationError if their alignment fails, or gravity is implausible.
         """
         a = self._aligned(imu, self._best_camera)
         arm = self._arm(imu, self._best_camera, a, GyroRotation.integrate(imu, a.gyro_bias))
@@ -114,36 +114,37 @@ class _TargetViews:
 
     @property
     def _best_camera(self) -> int:
-        """The number of the camera with most poses."""
+        """Index of the camera with most poses."""
         return int(np.argmax([q.ok.sum() for q in self.poses]))
 
     def _aligned(self, imu: ImuData, k: int) -> RateAlignment:
-        """Time offset, rotation and gyroscope bias by camera `k`."""
+        """Time offset, rotation and gyroscope bias from the poses of camera `k`."""
         stream = self.measurements.cameras[k]
         return align_camera(self.rig.cameras[k], stream, camera_rates(stream, self.poses[k]), imu, self.measurements)
 
     def _offset(self, imu: ImuData, k: int, found: RateAlignment) -> float:
-        """The time offset [s] of camera `k` between first stamps, from the rig file or from `found`."""
+        """The time offset [s] of camera `k` from the rig file or `found`, with clocks counted from first stamps."""
         camera, stream = self.rig.cameras[k], self.measurements.cameras[k]
         raw = camera.time_offset.value
         given = None if raw is None else relative_offset(raw, stream, self.measurements)
         return chosen_offset(camera, camera_rates(stream, self.poses[k]), imu, given, found)
 
     def _arm(self, imu: ImuData, k: int, aligned: RateAlignment, gyro: GyroRotation) -> LeverArm:
-        """Lever arm, gravity and accelerometer bias by camera `k`."""
+        """Lever arm, gravity and accelerometer bias from the poses of camera `k`."""
         t, known = self.measurements.cameras[k].seconds + aligned.offset, known_value(self.rig.cameras[k].translation)
         return solve_camera_lever_arm(imu, t, self.poses[k], aligned.rotation, gyro, known)
 
     def _check_gravity(self, imu: ImuData, arm: LeverArm, aligned: RateAlignment) -> None:
+        """Raises EstimationError if the length of gravity in `arm` is implausible."""
         check_gravity(float(np.linalg.norm(arm.gravity)), self.rig.gravity, imu.name, aligned.given)
 
 
 def _camera_guess(
     camera: Camera, offset: float, params: np.ndarray, aligned: RateAlignment, arm: LeverArm, poses: TargetPoses
 ) -> CameraGuess:
-    """The guess of one camera: values of the rig file, else the estimates.
+    """The guess of one camera: values of the rig file, else the estimates `aligned` and `arm`.
 
-    An estimate replaces an initial guess of the rig file that it contradicts.
+    An estimate replaces an initial guess of the rig file if it contradicts it.
     """
     p = camera.translation.value
     if p is not None and camera.translation.mode == "free":
@@ -158,12 +159,12 @@ def _camera_guess(
 
 
 def _mean_bias(arms: list[LeverArm]) -> np.ndarray:
-    """(3,) [m/s^2] accelerometer bias, the mean over the estimates by each camera."""
+    """(3,) [m/s^2] accelerometer bias: mean of the estimates from each camera."""
     return np.mean([a.accel_bias for a in arms], axis=0)
 
 
 def _attitude_of_board(gravity_board: np.ndarray) -> np.ndarray:
-    """R_world_board (3, 3) from gravity (3,) in the board's frame: world z is up.
+    """R_world_board (3, 3) from gravity (3,) [m/s^2], which points down, in the board's frame; world z is up.
 
     World x is the projection of the board's x axis on the horizontal plane, or of its y axis if x is nearly vertical.
     """

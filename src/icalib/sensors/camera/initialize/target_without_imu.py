@@ -1,4 +1,4 @@
-"""Initial guess of a rig without IMU: relative poses of cameras, from images of the target at the same instants."""
+"""Initial guess of a rig without an IMU: relative poses of cameras from simultaneous images of the target."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from icalib.rig import Rig
 from icalib.sensors.camera.connected_bodies import taken_at_once
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 
-# Pairs of images that give the relative pose of two cameras, spread over the recording. The cost grows with the square
-# of the number, and the initial guess needs no better mean.
+# Largest number of image pairs, spread over the recording, that determine the relative pose of two cameras. The cost
+# grows with its square, and the initial guess needs no better mean.
 MAX_IMAGE_PAIRS = 200
 Scene = dict[Key, np.ndarray]
-Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3), p (3,)
+Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3), p (3,) m
 
 
 def guess_without_imu(
@@ -25,9 +25,9 @@ def guess_without_imu(
 ) -> Guess:
     """The initial guess of one recording; the first camera is the body, and the world is the target's frame.
 
-    params: (P,) intrinsics and distortion of each camera; poses: of each camera in the frame of the target; scene:
-    poses of the target's bodies. Raises EstimationError naming a camera without any pose, or a camera that no pair of
-    simultaneous images connects to the first one.
+    params: (P,) intrinsics and distortion of each camera; poses: T_target_cam of the images of each camera; scene:
+    poses of the target's bodies. Raises EstimationError naming a camera without any pose, or cameras that no
+    simultaneous images connect to the first one.
     """
     for camera, camera_poses in zip(rig.cameras, poses, strict=True):
         if not camera_poses.ok.any():
@@ -59,10 +59,10 @@ def trajectory_without_imu(
 
 
 def _extrinsics(rig: Rig, times: list[np.ndarray], poses: list[TargetPoses]) -> list[Pose]:
-    """T_body_cam of each camera: that of the rig file, else a chain of relative poses that begins at the first camera.
+    """T_body_cam of each camera: that of the rig file, else by a tree of relative poses from the first camera.
 
-    The chain always takes the pair of cameras with most simultaneous images. times: (M,) [s] of the images of each
-    camera on the body's clock.
+    The tree grows by the pair of cameras with most simultaneous images. times: (M,) [s] instants of the images of each
+    camera on the body's clock; poses: T_target_cam. Raises EstimationError if a camera is not connected.
     """
     found: dict[int, Pose] = {0: (np.eye(3), np.zeros(3))}
     for i, c in enumerate(rig.cameras[1:], 1):
@@ -83,7 +83,7 @@ def _extrinsics(rig: Rig, times: list[np.ndarray], poses: list[TargetPoses]) -> 
 
 
 def _relative_poses(ta: np.ndarray, a: TargetPoses, tb: np.ndarray, b: TargetPoses) -> list[Pose]:
-    """T_a_b of two cameras, one for each pair of simultaneous images at times `ta` and `tb` [s]."""
+    """T_a_b of two cameras, one for each of up to `MAX_IMAGE_PAIRS` pairs of simultaneous images, at `ta`, `tb` [s]."""
     pairs = np.column_stack(taken_at_once(ta, tb))
     pairs = pairs[a.ok[pairs[:, 0]] & b.ok[pairs[:, 1]]]
     if len(pairs) > MAX_IMAGE_PAIRS:
@@ -92,7 +92,7 @@ def _relative_poses(ta: np.ndarray, a: TargetPoses, tb: np.ndarray, b: TargetPos
 
 
 def _medoid(poses: list[Pose]) -> Pose:
-    """The pose with the least median distance to the others, a robust mean. One radian counts as one metre."""
+    """The medoid, a robust mean: the pose with the least median distance to all. One radian counts as one metre."""
     R, p = np.array([R for R, _ in poses]), np.array([p for _, p in poses])
     angles = np.linalg.norm(so3.log_many((R[:, None].swapaxes(-1, -2) @ R[None]).reshape(-1, 3, 3)), axis=1)
     distance = angles.reshape(len(R), -1) + np.linalg.norm(p[:, None] - p[None], axis=2)
@@ -100,7 +100,7 @@ def _medoid(poses: list[Pose]) -> Pose:
 
 
 def _not_connected(rig: Rig, found: dict[int, Pose]) -> EstimationError:
-    """The error that no simultaneous images connect the other cameras to those in `found`."""
+    """The error, not raised, that no simultaneous images connect some cameras to those in `found`."""
     lost = ", ".join(c.name for i, c in enumerate(rig.cameras) if i not in found)
     known = ", ".join(c.name for i, c in enumerate(rig.cameras) if i in found)
     return EstimationError(

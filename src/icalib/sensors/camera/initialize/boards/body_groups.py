@@ -1,10 +1,10 @@
 """Relative poses of bodies that no image shows together, but that two cameras of a rig see at the same instants.
 
-Cameras a, b of a rig see bodies A, B, which do not move. At each instant i
+Cameras a and b of a rig see the bodies A and B, which do not move. At each instant i
 
     T_A_a(i) T_a_b = T_A_B T_B_b(i),
 
-which is AX = YB, robot-world/hand-eye calibration (Zhuang, Roth, Sudhakar 1994; Shah 2013).
+which is the equation AX = YB of robot-world/hand-eye calibration (Zhuang, Roth, Sudhakar 1994; Shah 2013).
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def register_groups(
 ) -> TargetScene:
     """Poses of all bodies: within groups that images connect, then between groups by simultaneous images.
 
-    params: fixed intrinsics and distortion (P,) by camera. Raises UnconnectedBodiesError naming bodies that are not
-    connected to the first group; EstimationError if images are mirrored, or cameras are not rigidly connected.
+    params: fixed intrinsics and distortion (P,) by camera name. Raises UnconnectedBodiesError naming bodies that are
+    not connected to the first group; EstimationError if images are mirrored, or cameras are not rigidly connected.
     """
     used = tied_by_images(bodies, recordings)
     groups = [_Group.of(rig, replace(bodies, used=own), recordings, params) for own in used]
@@ -62,7 +62,8 @@ def register_groups(
 class _Group:
     """Bodies that images connect, in the frame of the first one.
 
-    times, poses: by recording and camera, instants [s] of the images that show these bodies, and their poses.
+    times, poses: for each recording and camera, instants (M,) [s] of the images that show these bodies, and the poses
+    of the camera in the frame of the group.
     """
 
     scene: TargetScene
@@ -71,7 +72,9 @@ class _Group:
 
     @classmethod
     def of(cls, rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]) -> _Group:
-        """The group of `bodies`, with poses in all `recordings`; params: (P,) by camera."""
+        """The group of `bodies`, with camera poses in all `recordings`.
+
+        params: (P,) intrinsics and distortion by camera name."""
         own = [restrict(bodies, r) for r in recordings]
         models = [camera_model(c.model) for c in rig.cameras]
         scene = TargetScene(bodies)
@@ -86,7 +89,7 @@ class _Group:
         return cls(scene, times, poses)
 
     def values_at(self, frame: Frame) -> dict[Key, np.ndarray]:
-        """Poses of the bodies as in a state, if `frame` is the pose of the group."""
+        """Poses T_scene_body of the bodies as in a state, for the pose `frame` of the group in the scene."""
         R, p = self.scene.bodies.poses(self.scene.values)
         found: dict[Key, np.ndarray] = {}
         for k, name in zip(self.scene.bodies.used, self.scene.bodies.names, strict=True):
@@ -96,7 +99,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Tied:
-    """Poses of camera number `a` in one group, and of camera `b` in another, at the same instants."""
+    """Poses of camera number `a` in one group, and of camera number `b` in another, at the same instants."""
 
     a: int
     b: int
@@ -104,13 +107,13 @@ class _Tied:
 
 
 def _tied(g: _Group, h: _Group) -> _Tied:
-    """The poses of the two cameras with most simultaneous images of the groups `g` and `h`."""
+    """The poses of the pair of cameras that has most simultaneous images of the groups `g` and `h`."""
     cameras = permutations(range(len(g.poses[0])), 2)
     return max((_Tied(a, b, _pairs(g, h, a, b)) for a, b in cameras), key=lambda t: len(t.pairs.p_body))
 
 
 def _pairs(g: _Group, h: _Group, a: int, b: int) -> PosePairs:
-    """Simultaneous poses of camera `a` in group `g` and of camera `b` in group `h`, of all recordings."""
+    """Simultaneous poses of camera `a` in group `g` and of camera `b` in group `h`, from all recordings."""
     found = []
     for times_g, poses_g, times_h, poses_h in zip(g.times, g.poses, h.times, h.poses, strict=True):
         i, j = taken_at_once(times_g[a], times_h[b])
@@ -121,7 +124,9 @@ def _pairs(g: _Group, h: _Group, a: int, b: int) -> PosePairs:
 
 
 def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
-    """Pose of the second group in the first. Raises EstimationError if the cameras are not rigidly connected."""
+    """Pose of the second group in the first, by hand-eye calibration.
+
+    Raises EstimationError if the cameras are not rigidly connected."""
     a, b = cameras[tied.a], cameras[tied.b]
     found = hand_eye(tied.pairs, _given(a, b, tied.a == 0, tied.b == 0), (False, False))
     if (left := unexplained_motion(tied.pairs, found)) > MAX_UNEXPLAINED_MOTION:
@@ -134,7 +139,7 @@ def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
 
 
 def _given(a: Camera, b: Camera, a_is_body: bool, b_is_body: bool) -> Extrinsics | None:
-    """T_a_b if the rig file gives both extrinsics, else None. The body camera has the identity."""
+    """T_a_b if the rig file has the extrinsics of both cameras, else None. Those of the reference are the identity."""
     mounts = []
     for camera, is_body in ((a, a_is_body), (b, b_is_body)):
         R, p = camera.rotation.value, camera.translation.value

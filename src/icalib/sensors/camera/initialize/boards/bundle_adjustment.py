@@ -1,8 +1,8 @@
 """Bundle adjustment of the poses of bodies, the poses of images, and the intrinsics of cameras.
 
 Levenberg-Marquardt with Huber's loss; the poses of images are eliminated by the Schur complement. Broad priors on the
-intrinsics keep problems with few images regular. Steps of a pose are perturbations in its own frame, (rotation,
-translation) in rad and m.
+intrinsics keep problems with few images regular. Steps of a pose are right perturbations (rotation, translation) in rad
+and m, in the frame of the image or body.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ class CameraIntrinsics:
 class SceneState:
     """Poses T_scene_cam of M images and T_scene_body of B bodies, and intrinsics of the cameras.
 
-    The scene is the frame of one fixed image.
+    The scene frame is the camera frame of one fixed image.
+
+    R_image (M, 3, 3), p_image (M, 3) [m], R_body (B, 3, 3), p_body (B, 3) [m].
     """
 
     R_image: np.ndarray
@@ -55,8 +57,8 @@ class SceneState:
 class SceneViews:
     """N corners in V views; a view is one body in one image, and the views of an image follow one another.
 
-    start: (V + 1,), view v has the corners start[v]:start[v + 1]; image, body: (V,) of each view.
-    points: (N, 3) [m] in the frames of the bodies; uv: (N, 2) [px]; camera: (M,) of each image.
+    start: (V + 1,), view v has the corners start[v]:start[v + 1]; image, body: (V,) indices for each view.
+    points: (N, 3) [m] in the frames of the bodies; uv: (N, 2) [px]; camera: (M,) index of the camera of each image.
     """
 
     start: np.ndarray
@@ -68,16 +70,16 @@ class SceneViews:
 
     @property
     def of_corner(self) -> np.ndarray:
-        """(N,) the view that each corner belongs to."""
+        """(N,) index of the view of each corner."""
         return np.repeat(np.arange(len(self.image)), np.diff(self.start))
 
     @property
     def first_of_images(self) -> np.ndarray:
-        """The first view of each image that has views, and the number of views at the end."""
+        """Index of the first view of each image that has views, then the number of views V."""
         return np.flatnonzero(np.diff(self.image, prepend=-1, append=-1))
 
     def select(self, views: np.ndarray) -> SceneViews:
-        """The selected `views`, (V,) bool."""
+        """The views that `views` (V,) bool selects, with their corners."""
         rows = views[self.of_corner]
         start = np.concatenate([[0], np.cumsum(np.diff(self.start)[views])])
         return replace(
@@ -91,7 +93,9 @@ class SceneViews:
 
 
 def bundle_adjust(views: SceneViews, state: SceneState, fixed_image: int, max_steps: int) -> SceneState:
-    """`state` after up to `max_steps` steps; bodies and images without a view do not change."""
+    """`state` after up to `max_steps` steps of Levenberg-Marquardt.
+
+    The pose of image number `fixed_image`, and those of bodies and images without a view, do not change."""
     damping, system = FIRST_SCENE_DAMPING, _SceneSystem.at(views, state)
     for _ in range(max_steps):
         trial = system.step(views, state, fixed_image, damping)
@@ -203,7 +207,9 @@ def _residuals(views: SceneViews, state: SceneState) -> tuple[np.ndarray, np.nda
 def _moved(
     state: SceneState, step: np.ndarray, begins: list[int], images: np.ndarray, pose_steps: np.ndarray
 ) -> SceneState:
-    """The state after a `step` of bodies and cameras, and `pose_steps` (m, 6) of the images numbered `images` (m,)."""
+    """The state after a `step` (n,) of bodies and cameras, and `pose_steps` (m, 6) of the images `images` (m,).
+
+    begins: first column of each camera in `step`, then n."""
     R, p = state.R_image.copy(), state.p_image.copy()
     p[images] += np.einsum("nij,nj->ni", R[images], pose_steps[:, 3:])
     R[images] = R[images] @ so3.exp_many(np.ascontiguousarray(pose_steps[:, :3]))
@@ -219,9 +225,9 @@ def _moved(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _columns(a, b, body, camera, begins, columns, local):
-    """Writes the columns of the calibration parameters in views a..b of one image: poses of bodies, then the camera.
+    """Writes the columns of body poses and camera parameters that views a..b of one image depend on.
 
-    columns: in the normal equations of all; local: in the terms of one view. Returns their number.
+    columns: indices in the normal equations of the scene; local: indices in the terms of a view. Returns their number.
     """
     n = 0
     for v in range(a, b):
@@ -238,8 +244,10 @@ def _columns(a, b, body, camera, begins, columns, local):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_views(matrix, gradient, a, b, columns, local, S, g, diagonal, C, H_pose, g_pose):
-    """Adds views a..b of one image to S, g, diagonal of the calibration parameters, to H_pose (6, 6) and g_pose (6,) of
-    the image's pose, and to C (6, n), the block between both."""
+    """Adds the terms of views a..b of one image to the normal equations.
+
+    S, g, diagonal: of body poses and camera parameters; H_pose (6, 6), g_pose (6,): of the image's pose; C (6, n): the
+    block between both."""
     n = C.shape[1]
     for v in range(a, b):
         first = 6 * (v - a)
@@ -260,10 +268,10 @@ def _add_views(matrix, gradient, a, b, columns, local, S, g, diagonal, C, H_pose
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _eliminate_poses(matrix, gradient, first, body, camera, begins, fixed, damping, S, g, diagonal):
-    """Adds the Schur complements of m images to the normal equations S (n, n), g (n,) of bodies and cameras, and the
-    diagonal before elimination to `diagonal` (n,). first: (m + 1,) the first view of each image.
+    """Adds the Schur complements of m images to the normal equations S (n, n), g (n,) of bodies and cameras.
 
-    Returns inverse blocks (m, 6, 6) and gradients (m, 6) of the poses, zero for a fixed image.
+    Their diagonal before elimination is added to `diagonal` (n,). first: (m + 1,) the first view of each image. Returns
+    inverse blocks (m, 6, 6) and gradients (m, 6) of the poses, zero for a fixed image.
     """
     m, n_params = len(first) - 1, matrix.shape[1] - 12
     H_inverse, g_pose = np.zeros((m, 6, 6)), np.zeros((m, 6))

@@ -1,7 +1,7 @@
 """Extrinsics of cameras by hand-eye calibration with the trajectory of a LiDAR or a pose sensor.
 
 A robot on a floor rotates about one axis only. The rotation of a camera about that axis is then unobservable from
-angular rates, but observable from the translations of both trajectories.
+angular rates. The translations of both trajectories make it observable.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from icalib.sensors.stream import seconds_since
 def with_hand_eye_guess(rig: Rig, camera_inputs: Inputs, others: Inputs, state: State) -> Rig:
     """`rig` with an initial guess of the extrinsics and time offset of each camera without a stated rotation.
 
-    The recording with most corners of the camera is used. camera_inputs: inputs of the cameras; others: inputs of the
-    sensors whose trajectory is in `state`. Raises EstimationError if the motion does not determine the extrinsics.
+    For each camera, the recording with most of its corners is used. camera_inputs: inputs of the cameras; others:
+    inputs of the sensors whose trajectory is in `state`. Raises EstimationError if the motion does not determine the
+    extrinsics.
     """
     recordings = [m.measurements for m in camera_inputs.motions]
     scene = find_scene(rig, camera_inputs.bodies, recordings)

@@ -1,8 +1,8 @@
 """Incremental structure from motion: relative poses of the bodies of a target, and intrinsics of the cameras.
 
-As in COLMAP (Schoenberger and Frahm 2016): the bodies in a first image get poses, images that show these bodies get
-poses, then further bodies, and so on, with a bundle adjustment after each round. One small tag alone determines neither
-its tilt nor the intrinsics; many tags in many images do.
+As in COLMAP (Schoenberger and Frahm 2016): poses are found of the bodies in a first image, then of images that show
+these bodies, then of further bodies, and so on. A bundle adjustment follows each round. One small tag alone determines
+neither its tilt nor the intrinsics; many tags in many images do.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ from icalib.sensors.camera.initialize.boards.target_scene import (
     view_poses,
 )
 
-MIN_PLACED_BODIES = 2  # in an image that is posed next, if there are such images; one body alone leaves two poses
-MAX_TRIAL_VIEWS = 12  # of a body, in which candidates of its pose are compared
-MAX_REPLACEMENT_RATIO = 0.7  # of the error of another pose to that of the present one, which it then replaces
-MIN_FITTING_SHARE = 0.25  # of the views of a body that its pose explains; with less the body is a misfit
-MAX_MISFIT_SHARE = 0.25  # of the bodies; with more misfits the scene itself is likely wrong, and all are kept
-MAX_ERROR_WITHOUT_MISFITS = 0.5  # of the error of the median image with misfits, or they are kept
-GROWTH_STEPS, FINAL_STEPS = 8, 40  # of bundle adjustment, while the scene grows and at its end
-REPLACEMENT_PASSES = 2  # over all poses at the end; the first poses were found from few images
-MIN_FOCAL_IMAGES = 5  # of a camera, from which on the strongest intrinsics are adjusted; fewer fit any focal length
-MIN_DISTORTION_IMAGES = 20  # of a camera, from which on all its parameters are adjusted
+MIN_PLACED_BODIES = 2  # in an image whose pose is found next, if possible; one flat body alone has two possible poses
+MAX_TRIAL_VIEWS = 12  # views of a body in which candidates for its pose are compared
+MAX_REPLACEMENT_RATIO = 0.7  # error of a new pose over that of the present pose, below which it replaces the latter
+MIN_FITTING_SHARE = 0.25  # of the views of a body; if its pose explains fewer, the body is a misfit
+MAX_MISFIT_SHARE = 0.25  # of the bodies; with more misfits the scene itself is likely wrong, so all are kept
+MAX_ERROR_WITHOUT_MISFITS = 0.5  # median image error without misfits over that with them; above, misfits are kept
+GROWTH_STEPS, FINAL_STEPS = 8, 40  # largest number of bundle adjustment steps, while the scene grows and at its end
+REPLACEMENT_PASSES = 2  # searches for better poses at the end, because the first poses were found from few images
+MIN_FOCAL_IMAGES = 5  # of a camera, to adjust focal lengths and first distortion; fewer images fit any focal length
+MIN_DISTORTION_IMAGES = 20  # images of a camera that are needed to adjust all its parameters
 
 
 @dataclass(frozen=True)
 class ReconstructedScene:
     """Poses of bodies and images, and intrinsics of the cameras.
 
-    placed: (B,) bool, bodies that have a pose; rms_px: (M,) error of each image, NaN if it has no pose.
+    placed: (B,) bool, bodies that have a pose; rms_px: (M,) RMS reprojection error of each image, NaN without a pose.
     """
 
     state: SceneState
@@ -64,7 +64,7 @@ class ReconstructedScene:
         return float(np.quantile(np.nan_to_num(self.rms_px, nan=INVISIBLE_ERROR_PX), share))
 
     def in_frame_of(self, reference: int, bodies: Bodies) -> dict[Key, np.ndarray]:
-        """Poses of all placed bodies in the frame of the body numbered `reference`, as in a state."""
+        """Poses of all placed bodies in the frame of the body number `reference`, keyed by body and parameter."""
         R0, p0 = self.state.R_body[reference], self.state.p_body[reference]
         values: dict[Key, np.ndarray] = {}
         for k in np.flatnonzero(self.placed):
@@ -75,7 +75,7 @@ class ReconstructedScene:
 
 
 class UnconnectedBodiesError(EstimationError):
-    """No image connects the bodies `names` with the others, so that their relative poses are unobservable."""
+    """The poses of the bodies `names` relative to the rest of the target are unobservable: no image connects them."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names
@@ -90,8 +90,8 @@ def place_bodies(
 ) -> TargetScene:
     """Relative poses of the bodies in use, from the images of all cameras.
 
-    params: fixed intrinsics and distortion (P,) by camera. Raises UnconnectedBodiesError naming bodies that no image
-    connects with the others; EstimationError if these are more than half of the bodies.
+    params: fixed intrinsics and distortion (P,) by camera name. Raises UnconnectedBodiesError naming bodies that no
+    image connects with the others; EstimationError if these are more than half of the bodies.
     """
     lenses = [fixed_lens(model, params[s.name]) for s, model in zip(streams, models, strict=True)]
     grown = reconstruct_scene(bodies, streams, lenses)
@@ -119,7 +119,7 @@ def reconstruct_scene(
 ) -> ReconstructedScene:
     """The scene from the most informative images of all cameras.
 
-    streams: corners of bodies in use only, ordered by image and body; lenses: start values by camera.
+    streams: corners of bodies in use only, sorted by image and body; lenses: start values for each camera.
     """
     streams = [informative_images(s, bodies.target.body) for s in streams]
     scene = _GrowingScene.begin(bodies, streams, lenses)
@@ -138,10 +138,10 @@ def reconstruct_scene(
 
 @dataclass
 class _GrowingScene:
-    """The scene while it grows.
+    """A scene that is reconstructed image by image.
 
-    begins: (C + 1,) number of the first image of each camera, and of all images. placed (B,), posed (M,): bool, bodies
-    and images that have a pose. seed: the image whose frame is the scene's.
+    begins: (C + 1,) number of the first image of each camera, then the number of all images. placed (B,), posed (M,):
+    bool, bodies and images that have a pose. seed: number of the image whose camera frame is the scene frame.
     """
 
     bodies: Bodies
@@ -157,7 +157,7 @@ class _GrowingScene:
     def begin(
         cls, bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[CameraIntrinsics]
     ) -> _GrowingScene:
-        """The scene of the image that shows most bodies with a pose, and these bodies."""
+        """The scene of one image, the seed, which shows most bodies with a pose, and of these bodies."""
         begins = np.cumsum([0, *(len(s.stamps_ns) for s in streams)])
         views = scene_views(bodies, streams, begins)
         m, b = int(begins[-1]), len(bodies.target.bodies)
@@ -181,7 +181,7 @@ class _GrowingScene:
         return found
 
     def extend(self) -> bool:
-        """Finds poses of further images, then of further bodies; False if there are none."""
+        """Finds poses of further images, then of further bodies. Returns False if none were found."""
         before = self.placed.sum() + self.posed.sum()
         self._pose_images()
         self._place_bodies(self._poses_by_view())
@@ -204,9 +204,9 @@ class _GrowingScene:
         self.state = replace(moved, lenses=restored)
 
     def drop_misfits(self) -> None:
-        """Removes bodies that few of their views fit, if the error of the other bodies then falls clearly.
+        """Removes bodies whose pose explains few of their views, if the error of the scene then decreases clearly.
 
-        Keeps all if many bodies are misfits, because then the scene itself is wrong.
+        Keeps all if many bodies are misfits, because the scene itself is then likely wrong.
         """
         used = self.views.select(self.posed[self.views.image] & self.placed[self.views.body])
         square = reprojection_errors(used, self.state) ** 2
@@ -223,7 +223,7 @@ class _GrowingScene:
             self.placed, self.state, _ = before
 
     def image_rms(self) -> np.ndarray:
-        """(M,) RMS error of each image [px], NaN if it has no pose."""
+        """(M,) [px] RMS reprojection error of each image, NaN without a pose."""
         used = self.views.select(self.posed[self.views.image] & self.placed[self.views.body])
         image = used.image[used.of_corner]
         m = len(self.posed)
@@ -231,7 +231,7 @@ class _GrowingScene:
         return np.sqrt(square / np.where(count > 0, 2 * count, np.nan))
 
     def _poses_by_view(self) -> list[TargetPoses]:
-        """By camera, both poses (V, 2, ...) of the image in the frame of the body, for each view by itself."""
+        """For each camera the two possible poses T_body_cam (V, 2, ...) of each view, found from that view alone."""
         body = self.bodies.target.body
         return [
             view_poses(s, Views.of(s, body), self.bodies, lens.model, lens.params)
@@ -239,9 +239,9 @@ class _GrowingScene:
         ]
 
     def _pose_images(self) -> None:
-        """Finds poses of the images that show most placed bodies, as many again as have a pose.
+        """Finds poses of the images that show most placed bodies; at most about doubles the posed images.
 
-        Replaces poses of other images by ones that fit clearly better, except that of the seed.
+        Replaces poses of other images, except that of the seed, if new poses fit clearly better.
         """
         known = np.bincount(self.views.image, self.placed[self.views.body], len(self.posed))
         wanted = np.flatnonzero(
@@ -258,7 +258,7 @@ class _GrowingScene:
         self.posed = self.posed | better
 
     def _scene_poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """RMS error (M,) [px], R_scene_cam (M, 3, 3), p_scene_cam (M, 3) of all images, by the placed bodies."""
+        """RMS error (M,) [px], R_scene_cam (M, 3, 3), p_scene_cam (M, 3) [m] of all images, from the placed bodies."""
         placed = np.flatnonzero(self.placed)
         first = int(placed[0])
         R0, p0 = self.state.R_body[first], self.state.p_body[first]
@@ -273,9 +273,9 @@ class _GrowingScene:
         return rms, R0 @ R, p @ R0.T + p0
 
     def _place_bodies(self, by_view: list[TargetPoses]) -> None:
-        """Finds poses of the bodies in images with a pose; replaces poses of bodies by ones that fit clearly better.
+        """Finds poses of the bodies in images with a pose. Replaces present poses if new ones fit clearly better.
 
-        by_view: poses (V, 2, ...) of the image in the frame of the body, by camera.
+        by_view: for each camera the poses T_body_cam (V, 2, ...) of its views.
         """
         rotation, position, ok = (
             np.concatenate([getattr(q, n) for q in by_view]) for n in ("rotation", "position", "ok")
@@ -299,7 +299,7 @@ class _GrowingScene:
     def _body_poses(
         self, views: np.ndarray, rotation: np.ndarray, position: np.ndarray, ok: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Candidates T_scene_body (n, ...) of the pose of a body, up to two from each of its `views`."""
+        """Candidates R_scene_body (n, 3, 3), p_scene_body (n, 3) [m] for one body: up to two from each of `views`."""
         v, side = np.nonzero(ok[views])
         image = self.views.image[views[v]]
         R = self.state.R_image[image] @ rotation[views[v], side].swapaxes(1, 2)

@@ -1,8 +1,8 @@
 """Intrinsics and distortion of one camera from images of the target.
 
 Focal lengths are tried on a grid. Bundle adjustments refine the best of them, and the candidate with the least
-reprojection error is returned. Each flat body of the target in each image is an image of its own here, so that no
-relative poses of bodies are needed.
+reprojection error is returned. Each flat body in an image is treated as a separate image, so that relative poses of
+bodies are not needed.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from icalib.rig import Camera
 from icalib.sensors.camera.corner_factor import Views
 from icalib.sensors.camera.initialize.boards.single_body_adjustment import adjust_intrinsics, has_good_pose
 
-# Images spread over the recording: to compare start values, to adjust all parameters, and to compare the results. The
-# results may differ by far less than the noise of a corner, and need most images.
+# Numbers of images, spread over the recording: to compare start values, to adjust all parameters, and to compare the
+# results. The last is largest, because results may differ by far less than the noise of a corner.
 FOCAL_TRIAL_IMAGES = 24
 ADJUSTED_IMAGES = 48
 COMPARISON_IMAGES = 300
-MIN_RICH_CORNERS = 40  # corners; an image with so many is used even if most images have more
+MIN_RICH_CORNERS = 40  # an image with so many corners is eligible, even if most images have more
 
 # Focal lengths to try, in image widths, 10 % apart: fields of view from 19 deg (pinhole) to a full sphere (fisheye).
 FOCAL_TRIAL_WIDTHS = np.geomspace(0.1, 3.0, 35)
 STRONGEST_PARAMS = np.array([0, 1, 4])  # fx, fy and the first distortion coefficient, which has the largest effect
 
-# Ratio to the least median error below which a start value is as good: the pose noise of few images.
+# Ratio of median errors below which start values count as equal, given the pose noise of few images.
 EQUAL_START_RATIO = 1.05
-MAX_NEIGHBOURING_STARTS = 5  # more equally good grid points than these are spread too far for one minimum
-# Ratio to the least median error above which a candidate is surely another local minimum. Judging all takes seconds.
+MAX_NEIGHBOURING_STARTS = 5  # equally good grid points; more are spread too far to belong to one minimum
+# Ratio to the least median error above which a candidate is certainly another local minimum, and dropped to save time.
 MAX_CANDIDATE_RATIO = 1.5
 EQUAL_COST_RATIO = 1.002  # costs within this ratio differ by less than their noise over `COMPARISON_IMAGES`
 
 MAX_INTRINSICS_RMS_PX = 2.0  # px, of the median image; detected corners err by tenths of a pixel, wrong models by more
 EXPECTED_RMS_PX = 0.5  # px, of the median image; a better fit than this is the global minimum
-FALLBACK_MODEL = "pinhole-equidistant"  # r = f theta, its start, is near every lens, narrow and wide
+FALLBACK_MODEL = "pinhole-equidistant"  # its start, r = f theta, is close to narrow and wide lenses
 
 
 def camera_params(camera: Camera, stream: CornerStream, target: Target) -> np.ndarray:
@@ -73,7 +73,7 @@ def camera_params(camera: Camera, stream: CornerStream, target: Target) -> np.nd
 
 
 def _stated(camera: Camera, with_guesses: bool) -> np.ndarray:
-    """(P,) values of the rig file that are fixed or have a prior, and initial guesses if asked for; else NaN."""
+    """(P,) values of the rig file that are fixed or have a prior; also initial guesses if `with_guesses`; else NaN."""
     stated = np.full(len(camera_model(camera.model).parameter_names), np.nan)
     for part, parameter in ((slice(0, 4), camera.intrinsics), (slice(4, None), camera.distortion)):
         if parameter.value is not None and (with_guesses or parameter.mode != "free"):
@@ -82,9 +82,10 @@ def _stated(camera: Camera, with_guesses: bool) -> np.ndarray:
 
 
 def _one_body_per_image(stream: CornerStream, target: Target) -> tuple[CornerStream, FlatPoints]:
-    """The stream with each body in each image as an image of its own, and the points of the bodies.
+    """The stream with each body of an image as a separate image, and the points of the bodies.
 
-    If boards (`MIN_POSE_CORNERS` or more) were seen, tags are left out: four corners constrain the lens weakly.
+    If a body with `MIN_POSE_CORNERS` points or more (a board) was seen, smaller bodies (tags) are left out, because
+    four corners constrain the lens weakly.
     """
     if len(target.bodies) == 1:
         return stream, FlatPoints(target.points)
@@ -178,9 +179,9 @@ def _candidates(
 
 
 def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, target: FlatPoints) -> np.ndarray:
-    """The best of the start values `starts` (F, P); three spread ones if many are equally good.
+    """The best of the start values `starts` (F, P) as (1, P); up to three spread ones if many are equally good.
 
-    Many are if all images show the target fronto-parallel: then no focal length fits better than another.
+    This happens if all images show the target fronto-parallel, because then all focal lengths fit equally.
     """
     medians = np.array([_median_rms(trial, model, start, target) for start in starts])
     good = np.flatnonzero(medians <= EQUAL_START_RATIO * medians.min())
@@ -230,8 +231,8 @@ def _least_cost(
 ) -> np.ndarray:
     """The candidate (P,) with the least cost after an adjustment of the parameters numbered `free` (n,).
 
-    The costs of local minima differ little against the noise, so all are computed over the same images. Of equal costs
-    the least distortion is taken. Returns zeros if there are no candidates.
+    The costs of local minima differ little against the noise, so all are computed over the same images. Among equal
+    costs, the candidate with least distortion is returned; zeros if there are no candidates.
     """
     if len(candidates) <= 1:
         return candidates[0] if candidates else np.zeros(len(model.parameter_names))
@@ -251,7 +252,8 @@ def _least_cost(
 def _starts(model: CameraModel, resolution: tuple[int, int], known: np.ndarray) -> Iterator[np.ndarray]:
     """For each start distortion of the model, start values (F, P) with every focal length to try.
 
-    Focal lengths are scales in the image centre, which are not fx in every model. `known` values (P,) are kept.
+    Focal lengths are scales in the image centre, which differ from fx in some models. known (P,): values that are kept,
+    NaN for the others.
     """
     width, height = resolution
     for distortion in model.start_distortions:

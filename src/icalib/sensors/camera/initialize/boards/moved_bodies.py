@@ -1,7 +1,8 @@
 """Detects bodies of a target that were moved relative to each other between recordings.
 
-The reprojection error of each recording in the common scene is compared with the errors in scenes of single recordings.
-Errors of the lens and of the target raise all of them. Bodies that were moved raise only the error in the common scene.
+The reprojection error of each recording in the common scene is compared with the errors in scenes that are
+reconstructed from single recordings. Errors of lens and target increase all of them. Moved bodies increase only the
+error in the common scene.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from icalib.sensors.camera.corner_noise import MIN_CORNER_NOISE_PX
 from icalib.sensors.camera.initialize.boards.incremental_scene import fixed_lens, reconstruct_scene
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, multi_body_poses
 
-# Ratio of the reprojection errors of median images. At 1.5 the movement adds 1.25 times the variance that the scenes of
-# single recordings have. At 3, movements of two standard deviations of the corners would pass.
+# Ratio of the reprojection errors of median images. At 1.5, movement adds 1.25 times the error variance in scenes of
+# single recordings. At 3, movements by two standard deviations of the corners would not be detected.
 MAX_SCENE_ERROR_RATIO = 1.5
 
 
@@ -42,9 +43,9 @@ def check_bodies_still(rig: Rig, scene: TargetScene, recordings: Sequence[Measur
 
 
 def scene_error_ratios(rig: Rig, scene: TargetScene, recordings: Sequence[Measurements]) -> np.ndarray:
-    """(n,) RMS error of each recording's median image in the common `scene`, over the largest error in own scenes.
+    """(n,) RMS error of each recording's median image in the common `scene`, over the largest single-recording error.
 
-    The largest is the reference, because a scene from few similar images fits these too well if the lens is wrong.
+    The largest error is the reference, because a scene from few similar images may fit them well with a wrong lens.
     """
     common, single = np.array([_median_errors(rig, scene, r) for r in recordings]).T
     return common / max(float(single.max()), MIN_CORNER_NOISE_PX)
@@ -53,8 +54,8 @@ def scene_error_ratios(rig: Rig, scene: TargetScene, recordings: Sequence[Measur
 def _median_errors(rig: Rig, scene: TargetScene, recording: Measurements) -> tuple[float, float]:
     """RMS errors [px] of the recording's median image in the common `scene`, and in the scene of this recording.
 
-    The latter is corrected for the degrees of freedom of its bodies. Both are zero if the recording alone does not
-    determine relative poses of bodies.
+    The second error is corrected for the degrees of freedom of its bodies. Both are zero if the recording alone does
+    not determine relative poses of bodies.
     """
     models = [camera_model(c.model) for c in rig.cameras]
     params = [scene.params[c.name] for c in rig.cameras]

@@ -1,6 +1,6 @@
-"""Intrinsics of cameras, and poses of bodies, from a target of several bodies.
+"""Intrinsics of cameras, and relative poses of bodies, from a target of several bodies.
 
-One small tag alone determines neither well; a reconstruction of the scene by all bodies together does.
+One small tag alone determines neither well. A reconstruction of the scene from all bodies together determines both.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from icalib.sensors.camera.initialize.boards.intrinsics import camera_params
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene
 
 TRIAL_FOCAL_WIDTHS = (0.6, 1.0, 0.35)  # focal lengths to try, in image widths: views of 80, 53 and 110 degrees
-# Quantile of the errors of images by which scenes are compared. The median would not see a wrong pose of a few bodies.
+# Quantile of the image errors by which scenes are compared. The median is insensitive to wrong poses of a few bodies.
 SCENE_RMS_QUANTILE = 0.9
 EXPECTED_SCENE_RMS_PX = 0.3  # px; a better fit than this is the global minimum, as detected corners are rarely better
-MAX_RECONSTRUCTIONS = 4  # from one start; each begins at the intrinsics of the one before
-MAX_REPEATED_ERROR = 0.9  # of the error before; with less progress a start is not repeated
+MAX_RECONSTRUCTIONS = 4  # from one start; each begins at the intrinsics of the previous one
+MAX_REPEATED_ERROR = 0.9  # error over that of the previous reconstruction, above which there is no further one
 MAX_SCENE_RMS_PX = 2.0  # px, of the median image in a scene that fits; wrong models and sizes give more
-CENTRE_SIGMA = 0.1  # image widths, the prior of the principal point about the middle; wide, it only regularises
-DISTORTION_SIGMA = 1.0  # the prior of each coefficient about its start; wide, it only regularises
+CENTRE_SIGMA = 0.1  # image widths, of the prior of the principal point about the image centre, for regularity only
+DISTORTION_SIGMA = 1.0  # of the prior of each distortion coefficient about its start value, for regularity only
 MAX_OFF_CENTRE = 0.25  # image sides, by which a principal point may lie outside the image
 FOCAL_RANGE = (0.05, 20.0)  # image widths; a fisheye lens has 0.2, a field of view of 5 deg has 11
 MAX_FOCAL_RATIO = 2.0  # fx over fy; pixels are square to a few percent, images squeezed to half width are rare
-MAX_INVISIBLE_SHARE = 0.05  # of the corners, that cannot be unprojected; they may be outliers
+MAX_INVISIBLE_SHARE = 0.05  # share of corners without a ray, which may be outliers
 
 
 def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> TargetScene:
@@ -56,7 +56,7 @@ def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> 
 
 
 def intrinsics_of(camera: Camera, stream: CornerStream, target: Target, scene: TargetScene) -> np.ndarray:
-    """(P,) intrinsics and distortion: those of the scene, else those of the camera alone."""
+    """(P,) intrinsics and distortion: those of `scene` if it has some, else by `camera_params` from single bodies."""
     return scene.params[camera.name] if camera.name in scene.params else camera_params(camera, stream, target)
 
 
@@ -88,8 +88,8 @@ def _best_reconstruction(
 ) -> tuple[float, np.ndarray]:
     """Error of the median image [px] and intrinsics (P,) of the best scene, or of the first one that fits well.
 
-    Each start is repeated from its result while the error falls, because better intrinsics correct wrong poses of
-    bodies. Returns infinity and an empty array if no scene has plausible intrinsics.
+    The reconstruction is repeated from its own result while the error decreases, because better intrinsics correct
+    wrong poses of bodies. Returns infinity and an empty array if no scene has plausible intrinsics.
     """
     best, median, params = np.inf, np.inf, np.empty(0)
     for start in starts:
@@ -129,7 +129,7 @@ def is_plausible_lens(model: CameraModel, params: np.ndarray, resolution: tuple[
 
 
 def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[CameraIntrinsics]:
-    """Start values: intrinsics by single bodies, if plausible; then each start distortion with several focal lengths.
+    """Start values: intrinsics from single bodies, if plausible; then start distortions with several focal lengths.
 
     Fixed values and priors of the rig file are kept in all of them.
     """

@@ -13,15 +13,15 @@ from icalib.model.bodies import Bodies
 from icalib.sensors.camera.corner_factor import Views
 from icalib.sensors.camera.initialize.boards.bundle_adjustment import SceneViews
 
-MAX_SCENE_IMAGES = 60  # of a camera, spread over the recording; the cost of an adjustment grows with it
-IMAGES_PER_PAIR = 4  # of two bodies on an edge of the spanning tree; one bad image must not separate them
+MAX_SCENE_IMAGES = 60  # of a camera, spread over the recording; the cost of bundle adjustment grows with the number
+IMAGES_PER_PAIR = 4  # images of each pair of bodies in the spanning tree, so that one bad image does not separate them
 
 
 def informative_images(stream: CornerStream, body: np.ndarray) -> CornerStream:
     """Images spread over the recording, and images that connect the bodies; body: (n_points,) the body of each point.
 
-    The graph of bodies has the number of images that show two bodies as the weight of an edge. For each edge of its
-    maximum spanning forest, `IMAGES_PER_PAIR` images with both bodies are taken.
+    In the graph of bodies, the weight of an edge is the number of images that show both bodies. For each edge of the
+    maximum spanning forest, at least `IMAGES_PER_PAIR` images with both bodies are used, if there are so many.
     """
     n, m = len(stream.stamps_ns), int(body.max()) + 1
     shows = np.zeros((n, m), dtype=np.float32)
@@ -42,7 +42,7 @@ def informative_images(stream: CornerStream, body: np.ndarray) -> CornerStream:
 def scene_views(bodies: Bodies, streams: Sequence[CornerStream], begins: np.ndarray) -> SceneViews:
     """All views of all cameras, with up to `MAX_POSE_CORNERS` corners each.
 
-    begins: (C + 1,) number of the first image of each camera, and of all images.
+    begins: (C + 1,) number of the first image of each camera, then the number of all images.
     """
     columns = []
     for c, stream in enumerate(streams):
@@ -57,7 +57,7 @@ def scene_views(bodies: Bodies, streams: Sequence[CornerStream], begins: np.ndar
 
 
 def _spread_corners(views: Views) -> np.ndarray:
-    """(N,) bool: at most `MAX_POSE_CORNERS` corners of each view, evenly spread over its list of corners."""
+    """(N,) bool: selects at most `MAX_POSE_CORNERS` corners of each view, evenly spaced in its list of corners."""
     length = np.diff(views.start)
     place = np.arange(int(views.start[-1])) - np.repeat(views.start[:-1], length)
     length = np.repeat(length, length)

@@ -39,8 +39,8 @@ def adjust_intrinsics(
 ) -> tuple[np.ndarray, float]:
     """Parameters (P,) and robust cost [px^2] after a bundle adjustment of those numbered `free` (n,) and all poses.
 
-    params: (P,) start values; used: (M,) bool, the images, by default those with a good pose. Raises LinAlgError if the
-    normal equations are singular.
+    params: (P,) start values; used: (M,) bool, images in use, by default those with a good pose. Raises LinAlgError if
+    the normal equations are singular.
     """
     poses = target_poses(stream, model, params, target)
     images = np.flatnonzero(has_good_pose(poses) if used is None else used)
@@ -116,7 +116,7 @@ def _linearised(
     size = np.sqrt((r**2).sum(axis=1))
     is_large, k = size > INTRINSICS_HUBER_PX, INTRINSICS_HUBER_PX
     cost = float(np.where(is_large, k * (size - 0.5 * k), 0.5 * size**2).sum())
-    # Corners that cannot be projected cost like outliers. Else parameters with which fewer are visible would fit best.
+    # Corners that cannot be projected have the cost of outliers, or parameters that project fewer would fit best.
     cost += float((~valid).sum()) * UNSEEN_COST_PX2
     weight = np.repeat(np.where(is_large, k / np.maximum(size, 1e-12), 1.0) * valid, 2)[:, None]
     J_pose = np.concatenate([cross(J_point, X[:, None, :]), -J_point], axis=2).reshape(-1, 6)
@@ -132,5 +132,5 @@ def _linearised(
 
 
 def _products(A: np.ndarray, B: np.ndarray, rows: list[slice]) -> np.ndarray:
-    """(m, a, ...) A^T B of each of m slices of the rows of A (N, a) and B (N, ...)."""
+    """(m, a, ...) products A^T B over each of m slices `rows` of the rows of A (N, a) and B (N, ...)."""
     return np.array([A[k].T @ B[k] for k in rows]).reshape(len(rows), A.shape[1], *B.shape[1:])

@@ -1,8 +1,8 @@
 """Resolves the rotational ambiguity of symmetric targets consistently over the images of all cameras.
 
-A single image of such a target leaves several rotations of the sheet possible. Detection compares successive images of
-one camera. Here the gyroscope bridges gaps between images, and the extrinsics make the choice consistent between
-cameras. The intrinsics do not depend on the choice, and each pose changes with it in a known way.
+A single image of such a target is consistent with several rotations of the target about its normal. Detection resolves
+them between successive images of one camera. Here the gyroscope bridges gaps between images, and the extrinsics make
+the choice consistent between cameras. Intrinsics do not depend on the choice; poses change by the known symmetry.
 """
 
 from __future__ import annotations
@@ -29,18 +29,19 @@ from icalib.sensors.camera.initialize.align_camera import align_camera
 from icalib.sensors.camera.initialize.boards.intrinsics import camera_params
 from icalib.sensors.camera.initialize.guess import relative_offset
 
-# Pairs of simultaneous images that give the relative rotation of two cameras. The cost grows with the square of the
-# number, and the rotation has only to tell symmetries apart.
+# Largest number of pairs of simultaneous images that determine the relative rotation of two cameras. The cost grows
+# with its square, and the rotation only has to distinguish symmetries.
 MAX_SYMMETRY_PAIRS = 60
 
-ParamsByCamera = dict[str, np.ndarray]  # intrinsics and distortion (P,)
+ParamsByCamera = dict[str, np.ndarray]  # intrinsics and distortion (P,) by camera name
 
 
 @dataclass(frozen=True)
 class _Symmetries:
-    """The g symmetries of a sheet of n points, x' = rotation x + shift.
+    """The g rotational symmetries of a flat target with n points, x' = rotation x + shift.
 
-    number: (g, n) the point that each point is mapped to, as `Target.turns`; rotation: (g, 3, 3); shift: (g, 3) [m].
+    number: (g, n) index of the point that each point is mapped to, as in `Target.turns`; rotation: (g, 3, 3); shift:
+    (g, 3) [m].
     """
 
     number: np.ndarray
@@ -49,7 +50,7 @@ class _Symmetries:
 
     @classmethod
     def of(cls, target: Target) -> _Symmetries:
-        """The symmetries of `target`, rotations about its normal."""
+        """The symmetries of `target`: rotations about its normal through the mean of its points."""
         middle = target.points.mean(axis=0)
         x, number = target.points - middle, np.stack(target.turns)
         mapped = x[number]
@@ -61,7 +62,9 @@ class _Symmetries:
 
 @dataclass(frozen=True)
 class _Views:
-    """Images of one target by one camera, and their poses; rows: (N,) rows of their corners in the camera's stream."""
+    """Images of one target by one camera, with poses T_target_cam.
+
+    rows: (N,) rows of their corners in the camera's stream."""
 
     camera: Camera
     rows: np.ndarray
@@ -70,7 +73,9 @@ class _Views:
 
 
 class _CameraOnBody(NamedTuple):
-    """rotation: R_body_cam (3, 3); offset: t_body - t_cam [s], t_cam counted from the camera's first such image."""
+    """Alignment of a camera with the body.
+
+    rotation: R_body_cam (3, 3); offset: t_body - t_cam [s], t_cam since the camera's first image of the target."""
 
     rotation: np.ndarray
     offset: float
@@ -79,14 +84,14 @@ class _CameraOnBody(NamedTuple):
 def resolve_symmetry(rig: Rig, recordings: Sequence[Measurements]) -> list[Measurements]:
     """The recordings with the points of each symmetric target numbered consistently.
 
-    The numbers do not change if the intrinsics of a camera are not found. Those of a camera do not change if the motion
-    does not determine its rotation relative to the body.
+    No number changes if the intrinsics of some camera are not found. The numbers of one camera do not change if its
+    rotation relative to the body is not found.
     """
     if not rig.target.symmetric:
         return list(recordings)
     try:
         params = _params_by_camera(rig, recordings)
-    except EstimationError:  # the initial guess raises it again
+    except EstimationError:  # the initial guess raises this error again
         return list(recordings)
     for part in parts_of(rig.target):
         if part[1].symmetric:
@@ -95,7 +100,7 @@ def resolve_symmetry(rig: Rig, recordings: Sequence[Measurements]) -> list[Measu
 
 
 def _params_by_camera(rig: Rig, recordings: Sequence[Measurements]) -> ParamsByCamera:
-    """Intrinsics and distortion of all cameras that saw the target. Raises EstimationError if some are not found."""
+    """Intrinsics and distortion of all cameras with corner streams. Raises EstimationError if some are not found."""
     streams = {c.name: [s for m in recordings for s in m.cameras if s.name == c.name] for c in rig.cameras}
     return {
         c.name: camera_params(c, CornerStream.joined(streams[c.name]), rig.target)
@@ -105,7 +110,7 @@ def _params_by_camera(rig: Rig, recordings: Sequence[Measurements]) -> ParamsByC
 
 
 def _renumbered(rig: Rig, part: Part, params: ParamsByCamera, measured: Measurements) -> Measurements:
-    """One recording with the points of one target, `part`, numbered consistently."""
+    """One recording with the points of one target, `part` (name, target, index of its first point), renumbered."""
     _, target, first = part
     cameras = {c.name: c for c in rig.cameras}
     views = [_views_of(cameras[s.name], s, part, params[s.name]) for s in measured.cameras]
@@ -138,8 +143,8 @@ def _chosen_symmetries(
 ) -> list[np.ndarray]:
     """By camera, (M,) the number of the symmetry that makes each of its images consistent with the others.
 
-    The attitude of the target is propagated from image to image of all cameras with a known rotation on the body: by
-    the gyroscope, except across its gaps, or unchanged if there is no gyroscope.
+    The attitude of the target relative to the body is propagated over the images of all cameras with a known rotation
+    on the body: by the gyroscope, or unchanged across its gaps and without a gyroscope.
     """
     imu = imu_data(rig, measured)
     cameras = sorted((k for k, v in enumerate(views) if v.poses.ok.any()), key=lambda k: -views[k].poses.ok.sum())
@@ -155,7 +160,7 @@ def _chosen_symmetries(
     R_last = np.eye(3)
     for v, (k, i) in enumerate(zip(camera, image, strict=True)):
         poses, R_body_cam = views[k].poses, mounted[k].rotation
-        if not poses.ok[i]:  # detection chose the symmetry of the image before
+        if not poses.ok[i]:  # as the previous image, with which detection made it consistent
             chosen[k][i] = chosen[k][i - 1] if i else 0
             continue
         R_board_body = symmetries.rotation @ poses.rotation[i] @ R_body_cam.T
@@ -170,7 +175,9 @@ def _chosen_symmetries(
 def _in_temporal_order(
     views: list[_Views], mounted: dict[int, _CameraOnBody]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(V,) each: instant on the body's clock [s], camera and image of all images of the `mounted` cameras, by time."""
+    """All images of the `mounted` cameras, sorted by time.
+
+    Returns instants on the body's clock [s], camera numbers and image numbers, (V,) each."""
     t = [views[k].images.seconds + mount.offset for k, mount in mounted.items()]
     camera = [np.full(len(own), k) for k, own in zip(mounted, t, strict=True)]
     image = [np.arange(len(own)) for own in t]
@@ -180,9 +187,9 @@ def _in_temporal_order(
 
 
 def _attitudes(gyro: GyroRotation | None, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R_start_body (V, 3, 3) at instants t (V,) [s], and (V,) the section between gaps of the gyroscope of each.
+    """R_start_body (V, 3, 3) at instants t (V,) [s], and (V,) the number of the gap-free section of the gyroscope.
 
-    Without a gyroscope all are the identity.
+    Without a gyroscope, all attitudes are the identity, in one section.
     """
     if gyro is None:
         return np.tile(np.eye(3), (len(t), 1, 1)), np.zeros(len(t), dtype=int)
@@ -193,9 +200,9 @@ def _attitudes(gyro: GyroRotation | None, t: np.ndarray) -> tuple[np.ndarray, np
 def _mounted_by_imu(
     imu: ImuData, measured: Measurements, views: list[_Views], cameras: list[int]
 ) -> tuple[dict[int, _CameraOnBody], GyroRotation | None]:
-    """The `cameras` whose angular rates match the IMU's, on the body, and the integrated gyroscope.
+    """Alignments of the `cameras` whose angular rates match the IMU's, and the integrated gyroscope, None without any.
 
-    cameras: numbers, the one with most poses first. Its estimate of the gyroscope bias is used.
+    cameras: numbers, the camera with most poses first. The first alignment gives the gyroscope bias.
     """
     aligned = {}
     for k in cameras:
@@ -210,9 +217,9 @@ def _mounted_by_imu(
 def _mounted_by_images(
     measured: Measurements, views: list[_Views], cameras: list[int], symmetries: _Symmetries
 ) -> dict[int, _CameraOnBody]:
-    """The `cameras` that simultaneous images connect to the first one, which is the body.
+    """Alignments of the `cameras` that simultaneous images connect to the first one, which is the body.
 
-    Empty if none is connected: one camera alone does not tell how the target moved between its images.
+    Empty if none is connected, because one camera alone does not show how the target moved between its images.
     """
     given = [own.camera.time_offset.value for own in views]
     offsets = [
@@ -235,7 +242,9 @@ def _mounted_by_images(
 
 
 def _simultaneous(a: _Views, offset_a: float, b: _Views, offset_b: float) -> np.ndarray:
-    """(n, 2) pairs of simultaneous images of two cameras that have poses, spread over the recording."""
+    """(n, 2) indices of simultaneous images with poses of two cameras, spread over the recording.
+
+    offset_a, offset_b: time offsets [s], clocks counted from first stamps; n is at most `MAX_SYMMETRY_PAIRS`."""
     ta, tb = a.images.seconds + offset_a, b.images.seconds + offset_b
     pairs = np.column_stack(taken_at_once(ta, tb))
     pairs = pairs[a.poses.ok[pairs[:, 0]] & b.poses.ok[pairs[:, 1]]]
@@ -249,9 +258,9 @@ def _simultaneous(a: _Views, offset_a: float, b: _Views, offset_b: float) -> np.
 def _common_rotation(a: TargetPoses, b: TargetPoses, pairs: np.ndarray, symmetries: _Symmetries) -> np.ndarray:
     """R_a_b (3, 3) of two cameras from simultaneous images; pairs: (n, 2) their numbers.
 
-    Each pair gives one candidate T_a_b for each symmetry. The right candidates agree; the wrong ones depend on the
-    attitude of the target. The candidate with the least median distance to the nearest candidate of each pair is taken.
-    One radian counts as one median distance from the target.
+    Each pair gives one candidate T_a_b for each symmetry. The correct candidates agree; the wrong ones vary with the
+    attitude of the target. For each candidate, the distances to the nearest candidate of every pair have a median. The
+    candidate with the least median is returned. One radian counts as one median distance from the target.
     """
     i, j = pairs.T
     to_a = a.rotation[i].swapaxes(1, 2)

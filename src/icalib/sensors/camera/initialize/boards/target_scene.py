@@ -1,7 +1,7 @@
 """Camera poses in a scene of bodies with known poses, image by image, without an initial guess.
 
-The pose of each body in each image is found first. A small flat body far away has two poses that project alike; the
-other bodies in the image decide between them.
+The pose of each body in each image is found first. A small flat body far away has two possible poses with nearly the
+same projection. The other bodies in the image resolve this ambiguity.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ from icalib.model.bodies import Bodies
 from icalib.optim.state import Key
 from icalib.sensors.camera.corner_factor import Views
 
-POSES_PER_VIEW = 2  # a flat body and its mirror image, with depths reflected about the middle of the body
-NO_POSE_RMS_PX = 1e9  # px, stands for the error of an image without a pose
+POSES_PER_VIEW = 2  # two-fold ambiguity of a flat body: depths relative to its centre may be mirrored
+NO_POSE_RMS_PX = 1e9  # px, error that marks an image without a pose
 
 
 @dataclass(frozen=True)
 class TargetScene:
     """Poses of the bodies of a target.
 
-    values: R_scene_body, p_scene_body by body and name, as in a state; the scene is the frame of the first body in use.
-    params: intrinsics and distortion (P,) by camera, with which the poses were found, if there are several bodies.
+    values: R_scene_body, p_scene_body as in a state, keyed by body and parameter; the scene frame is that of the first
+    body in use. params: intrinsics and distortion (P,) by camera name, with which the poses were found; empty for one
+    body.
     """
 
     bodies: Bodies
@@ -65,7 +66,7 @@ class TargetScene:
 def view_poses(
     stream: CornerStream, views: Views, bodies: Bodies, model: CameraModel, params: np.ndarray
 ) -> TargetPoses:
-    """Both poses (V, 2, ...) of the camera in the frame of the body, for each of V views of one body in one image."""
+    """Both possible poses T_body_cam (V, 2, ...) for each of V views; a view is one body in one image."""
     size = np.bincount(bodies.target.body)
     fewest = np.minimum(size, MIN_POSE_CORNERS)[views.body]
     return flat_poses(stream, views.start, fewest, model, params, bodies.target.points, POSES_PER_VIEW)
@@ -84,7 +85,9 @@ def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, sc
 
 
 def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: TargetScene) -> TargetPoses:
-    """Camera poses in the scene, one for each image, from the bodies that have a pose in it; params: (P,)."""
+    """Camera poses in the scene, one for each image, from all bodies that have a pose in the scene.
+
+    params: (P,) intrinsics and distortion."""
     views = Views.of(stream, scene.bodies.target.body)
     by_view = view_poses(stream, views, scene.bodies, model, params)
     R_sb, p_sb = scene.bodies.poses(scene.values)
@@ -117,8 +120,10 @@ def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarra
 def _best_poses(
     start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms
 ):
-    """Writes the poses of M images: rotation, position, rms. Candidates are the poses of the views, R_bc, p_bc, ok
-    (V, 2, ...), composed with R_sb, p_sb; the one with the least error over all corners is refined on all corners."""
+    """Writes camera poses in the scene and errors of M images: rotation (M, 3, 3), position (M, 3) m, rms (M,) px.
+
+    Candidates are the poses T_body_cam of the views, R_bc, p_bc, ok (V, 2, ...), composed with T_scene_body, R_sb,
+    p_sb. The candidate with the least error over all corners of the image is refined on all of them."""
     points, seen = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     R, t, trial_R, trial_t = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     R_sc, p_sc = np.empty((3, 3)), np.empty(3)

@@ -1,9 +1,9 @@
 """Extrinsics, time offset and intrinsics of a camera with feature tracks, on a known trajectory of the IMU.
 
-Both rays to a point that two images share, and the translation of the camera in between, lie in one epipolar plane. The
-trajectory is known, so that the epipolar errors of thousands of points determine a few unknowns: rotation, lever arm,
-time offset and up to two directions of the intrinsics. Points are not estimated. Angular rates give start values. If
-the robot rotates about one axis only, as on a floor, start rotations about that axis are tried on a grid.
+If two images share a point, its two rays and the translation of the camera in between lie in one epipolar plane. As the
+trajectory is known, epipolar errors of thousands of points determine a few unknowns: rotation, lever arm, time offset
+and up to two directions of the intrinsics. Points are not estimated. Angular rates give start values. Start rotations
+about the main axis of the motion are tried on a grid, because a robot on a floor rotates about this axis only.
 """
 
 from __future__ import annotations
@@ -25,34 +25,35 @@ from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
 from icalib.motion.sweep import EstimatedMotion
 
-PAIR_STEPS_S = (0.5, 1.0)  # s between two images; the motion in between must be several times the error of rays
-MAX_EPIPOLAR_PAIRS = 300  # pairs of images for each step
-MIN_EPIPOLAR_PAIRS = 20  # pairs of images; fewer show too little of the motion for seven unknowns
-EPIPOLAR_RAY_SIGMA = 3e-3  # rad, of a ray, by the initial guess of the intrinsics; detected points err by less
-CORRELATED_RAYS = 30.0  # rays of a pair that wrong intrinsics bend alike; they count as one observation
-TRACK_ARM_SIGMA_M = 0.3  # m, the prior of the lever arm about zero; rigs are of this size
-LENS_SIGMA = 0.03  # rad, RMS over the rays, the prior of a step along one direction of the intrinsics
+PAIR_STEPS_S = (0.5, 1.0)  # s between the images of a pair; over shorter times the motion is small against ray errors
+MAX_EPIPOLAR_PAIRS = 300  # pairs of images for each of `PAIR_STEPS_S`
+MIN_EPIPOLAR_PAIRS = 20  # pairs of images; fewer contain too little motion to determine seven unknowns
+EPIPOLAR_RAY_SIGMA = 3e-3  # rad, standard deviation of a ray, dominated by the initial guess of the intrinsics
+CORRELATED_RAYS = 30.0  # rays of a pair with about the same error by wrong intrinsics; they count as one observation
+TRACK_ARM_SIGMA_M = 0.3  # m, standard deviation of the zero-mean prior of the lever arm; typical size of rigs
+LENS_SIGMA = 0.03  # rad, RMS change of the rays by one standard deviation of each direction of the intrinsics (prior)
 MAX_LENS_SIGMAS = 3.0  # largest step along one direction, in standard deviations of its prior
-MIN_COVERED_PAIR_SHARE = 0.5  # of the possible pairs; a short interval with little motion fits any extrinsics
-MIN_POINT_RANGE_M = 0.2  # m; no scene is nearer to a camera
-CAUCHY_SIGMAS = 2.0  # standard deviations, the scale of Cauchy's loss
+MIN_COVERED_PAIR_SHARE = 0.5  # of the pairs that could overlap the motion; a short overlap fits any extrinsics
+MIN_POINT_RANGE_M = 0.2  # m; nearer points are implausible
+CAUCHY_SIGMAS = 2.0  # scale of Cauchy's loss, in standard deviations of a ray
 AXIS_ANGLES = 24  # start rotations about the main axis, 15 deg apart
-MAX_REFINED_STARTS = 4  # of all starts, those with the least cost
+MAX_REFINED_STARTS = 4  # starts with the least cost, which are refined
 START_SUBSAMPLING = 6  # every 6th pair is used to compare starts
-REFINEMENT_SUBSAMPLING = (3, 3, 1)  # every so many pairs are used, in rounds that evaluate motion and rays anew
+REFINEMENT_SUBSAMPLING = (3, 3, 1)  # every n-th pair is used in each round; a round relinearises motion and rays
 EPIPOLAR_COST_TOLERANCE = 1e-4  # relative decrease of the cost at which a round has converged
-RAY_ERROR_QUANTILE = 0.75  # of the rays, checked against `MAX_RAY_ERROR`; outliers are fewer than a quarter
+RAY_ERROR_QUANTILE = 0.75  # quantile of the ray errors that `MAX_RAY_ERROR` limits; fewer than a quarter are outliers
 MAX_RAY_ERROR = 0.01  # rad, three times `EPIPOLAR_RAY_SIGMA`
-MAX_ROTATION_SIGMA = np.deg2rad(5.0)  # rad; with more the rotation counts as unobservable
+MAX_ROTATION_SIGMA = np.deg2rad(5.0)  # rad; with a larger uncertainty the rotation counts as unobservable
 N_EXTRINSICS = 7  # rotation (3), lever arm (3), time offset
-EXTRINSICS_SCALE = np.repeat([0.1, 0.1, 0.01], [3, 3, 1])  # rad, m, s; steps of the solver are in these units
+EXTRINSICS_SCALE = np.repeat([0.1, 0.1, 0.01], [3, 3, 1])  # rad, m, s; the solver's unknowns are scaled by these
 
 
 @dataclass(frozen=True)
 class CameraExtrinsics:
-    """rotation, position: T_imu_cam. offset: t_imu - t_camera [s], each clock counted from its first stamp.
+    """Extrinsics, time offset and intrinsics of a camera.
 
-    lens_step: (L,) step from the initial guess along each of the free directions of the intrinsics.
+    rotation (3, 3), position (3,) [m]: T_imu_cam. offset: t_imu - t_camera [s], each clock counted from its first
+    stamp. lens_step: (L,) step from the initial guess of the intrinsics, along `ImagePairs.lens_directions`.
     """
 
     rotation: np.ndarray
@@ -61,7 +62,7 @@ class CameraExtrinsics:
     lens_step: np.ndarray
 
     def moved(self, x: np.ndarray) -> CameraExtrinsics:
-        """After a step x (7 + L,): rotation in the camera's frame [rad], lever arm [m], offset [s], intrinsics."""
+        """These after a step x (7 + L,): rotation in the camera frame [rad], lever arm [m], offset [s], `lens_step`."""
         R, p = self.rotation @ so3.exp(x[:3].copy()), self.position + x[3:6]
         return CameraExtrinsics(R, p, self.offset + float(x[6]), self.lens_step + x[N_EXTRINSICS:])
 
@@ -70,9 +71,10 @@ class CameraExtrinsics:
 class ImagePairs:
     """m pairs of images of one camera, and the points that the two images of each pair share.
 
-    uv: (o, 2) [px] observations. times: (m, 2) [s] on the camera's clock. shared: (n, 2) observations of the same point
-    in both images; pair k has the rows begin[k]:begin[k + 1]. lens: (P,) initial guess of intrinsics and distortion.
-    lens_directions: (L, P) free directions of these, each as long as the standard deviation of its prior.
+    uv: (o, 2) [px] observations. times: (m, 2) [s] on the camera's clock since its first stamp. shared: (n, 2) indices
+    of the observations of one point in both images; pair k has the rows begin[k]:begin[k + 1]. lens: (P,) initial guess
+    of intrinsics and distortion. lens_directions: (L, P) directions in which `lens` is adjusted; the length of each is
+    the standard deviation of its prior.
     """
 
     name: str
@@ -88,7 +90,7 @@ class ImagePairs:
     def of(cls, stream: TrackStream, model: CameraModel, lens: np.ndarray, directions: np.ndarray) -> ImagePairs:
         """The pairs of `stream`; directions: (L, P) free directions of the intrinsics, of any length.
 
-        Raises EstimationError if hardly any images share enough points.
+        Raises EstimationError if fewer than `MIN_EPIPOLAR_PAIRS` pairs share enough points.
         """
         rays, valid = model.unproject(lens, stream.uv)
         pairs = list(pairs_with_shared_points(stream, valid, PAIR_STEPS_S, MAX_EPIPOLAR_PAIRS))
@@ -114,7 +116,7 @@ class ImagePairs:
         return self.select(np.arange(len(self.times)) % n == 0)
 
     def select(self, kept: np.ndarray) -> ImagePairs:
-        """The pairs `kept`, (m,) bool."""
+        """The pairs that `kept` (m,) bool selects."""
         count = np.diff(self.begin)
         begin = np.cumsum([0, *count[kept]])
         uv, shared = _used(self.uv, self.shared[np.repeat(kept, count)])
@@ -122,16 +124,16 @@ class ImagePairs:
 
 
 def _used(uv: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The observations in `uv` (o, 2) that `shared` (n, 2) refers to, and `shared` renumbered for them."""
+    """The observations of `uv` (o, 2) that the indices `shared` (n, 2) refer to, and the indices into these."""
     used, renumbered = np.unique(shared, return_inverse=True)
     return uv[used], renumbered.reshape(shared.shape)
 
 
 def ray_derivatives(model: CameraModel, lens: np.ndarray, directions: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """(L, n, 3) derivatives of the rays (n, 3) of fixed pixels by steps of the intrinsics along `directions` (L, P).
+    """(L, n, 3) derivatives of the unit rays (n, 3) of fixed pixels by steps of `lens` (P,) along `directions` (L, P).
 
-    With the projection K(f, lens) = uv: df = -K_f^+ K_lens d, perpendicular to f. Zero for rays that the model does not
-    project.
+    For the projection K(f, lens) = uv with Jacobians K_f, K_lens, a step d gives df = -K_f^+ K_lens d, perpendicular to
+    f. Zero for rays that the model does not project.
     """
     _, valid, J_ray, J_lens = model.project_with_jacobians(lens, rays)
     pixels = np.einsum("nrp,lp->lnr", J_lens, directions)
@@ -147,10 +149,10 @@ def ray_derivatives(model: CameraModel, lens: np.ndarray, directions: np.ndarray
 def _ray_errors(f, h, J_f, J_h, lens_step, begin, R, b, e):
     """Writes the epipolar errors e (n,) [rad] of the rays f and h (n, 3) of m pairs of images.
 
-    R (m, 3, 3), b (m, 3): rotation and position of the camera of f in the frame of the camera of h. lens_step (L,)
-    moves the rays along their derivatives J_f, J_h (L, n, 3). Rays that meet nearer than MIN_POINT_RANGE_M, or behind a
-    camera, have in addition the part of their parallax that this range does not allow. Without it, a camera that does
-    not move would fit best.
+    R (m, 3, 3), b (m, 3) [m]: pose of the camera of f in the frame of the camera of h. lens_step (L,) moves the rays
+    along their derivatives J_f, J_h (L, n, 3). Pair k has the rays begin[k]:begin[k + 1]. If rays intersect nearer than
+    MIN_POINT_RANGE_M or behind a camera, the excess of their parallax is added to the error. Without this term, a
+    camera without motion would fit best.
     """
     for k in range(len(begin) - 1):
         size = np.sqrt(b[k, 0] * b[k, 0] + b[k, 1] * b[k, 1] + b[k, 2] * b[k, 2]) + 1e-9
@@ -178,8 +180,8 @@ def _ray_errors(f, h, J_f, J_h, lens_step, begin, R, b, e):
 class _PairResiduals:
     """Epipolar residuals of `pairs` of images, as a function of a step from the extrinsics `at`.
 
-    first, second: poses of the IMU at the instants of both images (m,). f, h: (n, 3) rays in both images; J_f, J_h:
-    (L, n, 3) their derivatives by the intrinsics.
+    first, second: poses of the IMU at the instants of the first and second image of each pair. f, h: (n, 3) rays in
+    both images; J_f, J_h: (L, n, 3) their derivatives by the steps of the intrinsics.
     """
 
     pairs: ImagePairs
@@ -193,7 +195,7 @@ class _PairResiduals:
 
     @classmethod
     def of(cls, pairs: ImagePairs, motion: EstimatedMotion, at: CameraExtrinsics) -> _PairResiduals:
-        """The residuals of all pairs within the known `motion`."""
+        """The residuals of the pairs with both images within the known `motion`, linearised at the extrinsics `at`."""
         t = pairs.times + at.offset
         pairs = pairs.select(is_known(motion.state.seconds, t[:, 0]) & is_known(motion.state.seconds, t[:, 1]))
         t1, t2 = (pairs.times + at.offset).T
@@ -205,7 +207,7 @@ class _PairResiduals:
         return cls(pairs, at, imu_poses(motion, t1), imu_poses(motion, t2), rays[p], rays[q], J[:, p], J[:, q])
 
     def errors(self, x: np.ndarray) -> np.ndarray:
-        """(n,) [rad] epipolar errors of all rays, after a step x (7 + L,) as in `CameraExtrinsics.moved`."""
+        """(n,) [rad] epipolar errors of all points, after a step x (7 + L,) as in `CameraExtrinsics.moved`."""
         camera = self.at.moved(x)
         R_ic, p_ic = camera.rotation, camera.position
         (R1, p1), (R2, p2) = _after(self.first, x[6]), _after(self.second, x[6])
@@ -218,13 +220,13 @@ class _PairResiduals:
 
     @property
     def errors_at(self) -> np.ndarray:
-        """(n,) [rad] epipolar errors of all rays at the extrinsics `at`."""
+        """(n,) [rad] epipolar errors of all points at the extrinsics `at`."""
         return self.errors(np.zeros(N_EXTRINSICS + len(self.pairs.lens_directions)))
 
     def minimise(self, fixed: np.ndarray) -> tuple[CameraExtrinsics, OptimizeResult]:
         """The extrinsics at the nearest minimum of the robust cost, and the solver's result.
 
-        fixed: (7,) bool, unknowns that stay. Loss: Cauchy for epipolar errors, quadratic for the priors.
+        fixed: (7,) bool, unknowns that do not change. The loss is Cauchy's for epipolar errors, quadratic for priors.
         """
         n, sigma = len(self.pairs.lens_directions), EPIPOLAR_RAY_SIGMA * np.sqrt(CORRELATED_RAYS)
         scale, free = (
@@ -242,7 +244,7 @@ class _PairResiduals:
             camera = self.at.moved(x)
             return np.concatenate([self.errors(x) / sigma, camera.position / TRACK_ARM_SIGMA_M, camera.lens_step])
 
-        # Without bounds an infinite focal length fits best if the motion contradicts the tracks: all rays are parallel.
+        # Bounds, because an infinite focal length, with parallel rays, fits best if the motion contradicts the tracks.
         limit, inside = np.append(np.full(len(free) - n, np.inf), np.full(n, MAX_LENS_SIGMAS)), 0.99 * MAX_LENS_SIGMAS
         present = np.append(np.zeros(len(free) - n), np.clip(self.at.lens_step, -inside, inside))
         result = least_squares(
@@ -258,9 +260,9 @@ class _PairResiduals:
 
 
 def _cauchy_of_first(n: int) -> Any:
-    """The loss of `least_squares`: Cauchy's for the first n residuals, quadratic for the priors after them.
+    """The callable `loss` of scipy's `least_squares`: Cauchy's for the first n residuals, quadratic for the priors.
 
-    The type stubs of scipy lack callable losses.
+    Its type is Any, because the type stubs of scipy lack callable losses.
     """
 
     def loss(z: np.ndarray) -> np.ndarray:
@@ -286,10 +288,11 @@ def extrinsics_on_motion(
 ) -> CameraExtrinsics:
     """The extrinsics of the camera that fit its `pairs` of images best, given the `motion` of the IMU.
 
-    The minimum is searched from each of the `starts`, rotated by a grid of angles about `axis` (3,) in the IMU's frame
-    if one is given. fixed: (7,) bool, unknowns that stay as in the starts, in the order of `CameraExtrinsics.moved`.
+    The search begins at each of the `starts`, rotated by a grid of angles about `axis` (3,) in the IMU's frame if that
+    is not None. fixed: (7,) bool, unknowns that stay as in the starts, in the order of `CameraExtrinsics.moved`.
 
-    Raises EstimationError if the tracks contradict the motion, or the motion does not determine the rotation.
+    Raises EstimationError if too few images overlap the motion in time, the tracks contradict the motion, or the motion
+    does not determine the rotation.
     """
     angles = np.linspace(0.0, 2.0 * np.pi, AXIS_ANGLES, endpoint=False)
     rotations = [np.eye(3)] if axis is None else [so3.exp(a * axis) for a in angles]
@@ -304,7 +307,7 @@ def extrinsics_on_motion(
         )
     best = sorted(tried, key=_mean_cost)[:MAX_REFINED_STARTS]
     found = [(*s.minimise(fixed), len(s.f)) for s in best]
-    camera, result, _ = min(found, key=lambda x: x[1].cost / x[2])  # by ray: the numbers of rays differ
+    camera, result, _ = min(found, key=lambda x: x[1].cost / x[2])  # cost per ray, because the numbers of rays differ
     for n in REFINEMENT_SUBSAMPLING:
         camera, result = _PairResiduals.of(pairs.every(n), motion, camera).minimise(fixed)
     _check(_PairResiduals.of(pairs, motion, camera), result, fixed)
@@ -323,7 +326,9 @@ def _mean_cost(residuals: _PairResiduals) -> float:
 
 
 def _check(residuals: _PairResiduals, result: OptimizeResult, fixed: np.ndarray) -> None:
-    """Raises EstimationError if the residuals are too large, or the rotation is free and its uncertainty too large."""
+    """Raises EstimationError if the residuals are too large, or a free rotation is too uncertain.
+
+    result: of the last `minimise`; fixed: (7,) bool."""
     name = residuals.pairs.name
     error = float(np.quantile(np.abs(residuals.errors_at), RAY_ERROR_QUANTILE))
     if error > MAX_RAY_ERROR:

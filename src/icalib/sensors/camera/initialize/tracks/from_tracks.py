@@ -1,8 +1,8 @@
 """Initial guess from feature tracks and an IMU, without a target.
 
-Epipolar geometry gives the rotations of each camera between images. Their comparison with the gyroscope gives time
-offsets, extrinsic rotations and the gyroscope bias. With rotations known, velocities, gravity, accelerometer bias and
-lever arms are a linear problem (`linear_motion`).
+Epipolar geometry gives the rotations of each camera between images. Their alignment with the gyroscope gives time
+offsets, extrinsic rotations and the gyroscope bias. With known rotations, velocities, gravity, accelerometer bias and
+lever arms are the solution of a linear problem (`linear_motion`).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from icalib.sensors.camera.initialize.tracks.linear_motion import Rays, WindowMo
 from icalib.sensors.camera.initialize.tracks.track_intrinsics import find_intrinsics
 from icalib.sensors.sensor import ROTATION
 
-MAX_IMAGE_STEP_S = 0.15  # s between images in the linear problem; images in between add little information
-MIN_TRACK_IMAGES = 3  # images in which a typical track is seen; the linear problem uses no shorter ones
-MIN_GRAVITY_RATIO = 0.7  # median specific force over gravity; hand-held and driven rigs accelerate by less than 3 m/s^2
+MAX_IMAGE_STEP_S = 0.15  # s between the images that the linear problem uses; others add little information
+MIN_TRACK_IMAGES = 3  # selected images that a typical track spans; the linear problem uses no shorter tracks
+MIN_GRAVITY_RATIO = 0.7  # median specific force over gravity; typical rigs accelerate by less than 3 m/s^2
 
 
 def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
-    """The initial guess of one recording; the poses in it are those of the cameras in the world.
+    """The initial guess of one recording; its camera poses are in the world frame.
 
     Raises EstimationError if the tracks do not determine the guess, or the intrinsics of a camera.
     """
@@ -67,7 +67,9 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
 def _aligned_together(
     rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], aligned: list[RateAlignment]
 ) -> list[RateAlignment]:
-    """The alignments of all cameras refined together: see `joint_alignment`; params: (P,) by camera."""
+    """The alignments of all cameras, refined together with one gyroscope bias; see `joint_alignment`.
+
+    params: (P,) intrinsics and distortion of each camera; aligned: alignments of single cameras."""
     pairs = []
     for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
         pairs += shared_rays(k, stream, camera_model(camera.model), params[k])
@@ -76,7 +78,7 @@ def _aligned_together(
 
 
 def _check_units(imu: ImuData, gravity: float) -> None:
-    """Raises EstimationError if the median specific force is far from `gravity` [m/s^2]."""
+    """Raises EstimationError if the ratio of median specific force and `gravity` [m/s^2] is far from 1."""
     force = float(np.median(np.linalg.norm(imu.accel, axis=1)))
     if not MIN_GRAVITY_RATIO < force / gravity < 1.0 / MIN_GRAVITY_RATIO:
         raise EstimationError(
@@ -88,7 +90,7 @@ def _check_units(imu: ImuData, gravity: float) -> None:
 def start_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, measurements: Measurements) -> np.ndarray:
     """(P,) intrinsics and distortion: those of the rig file, else those estimated from the tracks.
 
-    If the rig file gives intrinsics without distortion, the distortion is the first start value of the camera model.
+    If the rig file has intrinsics but no distortion, the distortion is the first start value of the camera model.
     Raises EstimationError as `find_intrinsics` does.
     """
     if camera.intrinsics.value is None:
@@ -102,7 +104,9 @@ def start_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, measurem
 
 
 def _rays(rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], offsets: list[float]) -> Rays:
-    """Rays of all cameras in the selected images within the IMU's recording; offsets: [s] between first stamps."""
+    """Rays of all cameras in the selected images within the IMU's recording.
+
+    params: (P,) by camera; offsets: time offsets [s] by camera, clocks counted from their first stamps."""
     parts = []
     for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
         direction, valid = camera_model(camera.model).unproject(params[k], stream.uv)
@@ -113,16 +117,16 @@ def _rays(rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.nd
 
 
 def _selected_images(stream: TrackStream) -> np.ndarray:
-    """(M,) bool: the first image in each interval of `MAX_IMAGE_STEP_S`.
+    """(M,) bool: selects the first image in each interval of `MAX_IMAGE_STEP_S`.
 
-    The interval is shorter if most tracks are too short for `MIN_TRACK_IMAGES` such images.
+    The interval is shorter if the median track is too short for `MIN_TRACK_IMAGES` such images.
     """
     t = stream.seconds
     numbers, track = np.unique(stream.feature, return_inverse=True)
     first, last = np.full(len(numbers), np.inf), np.full(len(numbers), -np.inf)
     np.minimum.at(first, track, t[stream.image])
     np.maximum.at(last, track, t[stream.image])
-    duration = float(np.median((last - first)[track]))  # over observations, so that short tracks count little
+    duration = float(np.median((last - first)[track]))  # weighted by observations, so that short tracks count little
     step = min(MAX_IMAGE_STEP_S, duration / MIN_TRACK_IMAGES)
     return np.diff(np.floor((t - t[0]) / max(step, 1e-3) + 1e-6), prepend=-1.0) > 0.0
 

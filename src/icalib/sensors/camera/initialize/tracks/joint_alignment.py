@@ -1,4 +1,4 @@
-"""Joint refinement of time offsets, extrinsic rotations and gyroscope bias, from rotations of cameras and gyroscope.
+"""Joint refinement of time offsets, extrinsic rotations and gyroscope bias from rotations of cameras and gyroscope.
 
 Between two images, half a second or more apart, the gyroscope predicts the rotation of camera c as
 
@@ -9,7 +9,8 @@ The epipolar geometry of the shared points gives the error d of this prediction 
 
     d = (R_c2_c1 - 1) theta_i_c + R_i_c^T (R_i2_i1 w_1 - w_2) dt + R_i_c^T (int R_i2_i dt) b_g
 
-with the right perturbation theta_i_c of R_i_c, the change dt of the time offset and the change b_g of the bias.
+with the right perturbation theta_i_c of R_i_c, the angular rates w_1, w_2 of the IMU at both images, the change dt of
+the time offset and the change b_g of the gyroscope bias.
 """
 
 from __future__ import annotations
@@ -27,15 +28,17 @@ from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.rate_alignment import MIN_SECOND_AXIS_RATIO, RateAlignment, only_axis
 from icalib.optim.calib_block import complement
 
-ALIGNMENT_STEPS_S = (0.5, 1.0)  # s between two images; rotations must be several times the error of rays
-MAX_ALIGNMENT_PAIRS = 400  # pairs of images for each camera and step; more change the result by less than its noise
+ALIGNMENT_STEPS_S = (0.5, 1.0)  # s between two images; over shorter times rotations are small against ray errors
+MAX_ALIGNMENT_PAIRS = 400  # image pairs for each camera and step; more change the result by less than its noise
 ALIGNMENT_ITERATIONS = 6  # of Gauss-Newton; starts are within a few degrees and milliseconds
 ALIGNMENT_RIDGE = 1e-12  # relative to the diagonal; keeps the normal matrix regular
 
 
 @dataclass(frozen=True)
 class SharedRays:
-    """Rays f and h (n, 3) to the points that two images of a camera share, taken at t1 and t2 [s] on its clock."""
+    """Unit rays f and h (n, 3) to the points that two images share, in the frame of the camera number `camera`.
+
+    t1, t2: instants of the images [s] on the camera's clock since its first stamp."""
 
     camera: int
     t1: float
@@ -47,8 +50,8 @@ class SharedRays:
 class GyroRotations(NamedTuple):
     """Rotations by the gyroscope over the m of n intervals t1 to t2 that its recording covers.
 
-    covered: (m,) numbers of these intervals. R: (m, 3, 3) R_i2_i1. J_offset: (m, 3) R_i2_i1 w_1 - w_2 [rad/s], the
-    derivative by the time offset. J_bias: (m, 3, 3) the integral of R_i2_i over the interval [s], that by the bias.
+    covered: (m,) indices of these intervals. R: (m, 3, 3) R_i2_i1. J_offset: (m, 3) derivative by the time offset,
+    R_i2_i1 w_1 - w_2 [rad/s]. J_bias: (m, 3, 3) derivative by the bias, the integral of R_i2_i over the interval [s].
     """
 
     covered: np.ndarray
@@ -58,7 +61,7 @@ class GyroRotations(NamedTuple):
 
 
 def shared_rays(camera: int, stream: TrackStream, model: CameraModel, params: np.ndarray) -> list[SharedRays]:
-    """The rays of all pairs of images that share enough points; params: (P,) intrinsics and distortion."""
+    """The rays of image pairs that share enough points. camera: its number; params: (P,) intrinsics, distortion."""
     rays, valid = model.unproject(params, stream.uv)
     t = stream.seconds
     return [
@@ -72,8 +75,9 @@ def align_jointly(
 ) -> list[RateAlignment]:
     """The alignments of all C cameras after Gauss-Newton, with one gyroscope bias.
 
-    start: alignments to begin at; fixed: by camera, whether its rotation and its time offset are known. Rotations about
-    the only axis of a motion do not change. Returns `start` if the gyroscope covers no pair of images.
+    start: alignments to begin at; fixed: for each camera, whether its rotation and its time offset do not change. If
+    the motion has one axis only, extrinsic rotations about this axis do not change. Returns `start` if the gyroscope
+    covers no pair of images.
     """
     imu, n, bias = gyro.imu, 4 * len(start), np.mean([a.gyro_bias for a in start], axis=0)
     is_fixed = np.array([x for r, t in fixed for x in (r, r, r, t)] + [False] * 3)
@@ -95,9 +99,9 @@ def align_jointly(
 
 
 def _null_space(start: list[RateAlignment], turns: np.ndarray) -> np.ndarray:
-    """(4 C + 3, C) the rotation of each camera about the only axis of the rotation vectors `turns` (m, 3) [rad].
+    """(4 C + 3, C) unobservable directions: rotation of each camera about the only axis of the motion.
 
-    Has no columns if the motion has more than one axis.
+    turns: (m, 3) [rad] rotation vectors of the motion. The result has no columns if these have more than one axis.
     """
     axis = only_axis(turns, MIN_SECOND_AXIS_RATIO)
     if axis is None:
@@ -109,7 +113,7 @@ def _null_space(start: list[RateAlignment], turns: np.ndarray) -> np.ndarray:
 
 
 def _solve(N: np.ndarray, r: np.ndarray, fixed: np.ndarray, null_space: np.ndarray) -> np.ndarray:
-    """The solution x of N x = r with x zero where `fixed` (n,) bool, and orthogonal to `null_space` (n, m)."""
+    """The solution x (n,) of N x = r that is zero where `fixed` (n,) bool, and orthogonal to `null_space` (n, m)."""
     constrained = np.concatenate([np.eye(len(r))[:, fixed], null_space], axis=1)
     free = complement(np.linalg.qr(constrained)[0], len(r))
     M = free.T @ N @ free
@@ -141,7 +145,7 @@ def _normal_equations(
 
 
 def gyro_rotations(gyro: GyroRotation, t1: np.ndarray, t2: np.ndarray) -> GyroRotations:
-    """Rotations of the IMU over the intervals t1 to t2 (n,) [s] on its clock, with derivatives."""
+    """Rotations of the IMU over the intervals t1 to t2 (n,), s on its clock since its first stamp, and derivatives."""
     imu = gyro.imu
     h = np.diff(imu.seconds)[:, None]
     flat = gyro.rotation.reshape(-1, 9)
@@ -161,5 +165,5 @@ def gyro_rotations(gyro: GyroRotation, t1: np.ndarray, t2: np.ndarray) -> GyroRo
 
 
 def gyro_bias_of(gyro: GyroRotation) -> np.ndarray:
-    """(3,) [rad/s] the bias that `gyro` was integrated with."""
+    """(3,) [rad/s] the bias that was subtracted before `gyro` was integrated."""
     return 0.5 * (gyro.imu.gyro[0] + gyro.imu.gyro[1]) - gyro.rate[0]

@@ -1,13 +1,14 @@
-"""Trajectory of the IMU from feature tracks and known rotations: a linear problem (as Dong-Si and Mourikis 2012).
+"""Trajectory of the IMU from feature tracks and known rotations, as a linear problem (Dong-Si and Mourikis 2012).
 
-Rotations come from the gyroscope. Within a window of a few seconds the position relative to its beginning is
+Rotations come from the gyroscope. Within a window of a few seconds, the position relative to that at its beginning is
 
     p(t) = v0 t + g t^2 / 2 + D_f(t) - D_R(t) b_a        D_f'' = R f,  D_R'' = R
 
-A camera at p(t) + R p_imu_cam sees its points along known rays. The distances of points from their rays are linear in
-the points, v0, g, b_a and the lever arms. Points are eliminated first, then v0 and g of each window. A distance is
-weighted by the inverse of the range of its point, which is found iteratively. The gravity of a window may differ a
-little from the common one, because the gyroscope drifts; the length of gravity is known.
+with the specific force f, the initial velocity v0, gravity g and the accelerometer bias b_a. A camera at
+p(t) + R p_imu_cam observes points along known rays. The distances of points from their rays are linear in the points,
+v0, g, b_a and the lever arms. Points are eliminated first, then v0 and g of each window. Distances are weighted by the
+inverse range of their points, which is found iteratively. Each window has a gravity close to a common one, because the
+gyroscope drifts. The length of gravity is known.
 """
 
 from __future__ import annotations
@@ -20,25 +21,25 @@ import numpy as np
 
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 
-MOTION_WINDOW_S = 4.0  # s; over longer windows the drift of the gyroscope bends the parabola of gravity
+MOTION_WINDOW_S = 4.0  # s; over longer windows gravity rotates in the drifting gyroscope frame
 REWEIGHTING_ROUNDS = 5  # ranges and weights change little after the third
-MIN_WINDOW_OBSERVATIONS = 3  # of a point in a window; with two, the point takes up nearly all information
-MIN_RANGE_M = 0.1  # m, of a point, in the weights
-ACCEL_BIAS_SIGMA = 0.3  # m/s^2, the prior about zero; of consumer MEMS accelerometers
-WINDOW_ARM_SIGMA_M = 0.5  # m, the prior of lever arms about zero
+MIN_WINDOW_OBSERVATIONS = 3  # of a point in a window; of two, nearly all information determines the point itself
+MIN_RANGE_M = 0.1  # m, lower limit of the range of a point in its weights
+ACCEL_BIAS_SIGMA = 0.3  # m/s^2, standard deviation of the zero-mean prior; for consumer MEMS accelerometers
+WINDOW_ARM_SIGMA_M = 0.5  # m, standard deviation of the zero-mean prior of lever arms
 GRAVITY_DRIFT_SIGMA = 0.3  # m/s^2, of the gravity of one window about the common one: 2 deg of gyroscope drift
-GRAVITY_NORM_SIGMA = 0.05  # m/s^2, of the length of gravity; it varies by as much over the earth
-WINDOW_RAY_SIGMA = 5e-3  # rad, of a ray, by rough intrinsics
-MAX_INDEPENDENT_RAYS = 100  # of a window; rough intrinsics bend rays alike, so that more add no information
-N_WINDOW, N_COMMON = 6, 6  # unknowns: v0, g - g_common of a window; g_common, b_a of all, before the lever arms
-FIXED_INFORMATION = 1e12  # m^-2, of a known lever arm: a standard deviation of a micrometre
+GRAVITY_NORM_SIGMA = 0.05  # m/s^2, of the length of gravity, which varies by as much over the earth
+WINDOW_RAY_SIGMA = 5e-3  # rad, standard deviation of a ray with rough intrinsics
+MAX_INDEPENDENT_RAYS = 100  # of a window; rough intrinsics make ray errors correlate, so more add no information
+N_WINDOW, N_COMMON = 6, 6  # unknowns of a window: v0, g - g_common; common unknowns before lever arms: g_common, b_a
+FIXED_INFORMATION = 1e12  # m^-2, prior information of a known lever arm: a standard deviation of a micrometre
 
 
 @dataclass(frozen=True)
 class Rays:
-    """n observations of all cameras: times (n,) [s] on the IMU's clock, camera and feature (n,) numbers.
+    """n observations by all cameras.
 
-    direction: (n, 3) unit rays in the frame of the camera.
+    times: (n,) [s] on the IMU's clock; camera, feature: (n,) numbers; direction: (n, 3) unit rays in the camera frame.
     """
 
     times: np.ndarray
@@ -49,10 +50,10 @@ class Rays:
 
 @dataclass(frozen=True)
 class WindowMotion:
-    """The solution for W windows, in the frame in which `gyro` starts.
+    """The solution for W windows, in the start frame of `gyro` (the IMU's attitude at its first reading).
 
-    begins: (W,) [s], each window lasts until the next begins. velocity: (W, 3) [m/s] at the beginnings; gravity: (W, 3)
-    [m/s^2]; accel_bias: (3,) [m/s^2]; arms: (C, 3) p_imu_cam [m].
+    begins: (W,) [s] on the IMU's clock; a window ends where the next begins. velocity: (W, 3) [m/s] at the beginnings;
+    gravity: (W, 3) [m/s^2]; accel_bias: (3,) [m/s^2]; arms: (C, 3) [m] p_imu_cam of each camera.
     """
 
     gyro: GyroRotation
@@ -73,9 +74,9 @@ class WindowMotion:
         return self.velocity[window] * s + 0.5 * self.gravity[window] * s**2 + D_f - D_R @ self.accel_bias
 
     def poses(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """R_world_imu (n, 3, 3) and position (n, 3) [m] at times t (n,) [s]; world z is up.
+        """R_world_imu (n, 3, 3) and p_world_imu (n, 3) [m] at times t (n,) [s]; world z is up.
 
-        Each window begins where the one before ends. Each is rotated so that its own gravity points down.
+        Each window begins at the final position of the previous one, and is rotated so that its gravity points down.
         """
         window = np.clip(np.searchsorted(self.begins, t, side="right") - 1, 0, None)
         rotation, position = np.empty((len(t), 3, 3)), np.empty((len(t), 3))
@@ -91,9 +92,9 @@ class WindowMotion:
 
 @dataclass(frozen=True)
 class _Integrals:
-    """First and second time integrals, (N, 12) each, of R f (3) and R (9) at the IMU's stamps `seconds` (N,).
+    """First and second time integrals of R f (3 columns) and R (9 columns), once and twice (N, 12).
 
-    f is the specific force, R = R_start_imu by the gyroscope.
+    seconds: (N,) stamps of the IMU; f: specific force; R = R_start_imu by the gyroscope.
     """
 
     seconds: np.ndarray
@@ -102,7 +103,7 @@ class _Integrals:
 
     @classmethod
     def of(cls, gyro: GyroRotation) -> _Integrals:
-        """Integrals of the readings of the IMU, linear in between."""
+        """Integrals of R f and R, both taken as linear between readings of the IMU."""
         imu, R = gyro.imu, gyro.rotation
         x = np.concatenate([np.einsum("nij,nj->ni", R, imu.accel), R.reshape(-1, 9)], axis=1)
         h = np.diff(imu.seconds)[:, None]
@@ -125,9 +126,9 @@ class _Integrals:
 def solve_linear_motion(
     gyro: GyroRotation, rays: Rays, R_imu_cam: list[np.ndarray], arms: list[np.ndarray | None], gravity: float
 ) -> WindowMotion:
-    """The motion of the IMU while `rays` were observed, by cameras with known rotations R_imu_cam (3, 3).
+    """The motion of the IMU over the time of `rays`, from cameras with known rotations R_imu_cam (3, 3).
 
-    arms: lever arms (3,) [m] that are known, else None; gravity: its length [m/s^2].
+    arms: known lever arm (3,) [m] of each camera, or None; gravity: its length [m/s^2].
     """
     low, high = float(rays.times.min()), float(rays.times.max())
     edges = np.linspace(low, high, max(int(round((high - low) / MOTION_WINDOW_S)), 1) + 1)
@@ -149,7 +150,7 @@ def solve_linear_motion(
 
 
 def _common_prior(arms: list[np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and information (6 + 3 C,) of the prior of the common unknowns: g, b_a, lever arms."""
+    """Mean and information (inverse variance), (6 + 3 C,) each, of the prior of the common unknowns: g, b_a, arms."""
     information = np.concatenate(
         [np.zeros(3), np.full(3, ACCEL_BIAS_SIGMA**-2), np.full(3 * len(arms), WINDOW_ARM_SIGMA_M**-2)]
     )
@@ -180,10 +181,11 @@ def _solve_windows(
 
 @dataclass
 class _Window:
-    """The n observations of one window, sorted by track, as linear functions of the m unknowns x.
+    """The n observations of one window, sorted by track, with camera centres linear in the m unknowns x.
 
-    position: (n, 3, m + 1), the camera centre is position (x, 1). direction: (n, 3) of the ray in the gyroscope's start
-    frame. track: (n,) numbers; begins: (t,) the first observation of each track. weight: (n,) [m^-2] of the last round.
+    position: (n, 3, m + 1), so that the camera centre is position (x, 1) [m]. direction: (n, 3) unit rays; both are in
+    the start frame of the gyroscope. track: (n,) indices; begins: (t,) first observation of each track. weight: (n,)
+    [m^-2] of the last round, None before the first.
     """
 
     position: np.ndarray
@@ -218,7 +220,9 @@ class _Window:
         return np.add.reduceat(x, self.begins, axis=0) if len(x) else x
 
     def normal_equations(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix (m, m) and right-hand side (m,), points eliminated; weights at the solution `x` (m,) before."""
+        """Normal matrix (m, m) and right-hand side (m,), with points eliminated.
+
+        Updates the weights by the previous solution `x` (m,); in the first round they are 1."""
         Q = np.eye(3) - self.direction[:, :, None] * self.direction[:, None, :]
         if self.weight is not None:
             self.weight = self._reweighted(Q, self.weight, x)
@@ -234,9 +238,9 @@ class _Window:
         return G[:-1, :-1], -G[:-1, -1]
 
     def _reweighted(self, Q: np.ndarray, weight: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """(n,) [m^-2] weights by the range of each point at the solution `x` (m,), with Cauchy's loss.
+        """(n,) [m^-2] weights from ranges and ray errors of the points at the solution `x` (m,), with Cauchy's loss.
 
-        Q: (n, 3, 3) projections perpendicular to the rays. The points are intersected with the present `weight`.
+        Q: (n, 3, 3) projectors perpendicular to the rays. Points are triangulated with the present `weight` (n,).
         """
         centre, wQ = self.position @ np.append(x, 1.0), weight[:, None, None] * Q
         M, b = self._by_track(wQ), self._by_track(np.einsum("nij,nj->ni", wQ, centre))
@@ -251,7 +255,7 @@ class _Window:
 
 
 def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:
-    """R_world_start (3, 3): the smallest rotation that maps `gravity` (3,) to -z."""
+    """R_world_start (3, 3): the smallest rotation that maps the direction of `gravity` (3,) to -z."""
     d = -gravity / np.linalg.norm(gravity)
     axis = np.cross(d, [0.0, 0.0, 1.0])
     K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])

@@ -1,4 +1,4 @@
-"""Calibration parameters of cameras with feature tracks, on a trajectory by other sensors."""
+"""Calibration parameters of cameras with feature tracks, on a trajectory from other sensors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     """Calibration parameters of all cameras: values of the rig file, else estimates from their tracks.
 
-    state: has the trajectory of the IMU. Raises EstimationError if neither determines a parameter.
+    state: with the trajectory of the IMU. Raises EstimationError if neither determines a parameter.
     """
 
     def values_of(number: int) -> dict[Key, np.ndarray]:
@@ -50,12 +50,12 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             values |= _estimated_values(inputs, state, number, lens)
         return values | known
 
-    with ThreadPoolExecutor(N_THREADS) as pool:  # not the solver's pool, whose threads the tasks may wait for
+    with ThreadPoolExecutor(N_THREADS) as pool:  # not the solver's pool: tasks may wait for its threads
         return {k: v for own in pool.map(values_of, range(len(inputs.rig.cameras))) for k, v in own.items()}
 
 
 def _start_lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
-    """(P,) start values of the intrinsics and distortion of camera `number`, by one recording."""
+    """(P,) start values of the intrinsics and distortion of camera `number`, from the recording number `recording`."""
     own = single_recording(inputs, recording)
     assert own.imu is not None
     return start_intrinsics(inputs.rig.cameras[number], own.measurements.tracks[number], own.imu, own.measurements)
@@ -64,7 +64,7 @@ def _start_lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
 def _estimated_values(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
     """Extrinsics, time offset, intrinsics and distortion of camera `number`, with start values `lens` (P,).
 
-    The recording with most observations determines them. A clock that restarts has one offset for each recording.
+    They come from the recording with most observations. A clock that restarts has one offset for each recording.
     """
     camera, best = inputs.rig.cameras[number], fullest_recording(inputs, inputs.measurements.tracks[number].key)
     estimate_in = partial(_estimate_in, inputs, state, number, lens)
@@ -83,7 +83,9 @@ def _estimated_values(inputs: Inputs, state: State, number: int, lens: np.ndarra
 def _estimate_in(
     inputs: Inputs, state: State, number: int, lens: np.ndarray, recording: int, known: CameraExtrinsics | None = None
 ) -> tuple[CameraExtrinsics, np.ndarray]:
-    """Extrinsics and intrinsics (P,) of camera `number` by one recording; known: extrinsics that are kept."""
+    """Extrinsics, and intrinsics with distortion (P,), of camera `number` from the recording number `recording`.
+
+    known: rotation and translation to keep, or None; lens: (P,) start values."""
     own, camera = single_recording(inputs, recording), inputs.rig.cameras[number]
     assert own.imu is not None
     stream, model = own.measurements.tracks[number], camera_model(camera.model)
@@ -107,10 +109,10 @@ def _estimate_in(
 
 
 def _free_directions(camera: Camera, lens: np.ndarray) -> np.ndarray:
-    """(L, P) free directions of the intrinsics and distortion `lens` (P,).
+    """(L, P) directions in which the intrinsics and distortion `lens` (P,) are adjusted, L from 0 to 2.
 
-    These are a common scale of fx and fy, unless the rig file fixes them or states a prior, and the first coefficient
-    of distortion, which has the largest effect, if the rig file has none.
+    One is a common scale of fx and fy, unless the rig file fixes them or states a prior. The other is the first
+    coefficient of distortion, which has the largest effect, unless the rig file has a distortion.
     """
     rows = np.zeros((2, len(lens)))
     rows[0, :2], rows[1, 4] = lens[:2], 1.0

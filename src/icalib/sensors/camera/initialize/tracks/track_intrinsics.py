@@ -5,12 +5,14 @@ plane, and right about the optical axis:
 
     w_imu = R_imu_cam diag(s, s, 1) w_cam + b.
 
-1. The time offset is where the gyroscope's rates regress best on the camera's, whatever the matrix between them
-   (`rate_regression`). Then s gives the focal length.
+with the gyroscope bias b.
+
+1. The time offset is the one at which a linear regression of the gyroscope's rates on the camera's fits best, with an
+   arbitrary matrix (`rate_regression`). Then s gives the focal length.
 2. Gauss-Newton refines rotation, time offset, gyroscope bias, focal length, principal point and distortion together,
    from the epipolar geometry of pairs of images, given the gyroscope's rotation in between (`joint_alignment`). The
-   distortion is that of `FREE_MODEL` here.
-3. The result is fitted by the camera model of the rig file.
+   camera model is `FREE_MODEL`, unless the rig file has a distortion.
+3. The camera model of the rig file is fitted to the result.
 """
 
 from __future__ import annotations
@@ -37,32 +39,33 @@ from icalib.rig import Camera
 from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import ImagePairs, ray_derivatives
 from icalib.sensors.camera.initialize.tracks.joint_alignment import gyro_rotations
 
-FREE_MODEL = "pinhole-equidistant"  # r = f theta plus a polynomial; its start is near every lens, narrow and wide
-START_FOCAL_WIDTHS = (1.0, 0.35)  # image widths: near a usual lens, and near a fisheye lens
-FOCAL_SCALES = np.geomspace(0.1, 10.0, 100)  # of a start focal length, 5 % apart
-MAX_SCALE_ROUNDS, SCALE_TOLERANCE = 4, 0.05  # rates depend on the focal length, so that the scale is found repeatedly
-RATE_CAUCHY_MEDIANS = 3.0  # medians of the rate error, the scale of Cauchy's weights
+FREE_MODEL = "pinhole-equidistant"  # r = f theta plus a polynomial; zero distortion is close to narrow and wide lenses
+START_FOCAL_WIDTHS = (1.0, 0.35)  # start focal lengths in image widths: of a usual lens, and of a fisheye lens
+FOCAL_SCALES = np.geomspace(0.1, 10.0, 100)  # trial scales of the rates by a wrong start focal length, 5 % apart
+MAX_SCALE_ROUNDS, SCALE_TOLERANCE = 4, 0.05  # rounds; |log(scale)|. Rates depend on the focal length, hence rounds
+RATE_CAUCHY_MEDIANS = 3.0  # scale of Cauchy's weights, in medians of the rate error
 N_FREE_DISTORTION = 2  # coefficients of `FREE_MODEL` that are estimated; higher ones matter at the image border only
 # Standard deviations of the priors, in steps of `ImagePairs.lens_directions` (0.03 rad RMS over the rays): the focal
 # length is nearly free, pixels are square to 1 %, the principal point is near the middle; then each coefficient.
 LENS_PRIOR_SIGMAS, DISTORTION_PRIOR_SIGMA = np.array([10.0, 0.1, 1.0, 1.0]), 3.0
-CORRELATED_TRACK_RAYS = 300.0  # rays with the same error: one point is in many pairs, and wrong intrinsics bend many
+CORRELATED_TRACK_RAYS = 300.0  # rays that count as one: a point is in many pairs, and wrong intrinsics affect many
 MAX_REFINEMENT_STEPS = 15
 MAX_ROTATION_STEP, MAX_OFFSET_STEP_S, MAX_LENS_STEP = 0.3, 0.05, 3.0  # rad, s, steps of `lens_directions`
-REFINEMENT_TOLERANCE = 0.1  # standard deviations; with a smaller step the refinement has converged
+REFINEMENT_TOLERANCE = 0.1  # standard deviations of the unknowns; a smaller step means convergence
 MAX_LOG_FOCAL_SIGMA = 0.1  # of log(focal length); the estimator may not converge from a start further off
-MAX_UNEXPLAINED_TRACK_RATE = 0.35  # share of the angular rate
+MAX_UNEXPLAINED_TRACK_RATE = 0.35  # share of the angular rate; with more, the motions of camera and IMU do not match
 MIN_RAYS_PER_PARAMETER = 4  # of a model that is fitted to rays
 MAX_FITTED_RAYS = 400  # rays to which a model is fitted, spread over the tracks
-EQUAL_FIT_PX = 0.5  # px RMS by which a fit may be worse than the best one and is still compared by the tracks
-INVISIBLE_RAY_COST = 5.0  # of a ray that the model cannot unproject; else lenses that see less would fit best
+EQUAL_FIT_PX = 0.5  # px RMS by which a fit may be worse than the best, and still be compared with it by the tracks
+INVISIBLE_RAY_COST = 5.0  # of a pixel that the model cannot unproject; else models of narrow lenses would fit best
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """lens: (P,) intrinsics and distortion; aligned: rotation, time offset and gyroscope bias.
+    """Intrinsics and alignment of a camera.
 
-    sigma: standard deviation of the logarithm of the focal length; cost: negative log-likelihood.
+    lens: (P,) intrinsics and distortion; aligned: rotation, time offset and gyroscope bias; sigma: standard deviation
+    of the logarithm of the focal length; cost: negative log-likelihood. The last two are infinite before refinement.
     """
 
     lens: np.ndarray
@@ -72,7 +75,7 @@ class _Fit:
 
 
 def find_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, offset: float | None) -> np.ndarray:
-    """(P,) intrinsics and distortion; a distortion in the rig file is kept.
+    """(P,) intrinsics and distortion of `camera`; a distortion in the rig file is kept.
 
     offset: t_imu - t_camera [s], each clock counted from its first stamp, if it is known.
     Raises EstimationError if the tracks and the motion do not determine the intrinsics.
@@ -92,7 +95,7 @@ def find_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, offset: f
 
 
 def _starts(camera: Camera, distortion: np.ndarray | tuple[float, ...], model: CameraModel) -> list[np.ndarray]:
-    """Start values (P,) with each of `START_FOCAL_WIDTHS`, the principal point in the middle."""
+    """Start values (P,) with each of `START_FOCAL_WIDTHS`, and the principal point in the image centre."""
     width, height = camera.resolution
     lens = np.array([1.0, 1.0, 0.5 * (width - 1), 0.5 * (height - 1), *distortion])
     focal = [share * width / model.central_scale(lens) for share in START_FOCAL_WIDTHS]
@@ -102,7 +105,9 @@ def _starts(camera: Camera, distortion: np.ndarray | tuple[float, ...], model: C
 def _rough(
     stream: TrackStream, imu: ImuData, model: CameraModel, starts: list[np.ndarray], offset: float | None
 ) -> _Fit:
-    """Focal length, rotation, time offset and bias by regression of the rates. Raises EstimationError if none fit."""
+    """Focal length, rotation, time offset and gyroscope bias by regression of angular rates.
+
+    starts: (P,) start values; offset: known time offset [s], or None. Raises EstimationError if none fit."""
     rates, best = [matching_track_rates(imu, stream, model, starts[0])], 0
     step = float(np.median(rates[0].end - rates[0].start))
     rates += [track_rates(stream, model, lens, step, thinned=True) for lens in starts[1:]]
@@ -130,9 +135,10 @@ def _rough(
 
 
 def _scaled(imu: ImuData, rates: SensorRates, offset: float, name: str) -> tuple[RateAlignment, float, float]:
-    """Alignment of the rates, scale s of the camera's rates about the axes of its image plane, and unexplained share.
+    """Alignment of the rates, scale s of the camera's rates about image-plane axes, and the unexplained share.
 
-    offset: [s] between first stamps. The share is the median error over the median rate about its median.
+    offset: [s], clocks counted from their first stamps. The share is the median rate error over the median deviation of
+    the gyroscope's rates from their median. Raises EstimationError if the recordings do not overlap.
     """
     inside = covered(imu, rates, offset)
     if not inside.any():
@@ -147,7 +153,9 @@ def _scaled(imu: ImuData, rates: SensorRates, offset: float, name: str) -> tuple
 
 
 def _robust_rotation(gyro: np.ndarray, rates: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Median error [rad/s], R (3, 3) and b (3,) of gyro = R rates + b (n, 3), by reweighted least squares."""
+    """Median error [rad/s], R (3, 3) and b (3,) [rad/s] of gyro = R rates + b, by iteratively reweighted least squares.
+
+    gyro, rates: (n, 3) [rad/s]."""
     R, bias = kabsch(gyro, rates, np.ones(len(gyro)))
     for _ in range(2):
         error = np.linalg.norm(gyro - rates @ R.T - bias, axis=1)
@@ -159,7 +167,9 @@ def _robust_rotation(gyro: np.ndarray, rates: np.ndarray) -> tuple[float, np.nda
 def _refined(
     stream: TrackStream, imu: ImuData, model: CameraModel, rough: _Fit, keep_offset: bool, n_distortion: int
 ) -> _Fit:
-    """All unknowns together by Gauss-Newton, with the first `n_distortion` coefficients of the distortion."""
+    """Refines `rough` by Gauss-Newton over all unknowns, with the first `n_distortion` coefficients of the distortion.
+
+    keep_offset: whether the time offset is known."""
     aligned, n = rough.aligned, 4 + n_distortion
     pairs = ImagePairs.of(stream, model, rough.lens, _free_directions(rough.lens, n_distortion))
     lens_step, sigma, cost = np.zeros(n), np.ones(7 + n), np.inf
@@ -177,12 +187,12 @@ def _refined(
         lens_step = lens_step + x[7:]
         if np.abs(x / sigma).max() < REFINEMENT_TOLERANCE:
             break
-    log_focal = float(pairs.lens_directions[0, 0] / rough.lens[0])  # for one step along the first direction
+    log_focal = float(pairs.lens_directions[0, 0] / rough.lens[0])  # change of log(focal length) per first step
     return _Fit(rough.lens + lens_step @ pairs.lens_directions, aligned, log_focal * float(sigma[7]), cost)
 
 
 def _step_length(x: np.ndarray) -> float:
-    """The largest ratio of a part of the step x (7 + L,) to its limit."""
+    """The largest ratio of rotation, time offset or intrinsics in the step x (7 + L,) to its limit."""
     rotation, offset, lens = np.linalg.norm(x[:3]), abs(x[3]), np.abs(x[7:]).max()
     return max(rotation / MAX_ROTATION_STEP, offset / MAX_OFFSET_STEP_S, lens / MAX_LENS_STEP)
 
@@ -190,7 +200,7 @@ def _step_length(x: np.ndarray) -> float:
 def _free_directions(lens: np.ndarray, n_distortion: int) -> np.ndarray:
     """(4 + n_distortion, P) directions in which `lens` (P,) is adjusted.
 
-    Scale of fx and fy, fy alone, principal point (2), then the first coefficients of the distortion.
+    They are the common scale of fx and fy, fy alone, the principal point (2), and the first distortion coefficients.
     """
     out = np.zeros((4 + n_distortion, len(lens)))
     out[0, :2], out[1, 1], out[2, 2], out[3, 3] = lens[:2], lens[1], lens[0], lens[1]
@@ -203,8 +213,8 @@ def _normal_equations(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Normal matrix (7 + L, 7 + L), right-hand side (7 + L,), and the negative log-likelihood.
 
-    Unknowns: rotation (3), time offset, gyroscope bias (3), steps of the intrinsics (L). The noise of each pair of
-    images is unknown, so that the likelihood is the product of powers of their sums of squares.
+    Unknowns: rotation (3), time offset, gyroscope bias (3), steps of the intrinsics (L). The noise of each image pair
+    is unknown. So the log-likelihood sums -n / 2 log(mean squared error) over pairs with n rays each.
     """
     rotations = gyro_rotations(GyroRotation.integrate(imu, aligned.gyro_bias), *(pairs.times + aligned.offset).T)
     pairs = pairs.select(np.isin(np.arange(len(pairs.times)), rotations.covered))
@@ -231,10 +241,10 @@ def _normal_equations(
 def _in_model(
     camera: Camera, stream: TrackStream, imu: ImuData, model: CameraModel, fit: _Fit, keep_offset: bool
 ) -> np.ndarray:
-    """(P,) intrinsics and distortion of the camera's model, fitted to the rays of `fit` where points were seen.
+    """(P,) intrinsics and distortion of the rig file's camera model, fitted to the rays of `fit` at observed pixels.
 
-    Models with two shape parameters may have several fits of about the same error. Of these the one that explains the
-    tracks best after a refinement is taken. Raises EstimationError if the model fits no such rays.
+    model: the camera model of `fit`. Models with two shape parameters may have several fits with about the same error.
+    The one that explains the tracks best after a refinement is returned. Raises EstimationError if no fit is found.
     """
     wanted = camera_model(camera.model)
     uv = stream.uv[:: max(1, len(stream.uv) // MAX_FITTED_RAYS)]
