@@ -1,1 +1,1 @@
-"""LiDARs: the factor of points on planes, and all that other stages ask of the sensor."""
+"""LiDARs: rig-file fields, reading, initial guess, factor of points on planes, report and simulation."""

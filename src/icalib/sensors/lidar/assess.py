@@ -1,4 +1,5 @@
-"""LiDARs in a result: residuals of points on planes, notes, and warnings about stamps, point times and planes."""
+"""Assessment of LiDARs in a result: residuals of points on planes, notes, and warnings about stamps, point times and
+planes."""
 
 from __future__ import annotations
 
@@ -25,15 +26,15 @@ from icalib.sensors.lidar.initialize.degeneracy import count_directions, normal_
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
 
-MAX_KEPT_POINTS = 200_000  # of all LiDARs together, in a result: some 10 MB
+MAX_KEPT_POINTS = 200_000  # of all LiDARs together that a result saves: some 10 MB
 MIN_FITTED_POINTS = 4  # a plane has 3 unknowns; fewer points leave no residual
-MIN_SHARE_ON_PLANES = 0.2  # of the points; fewer lie on planes only if the scene is not flat, or points are misplaced
-PERIOD_TOLERANCE = 0.15  # of the scan period: a time offset so near a period means stamps at the other end of a scan
-# Relative error of the times of points within a scan: 0.0015 if they are right, 0.06 and more if they are half or
-# twice as long.
+MIN_SHARE_ON_PLANES = 0.2  # of all points; a smaller share means few flat surfaces or misplaced points
+PERIOD_TOLERANCE = 0.15  # of the scan period; a time offset that near to a period means stamps at the wrong scan end
+# Relative error of the times of points within a scan: 0.0015 for correct times, 0.06 and more for times that are half
+# or twice as long.
 MAX_TIME_STRETCH = 0.03
 SIGNIFICANT_STRETCH = 10.0  # standard deviations: residuals of points in one scan are correlated
-HALF_STEP_S = np.float32(2e-3)  # of the central difference of residuals by time
+HALF_STEP_S = np.float32(2e-3)  # half the step of the central difference of residuals by time
 
 
 def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
@@ -45,7 +46,7 @@ def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[LidarResiduals]:
-    """Residuals of each LiDAR that takes part, at the estimate and at the initial guess, evenly thinned."""
+    """Residuals of each LiDAR at the estimate and at the initial guess, evenly thinned; none without planes."""
     if not inputs.clouds.count:
         return
     state = found.outcome.state
@@ -91,8 +92,10 @@ def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.
 
 
 def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:
-    """(P, 6) planes fitted to clouds: points (N, 3) and the plane (N,) of each. The side of the normal, and planes with
-    too few points, are those of `values` (P, 6)."""
+    """Planes (P, 6), normal and point, fitted to `clouds`: pairs of points (N, 3) and the plane number (N,) of each.
+
+    `values` (P, 6) gives the sign of the normals, and the planes with too few points.
+    """
     out = values.copy()
     for k in range(len(values)):
         own = np.concatenate([points[plane == k] for points, plane in clouds]).astype(np.float64)
@@ -104,7 +107,7 @@ def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarr
 
 
 def _some_points(stream: LidarStream, own: np.ndarray) -> LidarStream:
-    """The stream with the points numbered `own` (n,), increasing. All scans stay."""
+    """The stream with the points numbered `own` (n,), increasing. Scans without such points stay as empty ones."""
     start = np.searchsorted(own, stream.start)
     columns = {name: getattr(stream, name)[own] for name in ("offset_s", "xyz", "plane")}
     return replace(stream, start=start, **columns)
@@ -136,7 +139,7 @@ def _used(found: Estimate, name: str) -> int:
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
-    """Number of points used, and their noise."""
+    """Notes on the number of points used and their noise."""
     if not inputs.clouds.count:
         return
     ranging = [found.judged.noise[s.name] for s in inputs.rig.lidars]
@@ -152,7 +155,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Warnings: degenerate scene, wrong point times, few points on planes, stamps at the other end of a scan."""
+    """Warnings: degenerate scene, wrong point times, few points on planes, stamps at the wrong end of a scan."""
     if not inputs.clouds.count:
         return
     yield from _degeneracy_warnings(inputs, found)
@@ -228,5 +231,5 @@ def misfit(lidar: Lidar, f: SensorFit, is_noise: bool) -> str | None:
 
 
 def length(lidar: Lidar, rig: Rig) -> str | None:
-    """The source of the scale, for sentences."""
+    """The source of the scale, as text for messages."""
     return f"the ranges of {lidar.name}"

@@ -1,15 +1,15 @@
-"""From the points of LiDAR scans to moments, which the point-to-plane residuals of a pass depend on.
+"""Sums the points of LiDAR scans to moments, from which the point-to-plane residuals of a pass follow.
 
-A residual n . (p + R x) - d is linear in (1, x). The sum of squares over the points of one plane in one time bin, and
-its derivatives by the pose of the bin and the plane, follow exactly from ten weighted moments of (1, x). Points are
-first moved to the centre of their bin: within a step of 1 ms by the twist of the LiDAR, from step to step by its poses.
-The remaining error is at most an eighth of the acceleration times the square of the step: 1e-6 m at 5 m/s^2.
+A residual n . (p + R x) - d is linear in (1, x). For the points of one plane in one time bin, the sum of squares
+follows exactly from ten weighted moments of (1, x). So do its derivatives by the pose of the bin and by the plane.
+Points are first moved to the centre of their bin: within a step of 1 ms by the twist of the LiDAR, from step to step by
+its poses. The remaining error is at most an eighth of the acceleration times the square of the step: 1e-6 m at 5 m/s^2.
 
-Range noise moves a point across its plane and along it at once. J^T r of noisy points therefore has a mean that is not
-zero, and grows with the incidence of the beams: 0.8 standard deviations of a focal length in a room where roll and
-pitch of the LiDAR constrain the images. The minimised term is r^2 over the variance of r, which depends on the
+Range noise moves a point both across its plane and along it. J^T r of noisy points therefore has a nonzero mean, which
+grows with the incidence of the beams. This bias reaches 0.8 standard deviations of a focal length in a room where roll
+and pitch of the LiDAR constrain the images. The minimised term is r^2 over the variance of r, which depends on the
 incidence (n . R x)^2 / |x|^2. The derivative of this variance removes the bias. It is linear in R^T n and is stored
-beside the moments as the incidence term.
+with the moments as the incidence term.
 """
 
 from __future__ import annotations
@@ -38,18 +38,17 @@ from icalib.sensors.lidar.moments import (
     step_range,
 )
 
-BIN_S = 3e-3  # time of a bin: its points share the pose perturbation of its centre
-COARSE_BIN_S = 11e-3  # time of a bin in early passes: fewer bins while the state is still rough
-BIN_STEP_S = 1e-3  # time of a step within a longer bin: constant twist is wrong by 1e-6 m at 5 m/s^2
-MAX_OUTLINE_POINTS = 500_000  # points of a LiDAR that show where planes end; more cost memory and show no more
-POINTS_PER_CHUNK = 150_000  # of a thread at a time: their entries need 20 MB at most
+BIN_S = 3e-3  # duration of a bin; its points share the pose perturbation of its centre
+COARSE_BIN_S = 11e-3  # duration of a bin in early passes: fewer bins while the state is still inaccurate
+BIN_STEP_S = 1e-3  # duration of a step within a bin; a constant twist errs by 1e-6 m at 5 m/s^2
+MAX_OUTLINE_POINTS = 500_000  # points of a LiDAR from which the extent of planes is found; bounds the memory
+POINTS_PER_CHUNK = 150_000  # points of a thread at a time; their entries need 20 MB at most
 
 
 @dataclass(frozen=True)
 class LidarNoise:
-    """Noise of a point's distance from its plane: sigma [m], the same in all directions, and beam_sigma [m], range
-    noise along the beam, of which the part along the normal counts. Robust loss, and its scale in standard
-    deviations."""
+    """Noise of a point's distance from its plane. sigma [m]: isotropic part. beam_sigma [m]: range noise along the
+    beam, projected on the normal. loss: robust loss; loss_scale: its scale in standard deviations."""
 
     sigma: float
     beam_sigma: float = 0.0
@@ -59,8 +58,8 @@ class LidarNoise:
 
 @dataclass(frozen=True)
 class AssociatedPoints:
-    """Points of one LiDAR that lie on planes. plane (N,) int32: row of each point in `planes` (P, 6), normal and point
-    in the world, -1: none."""
+    """Points of one LiDAR and their planes. plane (N,) int32: row of `planes` for each point, -1: none. planes (P, 6):
+    normal, and a point [m], in the world frame."""
 
     stream: LidarStream
     plane: np.ndarray
@@ -69,12 +68,13 @@ class AssociatedPoints:
 
 @dataclass(frozen=True)
 class Moments:
-    """Bins of one LiDAR, in the order of time, and planes seen in each: entries start[j]:start[j + 1] of bin j.
+    """Moments of n time bins of one LiDAR, ordered by time. An entry is one plane in one bin; bin j has the entries
+    start[j]:start[j + 1].
 
     seconds (n,): centres of the bins on the LiDAR's clock, since its first stamp; plane, count (E,): plane and number
-    of points of each entry; root (E, 10): lower Cholesky factor L, row by row, of its moments sum w (1, x) (1, x)^T,
-    with w the robust weight of a point over its variance; incidence (E, 4): half the chi^2 changes with the variances,
-    too, by incidence . (1, R_world_lidar^T n).
+    of points of each entry. root (E, 10): lower Cholesky factor L, row by row, of the moments sum w (1, x) (1, x)^T; w
+    is the robust weight of a point over its variance. incidence (E, 4): incidence term, the change of half the chi^2
+    with the variances, incidence . (1, R_world_lidar^T n).
     """
 
     seconds: np.ndarray
@@ -88,8 +88,8 @@ class Moments:
 def take_moments(cloud: AssociatedPoints, motion: EstimatedMotion, noise: LidarNoise, bin_s: float = BIN_S) -> Moments:
     """Moments of all points that lie on a plane, with poses, planes and residuals at the state of `motion`.
 
-    Points in IMU gaps that are not bridged are left out. Groups of scans are summed one after another, on two threads,
-    so that little memory is needed beside the cloud. Raises EstimationError if no point is left.
+    Points in IMU gaps that are not bridged are left out. Groups of scans are summed one after another on two threads,
+    which bounds the memory. Raises EstimationError if no point is left.
     """
     groups = _scan_groups(cloud.stream)
     seconds, bins, *entries = zip(
@@ -111,7 +111,7 @@ def take_moments(cloud: AssociatedPoints, motion: EstimatedMotion, noise: LidarN
 
 
 def _scan_groups(stream: LidarStream) -> Iterator[slice]:
-    """Consecutive scans with about POINTS_PER_CHUNK points together."""
+    """Groups of consecutive scans that have about POINTS_PER_CHUNK points together."""
     ends = np.searchsorted(stream.start, np.arange(0, stream.start[-1], POINTS_PER_CHUNK))
     edges = np.unique(np.append(ends, len(stream.stamps_ns)))
     return (slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
@@ -121,7 +121,7 @@ def _scans_with_steps(
     stream: LidarStream, plane: np.ndarray, step_s: float, per_bin: int, group: slice
 ) -> tuple[Scans, np.ndarray, slice]:
     """A group of scans divided into steps of step_s, per_bin of which make a bin; the middles of the steps (n,) on the
-    LiDAR's clock [s]; and the slice of the points. plane (N,): of all points of the stream."""
+    LiDAR's clock [s]; and the slice of the points. plane (N,): plane of each point of the stream."""
     start = stream.start[group.start : group.stop + 1]
     points = slice(int(start[0]), int(start[-1]))
     start, offset_s = start - start[0], stream.offset_s[points]
@@ -151,13 +151,13 @@ def _moments_of(
 
 
 def _bin_poses(steps: int, bins: int) -> BinPoses:
-    """Arrays to be filled."""
+    """Uninitialised arrays for the poses of steps and bins."""
     known, R_bin_step, p_bin_step = np.empty(steps, np.bool_), np.empty((steps, 3, 3)), np.empty((steps, 3))
     return BinPoses(known, R_bin_step, p_bin_step, np.empty((bins, 3, 3)), np.empty((bins, 3)))
 
 
 def _empty_entries(n: int) -> tuple[np.ndarray, ...]:
-    """Arrays to be filled: bin, plane, count, root, incidence."""
+    """Uninitialised arrays for n entries: bin, plane, count, root, incidence."""
     numbers = (np.empty(n, np.int64) for _ in range(3))
     return *numbers, np.empty((n, N_MOMENTS)), np.empty((n, 4))
 
@@ -185,6 +185,6 @@ def in_world(motion: EstimatedMotion, stream: LidarStream) -> tuple[np.ndarray, 
 
 def points_on_planes(motion: EstimatedMotion, stream: LidarStream, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) on planes in the world frame [m], about MAX_OUTLINE_POINTS at most, and the plane of each (n,).
-    plane (N,): of each point of the stream, -1: none."""
+    plane (N,): plane of each point of the stream, -1: none."""
     some = (plane >= 0) & (np.arange(len(plane)) % (len(plane) // MAX_OUTLINE_POINTS | 1) == 0)
     return in_world(motion, stream.some(some))[0], plane[some]

@@ -1,4 +1,4 @@
-"""LiDARs in a recording: their topics, how their points are timed, and their lines in a draft rig file."""
+"""Inspection of a recording for LiDARs: topics, point times, and their lines in a draft rig file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class LidarFacts:
 
 
 class LidarInspector(KindInspector):
-    """Finds LiDARs. Every topic of point clouds is taken for a LiDAR on the robot."""
+    """Finds LiDARs and drafts their rig file entries. Every topic of point clouds is taken for a LiDAR on the robot."""
 
     sensor: ClassVar[type[Sensor]] = Lidar
     topic_kinds: ClassVar[tuple[str, ...]] = ("points",)

@@ -1,7 +1,8 @@
-"""Compiled sums of the LiDAR factor: from moments of bins to the normal equations of a piece.
+"""Compiled kernels of the LiDAR factor: from moments of bins to the normal equations of a piece of the trajectory.
 
-A plane in a bin (an entry) has four whitened residuals L^T m. L L^T are the moments of its points, and m . (1, x) is
-the distance of a point x from the plane. Sums of squares and products of derivatives equal those of the points.
+An entry is one plane in one bin. It has four whitened residuals L^T m. L L^T is the matrix of moments of its points,
+and m . (1, x) is the distance of a point x from the plane. The sum of squares of the four residuals, and the products
+of their derivatives, equal those of all points of the entry.
 """
 
 from __future__ import annotations
@@ -26,12 +27,13 @@ from icalib.sensors.lidar.propagation_noise import (
 )
 
 N_WHITENED = 4  # residuals of an entry
-DISTANCE = POSE_DIM + PLANE_DIM  # row of the residual itself in the Jacobians of an entry, after its derivatives
+DISTANCE = POSE_DIM + PLANE_DIM  # row of the residual itself in the arrays of an entry, after its derivatives
 
 
 class Bins(NamedTuple):
-    """n bins with E entries. keyframe (n,): from which each is propagated; noise_angle (n,): standard deviation of the
-    rotation error that gyroscope noise makes on the way, about each axis [rad], negative before the keyframe.
+    """n bins with E entries. keyframe (n,): keyframe from which the pose of each is propagated. noise_angle (n,):
+    standard deviation [rad] of the rotation error about each axis from propagated gyroscope noise, negative before the
+    keyframe.
 
     Entries of bin i are start[i]:start[i + 1]; plane, root, incidence: see `Moments`. J_rows_noise (E, 3, 4) and
     J_incidence_noise (E, 3): derivatives of the whitened residuals, and of the incidence term, by the unknown rotation
@@ -50,7 +52,7 @@ class Bins(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _fill_distance(R_lw, p_wl, q, planes, m):
-    """m (4,), out: m . (1, x) is the distance of point x, in the LiDAR's frame, from plane q."""
+    """Fills m (4,), such that m . (1, x) is the distance [m] of point x, in the LiDAR's frame, from plane q."""
     m[0] = 0.0
     for a in range(3):
         m[0] += planes.normal[q, a] * (p_wl[a] - planes.point[q, a])
@@ -61,10 +63,11 @@ def _fill_distance(R_lw, p_wl, q, planes, m):
 
 @njit(cache=True, nogil=True)
 def _fill_jacobian(R_lw, p_wl, q, planes, m, J_distance):
-    """J_distance (10, 4), out: factors of (1, x) in the derivatives of the distance by pose 6 and plane 3, then m.
+    """Fills J_distance (10, 4): coefficients of (1, x) in the derivatives of the distance by pose (6 rows) and plane (3
+    rows), then m.
 
-    With a = R^T n the derivatives by the pose are (x cross a; a): a rotation t of the LiDAR moves x by t cross x, and
-    a . (t cross x) = t . (x cross a).
+    With a = R^T n the derivatives by the pose are (x cross a; a), because a rotation t of the LiDAR moves x by
+    t cross x, and a . (t cross x) = t . (x cross a).
     """
     A = J_distance
     A[:] = 0.0
@@ -85,7 +88,7 @@ def _fill_jacobian(R_lw, p_wl, q, planes, m, J_distance):
 
 @njit(cache=True, nogil=True)
 def _times_root(A, root, B):
-    """B (n, 4) = A[:n] L, with L the lower triangle `root` (10,), row by row."""
+    """Fills B (n, 4) = A[:n] L, with L (4, 4) the lower triangular matrix `root` (10,), row by row."""
     for i in range(len(B)):
         B[i, 0] = A[i, 0] * root[0] + A[i, 1] * root[1] + A[i, 2] * root[3] + A[i, 3] * root[6]
         B[i, 1] = A[i, 1] * root[2] + A[i, 2] * root[4] + A[i, 3] * root[7]
@@ -95,8 +98,8 @@ def _times_root(A, root, B):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_pose_gram(J_rows, J_distance, incidence, gram):
-    """Adds an entry to gram (6, 7): products of its derivatives by the pose with one another and with the residual,
-    and the gradient of the incidence term, whose second derivative is negligible."""
+    """Adds an entry to gram (6, 7): products of its derivatives by the pose with one another and with the residual.
+    The gradient of the incidence term is added to the last column; its second derivative is neglected."""
     for i in range(POSE_DIM):
         for j in range(POSE_DIM + 1):
             c = j if j < POSE_DIM else DISTANCE
@@ -115,7 +118,7 @@ def _add_pose_gram(J_rows, J_distance, incidence, gram):
 def _add_plane(k, J_rows, J_pose, columns, own, sums, V):
     """Adds to the sums of keyframe k all products of an entry with the columns `own` (3,) of its plane.
 
-    J_pose (6, w): the pose by keyframes and calibration columns (c,); V (3, w): work space.
+    J_pose (6, w): derivative of the pose of the bin by keyframes and calibration columns (c,); V (3, w): workspace.
     """
     B, n_b, n_chain = J_rows, sums.calib.shape[0] - 1, J_pose.shape[1] - len(columns)
     V[:] = 0.0
@@ -157,7 +160,7 @@ def _add_plane_incidence(J_distance, incidence, own, sums):
 
 @njit(cache=True, nogil=True, inline="always")
 def _eliminate_noise(k, noise, n_chain, columns, plane_columns, sums):
-    """Eliminates the unknown rotation of one side of keyframe k. Returns what the chi^2 loses."""
+    """Eliminates the unknown rotation of one side of keyframe k. Returns the decrease of the chi^2 by it."""
     own, V = noise_columns(noise, columns, plane_columns), eliminated_noise(noise)
     last = V.shape[1] - 1
     if len(sums.diagonal) > 0:
@@ -174,10 +177,12 @@ def _is_last_of_side(i, bins):
 
 
 class _BinWork(NamedTuple):
-    """Work space. J_pose (6, w), J_imu_pose (6, 6): see `fill_chain`; m: see `_fill_distance`; J_distance, J_rows
-    (10, 4): derivatives of an entry, and these times its root; gram (6, 7), gram_noise (3, 6): products of a bin's
-    derivatives by its pose with themselves and the residual, and with those by the unknown rotation; F, V: see
-    `add_gram` and `_add_plane`."""
+    """Workspace. J_pose (6, w), J_imu_pose (6, 6): see `fill_chain`; m (4,): see `_fill_distance`.
+
+    J_distance, J_rows (10, 4): derivatives of an entry, and these times its root. gram (6, 7): products of the
+    derivatives of a bin by its pose with themselves and with the residual. gram_noise (3, 6): their products with the
+    derivatives by the unknown rotation. F, V: see `add_gram` and `_add_plane`.
+    """
 
     J_pose: np.ndarray
     J_imu_pose: np.ndarray
@@ -192,7 +197,7 @@ class _BinWork(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _work_space(at, n_columns):
-    """Arrays for poses `at` with n_columns calibration columns."""
+    """The workspace for poses `at` with n_columns calibration columns."""
     width = chain_width(at) + n_columns
     shape = (DISTANCE + 1, N_WHITENED)
     return _BinWork(
@@ -210,8 +215,8 @@ def _work_space(at, n_columns):
 
 @njit(cache=True, nogil=True, inline="always")
 def _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows):
-    """Whitened residuals of entry e, with the LiDAR at R_lw, p_wl, into `rows` (E, 4). Returns half their chi^2 plus
-    the incidence term."""
+    """Fills row e of `rows` (E, 4), the whitened residuals of entry e with the LiDAR at R_lw, p_wl. Returns half their
+    chi^2 plus the incidence term."""
     m, incidence = work.m, bins.incidence
     _fill_distance(R_lw, p_wl, bins.plane[e], planes, m)
     for c in range(N_WHITENED):
@@ -226,7 +231,8 @@ def _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows):
 
 @njit(cache=True, nogil=True)
 def linearise_noise(bins, at, columns, planes):
-    """Adds the derivatives by the unknown rotation to J_rows_noise and J_incidence_noise of the bins, which are 0.
+    """Adds the derivatives by the unknown rotation x to J_rows_noise and J_incidence_noise of the bins, which must be
+    0.
 
     at: poses of the LiDAR at the bins; columns (c,): their calibration columns.
     """
@@ -249,7 +255,7 @@ def linearise_noise(bins, at, columns, planes):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise, has_noise):
-    """Adds entry e, of a bin of keyframe k, to the sums where they are wanted. Returns its part of the cost."""
+    """Adds entry e, of a bin of keyframe k, to the sums unless these are empty. Returns its part of the cost."""
     q, wanted = bins.plane[e], len(sums.diagonal) > 0
     own, A, B = planes.columns[q], work.J_distance, work.J_rows
     cost = _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows)
@@ -269,10 +275,11 @@ def _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise,
 
 @njit(cache=True, nogil=True)
 def accumulate(bins, at, columns, planes, sums, rows):
-    """Fills the whitened residuals `rows` (E, 4) of all bins, and adds their normal equations to `sums` if wanted.
+    """Fills the whitened residuals `rows` (E, 4) of all bins, and adds their normal equations to `sums` unless these
+    are empty.
 
-    at: poses of the LiDAR at the bins; columns (c,): calibration columns of these. Returns half the chi^2, less
-    the part that propagated noise absorbs, plus the incidence term.
+    at: poses of the LiDAR at the bins; columns (c,): their calibration columns. Returns half the chi^2, minus the part
+    that propagated noise absorbs, plus the incidence term.
     """
     wanted, work, cost = len(sums.diagonal) > 0, _work_space(at, len(columns)), 0.0
     J_pose, n_chain = work.J_pose, chain_width(at)

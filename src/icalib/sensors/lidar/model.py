@@ -1,4 +1,4 @@
-"""How a LiDAR enters the problem: by the factor of its points on planes."""
+"""The sensor model of a LiDAR, with the factor of its points on planes."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from icalib.rig import Lidar, Settings
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.residual import LidarFactor
 
-# Noise of the distance beside stated range noise: without it beams that graze a plane would have infinite weight.
+# Isotropic noise in addition to stated range noise; without it beams parallel to a plane would have infinite weight.
 GRAZING_SIGMA_M = 1e-3
 FIRST_RANGE_SIGMA_M = 0.03  # in the first pass if the rig file states none: typical of a spinning LiDAR
 MIN_RANGE_SIGMA_M = 1e-3  # of estimated noise: keeps weights of simulated points without noise finite
 
 
 class LidarModel(SensorModel[Lidar, LidarNoise]):
-    """A LiDAR takes part once planes are known. Stated noise is along the beam; estimated noise is the same in all
-    directions."""
+    """Sensor model of a LiDAR, used once planes are known. Stated noise is along the beam; estimated noise is
+    isotropic."""
 
     keyframes = "scans"
 
@@ -40,7 +40,7 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         return LidarNoise(GRAZING_SIGMA_M, sensor.range_noise_m, loss, scale)
 
     def next_noise(self, sensor: Lidar, noise: LidarNoise, found: ResidualStatistics) -> LidarNoise:
-        """Noise that the rig file does not state, scaled by the RMS of the whitened distances."""
+        """The noise scaled by the RMS of the whitened distances, unless the rig file states it."""
         points = found.squares.get("points")
         if sensor.range_noise_m is not None or points is None:
             return noise
@@ -52,7 +52,7 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         return int(sensor.range_noise_m is None)
 
     def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[LidarFactor]:
-        """One factor. Coarse passes use fewer points and longer bins."""
+        """One factor for all points on planes. Coarse passes use fewer points and longer bins."""
         assert at.motion is not None
         plane = _plane(sensor, at)
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)

@@ -15,16 +15,16 @@ from icalib.optim.robust_weights import weight
 
 N_MOMENTS = 10  # products of (1, x, y, z), lower triangle row by row
 N_SUMS = N_MOMENTS + 3  # the moments, then the gradient of the incidence term
-MAX_INCIDENCE_CHI2 = 16.0  # 4 sigma: beyond, a point is an outlier or the state poor, and not in the incidence term
-MIN_PIVOT = 1e-13  # of a diagonal moment: a smaller pivot is rounding of float64
+MAX_INCIDENCE_CHI2 = 16.0  # 4 sigma; larger values do not enter the incidence term: outliers, or an inaccurate state
+MIN_PIVOT = 1e-13  # relative to the diagonal moment; a smaller pivot is a rounding error of float64
 
 
 class Scans(NamedTuple):
-    """S scans of N points, and the time steps that these fall into.
+    """S scans of N points, and the time steps into which the points fall.
 
-    start (S + 1,): points of scan i are start[i]:start[i + 1]; offset_s (N,): from the stamp of the scan; xyz (N, 3)
-    [m]; plane (N,): -1 where a point lies on none. first_step (S,): number of the first step, counted from the stamp of
-    the scan; step_start (S + 1,): its position among all steps. Both are multiples of the steps of a bin.
+    start (S + 1,): points of scan i are start[i]:start[i + 1]; offset_s (N,): time since the stamp of the scan; xyz
+    (N, 3) [m]; plane (N,): plane of each point, -1: none. first_step (S,): number of the first step of a scan, counted
+    from its stamp. step_start (S + 1,): position of this step among all steps. Both are multiples of the steps per bin.
     """
 
     start: np.ndarray
@@ -36,9 +36,9 @@ class Scans(NamedTuple):
 
 
 class BinPoses(NamedTuple):
-    """Poses of the LiDAR at n steps and m bins. known (n,): whether IMU readings cover the step and its bin; R_bin_step
-    (n, 3, 3), p_bin_step (n, 3): middle of each step, in the frame of the LiDAR at the centre of its bin; R_world_bin
-    (m, 3, 3), p_world_bin (m, 3): centre of each bin."""
+    """Poses of the LiDAR at n steps and m bins. known (n,) bool: IMU readings cover the step and its bin. R_bin_step
+    (n, 3, 3), p_bin_step (n, 3) [m]: pose at the middle of each step, in the frame of the LiDAR at the centre of its
+    bin. R_world_bin (m, 3, 3), p_world_bin (m, 3) [m]: pose at the centre of each bin."""
 
     known: np.ndarray
     R_bin_step: np.ndarray
@@ -48,8 +48,8 @@ class BinPoses(NamedTuple):
 
 
 class RangeWeights(NamedTuple):
-    """Noise and robust loss of points: variance [m^2] of the distance from a plane, the same in all directions;
-    variance [m^2] along the beam; number of the loss, and its scale in standard deviations."""
+    """Noise and robust loss of points. variance [m^2]: isotropic part of the variance of the distance from a plane;
+    beam_variance [m^2]: variance along the beam; loss: number of the robust loss; scale: in standard deviations."""
 
     variance: float
     beam_variance: float
@@ -59,8 +59,8 @@ class RangeWeights(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def step_range(start, offset_s, per_s, per_bin, first, count):
-    """Fills the first step of each scan, counted from its stamp, and the number of its steps: whole bins of per_bin
-    steps. per_s: steps in a second. A scan without points has no step."""
+    """Fills first (S,), the first step of each scan counted from its stamp, and count (S,), its number of steps. Scans
+    have whole bins of per_bin steps; per_s: steps per second. A scan without points has no step."""
     for i in range(len(start) - 1):
         least, most = np.inf, -np.inf
         for n in range(start[i], start[i + 1]):
@@ -72,8 +72,8 @@ def step_range(start, offset_s, per_s, per_bin, first, count):
 
 @njit(cache=True, nogil=True)
 def fill_bin_poses(motion, per_bin, ok, poses):
-    """Fills `poses` for bins of per_bin steps. motion: `Sweep` at the middles of the steps (n,), of which ok (n,) are
-    covered by IMU readings."""
+    """Fills `poses` for bins of per_bin steps. motion: `Sweep` at the middles of the n steps; ok (n,) bool: IMU
+    readings cover the step."""
     for c in range(len(ok) // per_bin):
         m = c * per_bin + per_bin // 2
         R, p = motion.rotation[m], motion.position[m]
@@ -94,8 +94,8 @@ def fill_bin_poses(motion, per_bin, ok, poses):
 
 @njit(cache=True, nogil=True, inline="always")
 def _fill_distance_at(R, p, plane, m):
-    """m (4,), out: (n . p - d, R^T n), so that m . (1, x) is the distance of point x, in the LiDAR's frame, from the
-    plane (6,): normal, point."""
+    """Fills m (4,) = (n . p - d, R^T n), such that m . (1, x) is the distance [m] of point x, in the LiDAR's frame,
+    from the plane (6,): normal n, point."""
     m[0] = 0.0
     for a in range(3):
         m[0] += plane[a] * (p[a] - plane[3 + a])
@@ -106,8 +106,8 @@ def _fill_distance_at(R, p, plane, m):
 def _sort_scan(i, scans, per_s, n_planes, ends, points):
     """Sorts the points of scan i by step and plane (counting sort).
 
-    points (4, n), out: x, y, z [m], and time since the middle of the step [s]. The group of a step and plane ends at
-    ends[step * n_planes + plane], where the next group begins.
+    Fills points (4, n): x, y, z [m], and time since the middle of the step [s]; and ends: the group of a step and plane
+    ends before ends[step * n_planes + plane], where the next group begins.
     """
     first_step, step_s = scans.first_step[i], 1.0 / per_s
     # Unsigned indices spare the test whether an index counts from the end.
@@ -133,8 +133,8 @@ def _sort_scan(i, scans, per_s, n_planes, ends, points):
 
 @njit(cache=True, nogil=True, inline="always")
 def _moved_by_twist(x, y, z, dt, rate, velocity):
-    """Point (x, y, z), seen dt seconds after the middle of its step, in the LiDAR's frame at that middle: the twist is
-    integrated to second order. rate [rad/s], velocity [m/s]: of the LiDAR, in its own axes."""
+    """Point (x, y, z), measured dt seconds after the middle of its step, in the LiDAR's frame at that middle. The twist
+    is integrated to second order; rate [rad/s], velocity [m/s] of the LiDAR in LiDAR axes."""
     (w0, w1, w2), (v0, v1, v2), h = rate, velocity, 0.5 * dt
     mx, my, mz = x + h * (w1 * z - w2 * y), y + h * (w2 * x - w0 * z), z + h * (w0 * y - w1 * x)
     return (
@@ -146,7 +146,7 @@ def _moved_by_twist(x, y, z, dt, rate, velocity):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums):
-    """Adds the weighted points begin:end, of one step and plane, to sums (13,): see N_SUMS.
+    """Adds the weighted points begin:end of one step and plane to sums (13,), see N_SUMS.
 
     R, p: pose of the step at the centre of its bin; rate, velocity: twist; m (4,): distance from the plane, see
     `_fill_distance_at`. The loop holds scalars only, so that the compiler vectorises it.
@@ -182,7 +182,7 @@ def _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums):
 
 @njit(cache=True, nogil=True, inline="always")
 def _factorise(M):
-    """Replaces moments M (10,) by their lower Cholesky factor. A column whose pivot is rounding becomes 0."""
+    """Replaces moments M (10,) by their lower Cholesky factor. A column whose pivot is below MIN_PIVOT becomes 0."""
     for j in range(4):
         d = M[j * (j + 1) // 2 + j]
         least = MIN_PIVOT * d
@@ -240,8 +240,8 @@ def _bin_scan(i, scans, motion, poses, per_bin, planes, weights, sorted_points, 
 def bin_scans(scans, motion, poses, per_bin, planes, weights, per_s, entries):
     """Sums the points of all scans in bins of per_bin steps. Returns the number of entries.
 
-    motion: `Sweep` at the steps; planes (P, 6): normal, point; per_s: steps in a second. entries, out: bin, plane,
-    count, root and incidence of each, see `Moments`.
+    motion: `Sweep` at the steps; planes (P, 6): normal, point; per_s: steps per second. Fills `entries`: bin, plane,
+    count, root and incidence of each entry, see `Moments`.
     """
     n_keys, n_points, total = 0, 0, 0
     for i in range(len(scans.start) - 1):
@@ -258,8 +258,8 @@ def bin_scans(scans, motion, poses, per_bin, planes, weights, per_s, entries):
 
 @njit(cache=True, nogil=True)
 def move_to_world(scans, motion, step_s, points, seen_from):
-    """Fills `points` (N, 3), all points in the world [m], and `seen_from` (N, 3), where the LiDAR was at each. motion:
-    `Sweep` at the middles of steps of step_s."""
+    """Fills `points` (N, 3), all points in the world [m], and `seen_from` (N, 3), the position of the LiDAR at the
+    instant of each point [m]. motion: `Sweep` at the middles of steps of step_s seconds."""
     for i in range(len(scans.start) - 1):
         for n in range(scans.start[i], scans.start[i + 1]):
             offset = np.float64(scans.offset_s[n])

@@ -1,14 +1,14 @@
 """Propagated gyroscope noise between a keyframe and the bins of a LiDAR, eliminated from the normal equations.
 
 IMU readings propagate the pose of a keyframe to a bin. Their noise makes the rotation error of the bin a random walk
-that starts at the keyframe. Bins on one side of a keyframe share one unknown x ~ N(0, I): bin i is rotated by
-noise_angle[i] x, with the standard deviation of the walk at its instant as noise_angle. The chi^2 gets the prior term
-|x|^2, and x is eliminated by its Schur complement (M = J^T J and u = J^T (J_all, r) by x, summed over the bins): the
-normal equations lose u^T (I + M)^-1 u. J is evaluated at the state that a pass starts from. A Jacobian of the current
-state would pull the estimate to states where the noise absorbs more.
+that starts at the keyframe. All bins on one side of a keyframe share one unknown x (3,) ~ N(0, I). Bin i is rotated by
+noise_angle[i] x, where noise_angle is the standard deviation of the walk at the bin. The chi^2 gets the prior term
+|x|^2, and x is eliminated by its Schur complement. With J the Jacobian by x, M = J^T J and u = J^T (J_all, r), summed
+over the bins, u^T (I + M)^-1 u is subtracted from the normal equations. J is evaluated at the state from which a pass
+starts. A Jacobian at the current state would bias the estimate to states where the noise absorbs more.
 
-An industrial IMU loses less in 12 ms than a spinning LiDAR measures. An IMU with ten times its noise loses as much:
-without this model rotations are off by 1.6 times their standard deviations.
+The rotation error of an industrial IMU over 12 ms is smaller than the rotation uncertainty from points of a spinning
+LiDAR. With ten times that IMU noise both are equal: without this model rotations are off by 1.6 standard deviations.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry.small import cholesky
 
-POSE_DIM, PLANE_DIM = 6, 3  # number of columns by a pose, and by a plane
+POSE_DIM, PLANE_DIM = 6, 3  # parameters of a pose and of a plane
 
 
 class NoiseSums(NamedTuple):
     """Products of Jacobians by the unknown rotation x, summed over the bins on one side of a keyframe.
 
-    information (3, 3): x with itself; by_pose (3, w + 1): x with the w columns of keyframes and calibration parameters
-    that act through the pose, and with the residual; by_plane (P, 3, 3): x with the columns of each plane, filled for
-    the planes in `seen` (P,) alone, of which there are n_seen (1,).
+    information (3, 3): products of x with itself. by_pose (3, w + 1): products of x with the w columns of keyframes and
+    calibration parameters that act through the pose, and with the residual. by_plane (P, 3, 3): products of x with the
+    columns of each plane; only the first n_seen (1,) planes in `seen` (P,) are filled.
     """
 
     information: np.ndarray
@@ -40,7 +40,7 @@ class NoiseSums(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def empty_noise_sums(width, n_planes):
-    """Sums of no bin, for `width` columns that act through the pose."""
+    """Sums of zero, for `width` columns that act through the pose."""
     by_plane = np.zeros((n_planes, 3, PLANE_DIM))
     return NoiseSums(
         np.zeros((3, 3)), np.zeros((3, width + 1)), by_plane, np.zeros(n_planes, np.int64), np.zeros(1, np.int64)
@@ -49,10 +49,11 @@ def empty_noise_sums(width, n_planes):
 
 @njit(cache=True, nogil=True, inline="always")
 def add_entry_noise(J_rows_noise, J_incidence_noise, row, J_rows, gram, noise):
-    """Adds one plane in a bin to the information and the residual's column.
+    """Adds one entry to the information, to the column of the residual, and to gram (3, 6), the products of x with the
+    pose of the bin.
 
     J_rows_noise (3, 4), J_incidence_noise (3,): see `Bins`; row (4,): whitened residuals; J_rows (>= 6, 4): their
-    derivatives, by the pose of the bin first; gram (3, 6), which is added to: x with the pose of the bin.
+    derivatives, by the pose of the bin first.
     """
     last = noise.by_pose.shape[1] - 1
     for a in range(3):
@@ -68,7 +69,8 @@ def add_entry_noise(J_rows_noise, J_incidence_noise, row, J_rows, gram, noise):
 
 @njit(cache=True, nogil=True, inline="always")
 def add_pose_noise(gram, J_pose, noise):
-    """Adds the products gram (3, 6) of a bin by the chain rule J_pose (6, w): its pose by keyframes and columns."""
+    """Adds the products gram (3, 6) of a bin by the chain rule. J_pose (6, w): derivative of the pose of the bin by
+    keyframes and calibration columns."""
     for a in range(3):
         for j in range(POSE_DIM):
             for i in range(J_pose.shape[1]):
@@ -77,7 +79,7 @@ def add_pose_noise(gram, J_pose, noise):
 
 @njit(cache=True, nogil=True, inline="always")
 def add_plane_noise(J_rows_noise, J_rows, q, noise):
-    """Adds plane q in a bin to its columns. J_rows (10, 4): derivatives by the plane follow those by the pose."""
+    """Adds the products of x with plane q in one bin. J_rows (10, 4): derivatives by the pose, then by the plane."""
     known = False
     for i in range(noise.n_seen[0]):
         known = known or noise.seen[i] == q

@@ -1,4 +1,4 @@
-"""Residuals of points on planes that a result keeps."""
+"""The record of residuals of points on planes in a result."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from icalib.sensors.records import Shapes, Successive
 
-MAX_SUCCESSIVE_S = 0.3  # between successive points of a plane: longer than a turn of a spinning LiDAR
+MAX_SUCCESSIVE_S = 0.3  # between successive points of a plane; longer than a revolution of a spinning LiDAR
 
 
 @dataclass(frozen=True)
 class LidarResiduals:
     """Points of one LiDAR on planes, evenly thinned. residual = n . x - d [m], positive on the side of the normal.
 
-    points_read counts all points of the recording, points_used those of the estimate. first_world and first_residual
-    belong to the initial guess: points, and their distances from the planes that fit these points best.
+    points_read: number of points in the recording; points_used: number of points in the estimate. first_world and
+    first_residual are points at the initial guess, and their distances from the planes that fit these points best.
     """
 
     kind: str = field(default="points", init=False)

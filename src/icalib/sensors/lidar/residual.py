@@ -1,10 +1,10 @@
-"""Points of one LiDAR on planes (paper (23)-(26)).
+"""The factor of points of one LiDAR on planes: equations (23)-(26) of the paper.
 
-    residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d    of each point x at its own instant t
+    residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d    for each point x at its instant t
 
-This is the form of (24) and (25) that keeps its sign on both sides of the plane. A factor stores moments of the points
-(`take_moments`), taken once a pass: robust weights and the association with planes stay constant while the solver runs.
-Its rows are the four whitened residuals of each plane in a bin, which stand for all points there (`kernels`).
+This is the signed form of (24) and (25). A factor stores moments of the points (`take_moments`), computed once per
+pass: robust weights and the association with planes stay constant while the solver runs. Its rows are the four whitened
+residuals of each plane in a bin, which are equivalent to the residuals of all points there (`kernels`).
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from icalib.sensors.lidar import kernels
 from icalib.sensors.lidar.binning import BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.kernels import N_WHITENED, Bins
 
-BINS_PER_CHUNK = 512  # whose poses and Jacobians stay in the processor cache
+BINS_PER_CHUNK = 512  # poses and Jacobians of so many bins fit the processor cache
 
 
 @dataclass(frozen=True)
 class LidarFactor(RowFactor):
     """All scans of one LiDAR.
 
-    keyframe (n,), increasing: from which each bin of `moments` is propagated. noise_angle (n,), J_rows_noise
-    (E, 3, 4), J_incidence_noise (E, 3): see `Bins`, at the state that the pass starts from. planes: keys of the planes
-    of the moments in the values of a state.
+    keyframe (n,), increasing: keyframe from which the pose of each bin of `moments` is propagated. noise_angle (n,),
+    J_rows_noise (E, 3, 4), J_incidence_noise (E, 3): see `Bins`, at the state from which the pass starts. planes: keys,
+    in the values of a state, of the planes of the moments.
     """
 
     name: str
@@ -68,7 +68,7 @@ class LidarFactor(RowFactor):
         scheme: Scheme = "inertial",
         bin_s: float = BIN_S,
     ) -> LidarFactor:
-        """The factor of a pass that starts from `motion`. plane (N,) int32: index into `planes` of each point, -1:
+        """The factor of a pass that starts from `motion`. plane (N,) int32: index of each point into `planes`, -1:
         none. Raises EstimationError if no point is left."""
         values = np.array([motion.state.values[p] for p in planes])
         moments = take_moments(AssociatedPoints(stream, plane, values), motion, noise, bin_s)
@@ -113,7 +113,7 @@ class LidarFactor(RowFactor):
         return {"points": slice(0, N_WHITENED)}
 
     def output(self) -> Whitened:
-        """Empty rows (E, 4) for `accumulate` to fill; the moments hold the robust weights."""
+        """Empty rows (E, 4) for `accumulate` to fill; the robust weights are included in the moments."""
         return Whitened.without_loss(len(self.moments.plane), N_WHITENED)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
@@ -125,12 +125,12 @@ class LidarFactor(RowFactor):
         return total
 
     def count(self, out: Whitened, kind: str) -> int:
-        """Number of points. Their chi^2 equals that of the rows."""
+        """Number of points, as the chi^2 of the rows equals that of all points."""
         del out, kind
         return int(self.moments.count.sum())
 
     def times(self, state: State) -> np.ndarray:
-        """(E,) centre of the bin of each entry, seconds on the IMU's clock."""
+        """(E,) centre of the bin of each entry on the IMU's clock [s]."""
         at = self.moments.seconds + offset_at(state, self.name, self.keyframe)
         return np.repeat(at, np.diff(self.moments.start))
 
@@ -141,7 +141,7 @@ class LidarFactor(RowFactor):
         return float(np.sqrt((out.residual**2).sum() / weight)), "m"
 
     def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, SensorPose, np.ndarray, Planes]]:
-        """Bins b0:b1 in chunks, with poses of the LiDAR, their calibration columns (c,), and the planes."""
+        """Yields bins b0:b1 in chunks, with poses of the LiDAR, their calibration columns (c,), and the planes."""
         planes, m = Planes.of(self.planes, state, self._plane_columns), self.moments
         kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
         for columns, a, b in self._chunk_ends(state, kinematics, b0, b1):
@@ -152,7 +152,8 @@ class LidarFactor(RowFactor):
     def _chunk_ends(
         self, state: State, kinematics: Kinematics, b0: int, b1: int
     ) -> Iterator[tuple[np.ndarray, int, int]]:
-        """Bins b0:b1 in chunks: calibration columns (c,) of their poses, first bin, and the one after the last."""
+        """Yields bins b0:b1 in chunks: calibration columns (c,) of their poses, first bin, and the bin after the
+        last."""
         for clock, own in slices_by_clock(state, self.name, self.keyframe[b0:b1]):
             columns = kinematics.columns(clock)
             first, last = b0 + own.start, b0 + own.stop
@@ -164,8 +165,8 @@ class LidarFactor(RowFactor):
                 yield columns, first + int(a), first + int(b)
 
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
-        """First bin of `piece`, and the one after its last. A piece has the keyframes from its first to before its
-        last; the last piece of the trajectory has the last keyframe as well."""
+        """First bin of `piece`, and the bin after its last one. The last keyframe of a piece belongs to the next piece,
+        except in the last piece of the trajectory."""
         stop = piece.last + 1 if piece.last == self.n_keyframes - 1 else piece.last
         b0, b1 = np.searchsorted(self.keyframe, [piece.first, stop])
         return int(b0), int(b1)

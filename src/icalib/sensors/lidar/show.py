@@ -1,4 +1,4 @@
-"""LiDARs in report and 3D view: points on planes before and after, and residuals over time and distance."""
+"""LiDARs in report and 3D view: points on planes before and after calibration, residuals over time and distance."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from icalib.sensors.lidar.record import LidarResiduals
 MAX_DOTS = 2500  # points in a figure of residuals: more hide one another
 MAX_MAP_POINTS = 20_000  # points in a 3D map of the planes: keeps the page small
 N_FIGURE_BINS = 60  # along the x axis of RMS and mean
-MIN_BIN_POINTS = 20  # for an RMS to 16 %
-CURVE_BIN_S = 0.1  # of a curve in the 3D view: some thousand points of a usual LiDAR
+MIN_BIN_POINTS = 20  # of a figure bin; their RMS has a standard deviation of 16 %
+CURVE_BIN_S = 0.1  # duration of a bin of the curves in the 3D view: some thousand points of a usual LiDAR
 MAX_COLOR_RMS = 4.0  # end of the colour scale, in RMS of the result
 MAX_RESIDUAL_RMS = 5.0  # end of the residual axis, in RMS of the residuals
 MIN_SLOPE = 0.1  # sine; the outline of a flatter plane is aligned with the axes of the world
@@ -54,7 +54,7 @@ def sections(c: Calibration) -> Iterator[Section]:
 
 
 def curves(r: LidarResiduals) -> Iterator[ResidualCurve]:
-    """RMS [mm] of the points in each CURVE_BIN_S."""
+    """The curve of the RMS residual [mm] of points over time, in bins of CURVE_BIN_S."""
     number, of = np.unique(np.floor(r.seconds / CURVE_BIN_S).astype(np.int64), return_inverse=True)
     total = np.bincount(of, r.residual.astype(np.float64) ** 2, len(number))
     rms = np.sqrt(total / np.bincount(of, minlength=len(number)))
@@ -62,25 +62,25 @@ def curves(r: LidarResiduals) -> Iterator[ResidualCurve]:
 
 
 def clouds(c: Calibration) -> Iterator[ResidualCloud]:
-    """Points on planes in the world, with their distances from these."""
+    """Points on planes in the world, with their absolute distances from the planes [m]."""
     for r in c.lidar_residuals:
         yield ResidualCloud(r.sensor, r.seconds, r.world, np.abs(r.residual.astype(np.float64)))
 
 
 def amounts(c: Calibration) -> Iterator[str]:
-    """Numbers of scans, points and planes, for the summary."""
+    """Numbers of scans, points and planes, as text for the summary."""
     if c.lidar_residuals:
         points = sum(r.points_used for r in c.lidar_residuals)
         yield f"{sum(r.scans for r in c.lidar_residuals)} scans with {points} points on {len(c.planes)} planes"
 
 
 def shape(c: Calibration, name: str, spread: float) -> np.ndarray:
-    """Rings that depict a LiDAR, in its frame (n, 3) [m]. spread: size of the rig [m]."""
+    """Polyline (n, 3) [m] of rings that depict a LiDAR, in its frame. spread: size of the rig [m]."""
     return rings(0.3 * spread)
 
 
 def rings(radius: float) -> np.ndarray:
-    """(n, 3) three circles about z, as the beams of a spinning LiDAR at elevations -15, 0 and 15 deg."""
+    """Polyline (n, 3) [m] of three circles about z, like beams of a spinning LiDAR at elevations -15, 0 and 15 deg."""
     x, y = CIRCLE.T
     tilted = ((np.cos(e), np.sin(e)) for e in np.deg2rad([-15.0, 0.0, 15.0]))
     circles = [radius * np.stack([a * x, a * y, np.full_like(x, b)], axis=1) for a, b in tilted]
@@ -155,7 +155,7 @@ def _cloud(cloud: tuple[np.ndarray, np.ndarray], own: np.ndarray, top: float) ->
 
 
 def _map(traces: list[list[dict[str, Any]]], names: list[str]) -> Figure:
-    """Figure of the traces of each recording. The first recording is shown at the start."""
+    """Figure with the traces of all recordings. A menu selects one; the first is selected at the start."""
     scene = {name: {"title": {"text": f"world {name[0]} [m]"}, "nticks": 6} for name in ("xaxis", "yaxis", "zaxis")}
     layout: dict[str, Any] = {"scene": scene | VIEW, "margin": {"l": 0, "r": 0, "t": 10, "b": 0}}
     of = [k for k, own in enumerate(traces) for _ in own]
@@ -186,7 +186,8 @@ def _outlines(planes: tuple[Plane, ...], points: np.ndarray, plane: np.ndarray) 
 
 
 def _level_axes(normal: np.ndarray) -> np.ndarray:
-    """(2, 3) orthonormal vectors in the plane of a unit normal. The first is level."""
+    """(2, 3) orthonormal vectors in the plane with the unit `normal` (3,). The first is horizontal unless the plane
+    nearly is, see MIN_SLOPE."""
     level = np.array([-normal[1], normal[0], 0.0])
     length = float(np.linalg.norm(level))
     level = level / length if length > MIN_SLOPE else np.array([0.0, normal[2], -normal[1]]) / np.hypot(*normal[1:])

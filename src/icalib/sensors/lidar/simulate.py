@@ -22,7 +22,7 @@ from icalib.tools.simulation.scenario.room import Room, RoomSurfaces, nearest
 from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
-_FIRING_S = 2.304e-6  # between two lasers of a column (Velodyne VLP-16 manual)
+_FIRING_S = 2.304e-6  # between the firings of two lasers of a column (Velodyne VLP-16 manual)
 _CLOUD_MESSAGE = "sensor_msgs/msg/PointCloud2"
 _FLOAT32 = 7  # datatype of sensor_msgs/PointField
 
@@ -66,7 +66,7 @@ class SimLidar(SimSensor):
 
     @property
     def points(self) -> int:
-        """Most points of a scan."""
+        """Largest number of points in a scan."""
         return self.rings * self.azimuth_steps
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
@@ -75,7 +75,7 @@ class SimLidar(SimSensor):
         stamps, seconds = stamped(self, scene.duration_s - LEAD_S - 1.0 / self.rate_hz)
         noise_m = self.range_noise_m * float(scene.noisy)
         start = np.zeros(len(stamps) + 1, dtype=np.int64)
-        xyz = np.empty((len(stamps) * self.points, 3), dtype=np.float32)  # pages that stay empty take no memory
+        xyz = np.empty((len(stamps) * self.points, 3), dtype=np.float32)  # unused memory pages are never allocated
         offset, plane = np.empty(len(xyz), dtype=np.float32), np.empty(len(xyz), dtype=np.int32)
         column_s = 1.0 / (self.rate_hz * self.azimuth_steps)
         for i, begin in enumerate(seconds):
@@ -118,7 +118,7 @@ def _clouds(lidar: LidarStream, offset_ns: int) -> Iterator[BagEvent]:
 
 
 def _cloud(bag: BagWriter, stamp_ns: int, frame: str, xyz: np.ndarray, offset_s: np.ndarray) -> Any:
-    """PointCloud2 of points xyz (N, 3) [m] at offset_s (N,) since the stamp, float32."""
+    """PointCloud2 message of points xyz (N, 3) [m] with times offset_s (N,) since the stamp, all float32."""
     names = ("x", "y", "z", "time")
     fields = [bag.make("sensor_msgs/msg/PointField", name, 4 * i, _FLOAT32, 1) for i, name in enumerate(names)]
     rows = np.ascontiguousarray(np.column_stack([xyz, offset_s]), dtype="<f4")
@@ -128,7 +128,7 @@ def _cloud(bag: BagWriter, stamp_ns: int, frame: str, xyz: np.ndarray, offset_s:
 
 
 class _Turn(NamedTuple):
-    """One turn of A columns of K lasers, with poses in the room at the start of each column and at the end."""
+    """One revolution with A columns of K lasers, and world poses at the start of each column and at the end."""
 
     rotation: np.ndarray  # (A + 1, 3, 3) R_world_lidar
     position: np.ndarray  # (A + 1, 3)
@@ -139,7 +139,7 @@ class _Turn(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Arrays for the points of a turn, at most A K."""
+    """Arrays for the points of one revolution, at most A K: xyz (n, 3) [m], offset_s (n,), plane (n,)."""
 
     xyz: np.ndarray
     offset_s: np.ndarray
@@ -147,7 +147,7 @@ class _Points(NamedTuple):
 
 
 def _turn(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.ndarray) -> _Turn:
-    """The turn that begins at `begin` [s], with range noise (A, K) [m]."""
+    """The revolution that begins at `begin` [s], with range noise (A, K) [m]."""
     steps, rings = lidar.azimuth_steps, lidar.rings
     column_s = 1.0 / (lidar.rate_hz * steps)
     rotation, position, _ = trajectory.pose_at(begin + column_s * np.arange(steps + 1))

@@ -1,4 +1,4 @@
-"""A LiDAR of the rig, and its fields in the rig file."""
+"""A LiDAR in the rig file: its fields and defaults."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _FIELDS = (
 class Lidar(MountedSensor):
     """One LiDAR. Points closer than min_range_m or farther than max_range_m are not used.
 
-    point_time: what the stamp of a scan and the times of its points mean; see `read.point_times`. point_time_field,
+    point_time: meaning of the stamp of a scan and of the times of its points; see `read.point_times`. point_time_field,
     point_time_unit: field and unit of these times; None: detected from the data.
     """
 
@@ -42,7 +42,7 @@ class Lidar(MountedSensor):
     min_range_m: float = 0.5
     max_range_m: float = 100.0
     point_time: PointTime = "auto"
-    topic: str | None = None  # of its clouds; None: the topic with the LiDAR's name, or the only one
+    topic: str | None = None  # topic of the clouds; None: the topic with the LiDAR's name, or the only one
     point_time_field: str | None = None
     point_time_unit: TimeUnit | None = None
 
@@ -77,7 +77,7 @@ class Lidar(MountedSensor):
 
 
 def _point_time(found: dict[str, YamlValue]) -> PointTime:
-    """The field point_time. Raises RigError if a field or unit of point times is given although it uses none."""
+    """The value of point_time. Raises RigError if a field or unit of point times is given although it uses no times."""
     chosen = choice_or(found, "point_time", PointTime, Lidar.point_time)
     for name in ("point_time_field", "point_time_unit"):
         if name in found and chosen in ("azimuth", "snapshot"):

@@ -1,4 +1,4 @@
-"""Measurements of a LiDAR: scans of points."""
+"""The stream of a LiDAR: scans of points."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class LidarStream(Stream):
         check(self.plane.dtype == np.int32, f"{self.name}: plane must be int32.")
 
     def some(self, kept: np.ndarray) -> LidarStream:
-        """The stream with the points `kept` (N,) bool. All scans stay, even without points."""
+        """The stream with the points selected by the mask `kept` (N,). All scans stay, even without points."""
         if kept.all():
             return self
         start = np.concatenate([[0], np.cumsum(kept)])[self.start].astype(np.int64)

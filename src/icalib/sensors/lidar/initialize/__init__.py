@@ -1,4 +1,4 @@
-"""Initial guess of LiDARs: a trajectory by registration of scans, extrinsics, and points on planes."""
+"""Initial guess of LiDARs: trajectory by registration of scans, extrinsics, and association of points with planes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from icalib.sensors.lidar.initialize.self_returns import without_self_returns
 
 
 class LidarInitializer(Initializer[Lidar]):
-    """The first LiDAR gives the trajectory if no camera sees a target. All others are aligned to it."""
+    """Initializer of LiDARs. The first one gives the trajectory if no camera sees a target; all other LiDARs are
+    aligned to it."""
 
     moves_keyframes = True
 
@@ -43,8 +44,8 @@ class LidarInitializer(Initializer[Lidar]):
         return lidar_values(inputs, state)
 
     def associated(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        """Points on planes. The rounds may change parameters that the motion does not determine, so the inputs keep the
-        initial guess from before the rounds."""
+        """Inputs and state with points associated with planes, and known values. The rounds may change parameters that
+        the motion does not determine, so the inputs keep the initial guess from before the rounds."""
         known = {key: value for lidar in inputs.rig.lidars for key, value in stated_values(inputs, lidar).items()}
         guess = replace(state, values=state.values | known)
         inputs, state = with_lidars(inputs, state)

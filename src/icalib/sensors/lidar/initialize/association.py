@@ -20,16 +20,17 @@ from icalib.optim.arrowhead import in_parallel
 from icalib.optim.state import Key
 from icalib.sensors.lidar.binning import in_world
 
-POINTS_PER_PART = 200_000  # of a thread at a time: bounds the memory beside the clouds
+POINTS_PER_PART = 200_000  # points of a thread at a time; bounds the memory
 ASSOCIATION_ROUNDS = 4
 # Assumed error of the state in each round: position [m], and rotation about the sensor [rad].
 STATE_ERRORS = (0.03, 0.01, 0.003, 0.001)
-MIN_KEPT_POINTS = 0.5  # share of a plane's points that had a plane before: the majority keeps the name
+MIN_KEPT_POINTS = 0.5  # share of the associated points of a plane from the old plane whose name it keeps
 
 
 @dataclass(frozen=True)
 class Association:
-    """Points associated with planes (P, 6): normal, and a point in the world, in the order of the names in `clouds`."""
+    """Points associated with planes. planes (P, 6): normal, and a point [m], in the world frame; ordered as the names
+    in `clouds`."""
 
     clouds: Clouds
     planes: np.ndarray
@@ -41,7 +42,7 @@ class Association:
 
 
 def round_search(k: int, noise_m: float) -> PlaneSearch:
-    """Tolerances of round k, counted from 0. noise_m: of a point."""
+    """Tolerances of the plane search in round k, counted from 0. noise_m: standard deviation of a point [m]."""
     error = STATE_ERRORS[min(k, len(STATE_ERRORS) - 1)]
     return PlaneSearch(noise_m=noise_m, position_m=error, angle_rad=error)
 
@@ -49,8 +50,8 @@ def round_search(k: int, noise_m: float) -> PlaneSearch:
 def associate(
     streams: Sequence[LidarStream], motion: EstimatedMotion, search: PlaneSearch, before: Association | None = None
 ) -> Association:
-    """Planes, and their points, at the state of `motion`. Planes get the names of those in `before` with which they
-    share most points. Raises EstimationError if there is no plane."""
+    """Planes and their points at the state of `motion`. A plane gets the name of the plane in `before` with which it
+    shares most points. Raises EstimationError if there is no plane."""
     moved = [in_world(motion, s) for s in streams]
     found = find_planes(*_thinned(moved), search)
     if not found.count:
@@ -65,28 +66,28 @@ def associate(
 
 
 def _thinned(clouds: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Points and the positions from which they were seen, of all clouds together, at most as many as the search uses.
-    The step is odd, as an even one would keep some lasers of a spinning LiDAR only."""
+    """Points, and the positions from which they were seen, of all clouds together, thinned to at most MOST_POINTS. The
+    step is odd, as an even step would select only some lasers of a spinning LiDAR."""
     step = odd_step(sum(len(points) for points, _ in clouds))
     points, seen_from = zip(*clouds, strict=True)
     return np.concatenate([p[::step] for p in points]), np.concatenate([s[::step] for s in seen_from])
 
 
 def odd_step(points: int) -> int:
-    """Odd step that leaves at most as many of so many points as the search uses."""
+    """Odd step that thins `points` points to at most MOST_POINTS."""
     return -(-points // MOST_POINTS) | 1
 
 
 def _plane_of_points(found: FoundPlanes, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
-    """(N,) int32 plane of each point, -1: none; see `FoundPlanes.of_points`. On two threads."""
+    """(N,) int32 plane of each point, -1: none; see `FoundPlanes.of_points`. Uses two threads."""
     parts = [slice(a, a + POINTS_PER_PART) for a in range(0, len(points), POINTS_PER_PART)]
     own = in_parallel(lambda part: found.of_points(points[part], seen_from[part], search), parts)
     return np.concatenate([np.zeros(0, np.int32), *own])
 
 
 def _plane_names(count: int, plane: tuple[np.ndarray, ...], before: Clouds | None) -> tuple[str, ...]:
-    """A name for each of `count` planes: of the plane before with which it shares most points, else a new one. plane:
-    of each LiDAR's points (N,)."""
+    """A name for each of `count` planes: that of the plane in `before` with which it shares most points, else a new
+    one. plane: for each LiDAR, the plane (N,) of its points."""
     if before is None:
         return tuple(f"plane {k}" for k in range(count))
     shared = np.zeros((count, len(before.names)), dtype=np.int64)

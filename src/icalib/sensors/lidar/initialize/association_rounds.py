@@ -49,12 +49,13 @@ from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_o
 from icalib.sensors.lidar.model import FIRST_RANGE_SIGMA_M
 from icalib.sensors.sensor import MOUNTED_NAMES
 
-# The rounds diverge if the share of points on planes is below both: of all points, and of the share in the first round.
+# The rounds diverge if the share of points on planes falls below both: a share of all points, and a ratio to the share
+# in the first round.
 MIN_LAST_SHARE, MIN_RELATIVE_SHARE = 0.2, 0.7
 
 
 def state_from_lidar(inputs: Inputs) -> State:
-    """The initial state from the first LiDAR and the IMU. The recording with most points gives the extrinsics.
+    """The initial state from the first LiDAR and the IMU. The extrinsics come from the recording with most points.
 
     Raises EstimationError if a recording does not determine the trajectory.
     """
@@ -68,7 +69,7 @@ def state_from_lidar(inputs: Inputs) -> State:
 
 
 def _single_state(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
-    """The initial state of one recording. held: extrinsics of the LiDAR from another recording."""
+    """The initial state of one recording. held: known extrinsics of the LiDAR from another recording."""
     assert inputs.imu is not None
     lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
     try:
@@ -79,9 +80,10 @@ def _single_state(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
         known = known_extrinsics(inputs, lidar, guesses=True)
         if held is not None or known.rotation is None or known.offset is None:
             raise
-        # Without sufficient motion the initial guess of the rig file is used instead.
+        # The motion is insufficient: the initial guess of the rig file is used as known extrinsics.
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
-    # Rotation and offset from angular rates are more accurate than a guess, by which planes would be too thick to find.
+    # Rotation and offset from angular rates are more accurate than a guess, which would make planes too thick to
+    # detect.
     names = ("translation", *known_names(lidar)) if guess.turned else MOUNTED_NAMES
     own, known = guess.values(lidar.name), stated_values(inputs, lidar, names)
     values = start_values(inputs, merged_values(lidar, known, own) if guess.turned else own | known)
@@ -92,8 +94,8 @@ def _single_state(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
 
 
 def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
-    """Inputs with points associated with planes, and the state after the rounds, with planes. `state` has the
-    trajectory and initial values of all parameters. Raises EstimationError if there are no planes."""
+    """Inputs with points associated with planes, and the state with planes after the rounds. `state` has the trajectory
+    and initial values of all parameters. Raises EstimationError if there are no planes."""
     inputs = with_known_motion(inputs, state)
     recordings = points_by_recording(inputs)
     if any((s.plane >= 0).any() for streams in recordings for s in streams):
@@ -104,7 +106,7 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
 
 
 def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[LidarStream, ...]]) -> tuple[Inputs, State]:
-    """See `with_lidars`. All rounds except the last use thinned points."""
+    """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points."""
     step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars))
     fewer = _thinned_inputs(inputs, step)
     found: Sequence[Association | None] = [None] * len(recordings)
@@ -125,8 +127,8 @@ def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[Lidar
 def _associated(
     inputs: Inputs, state: State, k: int, before: Sequence[Association | None]
 ) -> tuple[Inputs, State, list[Association]]:
-    """Association of round k at `state`, without a solve: inputs, state with planes, and the association of each
-    recording. before: associations of the round before, None in the first."""
+    """Association of round k at `state`, without a solve. Returns inputs, state with planes, and the association of
+    each recording. before: associations of the previous round, None in the first."""
     noise = max(x.range_noise_m or FIRST_RANGE_SIGMA_M for x in inputs.rig.lidars)
     found = []
     for r, streams in enumerate(points_by_recording(inputs)):
@@ -139,14 +141,14 @@ def _associated(
 
 
 def _thinned_inputs(inputs: Inputs, step: int) -> Inputs:
-    """The inputs with each `step`th point. More points than the plane search uses do not improve early rounds."""
+    """The inputs with every `step`th point. More points than the plane search uses do not improve early rounds."""
     streams = inputs.measurements.lidars
     fewer = [s.some(np.arange(len(s.xyz)) % step == 0) for s in streams]
     return replace(inputs, measurements=inputs.measurements.with_streams(*fewer))
 
 
 def _first_points(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
-    """(R, L) number of the first point of each recording among all points of each LiDAR."""
+    """(R, L) index of the first point of each recording among all points of each LiDAR."""
     sizes = np.array([[len(s.xyz) for s in streams] for streams in recordings])
     return np.cumsum(sizes, axis=0) - sizes
 
@@ -154,7 +156,8 @@ def _first_points(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
 def _unthinned(
     found: Association | None, streams: tuple[LidarStream, ...], first: np.ndarray, step: int
 ) -> Association | None:
-    """The association of thinned points as one of all points of a recording; first (L,): see `_first_points`."""
+    """The association `found` of points thinned by `step`, expanded to all points of a recording; points that were left
+    out get no plane. first (L,): see `_first_points`."""
     if found is None:
         return None
     planes = tuple(np.full(len(s.xyz), -1, np.int32) for s in streams)
@@ -169,8 +172,8 @@ def _share_on_planes(clouds: Clouds) -> float:
 
 
 def check_shares(shares: Sequence[float], names: str) -> None:
-    """Raises EstimationError if the rounds diverge: planes must get thinner from round to round, and have more
-    points."""
+    """Raises EstimationError if the rounds diverge. shares: share of points on planes after each round; names:
+    LiDARs."""
     first, last = shares[0], shares[-1]
     if last < MIN_LAST_SHARE and last < MIN_RELATIVE_SHARE * first:
         raise EstimationError(
@@ -186,8 +189,10 @@ def _without_planes(state: State) -> dict[Key, np.ndarray]:
 
 
 def with_known_motion(inputs: Inputs, state: State) -> Inputs:
-    """Inputs without points that are not finite, and without scans far from the keyframes of `state`: poses propagated
-    there have errors that the model does not contain. Raises EstimationError if no scan is left."""
+    """Inputs without points that are not finite, and without scans far from the keyframes of `state`.
+
+    The model does not include the errors of poses propagated so far. Raises EstimationError if no scan is left.
+    """
     measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
     for stream in measured.lidars:
         begin = instants(stream, state.values)
@@ -211,8 +216,9 @@ def with_known_motion(inputs: Inputs, state: State) -> Inputs:
 def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     """Initial extrinsics and time offsets of all LiDARs, given the trajectory in `state`.
 
-    A LiDAR that `state` lacks has the values of the rig file, or those from its scans. The others have the known values
-    of the rig file alone. Raises EstimationError if a recording does not determine them.
+    A LiDAR without values in `state` gets those of the rig file, or else those from its scans. For a LiDAR with values
+    in `state`, only the known values of the rig file are returned. Raises EstimationError if a recording does not
+    determine them.
     """
     out: dict[Key, np.ndarray] = {}
     for i, lidar in enumerate(inputs.rig.lidars):
@@ -238,7 +244,8 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
 
 
 def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: KnownExtrinsics, recording: int) -> float:
-    """Time offset [s] of the LiDAR number `lidar` in one recording, between first stamps, with extrinsics `held`."""
+    """Time offset [s] of the LiDAR with index `lidar` in one recording, relative to the first stamps of that recording;
+    held: known extrinsics."""
     own, motion = single_recording(inputs, recording), state_of_recording(inputs, recording, state)
     assert own.imu is not None
     stream = own.measurements.lidars[lidar]
@@ -247,8 +254,8 @@ def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: KnownExtri
 
 
 def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.ndarray]:
-    """Planes fitted to known points on planes at `state` (total least squares), as values of a state. Of very many
-    points some are used."""
+    """Planes fitted to points with known planes at `state` (total least squares), as values of a state. Very large
+    clouds are thinned."""
     motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
     for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
         if (plane >= 0).any():
@@ -275,8 +282,8 @@ def _add_in_world(moments: Moments, motion: EstimatedMotion, stream: LidarStream
 
 
 def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
-    """Streams of all LiDARs with the points of each recording, on the joined clock. All scans stay, without points of
-    other recordings."""
+    """For each recording, the streams of all LiDARs on the joined clock with the points of this recording. Scans of
+    other recordings stay as empty scans."""
     streams = inputs.measurements.lidars
     if len(inputs.parts) == 1:
         return [streams]

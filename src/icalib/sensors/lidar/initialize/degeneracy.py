@@ -16,7 +16,7 @@ MAX_SAMPLED_POINTS = 6000  # of a scan
 NORMAL_VOXEL_M = 1.0  # edge of the voxels whose normals are counted
 MAX_NORMAL_VOXELS = 1 << 13
 MIN_PLANAR_SCANS = 5  # scans with planar voxels, for a verdict
-MIN_DIRECTION_SHARE = 0.02  # of the points: 0.2 and more on walls that face it, 0.002 and less by noise of normals
+MIN_DIRECTION_SHARE = 0.02  # of the points: 0.2 and more for a direction that walls face, 0.002 and less by noise
 DEGENERACIES = {
     1: "face one direction only, such as a floor or parallel walls, so the motion along them is unobservable",
     2: "face two directions only, as in a corridor, so the motion along both is unobservable",
@@ -25,7 +25,7 @@ DEGENERACIES = {
 
 @contextmanager
 def explaining_degeneracy(streams: Sequence[LidarStream]) -> Iterator[None]:
-    """Replaces an EstimationError raised within by one that names the degenerate scene, if a LiDAR saw such a scene."""
+    """Context that replaces an EstimationError by one that names the degenerate scene, if a LiDAR saw such a scene."""
     try:
         yield
     except EstimationError as error:
@@ -47,7 +47,7 @@ def n_directions(stream: LidarStream) -> int:
 
 
 def count_directions(shares: np.ndarray) -> int:
-    """Number of independent directions, from the shares (3,) of `normal_shares`."""
+    """Number of independent directions that surfaces face, 0 to 3. shares (3,): see `normal_shares`."""
     return int((shares > MIN_DIRECTION_SHARE).sum())
 
 
@@ -65,6 +65,6 @@ def _scan_shares(stream: LidarStream, scan: int) -> np.ndarray | None:
 
 
 def normal_shares(normal: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(3,) shares of the weight (n,) of normals (n, 3) along their principal axes, increasing: eigenvalues of the
-    weighted mean of n n^T."""
+    """Shares (3,) of the total weight along the principal axes of normals, increasing: eigenvalues of the weighted mean
+    of n n^T. normal (n, 3); weight (n,)."""
     return np.linalg.eigvalsh((normal * weight[:, None]).T @ normal / weight.sum())

@@ -1,8 +1,8 @@
 """Initial extrinsics and time offset of a LiDAR, and the IMU trajectory if no other sensor gives it.
 
-Odometry gives angular rates of the LiDAR. Alignment with the gyroscope gives time offset and rotation. With rotations
-from the gyroscope, odometry is repeated, and is more accurate. The lever arm follows from its positions: against a
-known trajectory, or against the readings of the IMU, together with gravity.
+LiDAR odometry gives angular rates of the LiDAR. Their alignment with the gyroscope gives time offset and rotation.
+Odometry is then repeated with rotations from the gyroscope, and is more accurate. The lever arm follows from the
+positions of odometry, compared with a known trajectory, or with the readings of the IMU together with gravity.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from icalib.optim.state import State
 from icalib.sensors.lidar.initialize.odometry import Scan, lidar_trajectory, sampled_scans
 
 MIN_LIDAR_RATE_CORRELATION = 0.6  # of angular rates with those of the gyroscope
-LEVER_ARM_ROUNDS = 2  # of odometry near the known trajectory, and lever arm
-# Alignments nearer than this rotate the points of a scan alike, within the noise of the registration.
+LEVER_ARM_ROUNDS = 2  # alternations of odometry near the known trajectory, and lever arm
+# Alignments that differ by less give the same points of a scan, within the noise of the registration.
 SAME_ALIGNMENT_RAD, SAME_ALIGNMENT_S = 5e-3, 1e-3
 
 
@@ -57,8 +57,8 @@ def lidar_and_motion(
 def lidar_on_motion(
     imu: ImuData, stream: LidarStream, known: State, held: KnownExtrinsics = NOTHING_KNOWN
 ) -> ExtrinsicsGuess:
-    """Extrinsics given the IMU trajectory `known`, with keyframes at most some 50 ms apart. held: known extrinsics.
-    Raises EstimationError if the recording does not determine them."""
+    """Extrinsics and time offset given the IMU trajectory `known`, with keyframes at most about 50 ms apart. held:
+    known extrinsics. Raises EstimationError if the recording does not determine them."""
     scans = sampled_scans(stream)
     aligned, free, rates = _aligned(imu, stream.name, scans, held)
     guess = ExtrinsicsGuess(aligned.rotation, np.zeros(3) if held.position is None else held.position, aligned.offset)
@@ -77,7 +77,7 @@ def lidar_on_motion(
         return ExtrinsicsGuess(found[0], found[1][3:6], aligned.offset)
 
     if held.rotation is None and only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is not None:
-        # Rates about one axis leave the rotation about it free: the known trajectory must fix it first.
+        # Rates about one axis do not determine the rotation about it: it comes from the known trajectory first.
         guess = fitted(free, guess)
     for _ in range(LEVER_ARM_ROUNDS):
         guess = fitted(_trajectory_near(stream.name, scans, known, gyro, guess), guess)
@@ -102,8 +102,8 @@ def _trajectory_near(
 def _aligned(
     imu: ImuData, name: str, scans: list[Scan], held: KnownExtrinsics
 ) -> tuple[RateAlignment, SensorTrajectory, SensorRates]:
-    """Time offset, rotation and gyroscope bias; LiDAR trajectory with the rotations of the gyroscope, while the IMU was
-    running; and its angular rates."""
+    """Alignment with the gyroscope: time offset, rotation and gyroscope bias. Also the LiDAR trajectory with rotations
+    from the gyroscope, while the IMU was running; and the angular rates of this trajectory."""
     first = align_trajectory(imu, name, _rates(name, lidar_trajectory(name, scans, single_map=False)), held)
     trajectory = _trajectory_with_gyro(imu, name, scans, first)
     rates = _rates(name, trajectory)
@@ -116,13 +116,13 @@ def _aligned(
 
 
 def _is_same(a: RateAlignment, b: RateAlignment) -> bool:
-    """Whether two alignments rotate the points of a scan alike."""
+    """True if two alignments are equal within SAME_ALIGNMENT_RAD and SAME_ALIGNMENT_S."""
     apart = so3.log(np.ascontiguousarray(a.rotation.T @ b.rotation))
     return float(np.linalg.norm(apart)) < SAME_ALIGNMENT_RAD and abs(a.offset - b.offset) < SAME_ALIGNMENT_S
 
 
 def _trajectory_with_gyro(imu: ImuData, name: str, scans: list[Scan], aligned: RateAlignment) -> SensorTrajectory:
-    """Odometry with the rotations of the gyroscope."""
+    """LiDAR trajectory from odometry with rotations from the gyroscope."""
     gyro = GyroRotation.integrate(imu, aligned.gyro_bias)
     return lidar_trajectory(name, scans, lambda t: gyro.at(t + aligned.offset) @ aligned.rotation)
 
@@ -138,7 +138,7 @@ def _rates(name: str, trajectory: SensorTrajectory) -> SensorRates:
 
 
 def _too_short(stream: LidarStream) -> EstimationError:
-    """The error if too few scans remain for the lever arm."""
+    """The error for too few scans to estimate the lever arm."""
     return EstimationError(
         f"{stream.name}: too few of its scans fall within the recording of the IMU to estimate its lever arm; "
         "check that both clocks overlap, or record for longer."
@@ -146,7 +146,7 @@ def _too_short(stream: LidarStream) -> EstimationError:
 
 
 def _check_axes(lidar: str, imu: str, mirrored: bool) -> None:
-    """Raises EstimationError if the positions are mirrored."""
+    """Raises EstimationError if the positions of the LiDAR are mirrored."""
     if mirrored:
         raise EstimationError(
             f"{lidar} turns as {imu} does, but moves the other way: its points are mirrored, as one of its axes, or "

@@ -1,8 +1,8 @@
-"""LiDAR odometry: each scan is registered to a map of planar voxels that the scans before it made.
+"""LiDAR odometry: each scan is registered to a map of planar voxels built from the previous scans.
 
-A scan has a pose at its middle and a twist, so that each point is seen from the pose at its own instant. Without the
-gyroscope the twist describes the rotation within a scan, too. Once the LiDAR is aligned with the IMU, the gyroscope
-rotates the points of a scan to its middle and predicts the rotation since the scan before.
+A scan has a pose at its middle and a twist, from which the pose at the instant of each point follows. Without gyroscope
+the twist also describes the rotation within a scan. Once the LiDAR is aligned with the IMU, the gyroscope gives the
+rotation within a scan and predicts the rotation since the previous scan.
 """
 
 from __future__ import annotations
@@ -22,42 +22,42 @@ from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, insert
 
 # Points of a scan:
 MAX_MATCHED_POINTS, MAX_MAPPED_POINTS = 1500, 6000  # registered to the map, and added to it
-MAX_NEIGHBOUR_POINTS = 500  # in steps that search 27 voxels for each point
-MIN_SCAN_POINTS = 100  # of a scan that is used
+MAX_NEIGHBOUR_POINTS = 500  # used in steps that search 27 voxels for each point
+MIN_SCAN_POINTS = 100  # scans with fewer points are not used
 MIN_ODOMETRY_RANGE_M = 0.3  # nearer points lie on the housing of the LiDAR
-GOLDEN_RATIO = 0.6180339887498949  # of all points as a step: any number of steps covers a scan evenly
-MIN_SCANS = 20  # of a recording
+GOLDEN_RATIO = 0.6180339887498949  # step as a share of all points: any number of such steps covers a scan evenly
+MIN_SCANS = 20  # in a recording
 # The map:
-VOXELS_PER_MEDIAN_RANGE = 8.0  # edges of a voxel in the median range of points
+VOXELS_PER_MEDIAN_RANGE = 8.0  # median range of points, in edges of a voxel
 VOXEL_EDGE_RANGE_M = (0.3, 2.0)  # shortest and longest edge
 MAX_VOXELS = 1 << 17  # 25 MB
 SCAN_DECAY, SCAN_DECAY_WITH_GYRO = (
     0.85,
     0.995,
-)  # of the weight of points, by the scan; drift is faster without gyroscope
+)  # factor of the weight of old points per scan; odometry drifts faster without gyroscope
 # Scale of the robust weights in the last step, in edges of a voxel.
 FINAL_SCALE, FINAL_SCALE_WITH_GYRO = 0.2, 0.1
-MIN_SHARE_NEAR_MAP = 0.3  # of the matched points, near planes of the map, for a scan that fits
+MIN_SHARE_NEAR_MAP = 0.3  # share of the matched points near planes of the map; a scan with fewer does not fit
 MAX_LOST_SCANS = 5  # in a row that do not fit, before a new map starts
-MIN_MAP_SCANS = 10  # that fit a map; a single map with fewer is given up, as its first scan showed too little
+MIN_MAP_SCANS = 10  # that fit a map; a single map with fewer is discarded, as its first scan showed too little
 FIRST_TWIST_ROUNDS = 4  # to estimate the twist of the first scan of a map
 # Two halves on two threads:
-MIN_SCANS_FOR_TWO_MAPS = 200  # of a recording: the second map costs time, too
-OVERLAP_SCANS, MIN_OVERLAP_SCANS = 20, 5  # in both maps, and those of them that fit both, to join the maps
+MIN_SCANS_FOR_TWO_MAPS = 200  # in a recording; for fewer the cost of a second map exceeds the gain
+OVERLAP_SCANS, MIN_OVERLAP_SCANS = 20, 5  # scans in both maps, and least number that fits both, to join the maps
 # Points of single rings, see `_share_on_lines`:
-MAX_SHARE_ON_LINES = 0.8  # of the points; a scan with more shows no surfaces
-MIN_LINE_POINTS, MAX_LINE_WIDTH = 5, 0.25  # in a voxel; and width of a line as a share of its length
+MAX_SHARE_ON_LINES = 0.8  # of the points; a scan with a larger share shows no surfaces
+MIN_LINE_POINTS, MAX_LINE_WIDTH = 5, 0.25  # points of a line in a voxel; width as a share of the length
 GYRO_STEP_S = 1e-3  # between rotations by the gyroscope within a scan
 MAX_SCAN_STEP_S = 1.0  # between scans, over which the twist is extrapolated
 
 RotationAt = Callable[[np.ndarray], np.ndarray]  # instants (n,) on the LiDAR's clock -> R_start_lidar (n, 3, 3)
-PositionAt = Callable[[np.ndarray], np.ndarray]  # -> p_start_lidar (n, 3) [m], approximate
+PositionAt = Callable[[np.ndarray], np.ndarray]  # instants (n,) -> approximate p_start_lidar (n, 3) [m]
 
 
 @dataclass(frozen=True)
 class Scan:
-    """Some points of a scan. middle [s]: on the LiDAR's clock; xyz (n, 3) [m] at tau (n,) [s] from the middle, in an
-    order in which the first points are spread over the scan."""
+    """Points sampled from a scan. middle [s]: instant on the LiDAR's clock; xyz (n, 3) [m]; tau (n,): time of each
+    point since the middle [s]. Any first few points are spread over the scan."""
 
     middle: float
     xyz: np.ndarray
@@ -65,8 +65,8 @@ class Scan:
 
 
 def sampled_scans(stream: LidarStream) -> list[Scan]:
-    """At most MAX_MAPPED_POINTS of each scan, without scans of few points. Raises EstimationError if scans are too
-    few."""
+    """Scans with at most MAX_MAPPED_POINTS points each, without scans of few points. Raises EstimationError if there
+    are too few scans."""
     with ThreadPoolExecutor(N_THREADS) as pool:
         scans = list(pool.map(lambda i: _sampled_scan(stream, i), range(len(stream.stamps_ns))))
     scans = [s for s in scans if len(s.tau) >= MIN_SCAN_POINTS]
@@ -85,11 +85,11 @@ def lidar_trajectory(
     position_at: PositionAt | None = None,
     single_map: bool = True,
 ) -> SensorTrajectory:
-    """Scan-to-map odometry of LiDAR `name`: poses of the middles of scans in the frame of the map.
+    """Scan-to-map odometry of LiDAR `name`: poses at the middles of scans in the frame of the map.
 
     rotation_at, position_at: known rotations, and approximate positions. single_map: one map for all scans; scans
-    before it, which fit no map, are not ok. Else a lost LiDAR starts a new map, and scans within MAX_SCAN_STEP_S after
-    the last good one are not ok, so that no step leads from map to map.
+    before it that fit no map are not ok. Otherwise a new map starts if the LiDAR is lost. Scans within MAX_SCAN_STEP_S
+    after the last good one are then not ok, so that no step connects two maps.
 
     Raises EstimationError if more than half of the scans fit no map.
     """
@@ -109,7 +109,7 @@ def lidar_trajectory(
 
 
 def _mismatch_cause(scans: list[Scan], edge_m: float) -> str:
-    """Why scans do not match, and what to do."""
+    """Cause of the mismatch of scans, and advice, as text."""
     if (share := np.median([_share_on_lines(scan, edge_m) for scan in scans])) <= MAX_SHARE_ON_LINES:
         return "there may be too few flat surfaces, or the point times may be wrong"
     return (
@@ -120,8 +120,8 @@ def _mismatch_cause(scans: list[Scan], edge_m: float) -> str:
 
 
 def _share_on_lines(scan: Scan, edge_m: float) -> float:
-    """Share of the points in voxels whose points form a line, as those of a single ring. Voxels with few points do not
-    count."""
+    """Share of the points in voxels whose points form a line, as the points of a single ring do. Voxels with fewer than
+    MIN_LINE_POINTS points are ignored."""
     _, voxel, count = np.unique(np.floor(scan.xyz / edge_m), axis=0, return_inverse=True, return_counts=True)
     voxel = voxel.ravel()
     mean = np.stack([np.bincount(voxel, x) for x in scan.xyz.T], axis=1) / count[:, None]
@@ -149,7 +149,8 @@ def _sampled_scan(stream: LidarStream, i: int) -> Scan:
 
 
 def evenly_spread(n: int, most: int, begin: int) -> np.ndarray:
-    """(min(n, most),) different indices below n. Any first few of them are spread evenly, too."""
+    """(min(n, most),) different indices below n, evenly spread, starting with `begin` modulo n. Any first few of them
+    are evenly spread as well."""
     step = max(int(GOLDEN_RATIO * n), 1)
     while np.gcd(step, n) > 1:
         step += 1
@@ -157,7 +158,7 @@ def evenly_spread(n: int, most: int, begin: int) -> np.ndarray:
 
 
 def _rotated_to_middle(scan: Scan, rotation_at: RotationAt) -> Scan:
-    """The scan as a LiDAR would see it that keeps the rotation of its middle."""
+    """The scan with its points rotated into the axes of the LiDAR at the middle of the scan."""
     which = np.floor(scan.tau / GYRO_STEP_S).astype(np.int64)
     low = which.min()
     steps = scan.middle + (np.arange(low, which.max() + 1) + 0.5) * GYRO_STEP_S
@@ -169,15 +170,15 @@ def _rotated_to_middle(scan: Scan, rotation_at: RotationAt) -> Scan:
 
 @dataclass(frozen=True)
 class _KnownSteps:
-    """Known motion from the scan before to each of n scans, None if unknown: rotation R_before_scan (n, 3, 3),
-    translation p_before_scan (n, 3) [m]. The first scan has none."""
+    """Known motion from the previous scan to each of n scans, None if unknown: rotation R_before_scan (n, 3, 3),
+    translation p_before_scan (n, 3) [m]. The step of the first scan is zero."""
 
     rotation: np.ndarray | None
     translation: np.ndarray | None
 
     @classmethod
     def of(cls, seconds: np.ndarray, rotation_at: RotationAt | None, position_at: PositionAt | None) -> _KnownSteps:
-        """Steps between scans whose middles are at `seconds` (n,) on the LiDAR's clock."""
+        """Steps between scans with middles at `seconds` (n,) on the LiDAR's clock."""
         if rotation_at is None:
             return cls(None, None)
         R = rotation_at(seconds)
@@ -186,12 +187,13 @@ class _KnownSteps:
         return cls(back @ R, None if step is None else np.einsum("nij,nj->ni", back, step))
 
     def part(self, own: slice) -> _KnownSteps:
-        """Steps of some of the scans."""
+        """The steps of the scans `own`."""
         return _KnownSteps(*(None if x is None else x[own] for x in (self.rotation, self.translation)))
 
 
 def _track_in_several_maps(scans: list[Scan], known: _KnownSteps, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
-    """Poses and their validity, in as many maps as needed. The halves of a long recording run on two threads."""
+    """Poses, and a mask (n,) of valid ones, in as many maps as needed. Halves of a long recording run on two
+    threads."""
     n, seconds = len(scans), np.array([s.middle for s in scans])
     parts = [slice(0, n)] if n < MIN_SCANS_FOR_TWO_MAPS else [slice(0, n // 2), slice(n // 2, n)]
     found = _track_parts(scans, known, edge_m, parts, False)
@@ -202,8 +204,8 @@ def _track_in_several_maps(scans: list[Scan], known: _KnownSteps, edge_m: float)
 
 
 def _track_in_single_map(scans: list[Scan], known: _KnownSteps, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
-    """Poses and their validity, in one map. The halves of a long recording run on two threads, and are joined by the
-    scans that both contain."""
+    """Poses, and a mask (n,) of valid ones, in one map. The halves of a long recording run on two threads, and are
+    joined by the scans that both contain."""
     middle = len(scans) // 2
     if len(scans) >= MIN_SCANS_FOR_TWO_MAPS:
         parts = [slice(0, middle + OVERLAP_SCANS), slice(middle, len(scans))]
@@ -218,7 +220,7 @@ def _track_in_single_map(scans: list[Scan], known: _KnownSteps, edge_m: float) -
 def _track_parts(
     scans: list[Scan], known: _KnownSteps, edge_m: float, parts: list[slice], single_map: bool
 ) -> list[tuple[list[ScanPose], np.ndarray]]:
-    """Poses and their validity of each part, each on a thread."""
+    """Poses, and a mask of valid ones, for each part; one thread per part."""
 
     def track(own: slice) -> tuple[list[ScanPose], np.ndarray]:
         return _MapTracker(scans[own], known.part(own), edge_m, single_map).track()
@@ -228,7 +230,8 @@ def _track_parts(
 
 
 def _joined(here: list[ScanPose], there: list[ScanPose], others: list[ScanPose]) -> list[ScanPose]:
-    """Poses `others` of a second map, transformed to the first. here, there: poses of the same scans in both maps."""
+    """Poses `others` in the second map, transformed to the first. here, there: poses of the same scans in the first and
+    in the second map."""
     u, _, vt = np.linalg.svd(
         sum((a.rotation @ b.rotation.T for a, b in zip(here, there, strict=True)), np.zeros((3, 3)))
     )
@@ -243,12 +246,12 @@ class _MapTracker:
     def __init__(self, scans: list[Scan], known: _KnownSteps, edge_m: float, single_map: bool) -> None:
         self._scans, self._known, self._single_map = scans, known, single_map
         self._voxels = VoxelMap.empty(edge_m, MAX_VOXELS)
-        self._fits = np.ones(len(scans), dtype=bool)  # each its map
-        self._excluded = np.zeros(len(scans), dtype=bool)  # from the trajectory, although they may fit
+        self._fits = np.ones(len(scans), dtype=bool)  # the scan fits its map
+        self._excluded = np.zeros(len(scans), dtype=bool)  # excluded from the trajectory, although it may fit
         self._excluded_until = -np.inf  # instant [s]
 
     def track(self) -> tuple[list[ScanPose], np.ndarray]:
-        """Poses of the scans, and whether each is valid (n,)."""
+        """Poses of the n scans, and a mask (n,) of valid ones."""
         gyro = self._known.rotation is not None
         scale, decay = (FINAL_SCALE_WITH_GYRO, SCAN_DECAY_WITH_GYRO) if gyro else (FINAL_SCALE, SCAN_DECAY)
         poses, lost = [self._start_map(0)], 0
@@ -265,7 +268,8 @@ class _MapTracker:
         return poses, self._fits & ~self._excluded
 
     def _place(self, k: int, before: ScanPose, scale: float) -> ScanPose:
-        """Pose of scan k, given that of the scan before. A scan that does not fit gets the predicted pose."""
+        """Pose of scan k, given the pose `before` of the previous scan. A scan that does not fit gets the predicted
+        pose."""
         scan, known = self._scans[k], self._known
         step = scan.middle - self._scans[k - 1].middle
         rotation, translation = (None if x is None else x[k] for x in (known.rotation, known.translation))
@@ -276,7 +280,8 @@ class _MapTracker:
         return pose if self._fits[k] else predicted_pose(prediction)
 
     def _start_map(self, k: int) -> ScanPose:
-        """Starts a new map from scan k. Its rate and velocity are estimated by registering scan k + 1 to it."""
+        """Starts a new map from scan k, and returns its pose. Its twist is estimated by registering scan k + 1 to
+        it."""
         still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         pose = still
         for _ in range(FIRST_TWIST_ROUNDS):
@@ -291,12 +296,12 @@ class _MapTracker:
         insert(self._voxels, pose, self._scans[k].xyz, self._scans[k].tau, k, decay)
 
     def _may_restart(self, k: int) -> bool:
-        """Whether a new map may start at scan k: there is a scan after it, and a single map has few scans yet."""
+        """True if a new map may start at scan k: a scan follows it, and a single map still has few valid scans."""
         n_valid = np.count_nonzero((self._fits & ~self._excluded)[:k])
         return k + 1 < len(self._scans) and not (self._single_map and n_valid > MIN_MAP_SCANS)
 
     def _exclude_before(self, k: int, lost: int) -> None:
-        """Excludes the scans of a map that is given up, or those too soon after its last good one."""
+        """Excludes the scans of a discarded single map; with several maps, scans too soon after the last good one."""
         if self._single_map:
             self._excluded[:k] = True
         else:

@@ -1,4 +1,4 @@
-"""Compiled registration of a scan to a map of planar voxels, near the pose predicted from the scan before."""
+"""Compiled registration of a scan to a map of planar voxels, near the pose predicted from the previous scan."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ MAX_REGISTRATION_ROUNDS = 14  # Gauss-Newton steps of a scan
 NEIGHBOUR_ROUNDS = 4  # first steps, which also search the neighbours of a voxel
 FIRST_SCALE = 0.5  # scale of the robust weights in the first step, in edges of a voxel
 CONVERGED_STEP = 1e-4  # rad, m: a smaller step ends the registration
-POINT_SIGMA_M = 0.1  # of a point, as against the prediction: larger than its noise, as points of a plane err together
-# Without the gyroscope: how much a motion changes between scans (rad/s^2, m/s^2), and by how much a step departs from
-# the mean of the rates around it (rad, m), as of a LiDAR carried by hand.
+POINT_SIGMA_M = 0.1  # sigma of a point relative to the prediction; above its noise, as errors of points are correlated
+# Without gyroscope, for a handheld LiDAR: standard deviations of accelerations (rad/s^2, m/s^2), and of the difference
+# between a step and the mean of the rates before and after it (rad, m).
 ANGULAR_ACCELERATION_SIGMA, ACCELERATION_SIGMA = 6.0, 5.0
 STEP_ROTATION_SIGMA, STEP_POSITION_SIGMA = 0.02, 0.02
-# With the gyroscope: errors of its bias (rad/s), and of its rotation between scans (rad).
+# With gyroscope: standard deviations of its bias (rad/s), and of its rotation between scans (rad).
 GYRO_RATE_SIGMA, GYRO_ROTATION_SIGMA = 0.01, 0.004
-KNOWN_TRANSLATION_SIGMA = 0.03  # m between scans: a lever arm that is still unknown, times the rotation
+KNOWN_TRANSLATION_SIGMA = 0.03  # m between scans: rotation times the lever arm, which is not yet known
 
 
 class PosePrediction(NamedTuple):
-    """Prediction of a pose from that `before`, `step` seconds earlier. rotation R_before_scan (3, 3), if known;
-    translation (3,): from the scan before to this one, in axes of the one before [m], if known."""
+    """Prediction of a pose from the pose `before`, `step` seconds earlier. rotation: R_before_scan (3, 3), if known;
+    translation (3,): from the previous scan to this one, in axes of the previous one [m], if known."""
 
     before: ScanPose
     step: float
@@ -53,7 +53,7 @@ class PosePrediction(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _displacement(prediction):
-    """(3,) predicted translation since the scan before, in axes of the map [m]."""
+    """(3,) predicted translation since the previous scan, in axes of the map [m]."""
     before, translation = prediction.before, prediction.translation
     out = np.empty(3)
     for i in range(3):
@@ -65,7 +65,7 @@ def _displacement(prediction):
 
 @njit(cache=True, nogil=True)
 def predicted_pose(prediction):
-    """The predicted pose and twist, by constant rates as far as nothing else is known."""
+    """The predicted pose and twist. Rotation and translation that are not known follow from a constant twist."""
     b, h, d = prediction.before, prediction.step, _displacement(prediction)
     turn, position, rate, velocity = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):  # in loops: array expressions take seconds to compile
@@ -77,8 +77,8 @@ def predicted_pose(prediction):
 
 @njit(cache=True, nogil=True)
 def _add_row(i, r, sigma, J_rate, H, g):
-    """Adds a prediction of unknown i to the normal equations: residual r with standard deviation sigma, derivative 1 by
-    the unknown and -J_rate by its rate, unknown i + 6."""
+    """Adds a prediction of unknown i to the normal equations H (12, 12), g (12,). The residual r has the standard
+    deviation sigma, the derivative 1 by unknown i, and -J_rate by the rate of it, unknown i + 6."""
     w, j = (POINT_SIGMA_M / sigma) ** 2, i + 6
     H[i, i] += w
     g[i] += w * r
@@ -93,8 +93,8 @@ def _add_row(i, r, sigma, J_rate, H, g):
 def add_prediction(prediction, pose, H, g):
     """Adds the prediction of `pose` to the normal equations H (12, 12), g (12,), in units of POINT_SIGMA_M.
 
-    Known rotations and translations are predicted directly. Unknown ones follow the mean of the rates before and after,
-    and these rates change little.
+    Known rotations and translations are predicted directly. Unknown ones are predicted from the mean of the rates
+    before and after; rates are predicted to be constant.
     """
     b, h, d = prediction.before, prediction.step, _displacement(prediction)
     R = mul3(b.rotation, prediction.rotation) if prediction.knows_rotation else b.rotation
@@ -119,8 +119,8 @@ def add_prediction(prediction, pose, H, g):
 def register(voxels, xyz, tau, n_neighbour, prediction, final_scale):
     """Pose of a scan in the map (Gauss-Newton, point to plane), and its number of points near planes of the map.
 
-    xyz (n, 3) [m] at tau (n,) [s] from the middle of the scan; the first n_neighbour of them are used in the steps that
-    search neighbours. Scales of the robust weights fall from FIRST_SCALE to final_scale, in edges of a voxel.
+    xyz (n, 3) [m] at tau (n,) [s] from the middle of the scan; steps that search neighbours use the first n_neighbour
+    points only. The scale of the robust weights falls from FIRST_SCALE to final_scale, in edges of a voxel.
     """
     pose, near = predicted_pose(prediction), 0
     H, g = np.empty((N_SCAN_UNKNOWNS, N_SCAN_UNKNOWNS)), np.empty(N_SCAN_UNKNOWNS)

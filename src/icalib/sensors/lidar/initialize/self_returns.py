@@ -1,9 +1,9 @@
-"""Self-returns: points of a LiDAR on the robot that carries it. They would form planes that move along with it.
+"""Removal of self-returns: points of a LiDAR on the robot that carries it. They would form planes that move with it.
 
-Self-returns occupy the same voxels in the frame of the LiDAR while it moves. So do points of a floor that a robot
-drives on, or of the walls of a corridor. The LiDAR sees those places of the world from a distance as well, before it
-arrives or after it has left. Where the robot was, it sees nothing else. The trajectory comes from odometry without
-these points.
+Self-returns occupy the same voxels in the frame of the LiDAR while it moves. Points on the floor below the robot, or on
+the walls of a corridor, may do so as well. The LiDAR sees such places of the world also from a distance, before it
+arrives or after it has left. It never sees a surface from a distance at the places where the robot was. The trajectory
+for this comparison comes from odometry without the points in question.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from icalib.geometry import so3
 from icalib.initialize.trajectories.sensor_trajectory import SensorTrajectory
 from icalib.sensors.lidar.initialize.odometry import MAX_MAPPED_POINTS, lidar_trajectory, sampled_scans
 
-ROBOT_RADIUS_M = 2.5  # a robot does not extend further from its LiDAR
+ROBOT_RADIUS_M = 2.5  # the robot is assumed not to extend further from its LiDAR
 ROBOT_VOXEL_M = 0.1  # edge of the voxels in the frame of the LiDAR
 N_VOXELS_SIDE = int(2 * ROBOT_RADIUS_M / ROBOT_VOXEL_M)
-N_ROBOT_VOXELS = (N_VOXELS_SIDE + 2) ** 3  # with a margin of one voxel
-SCANS_PER_GROUP = 3  # so that each voxel of the robot has a point in most groups
+N_ROBOT_VOXELS = (N_VOXELS_SIDE + 2) ** 3  # including a margin of one voxel on each side
+SCANS_PER_GROUP = 3  # enough for a point of most groups in each voxel of the robot
 MAX_SEARCHED_SCANS = 600  # one minute at 10 Hz
 MAX_GROUPS, MIN_GROUPS = 200, 10
-MIN_OCCUPIED_SHARE = 0.8  # of the groups have a point in a voxel of the robot
-MIN_STEP_M, MIN_STEP_RAD = 0.2, 0.2  # of the LiDAR between groups: a LiDAR at rest sees all voxels occupied
-WORLD_VOXEL_M = 0.2  # edge of the voxels in the world: twice the other edge, as odometry errs by centimetres
-MIN_SEEN_FROM_FAR = 0.5  # of the world places of a voxel; it then belongs to the scene, not to the robot
-MAX_FAR_POINTS = 1_000_000  # compared with these places: bounds the memory
+MIN_OCCUPIED_SHARE = 0.8  # share of the groups with a point in a voxel of the robot
+MIN_STEP_M, MIN_STEP_RAD = 0.2, 0.2  # motion of the LiDAR between groups; at rest all voxels seem occupied
+WORLD_VOXEL_M = 0.2  # edge of the voxels in the world; twice ROBOT_VOXEL_M, as odometry errs by centimetres
+MIN_SEEN_FROM_FAR = 0.5  # share of the world places of a voxel; a larger one means scene, not robot
+MAX_FAR_POINTS = 1_000_000  # far points that are compared with these places; bounds the memory
 MIN_SELF_RETURN_SHARE = 1e-3  # of all points; fewer are rejected by the robust loss
-MAX_MEAN_DIRECTION = 0.3  # length of the mean of unit directions; a shorter mean is `on all sides`
+MAX_MEAN_DIRECTION = 0.3  # length of the mean of unit directions; directions with a shorter mean are "on all sides"
 
 
 def without_self_returns(recording: Measurements) -> Measurements:
@@ -48,7 +48,7 @@ def without_self_returns(recording: Measurements) -> Measurements:
 
 
 def self_returns_of(stream: LidarStream) -> np.ndarray | None:
-    """(N,) whether each point is a self-return; None if there are none, or too few to do harm."""
+    """(N,) bool: the point is a self-return; None if there are none, or too few to do harm."""
     middle = _middle_scans(stream)
     near = _NearPoints.of(middle)
     robot = _robot_voxels(middle, near)
@@ -72,7 +72,7 @@ def _middle_scans(stream: LidarStream) -> LidarStream:
 
 
 def _robot_voxels(stream: LidarStream, near: _NearPoints) -> np.ndarray | None:
-    """(N_ROBOT_VOXELS,) whether a voxel belongs to the robot; None if none does, or the LiDAR moved too little."""
+    """(N_ROBOT_VOXELS,) bool: the voxel belongs to the robot; None if none does, or if the LiDAR moved too little."""
     occupied = near.occupied(np.arange(near.groups))
     at = near.point[occupied[near.voxel]]
     if len(at) < MIN_SELF_RETURN_SHARE * len(stream.xyz):
@@ -89,8 +89,8 @@ def _robot_voxels(stream: LidarStream, near: _NearPoints) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class _NearPoints:
-    """Points within ROBOT_RADIUS_M. point (n,): number of each, increasing; voxel (n,): in the frame of the LiDAR;
-    group (n,): group of scans of each, -1: none; first (G,): first scan of each group."""
+    """Points within ROBOT_RADIUS_M of the LiDAR. point (n,): index of each in the stream, increasing; voxel (n,): its
+    voxel in the frame of the LiDAR; group (n,): its group of scans, -1: none; first (G,): first scan of each group."""
 
     point: np.ndarray
     voxel: np.ndarray
@@ -117,7 +117,7 @@ class _NearPoints:
         return cls(point, voxel, group, first)
 
     def occupied(self, groups: np.ndarray) -> np.ndarray:
-        """(N_ROBOT_VOXELS,) whether most of `groups` (g,) have a point in each voxel."""
+        """(N_ROBOT_VOXELS,) bool: most of `groups` (g,) have a point in the voxel."""
         number = np.full(self.groups + 1, -1)
         number[groups] = np.arange(len(groups))
         own = number[self.group]
@@ -146,7 +146,7 @@ def _scan_of(trajectory: SensorTrajectory, stream: LidarStream, scan: np.ndarray
 
 
 def _moving_groups(trajectory: SensorTrajectory, at: np.ndarray) -> np.ndarray:
-    """Groups between which the LiDAR moved, of those at scans `at` (n,) of the trajectory."""
+    """Groups (g,) between which the LiDAR moved; at (n,): scan of the trajectory for each group."""
     chosen: list[int] = []
     for group, k in enumerate(at):
         if not trajectory.ok[k]:
@@ -163,8 +163,8 @@ def _moving_groups(trajectory: SensorTrajectory, at: np.ndarray) -> np.ndarray:
 def _seen_from_far(
     stream: LidarStream, trajectory: SensorTrajectory, near: _NearPoints, groups: np.ndarray, occupied: np.ndarray
 ) -> np.ndarray:
-    """(N_ROBOT_VOXELS,) whether the LiDAR sees, from beyond ROBOT_RADIUS_M at another time, most places of the world
-    that an occupied voxel passed in `groups` (g,)."""
+    """(N_ROBOT_VOXELS,) bool: most places of the world that an occupied voxel passed in `groups` (g,) are also seen by
+    the LiDAR from beyond ROBOT_RADIUS_M."""
     own = np.isin(near.group, groups) & occupied[near.voxel]
     far = np.flatnonzero(np.einsum("na,na->n", stream.xyz, stream.xyz) > np.float32(ROBOT_RADIUS_M) ** 2)
     far = far[:: -(-len(far) // MAX_FAR_POINTS) | 1]
@@ -174,7 +174,7 @@ def _seen_from_far(
 
 
 def _world_voxels(stream: LidarStream, trajectory: SensorTrajectory, point: np.ndarray) -> np.ndarray:
-    """(n,) voxel of the world of each point (n,); -1 if the pose of its scan is not valid."""
+    """(n,) world voxel of each point with index point (n,); -1 if the pose of its scan is not valid."""
     k = _scan_of(trajectory, stream, np.searchsorted(stream.start, point, side="right") - 1)
     world = np.einsum("nab,nb->na", trajectory.rotation[k], stream.xyz[point]) + trajectory.position[k]
     i, j, k3 = np.floor(world / WORLD_VOXEL_M).astype(np.int64).T

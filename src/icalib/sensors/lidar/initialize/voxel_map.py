@@ -1,6 +1,6 @@
-"""Compiled parts of LiDAR odometry: a map of planar voxels, and distances of a scan from it.
+"""Compiled map of planar voxels for LiDAR odometry, and point-to-plane distances of a scan from the map.
 
-A point x, taken tau seconds after the middle of its scan, is at y = R Exp(w tau) x + p + v tau in the map. The pose
+A point x, measured tau seconds after the middle of its scan, is at y = R Exp(w tau) x + p + v tau in the map. The pose
 (R, p) is that of the middle, w is the angular rate in axes of the LiDAR, and v the velocity in axes of the map. The
 distance r from the plane of the voxel at y has the differential
 
@@ -20,23 +20,23 @@ from icalib.geometry import so3
 from icalib.geometry.small import eigen3, mul3
 
 N_SCAN_UNKNOWNS = 12  # rotation, position, angular rate, velocity
-N_PRODUCTS = 27  # of a point: upper triangle of products of its 6 derivatives by the pose and its distance, without r^2
-N_VOXEL_MOMENTS = 9  # x; y; z; xx; yx, yy; zx, zy, zz about the centre of the cube
-MIN_VOXEL_POINTS = 6  # weight of a planar voxel: a plane has 3 unknowns
+N_PRODUCTS = 27  # per point: upper triangle of the products of its 6 pose derivatives and its distance r, without r^2
+N_VOXEL_MOMENTS = 9  # sums of x; y; z; xx; yx, yy; zx, zy, zz about the centre of the cube
+MIN_VOXEL_POINTS = 6  # least weight of a planar voxel; a plane has 3 unknowns
 # Standard deviations of the points of a planar voxel, as shares of its edge (a uniformly filled one has 0.29):
-MIN_PLANE_WIDTH = 0.06  # along the narrower direction in the plane; narrower points are a line
+MIN_PLANE_WIDTH = 0.06  # along the narrower direction in the plane; narrower points form a line
 MAX_PLANE_THICKNESS = 0.15  # along the normal
-NEAR_PLANE = 0.2  # of the edge: a point nearer to a plane of the map counts as matching
-MAX_VOXEL_INDEX = 1 << 20  # voxels from the origin along an axis: three indices fit 64 bits
+NEAR_PLANE = 0.2  # share of the edge; a point nearer to a plane of the map counts as near
+MAX_VOXEL_INDEX = 1 << 20  # limit of the voxel index along an axis, so that three indices fit 64 bits
 
 
 class VoxelMap(NamedTuple):
-    """A hash table of cubic voxels with edge `edge_m`, by linear probing. key (H,): of each voxel, -1 if empty; row
-    (H,): of each voxel in the arrays below; size (1,): number of voxels in use.
+    """A hash table of cubic voxels with edge `edge_m`, by linear probing. key (H,): key of the voxel in each slot, -1
+    if empty; row (H,): row of this voxel in the arrays below; size (1,): number of voxels in use.
 
-    Of each voxel: middle (V, 3) of the cube [m]; weight (V,): decayed number of points; moments (V, 9) about middle,
-    see N_VOXEL_MOMENTS; last_scan (V,): number of the last scan that added a point; centre, normal (V, 3) of the
-    points; flat (V,): whether the points are planar.
+    For each voxel: middle (V, 3): centre of the cube [m]; weight (V,): decayed number of points; moments (V, 9):
+    decayed moments about middle, see N_VOXEL_MOMENTS; last_scan (V,): number of the last scan that added a point;
+    centre (V, 3) [m], normal (V, 3): mean and plane normal of the points; flat (V,) bool: the points are planar.
     """
 
     edge_m: float
@@ -92,8 +92,8 @@ def _index(x, voxels):
 
 @njit(cache=True, nogil=True)
 def _slot(key, i, j, k):
-    """Slot of voxel (i, j, k) in the hash table, or the empty slot where it belongs; and its key. Voxels above one
-    another are neighbours in the table, as searches visit them together."""
+    """Slot of voxel (i, j, k) in the hash table, or the empty slot for it; and its key. Voxels that differ in k only
+    are neighbours in the table, as searches visit them together."""
     column = ((i + MAX_VOXEL_INDEX) << 21) + (j + MAX_VOXEL_INDEX)
     own, mask = (column << 21) + (k + MAX_VOXEL_INDEX), len(key) - 1
     s = (((column * 0x9E3779B97F4A7C1) >> 20) + k) & mask
@@ -104,7 +104,7 @@ def _slot(key, i, j, k):
 
 @njit(cache=True, nogil=True)
 def place_point(pose, x, y, z, tau, out):
-    """out (6,): the point (x, y, z) in the map, then Exp(w tau) (x, y, z)."""
+    """Fills out (6,): the point (x, y, z) in the map [m], then Exp(w tau) (x, y, z)."""
     w = pose.rate
     a, b, c = w[0] * tau, w[1] * tau, w[2] * tau
     # Exp to second order: a scan turns by less than 0.5 rad to either side of its middle.
@@ -119,8 +119,8 @@ def place_point(pose, x, y, z, tau, out):
 
 @njit(cache=True, nogil=True)
 def insert(voxels, pose, xyz, tau, scan, decay):
-    """Adds points xyz (n, 3) [m] at tau (n,) [s] of scan number `scan`, seen from `pose`. Older points of a voxel decay
-    by the factor `decay` per scan."""
+    """Adds points xyz (n, 3) [m], at tau (n,) [s] from the middle of scan number `scan`, with the LiDAR at `pose`. The
+    weights of older points decay by the factor `decay` per scan."""
     y, touched, n_touched = np.empty(6), np.empty(len(xyz), np.int64), 0
     for n in range(len(xyz)):
         place_point(pose, xyz[n, 0], xyz[n, 1], xyz[n, 2], tau[n], y)
@@ -198,8 +198,8 @@ def _planar_voxel_at(voxels, y, around):
 
 @njit(cache=True, nogil=True, inline="always")
 def _fill_jacobian(R, normal, y, J):
-    """First 6 entries of J, out: derivatives of a distance by rotation and position. n . (-R [z]x d) = d . (z x R^T n)
-    with z = y[3:]."""
+    """Fills the first 6 entries of J: derivatives of a distance by rotation and position. n . (-R [z]x d) = d . (z x
+    R^T n) with z = y[3:]."""
     b0 = R[0, 0] * normal[0] + R[1, 0] * normal[1] + R[2, 0] * normal[2]
     b1 = R[0, 1] * normal[0] + R[1, 1] * normal[1] + R[2, 1] * normal[2]
     b2 = R[0, 2] * normal[0] + R[1, 2] * normal[1] + R[2, 2] * normal[2]
@@ -210,7 +210,7 @@ def _fill_jacobian(R, normal, y, J):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_products(product, tau, by_0, by_1, by_2):
-    """Adds the products of a point to the sums by 1, tau and tau^2. A loop of its own, so that it is vectorised."""
+    """Adds the products of a point times 1, tau and tau^2 to three sums. A separate loop, so that it is vectorised."""
     for k in range(N_PRODUCTS):
         by_0[k] += product[k]
         by_1[k] += tau * product[k]
@@ -220,9 +220,10 @@ def _add_products(product, tau, by_0, by_1, by_2):
 @njit(cache=True, nogil=True)
 def accumulate_scan(voxels, pose, xyz, tau, around, scale, H, g):
     """Fills the normal equations H (12, 12), g (12,) of the distances [m] of points xyz (n, 3) from the map, with the
-    weights of Geman and McClure. around: see `_planar_voxel_at`. Returns numbers of points: with a plane, near it."""
+    weights of Geman and McClure. around: see `_planar_voxel_at`. Returns the numbers of points with a plane, and of
+    those near their plane."""
     y, J, matched, near = np.empty(6), np.empty(7), 0, 0
-    # Derivatives by rates are tau times those by the pose, so that sums of products by 1, tau and tau^2 are enough.
+    # Derivatives by rates are tau times those by the pose, so that sums of products times 1, tau and tau^2 are enough.
     product, by_0, by_1, by_2 = np.empty(N_PRODUCTS), np.zeros(N_PRODUCTS), np.zeros(N_PRODUCTS), np.zeros(N_PRODUCTS)
     for n in range(len(xyz)):
         place_point(pose, xyz[n, 0], xyz[n, 1], xyz[n, 2], tau[n], y)
@@ -257,8 +258,8 @@ def accumulate_scan(voxels, pose, xyz, tau, around, scale, H, g):
 
 @njit(cache=True, nogil=True)
 def pick_points(xyz, offset, chosen, middle, nearest, points, tau):
-    """Fills points (n, 3) [m] and tau (n,), seconds from `middle`, with those of the points `chosen` (n,) that are
-    finite and further than `nearest` [m]. Returns their number."""
+    """Fills points (n, 3) [m] and tau (n,), their times since `middle` [s]. Points with indices `chosen` (n,) that are
+    not finite, or not further away than `nearest` [m], are skipped. Returns the number of points filled."""
     count = 0
     for i in chosen:
         x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
@@ -272,7 +273,7 @@ def pick_points(xyz, offset, chosen, middle, nearest, points, tau):
 
 @njit(cache=True, nogil=True)
 def rotate_points(xyz, which, rotations):
-    """Rotates points xyz (n, 3) in place, each by rotations[which[n]]."""
+    """Rotates points xyz (n, 3) in place; point n is rotated by rotations[which[n]]."""
     for n in range(len(xyz)):
         R, x, y, z = rotations[which[n]], xyz[n, 0], xyz[n, 1], xyz[n, 2]
         for a in range(3):
@@ -281,7 +282,7 @@ def rotate_points(xyz, which, rotations):
 
 @njit(cache=True, nogil=True)
 def corrected_pose(pose, d):
-    """The pose corrected by d (12,): rotation, position, angular rate, velocity."""
+    """The pose and twist corrected by d (12,): rotation, position, angular rate, velocity."""
     position, rate, velocity = np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         position[i], rate[i] = pose.position[i] + d[3 + i], pose.rate[i] + d[6 + i]

@@ -1,4 +1,4 @@
-"""Scans of a LiDAR: arrays in a file, topics of point clouds -> a checked stream."""
+"""Reads scans of a LiDAR from arrays in a file, or from topics of point clouds, into a checked stream."""
 
 from __future__ import annotations
 
@@ -43,18 +43,19 @@ TABLES = (TableFile("scans.npz", "scans", "points", _stamps),)
 
 
 def read(recording: Recording, sensors: Sequence[Lidar], reading: Reading) -> list[ReadStream]:
-    """The checked streams, and notes. Raises RecordingError as `scans` and `checked_lidar`."""
+    """The checked stream of each LiDAR, with notes for the user. Raises RecordingError as `scans` and
+    `checked_lidar`."""
     found = []
     for sensor in sensors:
         where = recording.where(sensor)
-        # Checked before it is cut, as a single wrong stamp is no jump of the clock.
+        # Checked before the cut, which would take a single wrong stamp for a jump of the clock.
         stream, notes = checked_lidar(scans(recording, sensor), where)
         found.append((reading.cut(stream, f"{where} ({sensor.name})"), notes))
     return found
 
 
 def scans(recording: Recording, sensor: Lidar) -> LidarStream:
-    """All scans without unusable points, which the recording notes; a scan may have no point.
+    """All scans without unusable points, on which the recording gets a note. A scan may be empty.
 
     Raises RecordingError naming file or topic if the data are missing or cannot be read, or point times are unknown.
     """
@@ -74,7 +75,7 @@ def scans(recording: Recording, sensor: Lidar) -> LidarStream:
 
 
 def where(recording: Recording, sensor: Lidar) -> str:
-    """File or topic of the scans, for sentences."""
+    """File or topic of the scans, as text for messages."""
     if recording.has_messages:
         return recording.place(_topic(recording, sensor))
     return str(recording.table(sensor, sensor.path))

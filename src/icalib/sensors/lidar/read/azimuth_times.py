@@ -8,22 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 _TURN = 2.0 * np.pi
-_MIN_TURNS = 0.5  # turns of a scan; a LiDAR with fewer oscillates, or has no order of azimuth
-_MIN_TURNS_BY_ROWS = 1.5  # turns of the points of a scan; with more, whole rings follow one another
-_SEAM_TURNS = 0.25  # of a turn: points so near the first column may belong to either end of the scan
+_MIN_TURNS = 0.5  # turns per scan; a LiDAR with fewer oscillates, or its points are not in order of azimuth
+_MIN_TURNS_BY_ROWS = 1.5  # turns per scan; with more, the message contains one ring after another
+_SEAM_TURNS = 0.25  # points that near to the first column may belong to either end of the scan
 
 
 @dataclass(frozen=True)
 class SweepOrder:
-    """Order of points in a scan. direction: 1 counterclockwise seen from above, -1 clockwise. by_rows: whole rings
-    follow one another in the message; else columns."""
+    """Order of points in a scan. direction: 1 counterclockwise seen from above, -1 clockwise. by_rows: the message
+    contains one ring after another; otherwise one column after another."""
 
     direction: int
     by_rows: bool
 
 
 def find_sweep(scans: Sequence[np.ndarray]) -> SweepOrder | None:
-    """Order of the points (N, 3) of some scans in messages; None if the LiDAR does not spin."""
+    """Order of points, found from the points (N, 3) of some scans in message order; None if the LiDAR does not spin."""
     turned = np.array([_turned(xyz) for xyz in scans])
     middle = float(np.median(turned))
     if abs(middle) < _MIN_TURNS:
@@ -32,8 +32,8 @@ def find_sweep(scans: Sequence[np.ndarray]) -> SweepOrder | None:
 
 
 def sweep_share(sweep: SweepOrder, xyz: np.ndarray, height: int) -> np.ndarray:
-    """(N,) instant of each point (N, 3), as a share of the turn since the first column; NaN for points that are zero or
-    not finite. height: rows of an organised message.
+    """(N,) time of each point (N, 3) since the first column, as a share of a turn; NaN for points that are zero or not
+    finite. height: number of rows of an organised message.
 
     Lasers of a column have slightly different azimuths. A point near the first column may thus belong to the beginning
     or the end of the scan; its position in the message decides.
@@ -62,7 +62,7 @@ def _usable(xyz: np.ndarray) -> np.ndarray:
 
 
 def _turned(xyz: np.ndarray) -> float:
-    """Number of turns of successive points (N, 3), positive counterclockwise."""
+    """Number of turns over the successive points (N, 3), positive counterclockwise."""
     used = xyz[_usable(xyz)]
     step = np.diff(np.arctan2(used[:, 1], used[:, 0], dtype=np.float64))
     return float((np.mod(step + np.pi, _TURN) - np.pi).sum() / _TURN)

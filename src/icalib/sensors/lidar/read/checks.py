@@ -10,13 +10,13 @@ from icalib.errors import RecordingError
 from icalib.sensors.lidar.read.scan_order import at_even_steps, in_order, selected, without_repeats
 
 _SCAN_RATE_HZ = (0.1, 1000.0)  # lowest and highest plausible rate
-_MAX_POINT_PERIODS = 2.0  # from the stamp of a scan to its points, in scan periods
-_MAX_FAR_SHARE = 0.1  # of the scans; if more have points farther off, the unit or origin of point times is wrong
+_MAX_POINT_PERIODS = 2.0  # time from the stamp of a scan to its points, in scan periods
+_MAX_FAR_SHARE = 0.1  # of the scans; if more exceed _MAX_POINT_PERIODS, unit or origin of point times is wrong
 _POINTS_PER_BATCH = 1_000_000  # bounds the memory
 
 
 class Sieve:
-    """Selects points from min_range_m to max_range_m, and counts the others by reason."""
+    """Selects finite points with a time, from min_range_m to max_range_m, and counts all other points by reason."""
 
     def __init__(self, min_range_m: float, max_range_m: float) -> None:
         self._near_m, self._far_m = min_range_m, max_range_m
@@ -24,8 +24,8 @@ class Sieve:
         self._dropped = np.zeros(5, np.int64)
 
     def keep(self, xyz: np.ndarray, offset_s: np.ndarray) -> np.ndarray:
-        """(N,) bool, whether each point xyz (N, 3) [m] can be used. offset_s (N,): its time, NaN if it has none."""
-        with np.errstate(over="ignore", invalid="ignore"):  # 1e28 m is as far as infinity
+        """(N,) bool: the point xyz (N, 3) [m] can be used. offset_s (N,): its time, NaN if it has none."""
+        with np.errstate(over="ignore", invalid="ignore"):  # squares of huge values overflow to infinity
             r2 = np.einsum("ij,ij->i", xyz, xyz)
         near, far = r2 < np.float32(self._near_m) ** 2, r2 > np.float32(self._far_m) ** 2
         good, timed = np.isfinite(r2), np.isfinite(offset_s)
@@ -53,8 +53,8 @@ class Sieve:
 
 
 def sifted(stream: LidarStream, sieve: Sieve) -> LidarStream:
-    """The stream with the points that the sieve keeps; a scan may lose all. Reuses the arrays of `stream`, which are
-    invalid afterwards: a second cloud may not fit in memory."""
+    """The stream with the points that the sieve keeps; a scan may become empty. Reuses the arrays of `stream`, which
+    are invalid afterwards, as a second cloud may not fit in memory."""
     n = len(stream.xyz)
     columns = (stream.offset_s, stream.xyz, stream.plane)
     keep = np.empty(n, bool)
@@ -71,10 +71,10 @@ def sifted(stream: LidarStream, sieve: Sieve) -> LidarStream:
 
 
 def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """`stream` without scans that have no points, repeat one shortly before, or have a wrong stamp, and notes on these.
+    """`stream` without scans that are empty, repeat a recent scan, or have a wrong stamp; and notes on these.
 
-    Raises RecordingError naming `where` and the instant: fewer than two scans with points, stamps that were set back,
-    at an impossible rate, or points far from their scan's stamp.
+    Raises RecordingError naming `where` and the instant: fewer than two scans with points, a clock that was set back,
+    an implausible rate, or points far from the stamp of their scan.
     """
     what = f"{where} ({stream.name})"
     filled = np.diff(stream.start) > 0
@@ -103,8 +103,8 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
 
 
 def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """The stream without scans whose points are far from their stamp, and a note. Raises RecordingError if these are
-    many."""
+    """The stream without scans whose points are far in time from the stamp, and a note. Raises RecordingError if there
+    are many such scans."""
     period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
     low, high = (extreme.reduceat(stream.offset_s, stream.start[:-1]) for extreme in (np.minimum, np.maximum))
     far = np.maximum(-low, high) > _MAX_POINT_PERIODS * period_s

@@ -1,6 +1,6 @@
-"""Livox's own message of points: CustomMsg of livox_ros_driver, livox_ros_driver2 and livox_ros2_driver.
+"""Parser of the point message of Livox: CustomMsg of livox_ros_driver, livox_ros_driver2 and livox_ros2_driver.
 
-ROS does not define it:
+Its definition, which ROS does not include:
 
 Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd; CustomPoint[] points
 CustomPoint: uint32 offset_time [ns]; float32 x, y, z [m]; uint8 reflectivity, tag, line
@@ -15,7 +15,7 @@ import numpy as np
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg", "livox_interfaces/msg/CustomMsg")
 _POINT_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
-_POINT_BYTES = 19  # in CDR padded to a multiple of 4
+_POINT_BYTES = 19  # size of a point; in CDR padded to a multiple of 4
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,14 @@ class Header:
 
 @dataclass(frozen=True)
 class LivoxCloud:
-    """A CustomMsg. points (N,): structured, with the fields of the message."""
+    """A CustomMsg. points (N,): structured array with the fields of CustomPoint."""
 
     header: Header
     points: np.ndarray
 
 
 def parse_ros1(content: bytes) -> LivoxCloud:
-    """The message in ROS 1 serialisation. Raises ValueError or struct.error where the bytes are not such a message."""
+    """Parses a message in ROS 1 serialisation. Raises ValueError or struct.error if the bytes are no such message."""
     _, sec, nanosec, length = struct.unpack_from("<4I", content)
     at = 16 + length
     header = Header(Stamp(sec, nanosec), content[16:at].decode("utf-8", "replace"))
@@ -51,7 +51,7 @@ def parse_ros1(content: bytes) -> LivoxCloud:
 
 
 def parse_cdr(content: bytes) -> LivoxCloud:
-    """The message in CDR (ROS 2). Raises ValueError or struct.error where the bytes are not such a message."""
+    """Parses a message in CDR (ROS 2). Raises ValueError or struct.error if the bytes are no such message."""
     body = content[4:]  # alignment counts from here
     order = "<" if content[1:2] == b"\x01" else ">"
     sec, nanosec, length = struct.unpack_from(order + "iII", body)
@@ -61,7 +61,7 @@ def parse_cdr(content: bytes) -> LivoxCloud:
 
 
 def _points(content: bytes, at: int, order: str, step: int) -> np.ndarray:
-    """The points, whose number is at byte `at`, each `step` bytes after the one before."""
+    """Points (N,), structured. N is stored at byte `at`; the points follow, `step` bytes each. order: byte order."""
     (count,) = struct.unpack_from(order + "I", content, at)
     size = step * count - (step - _POINT_BYTES) * (count > 0)
     data = content[at + 4 : at + 4 + size]

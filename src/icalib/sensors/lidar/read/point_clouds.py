@@ -1,4 +1,4 @@
-"""Clouds of points, message by message -> the stream of a LiDAR."""
+"""Converts point cloud messages to the stream of a LiDAR."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from icalib.sensors.lidar.read.checks import Sieve
 from icalib.sensors.lidar.read.livox import LivoxCloud
 from icalib.sensors.lidar.read.point_times import PointTimes, clock_note, find_point_times, likely_fields
 
-_N_TIMING_CLOUDS = 8  # first clouds with points, which show the times of points
+_N_TIMING_CLOUDS = 8  # first clouds with points, from which field and unit of point times are found
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """A message of points (N,), structured, with the fields of the message (x, y, z [m], ...) in its order. height:
-    rows of the message, one after another."""
+    """A message with points (N,): a structured array with the fields of the message (x, y, z [m], ...), in message
+    order. height: number of rows of the message."""
 
     stamp_ns: int
     frame: str
@@ -35,21 +35,21 @@ class PointCloud:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Names of fields with a single number for each point."""
+        """Names of the fields with a single number per point."""
         kind = self.points.dtype
         return tuple(name for name in kind.names or () if not kind[name].shape)
 
 
 Timing = Callable[
     [PointCloud, np.ndarray], tuple[int, np.ndarray]
-]  # cloud, points -> stamp [ns], times from it [s, or turns]
+]  # (cloud, points (N, 3)) -> stamp [ns], times (N,) since it [s, or turns for azimuth]
 
 
 def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """All points of `clouds` that can be used, and notes on the others and on how they are timed; a cloud may have
-    none. `what` names the topic in sentences.
+    """The stream of all usable points of `clouds`, and notes on rejected points and on point times. A scan may be
+    empty. what: name of the topic in messages.
 
-    Raises RecordingError: fewer than two clouds with points, no coordinates, points whose times are not known.
+    Raises RecordingError if fewer than two clouds have points, or if points have no coordinates or no known times.
     """
     ahead = _first_clouds(clouds, what)
     alike, fields = _with_usual_fields(ahead)
@@ -63,7 +63,7 @@ def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[
             others.append(cloud.stamp_ns)
             continue
         stamp_ns, xyz, offset = cloud.stamp_ns, np.empty((0, 3), np.float32), np.empty(0, np.float32)
-        if len(cloud.points):  # one without points may have no fields either
+        if len(cloud.points):  # a cloud without points may have no fields
             xyz = coordinates(cloud, what)
             stamp_ns, offset = timing(cloud, xyz)
         keep = sieve.keep(xyz, offset)
@@ -83,10 +83,10 @@ def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[
 
 
 def timing_fields(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[str | None, TimeUnit | None]:
-    """point_time_field and point_time_unit that the rig file should give of a LiDAR with these clouds, of which the
-    first are read; None of what the data tell.
+    """point_time_field and point_time_unit that the rig file must give for a LiDAR with these clouds; each None if it
+    is detected from the data. Only the first clouds are read.
 
-    Raises RecordingError as `read_clouds`, where no field will do.
+    Raises RecordingError as `read_clouds` if no field can be the time.
     """
     ahead, _ = _with_usual_fields(_first_clouds(clouds, what))
     stamps_ns, scans = _stamps(ahead, what), [cloud.points for cloud in ahead]
@@ -104,7 +104,8 @@ def timing_fields(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tupl
 
 
 def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:
-    """Clouds up to the eighth with points. Raises RecordingError if fewer than two have points."""
+    """Clouds up to the one that is number _N_TIMING_CLOUDS with points. Raises RecordingError if fewer than two have
+    points."""
     found: list[PointCloud] = []
     filled = 0
     for cloud in clouds:
@@ -120,14 +121,14 @@ def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:
 
 
 def _with_usual_fields(clouds: Sequence[PointCloud]) -> tuple[list[PointCloud], frozenset[str]]:
-    """Clouds with points and with the most common fields; and these fields."""
+    """Those clouds that have points and the most common set of fields; and this set."""
     filled = [cloud for cloud in clouds if len(cloud.points)]
     usual = frozenset(Counter(cloud.fields for cloud in filled).most_common(1)[0][0])
     return [cloud for cloud in filled if usual.issubset(cloud.fields)], usual
 
 
 def coordinates(cloud: PointCloud, what: str) -> np.ndarray:
-    """(N, 3) float32 m. Raises RecordingError where the cloud has no x, y, z."""
+    """Points (N, 3) float32 [m] in the LiDAR's frame. Raises RecordingError if the cloud has no x, y, z."""
     if any(axis not in cloud.fields for axis in "xyz"):
         names = ", ".join(cloud.fields)
         raise RecordingError(
@@ -152,8 +153,8 @@ def _stamps(clouds: Sequence[PointCloud], what: str) -> np.ndarray:
 
 
 def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timing, tuple[str, ...]]:
-    """The function that times points, from the first clouds; and notes. Raises RecordingError if times are not
-    known."""
+    """The function that computes stamp and point times of a cloud, chosen from the first clouds; and notes. Raises
+    RecordingError if point times are not known."""
     stamps_ns = _stamps(clouds, what)
     if lidar.point_time == "snapshot":
         note = f"{what}: all points of a cloud are taken at its stamp, as point_time says; motion within it is ignored."
@@ -176,23 +177,23 @@ def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timi
 
 
 def _at_the_stamp(cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
-    """Stamp, and times of 0."""
+    """Stamp [ns] of the cloud, and times of 0 (N,)."""
     return cloud.stamp_ns, np.zeros(len(xyz), np.float32)
 
 
 def _by_azimuth(sweep: SweepOrder, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
-    """Stamp, and times as shares of a turn."""
+    """Stamp [ns] of the cloud, and times (N,) since it as shares of a turn."""
     return cloud.stamp_ns, sweep_share(sweep, xyz, cloud.height).astype(np.float32)
 
 
 def _by_field(times: PointTimes, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
-    """Stamp, and times [s] from the field."""
+    """Stamp [ns], and times (N,) since it [s], from the field of point times."""
     del xyz
     return times.of(cloud.stamp_ns, cloud.points[times.field])
 
 
 def _joined(lidar: Lidar, stamps_ns: np.ndarray, parts: list[tuple[np.ndarray, np.ndarray]]) -> LidarStream:
-    """The stream of all clouds, joined column by column, so that one column at most is in memory twice. Empties
+    """The stream of all clouds. Columns are joined one after another, so that at most one is in memory twice. Empties
     `parts`."""
     start = np.concatenate([[0], np.cumsum([len(offset) for _, offset in parts], dtype=np.int64)])
     offsets = [offset for _, offset in parts]
@@ -204,14 +205,14 @@ def _joined(lidar: Lidar, stamps_ns: np.ndarray, parts: list[tuple[np.ndarray, n
 
 
 def point_clouds(bag: HasMessages, topic: str) -> Iterator[PointCloud]:
-    """The PointCloud2, or Livox's CustomMsg, of `topic`, one at a time; those shorter than their points are left out as
-    damaged messages. Raises RecordingError as `BagRecording.messages`."""
+    """Yields the PointCloud2 or Livox CustomMsg messages of `topic`. Messages with too little data for their points are
+    damaged and left out. Raises RecordingError as `BagRecording.messages`."""
     for stamp_ns, (frame, points, height) in bag.messages(topic, "points", _points_of):
         yield PointCloud(stamp_ns, frame, points, height)
 
 
 def _points_of(message: Any) -> tuple[str, np.ndarray, int]:
-    """Frame, points and rows of a message. Raises ValueError where it is shorter than its points."""
+    """Frame, points and number of rows of a message. Raises ValueError if its data are too short for its points."""
     m = message
     if isinstance(m, LivoxCloud):
         return m.header.frame_id, m.points, 1
@@ -227,7 +228,7 @@ _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 
 
 def _point_type(message: Any) -> np.dtype:
-    """Structured type of a point of a message. Raises ValueError if its fields cannot be read."""
+    """Structured dtype of the points of a message. Raises ValueError if its fields cannot be read."""
     order = ">" if message.is_bigendian else "<"
     unknown = [f.name for f in message.fields if f.datatype not in _FIELD_TYPES]
     if unknown or message.point_step < 1:

@@ -1,18 +1,18 @@
-"""Instants of the points of a cloud, from a field that drivers write beside the coordinates.
+"""Times of the points of a cloud, from a field that drivers write in addition to the coordinates.
 
 The field is one of FIELDS, or `point_time_field` of the rig file. Its values are
 
-- relative: seconds where it is a floating-point number, nanoseconds where it is a whole one or its name ends in _ns,
-  from the stamp of the message on (Velodyne's `time`, below zero where the last point is stamped; Ouster's `t`,
-  Livox's `offset_time`, Aeva's `time_offset_ns`, Blickfeld's `point_time_offset`);
+- relative to the stamp of the message: in seconds for floating-point numbers; in nanoseconds for integers, or if the
+  name ends in _ns (Velodyne's `time`, negative if the stamp is that of the last point; Ouster's `t`, Livox's
+  `offset_time`, Aeva's `time_offset_ns`, Blickfeld's `point_time_offset`);
 - or absolute, increasing from scan to scan: s, ms, us or ns of a clock (`timestamp` of Hesai and RoboSense in s, of
-  Livox in ns). Then this clock, not that of the messages' stamps, is the LiDAR's.
+  Livox in ns). This clock is then the LiDAR's clock instead of that of the message stamps.
 
-How long scans take tells the unit, for a scan takes 0.02 to 1.7 times what scans are apart: no two units fit.
+The unit is checked by the duration of scans, which is 0.02 to 1.7 scan periods; at most one unit fits.
 
-`point_time` of the rig file says otherwise. start, end: the message is stamped when its first, its last point was
-measured. azimuth: there are no times, and the LiDAR turns at a constant rate, once in a scan. snapshot: all points were
-measured at the stamp.
+`point_time` of the rig file overrides this. start, end: the message is stamped when its first or its last point was
+measured. azimuth: no times are recorded, and the LiDAR turns at a constant rate, once per scan. snapshot: all points
+were measured at the stamp.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ FIELDS = (
 )
 UNIT_NS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 MAX_SCAN_PERIODS = 1.7  # longest scan, in scan periods: scans may overlap
-_MIN_SCAN_PERIODS = 0.02  # shortest scan, a narrow sector of a turn; a shorter one has another unit, or is a flash
-_MAX_PERIOD_RATIO = 1.5  # of scan periods by point times and by stamps
-_MAX_TIME = 1e25  # larger values are no times: ns since 1970 are some 1e18
-_BULK_PERCENT = (5.0, 95.0)  # percentiles: the times of a scan without single wrong ones
+_MIN_SCAN_PERIODS = 0.02  # shortest scan, a narrow sector of a turn; shorter ones have another unit, or are flashes
+_MAX_PERIOD_RATIO = 1.5  # largest ratio between the scan periods by point times and by stamps
+_MAX_TIME = 1e25  # larger values are no times; ns since 1970 are about 1e18
+_BULK_PERCENT = (5.0, 95.0)  # percentiles of the times of a scan, robust against outliers
 _LIKE_A_TIME = re.compile(r"time|stamp|offset|curvature|(^|_)(t|ts|dt|s|ms|us|ns|[mun]?secs?)\d*(_|$)", re.IGNORECASE)
 _NO_TIMES = {"x", "y", "z", "intensity", "reflectivity", "ring", "line", "tag", "range", "rgb", "rgba"}
 _POINT_TIME_CHOICES = "set point_time to azimuth (it turns) or snapshot (all points at the stamp) in the rig file"
@@ -52,8 +52,8 @@ _POINT_TIME_CHOICES = "set point_time to azimuth (it turns) or snapshot (all poi
 
 @dataclass(frozen=True)
 class PointTimes:
-    """How the times in `field` are read: in `unit`, whether they are absolute, and what the message's stamp means.
-    longest_s: how long a scan may take."""
+    """Interpretation of the times in `field`: their unit; absolute or relative to the stamp; point_time: meaning of the
+    stamp of a message. longest_s: largest duration of a scan [s]."""
 
     field: str
     unit: TimeUnit
@@ -62,8 +62,8 @@ class PointTimes:
     longest_s: float
 
     def of(self, stamp_ns: int, values: np.ndarray) -> tuple[int, np.ndarray]:
-        """The stamp of a scan and seconds (N,) float32 from it to each point, NaN where it has no time, or one that
-        cannot be its scan's. stamp_ns: of the message; values (N,): of the field."""
+        """Stamp [ns] of a scan, and time (N,) float32 [s] of each point since it; NaN for points without a time, or
+        with an outlying one. stamp_ns: stamp of the message; values (N,): values of the field."""
         unit_ns = UNIT_NS[self.unit]
         times = _decimal(values)
         timed = _timed(times, self.absolute)
@@ -84,7 +84,8 @@ class PointTimes:
 
 
 def within_scan(times: np.ndarray, longest: float) -> np.ndarray:
-    """(N,) bool: which of the finite `times` (N,) of a scan that lasts no longer than `longest` can be its own."""
+    """(N,) bool: the time is no outlier. times (N,): finite times of a scan; longest: its largest duration, in the same
+    unit."""
     if not len(times) or times.max() - times.min() <= longest:
         return np.ones(len(times), bool)
     near = times[np.abs(times - np.median(times)) <= longest]
@@ -95,10 +96,10 @@ def within_scan(times: np.ndarray, longest: float) -> np.ndarray:
 def find_point_times(
     what: str, stamps_ns: np.ndarray, scans: Sequence[np.ndarray], lidar: Lidar
 ) -> tuple[PointTimes, tuple[str, ...]]:
-    """How the points of some scans, structured arrays of messages stamped stamps_ns (S,), are timed; and a note where
-    their unit is not the one that drivers use.
+    """Interpretation of point times, found from some scans: structured arrays of messages with stamps_ns (S,). Also a
+    note if their unit is not the usual one of drivers.
 
-    Raises RecordingError naming `what`: no field with times, or one that says nothing, or fits in no unit.
+    Raises RecordingError naming `what` if there is no field of times, if its values are constant, or if no unit fits.
     """
     field = _field(what, scans, lidar)
     times = [_decimal(scan[field]) for scan in scans]
@@ -115,10 +116,10 @@ def find_point_times(
 def unit_of_offsets(
     times: str, used: Sequence[np.ndarray], period_s: float, lidar: Lidar, usual: TimeUnit
 ) -> tuple[TimeUnit, tuple[str, ...]]:
-    """The unit of relative times of some scans that are period_s apart: the one in the rig file, else the usual one,
-    else the only one in which scans take as long as they can, with a note. `times` names them in sentences.
+    """Unit of relative times `used` of some scans with the period period_s: that of the rig file, else the usual one,
+    else the only one that gives a plausible duration of scans, with a note. times: their name in messages.
 
-    Raises RecordingError where there is none.
+    Raises RecordingError if no unit fits.
     """
     bulk = _median([np.ptp(np.percentile(t, _BULK_PERCENT)) for t in used])
     spans = (bulk, _median([np.ptp(t) for t in used]))
@@ -142,14 +143,14 @@ def unit_of_offsets(
 
 
 def likely_fields(scans: Sequence[np.ndarray]) -> list[str]:
-    """Fields of structured arrays that may hold times by their names, though these are not known, and whose values
+    """Fields of the structured arrays `scans` that are not in FIELDS, but have a name like a time and values that
     differ within a scan."""
     return [n for n in _differing(scans) if _LIKE_A_TIME.search(n) and n not in FIELDS]
 
 
 def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> str | None:
-    """A sentence where points are timed on another clock than that of the messages' stamps: one was stamped stamp_ns,
-    its first point first_ns."""
+    """A sentence if the clock of point times differs from that of the message stamps, else None. stamp_ns: stamp of a
+    message; first_ns: time of its first point."""
     if not times.absolute or times.point_time != "auto" or abs(first_ns - stamp_ns) < 1_000_000_000:
         return None
     return (
@@ -160,7 +161,8 @@ def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> st
 
 
 def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
-    """The field of the times: the one in the rig file, else the first known one that differs from point to point."""
+    """The field of point times: that of the rig file, else the first one of FIELDS whose values differ within scans.
+    Raises RecordingError if there is none."""
     names, differs = scans[0].dtype.names or (), _differing(scans)
     listed = f"their fields are {', '.join(scans[0].dtype.names or ())}"
     if (given := lidar.point_time_field) is not None:
@@ -219,7 +221,7 @@ def _differ(values: np.ndarray) -> bool:
 
 
 def _timed(times: np.ndarray, absolute: bool) -> np.ndarray:
-    """(N,) bool, whether each point has a time. Drivers write an absolute time of 0 for beams without return."""
+    """(N,) bool: the point has a time. Drivers write an absolute time of 0 for beams without return."""
     return np.isfinite(times) & ((times != 0) | (not absolute))
 
 
@@ -229,13 +231,13 @@ def _median(values: Sequence[float]) -> float:
 
 
 def _fits(span: float, unit: TimeUnit, period_s: float) -> bool:
-    """Whether a scan of duration `span` in `unit` has a plausible length."""
+    """True if `span`, in `unit`, is a plausible duration of a scan with the period period_s."""
     return _MIN_SCAN_PERIODS <= span * UNIT_NS[unit] * 1e-9 / period_s <= MAX_SCAN_PERIODS
 
 
 def _clock_instants(used: Sequence[np.ndarray], period_s: float) -> np.ndarray | None:
-    """(S,) an instant of each scan if times increase from scan to scan, else None: the last time, or the median if
-    single times are wrong."""
+    """One time per scan (S,) if times are absolute, increasing from scan to scan; else None. It is the last time, or
+    the median if there are outliers."""
     if len(used) < 2:
         return None
     lasts, middles = np.array([t.max() for t in used]), np.array([np.median(t) for t in used])
@@ -246,13 +248,13 @@ def _clock_instants(used: Sequence[np.ndarray], period_s: float) -> np.ndarray |
 
 
 def _clock_units(step: float, period_s: float) -> list[TimeUnit]:
-    """Units in which times that increase by `step` from scan to scan fit the scan period: one, or none."""
+    """Units in which times that increase by `step` from scan to scan match the scan period: one or none."""
     return [u for u, ns in UNIT_NS.items() if 1.0 / _MAX_PERIOD_RATIO < step * ns * 1e-9 / period_s < _MAX_PERIOD_RATIO]
 
 
 def _unit_of_clock(what: str, field: str, ends: np.ndarray, period_s: float, lidar: Lidar) -> TimeUnit:
-    """Unit of absolute times, from the scan period. Raises RecordingError if none fits, or not the one of the rig
-    file."""
+    """Unit of absolute times, from the scan period. Raises RecordingError if no unit fits, or if that of the rig file
+    does not."""
     step, given = float(np.median(np.diff(ends))), lidar.point_time_unit
     fitting = _clock_units(step, period_s)
     if given in fitting or (fitting and given is None):

@@ -1,4 +1,4 @@
-"""Repeated scans, scans out of order, and scans with wrong stamps."""
+"""Removes repeated scans and scans with wrong stamps, and sorts scans that are out of order."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.errors import RecordingError
 
-_N_RECENT_SCANS = 4  # among which a copy is searched: messages overtake few others
+_N_RECENT_SCANS = 4  # among which a copy is searched; messages overtake only a few others
 _MAX_DELAY_S = 1.0  # of a message that others overtake on the network
-_MIN_NEIGHBOUR_PERIODS = 0.5  # from a late scan, sorted by its stamp, to its neighbours
-_MIN_EVEN_SCANS = 10  # for a robust scatter of stamps
-# A stamp is wrong if it is off by both: share of a period, and standard deviations of all stamps.
+_MIN_NEIGHBOUR_PERIODS = 0.5  # least distance in time of a late scan from its neighbours after sorting
+_MIN_EVEN_SCANS = 10  # needed for a robust estimate of the scatter of stamps
+# A stamp is wrong if its error exceeds both: a share of the period, and a number of standard deviations of all stamps.
 _MAX_STAMP_ERROR, _SIGNIFICANT_STAMP_ERROR = 0.05, 8.0
-_SCAN_ENDS_PERCENT = (1.0, 99.0)  # percentiles: first and last points of a scan without single wrong times
-_ISOLATED_S = 10.0  # a first or last scan so far from all others has a wrong stamp
+_SCAN_ENDS_PERCENT = (1.0, 99.0)  # percentiles of point times at the ends of a scan, robust against outliers
+_ISOLATED_S = 10.0  # a first or last scan further in time from all other scans has a wrong stamp
 _MAX_BAD_STAMPS = 0.1  # of all scans; with more, the clock was set back
 
 
 def without_repeats(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """The stream without scans that repeat the points of a recent one, whatever their stamp, and a note."""
+    """The stream without scans that repeat the points of a recent scan, whatever their stamp, and a note."""
     recent: deque[np.ndarray] = deque(maxlen=_N_RECENT_SCANS)
     fresh = np.ones(len(stream.stamps_ns), bool)
     for i in range(len(fresh)):
@@ -70,8 +70,11 @@ def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ..
 
 
 def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """The stream without single scans that are early or late between neighbours two periods apart, and a note. All stay
-    if such scans are many, or if only one end of a scan is missing."""
+    """The stream without scans that are stamped too early or too late between neighbours two periods apart, and a note.
+
+    All scans are kept if there are many such scans. A scan is kept if only its begin or its end is off, as part of it
+    may be missing.
+    """
     stamps_ns = stream.stamps_ns
     if len(stamps_ns) < _MIN_EVEN_SCANS:
         return stream, ()
@@ -91,7 +94,8 @@ def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[st
 
 
 def _is_off(stream: LidarStream, i: int, late_ns: float) -> bool:
-    """Whether both first and last points of scan i are off the mean of its neighbours' by more than late_ns."""
+    """True if the times of both ends of scan i deviate from the mean of its neighbours' by more than late_ns, in the
+    same direction."""
     around = range(i - 1, i + 2)
     ends = [np.percentile(stream.offset_s[stream.start[k] : stream.start[k + 1]], _SCAN_ENDS_PERCENT) for k in around]
     stamps = stream.stamps_ns[i - 1 : i + 2] - stream.stamps_ns[i]
@@ -101,7 +105,7 @@ def _is_off(stream: LidarStream, i: int, late_ns: float) -> bool:
 
 
 def selected(stream: LidarStream, scans: np.ndarray) -> LidarStream:
-    """The scans (K,) of `stream` by number, in that order."""
+    """The stream with the scans of numbers `scans` (K,), in that order."""
     parts = [slice(stream.start[i], stream.start[i + 1]) for i in scans.tolist()]
     counts = [part.stop - part.start for part in parts]
     columns = {name: np.concatenate([getattr(stream, name)[p] for p in parts]) for name in ("offset_s", "xyz", "plane")}
@@ -115,7 +119,8 @@ def _same(points: np.ndarray, others: np.ndarray) -> bool:
 
 
 def _without_isolated_ends(stamps_ns: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """The scans `kept` (K,) without a first or last one that is far from all others, as its stamp may be wrong."""
+    """The scan numbers `kept` (K,) without a first or last scan that is far in time from all others, as its stamp may
+    be wrong."""
     if len(kept) < _MIN_EVEN_SCANS:
         return kept
     first, last = (abs(int(stamps_ns[kept[a]] - stamps_ns[kept[b]])) > _ISOLATED_S * 1e9 for a, b in ((0, 1), (-1, -2)))
@@ -123,8 +128,8 @@ def _without_isolated_ends(stamps_ns: np.ndarray, kept: np.ndarray) -> np.ndarra
 
 
 def _sorted_by_stamp(stamps_ns: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, list[int], list[int]]:
-    """Numbers (K,) of `kept` and late scans by stamp; those of late scans; and those of scans with wrong stamps, which
-    would collide with another scan or have no neighbour."""
+    """Numbers (K,) of the kept and the late scans, sorted by stamp; numbers of the late scans; and numbers of scans
+    with wrong stamps, which would collide with another scan or have no neighbour."""
     period_ns = float(np.median(np.diff(stamps_ns[kept]))) if len(kept) > 1 else np.inf
     placed, order = stamps_ns[kept].tolist(), kept.tolist()
     late: list[int] = []
@@ -148,10 +153,10 @@ def _sorted_by_stamp(stamps_ns: np.ndarray, kept: np.ndarray) -> tuple[np.ndarra
 
 
 def _longest_increasing(stamps_ns: np.ndarray) -> np.ndarray:
-    """(K,) numbers of the longest strictly increasing subsequence (patience sorting)."""
+    """Indices (K,) of the longest strictly increasing subsequence (patience sorting)."""
     values = stamps_ns.tolist()
     tails: list[int] = []  # the smallest last value of an increasing subsequence of each length
-    at: list[int] = []  # its number
+    at: list[int] = []  # index of that value
     before = np.full(len(values), -1)
     for i, value in enumerate(values):
         length = bisect_left(tails, value)

@@ -1,4 +1,4 @@
-"""Scans of a LiDAR as arrays in a file (npz), as `icalib simulate` writes them. The format: docs/recordings.md."""
+"""Reads scans of a LiDAR from arrays in a file (npz), as `icalib simulate` writes them. Format: docs/recordings.md."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from icalib.sensors.lidar.read.point_times import MAX_SCAN_PERIODS, UNIT_NS, uni
 
 _REQUIRED = {"stamps_ns": np.int64, "start": np.int64, "offset_s": np.float32, "xyz": np.float32}
 _OPTIONAL = {"plane": np.int32}
-_N_UNIT_SCANS = 8  # first scans, which show the unit of point times
+_N_UNIT_SCANS = 8  # first scans, from which the unit of point times is found
 
 
 def read_scans(name: str, path: Path) -> LidarStream:
-    """The scans at `path`. Raises RecordingError naming the file, and the array that is missing or of another kind."""
+    """The scans in the file `path`. Raises RecordingError naming the file, and the array that is missing or invalid."""
     arrays = _arrays(path, tuple(_REQUIRED | _OPTIONAL))
     missing = [n for n in _REQUIRED if n not in arrays]
     if missing:
@@ -42,12 +42,13 @@ def read_scans(name: str, path: Path) -> LidarStream:
 
 
 def _are_planes(ids: np.ndarray) -> bool:
-    """Whether plane numbers are valid: -1, or below the number of points, as the largest one sizes arrays."""
+    """True if all plane numbers are -1, or from 0 to below the number of points: the largest one determines array
+    sizes."""
     return not ids.size or bool(ids.min() >= -1 and ids.max() < ids.size)
 
 
 def read_scan_stamps(path: Path) -> np.ndarray:
-    """(S,) int64 ns. Raises RecordingError as `read_scans`."""
+    """Stamps (S,) int64 [ns] of the scans in the file `path`. Raises RecordingError as `read_scans`."""
     arrays = _arrays(path, ("stamps_ns",))
     if "stamps_ns" not in arrays:
         raise RecordingError(f"{path} has no array stamps_ns; it needs {', '.join(_REQUIRED)}.")
@@ -55,8 +56,8 @@ def read_scan_stamps(path: Path) -> np.ndarray:
 
 
 def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """`stream` with times of points in seconds, NaN where they cannot be their scan's, and a note on the unit; in the
-    arrays of `stream` itself. Raises RecordingError where they fit in no unit."""
+    """`stream` with point times in seconds, NaN for outliers, and a note on the unit. Works in place on the arrays of
+    `stream`. Raises RecordingError if no unit fits."""
     scans = [stream.offset_s[a:b] for a, b in pairwise(stream.start.tolist()) if b > a]
     first = [scan[np.isfinite(scan)].astype(np.float64) for scan in scans[:_N_UNIT_SCANS]]
     first = [times for times in first if len(times) and np.ptp(times) > 0]
@@ -76,7 +77,7 @@ def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStrea
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The arrays `names` of a file, as far as it has them. Raises RecordingError if it cannot be read."""
+    """Those of the arrays `names` that the file has. Raises RecordingError if it cannot be read."""
     try:
         with path.open("rb") as file:
             sentence = not_data(path, file.read(HEAD_BYTES))
@@ -90,7 +91,7 @@ def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 
 def _of_kind(path: Path, name: str, array: np.ndarray, kind: type[np.generic]) -> np.ndarray:
-    """The array as `kind`, contiguous. Raises RecordingError if it has other axes or no such numbers."""
+    """The array as `kind`, contiguous. Raises RecordingError if its number of axes or its type of numbers is wrong."""
     axes = 2 if name == "xyz" else 1
     numbers = "iu" if np.issubdtype(kind, np.integer) else "iuf"
     if array.ndim != axes or array.dtype.kind not in numbers or (name == "start" and not array.size):
