@@ -96,8 +96,8 @@ def _upwards_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
 
 
 def _without_vertical(inputs: Inputs, found: Estimate) -> Iterator[tuple[str, np.ndarray]]:
-    """Names of wheels for which neither data nor rig file determine the sign of the vertical, with the z axis (3,) of
-    the wheel frame in the axes of the body."""
+    """Names of wheels for which neither data nor rig file determine the sign of the vertical. With each name: the z
+    axis (3,) of the wheel frame in the axes of the body."""
     values = found.outcome.state.values
     if not inputs.rig.assumes_motion or level_sensor(inputs, found.outcome.state) is not None:
         return

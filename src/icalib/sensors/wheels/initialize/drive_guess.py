@@ -279,8 +279,10 @@ def _robust_fit(A: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _no_slip(w: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
-    """Unit vector e_2 (2,) of either sign, and l_1 [m], that solve e_2 u + l_1 w = 0 by total least squares, with w
-    (n,) scaled to the norm of u (n, 2). Outliers are rejected."""
+    """Unit vector e_2 (2,) of either sign, and l_1 [m], from e_2 u + l_1 w = 0 by robust total least squares.
+
+    w (n,): yaw rate [rad/s], scaled to the norm of u; u (n, 2): horizontal velocity [m/s].
+    """
     scale = np.linalg.norm(u) / np.linalg.norm(w)
     rows, weight, x = np.column_stack([u, w * scale]), np.ones(len(w)), np.zeros(3)
     for _ in range(3):
