@@ -1,4 +1,4 @@
-"""Fields of the rig file that several kinds of sensors share: parsed, and written back as plain data."""
+"""Rig-file fields that several kinds of sensors share: parsing, and conversion back to plain data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def parameter_fields(sensor: type[Sensor]) -> tuple[str, ...]:
 
 
 def parameters(found: dict[str, YamlValue], specs: Iterable[ParameterSpec]) -> dict[str, Any]:
-    """Arguments of a sensor: the parameters of `specs` and clock_restarts, where the rig file has them."""
+    """Keyword arguments of a sensor: those parameters of `specs`, and clock_restarts, that the rig file has."""
     groups: dict[str, Any] = {spec.name: parameter(found[spec.name], spec) for spec in specs if spec.name in found}
     if "clock_restarts" in found:
         groups["clock_restarts"] = found["clock_restarts"].boolean()
@@ -39,7 +39,7 @@ def choice_or(found: dict[str, YamlValue], name: str, kind: Any, default: Any) -
 
 
 def axes_or_none(found: dict[str, YamlValue], name: str) -> Axes | None:
-    """Three recorded columns with their signs, each column once; None if the field is missing."""
+    """The recorded columns that become x, y, z, with signs, such as ("x", "-y", "-z"); None if the field is missing."""
     if name not in found:
         return None
     entries = [entry.text() for entry in found[name].items()]
@@ -56,7 +56,7 @@ def path_or(found: dict[str, YamlValue], default: str) -> str:
 
 
 def table_layout(found: dict[str, YamlValue]) -> TableLayout:
-    """The layout of the sensor's table, by the fields of `TABLE`."""
+    """The layout of the sensor's table, from the fields of `TABLE`."""
     if not set(TABLE) & set(found):
         return PLAIN_TABLE
     columns = tuple(item.text() for item in found["columns"].items()) if "columns" in found else ()
@@ -75,6 +75,6 @@ def topic_or_none(found: dict[str, YamlValue]) -> str | None:
 
 
 def groups_to_plain(sensor: Sensor) -> dict[str, Any]:
-    """The parameters of the sensor, and whether its clock restarts."""
+    """The parameters of the sensor as plain data by name, and clock_restarts if it is true."""
     plain = {spec.name: parameter_to_plain(getattr(sensor, spec.name)) for spec in sensor.stated()}
     return plain | ({"clock_restarts": True} if sensor.clock_restarts else {})

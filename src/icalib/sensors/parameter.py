@@ -1,4 +1,4 @@
-"""One group of parameters of a sensor and its treatment: free, a guess, fixed or a prior."""
+"""One group of parameters of a sensor and its treatment in the estimation: free, guess, fixed or prior."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from icalib.errors import RigError
 from icalib.sensors.parameter_spec import ParameterSpec
 
 Mode = Literal["free", "fixed", "prior"]
-ROUNDING = 1e-3  # largest |R R^T - 1| of a rotation with few digits; beyond it is a mistake
-_EXACT = 1e-12  # |R R^T - 1| below which a rotation is kept bit by bit
+ROUNDING = 1e-3  # largest |R R^T - 1| of a rotation with few digits; larger values are a mistake
+_EXACT = 1e-12  # |R R^T - 1| below which a rotation is not changed
 _ANY_VECTOR = "a vector of numbers, or a 3x3 rotation matrix"
 
 
@@ -25,7 +25,7 @@ class Parameter:
     free: estimated, with `value` (if given) as initial guess. fixed: constant at `value`. prior: estimated, with a
     Gaussian prior of mean `value` and standard deviation `sigma`. value None: the program finds an initial guess.
     Rotations are 3x3 matrices R_imu_sensor with sigma (3,) in rad about the sensor's axes (right perturbation). Other
-    values are vectors with sigma of the same shape. Raises RigError if the value or sigma makes no sense.
+    values are vectors with sigma of the same shape. Raises RigError for an invalid value or sigma.
     """
 
     mode: Mode = "free"
@@ -46,29 +46,31 @@ class Parameter:
 
     @property
     def size(self) -> int:
-        """Degrees of freedom of the value: 3 of a rotation; 0 without a value."""
+        """Degrees of freedom of the value: 3 for a rotation; 0 without a value."""
         return 0 if self.value is None else 3 if self.value.ndim == 2 else len(self.value)
 
 
 def free() -> Parameter:
-    """Estimated; the program finds an initial guess."""
+    """A parameter that is estimated; the program finds an initial guess."""
     return Parameter("free")
 
 
 def guess(value: Any) -> Parameter:
-    """Estimated, starting at `value`: a number, a vector, a 3x3 rotation matrix or a scipy Rotation."""
+    """A parameter that is estimated from the initial guess `value`: a number, a vector, a 3x3 rotation matrix or a
+    scipy Rotation."""
     return Parameter("free", _array(value))
 
 
 def fixed(value: Any) -> Parameter:
-    """Constant at `value`: a number, a vector, a 3x3 rotation matrix or a scipy Rotation."""
+    """A parameter that is constant at `value`: a number, a vector, a 3x3 rotation matrix or a scipy Rotation."""
     return Parameter("fixed", _array(value))
 
 
 def prior(value: Any, sigma: Any) -> Parameter:
-    """Estimated, with a Gaussian prior of mean `value` and standard deviation `sigma`, in the unit of the value.
+    """A parameter that is estimated with a Gaussian prior of mean `value` and standard deviation `sigma`.
 
-    sigma: one number for all entries, or one for each; of a rotation in rad about the sensor's axes.
+    value: as in `guess`. sigma: one number for all entries, or one for each, in the unit of the value; for a rotation
+    in rad about the sensor's axes.
     """
     return Parameter("prior", _array(value), _array(sigma))
 
@@ -89,8 +91,8 @@ def check_sizes(sensor: Any, specs: Iterable[ParameterSpec]) -> None:
 
 
 def check_fields(where: str, old: Any, fields: dict[str, Any]) -> None:
-    """Raises RigError if `fields` do not fit the dataclass `old`, which sentences call `where`: if it has no such
-    field, if a value is none of the choices of its field, or if a value replaces a `Parameter` and is none."""
+    """Raises RigError if `fields` are not valid for the dataclass `old`: it has no such field, a value is none of the
+    choices of its field, or a value for a `Parameter` is no `Parameter`. where: name of `old` in messages."""
     kinds = get_type_hints(type(old))
     for name, value in fields.items():
         if name not in kinds:
@@ -103,8 +105,8 @@ def check_fields(where: str, old: Any, fields: dict[str, Any]) -> None:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation nearest to `matrix`; `matrix` itself if it is one to the last digits. Raises RigError if it is no
-    rotation."""
+    """(3, 3) rotation nearest to `matrix`; `matrix` itself if it is orthonormal within _EXACT. Raises RigError if it is
+    a reflection, or not orthonormal within ROUNDING."""
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if not error <= ROUNDING:
         raise RigError(f"is not a rotation matrix (R R^T differs from the identity by {error:.2g})")
@@ -117,7 +119,8 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def _array(value: Any) -> np.ndarray:
-    """`value` as a float64 array: a number as a vector of one, a scipy Rotation as its matrix. Raises RigError."""
+    """`value` as a float64 array: a number as a vector of one, a scipy Rotation as its matrix. Raises RigError if it is
+    not numeric."""
     value = value.as_matrix() if hasattr(value, "as_matrix") else value
     try:
         return np.atleast_1d(np.asarray(value, dtype=np.float64))

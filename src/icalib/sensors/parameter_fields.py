@@ -1,4 +1,4 @@
-"""One parameter group of the rig file (free, a guess, fixed or a prior): parsed, and written back as plain data."""
+"""Parameter groups of the rig file (free, guess, fixed or prior): parsing, and conversion back to plain data."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _ROTATION_FORMS = "a 3x3 matrix, {xyzw: [x, y, z, w]} or {rpy_deg: [roll, pitch,
 
 
 def parameter(value: YamlValue, spec: ParameterSpec) -> Parameter:
-    """The group that `spec` defines. Raises RigError naming line and field."""
+    """Parses the parameter group that `spec` defines. Raises RigError naming line and field."""
     return rotation_parameter(value) if spec.manifold == "rotation" else vector_parameter(value, spec.size)
 
 
 def vector_parameter(value: YamlValue, size: int) -> Parameter:
-    """A group of `size` numbers. Raises RigError naming line and field."""
+    """Parses a group of `size` numbers. Raises RigError naming line and field."""
     mode, found = _mode(value, ("sigma",))
     if found is None:
         return Parameter("free")
@@ -33,7 +33,7 @@ def vector_parameter(value: YamlValue, size: int) -> Parameter:
 
 
 def rotation_parameter(value: YamlValue) -> Parameter:
-    """A rotation R_imu_sensor; sigma in rad or sigma_deg. Raises RigError naming line and field."""
+    """Parses a rotation R_imu_sensor with `sigma` in rad or `sigma_deg`. Raises RigError naming line and field."""
     mode, found = _mode(value, ("sigma", "sigma_deg"))
     if found is None:
         return Parameter("free")
@@ -46,7 +46,8 @@ def rotation_parameter(value: YamlValue) -> Parameter:
 
 
 def parameter_to_plain(parameter: Parameter) -> Any:
-    """`parameter` as lists, numbers and text of the rig file; None for a fixed group without a value (a default)."""
+    """`parameter` as lists, numbers and text of the rig file; None for a group fixed at its default, without a
+    value."""
     if parameter.value is None:
         return "free" if parameter.mode == "free" else None
     key = "guess" if parameter.mode == "free" else parameter.mode
@@ -57,7 +58,8 @@ def parameter_to_plain(parameter: Parameter) -> Any:
 
 
 def _mode(value: YamlValue, sigmas: tuple[str, ...]) -> tuple[str, dict[str, YamlValue] | None]:
-    """guess, fixed or prior and the fields given with it; ("free", None) for plain free."""
+    """The mode (guess, fixed or prior) and all fields of the mapping; ("free", None) for the text `free`. Raises
+    RigError."""
     if not value.is_mapping:
         if value.is_list or value.text() != "free":
             value.fail(f"must be free or a mapping, but is {value.shown()}; {_FORMS}.")
@@ -75,7 +77,7 @@ def _mode(value: YamlValue, sigmas: tuple[str, ...]) -> tuple[str, dict[str, Yam
 
 
 def _sigma(value: YamlValue, size: int) -> np.ndarray:
-    """(size,) standard deviations; one number stands for all."""
+    """(size,) standard deviations, from a list or from one number for all. Raises RigError unless they are above 0."""
     sigma = value.vector(size) if value.is_list else np.full(size, value.number())
     if (sigma <= 0).any():
         value.fail(
@@ -86,7 +88,8 @@ def _sigma(value: YamlValue, size: int) -> np.ndarray:
 
 
 def _rotation(value: YamlValue) -> np.ndarray:
-    """(3, 3) rotation; one with rounded digits is made orthonormal."""
+    """(3, 3) rotation from a matrix, a quaternion or rpy_deg; a matrix with rounded digits is made orthonormal. Raises
+    RigError."""
     if value.is_list:
         return _matrix(value)
     if not value.is_mapping:

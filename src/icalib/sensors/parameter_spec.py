@@ -14,7 +14,7 @@ Manifold = Literal["vector", "nuisance", "rotation", "tilt", "plane"]
 ToleranceSetting = Literal[
     "rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance"
 ]  # fields of `rig.Settings`
-# SI unit -> unit for people, and the factor by which SI values are multiplied.
+# SI unit -> unit in reports and messages, and the factor by which SI values are multiplied.
 SHOWN_UNITS = {"rad": ("deg", 180.0 / pi), "m": ("mm", 1e3), "s": ("ms", 1e3)}
 AXES = ("x", "y", "z")
 
@@ -23,15 +23,16 @@ AXES = ("x", "y", "z")
 class ParameterSpec:
     """One group of parameters.
 
-    name: in the rig file and in a result. size: count of numbers, or degrees of freedom of a rotation. unit: SI, or px;
-    empty for ratios. labels (size,): of the numbers; a single number has the name of the group. tolerance: largest
-    standard deviation of a determined number, in `unit` or as a setting of the rig file. prior_sigma: standard
-    deviation of an initial guess for which the rig file gives none, in `unit`.
+    name: name in the rig file and in a result. size: count of numbers, or degrees of freedom of a rotation. unit: SI,
+    or px; empty for ratios. labels (size,): names of the numbers; a single number has the name of the group. tolerance:
+    largest standard deviation of a number with the verdict `determined`, in `unit`, or the name of a setting of the rig
+    file. prior_sigma: standard deviation of an initial guess, in `unit`, if the rig file states none.
 
-    is_positive: a length or a factor above 0, whose changes are shown in percent. one: name of one number, if `name` is
-    a plural. is_auxiliary: a nuisance parameter without a verdict; `meaning` explains it. by_images: determined by
-    images, not by motion. motion: advice if the data do not determine it, with {axes} for the axes about which the rig
-    hardly turned; motion_on_wheels and motion_without_target replace it.
+    is_positive: a length or a factor above 0, whose changes are shown in percent. one: singular of `name`, if that is a
+    plural. is_auxiliary: a nuisance parameter without a verdict; `meaning` explains it. by_images: determined by
+    images, not by motion. motion: advice if the data do not determine the group; {axes} stands for the axes about which
+    the rig hardly turned. motion_on_wheels and motion_without_target replace `motion` for rigs on wheels and without
+    target.
     """
 
     name: str
@@ -56,15 +57,15 @@ class ParameterSpec:
         return self if count == 1 else replace(self, size=count, labels=labels)
 
     def entry(self, owner: str, estimated: bool = True) -> tuple[str, str, Manifold, int, bool]:
-        """The entry for `optim.state.make_layout`; owner: a sensor, or a part of the scene."""
+        """The entry of this group for `optim.state.make_layout`; owner: name of a sensor, or of a part of the scene."""
         return owner, self.name, self.manifold, self.size, estimated
 
     @property
     def shown_unit(self) -> tuple[str, float]:
-        """The unit for people, and the factor by which SI values are multiplied."""
+        """The unit in reports and messages, and the factor by which SI values are multiplied."""
         return shown_unit(self.unit)
 
 
 def shown_unit(unit: str) -> tuple[str, float]:
-    """The unit for people of values in the SI `unit`, and the factor by which they are multiplied."""
+    """The unit in reports and messages for values in the SI `unit`, and the factor by which they are multiplied."""
     return SHOWN_UNITS.get(unit, (unit, 1.0))

@@ -1,4 +1,5 @@
-"""The base classes of the sensors of a rig: all, those with a clock of their own, and those with extrinsics."""
+"""Base classes of the sensors of a rig: `Sensor`, `ClockedSensor` with a time offset, `MountedSensor` with
+extrinsics."""
 
 from __future__ import annotations
 
@@ -47,13 +48,13 @@ TIME_OFFSET = ParameterSpec(
     motion="turn or shake the rig faster, so that a time shift shows",
     motion_on_wheels="speed up, brake and turn more",
 )
-MOUNTED = (ROTATION, TRANSLATION, TIME_OFFSET)  # of every sensor but the IMU
+MOUNTED = (ROTATION, TRANSLATION, TIME_OFFSET)  # parameters of every `MountedSensor`
 MOUNTED_NAMES = tuple(spec.name for spec in MOUNTED)
 TARGET_FRAME = "target"  # name of the target's frame in the rig file
 
 
 def mounted(rotation: T, translation: T, time_offset: T) -> dict[str, T]:
-    """Values of `MOUNTED` by name."""
+    """The three values by the names of `MOUNTED`."""
     return dict(zip(MOUNTED_NAMES, (rotation, translation, time_offset), strict=True))
 
 
@@ -61,8 +62,8 @@ def mounted(rotation: T, translation: T, time_offset: T) -> dict[str, T]:
 class TableLayout:
     """The layout of a sensor's table.
 
-    columns: names in its header, or numbers from 1 on, in icalib's order; empty: found by the header, or in that order.
-    time_unit: of its stamps; None: found by their rate.
+    columns: header names, or column numbers from 1, of the columns in the order that icalib expects; empty: recognised
+    by the header, or already in that order. time_unit: unit of the stamps; None: recognised by their rate.
     """
 
     columns: tuple[str, ...] = ()
@@ -74,7 +75,8 @@ PLAIN_TABLE = TableLayout()
 
 @dataclass(frozen=True)
 class Lack:
-    """Why the sensors of a rig cannot be calibrated together. where: the field of the rig file, from its root on."""
+    """A reason why the sensors of a rig cannot be calibrated together. where: path of the field in the rig file, from
+    its root."""
 
     where: tuple[str, ...]
     sentence: str
@@ -84,10 +86,11 @@ class Lack:
 class Sensor:
     """A sensor of the rig.
 
-    A kind of sensor declares: sensor_type, its `type` in the rig file and its folder in `icalib.sensors`; noun, its
-    name in sentences; parameters, all that sensors of this kind can have; gives_motion, whether such a sensor and an
-    IMU determine the motion of the rig; needs_imu; is_inertial; shows_planes; drives, whether the rig drives on it
-    and hardly tilts.
+    A kind of sensor declares these class variables. sensor_type: its `type` in the rig file and its folder in
+    `icalib.sensors`. noun: its name in messages. parameters: all parameters that sensors of this kind can have.
+    gives_motion: such a sensor and an IMU determine the motion of the rig. needs_imu: it cannot be used without an IMU.
+    is_inertial: it is an IMU. shows_planes: it measures points on planes. drives: the rig drives on it, so that it
+    hardly tilts.
     """
 
     sensor_type: ClassVar[str]
@@ -110,7 +113,7 @@ class Sensor:
         raise NotImplementedError(cls)
 
     def plain(self) -> dict[str, Any]:
-        """The fields of the rig file, as lists, numbers and text: what `parse` reads back as the same sensor."""
+        """The fields of the rig file as lists, numbers and text, from which `parse` makes an equal sensor."""
         raise NotImplementedError(type(self))
 
     def specs(self) -> tuple[ParameterSpec, ...]:
@@ -118,15 +121,16 @@ class Sensor:
         return self.parameters
 
     def spec(self, name: str) -> ParameterSpec:
-        """The definition of a group of `parameters`, as this sensor has it."""
+        """The definition of the parameter group `name` for this sensor."""
         return next(spec for spec in (*self.specs(), *self.parameters) if spec.name == name)
 
     def is_estimated(self, spec: ParameterSpec) -> bool:
-        """Whether the group is estimated, as far as the sensor alone says."""
+        """Whether the group is estimated according to this sensor; the rest of the rig may still prevent it."""
         return getattr(self, spec.name).mode != "fixed"
 
     def gives_motion_without_imu(self, has_target: bool) -> bool:
-        """Whether this sensor alone determines the motion of the rig; has_target: the cameras of the rig see one."""
+        """Whether this sensor alone determines the motion of the rig; has_target: the cameras of the rig see a
+        target."""
         return False
 
     @property
@@ -136,7 +140,7 @@ class Sensor:
 
     @property
     def shared_frame(self) -> str:
-        """Name of the sensor, or `TARGET_FRAME`, in whose frame this sensor reports; empty: in none that is shared."""
+        """Name of the sensor in whose frame this sensor reports, or `TARGET_FRAME`; empty if it shares no frame."""
         return ""
 
     @property
@@ -145,22 +149,22 @@ class Sensor:
         return False
 
     def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
-        """What this sensor needs of the other `sensors` of its rig or of a target, and does not have."""
+        """Yields what this sensor needs and the rig lacks: other sensors, or a target."""
         if self.needs_imu and not has_imu(sensors):
             yield Lack(("sensors", self.name), "needs an IMU; add a sensor of type: imu, or remove this one.")
 
     @classmethod
     def stated(cls) -> tuple[ParameterSpec, ...]:
-        """Those of `parameters` that are fields of the rig file."""
+        """Those of `parameters` that have a field in the rig file."""
         names = {f.name for f in fields(cls)}
         return tuple(spec for spec in cls.parameters if spec.name in names)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClockedSensor(Sensor):
-    """A sensor whose stamps are of another clock than those of the reference: t_reference = t + time_offset [s].
+    """A sensor with a clock that differs from that of the reference sensor: t_reference = t + time_offset [s].
 
-    clock_restarts: each recording has its own time offset.
+    clock_restarts: each recording has a separate time offset.
     """
 
     time_offset: Parameter = Parameter()

@@ -1,4 +1,4 @@
-"""What all streams share: a stream is what one sensor measured, in arrays."""
+"""Base classes of streams: the measurements of one sensor as arrays."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ import numpy as np
 from icalib.errors import RecordingError
 
 S = TypeVar("S", bound="Stream")
-FAR_M = 100.0  # from the origin of a frame; its rotation and its origin are hard to tell apart from further away
+FAR_M = 100.0  # distance from the origin of a frame; further away its rotation and its origin are hard to separate
 
 
 def check(condition: bool, sentence: str) -> None:
-    """Raises RecordingError with `sentence` where the condition is false."""
+    """Raises RecordingError with `sentence` if the condition is false."""
     if not condition:
         raise RecordingError(sentence)
 
 
 def check_groups(name: str, stamps_ns: np.ndarray, start: np.ndarray, what: str, counts: dict[str, int]) -> None:
-    """Raises RecordingError unless start (N + 1,) runs from 0 upwards to the length of every column. counts: the
-    length of each column, by name; what: the word for one row of them, in the plural."""
+    """Raises RecordingError unless start (N + 1,) increases from 0 to the length of every column. counts: length of
+    each column, by name; what: plural noun for rows, in messages."""
     n = len(stamps_ns)
     check(start.shape == (n + 1,), f"{name}: start must have shape ({n + 1},), not {start.shape}.")
     rows = int(start[-1])
@@ -33,27 +33,27 @@ def check_groups(name: str, stamps_ns: np.ndarray, start: np.ndarray, what: str,
 
 
 def seconds_since(stamps_ns: np.ndarray, origin_ns: int) -> np.ndarray:
-    """Stamps as float64 seconds since `origin_ns`; the difference is taken in integers, so no digit is lost."""
+    """Stamps (N,) [ns] as float64 seconds since `origin_ns`; they are subtracted as integers, without rounding."""
     return (stamps_ns - np.int64(origin_ns)).astype(np.float64) * 1e-9
 
 
 def which_image(file: str, stamp_ns: int) -> str:
-    """Tells an image from others of its stream, in sentences: by its file, or else by its stamp."""
+    """Name of an image in messages: its file, or else its stamp."""
     return file or f"at {stamp_ns} ns"
 
 
 def far_origin(positions: np.ndarray) -> np.ndarray | None:
-    """(3,) whole metres among positions (N, 3) m, if these are far from the origin of their frame; None if they are
-    not. Whole numbers subtract without loss of a digit."""
+    """New origin (3,) in whole metres, the median of positions (N, 3) [m], if it is further than FAR_M from the origin
+    of their frame; else None. Whole numbers can be subtracted without rounding."""
     origin = np.round(np.median(positions, axis=0)) if len(positions) else np.zeros(3)
     return origin if np.linalg.norm(origin) > FAR_M else None
 
 
 @dataclass(frozen=True)
 class RawReadings:
-    """What one sensor measured, as it was written. stamps_ns (N,) int64, which may still repeat or run backwards.
+    """Measurements of one sensor as recorded, unchecked. stamps_ns (N,) int64 may still repeat or run backwards.
 
-    Subclasses add arrays of N rows; an array of 0 rows is one that is not stated.
+    Subclasses add arrays with N rows; an array with 0 rows means that the recording does not contain it.
     """
 
     name: str
@@ -65,7 +65,7 @@ class RawReadings:
         return seconds_since(self.stamps_ns, int(self.stamps_ns[0]))
 
     def some(self, kept: np.ndarray) -> Self:
-        """Those `kept` (N,), a mask."""
+        """The readings selected by the mask `kept` (N,)."""
         if kept.all():
             return self
         arrays = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray) and len(v) == len(kept)}
@@ -74,14 +74,14 @@ class RawReadings:
 
 @dataclass(frozen=True)
 class Stream:
-    """What one sensor measured. name: of the sensor; stamps_ns (N,) int64, in nanoseconds of the sensor's own clock;
-    joins_ns: where several recordings were joined, the first stamp of each but the first.
+    """Checked measurements of one sensor. name: name of the sensor; stamps_ns (N,) int64 [ns] on the sensor's clock;
+    joins_ns: if several recordings were joined, the first stamp of each except the first.
 
-    Subclasses add arrays with N rows. Those with `start` (N + 1,) have rows start[i]:start[i + 1] for stamp i. An array
-    of 0 rows is one that the sensor does not state. Raises RecordingError for shapes that do not fit.
+    Subclasses add arrays with N rows. Subclasses with `start` (N + 1,) have rows start[i]:start[i + 1] for stamp i. An
+    array with 0 rows means that the sensor does not report it. Raises RecordingError for inconsistent shapes.
     """
 
-    sensor_type: ClassVar[str]  # that of the sensors that have such streams
+    sensor_type: ClassVar[str]  # `Sensor.sensor_type` of the sensors with such streams
     name: str
     stamps_ns: np.ndarray
     joins_ns: tuple[int, ...] = field(default=(), kw_only=True)
@@ -91,7 +91,7 @@ class Stream:
 
     @property
     def key(self) -> str:
-        """Its name in `Measurements.streams`: that of the sensor, unless a sensor has several streams."""
+        """Key of the stream in `Measurements.streams`: the name of the sensor, unless a sensor has several streams."""
         return self.name
 
     @property
@@ -100,35 +100,37 @@ class Stream:
 
     @property
     def seconds(self) -> np.ndarray:
-        """(N,) seconds since this clock's own first stamp."""
+        """(N,) seconds since the first stamp of the stream."""
         return seconds_since(self.stamps_ns, self.origin_ns)
 
     @property
     def rows(self) -> int:
-        """How many rows its arrays have, beside stamps_ns and start."""
+        """Number of rows of the arrays other than stamps_ns and start."""
         start = getattr(self, "start", None)
         return len(self.stamps_ns) if start is None else int(start[-1])
 
     def columns(self) -> dict[str, np.ndarray]:
-        """All arrays by name, but for stamps_ns and start."""
+        """All arrays by name, except stamps_ns and start."""
         found = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {k: v for k, v in found.items() if isinstance(v, np.ndarray) and k not in ("stamps_ns", "start")}
 
     def near_origin(self) -> tuple[Self, tuple[str, ...]]:
-        """The same with positions counted from among them where the origin of their frame is far, and notes on it."""
+        """The stream with positions relative to a near origin if the origin of their frame is far (`far_origin`), and
+        notes on it. Here the stream itself: subclasses with positions override it."""
         return self, ()
 
     @classmethod
     def disjoint(cls, recordings: Sequence[Sequence[Self]]) -> Sequence[Sequence[Self]]:
-        """The streams of this class of several recordings, such that a number in two of them is two things."""
+        """The streams of this class in several recordings, renumbered so that no identifier occurs in two recordings.
+        Here unchanged: subclasses with identifiers override it."""
         return recordings
 
     @classmethod
     def joined(cls, streams: Sequence[Self], shifts_ns: Sequence[int] | None = None) -> Self:
-        """One sensor's streams of several recordings, one after the other. shifts_ns: what to add to the stamps of
-        each, by default nothing. A column that one of them does not state is dropped.
+        """The concatenation of one sensor's streams in several recordings. shifts_ns: added to the stamps of each, by
+        default 0. A column that is missing in one stream is dropped.
 
-        Raises RecordingError where streams of this class cannot be joined.
+        Raises RecordingError if streams of this class cannot be joined.
         """
         if len({type(s) for s in streams}) > 1:
             raise RecordingError(f"{cls.__name__} {streams[0].name}: another recording has a stream of another class.")
