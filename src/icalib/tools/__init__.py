@@ -1,1 +1,4 @@
-"""What works with calibrations: the library never imports it."""
+"""Tools around calibration: simulation, inspection, comparison, studies.
+
+Only `cli` and the modules `simulate` and `inspect` of sensors import them; calibration itself does not.
+"""

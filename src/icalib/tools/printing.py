@@ -1,4 +1,4 @@
-"""Targets on paper: PDF at true scale, in vectors, with the rig file's line for it and a ruler to check the print."""
+"""Targets as PDF for printing: vector graphics at true scale, with the target's line for the rig file and a ruler."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Markers, Tag, Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
 
-# Width and height [mm], upright; smallest first.
+# Width and height [mm] in portrait; smallest first.
 PAPERS = {
     "a4": (210.0, 297.0),
     "letter": (215.9, 279.4),
@@ -23,17 +23,18 @@ PAPERS = {
     "a1": (594.0, 841.0),
     "a0": (841.0, 1189.0),
 }
-EDGE_MM = 8.0  # that printers leave white
-FOOT_MM = 16.0  # for text and ruler, below the target
+EDGE_MM = 8.0  # margin that printers cannot print on
+FOOT_MM = 16.0  # height of the space for text and ruler, below the target
 RULER_MM = 100.0
-_POINTS = 72.0 / 25.4  # a millimetre
+_POINTS = 72.0 / 25.4  # PDF points per millimetre
 _FONT, _FONT_POINTS = "Helvetica", 7.5
 
 
 def write_target(path: str | Path, target: Target, paper: str = "a4", border_bits: int | None = None) -> None:
     """Writes `target_pdf` to `path`.
 
-    Raises as it does, and CalibrationError where the file cannot be written, or is there and not icalib's own.
+    Raises the errors of `target_pdf`, and CalibrationError if the file cannot be written, or exists and was not written
+    by icalib.
     """
     path = Path(path)
     refuse_foreign([path], advice="choose another place")
@@ -49,11 +50,11 @@ def write_target(path: str | Path, target: Target, paper: str = "a4", border_bit
 
 
 def target_pdf(target: Target, paper: str = "a4", border_bits: int | None = None) -> bytes:
-    """A page with `target`, upright or on its side as it fits, or one for each of several free tags; border_bits as in
-    `pattern_of`.
+    """PDF of `target` on one page, in portrait or landscape as it fits; free tags get one page each. paper: a key of
+    `PAPERS`; border_bits: width of the black border of tags, as in `pattern_of`.
 
-    Raises RigError where the paper is unknown or too small, CalibrationError where reportlab, or OpenCV for tags, is
-    not installed.
+    Raises RigError if the paper is unknown or too small, CalibrationError if reportlab, or OpenCV for tags, is not
+    installed.
     """
     if paper not in PAPERS:
         raise RigError(f"there is no paper {paper!r}; available are {', '.join(PAPERS)}.")
@@ -72,7 +73,7 @@ def target_pdf(target: Target, paper: str = "a4", border_bits: int | None = None
 
 
 def _patterns(target: Target, border_bits: int | None) -> dict[str, Pattern]:
-    """What is on each page, by name."""
+    """The pattern of each page, by the name of the tag on it; "" for a target of one page."""
     if not isinstance(target, Markers):
         return {"": pattern_of(target, border_bits)}
     tags = [Tag(target.family, int(i), target.size) for i in target.known]
@@ -80,9 +81,9 @@ def _patterns(target: Target, border_bits: int | None) -> dict[str, Pattern]:
 
 
 def _draw(page: Any, pattern: Pattern, width: float, height: float) -> None:
-    """The pattern in the middle of the page [mm], above its foot."""
+    """Draws the black boxes of the pattern in the middle of a page of width x height [mm], above its foot."""
     left, bottom = _lower_left_mm(pattern, width, height)
-    # One path: edges that boxes share would show as hairlines between several.
+    # One path for all boxes: with several paths, shared edges would show as hairlines.
     path = page.beginPath()
     for x0, y0, x1, y1 in 1e3 * pattern.black_boxes():
         x, y = left + x0 - 1e3 * pattern.x[0], bottom + y0 - 1e3 * pattern.y[0]
@@ -91,7 +92,7 @@ def _draw(page: Any, pattern: Pattern, width: float, height: float) -> None:
 
 
 def _draw_circles(page: Any, target: Target, pattern: Pattern, width: float, height: float) -> None:
-    """The circles of the target, black, where `_draw` has the paper around them."""
+    """Draws the circles of the target, black, on a page of width x height [mm]; `_draw` has drawn the rest."""
     left, bottom = _lower_left_mm(pattern, width, height)
     for point, radius in zip(1e3 * target.points, 1e3 * target.radii, strict=True):
         if radius > 0.0:
@@ -100,13 +101,14 @@ def _draw_circles(page: Any, target: Target, pattern: Pattern, width: float, hei
 
 
 def _lower_left_mm(pattern: Pattern, width: float, height: float) -> tuple[float, float]:
-    """Where the pattern begins on the page [mm]: in its middle, above its foot."""
+    """x and y of the pattern's lower left corner on a page of width x height, all in mm."""
     size_x, size_y = _size_mm(pattern)
     return 0.5 * (width - size_x), EDGE_MM + FOOT_MM + 0.5 * (height - 2.0 * EDGE_MM - FOOT_MM - size_y)
 
 
 def page_mm(pattern: Pattern, paper: str) -> tuple[float, float]:
-    """Width and height of the page [mm], turned so that the pattern fits. Raises RigError where it does not."""
+    """Width and height of the page [mm], portrait or landscape so that the pattern fits. Raises RigError if it does
+    not."""
     size = _size_mm(pattern)
     for width, height in (PAPERS[paper], PAPERS[paper][::-1]):
         if _fits(size, width, height):
@@ -135,14 +137,15 @@ def _canvas(width: float, height: float) -> Any:
         from reportlab.pdfgen.canvas import Canvas
     except ImportError:
         raise CalibrationError(f"PDF needs reportlab, which is not installed; run {install('print')}.") from None
-    # invariant: no date inside, so that the same target gives the same file.
+    # invariant: the file contains no date, so that the same target gives the same file.
     return Canvas(BytesIO(), pagesize=(_POINTS * width, _POINTS * height), pageCompression=0, invariant=1)
 
 
 def _foot(page: Any, target: Target, name: str, border_bits: int | None) -> None:
-    """What the rig file must say, which page it is, how to print, and the ruler; from the top down, at the left."""
+    """Draws at the left of the foot, from the top: the target's line for the rig file, the name of the page, how to
+    print, and the ruler."""
     fields = target.plain()
-    head = "" if isinstance(target, Tag) else "target: "  # a tag alone is no target of a rig file
+    head = "" if isinstance(target, Tag) else "target: "  # a rig file cannot have a single tag as target
     border = "" if border_bits is None or "border_bits" in fields else f", tags with a border of {border_bits} bits"
     page.setFont(_FONT, _FONT_POINTS)
     lines = (

@@ -1,4 +1,4 @@
-"""The noise of an IMU, from a recording of it at rest."""
+"""Noise densities, bias walks and bias instabilities of an IMU, from a recording at rest."""
 
 from icalib.tools.allan.analysis import ImuNoiseStudy, SensorNoise, study_imu, study_recording
 from icalib.tools.allan.deviation import Deviation, allan_deviation

@@ -1,4 +1,4 @@
-"""From a recording of an IMU at rest to its noise."""
+"""Estimates the noise of an IMU from a recording at rest, and warns of wrong units, rounding and short recordings."""
 
 from __future__ import annotations
 
@@ -22,20 +22,22 @@ from icalib.tools.allan.fit import AllanFit, bands_of_all, fit_noise, pooled
 from icalib.tools.allan.sampling import still_readings
 
 AXES = ("x", "y", "z")
-_WALK_KNOWN = 1.0  # of NoiseFit.lacking
-_WORSE = 1.5  # times the mean density
-_MISFIT = 0.15
-_NOISIEST_GYRO = 1e-3  # rad/s/sqrt(Hz): more than gyroscopes have that are sold; quiet ones have it in deg/s
-_APART = 5.0  # times as far from its class as the accelerometer, which vibration would disturb as well
-_SAMPLE = 200_000  # readings in which the steps of rounding are looked for
+_WALK_KNOWN = 1.0  # largest `AllanFit.lacking` without a warning
+_WORSE = 1.5  # an axis with a density of more than this many mean densities gets a warning
+_MISFIT = 0.15  # largest `AllanFit.misfit` without a warning
+_NOISIEST_GYRO = 1e-3  # rad/s/sqrt(Hz): no gyroscope on sale is noisier; the figure of a quiet one in deg/s may be
+_APART = 5.0  # ratio of gyroscope to accelerometer noise, each relative to its class: vibration would raise both
+_SAMPLE = 200_000  # readings that are searched for rounding
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of the gyroscope (unit rad/s) or the accelerometer (m/s^2). together: what all three axes are taken for.
+    """Noise of the gyroscope (unit rad/s) or the accelerometer (m/s^2). axes: fit of each axis; together: one fit to
+    the mean spectrum of the three axes.
 
-    instability (3,) in `unit`, and the averaging time (3,) [s] where the deviation is lowest; open: where that is the
-    longest or shortest averaging time, so that the instability is only bounded.
+    instability (3,): bias instability of each axis, in `unit`; instability_tau (3,): averaging time of the lowest Allan
+    deviation [s]; open: True if this is the longest or shortest averaging time, so that the instability is only an
+    upper bound.
     """
 
     kind: str
@@ -50,7 +52,8 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class ImuNoiseStudy:
-    """What `study_imu` found. warnings, notes: sentences."""
+    """Result of `study_imu`. where: source of the readings, for messages; seconds: length of the readings at rest;
+    period of the readings [s]; warnings, notes: sentences."""
 
     name: str
     where: str
@@ -69,10 +72,10 @@ class ImuNoiseStudy:
 def study_recording(
     path: str | Path, imu: str | None = None, gyro_unit: GyroUnit | None = None, accel_unit: AccelUnit | None = None
 ) -> ImuNoiseStudy:
-    """Of the IMU at `imu` (topic or table) in the recording; by default the only one. Units: of the readings as they
-    are recorded; None: SI units, and g is recognised.
+    """Noise of the IMU at `imu` (topic or table) in the recording; None: the only one. gyro_unit, accel_unit: units of
+    the recorded readings; None: SI units, or g, which is recognised.
 
-    Raises RecordingError as the readers do, and EstimationError where nothing stood still for 10 s.
+    Raises RecordingError if the readings are missing or wrong, EstimationError if the IMU was not at rest for 10 s.
     """
     recording: Recording = open_recording(path)
     topic = _imu_topic(str(path), recording, imu)
@@ -85,7 +88,8 @@ def study_recording(
 
 
 def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoiseStudy:
-    """Noise densities, bias walks and Allan deviations of `imu`. Raises EstimationError as `still_readings`."""
+    """Noise densities, bias walks and Allan deviations of `imu`; where, notes: for the result. Raises EstimationError
+    if the IMU was not at rest for 10 s."""
     still = still_readings(imu)
     gyro = _sensor_noise("gyroscope", "rad/s", [part[:, :3] for part in still.stretches], still.period)
     accel = _sensor_noise("accelerometer", "m/s^2", [part[:, 3:] for part in still.stretches], still.period)
@@ -97,8 +101,8 @@ def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoi
 
 
 def _imu_topic(where: str, recording: Recording, given: str | None) -> TopicInfo:
-    """The topic or table `given`, else the only one of an IMU, or one of its two where its sensors report apart. Raises
-    RecordingError listing what there is."""
+    """The topic or table `given`, else the only one with readings of an IMU. If gyroscope and accelerometer have a
+    topic each, one of the two. Raises RecordingError with a list of the topics."""
     topics = recording.topics()
     if given is not None:
         topic = find_topic(where, topics, given)
@@ -115,7 +119,7 @@ def _imu_topic(where: str, recording: Recording, given: str | None) -> TopicInfo
 
 
 def _sensor_noise(kind: str, unit: str, stretches: list[np.ndarray], period: float) -> SensorNoise:
-    """stretches: readings (n, 3) at rest."""
+    """Fits of one sensor. kind, unit: see `SensorNoise`; stretches: readings (n, 3) at rest, one every `period` s."""
     bands = [bands_of_all([part[:, k] for part in stretches], period) for k in range(3)]
     deviation = allan_deviation_of_all(stretches, period)
     instability, tau = deviation.instability()
@@ -133,7 +137,8 @@ def _sensor_noise(kind: str, unit: str, stretches: list[np.ndarray], period: flo
 
 
 def _unit_warnings(gyro: float, accel: float) -> tuple[str, ...]:
-    """A warning where the noise of the gyroscope is that of one in deg/s beside the accelerometer's."""
+    """A warning if the gyroscope's readings are probably in deg/s. gyro [rad/s/sqrt(Hz)] and accel [m/s^2/sqrt(Hz)] are
+    noise densities; only that of the gyroscope is far above its class."""
     usual = class_noise(DEFAULT_CLASS)
     times_gyro, times_accel = gyro / usual.gyro, accel / usual.accel
     if gyro < _NOISIEST_GYRO or times_gyro < _APART * times_accel:
@@ -174,7 +179,7 @@ def _shape_warnings(sensor: SensorNoise) -> tuple[str, ...]:
 
 
 def _rounding(kind: str, readings: np.ndarray) -> tuple[str, ...]:
-    """A warning where readings are rounded as coarsely as they are noisy."""
+    """A warning if the steps of rounding in readings (n, 3) are larger than their noise."""
     part = readings[:_SAMPLE]
     for axis, values in zip(AXES, part.T, strict=True):
         levels = np.unique(values)
@@ -189,5 +194,6 @@ def _rounding(kind: str, readings: np.ndarray) -> tuple[str, ...]:
 
 
 def _levels_of_noise(values: np.ndarray, step: float) -> float:
-    """More levels than the range holds are no rounding."""
+    """Number of levels that values rounded to `step` can have within their range, and one more. If there are more, the
+    values are not rounded."""
     return float(np.ptp(values) / step) + 2.0

@@ -1,4 +1,4 @@
-"""The folder that a study of an IMU's noise leaves."""
+"""Result files of `icalib allan`."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ FILES = ("allan.html", "noise.yaml", "allan.json")
 
 
 def check_folder(folder: Path) -> None:
-    """Makes `folder` and tries to write in it, before the work starts.
+    """Makes `folder` and checks that it is writable, before the work starts.
 
-    Raises CalibrationError where that fails, or files of these names that icalib did not write are there.
+    Raises CalibrationError if it is not, or if it has files of the names `FILES` that icalib did not write.
     """
     check_writable(folder)
     refuse_foreign(folder / name for name in FILES)
 
 
 def write_study(study: ImuNoiseStudy, folder: Path) -> None:
-    """Writes allan.html, noise.yaml (fields of a rig file) and allan.json. Raises CalibrationError."""
+    """Writes allan.html, noise.yaml (fields of a rig file) and allan.json to `folder`. Raises CalibrationError if that
+    fails, or a file of the same name is not from icalib."""
     texts = map(printable, (allan_html(study), rig_snippet(study, warned=True), study_json(study)))
     refuse_foreign(folder / name for name in FILES)
     write_texts(folder, sealed_texts(dict(zip(FILES, texts, strict=True))))

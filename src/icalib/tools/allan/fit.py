@@ -1,4 +1,4 @@
-"""White noise and random walk of a bias, by maximum likelihood of the differences of neighbouring readings.
+"""White noise and random walk of a bias, by maximum likelihood of the differences of successive readings.
 
 With readings y_i = b_i + w_i, w white with variance N^2 / T and b a random walk with steps of variance K^2 T (T: the
 period), the differences have the covariance K^2 T I + N^2 / T tridiag(-1, 2, -1). The discrete sine transform (type I)
@@ -6,7 +6,8 @@ makes it diagonal, so the likelihood is exact: coefficients z_k are independent,
 
     s_k = c + a (2 - 2 cos(pi k / (n + 1))),     a = N^2 / T,  c = K^2 T.
 
-Differences only drop the constant bias. Coefficients are averaged in bands; the model is linear in (a, c).
+Differences lose no information but the constant bias. Coefficients are averaged in frequency bands; the model is linear
+in (a, c).
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-_PER_OCTAVE = 8
-_HIGHEST = 0.05  # of the rate: above, the sensor's own filter and rounding shape the spectrum
-_LEAST_IN_BAND = 8  # coefficients that make a band's power about Gaussian
-_RESOLVED = 9.0  # twice the gain in log-likelihood by the walk, as 3 sigma
-_UPPER = 2.71  # one-sided 95 %
-_SURE = 5.0  # standard deviations of chi^2, beyond which the model does not fit
-_RATIOS = np.concatenate([[0.0], np.geomspace(1e-16, 1e4, 401)])  # c / a
+_PER_OCTAVE = 8  # bands
+_HIGHEST = 0.05  # highest frequency over the rate: above it, the sensor's filter and rounding shape the spectrum
+_LEAST_IN_BAND = 8  # coefficients, which make the mean power of a band about Gaussian
+_RESOLVED = 9.0  # twice the gain in log-likelihood by the walk: 3 sigma
+_UPPER = 2.71  # twice the loss in log-likelihood at the upper bound: one-sided 95 %
+_SURE = 5.0  # chi^2 above its mean by this many standard deviations shows that the model does not fit
+_RATIOS = np.concatenate([[0.0], np.geomspace(1e-16, 1e4, 401)])  # grid of c / a
 
 
 @dataclass(frozen=True)
 class Bands:
-    """Mean squares `power` (j,) of `count` (j,) coefficients each, about `frequency` (j,) [Hz]; slope (j,): the mean of
-    2 - 2 cos, the model's factor of a."""
+    """Power spectrum of the differences in j bands. frequency (j,): mean [Hz]; count (j,): number of coefficients;
+    power (j,): their mean square; slope (j,): mean of 2 - 2 cos, the factor of a in the model."""
 
     frequency: np.ndarray
     count: np.ndarray
@@ -38,11 +39,11 @@ class Bands:
 
 @dataclass(frozen=True)
 class AllanFit:
-    """white: density N [unit/sqrt(Hz)]; walk: density K [unit s^-1/sqrt(Hz)], with standard deviations.
+    """Fitted noise. white: density N [unit/sqrt(Hz)]; walk: density K [unit s^-1/sqrt(Hz)]; _std: standard deviations.
 
-    resolved: whether there is a walk for certain. walk_upper: what K stays below with 95 %. misfit: relative standard
-    deviation by which bands depart from the model beyond their noise, which the standard deviations allow for.
-    lacking: times as long a recording would give K to 20 %; below 1 this one does.
+    resolved: whether the walk is significant (3 sigma). walk_upper: upper bound of K (95 %). misfit: relative standard
+    deviation of the bands about the model, beyond their sampling noise; the standard deviations include it. lacking:
+    factor by which the recording must be longer to know K to 20 %; below 1 it is long enough.
     """
 
     white: float
@@ -56,14 +57,14 @@ class AllanFit:
 
 
 def bands_of_all(stretches: Sequence[np.ndarray], period: float) -> Bands:
-    """Of stretches of readings, each (n,), one every `period` seconds: their likelihoods multiply, so their bands stand
-    side by side, and no difference is taken from one stretch to the next."""
+    """Bands of several stretches of readings, each (n,), one every `period` seconds. The bands of all stretches are
+    concatenated, as their likelihoods multiply. No difference spans two stretches."""
     found = [bands_of(part, period) for part in stretches]
     return Bands(*(np.concatenate([getattr(b, f.name) for b in found]) for f in fields(Bands)))
 
 
 def bands_of(readings: np.ndarray, period: float) -> Bands:
-    """Of readings (n,), one every `period` seconds, up to a twentieth of the rate."""
+    """Bands of readings (n,), one every `period` seconds, up to a frequency of a twentieth of the rate."""
     differences = np.diff(readings)
     n = _smooth_size(len(differences) + 1) - 1
     odd = np.concatenate([[0.0], differences[:n], [0.0], -differences[:n][::-1]])
@@ -79,14 +80,16 @@ def bands_of(readings: np.ndarray, period: float) -> Bands:
 
 
 def pooled(axes: list[Bands]) -> Bands:
-    """The mean of the axes' spectra, whose a and c are the means of theirs. Axes that are weaker count for less."""
+    """Mean spectrum of several axes; its a and c are the means of those of the axes. The effective `count` is smaller
+    if the axes differ in power."""
     power = np.array([b.power for b in axes])
     weight = np.array([(b.power * b.count).sum() / b.count.sum() for b in axes])
     return Bands(axes[0].frequency, axes[0].count * weight.sum() ** 2 / (weight**2).sum(), power.mean(0), axes[0].slope)
 
 
 def fit_noise(bands: Bands, period: float) -> AllanFit:
-    """N and K of readings one every `period` seconds."""
+    """Maximum-likelihood N and K from `bands` of readings one every `period` seconds. The weights of the bands are
+    reduced until the misfit is consistent with them."""
     misfit, weight = 0.0, 0.5 * bands.count
     ratio, a = _most_likely(bands, weight)
     for _ in range(20):
@@ -120,14 +123,14 @@ def _slope(angle: np.ndarray) -> np.ndarray:
 
 
 def _cost(bands: Bands, weight: np.ndarray, ratio: float) -> float:
-    """Minus the log-likelihood at c / a = ratio, with the best a."""
+    """Negative log-likelihood at c / a = ratio, maximised over a."""
     shape = bands.slope + ratio
     a = (weight * bands.power / shape).sum() / weight.sum()
     return float((weight * np.log(a * shape)).sum())
 
 
 def _most_likely(bands: Bands, weight: np.ndarray) -> tuple[float, float]:
-    """c / a and a: a grid, then golden sections between its neighbours."""
+    """c / a and a of the highest likelihood, by a grid search and then golden-section search."""
     costs = [_cost(bands, weight, float(r)) for r in _RATIOS]
     best = int(np.argmin(costs))
     low, high = (float(_RATIOS[min(max(best + side, 0), len(_RATIOS) - 1)]) for side in (-1, 1))
@@ -143,7 +146,7 @@ def _most_likely(bands: Bands, weight: np.ndarray) -> tuple[float, float]:
 
 
 def _upper_ratio(bands: Bands, weight: np.ndarray, ratio: float, floor: float) -> float:
-    """The largest c / a that the data allow with 95 %."""
+    """Upper bound (95 %) of c / a on the grid, from the likelihood ratio. ratio, floor: estimate and its cost."""
     for r in _RATIOS[np.searchsorted(_RATIOS, ratio, "right") :]:
         if 2.0 * (_cost(bands, weight, float(r)) - floor) > _UPPER:
             return float(r)
@@ -159,11 +162,12 @@ def _std(bands: Bands, weight: np.ndarray, a: float, c: float) -> tuple[float, f
 
 
 def _misfit(bands: Bands, variance: np.ndarray) -> float:
-    """Relative standard deviation of the bands about the model beyond their own noise; 0 where chi^2 is as expected."""
+    """Relative standard deviation of the bands about the model `variance` (j,), beyond their sampling noise; 0 if chi^2
+    is as expected."""
     wide = bands.count >= _LEAST_IN_BAND
     off = (bands.power[wide] / variance[wide] - 1.0) ** 2
     noise, dof = 2.0 / bands.count[wide], max(1, int(wide.sum()) - 2)
-    # The mean of m squares has an excess kurtosis of 12 / m: 2 + 12 / m is the variance of its whitened square.
+    # The mean of m squares has an excess kurtosis of 12 / m, so that its whitened square has the variance 2 + 12 / m.
     if (off / noise).sum() < dof + _SURE * np.sqrt((2.0 + 6.0 * noise).sum()):
         return 0.0
     low, high = 0.0, 10.0
@@ -174,7 +178,7 @@ def _misfit(bands: Bands, variance: np.ndarray) -> float:
 
 
 def _smooth_size(n: int) -> int:
-    """The largest number up to n with no prime factor above 5, which transforms fast."""
+    """The largest number up to n without a prime factor above 5: an FFT of this size is fast."""
     best = 1
     five = 1
     while five <= n:

@@ -1,4 +1,4 @@
-"""`allan.html`: the Allan deviations with what was fitted, one file without network."""
+"""`allan.html`: Allan deviations and fitted noise, in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HEADERS = ("", "noise density", "bias walk", "bias instability")
 
 
 def allan_html(study: ImuNoiseStudy) -> str:
-    """The whole page as one HTML document, plotly.js included."""
+    """The page as one HTML document, plotly.js included."""
     figures = {sensor.kind: deviation_figure(sensor, study.period) for sensor in study.sensors}
     words = {"name": study.name, "seconds": f"{study.seconds:.0f}", "rate": f"{1.0 / study.period:.6g}"}
     words |= {"snippet": rig_snippet(study), "where": study.where}
@@ -32,7 +32,7 @@ def allan_html(study: ImuNoiseStudy) -> str:
 
 
 def deviation_figure(sensor: SensorNoise, period: float) -> Figure:
-    """Allan deviation of each axis with one standard deviation, and of what all together are taken for."""
+    """Allan deviation of each axis with one standard deviation, and that of the noise fitted to all axes together."""
     d, fit = sensor.deviation, sensor.together
     traces = []
     for k, (name, color) in enumerate(zip(AXES, AXIS_COLORS, strict=True)):

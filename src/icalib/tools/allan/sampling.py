@@ -1,4 +1,4 @@
-"""Readings at an even rate, and the stretches of them that stood still."""
+"""Evenly sampled readings of an IMU, and the stretches of them at rest."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from numpy.lib.stride_tricks import sliding_window_view
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
 
-_GAP_PERIODS = 5.0  # a longer step between stamps is a gap; shorter ones are jitter of whoever stamps
-_MOST_FILLED = 0.05  # share of readings; beyond it stamps come in bursts, and say nothing about gaps
-_WINDOW_S = 1.0  # in which noise is judged; gaps that are longer are not filled
-_LEAST_S = 10.0  # of the longest stretch
-_JUMP = np.repeat([0.02, 0.2], 3)  # rad/s, m/s^2: no bias walks that far from one second to the next
-_SURE = 8.0  # standard deviations of the mean of a window, which a jump of a noisy sensor exceeds too
-_OFF_RAD_S = 0.1  # nor that far from its median in hours
-_LOUDER, _SCATTERS = 1.5, 3.0  # times the quietest noise, and scatters of it (of its logarithm), are moved or touched
-_QUIET = 2.0  # times the quietest noise, below which windows show its scatter
-_SHORTEST = 0.25  # of the longest stretch; shorter ones tell little of slow noise
-_GLITCH, _ALONE = 15.0, 5.0  # times the usual distance from the neighbours' mean, and that of readings near by
-_NEAR = 3  # readings
-_SAMPLE = 200_000  # readings in which the step of rounding is looked for
+_GAP_PERIODS = 5.0  # periods: a longer interval between stamps is a gap, a shorter one is jitter of the stamps
+_MOST_FILLED = 0.05  # share of missing readings: beyond it, stamps come in bursts and do not show gaps
+_WINDOW_S = 1.0  # window in which the noise is computed; longer gaps are not filled
+_LEAST_S = 10.0  # shortest usable length of the longest stretch at rest
+_JUMP = np.repeat([0.02, 0.2], 3)  # rad/s, m/s^2: more change of the mean between windows is motion, not bias walk
+_SURE = 8.0  # standard deviations of a window's mean: the same limit for noisy sensors
+_OFF_RAD_S = 0.1  # a mean rate further from the median is motion; biases do not walk that far in hours
+_LOUDER, _SCATTERS = 1.5, 3.0  # limit of the noise at rest: factor on the quietest, and standard deviations of its log
+_QUIET = 2.0  # windows below this factor times the quietest noise give its scatter
+_SHORTEST = 0.25  # of the longest stretch: shorter stretches have little information on slow noise
+_GLITCH, _ALONE = 15.0, 5.0  # distance of a glitch from its neighbours' mean: over the median's, over that of near ones
+_NEAR = 3  # readings on each side that are near
+_SAMPLE = 200_000  # readings from which the step of rounding is found
 
 
 @dataclass(frozen=True)
 class Still:
-    """Stretches (n, 6) of readings, gyroscope [rad/s] then accelerometer [m/s^2], one every `period` seconds."""
+    """Readings at rest. stretches: arrays (n, 6), gyroscope [rad/s] then accelerometer [m/s^2], one every `period`
+    seconds; warnings: sentences."""
 
     stretches: tuple[np.ndarray, ...]
     period: float
@@ -35,7 +36,7 @@ class Still:
 
     @property
     def readings(self) -> np.ndarray:
-        """(n, 6) of all stretches, one after the other."""
+        """(n, 6) readings of all stretches, concatenated."""
         return np.concatenate(self.stretches)
 
     @property
@@ -44,10 +45,10 @@ class Still:
 
 
 def still_readings(imu: ImuStream) -> Still:
-    """The longest stretches of `imu` that stood still, at an even rate; what was filled or left out stands in warnings.
+    """The longest stretches of `imu` at rest, evenly sampled; warnings name readings that were filled or left out.
 
-    Windows of a second are compared with the noise of the quietest 10 s. Raises EstimationError where nothing stood
-    still for 10 s.
+    Each window of a second is compared with the noise of the quietest 10 s. Raises EstimationError if the IMU was not
+    at rest for 10 s.
     """
     readings, glitches = _without_glitches(np.concatenate([imu.gyro, imu.accel], axis=1), imu.name)
     parts, begins, period, gaps = _even(imu.name, imu.stamps_ns, readings)
@@ -71,7 +72,7 @@ def still_readings(imu: ImuStream) -> Still:
 
 
 def _what_is_used(total_s: float, stretches: list[tuple[float, float]]) -> str:
-    """stretches: how long, and from when on [s]."""
+    """End of a warning: which part of `total_s` is used. stretches: length and begin of each [s]."""
     if len(stretches) == 1:
         long, begin = stretches[0]
         return f"only the longest stretch at rest of {total_s:.0f} s is used, {long:.0f} s from {begin:.0f} s on."
@@ -84,17 +85,18 @@ def _what_is_used(total_s: float, stretches: list[tuple[float, float]]) -> str:
 
 
 def _without_glitches(readings: np.ndarray, name: str) -> tuple[np.ndarray, tuple[str, ...]]:
-    """`readings` (n, 6), of which single ones far off both neighbours became the mean of these, and a count."""
+    """`readings` (n, 6) in which glitches, single readings far off both neighbours, are replaced by the mean of these;
+    and a warning with their number."""
     found = np.zeros(readings.shape, bool)
     step = _rounding_step([readings])
     for k, values in enumerate(readings.T if len(readings) >= 2 * _NEAR else ()):
         off = np.abs(values[1:-1] - 0.5 * (values[:-2] + values[2:]))
         usual = 1.4826 * float(np.median(off)) + step[k]
-        padded = np.pad(off, _NEAR)  # the neighbours' own are half as large as that of a glitch between them
+        padded = np.pad(off, _NEAR)  # the neighbours of a glitch, whose `off` is half of the glitch's, are not compared
         near = np.zeros(len(off))
         for j in (-3, -2, 2, 3):
             np.maximum(near, padded[_NEAR + j : len(padded) - _NEAR + j], out=near)
-        step_size = np.abs(values[2:] - values[:-2])  # of a tilt; before and after a glitch readings are alike
+        step_size = np.abs(values[2:] - values[:-2])  # large if the IMU is tilted, small about a glitch
         found[1:-1, k] = off > np.maximum(_GLITCH * usual, _ALONE * np.maximum(near, step_size))
     if not found.any():
         return readings, ()
@@ -107,8 +109,8 @@ def _without_glitches(readings: np.ndarray, name: str) -> tuple[np.ndarray, tupl
 def _even(
     name: str, stamps_ns: np.ndarray, readings: np.ndarray
 ) -> tuple[list[np.ndarray], list[float], float, tuple[str, ...]]:
-    """Readings between gaps that are longer than a window, with shorter gaps filled by straight lines; when each part
-    begins [s]; and the period [s]."""
+    """Splits readings (n, 6) at gaps longer than a window, and fills shorter gaps by linear interpolation. Returns the
+    parts, the begin of each since the first stamp [s], the period [s], and warnings."""
     steps = np.diff(stamps_ns) * 1e-9
     longest = max(_WINDOW_S, _GAP_PERIODS * float(np.median(steps)))
     cuts = np.flatnonzero(steps > longest) + 1
@@ -133,14 +135,15 @@ def _even(
 
 
 def _filled(readings: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """With as many readings as are `missing` (n - 1,) behind each, on straight lines."""
+    """readings (n, 6) with missing (n - 1,) interpolated readings inserted after each."""
     at = np.concatenate([[0], np.cumsum(1 + missing)])
     every = np.arange(at[-1] + 1)
     return np.stack([np.interp(every, at, readings[:, k]) for k in range(6)], axis=1)
 
 
 def _disturbed(parts: list[np.ndarray], window: int) -> list[np.ndarray]:
-    """(m,) of each part: whether the IMU moved in each whole window, or was touched shortly before or after."""
+    """For each part (m,) bool: whether the IMU moved in each of its m windows, or vibrated in the window before or
+    after. window: readings per window."""
     windows = [part[: len(part) // window * window].reshape(-1, window, 6) for part in parts]
     means = [w.mean(axis=1) for w in windows]
     floor = 0.5 * _rounding_step(parts)
@@ -161,7 +164,8 @@ def _disturbed(parts: list[np.ndarray], window: int) -> list[np.ndarray]:
 
 
 def _limits(windows: list[np.ndarray], noises: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-    """(6,) noise of the quietest 10 s, and the most that a window at rest has; None where no part is that long."""
+    """Noise (6,) of the quietest 10 s, and the largest noise (6,) of a window at rest; None if no part has 10 s.
+    windows: readings (m, window, 6) of each part; noises: standard deviations (m, 6)."""
     least = round(_LEAST_S / _WINDOW_S)
     runs = [
         (np.median(sliding_window_view(noise, least, axis=0), axis=-1), readings)
@@ -180,21 +184,23 @@ def _limits(windows: list[np.ndarray], noises: list[np.ndarray]) -> tuple[np.nda
 
 
 def _scatter(noises: np.ndarray, quietest: np.ndarray) -> np.ndarray:
-    """(6,) standard deviation of the logarithm of the noise of quiet windows, from its median deviation."""
+    """(6,) standard deviation of the logarithm of the noise of quiet windows, by the median absolute deviation.
+    noises (m, 6), quietest (6,)."""
     quiet = np.log(np.where(noises <= _QUIET * quietest, noises, np.nan) / quietest)
     return 1.4826 * np.nanmedian(np.abs(quiet - np.nanmedian(quiet, axis=0)), axis=0)
 
 
 def _scatter_of_noise(windows: np.ndarray) -> float:
-    """The same by Bartlett's formula, from the spectrum of some windows (m, window) at rest: a filter leaves few of a
-    window's readings independent."""
+    """Standard deviation of the logarithm of the noise of windows (m, window) at rest, by Bartlett's formula from their
+    spectrum. It accounts for a filter, after which few readings of a window are independent."""
     power = np.abs(np.fft.rfft(windows.ravel() - windows.mean())[1:]) ** 2
-    squares = 0.5 * len(power) * float((power**2).sum()) / max(float(power.sum()) ** 2, 1e-300)  # of the correlation
+    # Sum of the squared autocorrelation.
+    squares = 0.5 * len(power) * float((power**2).sum()) / max(float(power.sum()) ** 2, 1e-300)
     return float(np.sqrt(0.5 * squares / windows.shape[1]))
 
 
 def _rounding_step(parts: list[np.ndarray]) -> np.ndarray:
-    """(6,) the usual step from one value of a reading to the next larger one: noise below it comes and goes."""
+    """(6,) median step between the distinct values of the readings: the resolution of rounded ones."""
     ends = np.cumsum([len(part) for part in parts])
     sample = np.concatenate([part[:_SAMPLE] for part in parts[: 1 + int(np.searchsorted(ends, _SAMPLE))]])
     levels = (np.unique(values) for values in sample.T)

@@ -1,4 +1,4 @@
-"""The study of an IMU's noise in words, as fields of a rig file, and as plain data."""
+"""An IMU noise study as text: table for the terminal, fields of a rig file, and JSON."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _FIELDS = {"gyroscope": ("gyro", "gyro_walk"), "accelerometer": ("accel", "accel
 
 
 def units(sensor: SensorNoise) -> tuple[str, str]:
-    """Of the noise density and of the bias walk."""
+    """Units of the noise density and of the bias walk."""
     return _UNITS[sensor.kind]
 
 
 def rig_snippet(study: ImuNoiseStudy, warned: bool = False) -> str:
-    """YAML to be pasted below the IMU of a rig file. A walk that was not seen is given as its upper bound. warned: the
-    warnings stand in it as comments."""
+    """YAML to be pasted below the IMU of a rig file. A walk that is not significant is given as its upper bound.
+    warned: add the warnings as comments."""
     lines = [
         f"# Noise of {study.name}, from {study.seconds:.0f} s at rest at {1.0 / study.period:.6g} Hz (icalib allan).",
         *(f"# Warning: {sentence}" for sentence in study.warnings if warned),
@@ -42,7 +42,7 @@ def rig_snippet(study: ImuNoiseStudy, warned: bool = False) -> str:
 
 
 def study_json(study: ImuNoiseStudy) -> str:
-    """All figures, SI units."""
+    """Text of allan.json: all figures of the study, in SI units."""
     plain: dict[str, Any] = {"imu": study.name, "recording": study.where, "seconds": study.seconds}
     plain |= {"rate": 1.0 / study.period, "warnings": list(study.warnings), "notes": list(study.notes)}
     for sensor in study.sensors:
@@ -58,7 +58,7 @@ def study_json(study: ImuNoiseStudy) -> str:
 
 
 def print_study(study: ImuNoiseStudy) -> None:
-    """Table, snippet and warnings on standard output."""
+    """Prints table, lines for the rig file, and warnings on standard output."""
     console = Console()
     console.print(noise_table(study))
     console.print("For the rig file, below the IMU:\n\n" + rig_snippet(study), markup=False, highlight=False)
@@ -68,7 +68,7 @@ def print_study(study: ImuNoiseStudy) -> None:
 
 
 def noise_table(study: ImuNoiseStudy) -> Table:
-    """A row of units, one for each axis, and one for all three."""
+    """Table of the study. Each sensor has a row of units, a row for each axis, and a row for all three together."""
     out = Table(title=f"Noise of {study.name}, {study.seconds:.0f} s at rest", title_justify="left")
     for header in ("", "noise density", "bias walk", "bias instability"):
         out.add_column(header, no_wrap=True)
@@ -79,7 +79,7 @@ def noise_table(study: ImuNoiseStudy) -> Table:
 
 
 def rows(sensor: SensorNoise) -> list[tuple[str, str, str, str]]:
-    """Units, then each axis, then all together: name, density, walk, instability."""
+    """Rows of one sensor: units, each axis, all together. Cells: name, noise density, bias walk, bias instability."""
     found = [(sensor.kind, *units(sensor), sensor.unit)]
     for k, (name, fit) in enumerate([*zip(AXES, sensor.axes, strict=True), ("together", sensor.together)]):
         walk = with_std(fit.walk, fit.walk_std) if fit.resolved else _short(f"below {fit.walk_upper:.1e}")
@@ -88,7 +88,7 @@ def rows(sensor: SensorNoise) -> list[tuple[str, str, str, str]]:
 
 
 def with_std(value: float, std: float) -> str:
-    """1.602e-4 +- 2.4e-7: as many digits as are known."""
+    """Text such as "1.602e-4 +- 2.4e-7"; the standard deviation sets the number of digits."""
     digits = int(np.clip(floor(log10(value)) - floor(log10(std)) + 1, 1, 6)) if value > 0 < std else 2
     return _short(f"{value:.{digits}e} +- {std:.1e}")
 
@@ -105,7 +105,7 @@ def _instability(sensor: SensorNoise, axis: int) -> str:
 
 
 def _figures(sensor: SensorNoise) -> list[tuple[str, str, float, float]]:
-    """Field of the rig file, unit, value, standard deviation."""
+    """For density and walk: field of the rig file, unit, value, standard deviation."""
     fit = sensor.together
     walk = fit.walk if fit.resolved else fit.walk_upper
     values = ((fit.white, fit.white_std), (walk, fit.walk_std))

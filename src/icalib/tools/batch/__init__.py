@@ -1,4 +1,4 @@
-"""Much work shared out to processes and machines by Dask, of which nothing finished is lost or done twice."""
+"""Many independent tasks on local processes or a Dask cluster; finished tasks are stored, so that a rerun resumes."""
 
 from icalib.tools.batch.alone import alone
 from icalib.tools.batch.files import replacing, write_whole

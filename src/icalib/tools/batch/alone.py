@@ -1,4 +1,4 @@
-"""One command at a time in one folder."""
+"""Exclusive lock on a folder."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ LOCK = ".lock"
 
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Nobody else works in `folder` meanwhile, who does this, too. However this process ends, the lock ends with it.
+    """Context with an exclusive lock on `folder`. The lock ends with the process, however that ends.
 
-    Raises CalibrationError where somebody else does, or the folder cannot be written.
+    Raises CalibrationError if another process has the lock, or the folder cannot be written. A file system without
+    locks is not protected.
     """
     filelock = load_filelock()
     lock = filelock.FileLock(folder / LOCK)
     try:
-        with suppress(NotImplementedError):  # of a file system that has no locks
+        with suppress(NotImplementedError):  # the file system has no locks
             lock.acquire(blocking=False)
     except filelock.Timeout:
         raise CalibrationError(

@@ -1,4 +1,4 @@
-"""One file at a time, whole or not there."""
+"""Atomic writing of single files."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from icalib.errors import CalibrationError
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Writes the file at once: whoever looks finds the old one or the new one. Raises CalibrationError."""
+    """Writes the file atomically: readers see the old content or the new one. Raises CalibrationError if it fails."""
     with replacing(path) as part, part.open("wb") as file:
         file.write(content)
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A place to write to, which takes the place of `path` at the end, and is removed where anything fails.
+    """Context with the path of a temporary file, which replaces `path` at the end, or is removed if anything fails.
 
-    Raises CalibrationError where it cannot be written.
+    Raises CalibrationError if the file cannot be written.
     """
     try:
         with staged(path.parent) as place:

@@ -1,4 +1,4 @@
-"""Which icalib it is that works."""
+"""Identity of the running code."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 
 @cache
 def program() -> str:
-    """Digest of icalib's own source: work of two versions, released or not, must not be mixed."""
+    """Digest of the Python source of `icalib.tools`, 16 hexadecimal digits. Results of different versions, released or
+    not, must not be mixed."""
     digest = hashlib.sha256()
     root = Path(__file__).parents[1]
     for file in sorted(root.rglob("*.py")):

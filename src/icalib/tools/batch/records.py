@@ -1,4 +1,4 @@
-"""What a task leaves behind, as JSON, and what is said where it failed."""
+"""Records of tasks as JSON, and messages on failed tasks."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def record_json(record: DataclassInstance, form: int) -> bytes:
-    """A dataclass of arrays and plain values, numbers in full; form: number of its format."""
+    """JSON of a dataclass of arrays and plain values, with all digits; form: number of the file format."""
     return json.dumps({"format": form} | asdict(record), default=lambda array: array.tolist()).encode()
 
 
 def plain_record(text: bytes, form: int) -> dict[str, Any]:
-    """The fields that `record_json` was given. Raises ValueError, KeyError or TypeError where `text` is something
-    else."""
+    """The fields of the dataclass that `record_json` wrote, as plain values. Raises ValueError, KeyError or TypeError
+    if `text` is not such a record of format `form`."""
     plain: dict[str, Any] = json.loads(text)
     if plain.pop("format") != form:
         raise ValueError("another format")
@@ -27,14 +27,15 @@ def plain_record(text: bytes, form: int) -> dict[str, Any]:
 
 
 def sentence_on(caught: Exception) -> str:
-    """A fault of the program must not end the work on a thousand tasks, nor be lost in it."""
+    """The message for the record of a failed task, which does not stop the others. An unexpected exception is reported
+    as a fault of icalib."""
     if isinstance(caught, CalibrationError):
         return str(caught)
     return f"the program failed ({type(caught).__name__}: {caught}), which is a fault of icalib; please report it."
 
 
 def check_worker(by: str, here: str) -> None:
-    """Raises CalibrationError where a task was done `by` another program than that of `here`, who asked for it."""
+    """Raises CalibrationError if the worker's program digest `by` differs from the digest `here` on this machine."""
     if by != here:
         raise CalibrationError(
             "a worker of the cluster runs another version of icalib than this machine; install the same "

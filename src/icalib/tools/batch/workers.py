@@ -1,4 +1,4 @@
-"""Tasks on many cores or machines, by Dask. A task whose worker dies is done again on another."""
+"""Tasks on many cores or machines, by Dask. If a worker dies, its task is repeated on another worker."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any, TypeVar
 from icalib.base.extras import load_dask, load_distributed
 from icalib.errors import CalibrationError
 
-ANSWER_WITHIN_S = 10
-# A task that waits at a worker would share the blame when that worker dies, and be given up in the end with the guilty.
+ANSWER_WITHIN_S = 10  # time limit to connect to a scheduler
+# No task is queued at a busy worker: Dask would count the worker's death against the queued task, too, and give it up.
 _ONE_TASK_A_WORKER = {"distributed.scheduler.worker-saturation": 1.0}
-SILENT = 60  # above every level of logging: what goes wrong is said in a sentence
+SILENT = 60  # above every logging level: icalib reports errors in its messages
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -22,8 +22,8 @@ Answer = TypeVar("Answer")
 
 @dataclass(frozen=True)
 class Crew:
-    """Who works. workers: processes on this machine, one for each core where None; scheduler: address of a Dask cluster
-    instead. Raises CalibrationError where both are given, or no worker."""
+    """A worker pool. workers: number of processes on this machine, None for one per core; scheduler: address of a Dask
+    cluster to be used instead. Raises CalibrationError if both are given, or workers is less than 1."""
 
     workers: int | None = None
     scheduler: str | None = None
@@ -39,23 +39,24 @@ class Crew:
 
 @dataclass(frozen=True)
 class Lost:
-    """In place of an answer: the sentence on a task that killed its worker time after time."""
+    """Result of a task that could not be run, because its worker died repeatedly or failed; sentence: the message."""
 
     sentence: str
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_all(
     work: Callable[[Task], Answer], tasks: Iterable[Task], crew: Crew
 ) -> Generator[tuple[Task, Answer | Lost], None, None]:
-    """Each task with `work`'s answer to it, as they are ready, in no order. `work` is of a module, and raises nothing.
+    """Runs `work` on each task, and yields pairs of task and result as they finish, in any order. `work` must be a
+    function of a module, so that it can be pickled, and must not raise.
 
-    A solve has two threads, but the rest of a calibration has one: hence a worker for each core. Raises
-    CalibrationError where no cluster answers or it goes away, RecordingError where Dask is not installed.
+    Each core has one worker: a solve has two threads, but the rest of a calibration has one. Raises CalibrationError
+    if no cluster answers or the connection is lost, RecordingError if Dask is not installed.
     """
     distributed = load_distributed()
     with ExitStack() as stack:
@@ -68,7 +69,7 @@ def run_all(
 
 def _client(distributed: Any, crew: Crew, stack: ExitStack) -> Any:
     if crew.scheduler is None:
-        # No dashboard, but its port is taken all the same: any one, so that two studies can run side by side.
+        # Dask opens a port even without a dashboard. Port 0 picks a free one, so that two studies can run in parallel.
         with load_dask().config.set(_ONE_TASK_A_WORKER):
             cluster = distributed.LocalCluster(
                 n_workers=crew.workers or cores(),
@@ -88,7 +89,7 @@ def _client(distributed: Any, crew: Crew, stack: ExitStack) -> Any:
 
 
 def _answer(distributed: Any, future: Any) -> Any:
-    """Raises CalibrationError where the scheduler is gone, and with it what it knew, or on the way the answer."""
+    """The result of a finished task, or `Lost`. Raises CalibrationError if the connection to the scheduler is lost."""
     try:
         error = future.exception()
         if error is None:

@@ -1,4 +1,4 @@
-"""Many simulated runs of one scenario, and whether their errors are as their covariances say."""
+"""Monte-Carlo studies: simulated calibrations of one scenario, and whether their errors match their covariances."""
 
 from icalib.tools.montecarlo.one_run import RunTask, run
 from icalib.tools.montecarlo.record import RunRecord

@@ -1,4 +1,4 @@
-"""A study for the terminal."""
+"""Prints the summary of a study on the terminal."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from icalib.tools.montecarlo.words import (
     undetermined_words,
 )
 
-MOST_FAILURES = 10
-IN_TWO_LINES = ("mean sigma", "sampled / predicted")  # headers that need not stand in one
+MOST_FAILURES = 10  # that are printed
+IN_TWO_LINES = ("mean sigma", "sampled / predicted")  # headers that may wrap
 
 
 def print_study(study: Study, folder: Path) -> None:
-    """The table of blocks, failed runs, and where the files are, on standard output."""
+    """Prints the table of blocks, failed runs, and the paths of the files on standard output."""
     console, found = Console(), study.consistency
     console.print(table(found))
     for line in (answer(found), largest_words(found), *_failures(found), *_undetermined(found)):
@@ -39,8 +39,8 @@ def print_study(study: Study, folder: Path) -> None:
 
 
 def table(found: Consistency) -> Table:
-    """One row for each block, and one for all together; outside its bounds the NEES is red."""
-    # All columns fit into 80.
+    """One row for each block, and one for all together; a NEES outside its bounds is red. The table fits into 80
+    columns of text."""
     out = Table(
         title="Consistency", title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0, show_edge=False
     )

@@ -1,5 +1,5 @@
-"""Error of each calibration parameter against the solver's iterations with its 3 sigma bound, as in the paper's Figures
-2 and 3; on logarithmic axes, since an error falls from degrees to thousandths of them."""
+"""Error and 3 sigma bound of each calibration parameter against the solver's iterations, as in the paper's Figures 2
+and 3. Axes are logarithmic, as errors fall by orders of magnitude."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ _PANEL_INCHES = (2.6, 1.9)
 
 @dataclass(frozen=True)
 class Curve:
-    """One parameter in one run: |error| (k,) and 3 sigma (k,) at the solver's iterations, in the unit that is shown."""
+    """One parameter in one run: |error| (k,) and 3 sigma bound (k,) at k iterations of the solver, in the unit of the
+    panel."""
 
     seed: int
     error: np.ndarray
@@ -30,7 +31,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """One parameter in several runs."""
+    """Plot of one parameter in several runs."""
 
     title: str
     unit: str
@@ -46,7 +47,8 @@ class PanelRow:
 
 
 def rows(records: Sequence[RunRecord]) -> tuple[PanelRow, ...]:
-    """Of the first runs that did not fail: all sensors, of cameras the first alone, as in the paper."""
+    """Panels of the first MOST_RUNS runs that did not fail, a row for each block. Of the cameras only the first is
+    shown, as in the paper."""
     runs = [r for r in sorted(records, key=lambda r: r.seed) if not r.failure][:MOST_RUNS]
     blocks = {b.key: b for r in runs for b in r.blocks}
     lenses = [b.sensor for b in blocks.values() if b.name == "distortion"]
@@ -67,8 +69,8 @@ def _row(runs: Sequence[RunRecord], block: GroupErrors) -> PanelRow:
 
 
 def _curve(record: RunRecord, column: int, scale: float) -> Curve:
-    """Error and bound of one parameter. For one fixed at the guess only the result has a standard deviation. The
-    consider covariance of all others is known of the result only, too, and is added at every iteration."""
+    """Error and bound of the parameter in one column. A parameter fixed at the guess gets the standard deviation of the
+    result. For others, the consider covariance of the result is added at each iteration."""
     verdicts = [v for b in record.blocks for v in b.verdict]
     error = np.array([w.error[column] for w in record.path])
     sigma, in_the_end = np.array([w.std[column] for w in record.path]), record.covariance[column, column]
@@ -99,7 +101,7 @@ def plotly_figure(row: PanelRow) -> Figure:
 
 
 def png(rows: Sequence[PanelRow], title: str) -> bytes:
-    """All blocks as one picture, a row each. Raises RecordingError where matplotlib is not installed."""
+    """PNG picture with a row of panels for each block. Raises RecordingError if matplotlib is not installed."""
     columns = max(len(r.panels) for r in rows)
     size = (_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * len(rows) + 0.6)
     sheet = load_matplotlib().Figure(figsize=size, layout="constrained")
@@ -132,5 +134,5 @@ def _words(panel: Panel) -> str:
 
 
 def _positive(values: np.ndarray) -> np.ndarray:
-    """What a logarithmic axis can show."""
+    """The values with NaN for those that are not positive, which a logarithmic axis cannot show."""
     return np.where(values > 0.0, values, np.nan)

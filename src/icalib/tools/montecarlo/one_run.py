@@ -1,4 +1,4 @@
-"""One run: simulate, calibrate, compare with the truth. Whatever goes wrong in it becomes part of its record."""
+"""One run: simulate, calibrate, compare with the truth. Exceptions become part of the record of the run."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ PlanesKind = Literal["known", "found"]
 
 @dataclass(frozen=True, eq=False)
 class RunTask:
-    """Inputs of a run. guess: the program finds its own, or starts from one drawn about the truth. Cameras with feature
-    tracks have a drawn guess of their intrinsics in either case, because tracks alone do not determine these. planes:
-    the plane of each LiDAR point is known, or found in the clouds."""
+    """Inputs of a run. guess: "none", the program finds the initial guess; "drawn", the guess is drawn at random about
+    the truth. Without a target, intrinsics always have a drawn guess, because feature tracks alone do not determine
+    them. planes: the plane of each LiDAR point is "known", or "found" in the clouds."""
 
     scenario: Scenario
     seed: int
@@ -33,8 +33,8 @@ class RunTask:
 
 
 def run(task: RunTask) -> RunRecord:
-    """Extrinsics, time offsets, intrinsics and distortions are estimated. The same task gives the same record, but for
-    the seconds that it took."""
+    """Simulates and calibrates. Extrinsics, time offsets, intrinsics and distortions are estimated. The record depends
+    on the task alone, except for its `seconds`."""
     started, visits = time.perf_counter(), list[Visited]()
     try:
         simulation = simulate(task.scenario, task.seed)
@@ -52,7 +52,7 @@ def run(task: RunTask) -> RunRecord:
 
 
 def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited], seconds: float) -> RunRecord:
-    """The record of a run that reached a result."""
+    """The record of a run that reached a result. visits: estimates at the solver's iterations; seconds: run time."""
     blocks, errors, columns = [], [np.empty(0)], list[int]()
     for g in result.groups:
         true = true_value(truth, g.sensor, g.name)
@@ -76,7 +76,7 @@ def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited],
 
 
 def _path(blocks: tuple[GroupErrors, ...], truth: Truth, visits: list[Visited]) -> tuple[Waypoint, ...]:
-    """From the last guess that all was estimated from, through every estimate that went on from there."""
+    """Waypoints from the last initial guess to the result; visits before it belong to guesses that were given up."""
     stages = [v.stage for v in visits]
     begins = [k for k, stage in enumerate(stages) if k == 0 or (stage == stages[0] and stages[k - 1] != stage)]
     return tuple(_waypoint(blocks, truth, v) for v in visits[begins[-1] :]) if visits else ()

@@ -1,4 +1,4 @@
-"""`consistency.html`: a study as one file without network."""
+"""`consistency.html`: a study in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MEAN = ("sensor", "kind", "mean over runs")
 
 
 def study_html(found: Consistency, identity: Identity, records: Sequence[RunRecord]) -> str:
-    """The whole page; `records` for the NEES of each run."""
+    """The page as one HTML document."""
     sections = [
         element("h2", "Blocks"),
         blocks_table(found),
@@ -58,7 +58,7 @@ def study_html(found: Consistency, identity: Identity, records: Sequence[RunReco
 
 
 def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, Figure]) -> str:
-    """A document in the style of the reports."""
+    """HTML document in the style of the reports, from its sections and figures."""
     body = Template(resource("icalib.tools.montecarlo", "page.html")).substitute(
         title=html(title), answer=html(summary), sections="".join(sections)
     )
@@ -66,7 +66,7 @@ def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, 
 
 
 def failures(found: Consistency) -> Html:
-    """Every failed run with its sentence."""
+    """List of the failed runs, each with its message."""
     return sentences([f"seed {f.seed}: {f.sentence}" for f in found.failures], "bad", "")
 
 
@@ -79,7 +79,7 @@ def blocks_table(found: Consistency) -> Html:
 
 
 def nees_figure(found: Consistency) -> Figure:
-    """Mean NEES of each block with the bounds within which it lies by chance."""
+    """Mean NEES of each block, with the 95 % bounds for a consistent covariance."""
     known: list[tuple[str, Nees]] = [(b.key, b.nees) for b in found.blocks if b.nees is not None]
     names = [name for name, _ in known]
     middle = np.array([0.5 * (n.low + n.high) for _, n in known])
@@ -105,7 +105,7 @@ def nees_figure(found: Consistency) -> Figure:
 
 
 def _undetermined(found: Consistency) -> list[Html]:
-    """What was undetermined in some run, if anything was."""
+    """Section on what was undetermined in at least one run; empty if nothing was."""
     if not found.undetermined:
         return []
     return [element("h2", "Undetermined"), sentences(undetermined_words(found), "care", "None.")]

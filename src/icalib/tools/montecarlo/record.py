@@ -1,4 +1,4 @@
-"""What one run leaves: its errors and what its covariance said of them, as JSON that reads back bit for bit."""
+"""Record of one run: its errors and their covariance, and the JSON format that preserves every bit of them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy as np
 from icalib.tools.batch import plain_record, record_json
 
 FORMAT = 1
-LEAST_SIGMA = 1e-100  # a number, however little
+LEAST_SIGMA = 1e-100  # replaces a standard deviation of 0, so that an error over it is finite
 
 
 @dataclass(frozen=True)
 class GroupErrors:
-    """One group of one sensor: which entries of the record's error it has, in order, and how each was judged."""
+    """One block: parameter group `name` of a sensor, such as cam0.rotation. labels, verdict: name and verdict of each
+    entry; its entries in `RunRecord.error` follow those of the blocks before it. unit: of the entries, SI."""
 
     sensor: str
     name: str
@@ -31,7 +32,7 @@ class GroupErrors:
 
 @dataclass(frozen=True)
 class Size:
-    """chi^2 of one kind of residual over the degrees of freedom that the fit left to it."""
+    """Residual statistics of one kind of residual: number of residuals, post-fit degrees of freedom, chi^2."""
 
     sensor: str
     kind: str
@@ -42,7 +43,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Mean square of whitened residuals, and their correlation with the next one in time."""
+    """Mean square of whitened residuals of one kind, and their lag-one autocorrelation."""
 
     sensor: str
     kind: str
@@ -52,7 +53,7 @@ class Whiteness:
 
 @dataclass(frozen=True)
 class Waypoint:
-    """The solver's state when it looked for a step: error and formal standard deviation, entries as in `RunRecord`."""
+    """One iteration of the solver: error and formal standard deviation before the step, entries as in `RunRecord`."""
 
     stage: str
     error: np.ndarray  # (n,)
@@ -61,11 +62,12 @@ class Waypoint:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """One run. failure: a sentence, or "" where the solver converged; a run that ended early has no blocks.
+    """One run. failure: the message, or "" if the solver converged; a run that ended early has no blocks. seconds: run
+    time.
 
-    error (n,): estimated minus true, block after block; of rotations e of R_estimated = R_true Exp(e) [rad].
-    covariance (n, n): formal, of the same. path: the solver's, from the guess that the answer was found from.
-    program: digest of the code that ran it.
+    error (n,): estimated minus true, block after block, SI units; for rotations e of R_estimated = R_true Exp(e) [rad].
+    covariance (n, n): formal covariance of `error`. undetermined: sentences on undetermined combinations. path:
+    iterations of the solver from the initial guess to the result. program: digest of the code that ran it.
     """
 
     seed: int
@@ -81,15 +83,15 @@ class RunRecord:
     path: tuple[Waypoint, ...] = ()
 
     def errors(self) -> Iterator[tuple[GroupErrors, str, str, float]]:
-        """Of every number that was estimated: its block, label and verdict, and its error in formal standard
-        deviations, one without any taken for an enormity."""
+        """Block, label and verdict of each entry of `error`, and its error in formal standard deviations. With a
+        standard deviation of 0 an error counts as huge."""
         sigma = np.maximum(np.sqrt(np.diag(self.covariance)), LEAST_SIGMA)
         entries = ((b, label, v) for b in self.blocks for label, v in zip(b.labels, b.verdict, strict=True))
         for (block, label, verdict), z in zip(entries, (self.error / sigma).tolist(), strict=True):
             yield block, label, verdict, z
 
     def columns(self, key: str) -> np.ndarray:
-        """(m,) entries of the block `key` ("cam0.rotation") in the error; none where the run has no such block."""
+        """(m,) indices in `error` of the block `key` ("cam0.rotation"); empty if the run has no such block."""
         start = 0
         for block in self.blocks:
             if block.key == key:
@@ -99,12 +101,12 @@ class RunRecord:
 
 
 def to_json(record: RunRecord) -> bytes:
-    """The record as JSON, numbers in full."""
+    """The record as JSON, with all digits."""
     return record_json(record, FORMAT)
 
 
 def from_json(text: bytes) -> RunRecord:
-    """The record that `to_json` was given. Raises ValueError, KeyError or TypeError where `text` is something else."""
+    """The record that `to_json` wrote. Raises ValueError, KeyError or TypeError if `text` is not such a record."""
     plain = plain_record(text, FORMAT)
     plain["blocks"] = tuple(_block(b) for b in plain["blocks"])
     plain["sizes"] = tuple(Size(**s) for s in plain["sizes"])

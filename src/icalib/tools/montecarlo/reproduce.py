@@ -1,4 +1,4 @@
-"""The paper's simulation again: Table II's robot in three dimensions and in the plane, Figures 2 and 3."""
+"""Reproduces the simulations of the paper: the robot of Table II in 3D and planar motion, and Figures 2 and 3."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ Progress = Callable[[str, float], None]
 
 
 def reproduce(output: Path, plan: StudyPlan, progress: Progress = lambda *_: None) -> dict[str, Study]:
-    """Both studies, each in a folder of its own below `output`, and there figures (reproduce.html, PNG) and table.
+    """Runs both studies, each in a subfolder of `output`, and writes figures and table to `output` (reproduce.html,
+    PNG). Returns the studies by the names in `MOTIONS`.
 
-    Raises what `run_study` raises.
+    Raises the errors of `run_study`.
     """
     refuse_foreign([output / PAGE, *(output / _picture(motion) for motion in MOTIONS)])
     studies = {}
@@ -43,7 +44,7 @@ def reproduce(output: Path, plan: StudyPlan, progress: Progress = lambda *_: Non
 
 
 def write_figures(output: Path, studies: dict[str, Study]) -> None:
-    """reproduce.html, and a picture of each motion in which some run reached a result."""
+    """Writes reproduce.html, and a PNG picture for each motion in which at least one run reached a result."""
     sections: list[Html] = []
     figures: dict[str, Figure] = {}
     for motion, study in studies.items():

@@ -1,4 +1,4 @@
-"""Errors of many runs against what their covariances say: NEES, and the sampled covariance."""
+"""Consistency of errors and covariances over many runs: NEES, and sampled against predicted covariance."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf, gammaincinv
 
-PROBABILITY = 0.95
-LEAST_VARIANCE = 1e-13  # of a scaled covariance: rounding
-DRAWS = 400  # of samples, for what chance alone makes of the sampled covariance
+PROBABILITY = 0.95  # that a consistent covariance has its statistic within the bounds
+LEAST_VARIANCE = 1e-13  # smallest eigenvalue of a correlation matrix: below it is rounding
+DRAWS = 400  # simulated studies, from which the bounds of the sampled covariance are found
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One run's part: error (m,) and covariance (m, m)."""
+    """Error (m,) and covariance (m, m) of some entries of one run."""
 
     seed: int
     error: np.ndarray
@@ -24,8 +24,8 @@ class Sample:
 
 @dataclass(frozen=True)
 class Nees:
-    """Mean of e^T P^-1 e per degree of freedom (1 where the covariance is honest), the bounds within which it lies by
-    chance, and the run that has most of it."""
+    """Normalised estimation error squared. mean: of e^T P^-1 e per degree of freedom, 1 for a consistent covariance;
+    low, high: its bounds for a consistent covariance; worst_seed, worst: the run with the largest value."""
 
     mean: float
     low: float
@@ -40,8 +40,9 @@ class Nees:
 
 @dataclass(frozen=True)
 class Spread:
-    """Square roots of the eigenvalues of sampled against predicted covariance: the least and the largest, each with
-    the bounds within which it lies by chance. 1 where both are the same, and runs are without number."""
+    """Ratios of sampled to predicted standard deviation: square roots of the smallest and largest generalised
+    eigenvalue of the two covariances, each with its bounds for a consistent covariance. They approach 1 if the
+    covariance is consistent and the runs are many."""
 
     least: float
     least_bounds: tuple[float, float]
@@ -51,9 +52,10 @@ class Spread:
 
 @dataclass(frozen=True)
 class Largest:
-    """The largest of `numbers` errors, in their own standard deviations: which, and in the run of which seed.
+    """The largest of `numbers` errors. sigmas: error in standard deviations; entry, seed: its name and run.
 
-    chance: with which honest covariances leave one so large, at most; dependence of the numbers only lessens it.
+    chance: upper bound of the probability of such an error for consistent covariances. Dependence between the errors
+    makes the probability smaller.
     """
 
     sigmas: float
@@ -64,8 +66,8 @@ class Largest:
 
 
 def nees(samples: list[Sample], probability: float = PROBABILITY) -> Nees:
-    """Of samples that may differ in dimension; the sum over them is chi^2 of the sum of these. `probability` that an
-    honest covariance lies within the bounds."""
+    """NEES of samples, which may differ in dimension: its sum is chi^2-distributed with the sum of the dimensions.
+    probability: that the NEES of a consistent covariance is within the bounds."""
     each = np.array([_squared(s.error, s.covariance) for s in samples])
     dof = sum(len(s.error) for s in samples)
     low, high = gammaincinv(dof / 2, [0.5 - 0.5 * probability, 0.5 + 0.5 * probability]) / (dof / 2)
@@ -75,8 +77,8 @@ def nees(samples: list[Sample], probability: float = PROBABILITY) -> Nees:
 
 
 def largest(errors: Sequence[tuple[float, str, int]]) -> Largest:
-    """Of errors in standard deviations, each with its entry and seed. For normal errors, however they depend on each
-    other, P(all |z| < c) is at least the product of each alone (Sidak, JASA 62, 1967)."""
+    """The largest of errors (error in standard deviations, entry, seed). For jointly normal errors, P(all |z| < c) is
+    at least the product of the single probabilities (Sidak, JASA 62, 1967)."""
     z, entry, seed = max(errors, key=lambda error: abs(error[0]))
     return Largest(abs(z), entry, seed, len(errors), float(1.0 - erf(abs(z) / np.sqrt(2.0)) ** len(errors)))
 
@@ -87,7 +89,7 @@ def _squared(e: np.ndarray, P: np.ndarray) -> float:
 
 
 def spread(samples: list[Sample]) -> Spread | None:
-    """Of samples of one dimension; None where they are too few for a sampled covariance of full rank."""
+    """Spread of samples; None if they differ in dimension, or are too few for a sampled covariance of full rank."""
     n = len(samples[0].error)
     if len(samples) <= n or any(len(s.error) != n for s in samples):
         return None
@@ -104,14 +106,15 @@ def spread(samples: list[Sample]) -> Spread | None:
 
 
 def _roots(errors: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """(n,) square roots of the generalised eigenvalues of the mean of e e^T, errors (N, n), against `predicted`."""
+    """(n,) square roots of the generalised eigenvalues of the mean of e e^T and `predicted` (n, n), ascending; errors
+    (N, n)."""
     whitened = np.linalg.solve(_factor(predicted), errors.T)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(whitened @ whitened.T / len(errors)), 0.0))
 
 
 def _factor(P: np.ndarray) -> np.ndarray:
-    """L with L L^T = P. Entries are scaled first, since radians beside pixels make a badly conditioned matrix; a
-    direction without any variance is given a little, so that an error in it counts as the enormity that it is."""
+    """L with L L^T = P. Entries are scaled first, since radians beside pixels make a badly conditioned matrix. A
+    direction without variance gets LEAST_VARIANCE, so that an error in it counts as huge."""
     sigma = np.sqrt(np.diag(P))
     values, vectors = np.linalg.eigh(P / np.outer(sigma, sigma))
     return sigma[:, None] * vectors * np.sqrt(np.maximum(values, LEAST_VARIANCE))

@@ -1,4 +1,4 @@
-"""The folder of a study: one file for each run, whole or not there, and what the runs were made from."""
+"""The folder of a study: one file per run, written atomically, and study.json with the inputs of all runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ STUDY, RUNS = "study.json", "runs"
 
 @dataclass(frozen=True)
 class Identity:
-    """What all runs of a folder have in common. scenario_sha256: of the scenario file, and of the motion it names."""
+    """Inputs that all runs of a folder share. scenario: its name; scenario_sha256: of the scenario file and the
+    trajectory file that it names; guess, planes: see `RunTask`; program, versions: of icalib, Python and libraries."""
 
     scenario: str
     scenario_sha256: str
@@ -28,7 +29,7 @@ class Identity:
 
     @classmethod
     def of(cls, scenario: str, scenario_sha256: str, guess: GuessKind, planes: PlanesKind) -> Identity:
-        """With the program that runs now."""
+        """The identity with the program and the versions of this process."""
         return cls(scenario, scenario_sha256, guess, planes, program(), versions())
 
 
@@ -42,7 +43,8 @@ _CHANGED = {
 
 
 class RunStore:
-    """Runs by seed in a folder. Raises CalibrationError where it holds another study's, or cannot be written."""
+    """Records of runs by seed in a folder. Raises CalibrationError if the folder has runs of another study, or cannot
+    be written."""
 
     def __init__(self, folder: Path, identity: Identity) -> None:
         self.folder, self.identity = folder, identity
@@ -61,12 +63,12 @@ class RunStore:
         return self._file(seed).exists()
 
     def add(self, record: RunRecord) -> None:
-        """Raises CalibrationError where the worker ran another icalib, or the file cannot be written."""
+        """Stores a record. Raises CalibrationError if the worker ran another icalib, or the file cannot be written."""
         check_worker(record.program, self.identity.program)
         write_whole(self._file(record.seed), to_json(record))
 
     def read(self, seed: int) -> RunRecord:
-        """Raises CalibrationError where the file is damaged."""
+        """The stored record of a seed. Raises CalibrationError if its file is damaged or missing."""
         path = self._file(seed)
         try:
             return from_json(path.read_bytes())

@@ -1,4 +1,4 @@
-"""A study: many runs of one scenario, resumed where it was left, and what they say together. This page is all of it."""
+"""A Monte-Carlo study: runs of one scenario with different seeds, and their summary. A rerun resumes it."""
 
 from __future__ import annotations
 
@@ -26,10 +26,8 @@ FILES = ("consistency.json", "consistency.html")
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """How many runs, from which seed on (the scenario's where None), from which guess, with planes that are known or
-    found, and who makes them.
-
-    workers: processes on this machine, one for each core where None; scheduler: address of a Dask cluster instead.
+    """Settings of a study. runs: their number; seed: of the first run, None for that of the scenario; guess, planes:
+    see `RunTask`; workers, scheduler: see `Crew`. Raises CalibrationError if they make no sense.
     """
 
     runs: int
@@ -42,7 +40,7 @@ class StudyPlan:
     def __post_init__(self) -> None:
         if self.runs < 1:
             raise CalibrationError(f"{self.runs} runs were asked for, but a study needs at least 1; correct --runs.")
-        Crew(self.workers, self.scheduler)  # refuses what makes no sense
+        Crew(self.workers, self.scheduler)  # raises CalibrationError if both are given, or no worker
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class Study:
 
 
 def run_file(path: str | Path, output: str | Path, plan: StudyPlan, progress: Progress = lambda *_: None) -> Study:
-    """`run_study` of a scenario file. Raises RigError too, where the file is wrong."""
+    """`run_study` of the scenario file at `path`. Raises also RigError if the file is wrong."""
     scenario = load_scenario(path)
     return run_study(scenario, str(path), scenario_digest(path, scenario), Path(output), plan, progress)
 
@@ -63,11 +61,11 @@ def run_file(path: str | Path, output: str | Path, plan: StudyPlan, progress: Pr
 def run_study(
     scenario: Scenario, name: str, digest: str, output: Path, plan: StudyPlan, progress: Progress = lambda *_: None
 ) -> Study:
-    """Makes the runs that `output` does not hold yet, and writes consistency.json and consistency.html there.
+    """Makes the runs that are missing in `output`, and writes consistency.json and consistency.html there.
 
-    digest: of all that the scenario is made from. Raises CalibrationError where the folder holds another study's runs,
-    cannot be written, has files that icalib did not write, another process is at work in it, or no cluster answers;
-    KeyboardInterrupt with a sentence on what was reached.
+    name, digest: of the scenario, see `scenario_digest`. Raises CalibrationError if the folder has runs of another
+    study, cannot be written, has files that icalib did not write or is locked by another process, or if no cluster
+    answers. KeyboardInterrupt gets a message with the number of finished runs.
     """
     refuse_foreign(output / name for name in FILES)
     store = RunStore(output, Identity.of(name, digest, plan.guess, plan.planes))
@@ -85,7 +83,7 @@ def run_study(
 
 
 def scenario_digest(path: str | Path, scenario: Scenario) -> str:
-    """sha256 of the file, and of that of the motion which it names."""
+    """sha256 of the scenario file at `path` and of the trajectory file that it names."""
     digest = hashlib.sha256(Path(path).read_bytes())
     if isinstance(scenario.motion, Drive) and scenario.motion.path is not None:
         digest.update(scenario.motion.path.read_bytes())
@@ -95,7 +93,8 @@ def scenario_digest(path: str | Path, scenario: Scenario) -> str:
 def _fill(
     store: RunStore, scenario: Scenario, seeds: range, plan: StudyPlan, progress: Progress
 ) -> dict[int, RunRecord]:
-    """Makes and stores the runs that are missing; gives those back whose worker died, which are not stored."""
+    """Makes and stores the missing runs. Returns the records of runs whose worker died, by seed, which are not
+    stored."""
     missing = [seed for seed in seeds if seed not in store]
     done, lost = len(seeds) - len(missing), dict[int, RunRecord]()
     if not missing:

@@ -1,4 +1,7 @@
-"""What the runs of a study say together. It is made from their records alone."""
+"""Summary of the runs of a study, computed from their records.
+
+Statistics exclude entries that are undetermined in a run: their formal standard deviation means nothing.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,9 @@ from icalib.tools.montecarlo.statistics import Largest, Nees, Sample, Spread, la
 
 @dataclass(frozen=True)
 class Entry:
-    """One number of a block: root mean square of its error and of its standard deviation over the runs in which it is
-    not undetermined (None where there are none), and how often it was judged what."""
+    """One parameter of a block over the runs. runs: number of those in which it is not undetermined; rmse, mean_sigma:
+    root mean square of its error and of its standard deviation over these runs, or None; verdicts: number of runs of
+    each verdict."""
 
     label: str
     runs: int
@@ -27,10 +31,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class BlockSummary:
-    """One block over the runs. dimension: the most entries that counted in a run; runs: those in which some did.
+    """One block over the runs, without undetermined entries. dimension: largest number of entries in a run; runs:
+    number of those with at least one entry.
 
-    rmse, mean_sigma: root mean squares over the entries and runs that count. nees and spread are absent where nothing
-    counts; spread too where runs are few, or differ in what they determine.
+    rmse, mean_sigma: root mean squares over entries and runs. All statistics are None if no run has an entry; spread
+    also if runs are few, or differ in their undetermined entries.
     """
 
     sensor: str
@@ -51,7 +56,7 @@ class BlockSummary:
 
 @dataclass(frozen=True)
 class Mean:
-    """Mean over the runs with its standard error, of one figure of a sensor's residuals."""
+    """Mean over the runs, with its standard error, of one statistic of a sensor's residuals."""
 
     sensor: str
     kind: str
@@ -61,7 +66,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class Failure:
-    """A run that reached no result, and why."""
+    """A run that reached no result, and the message."""
 
     seed: int
     sentence: str
@@ -69,9 +74,9 @@ class Failure:
 
 @dataclass(frozen=True)
 class Consistency:
-    """runs: of all, of which `failures` do not count below. whole: all blocks together. largest: of all single errors
-    that count. sizes: chi^2 per post-fit degree of freedom; lag1: correlation of whitened residuals with the next in
-    time. undetermined: how many runs left which combination open."""
+    """Summary of a study. runs: number of all; failures: runs that are excluded from the statistics. whole: NEES of all
+    blocks together. largest: among the errors that are not undetermined. sizes: chi^2 per post-fit degree of freedom;
+    lag1: lag-one autocorrelation of whitened residuals. undetermined: number of runs by undetermined combination."""
 
     runs: int
     failures: tuple[Failure, ...]
@@ -84,7 +89,7 @@ class Consistency:
 
 
 def summarise(records: Sequence[RunRecord]) -> Consistency:
-    """Of records in any order; those that failed are listed and count for nothing else."""
+    """Summary of records in any order. Failed runs are listed, and excluded from the statistics."""
     ordered = sorted(records, key=lambda r: r.seed)
     good = [r for r in ordered if not r.failure]
     first: dict[str, GroupErrors] = {}
@@ -106,12 +111,12 @@ def summarise(records: Sequence[RunRecord]) -> Consistency:
 
 
 def consistency_json(found: Consistency, study: Mapping[str, object]) -> bytes:
-    """`consistency.json`: `study` says what the runs were made from."""
+    """Content of consistency.json; study: inputs of the runs, see `Identity`."""
     return json.dumps({"format": "icalib consistency", "study": dict(study)} | asdict(found), indent=1).encode()
 
 
 def counting(record: RunRecord, key: str) -> np.ndarray:
-    """(m,) entries of the block in the record's error that are not undetermined: those that say something."""
+    """(m,) indices in `record.error` of the entries of block `key` that are not undetermined."""
     block = next((b for b in record.blocks if b.key == key), None)
     if block is None:
         return np.arange(0)
@@ -119,7 +124,7 @@ def counting(record: RunRecord, key: str) -> np.ndarray:
 
 
 def _errors(record: RunRecord) -> list[tuple[float, str, int]]:
-    """Of all entries that count: error in formal standard deviations, name, seed."""
+    """Error in formal standard deviations, name and seed of each entry that is not undetermined."""
     return [
         (z, block.key if label == block.name else f"{block.key} {label}", record.seed)
         for block, label, verdict, z in record.errors()
@@ -128,7 +133,7 @@ def _errors(record: RunRecord) -> list[tuple[float, str, int]]:
 
 
 def _samples(records: Sequence[RunRecord], keys: tuple[str, ...]) -> list[Sample]:
-    """Of the blocks `keys` together, runs without any entry that counts left out."""
+    """Sample of the blocks `keys` together for each run, without undetermined entries and runs without entries."""
     found = []
     for r in records:
         k = np.concatenate([np.arange(0), *(counting(r, key) for key in keys)])
@@ -170,8 +175,8 @@ def _root_mean(squares: np.ndarray) -> float | None:
 
 
 def _means(figures: list[tuple[str, str, float, float]]) -> tuple[Mean, ...]:
-    """Of (sensor, kind, amount, weight) of all runs: sum of the amounts over sum of the weights, in the order in which
-    they first appear."""
+    """Weighted means by sensor and kind, in order of first appearance: sum of the amounts over sum of the weights, from
+    tuples (sensor, kind, amount, weight) of all runs."""
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for sensor, kind, *pair in figures:
         found.setdefault((sensor, kind), []).append((pair[0], pair[1]))

@@ -1,4 +1,4 @@
-"""Whether what a calibration leaves unexplained is white: each whitened residual against the next in time."""
+"""Whiteness of residuals: lag-one autocorrelation of whitened residuals in time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from icalib.tools.montecarlo.record import Whiteness
 
 
 def whiteness(result: Calibration) -> tuple[Whiteness, ...]:
-    """Of every kind of residual that the result holds."""
+    """Whiteness of each kind of residual in `result`."""
     return tuple(
         _statistics(r.sensor, name, rows)
         for r in result.residuals.values()
@@ -20,7 +20,7 @@ def whiteness(result: Calibration) -> tuple[Whiteness, ...]:
 
 
 def _statistics(sensor: str, kind: str, rows: Successive) -> Whiteness:
-    """Mean square, and correlation of each row with the next one."""
+    """Mean square of whitened residuals, and correlation of each with its successor."""
     values = rows.whitened
     first, second = values[:-1][rows.follows], values[1:][rows.follows]
     mean_square = float(np.mean(values**2)) if values.size else 0.0

@@ -1,4 +1,4 @@
-"""A study's figures as people read them: degrees, millimetres, milliseconds."""
+"""Figures of a study as text, in degrees, millimetres and milliseconds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NUMBERS = HEADERS[1:7] + HEADERS[8:]
 
 
 def block_row(block: BlockSummary) -> tuple[str, ...]:
-    """Cells under HEADERS."""
+    """Cells of one block under `HEADERS`."""
     unit, scale = shown_unit(block.unit)
     sizes = ["" if x is None else shown(scale * x, 3) for x in (block.rmse, block.mean_sigma)]
     return (
@@ -36,7 +36,7 @@ def spread_words(found: Spread | None) -> str:
 
 
 def chance_words(found: Spread | None) -> str:
-    """What chance alone makes of the spread."""
+    """Bounds of the spread for a consistent covariance, smallest then largest; "" without a spread."""
     if found is None:
         return ""
     (a, b), (c, d) = found.least_bounds, found.largest_bounds
@@ -44,7 +44,7 @@ def chance_words(found: Spread | None) -> str:
 
 
 def verdict_words(block: BlockSummary) -> str:
-    """How the entries were judged over the runs, those always determined left out."""
+    """Number of runs of each verdict, for the entries that are not determined in every run."""
     odd = []
     for entry in block.entries:
         if set(entry.verdicts) - {"determined"}:
@@ -57,7 +57,7 @@ def mean_cells(mean: Mean) -> tuple[str, str, str]:
 
 
 def answer(found: Consistency) -> str:
-    """The study in a sentence."""
+    """The result of the study in one sentence: how many blocks have a NEES within its bounds."""
     counted = [b for b in found.blocks if b.nees is not None]
     if not counted:
         return "No run reached a result."
@@ -69,7 +69,7 @@ def answer(found: Consistency) -> str:
 
 
 def largest_words(found: Consistency) -> str:
-    """The largest single error, and whether chance explains it."""
+    """A sentence on the largest single error, and its probability by chance."""
     one = found.largest
     if one is None:
         return "No number was determined in any run."
@@ -87,6 +87,6 @@ def failures_words(found: Consistency) -> str:
 
 
 def undetermined_words(found: Consistency) -> list[str]:
-    """What was undetermined, and in how many of the runs that reached a result."""
+    """A line for each undetermined combination, with the number of runs in which it was undetermined."""
     reached = found.runs - len(found.failures)
     return [f"{n} of {reached} runs: {what}" for what, n in found.undetermined.items()]

@@ -1,4 +1,4 @@
-"""Runs on many cores or machines."""
+"""Runs of a study on many cores or machines."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icalib.tools.montecarlo.record import RunRecord
 def run_all(
     tasks: Iterable[RunTask], workers: int | None = None, scheduler: str | None = None
 ) -> Generator[RunRecord, None, None]:
-    """Records as they are ready, in no order. A run that killed its worker time after time ends as a failed one, with
-    no program. Raises what `icalib.tools.batch.run_all` raises."""
+    """Yields the records as they finish, in any order. A run whose worker died repeatedly has a failed record with an
+    empty `program`. Raises the errors of `icalib.tools.batch.run_all`."""
     for task, record in run_tasks(run, tasks, Crew(workers, scheduler)):
         yield RunRecord(task.seed, record.sentence, 0.0, "") if isinstance(record, Lost) else record
