@@ -1,4 +1,4 @@
-"""Whether a calibration is still valid on a new recording."""
+"""Tests whether a calibration is still valid on a new recording."""
 
 from icalib.tools.check.check import Check, GroupDifference, Validity, check_calibration, check_measurements
 

@@ -1,9 +1,9 @@
-"""A calibration against a new recording.
+"""Tests a calibration on a new recording.
 
-The new recording is calibrated on its own, from the old values as guesses, which have no weight. Both results have
-covariances, so each block (pose, time offset, lens, ...) is tested by its Mahalanobis distance. The significance is
-that of N sigma for all blocks together (Bonferroni), so that many blocks raise no false alarm. A second solve with the
-old values fixed gives the residuals of the old calibration on the new data.
+The new recording is calibrated separately, with the old values as initial guesses without weight. Both results have
+covariances, so each block (pose, time offset, lens, ...) is tested by the Mahalanobis distance of its change. The
+significance level of N sigma holds for all blocks together (Bonferroni), so that many blocks raise no false alarm. A
+second solve with the old values fixed gives the residuals of the old calibration on the new data.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from icalib.tools.comparison.significance import sigmas
 
 Validity = Literal["valid", "changed", "cannot say"]
 EXIT_CODES: dict[Validity, int] = {"valid": 0, "changed": 1, "cannot say": 3}
-READING_SHARE, SOLVED_SHARE = 0.5, 0.8  # of the time: the end of reading, and of the first solve
+READING_SHARE, SOLVED_SHARE = 0.5, 0.8  # progress at the end of reading, and progress of solving after the first solve
 
 
 @dataclass(frozen=True)
 class GroupDifference:
-    """One group that both results estimate, new minus old.
+    """Change of one parameter group that both results estimate, new minus old, in SI units.
 
-    change (n,): rotations as a rotation vector about the sensor's axes; SI units. std (n,): of both results together.
-    sigmas: the whole group's, from its joint covariance.
+    change (n,): for rotations, the rotation vector in the sensor's axes [rad]. std (n,): standard deviation of
+    `change`, from both results. sigmas: of the whole group, see `significance.sigmas`.
     """
 
     sensor: str
@@ -54,12 +54,13 @@ class GroupDifference:
 
 @dataclass(frozen=True)
 class Check:
-    """Whether a calibration still holds.
+    """Result of the test of a calibration.
 
-    limit: sigma above which one block counts as changed. tested: the blocks that both results estimate; changed: those
-    beyond the limit. unknown: parameters, as "cam0 translation", that the calibration knows and the new recording does
-    not determine. untested: those that the rig file fixes. reason: why nothing can be said, else empty. fits: of the
-    calibration's own recording; with its values fixed on the new one; of the new one alone.
+    limit: sigmas above which one block counts as changed. tested: the blocks that both results estimate; changed: those
+    beyond the limit. unknown: parameters, such as "cam0 translation", that the calibration determines and the new
+    recording does not. untested: parameters that the rig file fixes. reason: why there is no verdict, else "". drifts:
+    changes by parameter group. fits: residuals of the calibration on its recording; with its values fixed on the new
+    recording; of the new recording calibrated separately.
     """
 
     validity: Validity
@@ -88,10 +89,10 @@ def check_calibration(
     start_s: float = 0.0,
     end_s: float = inf,
 ) -> Check:
-    """Checks `calibration` on `recording`, or on several together. Of each the part from start_s to end_s is used.
+    """Checks `calibration` on one recording, or on several jointly. start_s, end_s: used part of each, from its start.
 
-    sigma: a change counts where chance makes one as large as rarely as N sigma. Raises CalibrationError, one sentence,
-    where the recording is not of the rig of the calibration.
+    sigma: significance level of a change, in standard deviations of a normal variable, for all blocks together. Raises
+    CalibrationError, one sentence, if the recording is not of the calibration's rig.
     """
     rig = rig_of_result(calibration, "guess")[0]
     read = measure(rig, recording, lambda s, done: progress(s, READING_SHARE * done), start_s=start_s, end_s=end_s)
@@ -107,7 +108,7 @@ def check_measurements(
     *,
     sigma: float = 3.0,
 ) -> Check:
-    """As `check_calibration`, from measurements in memory."""
+    """As `check_calibration`, with measurements in memory."""
     if not 0.0 < sigma < inf:
         raise CalibrationError(f"sigma must be a number above 0, but is {sigma:g}; 3 is usual.")
     rig = rig_of_result(calibration, "guess")[0]
@@ -133,7 +134,8 @@ def check_measurements(
 
 
 def joint_limit(sigma: float, tests: int) -> float:
-    """Sigma of each of `tests` tests, so that all together are as rarely wrong as one at `sigma` (Bonferroni)."""
+    """Sigmas for each of `tests` tests, so that the family of tests has the error probability of one test at `sigma`
+    (Bonferroni)."""
     normal = NormalDist()
     tail = (1.0 - normal.cdf(sigma)) / max(tests, 1)
     return max(sigma, -normal.inv_cdf(tail)) if tail > 0.0 else sigma
@@ -142,7 +144,8 @@ def joint_limit(sigma: float, tests: int) -> float:
 def _fits_of_fixed(
     rig: Rig, measurements: Measurements | Sequence[Measurements], progress: Progress
 ) -> tuple[SensorFit, ...]:
-    """Residuals of the old calibration; none where the data contradict it so far that there is no solution."""
+    """Residual statistics on `measurements` with the rig's values fixed; empty if there is no solution, because the
+    data contradict the values."""
     rest = 1.0 - SOLVED_SHARE
     try:
         return calibrate_measurements(rig, measurements, lambda s, done: progress(s, SOLVED_SHARE + rest * done)).fits
@@ -151,7 +154,7 @@ def _fits_of_fixed(
 
 
 def _undetermined(c: Calibration) -> list[str]:
-    """Names of groups that the data do not determine; a lens is judged by its projection, as the verdict does."""
+    """Names of groups that are undetermined; a lens is classified by the uncertainty of its projection."""
     found = []
     for g in c.groups:
         if g.columns is None or g.name in AUXILIARY or g.sensor not in c.rig["sensors"] or g.mode == "prior":
@@ -163,7 +166,7 @@ def _undetermined(c: Calibration) -> list[str]:
 
 
 def _fixed(c: Calibration) -> list[str]:
-    """Names of groups that the rig file fixes, but for the pose of the body in itself."""
+    """Names of groups that the rig file fixes, without the pose of the reference sensor, which is the identity."""
     own = [g for g in c.groups if g.columns is None and g.sensor in c.rig["sensors"] and g.name not in AUXILIARY]
     fixed = [
         _block(c, g) for g in own if g.mode == "fixed" and not (g.sensor == c.reference and g.name in MOUNTED_NAMES)

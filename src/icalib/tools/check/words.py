@@ -1,4 +1,4 @@
-"""A check in sentences, and as plain data."""
+"""Result of a check as sentences, and as JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _EXTRINSICS = ("rotation", "translation")
 
 
 def lines(check: Check) -> list[str]:
-    """What to print: residuals, changes, what limits the new result, and the verdict as the last line."""
+    """Lines to print: residuals, changes, notes on the new result, and the verdict as the last line."""
     found = []
     if check.fits[1]:
         found.append("Residuals on the new recording with the calibration fixed (in the calibration, calibrated anew):")
@@ -33,7 +33,7 @@ def lines(check: Check) -> list[str]:
 
 
 def verdict(check: Check) -> str:
-    """One sentence: valid, what changed by how many sigma, or why nothing can be said."""
+    """One sentence: valid; changed, with the sensors and sigmas; or cannot say, with the reason."""
     if check.reason:
         return f"Cannot say: {check.reason}"
     if check.changed:
@@ -48,7 +48,8 @@ def verdict(check: Check) -> str:
 
 
 def named(check: Check) -> list[str]:
-    """What changed, in a few words each: a sensor that moved against all others once, then all else."""
+    """A few words on each change. If one sensor moved relative to all others, its pose is named once; other changes
+    follow."""
     poses = [d for d in check.changed if d.what in _EXTRINSICS]
     words = []
     if poses:
@@ -66,7 +67,7 @@ def named(check: Check) -> list[str]:
 
 
 def check_json(check: Check) -> str:
-    """The same as plain data."""
+    """The check as JSON."""
     plain: dict[str, Any] = {
         "validity": check.validity,
         "sentence": verdict(check),
@@ -85,7 +86,7 @@ def check_json(check: Check) -> str:
 
 
 def _moved(differences: Sequence[Difference], changed: Sequence[Difference]) -> str:
-    """The one sensor that is part of every changed pair and of no unchanged one; empty where there are several."""
+    """The sensor that is part of every changed pose and of no unchanged one; "" unless there is exactly one."""
     pairs = {(d.sensor, d.frame) for d in differences if d.what in _EXTRINSICS}
     off = {(d.sensor, d.frame) for d in changed}
     named = {name for pair in off for name in pair}

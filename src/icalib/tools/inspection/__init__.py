@@ -1,4 +1,4 @@
-"""What is in a recording, whether it can be calibrated, and a first draft of its rig file."""
+"""Inspection of a recording: its sensors, whether it can be calibrated, and a first draft of its rig file."""
 
 from icalib.tools.inspection.draft import draft_rig, write_draft
 from icalib.tools.inspection.facts import Finding, GivenTarget, Inspection

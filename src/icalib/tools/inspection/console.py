@@ -1,4 +1,4 @@
-"""An inspection on the terminal: first whether it can be calibrated, then the figures."""
+"""Prints an inspection on the terminal: first whether the recording can be calibrated, then the figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _UNSEEN = Text("Yes, as far as can be told without searching images for the targ
 
 
 def print_inspection(found: Inspection, console: Console | None = None) -> None:
-    """On standard output."""
+    """Prints on `console`, by default on standard output."""
     out = console or Console()
     answer = _UNSEEN if found.verdict == "yes" and found.target is None else _ANSWERS[found.verdict]
     out.print(Text("Can this be calibrated? ", style="bold") + answer)
@@ -98,7 +98,7 @@ def frames_table(found: Inspection) -> Table:
 
 
 def target_table(found: Inspection) -> Table:
-    """One row for each camera: where it saw the target."""
+    """One row for each camera: number of images with the target, coverage of the image, tilts and distances."""
     table = _table(
         f"Target ({found.target.target.type} of {found.target.file})" if found.target else "",
         ("camera", "images", "with target", "corners", "cells covered", "tilt [deg]", "farthest / nearest"),
@@ -140,13 +140,13 @@ def _digit(count: int, most: int) -> str:
 def _table(title: str, headers: tuple[str, ...], right: int, caption: str) -> Table:
     table = Table(title=title, caption=caption, caption_justify="left", title_justify="left")
     for k, header in enumerate(headers):
-        # What is looked up by its name, the first column, stays in one piece.
+        # The first column, the name of the row, does not wrap.
         table.add_column(Text(header), justify="right" if k >= right else "left", overflow="fold", no_wrap=k == 0)
     return table
 
 
 def _origin(found: Inspection) -> int | None:
-    """The first stamp of all cameras and IMUs."""
+    """The earliest stamp of all cameras and IMUs [ns]; None if there is none."""
     sensors = {t.name for t in found.sources.imus.values()} | {c.topic.name for c in found.sources.cameras}
     stamps = [s.timing.first_ns for s in found.streams if s.timing and s.topic.name in sensors]
     return min(stamps, default=None)
@@ -159,7 +159,7 @@ def _caption(found: Inspection) -> str:
 
 
 def _type(found: Inspection, s: StreamFacts) -> str:
-    """The type, and of images resolution and encoding."""
+    """The message type of a topic; for images also resolution and encoding."""
     name = next((c.name for c in found.sources.cameras if c.images and c.images.name == s.topic.name), "")
     facts = found.images.get(name)
     kind = s.topic.type.removeprefix("sensor_msgs/msg/")

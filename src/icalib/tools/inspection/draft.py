@@ -1,4 +1,4 @@
-"""A first rig file for a recording: what is known is filled in and says where it is from, the rest is left to fill."""
+"""A first rig file for a recording: known values with their source, and empty fields for the user to fill in."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ target:
 
 
 def draft_rig(found: Inspection) -> str:
-    """The text of a rig file. Raises RecordingError where the sensors do not show the motion: no camera, no LiDAR or
-    poses beside an IMU, and no poses beside wheels or other poses."""
+    """The text of a rig file. Raises RecordingError if the sensors do not determine the motion: there is no camera, no
+    sensor such as a LiDAR beside an IMU, and no sensor that gives the motion without an IMU beside another one."""
     broken = {c.name: problem for c in found.sources.cameras if (problem := found.stream(c.topic).problem)}
     cameras = [c for c in found.sources.cameras if c.name not in broken]
     moved = moving(found) or found.moving_frames
@@ -69,7 +69,7 @@ def draft_rig(found: Inspection) -> str:
 
 
 def check_draft(path: Path) -> None:
-    """Raises CalibrationError where there is something at `path` already."""
+    """Raises CalibrationError if `path` exists."""
     if os.path.lexists(path):
         raise CalibrationError(
             f"{path} exists and was not changed; give another name for the draft, or give it as --target to "
@@ -78,7 +78,7 @@ def check_draft(path: Path) -> None:
 
 
 def write_draft(text: str, path: Path) -> None:
-    """Writes `text` to `path`, wholly or not at all, and never over another file. Raises CalibrationError."""
+    """Writes `text` to `path` atomically. Raises CalibrationError if `path` exists or cannot be written."""
     try:
         with staged(path.parent) as place:
             part = place / path.name
@@ -94,7 +94,7 @@ def write_draft(text: str, path: Path) -> None:
 
 
 def _link(part: Path, path: Path, text: str) -> None:
-    """Gives `part` the name `path`; unlike a rename, this fails where the name is taken."""
+    """Gives the file `part` the name `path`. Unlike a rename, this raises FileExistsError if `path` exists."""
     try:
         os.link(part, path)
     except FileExistsError:
@@ -136,8 +136,8 @@ def _imu(found: Inspection) -> list[str]:
 
 
 def _others(found: Inspection, has_cameras: bool) -> Iterator[str]:
-    """Sensors that are neither IMU nor camera. Those that may be no sensors on the robot are comments, unless nothing
-    else gives the motion."""
+    """Lines of sensors that are neither IMU nor camera. Topics that need not be sensors on the robot are comments,
+    unless no other sensor gives the motion."""
     kinds, imus = inspectors(), found.sources.imus
     sure = [n for n in moving(found) if kinds[found.sources.others[n].kind].is_certain]
     shown = not (has_cameras or (imus and sure))
@@ -154,7 +154,7 @@ def _others(found: Inspection, has_cameras: bool) -> Iterator[str]:
 
 
 def _kalibr_imu(found: Inspection, topic: str) -> KalibrImu | None:
-    """The entry with the IMU's topic; else the only one, where it names no topic of this recording."""
+    """Kalibr's entry for the IMU's topic; else its only entry, if that names no topic of this recording."""
     entries = found.kalibr.imus
     topics = {s.topic.name.strip("/") for s in found.streams}
     mine = [k for k in entries if k.topic.strip("/") == topic.strip("/")]
@@ -197,7 +197,7 @@ def _starts(lens: LensStart) -> Iterable[str]:
 
 
 def _places(halves: TwoSources, kind: str, frame: str) -> str:
-    """`topic` of an IMU on two of them."""
+    """The `topic` line of an IMU whose gyroscope and accelerometer have a topic each."""
     shown = f"{{gyro: {name_text(halves.gyro)}, accel: {name_text(halves.accel)}}}"
     return f"    topic: {shown}  # {comment(kind)}" + in_frame(frame)
 

@@ -1,4 +1,4 @@
-"""What was found in a recording, as plain data; figures are None where they could not be had."""
+"""Findings on a recording, as plain data; figures that cannot be determined are None."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ Vector = tuple[float, float, float]
 class Finding:
     """One sentence that says what is wrong or missing, and what to do.
 
-    problem: no calibration can be made; warning: it will be worse than it could be; hint: good to know.
+    severity: "problem", no calibration is possible; "warning", it will be less accurate than it could be; "hint", for
+    information.
     """
 
     severity: Severity
@@ -30,12 +31,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Timing:
-    """The stamps of one stream, on its own clock.
+    """Statistics of the stamps of one stream, on the clock of its sensor.
 
-    rate_hz: of the median interval; jitter_s: RMS of the intervals about their median, gaps left out. A gap is an
-    interval longer than 1.5 medians; longest_gap_at_s is seconds after the first stamp. backwards, repeated: how many
-    stamps are before, or the same as, the one in front of them. jumps: how often the clock jumps forward; all else is
-    of the longest part between them.
+    rate_hz: inverse of the median interval; jitter_s: RMS of the intervals about their median, without gaps. A gap is
+    an interval longer than 1.5 medians; longest_gap_at_s: since the first stamp. backwards, repeated: number of stamps
+    that are before, or equal to, their predecessor. jumps: number of forward jumps of the clock; all other fields are
+    of the longest part between jumps.
     """
 
     count: int
@@ -54,7 +55,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """One topic. timing: of the stamps of kinds that icalib reads. problem: the sentence where it cannot be read."""
+    """One topic. timing: None for topics that icalib does not read; problem: why it cannot be read, else ""."""
 
     topic: TopicInfo
     timing: Timing | None
@@ -63,8 +64,8 @@ class StreamFacts:
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """The images of one topic: resolution (width, height) px, encoding and frame id of the first. Of a sample of
-    `decoded` images, `damaged` cannot be decoded."""
+    """The images of one topic. resolution (width, height) px, encoding, frame: of the first image; decoded: number of
+    sampled images; damaged: number of these that cannot be decoded."""
 
     resolution: tuple[int, int] | None
     encoding: str
@@ -75,11 +76,12 @@ class ImageFacts:
 
 @dataclass(frozen=True)
 class ImuFacts:
-    """One IMU, x y z in its own axes: gyro [rad/s], accel [m/s^2], as they were written.
+    """Readings of one IMU, x y z in its axes: gyro [rad/s], accel [m/s^2], in the recorded units.
 
-    mean_accel: mean of |accel|. gyro_rms: RMS of each axis; accel_std: RMS about the mean. principal_rms: RMS rate
-    about the directions `principal` (unit vectors), from the strongest to the weakest. gravity_spread: see
-    `imu.gravity_spread`, for rates in rad/s, in deg/s, and for none.
+    frame: frame id. mean_accel: mean of |accel|. gyro_rms: RMS of each axis; accel_std: RMS about the mean.
+    principal_rms: RMS rate about the directions `principal` (unit vectors), largest first. gravity_spread: result of
+    `gravity_turns.gravity_spread` for rates taken as rad/s, as deg/s, and as zero. problem: why `calibrate` would
+    refuse the readings, else "".
     """
 
     frame: str
@@ -100,12 +102,12 @@ class ImuFacts:
 
 @dataclass(frozen=True)
 class TargetView:
-    """The target in the images of one camera.
+    """Detections of the target in the images of one camera.
 
-    images, seen: how many there are (None: only the corners were recorded), and how many show the target. cells: number
-    of corners in each cell of a grid over the image, row by row; None where the resolution is unknown. tilt_deg: 10th,
-    50th and 90th percentile of the angle between the optical axis and the target's normal; distance_ratio: the farthest
-    over the nearest, 90th over 10th percentile. Both without intrinsics, so roughly.
+    images: their number, None if only corners were recorded; seen: number of images with the target; corners: number in
+    all images. cells: number of corners in each cell of a grid over the image, row by row; None if the resolution is
+    unknown. tilt_deg: 10th, 50th and 90th percentile of the angle between the optical axis and the target's normal;
+    distance_ratio: 90th over 10th percentile of the distance. Both are rough, as the intrinsics are unknown.
     """
 
     camera: str
@@ -121,9 +123,8 @@ class TargetView:
 
 @dataclass(frozen=True)
 class CameraSource:
-    """One camera: the topics of its images, of its corners and tracks (tables) and of its CameraInfo; others: more
-    topics of the same images. topic: the corners where they were recorded, else the images, as `calibrate` takes them,
-    or the tracks where there is nothing else."""
+    """One camera: the topics of its images, corners, tracks (tables) and CameraInfo, or None. others: further topics of
+    the same images. topic: the one that `calibrate` reads, which is corners, else images, else tracks."""
 
     name: str
     topic: TopicInfo
@@ -136,7 +137,7 @@ class CameraSource:
 
 @dataclass(frozen=True)
 class SensorSource:
-    """A topic that may be a sensor's. kind: type of the sensor in a rig file."""
+    """A topic that can be a sensor. kind: type of the sensor in a rig file."""
 
     kind: str
     topic: TopicInfo
@@ -144,9 +145,9 @@ class SensorSource:
 
 @dataclass(frozen=True)
 class Sources:
-    """The sensors of a recording by name; left_out: topics of images that are no camera's to calibrate, and why.
-    others: of all other kinds, sorted by kind; some topics may be of something that is not on the robot. halves: both
-    topics of an IMU whose gyroscope and accelerometer report apart; `imus` has the gyroscope's."""
+    """The sensors of a recording by name. left_out: image topics that are not used, and why. others: sensors that are
+    neither cameras nor IMUs, sorted by kind; some may not be on the robot. halves: the two topics of an IMU whose
+    gyroscope and accelerometer have a topic each; `imus` has the gyroscope's."""
 
     cameras: tuple[CameraSource, ...]
     imus: Mapping[str, TopicInfo]
@@ -155,14 +156,14 @@ class Sources:
     halves: Mapping[str, TwoSources] = field(default_factory=dict)
 
     def of(self, kind: str) -> dict[str, TopicInfo]:
-        """Those of `others` that are of one kind, by name."""
+        """Topics of the sensors in `others` of one kind, by name."""
         return {name: source.topic for name, source in self.others.items() if source.kind == kind}
 
 
 @dataclass(frozen=True)
 class FramePair:
-    """A transform between two frames of `topic`: how often it was sent, at what rate (None: once, or a static one), and
-    whether it changes."""
+    """A transform between two frames in `topic`. count: number of messages; rate_hz: None if sent once or static;
+    moves: whether the transform changes."""
 
     topic: str
     parent: str
@@ -174,7 +175,7 @@ class FramePair:
 
 @dataclass(frozen=True)
 class GivenTarget:
-    """A target and the file that it is from; resolutions: of cameras by name, where the file is a rig file."""
+    """A target and its file; resolutions: (width, height) px of cameras by name, if the file is a rig file."""
 
     target: Target
     file: str
@@ -183,9 +184,9 @@ class GivenTarget:
 
 @dataclass(frozen=True)
 class Inspection:
-    """All that was found. images, infos and views are by camera, imus by IMU, facts by name of other sensors, each of
-    a class of its kind, or None; imu: the one to calibrate with. shown: where no target is known, the tags or the board
-    that a few images of each camera show, in words, "" for neither."""
+    """Result of `inspect_recording`. images, infos, views: by name of the camera; imus: by name of the IMU; facts: by
+    name of other sensors, a dataclass of the kind or None. imu: the IMU to calibrate with. shown: if no target is
+    known, words on the tags or checkerboard in a few images of each camera, "" for neither."""
 
     recording: str
     sources: Sources
@@ -205,12 +206,12 @@ class Inspection:
 
     @property
     def without_target(self) -> bool:
-        """Whether the cameras see no target, so that they can only track points of the scene, which takes an IMU."""
+        """Whether there is an IMU and no camera shows a target, so that cameras can only track points of the scene."""
         return bool(self.imus and self.shown) and not any(self.shown.values())
 
     @property
     def verdict(self) -> Literal["yes", "yes, but", "no"]:
-        """Can this be calibrated?"""
+        """Whether the recording can be calibrated: "no" with a problem, "yes, but" with a warning."""
         found = {f.severity for f in self.findings}
         return "no" if "problem" in found else "yes, but" if "warning" in found else "yes"
 

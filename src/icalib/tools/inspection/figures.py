@@ -1,4 +1,4 @@
-"""An inspection as plain data, for JSON: the figures that the terminal shows, in SI units."""
+"""Figures of an inspection as plain data and JSON, in SI units."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from icalib.tools.inspection.views import GRID
 
 
 def figures(found: Inspection) -> dict[str, Any]:
-    """Lists, numbers and text. Units stand in the names where they are not SI."""
+    """The inspection as dicts, lists, numbers and text. Names of figures that are not in SI units end with the unit."""
     return {
         "recording": found.recording,
         "verdict": found.verdict,
@@ -41,7 +41,7 @@ def figures_json(found: Inspection) -> str:
 
 
 def _stream(stream: StreamFacts) -> dict[str, Any]:
-    """One topic: what the index says of it, and its stamps."""
+    """One topic: its entry in the index, and the statistics of its stamps."""
     topic = dataclasses.asdict(stream.topic)
     return topic | {"timing": _plain(stream.timing) or None, "problem": stream.problem}
 
@@ -62,7 +62,7 @@ def _camera(found: Inspection, name: str) -> dict[str, Any]:
 
 
 def _overlap(found: Inspection, source: CameraSource) -> float | None:
-    """How long the camera and the IMU both ran, by their stamps [s]; negative: how far they are apart."""
+    """Overlap of the stamps of camera and IMU [s]; negative: the gap between them; None without one of the two."""
     camera = found.stream(source.topic).timing
     imu = found.stream(found.sources.imus[found.imu]).timing if found.imu else None
     return overlap_s(camera, imu) if camera and imu else None
@@ -77,7 +77,7 @@ def _target(found: Inspection) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> dict[str, Any]:
-    """The fields of a dataclass; {} of None."""
+    """The fields of a dataclass, arrays as lists; {} for None."""
     if value is None:
         return {}
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in dataclasses.asdict(value).items()}

@@ -1,4 +1,4 @@
-"""Can it be calibrated? Sentences that say what is wrong or missing, and what to do; the worst first."""
+"""Findings on a recording: what is wrong or missing for a calibration, and what to do."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from icalib.tools.inspection.sensors import missing_sensors
 from icalib.tools.inspection.timing import overlap_s
 from icalib.tools.inspection.unread import unread
 
-STILL_RAD_S = 0.03  # RMS: below it, nothing moved
-WEAK_RAD_S = 0.1  # RMS about one axis: below it, this axis is hardly determined
-SECOND_AXIS = 0.05  # of the strongest rotation; `calibrate` refuses less
-WEAK_M_S2 = 0.3  # RMS of the specific force about its mean
-FASTEST_RAD_S = 12.0  # a hand turns more slowly
+STILL_RAD_S = 0.03  # RMS rate below which the IMU is at rest
+WEAK_RAD_S = 0.1  # RMS rate about one axis: below it, parameters about this axis are weakly observable
+SECOND_AXIS = 0.05  # smallest ratio of the second principal rate to the first; `calibrate` refuses less
+WEAK_M_S2 = 0.3  # RMS of the specific force about its mean, below which a warning is given
+FASTEST_RAD_S = 12.0  # largest rate of a rig that is turned by hand
 DEGREE = np.pi / 180.0
-LIKELIER = 0.7  # as much spread of gravity: then this unit it is
-EXPLAINED = 0.95  # as much spread as without any rotation: then it explains something
-CONTRARY = 1.2  # times the spread without any rotation: then the rates are those of another motion
-SHORT_S, LEAST_SEEN = 20.0, 0.3
-FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 0.5  # beside what moves: 20 pairs of images no more than 2 s apart
-FEWEST_STILLS, FEW_STILLS = 2, 10  # of cameras alone: one image does not show a lens, few show it badly
-FLAT_DEG = 15.0
-EMPTY_EDGE = 0.5  # share of empty cells along an edge of the image from which on it counts as empty
+LIKELIER = 0.7  # rates are in deg/s if the spread of gravity is less than this times that for rad/s,
+EXPLAINED = 0.95  # and less than this times the spread without rotation
+CONTRARY = 1.2  # a spread of more than this times that without rotation shows that the rates contradict gravity
+SHORT_S, LEAST_SEEN = 20.0, 0.3  # shortest recording without a warning; share of images with the target
+FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 0.5  # with an IMU or wheels: 20 pairs of images at most 2 s apart
+FEWEST_STILLS, FEW_STILLS = 2, 10  # cameras alone: images to estimate a lens at all, and to estimate it well
+FLAT_DEG = 15.0  # a warning is given if the 90th percentile of the tilt is below
+EMPTY_EDGE = 0.5  # an edge of the image counts as empty if a larger share of its cells is
 _ORDER = ("problem", "warning", "hint")
 
 
 def findings(found: Inspection) -> tuple[Finding, ...]:
-    """Problems, then warnings, then hints."""
+    """All findings: problems, then warnings, then hints."""
     every = [
         *missing_sensors(found),
         *unread(found),
@@ -48,7 +48,7 @@ def findings(found: Inspection) -> tuple[Finding, ...]:
 
 
 def _broken(found: Inspection) -> Iterator[Finding]:
-    """Sensors that cannot be used are a problem where no other can take their place."""
+    """Findings on cameras and IMUs that cannot be used: problems if no other camera or IMU remains, else warnings."""
     reasons = [reason for c in found.sources.cameras if (reason := _unfit(found, c))]
     alone = len(reasons) == len(found.sources.cameras)
     yield from (Finding("problem" if alone else "warning", reason) for reason in reasons)
@@ -67,7 +67,7 @@ def _broken(found: Inspection) -> Iterator[Finding]:
 
 
 def _unfit(found: Inspection, camera: CameraSource) -> str:
-    """Why `calibrate` would refuse the camera; empty where it would not."""
+    """Why `calibrate` would refuse the camera; "" if it would not."""
     stream, view, name = found.stream(camera.topic), found.views.get(camera.name), camera.name
     timing = stream.timing
     if stream.problem or timing is None:
@@ -85,14 +85,14 @@ def _unfit(found: Inspection, camera: CameraSource) -> str:
 
 
 def _fewest_images(found: Inspection) -> tuple[int, str]:
-    """How many images `calibrate` asks of a camera, and how to get them."""
+    """Number of images that `calibrate` requires of a camera, and advice on how to record them."""
     if found.sources.imus or rolls(found):
         return FEWEST_IMAGES, "record for 30 to 90 s, with 10 to 30 images per second"
     return FEWEST_STILLS, "take 20 to 60 images of the target from all sides"
 
 
 def _few_stills(found: Inspection) -> Iterator[Finding]:
-    """Pictures that make a calibration, but no good one."""
+    """Warnings on cameras alone with enough images for a calibration, but too few for a good one."""
     if _fewest_images(found)[0] != FEWEST_STILLS:
         return
     for c in found.sources.cameras:
@@ -143,7 +143,7 @@ def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
             f"three axes{' in front of the target' if found.sources.cameras else ''}.",
         )
     elif second < SECOND_AXIS * strongest or second < STILL_RAD_S:
-        # Without a guess `calibrate` finds the rotation of cameras from turns alone, that of others from the path, too.
+        # Rotations of cameras are found from rotations of the rig alone; those of other sensors from its path as well.
         alone = not moving(found)
         rest = other_axes(name, facts.principal[0])
         yield Finding(
@@ -170,7 +170,7 @@ def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
 
 
 def _clocks(found: Inspection) -> Iterator[Finding]:
-    """Do the images and the IMU have a time in common?"""
+    """Warnings on cameras whose stamps overlap little or not at all with those of the IMU."""
     imu = _imu_timing(found)
     if imu is None or found.imu is None:
         return
@@ -191,7 +191,8 @@ def _clocks(found: Inspection) -> Iterator[Finding]:
 
 
 def _apart(camera: CameraSource, imu: str, topic: TopicInfo, apart_s: float) -> Finding:
-    """A bag says when messages were received, by one clock, and so whether the two ran together."""
+    """A warning on stamps that are apart_s seconds apart. The reception times in a bag are of one clock, and show
+    whether camera and IMU ran at the same time."""
     spans = [(t.first_ns or 0, t.last_ns or 0) for t in (camera.topic, topic)]
     together = min(last for _, last in spans) > max(first for first, _ in spans)
     says = f"The stamps of {camera.name} and {imu} do not overlap, they are {_span(apart_s)} apart"
@@ -213,7 +214,7 @@ def _span(seconds: float) -> str:
 
 
 def _streams(found: Inspection) -> Iterator[Finding]:
-    named = {t.name for t in found.sources.imus.values()}  # whose own notes say it
+    named = {t.name for t in found.sources.imus.values()}  # notes on IMUs name the jumps already
     for stream in found.streams:
         if stream.timing is not None and stream.timing.jumps and stream.topic.name not in named:
             yield Finding(
@@ -228,7 +229,7 @@ def _streams(found: Inspection) -> Iterator[Finding]:
         yield Finding("warning", f"{found.imu} has {_gaps(imu)}; check the load of the recorder and the bus.")
     for c in found.sources.cameras:
         timing = found.stream(c.topic).timing
-        # Images without the target are no gaps in the camera's work, so tables of corners are not judged.
+        # Images without the target leave gaps in a table of corners, which are no gaps of the camera.
         if timing is not None and timing.gaps and not c.corners:
             yield Finding("hint", f"{c.name} has {_gaps(timing)}.")
 
@@ -256,7 +257,7 @@ def _target(found: Inspection) -> Iterator[Finding]:
 
 
 def _unknown_target(found: Inspection) -> Iterator[Finding]:
-    """What to do where no target is known."""
+    """Hints if no target is known: what the images show, and to give a target."""
     if found.without_target:
         yield Finding(
             "hint",
@@ -292,7 +293,8 @@ def _view(v: TargetView) -> Iterator[Finding]:
 
 
 def empty_borders(cells: tuple[tuple[int, ...], ...]) -> tuple[str, ...]:
-    """Edges of the image along which most cells are empty, and empty corners of the image on other edges, in words."""
+    """Names of empty image regions, such as "top edge": edges along which most cells are empty, and empty corners on
+    the remaining edges. cells: number of target corners in each cell, row by row."""
     grid = np.array(cells)
     edges = {"top": grid[0], "bottom": grid[-1], "left": grid[:, 0], "right": grid[:, -1]}
     empty = [name for name, line in edges.items() if (line == 0).mean() > EMPTY_EDGE]

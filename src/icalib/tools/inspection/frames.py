@@ -9,7 +9,8 @@ from icalib.tools.inspection.facts import FramePair
 
 
 def frame_pairs(recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:
-    """All pairs of frames with a transform between them, by topic and name, and notes on topics that cannot be read."""
+    """All pairs of frames with a transform, sorted by topic and name, and notes on topics that cannot be read. Both are
+    empty for recordings that are not bags."""
     if not isinstance(recording, BagRecording):
         return (), ()
     topics = recording.topics()

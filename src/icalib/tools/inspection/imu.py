@@ -1,4 +1,4 @@
-"""What an IMU measured: ranges, units, and about which axes it was turned."""
+"""Statistics of an IMU's readings: ranges, units, and principal axes of the rotation."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _DEGREE = np.pi / 180.0
 
 
 def read_imu(recording: Recording, name: str, topic: str | TwoSources) -> tuple[ImuStream, str, tuple[str, ...]]:
-    """The readings as they were written, how a sentence names their place, and notes where two topics were joined.
-    Raises RecordingError."""
+    """The readings in recorded units, the name of their source for messages, and notes if two topics were joined.
+    Raises RecordingError if they cannot be read."""
     sensor = ImuSensor(name, topic, class_noise(DEFAULT_CLASS), topic=topic)
     where = recording.where(sensor)
     imu, notes = one_stream(readings(recording, sensor), f"{where} ({name})")
@@ -29,7 +29,8 @@ def read_imu(recording: Recording, name: str, topic: str | TwoSources) -> tuple[
 
 
 def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = ()) -> ImuFacts:
-    """Figures of `imu`, and in `problem` why it would be refused, if it would; `notes` come before its own."""
+    """Statistics of `imu`; `problem` says why `calibrate` would refuse it. where: name of the source for messages;
+    notes: to be put before those of this function."""
     problem, jumps = "", ClockJumps()
     try:
         imu, own = checked_imu(jumps.cut(imu, f"{where} ({imu.name})"), where)
@@ -38,7 +39,7 @@ def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = (
         problem = str(error)
     fine = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
     gyro, accel = (x[fine] if fine.any() else np.zeros((1, 3)) for x in (imu.gyro, imu.accel))
-    # eigh sorts upwards; the strongest direction comes first here.
+    # eigh sorts in ascending order; here the strongest direction comes first.
     squares, directions = np.linalg.eigh(gyro.T @ gyro / len(gyro))
     first, second, third = (_vector(d * np.sign(d[np.argmax(np.abs(d))])) for d in directions.T[::-1])
     return ImuFacts(

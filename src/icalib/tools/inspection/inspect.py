@@ -1,4 +1,4 @@
-"""From a recording to what is in it: this page reads, `findings` judges."""
+"""Reads a recording and collects its facts; `findings` derives problems and warnings from them."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ from icalib.tools.inspection.sources import find_sources
 from icalib.tools.inspection.timing import timing_of
 from icalib.tools.inspection.views import target_in, target_view
 
-SAMPLE = 16  # images that are decoded, spread over the recording
-READING_SHARE = 0.3  # of the time, where the target is looked for
-Progress = Callable[[str, float], None]  # what is being done, and how much of the whole is behind, 0 to 1
+SAMPLE = 16  # images per camera that are decoded, spread over the recording
+READING_SHARE = 0.3  # progress after reading, if the target is then searched for
+Progress = Callable[[str, float], None]  # called with the current step, and the progress of the whole, 0 to 1
 
 
 def inspect_recording(
@@ -58,12 +58,12 @@ def inspect_recording(
     start_s: float = 0.0,
     end_s: float = inf,
 ) -> Inspection:
-    """Reads the recording at `path` once, and says what is in it and whether it can be calibrated; of its part from
-    start_s to end_s after its start.
+    """Reads the recording at `path`: its sensors, and whether it can be calibrated. start_s, end_s: part that is read,
+    s after the start.
 
-    The `target`, or one of Kalibr's beside the recording, is looked for in all images; the corners are kept for
-    `calibrate`. Raises RecordingError, one sentence, where there is no recording, or nothing in it; faults of a single
-    topic are in the findings.
+    The `target`, or that of a Kalibr file beside the recording, is searched for in all images; `calibrate` uses the
+    found corners again. Raises RecordingError, one sentence, if there is no recording or it is empty. Faults of single
+    topics become findings.
     """
     recording = open_recording(path, start_s, end_s)
     topics = recording.topics()
@@ -86,12 +86,13 @@ def inspect_recording(
 
 
 def _beside(kalibr: KalibrFiles) -> GivenTarget | None:
-    """The target of Kalibr's file beside the recording."""
+    """The target of a Kalibr file beside the recording; None without one."""
     return GivenTarget(kalibr.target, kalibr.target_file, {}) if kalibr.target else None
 
 
 def resolution_of(found: Inspection, camera: CameraSource) -> tuple[int, int] | None:
-    """That of the camera's images; without images, the one that a rig file or Kalibr's camchain gives."""
+    """Resolution (width, height) px of the camera's images; without images, that of the rig file with the target or of
+    Kalibr's camchain; else None."""
     if camera.images:
         return found.images[camera.name].resolution
     given = found.target.resolutions.get(camera.name) if found.target else None
@@ -101,7 +102,8 @@ def resolution_of(found: Inspection, camera: CameraSource) -> tuple[int, int] | 
 def _read(
     recording: Recording, topics: tuple[TopicInfo, ...], sources: Sources, progress: Progress
 ) -> tuple[tuple[StreamFacts, ...], dict[str, ImageFacts], dict[str, ImuFacts]]:
-    """Every topic once: images and readings in full, of the others the stamps."""
+    """Reads every topic once. Returns facts by topic, on images by camera, and on IMUs by name. Images and IMU readings
+    are read in full, other topics only for their stamps."""
     cameras = {c.images.name: c.name for c in sources.cameras if c.images}
     names = {t.name: name for name, t in sources.imus.items()}
     images: dict[str, ImageFacts] = {}
@@ -122,7 +124,8 @@ def _read(
 
 
 def _joined_imu(recording: Recording, sources: Sources) -> Sources:
-    """The same, where two topics are one IMU's, which is then called imu0."""
+    """The sources, in which the two topics of one IMU (gyroscope, accelerometer) are joined to one IMU. Its name is
+    the first free one of imu0, imu1, ..."""
     pair = pair_of(recording, tuple(sources.imus.values())) if isinstance(recording, BagRecording) else None
     if pair is None:
         return sources
@@ -134,7 +137,7 @@ def _joined_imu(recording: Recording, sources: Sources) -> Sources:
 
 
 def _facts(recording: Recording, sources: Sources) -> dict[str, Any]:
-    """Of the sensors that are neither IMU nor camera, by name."""
+    """Facts on the sensors that are neither IMU nor camera, by name."""
     kinds = inspectors()
     return {name: kinds[s.kind].facts(recording, name, s.topic) for name, s in sources.others.items()}
 
@@ -160,7 +163,7 @@ def _read_images(recording: Recording, topic: TopicInfo) -> tuple[StreamFacts, I
 
 
 class _Sample:
-    """Decodes every n-th image."""
+    """Decodes every n-th image, and counts those that are damaged."""
 
     def __init__(self, every: int) -> None:
         self._every, self._seen = every, 0
@@ -198,7 +201,8 @@ def _read_imu(
 
 
 def _read_stamps(recording: Recording, topic: TopicInfo, left_out: bool) -> StreamFacts:
-    """Of what icalib does not read, of CameraInfo, transforms and images left out, only what the index says."""
+    """Facts on a topic from its stamps. Timing is None for topics that icalib does not read, CameraInfo, transforms and
+    images that are left out."""
     if left_out or not topic.count or topic.kind in ("", "camera info", TRANSFORMS):
         return StreamFacts(topic, None)
     try:
@@ -220,7 +224,7 @@ def _frame(recording: Recording, topic: TopicInfo) -> str:
 
 
 def _infos(recording: Recording, sources: Sources) -> dict[str, CameraInfo]:
-    """What the drivers say of the cameras; nothing of those whose messages cannot be read."""
+    """CameraInfo by name of the camera, without those whose messages cannot be read."""
     found: dict[str, CameraInfo] = {}
     for c in sources.cameras:
         if c.info and isinstance(recording, BagRecording):
@@ -232,14 +236,15 @@ def _infos(recording: Recording, sources: Sources) -> dict[str, CameraInfo]:
 
 
 def _choose(imus: dict[str, ImuFacts], sources: Sources, kalibr: KalibrFiles) -> str | None:
-    """The IMU to calibrate with: one that is not refused; the one that Kalibr's file names; the first."""
+    """Name of the IMU to calibrate with. An IMU without a problem is preferred, then one in Kalibr's file, then the
+    first. None without any."""
     named = {k.topic.strip("/") for k in kalibr.imus}
     order = sorted(imus, key=lambda n: (bool(imus[n].problem), sources.imus[n].name.strip("/") not in named))
     return order[0] if order else None
 
 
 def _shown(recording: Recording, found: Inspection) -> dict[str, str]:
-    """What of a target a few images of each camera show, where none is known."""
+    """Words on the target in a few images of each camera, see `Inspection.shown`; empty if a target is known."""
     if found.target is not None:
         return {}
     cameras = [c for c in found.sources.cameras if c.images and not (c.corners or found.stream(c.topic).problem)]
@@ -247,7 +252,7 @@ def _shown(recording: Recording, found: Inspection) -> dict[str, str]:
 
 
 def _views(recording: Recording, found: Inspection, progress: Progress) -> dict[str, TargetView]:
-    """The target in each camera whose images can be read."""
+    """Detections of the target by name of the camera, for cameras whose images can be read."""
     if found.target is None:
         return {}
     views: dict[str, TargetView] = {}

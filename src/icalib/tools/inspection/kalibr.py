@@ -1,4 +1,4 @@
-"""Kalibr's own files beside a recording: camchain, imu and target, recognised by their fields."""
+"""Kalibr's files beside a recording: camchain, imu and target, recognised by their fields."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Checkerboard, Target
 from icalib.rig import ImuNoise
 
-_LARGEST_BYTES = 100_000  # of a file that people write by hand
+_LARGEST_BYTES = 100_000  # larger YAML files are not read, as they are not written by hand
 _DENSITIES = (
     "gyroscope_noise_density",
     "gyroscope_random_walk",
     "accelerometer_noise_density",
     "accelerometer_random_walk",
 )
-# Kalibr's camera and distortion model -> ours, and how many of our coefficients stand before its focal lengths.
+# Kalibr's camera and distortion model -> icalib's model, and the number of coefficients before the focal lengths in
+# Kalibr's intrinsics, which icalib counts as distortion.
 MODELS = {
     ("pinhole", "radtan"): ("pinhole-radtan", 0),
     ("pinhole", "equidistant"): ("pinhole-equidistant", 0),
@@ -34,7 +35,7 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class KalibrCamera:
-    """One camera of a camchain: name there, topic, our model and its values; intrinsics fx, fy, cx, cy [px]."""
+    """One camera of a camchain, converted to a model of icalib: intrinsics fx, fy, cx, cy [px], and distortion."""
 
     file: str
     name: str
@@ -47,7 +48,7 @@ class KalibrCamera:
 
 @dataclass(frozen=True)
 class KalibrImu:
-    """The noise in an imu file, and the topic that it is for."""
+    """The noise in an imu file, and the topic of the IMU."""
 
     file: str
     topic: str
@@ -56,7 +57,7 @@ class KalibrImu:
 
 @dataclass(frozen=True)
 class KalibrFiles:
-    """What lies beside a recording. notes: files that could not be used, and why."""
+    """Contents of the Kalibr files beside a recording. notes: files that could not be used, and why."""
 
     cameras: tuple[KalibrCamera, ...] = ()
     imus: tuple[KalibrImu, ...] = ()
@@ -66,9 +67,9 @@ class KalibrFiles:
 
 
 def find_kalibr_files(recording: Path) -> KalibrFiles:
-    """Kalibr's files in the folder of the recording and in the one above; notes name faults of single files.
+    """Kalibr's files in the folder of the recording and in its parent; notes name faults of single files.
 
-    Targets that differ are not used: nobody knows which it was.
+    If several targets differ, none is used, as the right one is unknown.
     """
     cameras: list[KalibrCamera] = []
     imus: list[KalibrImu] = []
@@ -111,7 +112,7 @@ def kalibr_target(data: dict[str, Any], file: str) -> Target:
 
 
 def _circles(data: dict[str, Any], file: str) -> str:
-    """What to write for a circlegrid; Kalibr's file lacks the diameter of its circles."""
+    """Message on how to write a circle grid in the rig file, as Kalibr's file lacks the diameter of its circles."""
     rows, cols = (_whole(data, name, file) for name in ("targetRows", "targetCols"))
     spacing = _positive(data, "spacingMeters", file)
     asymmetric = ", asymmetric: true" if data.get("asymmetricGrid") else ""
@@ -130,7 +131,7 @@ def _yaml_files(recording: Path) -> list[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What lies in `folder`; nothing where that may not be seen."""
+    """Paths in `folder`, sorted; empty if it cannot be listed."""
     try:
         return sorted(folder.iterdir())
     except OSError:
@@ -138,7 +139,7 @@ def _entries(folder: Path) -> list[Path]:
 
 
 def yaml_mapping(path: Path) -> dict[str, Any]:
-    """The file's mapping; an empty one for files of others, whatever they are."""
+    """The mapping in a YAML file; empty if the file cannot be parsed or is no mapping."""
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError, RecursionError):
@@ -149,7 +150,8 @@ def yaml_mapping(path: Path) -> dict[str, Any]:
 def _read(
     path: Path, data: dict[str, Any], mark: str, make: Callable[[str, str, dict[str, Any]], Found]
 ) -> list[Found]:
-    """What `make` reads from the mappings that have `mark`: the whole file, or its entries (cam0, imu0)."""
+    """Results of make(file, name, mapping) for the mappings with the key `mark`: the whole file, or its entries (cam0,
+    imu0)."""
     entries = {"": data} if mark in data else {k: v for k, v in data.items() if isinstance(v, dict) and mark in v}
     return [make(str(path), str(name), entry) for name, entry in entries.items()]
 

@@ -1,6 +1,6 @@
-"""What of a recording can be a sensor: the base class of all kinds but IMUs and cameras.
+"""Base class of the inspectors, which recognise the sensors of one kind in a recording; IMUs and cameras have none.
 
-Each kind has its own in `icalib.sensors.KIND.inspect`, under the name `INSPECTOR`.
+The inspector of a kind is `icalib.sensors.KIND.inspect.INSPECTOR`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from icalib.tools.inspection.facts import Finding, Inspection
 
 
 class KindInspector:
-    """Says of one kind of sensor which topics can be one, and what a draft says of it.
+    """Recognises sensors of one kind by their topics, and writes their lines in a draft of the rig file.
 
-    sensor: its class in a rig. topic_kinds: those of `TopicInfo`, tables included. prefix: of the names of sensors
-    whose topic names none. plain_names: regular expression of parts of topics' names that say what is measured, and not
-    by which sensor. is_certain: whether such a topic is a sensor on the robot; else its lines are comments in a draft,
-    below `doubt`, unless nothing else gives the motion. moves_alone: whether it gives the motion without an IMU. rolls:
-    whether it is on wheels on the ground.
+    sensor: class of the sensor in a rig. topic_kinds: values of `TopicInfo.kind` of its topics and tables. prefix: of
+    names made up for sensors whose topic names none. plain_names: regular expression of parts of topic names that are
+    the measured quantity, not the sensor. is_certain: whether such a topic is always a sensor on the robot. If not, its
+    lines are comments in a draft, below `doubt`, unless no other sensor gives the motion. moves_alone: whether the
+    sensor gives the motion without an IMU. rolls: whether it shows that the robot is on wheels on the ground.
     """
 
     sensor: ClassVar[type[Sensor]]
@@ -34,56 +34,55 @@ class KindInspector:
     rolls: ClassVar[bool] = False
 
     def facts(self, recording: Recording, name: str, topic: TopicInfo) -> Any:
-        """What else can be said of the sensor: a dataclass, or None."""
+        """Facts on the sensor that are special to its kind: a dataclass, or None."""
         return None
 
     def findings(self, found: Inspection) -> Iterator[Finding]:
-        """What is wrong with sensors of this kind."""
+        """Findings on sensors of this kind."""
         yield from ()
 
     def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
-        """Fields of the sensor in a rig file, except its type and the place of its data."""
+        """Lines of the sensor in a rig file, except its type and its topic or path."""
         yield from ()
 
     def more_lines(self, found: Inspection, shown: bool) -> Iterator[str]:
-        """Sections of a rig file, from the name on, of sensors that are no topic of their own; comments unless
-        `shown`."""
+        """Lines of a rig file for sensors without a topic of this kind, name included; comments unless `shown`."""
         yield from ()
 
 
 def inspectors() -> dict[str, KindInspector]:
-    """By the type of the sensor in a rig file, in the order of `SENSOR_KINDS`."""
+    """The inspectors by type of the sensor in a rig file, in the order of `SENSOR_KINDS`."""
     modules = {kind: facet(kind, "inspect") for kind in SENSOR_KINDS}
     return {kind: module.INSPECTOR for kind, module in modules.items() if module is not None}
 
 
 def moving(found: Inspection) -> tuple[str, ...]:
-    """Names of sensors that give the motion beside an IMU, cameras not counted."""
+    """Names of sensors, without cameras, that give the motion together with an IMU."""
     kinds = inspectors()
     return tuple(name for name, source in found.sources.others.items() if kinds[source.kind].sensor.gives_motion)
 
 
 def rolls(found: Inspection) -> bool:
-    """Whether something that was recorded is on wheels on the ground."""
+    """Whether a recorded sensor shows that the robot is on wheels on the ground."""
     kinds = inspectors()
     return any(kinds[source.kind].rolls for source in found.sources.others.values())
 
 
 def without_imu(found: Inspection) -> tuple[str, ...]:
-    """Names of sensors that need no IMU, cameras not counted; one that gives the motion alone first."""
+    """Names of sensors, without cameras, that need no IMU; those that give the motion without an IMU first."""
     kinds = inspectors()
     free = [(n, kinds[s.kind]) for n, s in found.sources.others.items() if not kinds[s.kind].sensor.needs_imu]
     return tuple(name for name, _ in sorted(free, key=lambda x: not x[1].moves_alone))
 
 
 def moves_without_imu(found: Inspection) -> bool:
-    """Whether a sensor gives the motion without an IMU, and there is another one to calibrate; cameras not counted."""
+    """Whether a sensor gives the motion without an IMU, and another one can be calibrated to it; without cameras."""
     kinds, others = inspectors(), found.sources.others
     return len(without_imu(found)) > 1 and any(kinds[source.kind].moves_alone for source in others.values())
 
 
 def nouns(alone: bool = False) -> str:
-    """The kinds that give the motion beside an IMU, or `alone`, for a sentence."""
+    """Names of the kinds of sensors that give the motion, for a sentence; alone: only those that need no IMU for it."""
     kinds = [k for k in inspectors().values() if k.sensor.gives_motion and (k.moves_alone or not alone)]
     words = [k.sensor.noun for k in kinds]
     return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

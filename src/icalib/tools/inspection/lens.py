@@ -1,4 +1,4 @@
-"""Which camera model a draft starts with, and from which values: Kalibr's camchain, else CameraInfo, else none."""
+"""Camera model and initial values in a draft of the rig file: from Kalibr's camchain, else from CameraInfo."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ Values = tuple[float, ...]
 
 @dataclass(frozen=True)
 class LensStart:
-    """model, and why; intrinsics and distortion (None: found from nothing), and where they are from; notes."""
+    """Camera model with initial values. why: reason for the model; intrinsics: fx, fy, cx, cy [px]; None: no guess,
+    `calibrate` finds the values; source: of the values; notes: values that are not used, and why."""
 
     model: str
     why: str
@@ -32,7 +33,7 @@ class LensStart:
 
 
 def lens_start(found: Inspection, camera: CameraSource, resolution: tuple[int, int] | None) -> LensStart:
-    """What is known of the lens of `camera`, whose images have `resolution` px."""
+    """Model and initial values for the lens of `camera`, whose images have `resolution` (width, height) px."""
     notes: list[str] = []
     kalibr = _kalibr(found, camera)
     if kalibr is not None and kalibr.resolution != resolution:
@@ -69,7 +70,7 @@ def _from_info(
 
 
 def _model(info: CameraInfo) -> str:
-    """The plainest model that holds all coefficients, which OpenCV orders k1, k2, p1, p2, k3, k4, k5, k6, ..."""
+    """The simplest model for all coefficients, which OpenCV orders k1, k2, p1, p2, k3, k4, k5, k6, ..."""
     if info.model in _FISHEYES:
         return "pinhole-equidistant"
     if info.model not in _BROWN or len(info.distortion) < 5:
@@ -78,7 +79,7 @@ def _model(info: CameraInfo) -> str:
 
 
 def _distortion(info: CameraInfo, model: str) -> Values | None:
-    """None where `model` does not hold all coefficients that are not zero."""
+    """The distortion in the order of `model`; None if a coefficient that is not zero does not belong to it."""
     size = len(camera_model(model).parameter_names) - 4
     known = info.model in (*_BROWN, *_FISHEYES)
     if not known or len(info.distortion) < size or np.any(info.distortion[size:]):
@@ -87,7 +88,8 @@ def _distortion(info: CameraInfo, model: str) -> Values | None:
 
 
 def _kalibr(found: Inspection, camera: CameraSource) -> KalibrCamera | None:
-    """The entry with the camera's topic; else with its name, where no entry names a topic of this recording."""
+    """Kalibr's entry with the camera's topic. If no entry names a topic of this recording, that with the camera's
+    name."""
     topics = {s.topic.name.strip("/") for s in found.streams}
     named = any(k.topic.strip("/") in topics for k in found.kalibr.cameras)
     mine = camera.images.name.strip("/") if camera.images else None

@@ -1,4 +1,4 @@
-"""How values stand in the lines of a drafted rig file."""
+"""Formats values for the lines of a drafted rig file."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 
 
 def place_line(name: str, kind: str, frame: str = "") -> str:
-    """`topic` of a bag or a folder of images; `path` of a table. kind: of what is there, for a comment."""
+    """The line `topic: NAME` for a topic of a bag or a folder of images, `path: NAME` for a table. kind, frame: type
+    and frame id, for a comment."""
     endings = (".csv", *(PurePosixPath(table.name).suffix for table in table_files()))
     field = "path" if name.removesuffix(".gz").endswith(endings) else "topic"
     return f"{field}: {name_text(name)}  # {comment(kind)}" + in_frame(frame)
 
 
 def in_frame(frame: str) -> str:
-    """The end of a comment."""
+    """End of a comment with the frame id; "" without one."""
     return f", frame {json.dumps(frame)}" if frame else ""
 
 
 def name_text(name: str) -> str:
-    """A name of a topic or file, in quotes where YAML needs them."""
+    """The name of a topic or file, in quotes if YAML needs them."""
     return name if _PLAIN.fullmatch(name) else json.dumps(name)
 
 
@@ -38,5 +39,5 @@ def number(value: float) -> str:
 
 
 def comment(text: str) -> str:
-    """`text` on one line."""
+    """`text` on one line, for a comment."""
     return " ".join(text.split())

@@ -1,4 +1,4 @@
-"""Do the sensors that were recorded show the motion together, as `calibrate` asks of a rig?"""
+"""Findings on the set of recorded sensors: whether together they determine the motion, as `calibrate` requires."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from icalib.tools.inspection.kinds import inspectors, moves_without_imu, moving,
 
 
 def missing_sensors(found: Inspection) -> Iterator[Finding]:
-    """What there is too little of, and topics without messages."""
+    """Findings on missing sensors, and on topics without messages."""
     sources, held = found.sources, listing([s.topic for s in found.streams])
     if sources.imus:
         yield from _beside_an_imu(found, held)
@@ -66,7 +66,7 @@ def _cameras_without_imu(found: Inspection, held: str) -> Finding:
 
 
 def _alone(found: Inspection) -> str:
-    """Why the sensors, without IMU and camera, cannot be calibrated."""
+    """Why sensors without IMU and camera cannot be calibrated, as the begin of a sentence."""
     kinds, others = inspectors(), found.sources.others
     if not others:
         return "There is no sensor to calibrate"

@@ -1,4 +1,4 @@
-"""Which topics are sensors, and what to call them."""
+"""Finds the topics that are sensors, and names the sensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from icalib.data.recordings import TopicInfo
 from icalib.tools.inspection.facts import CameraSource, SensorSource, Sources
 from icalib.tools.inspection.kinds import inspectors
 
-# Parts of a topic's name that say what it carries, not whose it is; those of other kinds are `plain_names`.
+# Parts of topic names that are the content, not the sensor. Those of other kinds of sensors are their `plain_names`.
 _WHAT = (
     r"image(_(raw|color|mono|rect|rect_raw|rect_color))?|compressed|raw|camera_info|data(_raw)?|sample"
     r"|(data|corners|tracks)\.csv"
@@ -22,7 +22,7 @@ Key = tuple[str, ...]
 
 
 def find_sources(topics: Sequence[TopicInfo]) -> Sources:
-    """The sensors among `topics` that hold messages, each under a unique name made of its topic."""
+    """The sensors among the topics with messages, each under a unique name derived from its topic."""
     filled = [t for t in topics if t.count]
     depth = [t for t in filled if t.kind == "image" and "depth" in t.name.lower()]
     seen = {
@@ -49,7 +49,8 @@ def _plain_names() -> re.Pattern[str]:
 
 
 def _camera(name: str, key: Key, seen: Mapping[str, Mapping[Key, list[TopicInfo]]]) -> CameraSource:
-    """Of several topics of the same images: the one that is not rectified, has most messages, is not compressed."""
+    """The camera with the key `key`. Among several topics of its images, unrectified ones go first, then those with
+    most messages, then short names, which are of uncompressed images."""
     same = sorted(seen["image"].get(key, []), key=lambda t: ("rect" in t.name, -t.count, len(t.name)))
     corners, tracks, info = (seen[kind].get(key, [None])[0] for kind in ("corners", "tracks", "camera info"))
     images = same[0] if same else None
@@ -71,7 +72,7 @@ def _key(topic: TopicInfo) -> Key:
 
 
 def _names(sensors: list[tuple[Key, str]]) -> list[str]:
-    """For each sensor the last parts of its key, as few as tell all of them apart."""
+    """Unique names from the last parts of the sensors' keys, as few as make the names differ."""
     longest = max((len(key) for key, _ in sensors), default=1)
     names: list[str] = []
     for length in range(1, longest + 1):

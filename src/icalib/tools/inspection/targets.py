@@ -1,4 +1,4 @@
-"""The target that a user gives: in icalib's words, in a rig file, or in Kalibr's target file."""
+"""Reads the target that a user gives: a target or rig file of icalib, or Kalibr's target file."""
 
 from __future__ import annotations
 

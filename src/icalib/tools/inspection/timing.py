@@ -7,11 +7,11 @@ import numpy as np
 from icalib.data.stamps.jumps import longest_part
 from icalib.tools.inspection.facts import Timing
 
-GAP = 1.5  # medians: halfway between an interval and the one that a lost message leaves
+GAP = 1.5  # in median intervals; one lost message makes 2
 
 
 def timing_of(stamps_ns: np.ndarray) -> Timing | None:
-    """Figures of the stamps (N,) int64, in the order in which they were recorded; None where there are none."""
+    """Statistics of the stamps (N,) int64 [ns], in the order of recording; None without stamps."""
     if not len(stamps_ns):
         return None
     part, jumps = longest_part(stamps_ns)
@@ -40,5 +40,5 @@ def timing_of(stamps_ns: np.ndarray) -> Timing | None:
 
 
 def overlap_s(a: Timing, b: Timing) -> float:
-    """How long both ran, by their stamps [s]; negative: how far they are apart."""
+    """Overlap of the two spans of stamps [s]; negative: the gap between them."""
     return (min(a.last_ns, b.last_ns) - max(a.first_ns, b.first_ns)) * 1e-9

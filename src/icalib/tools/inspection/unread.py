@@ -1,4 +1,4 @@
-"""Topics that look like a sensor's, but hold what icalib does not read."""
+"""Topics of sensors in formats that icalib does not read."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from icalib.tools.inspection.facts import Finding, Inspection
 
 
 def unread(found: Inspection) -> Iterator[Finding]:
-    """Raw packets of LiDARs, and videos."""
+    """Warnings on topics with messages that icalib does not read, such as raw LiDAR packets and videos."""
     for stream in found.streams:
         if stream.topic.count and (held := type_not_read(stream.topic.type)):
             yield Finding("warning", f"{stream.topic.name} holds {held[1]}.")

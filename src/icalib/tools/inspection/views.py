@@ -1,4 +1,4 @@
-"""The target in the images: in how many, where in them, from how far and how tilted."""
+"""Detections of the target in images: their number, coverage of the image, tilts and distances."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.tools.inspection.facts import CameraSource, TargetView
 
 GRID = (8, 5)  # columns and rows of cells over the image
-_LEAST_CORNERS = 8  # for the pose of a board in one image; of a free tag, all four
+_LEAST_CORNERS = 8  # for the tilt of a board in one image; a free tag needs its four
 
 
 def target_view(
@@ -28,11 +28,11 @@ def target_view(
     resolution: tuple[int, int] | None,
     progress: Callable[[float], None],
 ) -> TargetView:
-    """Finds the target in all images of the camera, or reads the corners that were recorded. A failure is in
-    `problem`."""
+    """Finds the target in all images of the camera, or reads the recorded corners. A failure is described in
+    `TargetView.problem`."""
     images = source.images.name if source.images else None
     path = source.corners.name if source.corners else f"{source.name}/corners.csv"
-    # The model plays no part in finding corners.
+    # The detection of corners does not depend on the camera model.
     camera = Camera(source.name, path, "pinhole-radtan", resolution or (1, 1), topic=images)
     tabled = source.corners is not None
     try:
@@ -57,14 +57,14 @@ def target_view(
 
 
 def target_in(images: Iterable[np.ndarray]) -> str:
-    """The tags or the checkerboard that images (h, w) uint8 show, in words; "" for neither."""
+    """Words on the tags or the checkerboard in images (h, w) uint8; "" for neither."""
     grey = list(images)
     return tags_in(grey) or checkerboard_in(grey)
 
 
 def coverage(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[tuple[int, ...], ...]:
-    """How many of the corners uv (N, 2) [px] lie in each cell of the image of `resolution` (width, height): GRID[1]
-    rows of GRID[0]."""
+    """Number of corners uv (N, 2) [px] in each cell of an image of `resolution` (width, height): GRID[1] rows of
+    GRID[0] cells."""
     cell = np.floor((uv + 0.5) / resolution * GRID).astype(np.int64)
     col, row = np.clip(cell, 0, np.array(GRID) - 1).T
     counts = np.bincount(row * GRID[0] + col, minlength=GRID[0] * GRID[1]).reshape(GRID[1], GRID[0])
@@ -72,10 +72,11 @@ def coverage(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[tuple[int, ..
 
 
 def _poses(corners: CornerStream, target: Target) -> tuple[tuple[float, float, float] | None, float | None]:
-    """Percentiles of the tilt [deg], and farthest over nearest, from how each body's plane is stretched in each image.
+    """10th, 50th and 90th percentile of the tilt [deg], and 90th over 10th percentile of the distance; None without
+    data.
 
-    Seen from far, a plane tilted by a keeps its scale f / distance along the axis of the tilt, and has cos(a) times it
-    across.
+    Both follow from an affine map of each body's plane to each image. A distant plane that is tilted by a has the scale
+    f / distance along the axis of the tilt, and cos(a) times this scale across it.
     """
     scales: list[np.ndarray] = []
     body = target.body[corners.point]
