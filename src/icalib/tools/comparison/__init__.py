@@ -1,1 +1,1 @@
-"""What changed between two calibrations, or between a calibration and what others say of the same rig."""
+"""Differences between two calibrations, or between a calibration and a Kalibr file, URDF or rig file of its rig."""

@@ -1,4 +1,4 @@
-"""Two calibrations, block by block."""
+"""Compares two calibrations, block by block (rotation, translation, time offset, lens, ...)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from icalib.tools.comparison.sides import LensSide, Quantity, Side
 from icalib.tools.comparison.significance import sigmas
 from icalib.tools.comparison.units import DEFAULT_TOLERANCES
 
-_GRID = (24, 18)  # pixels across and down on which lenses are compared
+_GRID = (24, 18)  # columns and rows of the grid of pixels at which lenses are compared
 
 
 @dataclass(frozen=True)
 class ComparisonTolerances:
-    """Differences up to these do not count. None: they count by their standard deviations alone, and up to the default
-    where there are none."""
+    """Differences up to these tolerances are ignored. None: the tolerance is 0 if a standard deviation is known, else
+    that of `DEFAULT_TOLERANCES`."""
 
     deg: float | None = None
     mm: float | None = None
@@ -37,13 +37,14 @@ class ComparisonTolerances:
 
 @dataclass(frozen=True)
 class Difference:
-    """One block that both sides have, B against A.
+    """Difference of one block that both sides have, B minus A.
 
-    what: rotation, translation, lens, or the words of a quantity. vector (n,): rotation vector in the sensor's axes
-    [deg], translation in `frame`'s [mm], time offset [ms], of a quantity [percent] by label. size: its norm; of a lens
-    RMS [px]. std (n,), sigmas: of both sides together, None where not known; given_by: whose standard deviations they
-    are ("both", "A", "B", ""). most: of a lens the largest distance [px]. open: sides ("A", "B") on which the data did
-    not determine it.
+    sensor, frame: the block is of `sensor`, relative to `frame`. what: "rotation", "translation", "lens", or the name
+    of a quantity. vector (n,): rotation vector in the sensor's axes [deg], translation in the axes of `frame` [mm],
+    other quantities in `unit`; entries are named by `labels`. size: norm of `vector`; for a lens, RMS distance of image
+    points [px]. std (n,), sigmas: from both sides, None if unknown; given_by: the sides that have standard deviations
+    ("both", "A", "B", ""). differs: beyond tolerance and limit. open: sides ("A", "B") in which the block is
+    undetermined. most: for a lens, the largest distance of image points [px].
     """
 
     sensor: str
@@ -64,7 +65,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """reference: the sensor that poses are seen from. notes: what could not be compared, and why."""
+    """Result of a comparison. reference: the sensor to which poses are relative; notes: what could not be compared."""
 
     a: Side
     b: Side
@@ -79,7 +80,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two sides, and what counts."""
+    """Two sides, with the tolerances and the limit in standard deviations above which they differ."""
 
     a: Side
     b: Side
@@ -97,7 +98,8 @@ class _Pair:
         open_: tuple[str, ...],
         lens: tuple[float, float] | None = None,
     ) -> Difference:
-        """names: sensor, frame, what. vector in SI, which times `scale` is in `unit`."""
+        """The difference of one block. names: sensor, frame, what; vector: in SI units; scale: factor from SI to
+        `unit`; covariances: of both sides, NaN if unknown; lens: RMS and largest distance of image points [px]."""
         known = [bool(np.isfinite(c).all() and c.any()) for c in covariances]
         total = sum((np.zeros_like(c) if not np.isfinite(c).all() else c for c in covariances), np.zeros((1, 1)))
         count = sigmas(vector, total) if any(known) else None
@@ -121,10 +123,10 @@ class _Pair:
 
 
 def compare_sides(a: Side, b: Side, tolerances: ComparisonTolerances | None = None, limit: float = 3.0) -> Comparison:
-    """All that both say. A block differs where it is off by more than its tolerance and, where standard deviations are
-    known, by more than `limit` of them.
+    """Compares all blocks that both sides have. A block differs if its change exceeds the tolerance and, if standard
+    deviations are known, also `limit` of them.
 
-    Raises CalibrationError where they share nothing.
+    Raises CalibrationError if the sides have no block in common.
     """
     if a.has_imu and b.has_imu and a.body != b.body:
         b = b.renamed(b.body, a.body)
@@ -159,7 +161,8 @@ def _notes(a: Side, b: Side, shared: list[str]) -> tuple[str, ...]:
 
 
 def _poses(pair: _Pair, reference: str, shared: list[str]) -> Iterator[Difference]:
-    """Each sensor as seen from the reference; cameras from the first camera, too, which is known better."""
+    """Poses of each sensor relative to the reference; those of cameras also relative to the first camera, which are
+    known more accurately."""
     for sensor in shared:
         if sensor != reference and reference in shared:
             yield from _pose(pair, reference, sensor)
@@ -190,13 +193,13 @@ def _open(pair: _Pair, frame: str, sensor: str, name: str) -> tuple[str, ...]:
 
 
 def _quantities(pair: _Pair) -> Iterator[Difference]:
-    clocks = pair.a.has_imu and pair.b.has_imu  # without, a time offset is against another clock
+    clocks = pair.a.has_imu and pair.b.has_imu  # else time offsets may be relative to different clocks
     for (sensor, key), qa in pair.a.quantities.items():
         qb = pair.b.quantities.get((sensor, key))
         if qb is None or (key == TIME_OFFSET.name and not clocks):
             continue
         change, (Ca, Cb) = qb.value - qa.value, (qa.covariance, qb.covariance)
-        # Without a unit, as the intrinsics of an IMU, it is a share already.
+        # Quantities without a unit, such as the intrinsics of an IMU, are ratios already.
         unit, scale = shown_unit(qa.unit) if qa.unit and not qa.is_relative else ("percent", 1e2)
         if qa.is_relative:
             relative = np.outer(1.0 / qa.value, 1.0 / qa.value)
@@ -226,7 +229,8 @@ def _open_of(a: Quantity | LensSide, b: Quantity | LensSide) -> tuple[str, ...]:
 
 
 def distance_px(a: LensSide, b: LensSide) -> tuple[float, float]:
-    """RMS and largest distance [px] between where the two project the rays of pixels all over the image of a."""
+    """RMS and largest distance [px] between the image points of the two lenses. The points are a grid of pixels of
+    lens a, and the projections of their rays by lens b."""
     width, height = a.resolution
     u, v = np.meshgrid(np.linspace(0, width - 1, _GRID[0]), np.linspace(0, height - 1, _GRID[1]))
     uv = np.stack([u.ravel(), v.ravel()], axis=1)

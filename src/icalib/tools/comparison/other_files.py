@@ -1,4 +1,4 @@
-"""A side from files of others: Kalibr's camchain and imu file, URDF."""
+"""Sides of a comparison from files of other programs: Kalibr's camchain and imu file, URDF."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _KALIBR_NOISE = {
     "accel": "accelerometer_noise_density",
     "accel_walk": "accelerometer_random_walk",
 }
-_ROUNDING = 1e-3
+_ROUNDING = 1e-3  # largest deviation of R R^T from the identity, by printed digits
 
 
 def is_kalibr(entries: Mapping[str, YamlValue]) -> bool:
@@ -31,7 +31,7 @@ def is_kalibr(entries: Mapping[str, YamlValue]) -> bool:
 
 
 def side_of_kalibr(root: YamlValue) -> Side:
-    """Raises RigError naming line and field."""
+    """The side that a Kalibr camchain or imu file describes. Raises RigError naming line and field."""
     entries = root.entries()
     parts = {"imu0": root} if _KALIBR_NOISE["gyro"] in entries else {n: v for n, v in entries.items() if v.is_mapping}
     cameras = {n: v.entries() for n, v in parts.items() if "camera_model" in v.entries()}
@@ -56,7 +56,8 @@ def side_of_kalibr(root: YamlValue) -> Side:
 def _camera_pose(
     root: YamlValue, name: str, found: dict[str, YamlValue], poses: dict[str, np.ndarray], before: str | None
 ) -> np.ndarray:
-    """T_body_cam: from T_cam_imu, or OpenVINS' inverse of it, else along the chain of cameras; else NaN."""
+    """(4, 4) T_body_cam: from T_cam_imu, or its inverse T_imu_cam (OpenVINS), or along the chain of cameras; else
+    NaN. before: name of the previous camera of the chain."""
     if "T_cam_imu" in found:
         return np.linalg.inv(_transform(found["T_cam_imu"]))
     if "T_imu_cam" in found:
@@ -97,9 +98,10 @@ def _lens(found: dict[str, YamlValue]) -> LensSide | None:
 
 
 def side_of_urdf(path: Path, body: str, has_imu: bool, sensors: Sequence[str], frames: Mapping[str, str]) -> Side:
-    """Links that have the name of one of `sensors`, or are its link by `frames`; `body`: whose link poses are from.
+    """The side that a URDF describes: poses of `sensors` relative to `body`. frames: sensor -> its link, if the link
+    has another name than the sensor. Sensors without a link are left out.
 
-    Raises CalibrationError where the file cannot be read or the body has no link.
+    Raises CalibrationError if the file cannot be read, or if the body or a link in `frames` does not exist.
     """
     tree = read_urdf(path)
     link = {name: frames.get(name, name) for name in sensors}
@@ -113,9 +115,10 @@ def side_of_urdf(path: Path, body: str, has_imu: bool, sensors: Sequence[str], f
 
 
 def side_of_urdf_alone(path: Path, other: Path, frames: Mapping[str, str]) -> Side:
-    """Links that both files have, as seen from the first of them; those that can move are left out.
+    """The side that the URDF `path` describes, if the other side is a URDF as well. It has the links that both files
+    have, relative to the first of them, without links that can move.
 
-    Raises CalibrationError where one cannot be read, or they have no link in common.
+    Raises CalibrationError if a file cannot be read, if they have no link in common, or if `frames` is not empty.
     """
     tree, links = read_urdf(path), read_urdf(other).links
     common = sorted(set(tree.links) & set(links))

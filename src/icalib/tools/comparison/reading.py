@@ -1,4 +1,4 @@
-"""A path -> a side; the kind of file follows from its content."""
+"""Reads the two sides of a comparison from files, whose kind follows from their content."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def compare_files(
     tolerances: ComparisonTolerances | None = None,
     limit: float = 3.0,
 ) -> Comparison:
-    """Each of a, b: the folder of a result, a Kalibr camchain or imu file, a URDF, or a rig file. frames: sensor of
-    A -> its name in B, or of the other side -> its link in a URDF, where the two differ.
+    """Compares two files. a, b: each the folder of a result, a Kalibr camchain or imu file, a URDF, or a rig file.
+    frames: sensor of A -> its name in B, or sensor of one side -> its link in the URDF of the other, if names differ.
 
-    Raises CalibrationError, one sentence, where a file cannot be read or the two have nothing in common.
+    Raises CalibrationError, one sentence, if a file cannot be read or the two have nothing in common.
     """
     frames = frames or {}
     if _is_urdf(a) and _is_urdf(b):
@@ -51,7 +51,7 @@ def _beside(urdf: Path, side: Side, frames: Mapping[str, str]) -> Side:
 
 
 def _renamed(a: Side, b: Side, frames: Mapping[str, str]) -> tuple[Side, Side]:
-    """b with its sensors called as in a."""
+    """a unchanged, and b with its sensors renamed as in a. frames: name in a -> name in b."""
     for name, theirs in frames.items():
         _check_known(name, a)
         _check_known(theirs, b)

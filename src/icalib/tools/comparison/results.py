@@ -1,4 +1,4 @@
-"""A side from a calibration of icalib, or from a rig file, in which values may be typed from CAD or a data sheet."""
+"""Sides of a comparison from a result of icalib, or from a rig file with values from CAD or a data sheet."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ DENSITIES = {
 
 
 def compared_specs(kind: type[Sensor]) -> dict[str, ParameterSpec]:
-    """The parameters of a kind of sensor that have a difference of their own, by name: all but extrinsics, which are
-    seen from other sensors, and those of a lens, which are projected."""
+    """The parameters of a kind of sensor that are compared as quantities, by name. Extrinsics are compared as poses,
+    and parameters of a lens by projection."""
     return {s.name: s for s in kind.stated() if s not in (ROTATION, TRANSLATION) and not s.by_images}
 
 
 def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Quantity]:
-    """Densities by name, which have no standard deviation."""
+    """Noise densities as quantities by (imu, name), without standard deviation. noise: densities by name."""
     return {
         (imu, key): Quantity(what, ("",), np.array([float(noise[key])]), unknown(1)) for key, what in DENSITIES.items()
     }
 
 
 def side_of_result(c: Calibration, path: str) -> Side:
-    """All that was calibrated, with the joint covariance of it."""
+    """The side of a calibration, with covariances; path: its name in messages."""
     poses = {name: _pose_of_result(c, name) for name in c.mounted} | {c.reference: np.eye(4)}
     bad = [g for g in c.groups if "undetermined" in g.verdict]
     quantities = {}
     for g in c.groups:
-        # A clock that restarts has no time offset that another result could have, too.
+        # If a clock restarts in each recording, its time offsets have no counterpart in another result.
         several = g.name == TIME_OFFSET.name and len(g.value) > 1
         if g.sensor in c.mounted and not several:
             spec = compared_specs(SENSOR_TYPES[c.rig["sensors"][g.sensor]["type"]]).get(g.name)
@@ -68,7 +68,7 @@ def side_of_result(c: Calibration, path: str) -> Side:
 
 
 def _pose_of_result(c: Calibration, sensor: str) -> np.ndarray:
-    """(4, 4) T_body_sensor; the rotation is NaN where the sensor has none."""
+    """(4, 4) T_body_sensor; the rotation is NaN if the sensor has none, such as a position sensor."""
     T = c.T_imu_sensor(sensor)
     if not any((g.sensor, g.name) == (sensor, ROTATION.name) for g in c.groups):
         T[:3, :3] = np.nan
@@ -88,7 +88,8 @@ def _lens_of_result(c: Calibration, name: str) -> LensSide:
 
 
 def side_of_rig(path: Path) -> Side:
-    """Values that a rig file gives, whether guessed, fixed or prior; priors with their sigma. Raises RigError."""
+    """The side of a rig file: its guesses, fixed values and priors, the latter with their sigma. Raises RigError if the
+    file is wrong."""
     rig = load_rig(path)
     poses = {s.name: _pose(s) for s in rig.mounted} | {rig.reference: np.eye(4)}
     quantities = {}
@@ -122,19 +123,19 @@ def side_of_rig(path: Path) -> Side:
 
 
 def quantity(spec: ParameterSpec, value: np.ndarray, covariance: np.ndarray, is_open: bool = False) -> Quantity:
-    """Of a group: its words are those of one number, which needs no label where it is the only one."""
+    """Quantity of a parameter group. A group of one number has an empty label."""
     labels = spec.labels if spec.size > 1 else ("",)
     what = (spec.one or spec.name).replace("_", " ")
     return Quantity(what, labels, value, covariance, is_open, spec.unit, spec.is_positive)
 
 
 def _extrinsics(sensor: Sensor) -> tuple[Parameter, Parameter]:
-    """Rotation and translation; without a value where the sensor has none."""
+    """Rotation and translation; a Parameter without value if the sensor has none."""
     return getattr(sensor, ROTATION.name, Parameter()), getattr(sensor, TRANSLATION.name, Parameter())
 
 
 def _pose(sensor: Sensor) -> np.ndarray:
-    """(4, 4) T_body_sensor; NaN where the rig file gives no value."""
+    """(4, 4) T_body_sensor; NaN for values that the rig file does not give."""
     (rotation, translation), T = _extrinsics(sensor), np.eye(4)
     T[:3, :3] = np.nan if rotation.value is None else rotation.value
     T[:3, 3] = np.nan if translation.value is None else translation.value

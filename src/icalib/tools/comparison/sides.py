@@ -1,4 +1,4 @@
-"""What one side of a comparison says: poses of sensors, clocks, lenses and more, as far as it says them."""
+"""One side of a comparison: poses, time offsets, lenses and other quantities of sensors, as far as they are known."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ PoseCovariance = Callable[[str, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Quantity:
-    """value (n,) and covariance (n, n), NaN where it is not known. what: its words; open: undetermined there. unit: SI;
-    is_relative: changes are shares of the value."""
+    """A parameter that is compared by its value. what: its name in sentences; value (n,) in `unit` (SI); covariance
+    (n, n), NaN if unknown; open: undetermined by the data; is_relative: changes are relative to the value."""
 
     what: str
     labels: tuple[str, ...]
@@ -27,7 +27,8 @@ class Quantity:
 
 @dataclass(frozen=True)
 class LensSide:
-    """params: fx, fy, cx, cy [px], distortion; covariance of them all, NaN where it is not known."""
+    """A camera model. resolution: (width, height) px; params (n,): fx, fy, cx, cy [px], distortion; covariance (n, n),
+    NaN if unknown; open: undetermined by the data."""
 
     model: str
     resolution: tuple[int, int]
@@ -38,12 +39,12 @@ class LensSide:
 
 @dataclass(frozen=True)
 class Side:
-    """One side. body: the sensor whose frame the poses T_body_sensor (4, 4) are seen from, NaN where not given; the
-    body's own is there, too. has_imu: whether the body is an IMU.
+    """One side of a comparison. kind: of its file; body: the sensor that is the reference frame; has_imu: whether the
+    body is an IMU. poses: T_body_sensor (4, 4) by sensor, the body included; NaN for unknown parts.
 
-    covariance(frame, sensor): (6, 6) of T_frame_sensor, rotation about the sensor's axes [rad], translation [m]; NaN
-    where it is not known. open: rotations and translations that the data of a result did not determine.
-    quantities: by sensor and key ("time_offset", "radii", "baseline", "gyro", ...).
+    covariance(frame, sensor): (6, 6) of T_frame_sensor, rotation in the sensor's axes [rad], then translation [m]; NaN
+    if unknown. open: (sensor, "rotation" or "translation") that the data of a result did not determine.
+    quantities: by sensor and key ("time_offset", "radii", "baseline", "gyro", ...). lenses: by camera.
     """
 
     path: str
@@ -57,7 +58,7 @@ class Side:
     lenses: dict[str, LensSide] = field(default_factory=dict)
 
     def T(self, frame: str, sensor: str) -> np.ndarray:
-        """4x4 T_frame_sensor; NaN where it is not given."""
+        """(4, 4) T_frame_sensor; NaN for unknown parts."""
         a, b, out = self.poses[frame], self.poses[sensor], np.eye(4)
         if frame == self.body:
             return b
@@ -67,11 +68,11 @@ class Side:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of all that something is said of."""
+        """Names of all sensors with a pose, a quantity or a lens."""
         return tuple(dict.fromkeys([*self.poses, *(name for name, _ in self.quantities), *self.lenses]))
 
     def renamed(self, old: str, new: str) -> Side:
-        """The same with the sensor `old` called `new`."""
+        """This side with the sensor `old` renamed to `new`."""
 
         def now(name: str) -> str:
             return new if name == old else name
@@ -91,5 +92,5 @@ class Side:
 
 
 def unknown(size: int) -> np.ndarray:
-    """A covariance that is not known."""
+    """(size, size) NaN: an unknown covariance."""
     return np.full((size, size), np.nan)

@@ -1,4 +1,4 @@
-"""By how many standard deviations a difference is off."""
+"""Significance of a difference, in standard deviations of a normal variable."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from statistics import NormalDist
 
 import numpy as np
 
-_SINGULAR = 1e-10  # of the correlation; below, entries say the same
-_SMALLEST_P = 1e-14  # below, the quantile of the normal distribution loses its digits
+_SINGULAR = 1e-10  # smaller eigenvalues of the correlation matrix are zero
+_SMALLEST_P = 1e-14  # the normal quantile of a smaller probability has lost its digits
 
 
 def sigmas(difference: np.ndarray, covariance: np.ndarray) -> float | None:
-    """The normal deviate, either side, as rare as this difference (n,) or a larger one in its Mahalanobis distance.
+    """Significance of a difference (n,) with covariance (n, n): the two-sided normal deviate that has the p-value of
+    its Mahalanobis distance.
 
-    None where the covariance is not known (NaN), or the difference lies where it is exactly 0. Entries that are exactly
-    known on both sides and do not differ do not count.
+    None if the covariance is unknown (NaN), or if an entry with variance 0 differs. Entries with variance 0 that do not
+    differ are left out.
     """
     if not np.isfinite(covariance).all():
         return None

@@ -1,4 +1,4 @@
-"""A comparison in sentences, and as plain data."""
+"""A comparison as sentences, and as JSON."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from icalib.base.text_files import json_text, printable
 from icalib.tools.comparison.compare import Comparison, Difference
 
-_ALONG = 0.95  # of the whole: then it is about one axis
+_ALONG = 0.95  # a vector is along one axis if this component is a larger share of its norm
 _TITLES = {True: "same", False: "DIFFERS"}
 
 
 def lines(comparison: Comparison) -> list[str]:
-    """What to print: the two sides, a line for each block, what differs first, notes, and the verdict."""
+    """Lines to print: the two sides, a line for each block (differing ones first), notes, and the verdict."""
     c = comparison
     found = [f"A: {c.a.path} ({c.a.kind})", f"B: {c.b.path} ({c.b.kind}); from A to B:"]
     width = max(map(len, _TITLES.values()))
@@ -27,7 +27,7 @@ def lines(comparison: Comparison) -> list[str]:
 
 
 def sentence(d: Difference, c: Comparison) -> str:
-    """For example: cam1 turned by 0.12 deg about its x axis, 4.0 sigma."""
+    """A sentence on one difference, such as "cam1 turned by 0.12 deg about its x axis, 4.0 sigma"."""
     seen = "" if d.frame in (c.reference, d.sensor) else f" relative to {d.frame}"
     match d.what:
         case "rotation":
@@ -49,7 +49,7 @@ def sentence(d: Difference, c: Comparison) -> str:
 
 
 def comparison_json(comparison: Comparison) -> str:
-    """The same as plain data."""
+    """The comparison as JSON."""
     c = comparison
     plain = {
         "a": {"path": c.a.path, "kind": c.a.kind},
@@ -63,7 +63,7 @@ def comparison_json(comparison: Comparison) -> str:
 
 
 def digits(value: float) -> str:
-    """Two significant digits, without an exponent where that is readable."""
+    """The value with two significant digits; with an exponent below 1e-4 and from 1e5 on."""
     if value == 0.0 or not 1e-4 <= abs(value) < 1e5:
         return f"{value:.1e}" if value else "0"
     return f"{value:.{max(0, 1 - floor(log10(abs(value))))}f}"
@@ -74,7 +74,8 @@ def _signed(value: float) -> str:
 
 
 def _axis(d: Difference, one: str, several: str) -> str:
-    """Size and axis: the coordinate's own where it is about one."""
+    """Size and direction of a vector. one: format for a coordinate axis, along which the component has its sign;
+    several: format for a unit vector."""
     vector = np.array(d.vector)
     most = int(np.argmax(np.abs(vector)))
     if d.size == 0.0 or abs(vector[most]) >= _ALONG * d.size:

@@ -1,4 +1,4 @@
-"""Many recordings of many robots calibrated, resumed where they were left, and what changed over time."""
+"""Calibrates many recordings of many robots, and reports changes over time. A rerun calibrates new jobs only."""
 
 from icalib.tools.batch import Crew
 from icalib.tools.fleet.drift import Drift, GroupChange

@@ -1,4 +1,4 @@
-"""A fleet for the terminal."""
+"""Prints the result of a fleet on the terminal."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rich.table import Table
 from icalib.tools.fleet import words
 from icalib.tools.fleet.result import Fleet
 
-MOST = 20  # sentences of a kind; all are on the page
+MOST = 20  # sentences of each kind that are printed; fleet.html has all
 
 
 def print_fleet(fleet: Fleet, folder: Path) -> None:
-    """A row for each robot, what failed and what changed, and where the files are, on standard output."""
+    """Prints a row for each robot, failures, changes, and the paths of the files on standard output."""
     console = Console()
     console.print(table(fleet))
     console.print(words.answer(fleet), markup=False)

@@ -1,4 +1,4 @@
-"""What changed between calibrations of one robot, by the measure and in the words of `icalib compare`."""
+"""Changes between calibrations of one robot, with the tests and sentences of `icalib compare`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from icalib.tools.comparison.words import sentence
 
 @dataclass(frozen=True)
 class GroupChange:
-    """A block that differs from the job `before` to the job `after`. at_its_sensor: seen from the body or from nothing,
-    so that the change is the sensor's own. judged: both sides have determined it, with standard deviations."""
+    """A block that differs between the jobs `before` and `after`; words: the sentence on it. at_its_sensor: the block
+    is relative to the body or to no other sensor, so that the change is due to its sensor. judged: it is determined on
+    both sides, with standard deviations."""
 
     before: str
     after: str
@@ -29,10 +30,10 @@ class GroupChange:
 
 @dataclass(frozen=True)
 class Drift:
-    """Of one robot. jobs: those that reached a result, in order of time. changes: beyond `limit` sigmas, from each job
-    to the next, and from the first to the last where no step shows it. unsure: differences that nobody can judge,
-    undetermined or without standard deviations. judged: how many comparisons there were. notes: what could not be
-    compared."""
+    """Changes of one robot. jobs: those with a result, in order of time. changes: beyond `limit` sigmas, between
+    successive jobs; from the first to the last job only those that no step shows. unsure: differences that cannot be
+    tested, as they are undetermined or have no standard deviations. judged: number of tested differences. notes: what
+    could not be compared."""
 
     robot: str
     jobs: tuple[str, ...]
@@ -43,14 +44,15 @@ class Drift:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Those that changed; where only poses between two sensors did, the farther one."""
+        """Names of the sensors that changed. If only poses between two sensors changed, the sensor of the pair that is
+        not the reference frame."""
         own = [c for c in self.changes if c.at_its_sensor] or self.changes
         return tuple(dict.fromkeys(c.difference.sensor for c in own))
 
 
 @dataclass(frozen=True)
 class _Comparison:
-    """One comparison: what differs, how many blocks were judged, and sentences."""
+    """Comparison of two jobs: the blocks that differ, the number of tested blocks, and notes."""
 
     changes: tuple[GroupChange, ...] = ()
     judged: int = 0
@@ -58,8 +60,9 @@ class _Comparison:
 
 
 def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration], limit: float) -> Drift:
-    """jobs: names in order of time. load: gives the result of a job; where it raises CalibrationError, its sentence is
-    a note. No more than three results are in memory at a time."""
+    """Changes of one robot. jobs: names in order of time. load: returns the result of a job; the message of its
+    CalibrationError becomes a note. limit: sigmas beyond which a block has changed. At most three results are in
+    memory."""
     steps, notes, first, last = list[_Comparison](), list[str](), None, None
     for name in jobs:
         try:
@@ -86,7 +89,7 @@ def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration]
 
 
 def by_chance(judged: int, limit: float) -> float:
-    """How many of `judged` comparisons are beyond `limit` sigmas by chance alone."""
+    """Expected number of `judged` comparisons beyond `limit` sigmas by chance."""
     return judged * erfc(limit / sqrt(2.0))
 
 

@@ -1,4 +1,4 @@
-"""Parameters of a robot over time: each against its first calibration, with bars of one sigma."""
+"""Figures of a robot's parameters over time: differences from the first calibration, with one-sigma error bars."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ OPEN = "undetermined"
 
 
 def sensors(results: list[JobResult]) -> tuple[str, ...]:
-    """Those of which something was estimated."""
+    """Names of the sensors with at least one estimated parameter."""
     blocks = [b for r in results for b in r.record.blocks if _estimated(b)]
     return tuple(dict.fromkeys(b.sensor for b in blocks))
 
 
 def over_time(results: list[JobResult], sensor: str) -> Figure:
-    """results: in order of time. One panel for each block of the sensor, all its entries in it.
+    """Figure with a panel for each block of the sensor; results: in order of time.
 
-    Undetermined entries, which hold the guess, are hollow, and have no bars.
+    Undetermined entries, which are fixed to the guess, have hollow markers and no error bars.
     """
     found = [b for r in results for b in r.record.blocks if b.sensor == sensor and _estimated(b)]
     firsts = {b.name: b for b in reversed(found)}
@@ -40,7 +40,8 @@ def over_time(results: list[JobResult], sensor: str) -> Figure:
 
 
 def _places(results: list[JobResult]) -> tuple[dict[str, str], bool]:
-    """Where each job stands, by name, and whether that is a time; it is the name where two share a time or lack it."""
+    """Position of each job on the time axis, by name, and whether it is a time. It is the job's name if a job has no
+    time, or two have the same."""
     times = {r.job.name: r.time.isoformat() for r in results if r.time is not None}
     if len(set(times.values())) == len(results):
         return times, True
@@ -48,7 +49,7 @@ def _places(results: list[JobResult]) -> tuple[dict[str, str], bool]:
 
 
 def _traces(results: list[JobResult], places: dict[str, str], first: GroupRecord, panel: int) -> list[dict[str, Any]]:
-    """A trace for each entry of the block. Calibrations that do not have the same entries are left out."""
+    """A trace for each entry of the block. Calibrations in which the block has other entries are left out."""
     at, blocks = [], []
     for r in results:
         for b in r.record.blocks:
@@ -77,7 +78,7 @@ def _traces(results: list[JobResult], places: dict[str, str], first: GroupRecord
 
 
 def _in_legend_once(traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """x, y and z have the same colours in all panels."""
+    """The traces, each name only once in the legend: an entry has the same colour in all panels."""
     firsts = {t["name"]: k for k, t in reversed(list(enumerate(traces)))}
     return [t | {"showlegend": t["showlegend"] and firsts[t["name"]] == k} for k, t in enumerate(traces)]
 

@@ -1,4 +1,4 @@
-"""What a job's result was made from, so that it is made again where that changed."""
+"""Hashes of a job's inputs: a job is calibrated again if they changed."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from icalib.tools.fleet.jobs import Job
 
 @dataclass(frozen=True)
 class InputHashes:
-    """rig: sha256 of the file. recordings: of the sizes and the times of change of all files of each, which may be
-    larger than one likes to read; their names count, where they lie does not. program: digest of icalib's source."""
+    """Hashes of the inputs of a job. rig: sha256 of the file. recordings: for each, sha256 of the names, sizes and
+    modification times of its files, as hashing the contents would take long; the folder does not matter. program: see
+    `batch.program`."""
 
     rig: str
     recordings: tuple[str, ...]
@@ -23,11 +24,11 @@ class InputHashes:
 
     @classmethod
     def of(cls, job: Job) -> InputHashes:
-        """As they are now, with the program that runs now. What is not there is "absent"."""
+        """Hashes of the current files and the running program; "absent" for a missing file."""
         return cls(_content(job.rig), tuple(map(_sizes, job.recordings)), program())
 
     def changed(self, now: InputHashes) -> str:
-        """What is another one now, in words; empty where nothing is."""
+        """Words on the inputs that differ from `now`; "" if none does."""
         found = [words for name, words in _CHANGED.items() if getattr(self, name) != getattr(now, name)]
         return ", ".join(found)
 
@@ -48,7 +49,7 @@ def _sizes(path: Path) -> str:
     for file in sorted(_files(path)):
         try:
             about = file.stat()
-        except OSError:  # a link to nowhere, or gone in this moment: the reader will say what it misses
+        except OSError:  # a dangling link, or just deleted: the reader of the recording reports what is missing
             continue
         digest.update(os.fsencode(f"{os.path.relpath(file, path)}\0{about.st_size}\0{about.st_mtime_ns}\0"))
         found += 1

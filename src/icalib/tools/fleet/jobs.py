@@ -1,4 +1,4 @@
-"""JOBS.yaml -> jobs. The format: docs/fleet.md."""
+"""Reads a file of jobs; its format is described in docs/fleet.md."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _UNFIT = re.compile(r"[^A-Za-z0-9_.-]+")
 
 @dataclass(frozen=True)
 class Job:
-    """One calibration. name: of its folder. recordings: one, or several that are solved jointly. time: when they were
-    made, where the file says so."""
+    """One calibration. name: also that of its folder; recordings: one, or several that are solved jointly; time: of the
+    recordings (UTC), None if the file does not state it."""
 
     name: str
     robot: str
@@ -26,7 +26,7 @@ class Job:
 
 
 def load_jobs(path: str | Path) -> tuple[Job, ...]:
-    """Read a file of jobs. Paths in it are relative to it. Whether recordings are there is seen when they are read.
+    """Reads a file of jobs. Paths are relative to its folder. Recordings may be missing: their jobs will fail.
 
     Raises RigError, one sentence naming file, line, field, what is wrong and what to do.
     """
@@ -83,7 +83,7 @@ def _time(value: YamlValue) -> datetime:
 
 
 def _refuse_twins(jobs: tuple[Job, ...], values: list[YamlValue]) -> None:
-    """Names that some file systems take for the same count as the same."""
+    """Raises RigError if two jobs have the same name, upper and lower case being equal as in some file systems."""
     seen: dict[str, int] = {}
     for k, job in enumerate(jobs):
         first = seen.setdefault(job.name.casefold(), k)

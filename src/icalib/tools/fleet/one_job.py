@@ -1,4 +1,4 @@
-"""One job, on a worker: calibrate, and give back all that is to be written. What goes wrong becomes part of it."""
+"""Runs one job on a worker, and returns its record and the files of its result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from icalib.tools.fleet.record import JobRecord
 
 @dataclass(frozen=True)
 class JobTask:
-    """A job, and what it would be made from, looked at before: what changes while it waits is seen the next time."""
+    """A job and the hashes of its inputs. They are taken before it waits for a worker, so that the next run sees
+    changes of the inputs meanwhile."""
 
     job: Job
     inputs: InputHashes
@@ -23,14 +24,15 @@ class JobTask:
 
 @dataclass(frozen=True)
 class JobOutcome:
-    """files: of the result, by name; none where there is none."""
+    """Record of a job, and the files of its result by name; empty if the job failed."""
 
     record: JobRecord
     files: dict[str, bytes]
 
 
 def run(task: JobTask) -> JobOutcome:
-    """Never raises: the sentence of a job that failed is in its record. The inputs name the program that worked."""
+    """Runs a job. It never raises: the record of a failed job has the message. The record's inputs have the program of
+    the worker."""
     started, inputs = time.perf_counter(), replace(task.inputs, program=program())
     try:
         result = calibrate(task.job.rig, task.job.recordings)

@@ -1,4 +1,4 @@
-"""`fleet.html`: a fleet as one file without network, which says first what to look at."""
+"""`fleet.html`: the result of a fleet in one file that needs no network, failures and changes first."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BADGES = {"done": "determined", "failed": "undetermined"}  # green, red
 
 
 def fleet_html(fleet: Fleet, title: str) -> str:
-    """The whole page. title: name of the file of jobs."""
+    """The page as one HTML document; title: name of the file of jobs."""
     figures, folds = _over_time(fleet)
     texts = {
         "title": title,
@@ -45,7 +45,7 @@ def _titled(title: str, found: list[str], css: str) -> Html:
 
 
 def _aside(count: int) -> Html:
-    """Where to find the differences that nobody can judge."""
+    """Paragraph with a link to the `count` differences that cannot be tested; empty if there are none."""
     if not count:
         return Html("")
     return element("p", [Html('<a href="#facts">Cannot be judged</a>'), f": {count} more, undetermined or typed."])
@@ -57,7 +57,7 @@ def _robots(fleet: Fleet) -> Html:
 
 
 def _over_time(fleet: Fleet) -> tuple[dict[str, Figure], Html]:
-    """Figures by the id of their places, and a fold for each robot that has more than one calibration."""
+    """Figures by the id of their placeholder, and a collapsible section for each robot with several calibrations."""
     robots, figures, folds = by_robot(fleet.results), dict[str, Figure](), list[Html]()
     for i, drift in enumerate(fleet.drifts):
         results = robots[drift.robot]
@@ -89,7 +89,8 @@ def _jobs(fleet: Fleet) -> Html:
 
 
 def _link(one: JobResult) -> Html:
-    """To the job's report, where it has one; names of jobs are names of folders and need no quotes."""
+    """Link to the job's report; only the name if it has none. Job names are valid folder names, so that the URL needs
+    no quoting."""
     name = html(one.job.name)
     return Html(f'<a href="{JOBS}/{name}/report.html">{name}</a>') if one.record.blocks else name
 

@@ -1,4 +1,4 @@
-"""What one job leaves beside its result: how it ended, and its parameters, as JSON."""
+"""Record of one job, as JSON beside its result: how it ended, and its parameters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WALL_CLOCK_NS = (10**18, 4 * 10**18)  # 2001 to 2096; clocks that start with the
 
 @dataclass(frozen=True)
 class GroupRecord:
-    """One group of parameters of one sensor, as in `ParameterGroup`. value: (n,), of a rotation (3, 3)."""
+    """One parameter group of one sensor, as in `ParameterGroup`. value: (n,), for a rotation (3, 3)."""
 
     sensor: str
     name: str
@@ -32,10 +32,11 @@ class GroupRecord:
 
 @dataclass(frozen=True)
 class JobRecord:
-    """One job. failure: a sentence, or "" where the solver converged. status: how the solver ended, in a sentence.
+    """One job. failure: the message, or "" if the solver converged; seconds: run time; status: how the solver ended, a
+    sentence.
 
-    stamp_ns: the recording's first stamp where it is of a wall clock. undetermined, warnings: sentences. inputs: what
-    it was made from; None where its worker died, and nothing is kept.
+    inputs: hashes of the inputs; None if the worker died, and the record is not stored. stamp_ns: first stamp of the
+    recording, None unless it is of a wall clock. undetermined, warnings: sentences. blocks: parameter groups.
     """
 
     name: str
@@ -50,7 +51,7 @@ class JobRecord:
 
     @classmethod
     def of(cls, name: str, result: Calibration, seconds: float, inputs: InputHashes) -> JobRecord:
-        """Of a calibration that reached a result, whether it converged or not."""
+        """Record of a job with a result, converged or not."""
         stamp = min((r.origin_ns for r in result.recordings), default=0)
         low, high = WALL_CLOCK_NS
         blocks = tuple(_block(g) for g in shown_groups(result) if g.sensor in result.rig["sensors"])
@@ -65,12 +66,12 @@ def _block(g: ParameterGroup) -> GroupRecord:
 
 
 def to_json(record: JobRecord) -> bytes:
-    """The record as JSON, numbers in full, with icalib's seal."""
+    """The record as JSON, with all digits and icalib's seal."""
     return sealed(record_json(record, FORMAT))
 
 
 def from_json(text: bytes) -> JobRecord:
-    """The record that `to_json` was given. Raises ValueError, KeyError or TypeError where `text` is something else."""
+    """The record that `to_json` wrote. Raises ValueError, KeyError or TypeError if `text` is not such a record."""
     plain = plain_record(text, FORMAT)
     plain.pop(SEAL, None)
     inputs = plain["inputs"]

@@ -1,4 +1,4 @@
-"""What all jobs of a fleet found together."""
+"""Result of a fleet: the results of all jobs, and the changes of each robot."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from icalib.tools.fleet.record import JobRecord
 
 @dataclass(frozen=True)
 class JobResult:
-    """A job as the file gives it now, and what is known of it."""
+    """A job of the current file of jobs, and its record."""
 
     job: Job
     record: JobRecord
 
     @property
     def time(self) -> datetime | None:
-        """When the recording was made: the file's word, else the recording's clock, None where neither knows."""
+        """Time of the recording (UTC): from the file of jobs, else from the recording's clock, else None."""
         if self.job.time is not None or self.record.stamp_ns is None:
             return self.job.time
         return datetime.fromtimestamp(self.record.stamp_ns // 10**9, UTC)
@@ -39,8 +39,8 @@ class JobResult:
 
 @dataclass(frozen=True)
 class Fleet:
-    """results: in the order of the file. drifts: of each robot. limit: sigmas beyond which a change counts. again: jobs
-    that were done again, and what had changed."""
+    """Result of a fleet. results: in the order of the file of jobs; drifts: one for each robot; limit: sigmas beyond
+    which a block has changed; again: jobs that were calibrated again, and the changed inputs."""
 
     results: tuple[JobResult, ...]
     drifts: tuple[Drift, ...]
@@ -57,16 +57,17 @@ class Fleet:
 
     @property
     def by_chance(self) -> float:
-        """How many changes chance alone is expected to show."""
+        """Expected number of changes by chance."""
         return by_chance(sum(d.judged for d in self.drifts), self.limit)
 
     def of(self, job: str) -> JobResult:
-        """Raises KeyError where there is no such job."""
+        """Result of the job with this name. Raises KeyError if there is none."""
         return {r.job.name: r for r in self.results}[job]
 
 
 def by_robot(results: tuple[JobResult, ...]) -> dict[str, list[JobResult]]:
-    """Of each robot those that reached a result, by time; in the order of the file where one has none."""
+    """Results of each robot, without failed jobs. They are sorted by time, or in the order of the file if one has no
+    time."""
     found: dict[str, list[JobResult]] = {r.job.robot: [] for r in results}
     for r in results:
         if not r.failed:

@@ -1,4 +1,4 @@
-"""A fleet: many calibrations, resumed where they were left, and what changed over time. This page is all of it."""
+"""Runs a fleet: calibrates the jobs without an up-to-date result, and compares the results of each robot over time."""
 
 from __future__ import annotations
 
@@ -35,12 +35,13 @@ def run_fleet(
     progress: Progress = lambda *_: None,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> Fleet:
-    """Does the jobs of the file at `path` that `output` does not hold yet; writes fleet.sqlite and fleet.html there.
+    """Runs the jobs of the file at `path` that have no up-to-date result in `output`, and writes fleet.sqlite and
+    fleet.html there.
 
-    crew: by default a worker for each core. limit: sigmas beyond which a change counts. say: is told what is done
-    again, before it is. Raises RigError where the file is wrong, CalibrationError where the folder cannot be written or
-    has files that icalib did not write, another process is at work in it, or no cluster answers; KeyboardInterrupt with
-    a sentence on what was reached.
+    crew: the worker pool, by default a worker for each core. limit: sigmas beyond which a block has changed. say:
+    called with a sentence on each job that will be run again. Raises RigError if the file is wrong; CalibrationError if
+    the folder cannot be written, has files that icalib did not write or is locked by another process, or if no cluster
+    answers. KeyboardInterrupt gets a message with the number of finished jobs.
     """
     if not (isfinite(limit) and limit > 0.0):
         raise CalibrationError(f"the limit must be above 0 sigma, not {limit:g}; the usual limit is 3.")
@@ -56,7 +57,7 @@ def run_fleet(
 def _fleet(
     jobs: tuple[Job, ...], store: JobStore, crew: Crew, limit: float, progress: Progress, say: Callable[[str], None]
 ) -> Fleet:
-    """Jobs that are missing done, and all compared."""
+    """Runs the missing jobs, and compares the results of each robot."""
     inputs = {job.name: InputHashes.of(job) for job in jobs}
     done, again = to_do(store, inputs)
     for name, why in again.items():
@@ -72,7 +73,8 @@ def _fleet(
 
 
 def _do(tasks: list[JobTask], store: JobStore, crew: Crew, total: int, progress: Progress) -> dict[str, JobRecord]:
-    """Records of the tasks; all are stored but those whose worker died, which will be tried again the next time."""
+    """Runs the tasks, and returns their records by name. Records of jobs whose worker died are not stored, so that the
+    next run tries them again. total: number of all jobs, for the progress."""
     found: dict[str, JobRecord] = {}
     before = total - len(tasks)
     if not tasks:

@@ -1,4 +1,4 @@
-"""The folder of a fleet: below jobs/ one folder for each job, with its result and its record as one set."""
+"""The folder of a fleet: jobs/ has a folder for each job with its result and its record, written together."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ JOBS, RECORD = "jobs", "fleet-job.json"
 
 
 class JobStore:
-    """Records and results by the name of the job. Raises CalibrationError where the folder cannot be written."""
+    """Records and results by the name of the job. Raises CalibrationError if the folder cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         check_writable(folder / JOBS)
 
     def place(self, name: str) -> Path:
-        """Where the job's files are."""
+        """Folder of the job's files."""
         return below(self.folder / JOBS, name)
 
     def find(self, name: str) -> JobRecord | None:
-        """None where the job is not done, or its result was taken away.
+        """The record of a job; None if the job is not done, or its result was deleted.
 
-        Raises CalibrationError where its record is damaged, or what a killed writer left cannot be put in place.
+        Raises CalibrationError if the record is damaged, or an interrupted writing cannot be completed.
         """
         place = self.place(name)
         if not place.is_dir():
@@ -45,19 +45,20 @@ class JobStore:
         return record if not record.blocks or (place / "result.json").exists() else None
 
     def add(self, outcome: JobOutcome) -> None:
-        """Raises CalibrationError where the worker ran another icalib, or the folder cannot be written."""
+        """Stores record and files of a job. Raises CalibrationError if the worker ran another icalib, or the folder
+        cannot be written."""
         inputs = outcome.record.inputs
         check_worker(inputs.program if inputs is not None else "", program())
         write_files(self.place(outcome.record.name), outcome.files | {RECORD: to_json(outcome.record)})
 
     def load(self, name: str) -> Calibration:
-        """The job's result. Raises CalibrationError where there is none, or it is damaged."""
+        """The job's result. Raises CalibrationError if there is none, or it is damaged."""
         return load_calibration(self.place(name))
 
 
 def to_do(store: JobStore, inputs: dict[str, InputHashes]) -> tuple[dict[str, JobRecord], dict[str, str]]:
-    """Records of the jobs that are done, and of those whose inputs are others now what changed, in words. inputs: by
-    the name of the job."""
+    """Records of the jobs with an up-to-date result; and, for those whose inputs changed, words on the change. inputs:
+    current hashes by name of the job."""
     done, changed = dict[str, JobRecord](), dict[str, str]()
     for name, now in inputs.items():
         record = store.find(name)

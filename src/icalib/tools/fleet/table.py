@@ -1,4 +1,4 @@
-"""All results of a fleet as one table of SQLite, made anew from the records each time."""
+"""All results of a fleet as one SQLite table, which is written anew from the records each time."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ _NOTHING = (None,) * 7
 
 
 def write_table(path: Path, results: Iterable[JobResult]) -> None:
-    """Table `results`: a row for each entry of each job, and one for a job without a result. SI units; of rotations
-    roll, pitch and yaw, with sigma of small turns about the sensor's x, y and z. Written at once.
+    """Writes the table `results` atomically: a row for each parameter of each job, and one for a job without a result.
+    Units are SI. Rotations are roll, pitch and yaw [rad]; their sigma is of small rotations about the sensor's x, y, z.
 
-    Raises CalibrationError where that is not possible.
+    Raises CalibrationError if the file cannot be written.
     """
     try:
         with replacing(path) as part, closing(sqlite3.connect(part)) as base:
@@ -54,7 +54,7 @@ def write_table(path: Path, results: Iterable[JobResult]) -> None:
 
 
 def rows(one: JobResult) -> Iterator[tuple[object, ...]]:
-    """Of one job, cells as in the table."""
+    """Rows of one job, cells as in `_COLUMNS`."""
     about = (
         one.job.robot,
         one.time.isoformat() if one.time else None,

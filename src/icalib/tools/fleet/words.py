@@ -1,4 +1,4 @@
-"""A fleet in sentences, for the terminal and the page."""
+"""Sentences on the result of a fleet, for the terminal and the page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from icalib.tools.fleet.result import Fleet, JobResult
 
 
 def answer(fleet: Fleet) -> str:
-    """How many jobs, how many failed, and who changed."""
+    """Sentences with the number of jobs and failures, and the robots that changed."""
     jobs, robots, failed = len(fleet.results), len(fleet.drifts), len(fleet.failed)
     counts = f"{_count(jobs, 'job')} of {_count(robots, 'robot')}: {jobs - failed} calibrated, {failed} failed."
     return f"{counts} {changed_words(fleet)}"
@@ -25,7 +25,7 @@ def changed_words(fleet: Fleet) -> str:
 
 
 def chance_words(fleet: Fleet) -> str:
-    """How to take the number of changes."""
+    """A sentence that compares the number of changes with that expected by chance."""
     judged = sum(d.judged for d in fleet.drifts)
     changes = sum(len(d.changes) for d in fleet.drifts)
     return (
@@ -43,7 +43,7 @@ def changes(fleet: Fleet) -> list[str]:
 
 
 def unsure(fleet: Fleet) -> list[str]:
-    """What differs where one side did not determine it, or no standard deviation is known."""
+    """Sentences on differences that cannot be tested: undetermined on one side, or without standard deviation."""
     return [change_words(d.robot, c) for d in fleet.drifts for c in d.unsure]
 
 
@@ -56,20 +56,20 @@ def failures(fleet: Fleet) -> list[str]:
 
 
 def time_words(time: datetime | None) -> str:
-    """Without the time of day where it is not known, or midnight."""
+    """Date and time; only the date if the time is midnight, as it is if unknown; "" for None."""
     if time is None:
         return ""
     return f"{time:%Y-%m-%d}" if (time.hour, time.minute, time.second) == (0, 0, 0) else f"{time:%Y-%m-%d %H:%M}"
 
 
 def span_words(results: list[JobResult]) -> str:
-    """First and last time; empty where none is known."""
+    """First and last time; "" if none is known."""
     known = sorted(r.time for r in results if r.time is not None)
     return " to ".join(dict.fromkeys(time_words(t) for t in known[:1] + known[-1:]))
 
 
 def care_words(one: JobResult) -> str:
-    """What calls for a look into the job's report."""
+    """Number of undetermined combinations and of warnings of a job; "" if there are none."""
     parts = [_count(len(one.record.undetermined), "combination") + " undetermined"] if one.record.undetermined else []
     parts += [_count(len(one.record.warnings), "warning")] if one.record.warnings else []
     return ", ".join(parts)
@@ -79,7 +79,7 @@ ROBOT_HEADERS = "robot", "jobs", "failed", "time", "changed"
 
 
 def robot_rows(fleet: Fleet) -> list[tuple[str, int, int, str, str]]:
-    """A row for each robot, cells as in ROBOT_HEADERS."""
+    """A row for each robot, with the cells of `ROBOT_HEADERS`."""
     rows = []
     for drift in fleet.drifts:
         own = [r for r in fleet.results if r.job.robot == drift.robot]

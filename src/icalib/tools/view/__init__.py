@@ -1,4 +1,4 @@
-"""A 3D view of a result, and of the recording that it is of, in Rerun."""
+"""A 3D view of a result and its recording in Rerun."""
 
 from icalib.tools.view.show import view
 

@@ -1,10 +1,10 @@
-"""Colours of points by a value."""
+"""Colours from values, for points."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Five of matplotlib's viridis, which stays in order in grey and for colour-blind eyes, too.
+# Five colours of matplotlib's viridis, whose brightness increases steadily, also for colour-blind people.
 _STOPS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], np.float64)
 
 
@@ -16,5 +16,5 @@ def by_value(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def rgb(*colors: str) -> np.ndarray:
-    """(n, 3) uint8 of colours as in HTML, "#rrggbb"."""
+    """(n, 3) uint8 RGB of colours in HTML notation, "#rrggbb"."""
     return np.array([list(bytes.fromhex(color[1:])) for color in colors], np.uint8)

@@ -1,4 +1,4 @@
-"""Which windows the viewer opens: the world, the rig, each camera, and lines over time."""
+"""Layout of the viewer's windows: world, rig, cameras, and curves over time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from icalib.tools.view.stream import TIMELINE
 
 
 def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
-    """The layout; `readings`: those of the IMU are shown."""
+    """Rerun's blueprint of the windows. rr: the rerun package; readings: whether IMU readings are shown."""
     b = rr.blueprint
     images = [b.Spatial2DView(origin=f"{place(c, name)}/image", name=name) for name in c.cameras]
     rig = b.Spatial3DView(origin=f"world/{c.reference}", name="rig")
@@ -20,7 +20,7 @@ def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
     if readings and c.imu is not None:
         shown.append(b.TimeSeriesView(origin=f"readings/{c.imu}", name=f"readings of {c.imu}"))
     right = b.Vertical(b.Tabs(rig, b.TextDocumentView(origin="summary", name="summary")), *images[:2])
-    # All points of all planes at once hide what moves among them.
+    # Points on planes have a view of their own, as they would hide moving sensors.
     space = [b.Spatial3DView(origin="world", contents=["$origin/**", "- $origin/planes/**"], name="world")]
     if c.planes:
         parts = [f"$origin/{part}/**" for part in ("planes", "target", "trajectory")]
@@ -35,6 +35,6 @@ def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
 
 
 def _measured(c: Calibration) -> list[str]:
-    """Sensors with residuals over time, the IMU last."""
+    """Names of sensors with residuals over time, the IMU last."""
     names = dict.fromkeys(r.sensor for r in c.residuals.values() if len(r.seconds))
     return sorted(names, key=lambda name: name == c.imu)

@@ -1,4 +1,4 @@
-"""The pose of the body at any instant, from the keyframes of a result."""
+"""Poses of the body at any instant, interpolated between the keyframes of a result."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from icalib.geometry import so3
 from icalib.geometry.cubic import hermite
 from icalib.result import Calibration
 
-LONGEST_STEP_S = 0.5  # between keyframes; the pose between two that are further apart is not known
-_AT_KEYFRAME_S = 1e-6
+LONGEST_STEP_S = 0.5  # longest interval between keyframes in which poses are interpolated
+_AT_KEYFRAME_S = 1e-6  # an instant this close to a keyframe has its pose
 
 
 @dataclass(frozen=True)
 class CubicPath:
-    """A cubic through K keyframes: of positions, and of the rotation vector from each keyframe to the next.
+    """Cubic Hermite interpolation between K keyframes: of positions, and of the rotation vector from each keyframe to
+    the next.
 
-    The slopes at a keyframe are those of the parabola through it and its neighbours; that of the rotation is the
-    angular rate in the body's axes. seconds: on the clock of the result. usable (K - 1,): poses within the interval
-    are known.
+    The slopes at a keyframe are those of the parabola through it and its neighbours; the slope of the rotation is the
+    angular rate in the body's axes. seconds: on the clock of the result. usable (K - 1,) bool: whether poses in the
+    interval are known.
     """
 
     seconds: np.ndarray  # (K,)
@@ -43,8 +44,8 @@ class CubicPath:
         return cls(path.seconds, path.rotation, path.position, turn, rate, slope, usable)
 
     def at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """R_world_body (n, 3, 3), p_world_body (n, 3) at `seconds` (n,) of the result, and (n,) bool: where they are
-        known. Elsewhere they are those of a keyframe nearby."""
+        """R_world_body (n, 3, 3), p_world_body (n, 3) m at `seconds` (n,) of the result, and (n,) bool: which of them
+        are known. The others are those of the nearest keyframe."""
         last = max(len(self.seconds) - 2, 0)
         k = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, last)
         h = self.seconds[k + 1] - self.seconds[k]
@@ -65,7 +66,8 @@ class CubicPath:
 
 
 def _slopes(between: np.ndarray, step: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """(K, 3) slopes at the keyframes, from the mean slopes `between` them (K - 1, 3) without those across gaps."""
+    """(K, 3) slopes at the keyframes, from the mean slopes `between` (K - 1, 3) over steps (K - 1,) s; those that are
+    not `usable` have no weight."""
     weight = np.zeros((2, len(step) + 1))  # of the intervals before and after each keyframe
     weight[0, 1:], weight[1, :-1] = usable, usable
     i = np.flatnonzero((weight > 0.0).all(axis=0))

@@ -1,4 +1,4 @@
-"""The recording beside its result: readings, images and scans where the calibration puts them."""
+"""Shows the recording of a result: IMU readings, images and scans, placed by the calibration."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from icalib.tools.view.scene import POINT, place
 from icalib.tools.view.series import log_lines
 from icalib.tools.view.stream import RerunStream
 
-MOST_READINGS = 100_000
-MOST_IMAGES = 600  # of a camera
-MOST_SCANS, MOST_POINTS = 400, 15_000  # of a sensor, of a scan
+MOST_READINGS = 100_000  # shown of an IMU
+MOST_IMAGES = 600  # shown of a camera
+MOST_SCANS, MOST_POINTS = 400, 15_000  # shown of a sensor, and of a scan
 JPEG_QUALITY = 75
-_EDGE_S = 1.0  # around the result, in which data still are of it
-_HEIGHTS = (2.0, 98.0)  # percentiles between which colours change
+_EDGE_S = 1.0  # data this long before and after the span of the result belong to it
+_HEIGHTS = (2.0, 98.0)  # percentiles of the height between which colours change
 
 Progress = Callable[[str, float], None]
 
@@ -50,8 +50,8 @@ class ShownScans(Protocol):
 
 @dataclass(frozen=True)
 class Clock:
-    """From raw stamps of one sensor to seconds of the result: the body's clock shows what this sensor's shows, and
-    `offset_s` more."""
+    """Converts raw stamps of one sensor to seconds of the result. offset_s: time offset, which is added to the stamps
+    to get the body's clock; span: the recording."""
 
     span: RecordingSpan
     offset_s: float
@@ -65,17 +65,18 @@ class Clock:
         return cls(span, float(value[c.recordings.index(span) if len(value) > 1 else 0]))
 
     def seconds(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """(n,) from int64 stamps; whole nanoseconds are subtracted first, so that no digit is lost."""
+        """(n,) seconds of the result from int64 stamps [ns]. Whole nanoseconds are subtracted first, so that no digit
+        is lost."""
         since = stamps_ns - np.int64(self.span.origin_ns) + np.int64(round(1e9 * self.offset_s))
         return self.span.start + 1e-9 * since.astype(np.float64)
 
     def within(self, seconds: np.ndarray) -> np.ndarray:
-        """(n,) bool: during the recording, or so close to it that it is of it."""
+        """(n,) bool: whether `seconds` (n,) are within the recording, or less than _EDGE_S outside."""
         return (seconds > self.span.start - _EDGE_S) & (seconds < self.span.end + _EDGE_S)
 
 
 def span_of(c: Calibration, recording: Path) -> RecordingSpan:
-    """The recording of the result that lies at a path. Raises CalibrationError where it is none of them."""
+    """The span of the result's recording at a path. Raises CalibrationError if it is no recording of the result."""
     if not c.recordings:
         raise CalibrationError("the result does not tell the time of its recording; calibrate again to see both.")
     path = recording.resolve()
@@ -88,7 +89,7 @@ def span_of(c: Calibration, recording: Path) -> RecordingSpan:
 
 @dataclass(frozen=True)
 class Recorded:
-    """One of the recordings of a result, opened. Everything here raises RecordingError, one sentence."""
+    """One recording of a result, opened. where: its path. All methods may raise RecordingError, one sentence."""
 
     calibration: Calibration
     rig: Rig
@@ -97,13 +98,13 @@ class Recorded:
     where: Path
 
     def check(self) -> None:
-        """Raises where a sensor of the result is not in the recording."""
+        """Raises RecordingError if a sensor of the result is not in the recording."""
         for sensor in self.rig.sensors.values():
             if not (isinstance(sensor, Camera) and sensor.tracks is not None) or sees(self.recording, sensor):
                 self.recording.where(sensor)
 
     def log(self, s: RerunStream, progress: Progress) -> list[str]:
-        """Logs all, and returns sentences on what was left out."""
+        """Sends all data to Rerun, and returns sentences on data that were left out."""
         topics = image_topics(self.recording, [c for c in self.rig.cameras if self._pictured(c)])
         imus = () if self.rig.imu is None else (self.rig.imu,)
         work = [(sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in imus]
@@ -118,8 +119,8 @@ class Recorded:
         return notes
 
     def _pictured(self, camera: Camera) -> bool:
-        """Whether there are images of the camera. Where its corners come from a table, the only images that there are
-        may be another camera's."""
+        """Whether the recording has images of the camera. If its corners are in a table, the only image topic may be
+        another camera's, so that its name must match."""
         try:
             topic = self.recording.image_topic(camera)
         except RecordingError:
@@ -131,7 +132,7 @@ class Recorded:
         return Clock.of(self.calibration, self.span, sensor)
 
     def _during(self, sensor: str, seconds: np.ndarray) -> np.ndarray:
-        """Indices of what lies within the result. Raises where nothing does."""
+        """Indices of the `seconds` within the span of the result. Raises RecordingError if there are none."""
         inside = np.flatnonzero(self._clock(sensor).within(seconds))
         if not len(inside):
             raise RecordingError(
@@ -151,7 +152,7 @@ class Recorded:
         return _thinned(sensor.name, len(inside), MOST_READINGS, "readings")
 
     def _images(self, s: RerunStream, name: str, topic: str) -> list[str]:
-        """One after the other, and of those that are left out not even the pixels."""
+        """Sends images of the camera `name` one by one; images that are left out are not decoded."""
         seconds = self._clock(name).seconds(self.recording.stamps(topic))
         count = len(self._during(name, np.sort(seconds)))
         clock, damaged, shown = self._clock(name), 0, 0
@@ -187,9 +188,10 @@ class Recorded:
         ]
 
     def points_in_world(self, path: CubicPath, name: str, stream: ShownScans, scan: int, second: float) -> np.ndarray:
-        """(n, 3) float32 points of a scan in the world [m], each moved by the pose of the body at its own instant.
+        """(n, 3) float32 points of scan number `scan` in the world [m], each by the pose of the body at its instant
+        (motion compensation). second: time of the scan in the result.
 
-        They are thinned evenly to MOST_POINTS; those whose instant the trajectory does not reach are left out."""
+        At most MOST_POINTS points are used, evenly spaced; points at instants without a known pose are left out."""
         begin, end = (int(x) for x in stream.start[scan : scan + 2])
         own = slice(begin, end, _stride(end - begin, MOST_POINTS))
         T = self.calibration.T_imu_sensor(name)
@@ -204,7 +206,7 @@ def _instant(clock: Clock, stamp_ns: int) -> np.ndarray:
 
 
 def _stride(count: int, most: int) -> int:
-    """Every how many-th of `count` to take, so that no more than `most` are left."""
+    """Step with which to take items from `count`, so that at most `most` are taken."""
     return max(1, -(-count // most))
 
 

@@ -1,4 +1,4 @@
-"""The solution in space: the rig, how well it is known, the trajectory, the target, and points on planes."""
+"""The result in 3D: the rig and its uncertainty, the trajectory, the target, and points on planes."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from icalib.sensors import ask
 from icalib.tools.view.colors import by_value, rgb
 from icalib.tools.view.stream import RerunStream
 
-POINT = 1.5  # radius of a point of a scan, in points of the screen
+POINT = 1.5  # radius of a point of a scan, in screen points
 _TARGET, _TRAJECTORY = "#be185d", "#64748b"
-_WORST_OF_SCALE = 4.0  # of a scale of colours, in RMS of the result
+_WORST_OF_SCALE = 4.0  # residual at the top of the colour scale, in RMS of the residuals
 
 
 def place(c: Calibration, sensor: str) -> str:
-    """The entity of a sensor: the body is in the world, all else on the body."""
+    """Rerun's entity path of a sensor: the body is below the world, all other sensors are below the body."""
     return f"world/{sensor}" if sensor == c.reference else f"world/{c.reference}/{sensor}"
 
 
 def spans(c: Calibration) -> tuple[RecordingSpan, ...]:
-    """The recordings of the result; one without a name where it does not list them."""
+    """The recordings of the result; one span without a name if the result does not list them."""
     ends = c.trajectory.seconds[[0, -1]].tolist()
     return c.recordings or (RecordingSpan("", ends[0], ends[1], 0),)
 
 
 def log_rig(s: RerunStream, c: Calibration) -> None:
-    """Frames and shapes of all sensors; all but the body are fixed to it."""
+    """Sends frames and shapes of all sensors, at constant poses relative to the body."""
     spread = rig_shapes.spread(c)
     for name, T in rig_shapes.frames(c).items():
         s.still(place(c, name), s.rr.TransformAxes3D(0.25 * spread))
@@ -48,7 +48,8 @@ def log_rig(s: RerunStream, c: Calibration) -> None:
 
 
 def _pinhole(s: RerunStream, c: Calibration, name: str, depth: float):
-    """Rerun's pixel (0, 0) is the corner of the image, ours the centre of its first pixel; it knows no distortion."""
+    """Rerun's pinhole camera, without distortion. In Rerun pixel (0, 0) is the corner of the image, in icalib the
+    centre of the first pixel. depth [m]: distance of the drawn image."""
     fx, fy, cx, cy = c.group(name, "intrinsics").value
     return s.rr.Pinhole(
         resolution=c.rig["sensors"][name]["resolution"],
@@ -59,7 +60,7 @@ def _pinhole(s: RerunStream, c: Calibration, name: str, depth: float):
 
 
 def log_uncertainty(s: RerunStream, c: Calibration) -> None:
-    """The ellipsoids, magnified alike, coloured by verdict."""
+    """Sends the uncertainty ellipsoids of positions, with a common magnification, coloured by verdict."""
     factor = magnification(c)
     for e in ellipsoids(c):
         ellipsoid = s.rr.Ellipsoids3D(
@@ -74,7 +75,7 @@ def log_uncertainty(s: RerunStream, c: Calibration) -> None:
 
 
 def log_motion(s: RerunStream, c: Calibration) -> None:
-    """The pose of the body at each keyframe, and the trajectory of each recording so far."""
+    """Sends the pose of the body at each keyframe, and the whole trajectory of each recording."""
     path = c.trajectory
     s.still("world", s.rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     s.over(
@@ -88,7 +89,8 @@ def log_motion(s: RerunStream, c: Calibration) -> None:
 
 
 def log_target(s: RerunStream, c: Calibration) -> None:
-    """Outline and points of each body of the target; its scene has an orientation in the world of each recording."""
+    """Sends outline and points of each body of the target. The target has one orientation in the world per
+    recording."""
     target, orientations = target_from_plain(c.rig), rig_shapes.scene_in_worlds(c)
     if target is None or not orientations:
         return
@@ -104,7 +106,7 @@ def log_target(s: RerunStream, c: Calibration) -> None:
 
 
 def log_planes(s: RerunStream, c: Calibration) -> None:
-    """Measured points on the planes that they were found to lie on, coloured by the size of their residuals."""
+    """Sends the measured points that belong to planes, coloured by the size of their residuals."""
     cloud: ResidualCloud
     for cloud in ask("show", "clouds", c):
         of, size = c.recording_of(cloud.seconds), cloud.size
@@ -117,7 +119,7 @@ def log_planes(s: RerunStream, c: Calibration) -> None:
 
 
 def _strips(pen: np.ndarray) -> list[np.ndarray]:
-    """Lines from points (N, 3) in which a row of NaN lifts the pen."""
+    """Polylines from points (N, 3), in which a row of NaN separates two lines."""
     up = np.isnan(pen[:, 0])
     pieces = np.split(pen, np.flatnonzero(up))
     return [p for piece in pieces if len(p := piece[~np.isnan(piece[:, 0])]) > 1]

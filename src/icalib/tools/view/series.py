@@ -1,4 +1,4 @@
-"""What is left of the measurements, and the motion, over time."""
+"""Curves over time: residuals, velocity and biases."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from icalib.tools.view.colors import rgb
 from icalib.tools.view.scene import place
 from icalib.tools.view.stream import RerunStream
 
-_DOT = 3.0  # radius, in points of the screen
+_DOT = 3.0  # radius, in screen points
 _GOOD, _LEFT_OUT = "#22c55e", "#9ca3af"
 
 
 def log_residuals(s: RerunStream, c: Calibration) -> None:
-    """Residuals of all sensors over time, as each kind shows them; of images the measured points, too."""
+    """Sends the residuals of all sensors over time, and for cameras also the measured image points."""
     for r in c.residuals.values():
         for curve in curves(c, r):
             name = re.sub(r"[^0-9a-zA-Z]+", "_", curve.name)
@@ -30,7 +30,7 @@ def log_residuals(s: RerunStream, c: Calibration) -> None:
 
 
 def log_states(s: RerunStream, c: Calibration) -> None:
-    """Velocity [m/s] and biases [deg/s, m/s^2] at the keyframes; without an IMU they say nothing."""
+    """Sends velocity [m/s] and biases [deg/s, m/s^2] at the keyframes; nothing without an IMU."""
     path = c.trajectory
     if c.imu is None:
         return
@@ -40,7 +40,7 @@ def log_states(s: RerunStream, c: Calibration) -> None:
 
 
 def log_lines(s: RerunStream, entity: str, seconds: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
-    """Lines over time: values (n, m), a column for each of the m names."""
+    """Sends curves over time. seconds (n,); values (n, m): a column for each of the m names."""
     colors = AXIS_COLORS if len(names) == 3 else COLORS[: len(names)]
     s.still(entity, s.rr.SeriesLines(names=list(names), colors=rgb(*colors)))
     n, m = values.shape
@@ -48,8 +48,8 @@ def log_lines(s: RerunStream, entity: str, seconds: np.ndarray, values: np.ndarr
 
 
 def _log_seen(s: RerunStream, c: Calibration, r: ImageResiduals) -> None:
-    """Corners, or points that were followed, as they were measured in the camera's image; red where they were
-    rejected, grey where their track is not in use."""
+    """Sends measured corners or tracked points in the camera's image; rejected ones are red, those of unused tracks
+    grey."""
     rr, entity = s.rr, f"{place(c, r.sensor)}/image/{r.kind}"
     s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_DOT)))
     colors = rgb(_LEFT_OUT, _GOOD, REJECTED)[np.where(r.rejected, 2, r.used.astype(np.int64))]

@@ -1,4 +1,4 @@
-"""From a result on disk to what the viewer shows."""
+"""Shows a stored result and its recording in Rerun."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def view(
     save: str | Path | None = None,
     progress: Callable[[str, float], None] = lambda *_: None,
 ) -> list[str]:
-    """Shows the result of a calibration, and the recording that it is of, in Rerun's viewer, or writes the file `save`
-    that the viewer opens. Returns sentences on what was left out.
+    """Shows the result of a calibration, and its recording, in Rerun's viewer. With `save`, a file for the viewer is
+    written instead. Returns sentences on data that are not shown.
 
-    result: the folder that a calibration was written to, or the result.json in it. Raises CalibrationError: there is no
-    result, the recording is not that of the result, the file cannot be written, or Rerun is not installed.
+    result: the folder of a result, or the result.json in it. Raises CalibrationError if there is no result, the
+    recording is not that of the result, the file cannot be written, or Rerun is not installed.
     """
     rr, folder = load_rerun(), Path(result)
     folder = folder.parent if folder.name == "result.json" else folder
@@ -57,7 +57,7 @@ def _log_result(stream: RerunStream, c: Calibration) -> None:
 
 
 def summary(c: Calibration, notes: list[str]) -> str:
-    """Status, parameters and what to know, in Markdown."""
+    """Status, warnings and parameters of the result, in Markdown."""
     sentences = [("Undetermined", c.undetermined), ("Warning", c.warnings), ("Shown", notes)]
     if c.mounted:
         sentences.append(("Ellipsoids", [f"{SIGMAS:g} sigma of each position, {magnification(c):g} times as large."]))

@@ -1,4 +1,4 @@
-"""What is sent to Rerun: to its viewer, or into a file that appears whole or not at all."""
+"""Sends data to Rerun: to its viewer, or to a file that is written atomically."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from icalib.base.staging import staged
 from icalib.errors import CalibrationError
 
 TIMELINE = "imu clock"
-_PATIENCE_S = 30.0  # until the viewer has taken what it was sent
+_PATIENCE_S = 30.0  # time limit for the viewer to receive all data
 
 
 @dataclass(frozen=True)
 class RerunStream:
-    """One recording of Rerun, which may be watched while it grows. rr: the package, rec: its stream. All that is not
-    still is on one timeline, in seconds of the result's clock."""
+    """A Rerun recording. rr: the rerun package; rec: its stream. Time-dependent data are on one timeline, in seconds of
+    the result's clock."""
 
     rr: Any
     rec: Any
 
     def still(self, entity: str, *what: Any) -> None:
-        """Logs archetypes that hold at all times."""
+        """Sends archetypes that are valid at all times."""
         self.rec.log(entity, *what, static=True, strict=True)
 
     def at(self, entity: str, seconds: float, *what: Any) -> None:
-        """Logs archetypes that hold from an instant on."""
+        """Sends archetypes that are valid from an instant on."""
         self.rec.set_time(TIMELINE, duration=_rounded(np.array([seconds]))[0])
         self.rec.log(entity, *what, strict=True)
 
@@ -44,8 +44,8 @@ class RerunStream:
 
 @contextlib.contextmanager
 def opened(rr: Any, blueprint: Any, save: Path | None) -> Iterator[RerunStream]:
-    """A stream into the file `save`, which replaces an old one once all is written; without it into a viewer that is
-    started. Raises CalibrationError where the file cannot be written, or there is no viewer."""
+    """Context with a stream to the file `save`, which replaces an old file at the end; save None: to a viewer, which is
+    started. Raises CalibrationError if the file cannot be written, or there is no viewer."""
     rec = rr.RecordingStream("icalib")
     rec.set_log_time_enabled(False)
     if save is None:
@@ -81,5 +81,5 @@ def _sentence(what: str, advice: str) -> Iterator[None]:
 
 
 def _rounded(seconds: np.ndarray) -> np.ndarray:
-    """As Rerun counts: whole nanoseconds."""
+    """Seconds (n,) as whole nanoseconds, Rerun's unit of time."""
     return np.rint(1e9 * seconds).astype(np.int64).astype("timedelta64[ns]")
