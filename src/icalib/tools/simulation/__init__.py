@@ -1,4 +1,5 @@
-"""Simulated recordings with their truth, made with formulas of their own so that no sign can cancel."""
+"""Simulated recordings with their truth. Formulas are written separately from those of the estimator, so that a wrong
+sign in one of them cannot cancel."""
 
 from icalib.tools.simulation.images.filming import Film, Shot, film, sheets_of
 from icalib.tools.simulation.images.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses

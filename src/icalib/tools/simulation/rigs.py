@@ -15,13 +15,13 @@ from icalib.tools.simulation.sensors.imu import rotation_from_vector
 from icalib.tools.simulation.sensors.simulate import raw_time_offset, true_values
 
 Treatment = Literal["free", "start", "fixed"] | Parameter
-_GUESS_STREAM = 3000  # of random numbers; see `simulate` for the others
+_GUESS_STREAM = 3000  # number of the random stream of guesses; `simulate` has the others
 
 
 @dataclass(frozen=True)
 class GuessError:
-    """Standard deviations of a drawn initial guess: of each axis of a rotation [rad] and of a translation [m], of a
-    time offset [s]; relative: of focal lengths and own parameters of sensors, as a share of them."""
+    """Standard deviations of a drawn initial guess. rotation [rad], translation [m]: on each axis; time_offset [s];
+    relative: of focal lengths and parameters of special sensors, relative to their values."""
 
     rotation: float = float(np.deg2rad(5.0))
     translation: float = 0.05
@@ -30,7 +30,7 @@ class GuessError:
 
 
 def settings_for(scenario: Scenario) -> Settings:
-    """Settings that model just what the scenario disturbs; no empirical factor."""
+    """Settings that model exactly the disturbances of the scenario, without inflation of the sigmas by segments."""
     return Settings(
         loss="huber" if scenario.outlier_fraction > 0.0 else "none",
         outlier_std=4.0 if scenario.outlier_fraction > 0.0 else 0.0,
@@ -45,13 +45,13 @@ def settings_for(scenario: Scenario) -> Settings:
 def rig_for(
     scenario: Scenario, *, settings: Settings | None = None, others: Treatment = "free", **named: Treatment
 ) -> Rig:
-    """The scenario's rig, noise as simulated (as stated by the scenario, where its noise is switched off).
+    """The scenario's rig, with the noise of the scenario, also if noise is switched off there.
 
-    Cameras in a room without target and without `features` track its images. settings: by default those of
-    `settings_for`. Each group of parameters, of all sensors alike: "free" (no guess), "start" (free, from the truth),
-    "fixed" (at the truth), or a Parameter. named: by the name of the group in the rig, imu_intrinsics of the IMU; by
-    default both intrinsics and distortion are fixed. others: all groups that are not named. Raises TypeError for a name
-    that no group has.
+    In a room without target and without `features`, cameras track points of their images. settings: by default those of
+    `settings_for`. named, others: how each parameter group of all sensors is treated, "free" (no guess), "start" (free,
+    with the truth as guess), "fixed" (at the truth), or a Parameter. named: by name of the group in the rig, with
+    imu_intrinsics for the IMU; by default intrinsics, distortion and imu_intrinsics are fixed. others: for groups that
+    are not named. Raises TypeError for a name that no group has.
     """
     treated: dict[str, Treatment] = {"imu_intrinsics": "fixed", "intrinsics": "fixed", "distortion": "fixed", **named}
     sims = {sim.name: sim for sim in scenario.mounted}
@@ -70,7 +70,7 @@ def rig_for(
 
 
 def _camera(scenario: Scenario, sim: SimCamera) -> Camera:
-    """As `SimSensor.rig_entry`."""
+    """The camera's entry in the rig, see `SimSensor.rig_entry`."""
     tracks = f"{sim.name}/tracks.csv"
     if scenario.features is None:
         tracks = None if scenario.board or scenario.room is None else TRACK_IMAGES
@@ -88,7 +88,7 @@ def _camera(scenario: Scenario, sim: SimCamera) -> Camera:
 def _treated(
     sensor: Sensor, true: dict[str, np.ndarray], treatments: dict[str, Treatment], others: Treatment
 ) -> Sensor:
-    """The sensor with each group treated as asked for; true: values by name."""
+    """The sensor with each parameter group treated as in `rig_for`; true: values by name."""
     groups = {spec.name for spec in sensor.stated()} & true.keys()
     return replace(sensor, **{name: _parameter(treatments.get(name, others), true[name]) for name in groups})
 
@@ -96,8 +96,8 @@ def _treated(
 def with_drawn_guess(
     rig: Rig, scenario: Scenario, seed: int, error: GuessError | None = None, only: tuple[str, ...] | None = None
 ) -> Rig:
-    """The rig with a guess of each free group, or of those named in `only`, drawn about the truth; the same seed draws
-    the same. Principal points are guessed in the middle of the image, and of distortions there is no guess."""
+    """The rig with guesses of its free groups, or of those named in `only`, drawn about the truth. The guess of a
+    principal point is the middle of the image; distortions have no guess. The same seed gives the same guesses."""
     rng = np.random.default_rng([seed, _GUESS_STREAM])
     spread = GuessError() if error is None else error
     sims = {sim.name: sim for sim in scenario.mounted}
@@ -121,7 +121,7 @@ def _drawn_lens(sim: SimCamera, rng: np.random.Generator, error: GuessError) -> 
 def _drawn_pose(
     T_imu_sensor: np.ndarray, offset: float, rng: np.random.Generator, error: GuessError
 ) -> dict[str, np.ndarray]:
-    """Extrinsics and time offset, by the names of their groups; all are drawn, whether or not the sensor has them."""
+    """Drawn extrinsics and time offset by group name. All are drawn, even groups that the sensor lacks."""
     return mounted(
         T_imu_sensor[:3, :3] @ rotation_from_vector(error.rotation * rng.standard_normal(3)),
         T_imu_sensor[:3, 3] + error.translation * rng.standard_normal(3),

@@ -1,4 +1,4 @@
-"""A simulated recording as a bag of what the sensors' drivers send: ROS 1, or MCAP of ROS 2."""
+"""Writes a simulated recording as a bag with the messages of the sensors' drivers: ROS 1, or MCAP of ROS 2."""
 
 from __future__ import annotations
 
@@ -18,21 +18,20 @@ from icalib.tools.simulation.scenario.sensor import BagTopic
 from icalib.tools.simulation.sensors.simulate import Simulation
 from icalib.tools.simulation.tables import whole, write_truth
 
-Event = tuple[int, str, Callable[[BagWriter], Any]]  # when on the IMU's clock [ns], topic, what makes the message
+Event = tuple[int, str, Callable[[BagWriter], Any]]  # instant on the IMU's clock [ns], topic, maker of the message
 _EXPOSURE_S = 0.004
-_AT_A_TIME = 10_000  # readings as Python numbers, which take ten times the memory
+_AT_A_TIME = 10_000  # readings that are converted to Python numbers at once, which take ten times the memory
 
 
 def write_sensors(
     simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[str, ...]:
-    """Writes a bag and the truth beside it into the new folder `path`, all or nothing; a `path` that ends in .bag is a
-    bag of ROS 1, and has no truth.
+    """Writes an MCAP bag and its truth to the new folder `path`, atomically. If `path` ends with .bag, it is a ROS 1
+    bag without truth.
 
-    Topics are /imu0 (Imu), those of `SimSensor.bag_topic`, and /NAME/image_raw (Image, mono8) of the target, or without
-    one of the room.
-    Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written,
-    CalibrationError where a package is missing, RigError for a board that is not flat.
+    Topics are /imu0 (Imu), those of `SimSensor.bag_topic`, and /NAME/image_raw (Image, mono8), which shows the target,
+    or the room if there is no target. Returns sentences on data that were left out. Raises RecordingError if `path`
+    exists or cannot be written, CalibrationError if a package is missing, RigError for a board that is not flat.
     """
     if any(simulation.scenario.bow):
         raise RigError("boards are rendered flat; set the scenario's bow to zero.")
@@ -51,7 +50,7 @@ def write_sensors(
 
 
 def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[Iterator[Event]], tuple[str, ...]]:
-    """The type of each topic, the events of each stream, and sentences on what has none."""
+    """The message type of each topic, the events of each stream, and sentences on sensors without messages."""
     measured, truth = simulation.measurements, simulation.truth
     assert measured.imu is not None  # of every scenario
     topics, streams, notes = {IMU_TOPIC: IMU}, [_readings(measured.imu)], []
@@ -83,7 +82,7 @@ def _readings(imu: ImuStream) -> Iterator[Event]:
 
 
 def _images(simulation: Simulation, seed: int) -> Iterator[Event]:
-    """Rendered a few ahead, on all cores."""
+    """Events of all images, which are rendered on all cores, a few of them ahead."""
     imu, truth = simulation.measurements.imu, simulation.truth
     assert imu is not None  # of every scenario
     for shot in Film(simulation.scenario, seed, Imaging(blur_px=0.8, noise=2.0), _EXPOSURE_S, imu, truth).shots():

@@ -1,4 +1,4 @@
-"""A simulated recording as a folder of tables, with its truth. The format: docs/simulation.md."""
+"""Writes a simulated recording as a folder of tables with its truth; the format is described in docs/simulation.md."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _TRUTH_HEADER = """\
 
 
 def check_absent(path: Path) -> None:
-    """Raises RecordingError where `path` exists: a recording is never written over another."""
+    """Raises RecordingError if `path` exists, as recordings are never overwritten."""
     if path.exists():
         raise RecordingError(f"{path} exists already; remove it, or choose another path.")
 
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A place beside `path` to write to; moved to `path` at the end, and removed where anything fails.
+    """Context with a temporary path beside `path`. It is renamed to `path` at the end, and removed if anything fails.
 
-    Raises RecordingError where `path` exists or cannot be written.
+    Raises RecordingError if `path` exists or cannot be written.
     """
     check_absent(path)
     try:
@@ -51,10 +51,10 @@ def whole(path: Path) -> Iterator[Path]:
 def write_tables(
     simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[str, ...]:
-    """Writes the measurements as tables, and the truth beside them, into the new folder `path`: all or nothing.
+    """Writes the measurements as tables, and their truth, to the new folder `path`, atomically.
 
-    Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written,
-    CalibrationError where a sensor's name cannot be that of a folder.
+    Returns an empty tuple, as nothing is left out, see `write_sensors`. Raises RecordingError if `path` exists or
+    cannot be written, CalibrationError if a sensor's name is no valid folder name.
     """
     measured = simulation.measurements
     assert measured.imu is not None  # of every scenario
@@ -72,7 +72,7 @@ def write_tables(
 
 
 def write_truth(simulation: Simulation, seed: int, folder: Path) -> None:
-    """Writes truth.yaml and truth.npz into the folder `folder`, which is there."""
+    """Writes truth.yaml and truth.npz to the existing folder `folder`."""
     truth = simulation.truth
     text = yaml.safe_dump(_plain_truth(simulation.scenario, truth, seed), sort_keys=False, default_flow_style=None)
     (folder / "truth.yaml").write_text(_TRUTH_HEADER + text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Films as files: bags of ROS 1 and ROS 2, written by rosbags, and EuRoC's folder (extras `bags`, `images`)."""
+"""Writes films as bags of ROS 1 and ROS 2 by rosbags (extra `bags`), or in EuRoC's layout (extra `images`)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Reading = tuple[int, list[float]]  # stamp [ns]; gyro, accel
 
 
 class _Sink(AbstractContextManager["_Sink"], Protocol):
-    """One recording that is being written. received_ns: when the recorder received it, on the IMU's clock."""
+    """A recording that is being written. received_ns: instant of reception on the IMU's clock [ns]."""
 
     def image(self, shot: Shot, received_ns: int) -> None: ...
 
@@ -29,11 +29,11 @@ class _Sink(AbstractContextManager["_Sink"], Protocol):
 
 
 def write_film(film: Film, paths: Mapping[Form, Path], workers: int | None = None) -> None:
-    """Writes `film` once in each form of `paths`; each image is rendered once, and only a few are in memory.
+    """Writes `film` in each form of `paths`. Each image is rendered once, and only a few are in memory.
 
-    ros1: a file; mcap and sqlite3: folders of ROS 2; euroc: a folder that holds `mav0`, images as PNG. Images of cam0
-    are topic `/cam0/image_raw`, mono8. Raises RecordingError where a path exists, CalibrationError where a package is
-    missing.
+    ros1: a file; mcap and sqlite3: folders of ROS 2; euroc: a folder with `mav0`, images as PNG. Images of cam0 have
+    the topic `/cam0/image_raw`, mono8. workers: threads, None for all cores. Raises RecordingError if a path exists,
+    CalibrationError if a package is missing.
     """
     for path in paths.values():
         if path.exists():
@@ -50,7 +50,7 @@ def write_film(film: Film, paths: Mapping[Form, Path], workers: int | None = Non
 
 
 def _in_time(film: Film, workers: int | None) -> Iterator[tuple[int, Shot | Reading]]:
-    """Images and readings as they are taken, with that instant on the IMU's clock [ns]."""
+    """Images and readings in order of time, each with its instant on the IMU's clock [ns]."""
     values = np.concatenate([film.imu.gyro, film.imu.accel], axis=1)
     readings = zip(film.imu.stamps_ns.tolist(), values.tolist(), strict=True)
     next_reading = next(readings, None)
@@ -94,7 +94,7 @@ class _FilmBag:
 
 
 class _Folder:
-    """EuRoC's layout; every digit of the readings is written."""
+    """A folder in EuRoC's layout; readings are written with all digits."""
 
     def __init__(self, path: Path, cameras: list[str]) -> None:
         self._cv2 = package("cv2", "images")

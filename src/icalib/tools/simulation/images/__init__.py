@@ -1,1 +1,1 @@
-"""Rendered images of a room."""
+"""Rendered images of targets and rooms."""

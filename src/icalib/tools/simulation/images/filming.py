@@ -1,6 +1,6 @@
-"""What the sensors themselves deliver: rendered images instead of corners, on the clocks of the data-level simulation.
+"""Simulates recordings with rendered images instead of corners; stamps and motion are those of `simulate`.
 
-Images are rendered on threads when they are asked for, a few ahead: a recording never lies in memory as a whole.
+Images are rendered by threads on demand, a few ahead, so that a recording is never in memory as a whole.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from icalib.tools.simulation.sensors.corners import image_stamps
 from icalib.tools.simulation.sensors.imu import inside
 from icalib.tools.simulation.sensors.simulate import Truth, simulate
 
-_AHEAD = 2  # images being rendered or waiting, for each thread
+_AHEAD = 2  # images per thread that are rendered or waiting
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One image: the camera's name, its stamp on the camera's clock, the instant [s] on the IMU's since its origin,
-    pixels (H, W) uint8, and where the target's points truly are."""
+    """One image. camera: its name; stamp_ns: on the camera's clock; seconds: true instant on the IMU's clock since its
+    origin; pixels (H, W) uint8; target: true image points of the target."""
 
     camera: str
     stamp_ns: int
@@ -43,8 +43,8 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """One recording of IMU readings and images. `truth.corners` is that of the data-level simulation, not of these
-    images."""
+    """A recording of IMU readings and images. exposure_s: exposure time [s], 0 for an instant. `truth.corners` belongs
+    to the corners of `simulate`, not to these images."""
 
     scenario: Scenario
     seed: int
@@ -54,7 +54,7 @@ class Film:
     truth: Truth
 
     def shots(self, workers: int | None = None) -> Iterator[Shot]:
-        """All images of all cameras in the order in which they are taken. workers: threads; None: all cores."""
+        """All images of all cameras in order of time. workers: number of threads; None: one per core."""
         take = self._taker()
         workers = workers or _cores()
         waiting: deque[Future[Shot]] = deque()
@@ -67,11 +67,11 @@ class Film:
                 yield waiting.popleft().result()
 
     def count(self) -> int:
-        """How many images there are."""
+        """Number of images of all cameras."""
         return len(self._schedule())
 
     def _schedule(self) -> list[_Frame]:
-        """All images in time; stamps are those of `simulate`."""
+        """All images in order of time; stamps are those of `simulate`."""
         due: list[_Frame] = []
         for i, camera in enumerate(self.scenario.cameras):
             stamps, seconds = image_stamps(self.scenario, camera, np.random.default_rng([self.seed, 2 + i]))
@@ -94,8 +94,8 @@ class Film:
 
 
 class _Frame(NamedTuple):
-    """One image: its instant, number of the camera and stamp; number and instant of the image that it shows, which is
-    an earlier one where the camera is frozen."""
+    """One image. seconds: instant on the IMU's clock; camera: its number; stamp_ns: on its clock; shown, taken_s:
+    number and instant of the image that is shown, an earlier one while the camera is frozen."""
 
     seconds: float
     camera: int
@@ -105,18 +105,18 @@ class _Frame(NamedTuple):
 
 
 class _Taker(Protocol):
-    """Takes the pictures of a film."""
+    """Renders the images of a film."""
 
     @property
     def instants(self) -> int:
-        """Poses of an exposure."""
+        """Number of poses over an exposure."""
         ...
 
     def picture(self, frame: _Frame, poses: np.ndarray, rng: np.random.Generator) -> Picture: ...
 
 
 class _Sheets:
-    """Of printed targets."""
+    """Renders images of printed targets."""
 
     instants = 5
 
@@ -131,7 +131,7 @@ class _Sheets:
 
 
 class _Room:
-    """Of a room without targets."""
+    """Renders images of a room without targets."""
 
     instants = INSTANTS
 
@@ -153,13 +153,15 @@ class _Room:
 
 
 def _shown(seconds: np.ndarray, frozen: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """(M,) number of the image that each image (M,) shows: itself, or the last before a time in which it is frozen."""
+    """(M,) number of the image that each image shows: its own, or the last one before an interval in which the camera
+    is frozen. seconds (M,): instants of the images."""
     fresh = ~inside(frozen, seconds)
     return np.maximum(np.maximum.accumulate(np.where(fresh, np.arange(len(seconds)), -1)), 0)
 
 
 def sheets_of(target: Target, T_world_bodies: np.ndarray) -> list[Sheet]:
-    """Every body of `target` on paper of its own, at its pose (bodies, 4, 4); their points in turn are the target's."""
+    """A sheet for each body of `target`, at the poses T_world_bodies (bodies, 4, 4). The points of all sheets, in
+    order, are those of the target."""
     if isinstance(target, Scene):
         first = np.cumsum([0] + [len(t.bodies) for t in target.targets])
         groups = zip(target.targets, first[:-1], first[1:], strict=True)
@@ -172,12 +174,12 @@ def sheets_of(target: Target, T_world_bodies: np.ndarray) -> list[Sheet]:
 
 
 def film(scenario: Scenario, seed: int, imaging: Imaging | None = None, exposure_s: float = 0.0) -> Film:
-    """The scenario as its sensors record it: motion, IMU readings and stamps are those of `simulate`.
+    """The scenario as a recording with images; motion, IMU readings and stamps are those of `simulate`.
 
-    A scenario with a room and no target is filmed as the room from the inside, its surfaces textured. imaging: by
-    default a lens blur of 0.8 px and a noise of 2 grey levels. exposure_s: about the stamp, 5 poses, or 4 in a room; 0:
-    an instant. What the scenario says of corners (noise, bloom, outliers) has no part in images. Raises RigError for a
-    board that is not flat, and where there is neither target nor room.
+    Images show the target, or without one the textured room from the inside. imaging: by default a lens blur of 0.8 px
+    and a noise of 2 grey levels. exposure_s: exposure time, centred on the stamp and averaged over 5 poses, or 4 in a
+    room; 0: an instant. The scenario's corner noise, bloom and outliers do not affect images. Raises RigError for a
+    board that is not flat, and if there is neither target nor room.
     """
     if not scenario.board and scenario.room is None:
         raise RigError("there is nothing to film; give the scenario a target or a room.")

@@ -1,7 +1,7 @@
-"""From a pixel back to its ray, for each camera that can be simulated; formulas of their own, compiled.
+"""Rays of pixels (unprojection) by each camera model that can be simulated; compiled, without code of the estimator.
 
-Every model but the equidistant one ends with a point on a plane, which is a direction D. Seen from `shift` behind the
-centre of the unit sphere, D meets the sphere at t D - shift e_z, t = shift D_z + sqrt(1 - shift^2 (1 - D_z^2)).
+The models with a sphere use the following formula. The ray with unit direction D from the point `shift` behind the
+centre of the unit sphere meets the sphere at t D - shift e_z, where t = shift D_z + sqrt(1 - shift^2 (1 - D_z^2)).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ _NONE = (0.0, 0.0, 0.0)
 
 
 def lens_of(camera: SimCamera) -> tuple[int, np.ndarray]:
-    """The code of the camera's model, and (12,): fx, fy, cx, cy, then the distortion and zeros."""
+    """Code of the camera model, and its parameters (12,): fx, fy, cx, cy [px], distortion, zeros."""
     numbers = np.zeros(12)
     numbers[: 4 + len(camera.distortion)] = [*camera.intrinsics, *camera.distortion]
     return _CODES[camera.model], numbers
 
 
 def unproject(camera: SimCamera, uv: np.ndarray) -> np.ndarray:
-    """Pixels (..., 2) -> unit rays (..., 3) in the camera frame; NaN where the model has none."""
+    """Unit rays (..., 3) in the camera frame of pixels uv (..., 2); NaN outside the range of the model."""
     code, numbers = lens_of(camera)
     flat = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 2)
     rays = np.empty((len(flat), 3))
@@ -45,9 +45,10 @@ def _rays(code, numbers, uv, rays):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def ray(code, n, u, v):
-    """Direction of a pixel, of any length; NaN, or a point beyond the model's range, where there is none."""
+    """Direction (x, y, z) of pixel (u, v), not normalised; n: parameters of `lens_of`. Outside the range of the model
+    it is NaN or meaningless."""
     a, b = (u - n[2]) / n[0], (v - n[3]) / n[1]
-    if code in (RADTAN, RATIONAL):  # zeros are left after radtan's coefficients
+    if code in (RADTAN, RATIONAL):  # the coefficients that radtan lacks are zero
         w = _undistorted((n[4], n[5], n[8]), (n[9], n[10], n[11]), n[6], n[7], complex(a, b))
         return w.real, w.imag, 1.0
     if code == EQUIDISTANT:
@@ -56,7 +57,7 @@ def ray(code, n, u, v):
         by_radius = np.sin(angle) / radius if radius > 0.0 else 1.0
         return by_radius * a, by_radius * b, np.cos(angle)
     if code == EUCM:
-        # The unified model in a space stretched by sqrt(beta) across the axis.
+        # EUCM is the unified camera model with x and y scaled by sqrt(beta).
         stretch = np.sqrt(n[5])
         x, y, z = _from_behind(n[4] / (1.0 - n[4]), stretch * a * (1.0 - n[4]), stretch * b * (1.0 - n[4]), 1.0)
         return x / stretch, y / stretch, z
@@ -69,7 +70,7 @@ def ray(code, n, u, v):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _from_behind(shift, x, y, z):
-    """Where the ray (x, y, z) from `shift` behind the centre meets the unit sphere."""
+    """Point at which the ray (x, y, z) from the point `shift` behind the centre meets the unit sphere."""
     norm = np.sqrt(x * x + y * y + z * z)
     x, y, z = x / norm, y / norm, z / norm
     t = shift * z + np.sqrt(1.0 - shift * shift * (1.0 - z * z))

@@ -1,4 +1,4 @@
-"""People who walk before a camera: upright boxes that follow it, somewhat late, and sway from side to side."""
+"""People in front of a camera: upright boxes that follow it with a delay, and sway from side to side."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from icalib.tools.simulation.scenario.scenario import SimCamera
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
 _SIZE_M = (0.5, 0.3, 1.75)
-_AWAY_M, _NEARER_M = 1.8, 0.4  # from the camera, and by how much this changes
-_APART_RAD, _SWAY_RAD = 0.5, 0.35  # between two of them, and each from its middle
-_LATE_S = 0.5  # where the camera was, this long ago, is what they follow
-_HZ = 0.13  # of the first; every other sways by a tenth faster than the one before
+_AWAY_M, _NEARER_M = 1.8, 0.4  # mean distance from the camera, and amplitude of its change
+_APART_RAD, _SWAY_RAD = 0.5, 0.35  # angle between neighbours, and amplitude of the sway
+_LATE_S = 0.5  # delay with which people follow the camera
+_HZ = 0.13  # frequency of the first person's sway; that of each further person is a tenth higher
 
 
 def standing(count: int) -> tuple[Obstacle, ...]:
-    """As many people, anywhere."""
+    """`count` people at the origin; `walking` gives their places."""
     return tuple(Obstacle((0.0, 0.0), _SIZE_M) for _ in range(count))
 
 
 def walking(count: int, camera: SimCamera, trajectory: TrueTrajectory, seconds: float) -> tuple[Obstacle, ...]:
-    """Where they are at an instant of the IMU's clock."""
+    """`count` people at an instant [s] on the IMU's clock, in front of `camera`."""
     if not count:
         return ()
     rotation, position, _ = trajectory.pose_at(np.array([seconds - _LATE_S]))

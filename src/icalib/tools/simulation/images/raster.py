@@ -1,10 +1,10 @@
-"""Compiled: a flat black and white pattern averaged over the cells of a grid finer than the pixels, and its blur.
+"""Compiled rendering of a flat black and white pattern with anti-aliasing by area, and its blur.
 
-A pixel whose footprint on the sheet lies in one cell of the pattern has that cell's grey. Every other pixel is cut
-into s x s cells, each with a ray of its own, by the rays around the pixel to second order. To first order the place
-on the sheet that a cell sees spreads like the sum of two uniform variables, so what lies between two edges of the
-pattern is a difference of trapezoids' integrals: an edge is exact wherever it falls in the cell, not rounded to
-samples.
+A pixel with a footprint on the sheet inside one cell of the pattern has that cell's grey. Every other pixel is divided
+into s x s cells. The ray of each cell is a second-order expansion of the rays around the pixel. To first order, the
+coordinate on the sheet over a cell is distributed like the sum of two uniform variables. The share of a cell between
+two edges of the pattern is thus a difference of two integrals of a trapezoid. It is exact wherever the edge lies, and
+not sampled.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-_SLACK = 1.3  # of a pixel's linear footprint, for what the lens bends it
+_SLACK = 1.3  # factor on a pixel's linear footprint, which allows for the curvature of the lens
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def paint(rays, by_u, by_v, bends, s, R, C, x_edges, y_edges, grey_of, fine):
-    """Paints the sheet over the greys in `fine` (H s, W s), s x s cells a pixel.
+    """Paints the sheet over the greys in `fine` (H s, W s), with s x s cells per pixel.
 
-    rays (H, W, 3) through the pixels' centres, their derivatives, and bends (3, H, W, 3), those by uu, uv and vv; NaN
-    where there are none. R, C: rotation from the camera to the sheet, the camera's place on the sheet's frame; grey_of
-    (ny, nx): grey of each cell.
+    rays (H, W, 3): through the centres of the pixels, NaN for none; by_u, by_v (H, W, 3): their derivatives per pixel;
+    bends (3, H, W, 3): second derivatives by uu, uv and vv. R (3, 3): R_sheet_cam; C (3,): position of the camera in
+    the sheet's frame [m]; x_edges (nx + 1,), y_edges (ny + 1,): edges of the pattern [m]; grey_of (ny, nx): its greys.
     """
     for row in range(rays.shape[0]):
         for col in range(rays.shape[1]):
@@ -58,9 +58,10 @@ def paint(rays, by_u, by_v, bends, s, R, C, x_edges, y_edges, grey_of, fine):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def paint_discs(rays, by_u, by_v, bends, s, R, C, discs, black, fine):
-    """Paints discs (n, 3), centre and radius on the sheet, over the greys in `fine`, as `paint` does rectangles.
+    """Paints discs (n, 3), centre x, y and radius [m] on the sheet, over the greys in `fine`; other arguments as in
+    `paint`.
 
-    Within a cell, a quarter of a pixel, a disc's edge is taken for straight.
+    Within a cell, a quarter of a pixel, the edge of a disc is approximated by a line.
     """
     for row in range(rays.shape[0]):
         for col in range(rays.shape[1]):
@@ -92,7 +93,7 @@ def paint_discs(rays, by_u, by_v, bends, s, R, C, discs, black, fine):
 
 @njit(cache=True, nogil=True)
 def _ray(d, d_u, d_v, bend, du, dv):
-    """The ray du, dv pixels beside the one that is d."""
+    """The ray du, dv pixels beside the ray d, by a second-order expansion. d_u, d_v, bend: derivatives, see `paint`."""
     uu, uv, vv = 0.5 * du * du, du * dv, 0.5 * dv * dv
     x = d[0] + du * d_u[0] + dv * d_v[0] + uu * bend[0, 0] + uv * bend[1, 0] + vv * bend[2, 0]
     y = d[1] + du * d_u[1] + dv * d_v[1] + uu * bend[0, 1] + uv * bend[1, 1] + vv * bend[2, 1]
@@ -102,7 +103,8 @@ def _ray(d, d_u, d_v, bend, du, dv):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _on_sheet(d, d_u, d_v, R, C):
-    """Where a ray meets the sheet, its derivatives by u and v, and whether it does, from either side."""
+    """Point x, y at which a ray meets the sheet [m], its derivatives by u and v, and whether the ray meets the sheet
+    (from either side)."""
     z = R[2, 0] * d[0] + R[2, 1] * d[1] + R[2, 2] * d[2]
     t = -C[2] / z
     if not (t > 0.0 and t < 1e12):
@@ -121,7 +123,7 @@ def _on_sheet(d, d_u, d_v, R, C):
 
 @njit(cache=True, nogil=True)
 def _cell(edges, value):
-    """Index of the last edge that is not above `value`, -1 below all."""
+    """Index of the last of the ascending edges that is not above `value`; -1 if all are above."""
     low, high = -1, len(edges)
     while high - low > 1:
         middle = (low + high) // 2
@@ -134,9 +136,10 @@ def _cell(edges, value):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _average(x, y, z, R, C, Xu, Yu, Xv, Yv, x_edges, y_edges, grey_of):
-    """Mean grey over a cell whose centre has the ray (x, y, z), times the share that the sheet covers; and the share.
+    """Integral of the sheet's grey over a cell with the central ray (x, y, z), and the share of the cell that the sheet
+    covers.
 
-    X and Y are averaged apart: exact but where edges of both directions cross the same cell.
+    X and Y are averaged separately, which is exact unless edges of both directions cross the cell.
     """
     d_z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
     t = -C[2] / d_z
@@ -183,7 +186,8 @@ def _below(q, a, b):
 def pixel_kernel(sigma: float, s: int, pad: int) -> np.ndarray:
     """((2 pad + 1) s,) weights of the cells along one axis around a pixel: a box of one pixel, blurred by a Gaussian.
 
-    sigma [px]. The cells' own width adds a variance of 1 / (12 s^2) px^2, which is subtracted from the Gaussian's.
+    sigma: of the Gaussian [px]; s: cells per pixel; pad: pixels on each side. The width of the cells adds a variance of
+    1 / (12 s^2) px^2, which is subtracted from that of the Gaussian.
     """
     edges = np.arange((2 * pad + 1) * s + 1) / s - pad - 0.5
     spread = np.sqrt(max(sigma**2 - 1.0 / (12.0 * s * s), 0.0))
@@ -193,7 +197,7 @@ def pixel_kernel(sigma: float, s: int, pad: int) -> np.ndarray:
 
 
 def _ramp(x: float, sigma: float) -> float:
-    """The integral up to x of a step's integral, max(0, x), blurred by a Gaussian of `sigma`."""
+    """The ramp function max(0, x), blurred by a Gaussian of standard deviation `sigma`."""
     if sigma == 0.0:
         return max(x, 0.0)
     z = x / sigma
@@ -202,7 +206,7 @@ def _ramp(x: float, sigma: float) -> float:
 
 @njit(cache=True, nogil=True)
 def shrink(fine, kernel, s, out):
-    """out (H, W): each pixel the sum of `kernel` along both axes over the cells of `fine` around it."""
+    """Fills out (H, W) with the convolution of `fine` by `kernel` along both axes, sampled at the pixels."""
     n_rows, n = fine.shape[0], len(kernel)
     narrow = np.empty((n_rows, out.shape[1]))
     for row in range(n_rows):

@@ -1,7 +1,7 @@
-"""Images of printed targets as a simulated camera takes them, with the true places of their points.
+"""Images of printed targets by a simulated camera, with the true image points.
 
-Every pixel is the light of its square, (0, 0) being the CENTRE of the top left one, seen through the lens itself: no
-picture is resampled. Nothing here knows how corners are found.
+A pixel is the mean light over its square, by rays through the distorted lens; no image is resampled. Pixel (0, 0) is
+the CENTRE of the top left square. The renderer is independent of the detection of corners.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from icalib.tools.simulation.scenario.projection import project, visible
 from icalib.tools.simulation.scenario.scenario import SimCamera
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
-_CELLS = 4  # a pixel, along each axis
-_REACH = 4.0  # of the blur, in standard deviations
+_CELLS = 4  # per pixel, along each axis
+_REACH = 4.0  # standard deviations of the blur at which it is cut off
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A printed target somewhere in the world, on white paper that ends `margin` [m] beyond the print.
+    """A printed target in the world, on white paper that extends `margin` [m] beyond the print.
 
-    border_bits: see `pattern_of`. Where sheets overlap in the image, the one whose middle is nearer covers the other.
+    border_bits: see `pattern_of`. If sheets overlap in the image, the one with the nearer centre covers the other.
     """
 
     target: Target
@@ -44,11 +44,12 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Imaging:
-    """How light becomes grey. Greys 0 to 255: `white` and `black` of the print, `background` of everything else.
+    """Photometric model of a camera. white, black, background: grey levels (0 to 255) of the print and of everything
+    else.
 
-    blur_px: standard deviation of the lens's Gaussian blur. vignetting: share of the light lost in the image's corners,
-    growing with the square of the distance from its centre. gain: times all of it. noise: standard deviation of each
-    pixel's grey, white and Gaussian.
+    blur_px: standard deviation of the lens's Gaussian blur. vignetting: fraction of the light that is lost in the
+    corners of the image; the loss grows with the squared distance from the centre. gain: factor on all light. noise:
+    standard deviation of the white Gaussian noise of each pixel, in grey levels.
     """
 
     white: float = 210.0
@@ -62,8 +63,8 @@ class Imaging:
 
 @dataclass(frozen=True, eq=False)
 class SheetTruth:
-    """One sheet in a picture: uv (n, 2) [px] of its points, the mean over the exposure, and seen (n,) bool: in the
-    image and from the front all that time."""
+    """True image points of one sheet. uv (n, 2): mean over the exposure [px]; seen (n,) bool: in the image, and seen
+    from the front, during the whole exposure."""
 
     uv: np.ndarray
     seen: np.ndarray
@@ -71,20 +72,21 @@ class SheetTruth:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """grey (H, W) float64, neither rounded nor clipped, and the truth of each sheet in the order they were given."""
+    """A rendered image. grey (H, W) float64, neither rounded nor clipped; sheets: truth of each sheet, in the order of
+    the argument."""
 
     grey: np.ndarray
     sheets: tuple[SheetTruth, ...]
 
     @property
     def pixels(self) -> np.ndarray:
-        """(H, W) uint8."""
+        """(H, W) uint8: `grey`, rounded and clipped to 0 to 255."""
         return np.clip(np.rint(self.grey), 0.0, 255.0).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What a camera makes of the light in `cells` x `cells` cells of each pixel."""
+    """Blur, vignetting and noise of a camera; the light is given in `cells` x `cells` cells per pixel."""
 
     camera: SimCamera
     imaging: Imaging
@@ -92,7 +94,7 @@ class Optics:
 
     @property
     def pad(self) -> int:
-        """Pixels around the image whose light the blur brings in."""
+        """Width of the margin around the image from which blur brings in light [px]."""
         return int(np.ceil(_REACH * self.imaging.blur_px))
 
     @property
@@ -102,21 +104,21 @@ class Optics:
 
     @cached_property
     def falloff(self) -> np.ndarray:
-        """(H, W) share of the light that arrives."""
+        """(H, W) fraction of the light that vignetting leaves."""
         width, height = self.camera.resolution
         u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
         square = u[None] ** 2 + v[:, None] ** 2
         return 1.0 - self.imaging.vignetting * square / square.max()
 
     def grey(self, fine: np.ndarray) -> np.ndarray:
-        """(H, W) without noise, of the cells' greys."""
+        """(H, W) greys without noise, from the greys of the cells `fine` (of `fine_shape`)."""
         width, height = self.camera.resolution
         grey = np.empty((height, width))
         shrink(fine, pixel_kernel(self.imaging.blur_px, self.cells, self.pad), self.cells, grey)
         return grey * (self.imaging.gain * self.falloff)
 
     def with_noise(self, grey: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
-        """Raises RigError where noise is wanted without a generator."""
+        """grey (H, W) with noise. Raises RigError if there is noise and rng is None."""
         if self.imaging.noise <= 0.0:
             return grey
         if rng is None:
@@ -126,7 +128,7 @@ class Optics:
 
 @dataclass(frozen=True, eq=False)
 class Renderer:
-    """Takes pictures with one camera. What the lens does to the rays is worked out once, at the first picture."""
+    """Renders images of sheets by one camera. The rays through the lens are computed once, for the first image."""
 
     camera: SimCamera
     imaging: Imaging = Imaging()
@@ -134,9 +136,9 @@ class Renderer:
     def picture(
         self, sheets: Sequence[Sheet], T_world_cam: np.ndarray, rng: np.random.Generator | None = None
     ) -> Picture:
-        """One image of `sheets` from T_world_cam (4, 4), or the mean over the poses (K, 4, 4) of an exposure.
+        """Image of `sheets` at the pose T_world_cam (4, 4), or the mean over the poses (K, 4, 4) of an exposure.
 
-        rng: where noise is wanted. Raises RigError where noise is wanted without one.
+        rng: needed for noise, else RigError is raised.
         """
         poses = np.asarray(T_world_cam, dtype=np.float64).reshape(-1, 4, 4)
         fine = np.zeros(self._optics.fine_shape, dtype=np.float32)
@@ -151,8 +153,8 @@ class Renderer:
 
     @cached_property
     def _rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Rays (h, w, 3) through the centres of the pixels and of those around the image, their derivatives by u and
-        by v, and (3, h, w, 3) the second ones, by uu, uv and vv."""
+        """Rays (h, w, 3) through the centres of the pixels, a margin of `Optics.pad` included; their derivatives by u
+        and by v, and second derivatives (3, h, w, 3) by uu, uv and vv."""
         width, height = self.camera.resolution
         pad = self._optics.pad
         u, v = np.meshgrid(np.arange(-pad - 1.0, width + pad + 1.0), np.arange(-pad - 1.0, height + pad + 1.0))
@@ -166,7 +168,7 @@ class Renderer:
         return middle, by_u, by_v, np.stack([by_uu, by_uv, by_vv])
 
     def _instant(self, sheets: Sequence[Sheet], T_world_cam: np.ndarray) -> np.ndarray:
-        """(H s, W s) greys from one pose, before blur, the border included."""
+        """Greys of the cells (shape `Optics.fine_shape`) at one pose, before blur."""
         fine = np.full(self._optics.fine_shape, self.imaging.background, dtype=np.float32)
         seen_from = [(sheet, np.linalg.inv(sheet.T_world_target) @ T_world_cam) for sheet in sheets]
         for sheet, T_sheet_cam in sorted(seen_from, key=lambda s: -_distance(*s)):
@@ -181,7 +183,7 @@ class Renderer:
         return fine
 
     def _truth(self, sheet: Sheet, poses: np.ndarray) -> SheetTruth:
-        """By the simulator's own projection, at each pose."""
+        """True image points of a sheet, by the simulator's projection, over the poses (K, 4, 4)."""
         R_world_target, p_world_target = sheet.T_world_target[:3, :3], sheet.T_world_target[:3, 3]
         world = sheet.target.points @ R_world_target.T + p_world_target
         points = (world - poses[:, None, :3, 3]) @ poses[:, :3, :3]
@@ -200,7 +202,8 @@ def _distance(sheet: Sheet, T_sheet_cam: np.ndarray) -> float:
 def exposure_poses(
     camera: SimCamera, trajectory: TrueTrajectory, seconds: float, exposure_s: float, count: int = 5
 ) -> np.ndarray:
-    """(count, 4, 4) T_world_cam at the middles of equal parts of an exposure about `seconds` of the IMU's clock."""
+    """(count, 4, 4) T_world_cam at the middles of `count` equal parts of an exposure of exposure_s [s], which is
+    centred on the instant `seconds` of the IMU's clock."""
     at = seconds + exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
     rotation, position, _ = trajectory.pose_at(at)
     T_world_imu = np.tile(np.eye(4), (count, 1, 1))

@@ -1,9 +1,10 @@
-"""Compiled: the light that each cell of a grid finer than the pixels receives from the surfaces of a room.
+"""Compiled ray casting in a room with textured surfaces.
 
-Each cell has the ray of its own middle. Tiles of the image are told first which faces they can see at all, by the
-planes of the pyramid through the tile; a cell then takes the nearest of these. Its light is that of the parallelogram
-that it covers on the surface: samples along the longer axis of its footprint, each from the two levels of the pyramid
-of averages whose texels are as large as the shorter axis (Heckbert 1989, McCormack et al. 1999).
+Each pixel is divided into cells, and a cell has the ray through its middle. The faces that a tile of the image can see
+are found first, by the planes of the pyramid through the tile; a cell takes the nearest of these. The light of a cell
+is the mean texture over its footprint, by anisotropic filtering. Samples lie along the longer axis of the footprint.
+Each sample interpolates the two mipmap levels with texels of about the length of the shorter axis (Heckbert 1989,
+McCormack et al. 1999).
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ from icalib.base.compiled import njit
 from icalib.tools.simulation.scenario.room import RoomSurfaces, ground
 from icalib.tools.simulation.scenario.texture import Atlas
 
-CELLS = 2  # a pixel, along each axis
-TILE = 16  # pixels
-_MOST_SAMPLES = 8  # of a cell, along its footprint's longer axis
+CELLS = 2  # per pixel, along each axis
+TILE = 16  # pixels along each axis
+_MOST_SAMPLES = 8  # per cell, along the longer axis of its footprint
 
 
 class PixelRays(NamedTuple):
-    """rays (h s, w s, 3) of the cells of h x w pixels, any length, NaN: none; by_u, by_v (h, w, 3): derivatives by a
-    pixel; sides (tiles down, tiles across, 4, 3): normals of each tile's pyramid, into it; zeros: it has no rays."""
+    """Rays of h x w pixels in the camera frame. rays (h s, w s, 3): of the cells, not normalised, NaN for none; by_u,
+    by_v (h, w, 3): derivatives per pixel; sides (tiles down, tiles across, 4, 3): inward normals of each tile's
+    pyramid, zeros for a tile without rays."""
 
     rays: np.ndarray
     by_u: np.ndarray
@@ -32,7 +34,7 @@ class PixelRays(NamedTuple):
 
 
 class Tone(NamedTuple):
-    """Greys of texture 0 and 1, and of where nothing is seen."""
+    """Grey levels of texture values 0 (black) and 1 (white), and of rays that meet nothing (background)."""
 
     black: float
     white: float
@@ -40,9 +42,10 @@ class Tone(NamedTuple):
 
 
 class VisibleFaces(NamedTuple):
-    """What is seen. faces (F, 15): plane n, d; a, a0, b, b0 of the place on the texture, X = a . p - a0, Y = b . p - b0
-    [texels]; its width and height; 1.0: a triangle. vertices (F, 4, 3), the last of a triangle twice. ground (4,):
-    X = g0 x + g1, Y = g2 y + g3 on the hills, whose texture is the last. surfaces: of the hills."""
+    """Surfaces for `light`. faces (F, 15): plane n, d; a, a0, b, b0 with the texture coordinates X = a . p - a0,
+    Y = b . p - b0 [texels]; width and height of the texture [texels]; 1.0 for a triangle, 0.0 for a parallelogram.
+    vertices (F, 4, 3) m, the last one of a triangle repeated. ground (4,): X = g0 x + g1, Y = g2 y + g3 on the hills,
+    whose texture is the last one. surfaces: has the hills."""
 
     faces: np.ndarray
     vertices: np.ndarray
@@ -53,8 +56,8 @@ class VisibleFaces(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def light(view, lens, tone, R, C, fine):
-    """Fills fine (h s, w s) with greys. R (s s, 3, 3), C (s s, 3): rotation and place of the camera in the world at the
-    instant at which cell (a, b) of each pixel, a s + b, takes its light."""
+    """Fills fine (h s, w s) with greys. R (s s, 3, 3), C (s s, 3): R_world_cam and camera position in the world [m].
+    Entry a s + b is at the instant of cell (a, b) of each pixel."""
     chosen = np.empty(len(view.vertices), dtype=np.int64)
     for row in range(lens.sides.shape[0]):
         for col in range(lens.sides.shape[1]):
@@ -66,7 +69,7 @@ def light(view, lens, tone, R, C, fine):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _faces_of_tile(view, sides, R, C, chosen):
-    """Fills `chosen` with the faces that the tile may see from any of the poses; how many they are."""
+    """Fills `chosen` with the numbers of the faces that the tile may see at any of the poses; returns their count."""
     count = 0
     plane = view.faces
     for f in range(len(plane)):
@@ -83,7 +86,7 @@ def _faces_of_tile(view, sides, R, C, chosen):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _reaches(vertices, sides, R, c):
-    """False where all vertices are on the outer side of one of the pyramid's planes."""
+    """False if all vertices are outside one plane of the tile's pyramid, so that the tile cannot show the face."""
     for k in range(4):
         x = R[0, 0] * sides[k, 0] + R[0, 1] * sides[k, 1] + R[0, 2] * sides[k, 2]
         y = R[1, 0] * sides[k, 0] + R[1, 1] * sides[k, 1] + R[1, 2] * sides[k, 2]
@@ -99,7 +102,7 @@ def _reaches(vertices, sides, R, c):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pixel(view, lens, tone, R, C, chosen, i, j, fine):
-    """The cells of one pixel; their footprint is worked out once for each face that they see."""
+    """Fills the cells of pixel (i, j); their footprint is computed once for each face that they see."""
     last, plan = -2, (0.0, 0.0, 0.0, 1)
     for a in range(CELLS):
         for b in range(CELLS):
@@ -137,8 +140,8 @@ def _turned(R, k, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _nearest(faces, chosen, c, d):
-    """Distance in units of d to the nearest of the chosen faces, its number, and the place on its texture [texels]; the
-    distance is infinite where there is none."""
+    """Distance along the ray c + t d to the nearest of the chosen faces, in units of d; number of the face, and texture
+    coordinates [texels]. The distance is infinite without a face."""
     best, hit, X, Y = np.inf, -1, 0.0, 0.0
     for m in range(len(chosen)):
         f = chosen[m]
@@ -159,7 +162,8 @@ def _nearest(faces, chosen, c, d):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _scale(view, face, x, y):
-    """The gradients of X and Y [texels/m], and the normal, of any length, at x, y."""
+    """Gradients of the texture coordinates X and Y [texels/m], and a normal, not normalised, of a face, or of the hills
+    at x, y if face is -1."""
     if face >= 0:
         f = view.faces
         return (
@@ -177,10 +181,10 @@ def _scale(view, face, x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _plan(scale, d, d_u, d_v, length):
-    """The longer axis of a cell's footprint (x, y) [texels], the level of the pyramid, and how many samples.
+    """Longer axis (x, y) of a cell's footprint [texels], mipmap level, and number of samples.
 
-    length: distance times the cell's width [px]. The footprint is the image of a square; its axes are the singular
-    values of the derivative.
+    scale: see `_scale`; d, d_u, d_v: ray and its derivatives; length: distance times the cell's width [px]. The
+    footprint is the image of a square; the lengths of its axes are the singular values of the derivative.
     """
     A, B, n = scale
     along = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
@@ -207,7 +211,7 @@ def _plan(scale, d, d_u, d_v, length):
 
 @njit(cache=True, nogil=True)
 def _level(width):
-    """Binary logarithm of a width above 1, straight between powers of 2; 0 of any below."""
+    """Binary logarithm of `width`, linearly interpolated between powers of 2; 0 for widths below 1."""
     level = 0.0
     while width >= 2.0:
         width *= 0.5
@@ -217,7 +221,7 @@ def _level(width):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mean(atlas, face, X, Y, plan):
-    """The mean over the footprint about X, Y [texels of level 0]."""
+    """Mean texture, 0 to 1, over the footprint `plan` about X, Y [texels of level 0]."""
     x, y, level, count = plan
     low = min(int(level), atlas.first.shape[1] - 1)
     high = min(low + 1, atlas.first.shape[1] - 1)
@@ -233,7 +237,7 @@ def _mean(atlas, face, X, Y, plan):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _between(atlas, face, level, X, Y):
-    """Bilinear among the four texels around X, Y [texels of level 0]."""
+    """Bilinear interpolation between the four texels of a level around X, Y [texels of level 0]."""
     W, H, first = atlas.width[face, level], atlas.height[face, level], atlas.first[face, level]
     shrunk = 1.0 / (1 << level)
     x, y = min(max(X * shrunk - 0.5, 0.0), W - 1.0), min(max(Y * shrunk - 0.5, 0.0), H - 1.0)

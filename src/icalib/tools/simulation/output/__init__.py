@@ -1,1 +1,1 @@
-"""How simulated recordings are written: messages in bags, and tables."""
+"""Writers of simulated recordings: messages in bags, and tables."""

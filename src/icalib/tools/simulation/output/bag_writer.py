@@ -1,4 +1,4 @@
-"""Messages of the sensors, and the bags that hold them, by rosbags (extra `bags`)."""
+"""Writes messages of sensors to bags, by rosbags (extra `bags`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IMAGE, IMU = "sensor_msgs/msg/Image", "sensor_msgs/msg/Imu"
 
 
 class BagWriter:
-    """A bag that is being written. topics: the type of each. `imu`, `image` and `make` make messages."""
+    """A bag that is being written. topics: message type by topic; `imu`, `image` and `make` create messages."""
 
     def __init__(self, form: BagForm, path: Path, topics: dict[str, str]) -> None:
         typesys = package("rosbags.typesys", "bags")
@@ -46,28 +46,28 @@ class BagWriter:
         self._writer.__exit__(kind, error, trace)
 
     def write(self, topic: str, message: Any, received_ns: int) -> None:
-        """received_ns: when the recorder received it, on the IMU's clock."""
+        """Writes a message; received_ns: instant of reception on the IMU's clock [ns]."""
         serialise = self._store.serialize_ros1 if self._ros1 else self._store.serialize_cdr
         self._writer.write(self._connections[topic], received_ns, serialise(message, self._topics[topic]))
 
     def image(self, stamp_ns: int, frame: str, pixels: np.ndarray) -> Any:
-        """pixels (H, W) uint8, as mono8."""
+        """Image message in mono8; pixels (H, W) uint8."""
         height, width = pixels.shape
         return self.make(IMAGE, self.header(stamp_ns, frame), height, width, "mono8", 0, width, pixels.ravel())
 
     def imu(self, stamp_ns: int, values: list[float]) -> Any:
-        """values: gyro, then accel; the orientation is not known."""
+        """Imu message; values (6): gyro [rad/s], accel [m/s^2]. Orientation and covariances are left unknown."""
         unknown, turn = np.zeros(9), self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
         w, f = (self.make("geometry_msgs/msg/Vector3", *v) for v in (values[:3], values[3:]))
         return self.make(IMU, self.header(stamp_ns, "imu0"), turn, unknown, w, unknown, f, unknown)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
-        """The header of a message."""
+        """Header of a message, with stamp and frame id."""
         stamp = self.make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000))
         return self.make("std_msgs/msg/Header", *([0] if self._ros1 else []), stamp, frame)
 
     def make(self, kind: str, *values: Any) -> Any:
-        """A message of type `kind`; values: of its fields, in their order."""
+        """A message of type `kind`; values: its fields, in the order of the definition."""
         return self._store.types[kind](*values)
 
 

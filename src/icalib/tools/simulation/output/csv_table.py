@@ -1,4 +1,4 @@
-"""Tables as text."""
+"""Writes CSV tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def write_table(path: Path, header: str, *columns: np.ndarray) -> None:
-    """A CSV whose numbers read back exactly. columns: (N,) or (N, k) each."""
+    """Writes a CSV file with all digits of its numbers. columns: arrays (N,) or (N, k)."""
     lists = [c.tolist() for column in columns for c in (column.T if column.ndim == 2 else [column])]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8") as file:
