@@ -1,1 +1,1 @@
-"""What is simulated: the rig, its motion, room and noise."""
+"""Description of a simulation: the rig, its motion, the room and the noise."""

@@ -1,4 +1,4 @@
-"""`effects` of a scenario: how real sensors and targets differ from the ideal. The format: docs/simulation.md."""
+"""Reads `effects` of a scenario file: errors of real sensors and targets. The format is in docs/simulation.md."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from icalib.base.yaml_nodes import YamlValue
 from icalib.tools.simulation.scenario.sensor import SimSensor, simulated_kinds
 
-# Field of the IMU -> where its numbers stand in `Scenario.imu_intrinsics`.
+# Field of the IMU -> indices of its numbers in `Scenario.imu_intrinsics`.
 _IMU = {
     "accel_scale": (0, 2, 5),
     "accel_misalignment": (1, 3, 4),
@@ -20,12 +20,12 @@ _IMU = {
     "gyro_rotation": (12, 13, 14),
     "g_sensitivity": tuple(range(15, 24)),
 }
-_LARGEST = 0.2  # of a relative error: the recording is that of another sensor
+_LARGEST = 0.2  # limit of a relative error, which no usable sensor exceeds
 
 
 def read_effects(value: YamlValue, sensors: Sequence[SimSensor]) -> dict[str, Any]:
-    """The fields of `Scenario` that effects change; `sensors`: those of the scenario file. Raises RigError naming file,
-    line and field."""
+    """The fields of `Scenario` that effects change, by name. value: the section; sensors: those of the scenario file.
+    Raises RigError naming file, line and field."""
     scales = {effect: (kind, field) for kind in simulated_kinds().values() for effect, field in kind.effects.items()}
     found, changed = value.record((), ("imu", "target_size", *scales)), {}
     if "imu" in found:
@@ -39,14 +39,14 @@ def read_effects(value: YamlValue, sensors: Sequence[SimSensor]) -> dict[str, An
 
 
 def _scaled(value: YamlValue, sensors: Sequence[SimSensor], kind: type[SimSensor], field: str) -> tuple[SimSensor, ...]:
-    """The same sensors, `field` of those of `kind` changed to the ratio that `value` states for their names."""
+    """The sensors, with `field` of those of `kind` set to the ratio that `value` gives for their names."""
     ratios = value.record((), tuple(s.name for s in sensors if isinstance(s, kind)))
     by_name = {name: _ratio(ratio) for name, ratio in ratios.items()}
     return tuple(replace(s, **{field: by_name[s.name]}) if s.name in by_name else s for s in sensors)
 
 
 def _intrinsics(value: YamlValue) -> np.ndarray:
-    """(24,) as in `Scenario`."""
+    """(24,) IMU intrinsics, in the order of `Scenario.imu_intrinsics`."""
     intrinsics = np.zeros(24)
     for name, numbers in value.record((), tuple(_IMU)).items():
         own = numbers.vector(len(_IMU[name]))

@@ -1,4 +1,4 @@
-"""Fields of a scenario file that several sections share."""
+"""Reads fields of a scenario file that several sections share."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ CLOCK_OPTIONS = ("time_offset", "phase")
 def mounted_fields(
     value: YamlValue, start_ns: int, required: tuple[str, ...] = (), options: tuple[str, ...] = ()
 ) -> tuple[dict[str, YamlValue], dict[str, Any]]:
-    """The section of a sensor that has the fields `required` and may have `options` beside those of all sensors on the
-    robot; and the latter by the names that they have in `SimSensor`. All clocks start at start_ns."""
+    """The section of a sensor on the robot. required, options: fields of its kind, beside those that all sensors have.
+    Returns all fields, and the values of the common ones by their names in `SimSensor`. start_ns: origin of all clocks
+    [ns]. Raises RigError naming file, line and field."""
     found = value.record(("type", *CLOCK, *required), (*CLOCK_OPTIONS, *options))
     common = {
         "T_imu_sensor": pose(found["T_imu_sensor"]),
@@ -54,7 +55,7 @@ def interval(value: YamlValue) -> tuple[float, float]:
 
 
 def triple(value: YamlValue) -> tuple[float, float, float]:
-    """Three positive lengths."""
+    """Three positive numbers."""
     sides = value.items()
     if len(sides) != 3:
         value.fail(f"must be a list of 3 numbers, but has {len(sides)}.")
@@ -62,7 +63,7 @@ def triple(value: YamlValue) -> tuple[float, float, float]:
 
 
 def pose(value: YamlValue) -> np.ndarray:
-    """4 x 4, its rotation made orthonormal."""
+    """(4, 4) pose, its rotation made orthonormal."""
     rows = value.items()
     if len(rows) != 4:
         value.fail(f"must be 4 rows of 4 numbers, but has {len(rows)}.")

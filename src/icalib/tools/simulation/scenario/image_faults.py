@@ -1,4 +1,4 @@
-"""What goes wrong with images: people who walk, changes of gain, repeated images, the robot itself, dirt."""
+"""Disturbances of images: walking people, changes of gain, repeated images, parts of the robot in view, dirt."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ import numpy as np
 
 from icalib.tools.simulation.scenario.texture import Texture, leaves
 
-_PART_TEXEL_M = 0.002  # a pixel of the robot's own part, as if seen from 0.9 m at a focal length of 460 px
-_DIRT_SIZE = (0.02, 0.06)  # standard deviation of a spot, share of the image's width
-_DIRT_DARK = (0.4, 0.9)  # share of the light lost in its middle
-_PART_STREAM, _DIRT_STREAM = 20_000, 20_001  # of random numbers
+_PART_TEXEL_M = 0.002  # width of a pixel on the part of the robot, as from 0.9 m at a focal length of 460 px
+_DIRT_SIZE = (0.02, 0.06)  # range of the standard deviation of a spot, relative to the image's width
+_DIRT_DARK = (0.4, 0.9)  # range of the fraction of light that is lost in the middle of a spot
+_PART_STREAM, _DIRT_STREAM = 20_000, 20_001  # numbers of random streams
 
 
 @dataclass(frozen=True)
 class ImageFaults:
-    """Of images of a room, by all cameras alike; instants are seconds on the IMU's clock, since its origin.
+    """Disturbances of the images of a room, the same for all cameras. Instants are seconds on the IMU's clock since its
+    origin.
 
-    people: how many walk before the first camera, 1.4 to 2.2 m away; one covers about an eighth of an image of 80 deg.
-    gain_steps: (instant, gain), from when on all light is multiplied by gain. frozen: (start, end), in which a camera
-    repeats the image before. robot_part: share of the image, from below, that a part of the robot hides. dirt: spots on
-    the lens.
+    people: number of people who walk in front of the first camera, at 1.4 to 2.2 m; one covers about an eighth of an
+    image of 80 deg. gain_steps: (instant, gain), from the instant on all light is multiplied by gain. frozen: (start,
+    end), in which cameras repeat the image before. robot_part: fraction of the image, from the bottom, that a part of
+    the robot hides. dirt: number of spots on the lens.
     """
 
     people: int = 0
@@ -37,22 +38,23 @@ class ImageFaults:
 
 @dataclass(frozen=True, eq=False)
 class CameraFaults:
-    """What stays in one camera's view. share (H, W): of the light that arrives; own (H, W): texture of what hides the
-    rest, 0 to 1, of the robot's part (H, W) bool. Each may be None: nothing."""
+    """Constant disturbances in the view of one camera. share (H, W): fraction of the light that passes the dirt; part
+    (H, W): fraction of each pixel that the robot covers; own (H, W): texture of the robot there, 0 to 1. None stands
+    for no disturbance."""
 
     share: np.ndarray | None = None
     part: np.ndarray | None = None
     own: np.ndarray | None = None
 
     def applied(self, grey: np.ndarray, black: float, white: float) -> np.ndarray:
-        """grey (H, W) as it arrives."""
+        """grey (H, W) with the part of the robot and the dirt; black, white: greys of texture 0 and 1."""
         if self.part is not None and self.own is not None:
             grey = grey + self.part * (black + (white - black) * self.own - grey)
         return grey if self.share is None else grey * self.share
 
 
 def faults_of(faults: ImageFaults, resolution: tuple[int, int], camera: int) -> CameraFaults:
-    """Of the camera of this number."""
+    """The constant disturbances of camera number `camera`; resolution: (width, height) px."""
     width, height = resolution
     share = part = own = None
     u, v = np.meshgrid(np.arange(width) / width, np.arange(height) / height)

@@ -1,4 +1,4 @@
-"""When a sensor measures, and what its own clock shows then."""
+"""Instants and stamps of a sensor's measurements."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from icalib.errors import RigError
 
-LEAD_S = 0.05  # sensors start and end this far inside the IMU's readings
+LEAD_S = 0.05  # sensors start this long after the IMU, and end this long before it
 
 
 class Clocked(Protocol):
-    """A simulated sensor with a clock of its own; see `SimCamera`."""
+    """A simulated sensor with a separate clock; the attributes are explained in `SimCamera`."""
 
     @property
     def name(self) -> str: ...
@@ -27,8 +27,8 @@ class Clocked(Protocol):
 
 
 def stamped(sensor: Clocked, end_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps (M,) int64 ns on the sensor's clock up to end_s, and the instants (M,) [s] on the IMU's that these stamps
-    mean. Raises RigError where there are fewer than two."""
+    """Stamps (M,) int64 [ns] on the sensor's clock of its measurements up to end_s, and their true instants (M,) [s] on
+    the IMU's clock since its origin. Raises RigError if there are fewer than two."""
     begin = LEAD_S + sensor.phase_s
     nominal = begin + np.arange(int((end_s - begin) * sensor.rate_hz + 1e-9) + 1) / sensor.rate_hz
     check_enough(sensor.name, nominal)
@@ -38,7 +38,7 @@ def stamped(sensor: Clocked, end_s: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_enough(name: str, instants: np.ndarray) -> None:
-    """Raises RigError where a sensor has fewer than two instants at which it measures."""
+    """Raises RigError if the sensor `name` has fewer than two instants of measurement."""
     if len(instants) < 2:
         raise RigError(
             f"{name} has fewer than two measurements in this time; make the scenario longer, or its rate higher."

@@ -1,4 +1,4 @@
-"""Functions of time with their derivatives: truncated Taylor series, so that no derivative is worked out by hand."""
+"""Functions of time with their derivatives, by arithmetic of truncated Taylor series (automatic differentiation)."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ Rows = tuple[Vector, Vector, Vector]  # a matrix, row by row
 
 @dataclass(frozen=True, eq=False)
 class Jet:
-    """c (K + 1, N): at each of N instants the coefficients f, f', f''/2, ... f^(K)/K!."""
+    """A function of time at N instants. c (K + 1, N): Taylor coefficients f, f', f''/2, ... f^(K)/K! at each."""
 
     c: np.ndarray
 
     @staticmethod
     def time(seconds: np.ndarray, order: int) -> Jet:
-        """t itself at seconds (N,), with derivatives up to `order`, at least 1."""
+        """The function t at seconds (N,), with derivatives up to `order`, at least 1."""
         c = np.zeros((order + 1, len(seconds)))
         c[0], c[1] = seconds, 1.0
         return Jet(c)
 
     def constant(self, value: float) -> Jet:
-        """A constant with as many instants and derivatives as this."""
+        """The constant function `value`, with the instants and the order of this one."""
         c = np.zeros_like(self.c)
         c[0] = value
         return Jet(c)
 
     def derivative(self) -> Jet:
-        """f', of one order less."""
+        """The derivative f', with an order lower by one."""
         return Jet(self.c[1:] * np.arange(1, len(self.c))[:, None])
 
     def shortened(self, order: int) -> Jet:
         return Jet(self.c[: order + 1])
 
     def at(self, order: int) -> np.ndarray:
-        """(N,) the derivative of `order`, up to 2."""
+        """(N,) derivative of order 0, 1 or 2 at each instant."""
         return self.c[order] * (1.0, 1.0, 2.0)[order]
 
     def __add__(self, other: Jet | float) -> Jet:
@@ -71,7 +71,7 @@ class Jet:
         return Jet(c)
 
     def sine_cosine(self) -> tuple[Jet, Jet]:
-        """From s' = c f' and c' = -s f', coefficient by coefficient."""
+        """sin(f) and cos(f), coefficient by coefficient from s' = c f' and c' = -s f'."""
         sine, cosine = np.empty_like(self.c), np.empty_like(self.c)
         sine[0], cosine[0] = np.sin(self.c[0]), np.cos(self.c[0])
         slope = self.derivative().c
@@ -82,7 +82,7 @@ class Jet:
 
 
 def _folded(a: np.ndarray, b: np.ndarray, terms: range, k: int) -> np.ndarray:
-    """(N,) sum of a[i] b[k - i] over the terms."""
+    """(N,) sum of a[i] b[k - i] over the indices i in `terms`."""
     total = np.zeros(a.shape[1])
     for i in terms:
         total += a[i] * b[k - i]
@@ -103,10 +103,10 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def values(vector: Vector, order: int) -> np.ndarray:
-    """(N, 3) the derivative of `order`."""
+    """(N, 3) derivative of order 0, 1 or 2 of a vector."""
     return np.stack([component.at(order) for component in vector], axis=1)
 
 
 def matrices(rows: Rows, order: int) -> np.ndarray:
-    """(N, 3, 3) the derivative of `order`."""
+    """(N, 3, 3) derivative of order 0, 1 or 2 of a matrix."""
     return np.stack([values(row, order) for row in rows], axis=1)

@@ -1,6 +1,7 @@
-"""Projection by each camera model that can be simulated, written so that complex points pass through.
+"""Projection by each camera model that can be simulated, written so that points may be complex.
 
-A direction in the image is then Im(project(P + i h d)) / h, exact to rounding: no Jacobian to get wrong.
+The derivative of the projection along a direction d is then Im(project(P + i h d)) / h, exact to rounding (complex-step
+differentiation). No Jacobian must be written by hand.
 """
 
 from __future__ import annotations
@@ -21,19 +22,20 @@ _COMPLEX_STEP = 1e-30
 
 
 def project(camera: SimCamera, points: np.ndarray) -> np.ndarray:
-    """Points (..., 3) in the camera frame [m] -> (..., 2) [px]; meaningful where `visible`."""
+    """Image points (..., 2) [px] of points (..., 3) in the camera frame [m]; meaningless unless `visible`."""
     fx, fy, cx, cy = camera.intrinsics
     x, y = _PROJECTIONS[camera.model](camera.distortion, points[..., 0], points[..., 1], points[..., 2])
     return np.stack([fx * x + cx, fy * y + cy], axis=-1)
 
 
 def image_velocity(camera: SimCamera, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """d/ds project(P + s d) at s = 0, (..., 2) [px per unit of s], by the complex step."""
+    """(..., 2) d/ds project(P + s d) at s = 0 [px per unit of s], by complex-step differentiation."""
     return np.imag(project(camera, points + 1j * _COMPLEX_STEP * directions)) / _COMPLEX_STEP
 
 
 def visible(camera: SimCamera, points: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(...,) bool: where the model has an image, before it folds back, and inside the picture."""
+    """(...,) bool: whether points (..., 3) are in the valid range of the model, and their projections uv (..., 2) are
+    inside the image."""
     seen = in_range(camera, np.hypot(points[..., 0], points[..., 1]), points[..., 2])
     width, height = camera.resolution
     u, v = uv[..., 0], uv[..., 1]
@@ -41,7 +43,8 @@ def visible(camera: SimCamera, points: np.ndarray, uv: np.ndarray) -> np.ndarray
 
 
 def in_range(camera: SimCamera, radius: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """(...,) bool: whether the model has an image, not folded back, of points at `radius` from the axis and depth z."""
+    """(...,) bool: whether points at distance `radius` from the optical axis and depth z are in the range in which the
+    model projects one-to-one."""
     d = camera.distortion
     if camera.model == "pinhole-radtan":
         return (z > 0.0) & (radius < _first_extremum(d[:2]) * z)
@@ -62,7 +65,8 @@ def in_range(camera: SimCamera, radius: np.ndarray, z: np.ndarray) -> np.ndarray
 
 
 def _shift_limit(shift: float) -> float:
-    """Cosine of the ray furthest behind a unit sphere that is seen from `shift` behind its centre, sign changed."""
+    """Negative cosine of the largest angle from the axis that is visible on the unit sphere from the point `shift`
+    behind its centre."""
     return min(shift, 1.0 / shift) if shift > 0.0 else 0.0
 
 
@@ -100,7 +104,7 @@ def _equidistant(
     """Kannala and Brandt: radius = theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9."""
     radius = np.sqrt(X * X + Y * Y)
     radius = np.where(radius == 0.0, 1e-300, radius)
-    # arctan2 has no complex form; the two branches keep its argument below one.
+    # NumPy's arctan2 takes no complex numbers; the two branches keep the argument of arctan below one.
     steep = np.real(radius) > np.abs(np.real(Z))
     theta = np.where(
         steep,
@@ -112,7 +116,8 @@ def _equidistant(
 
 
 def _eucm(distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Khomutenko: (alpha, beta), the depth a mean of z and of the distance in a space stretched across the axis."""
+    """EUCM of Khomutenko et al.: (alpha, beta). The depth is the mean, weighted by alpha, of the distance with x and y
+    scaled by sqrt(beta) and of z."""
     alpha, beta = distortion
     depth = alpha * np.sqrt(beta * (X * X + Y * Y) + Z * Z) + (1.0 - alpha) * Z
     return X / depth, Y / depth
@@ -121,13 +126,15 @@ def _eucm(distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.nda
 def _double_sphere(
     distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Usenko: (xi, alpha), the unified model (EUCM with beta = 1) after the points moved by xi times their distance."""
+    """Double sphere of Usenko et al.: (xi, alpha). Points are shifted along z by xi times their distance, and then
+    projected by the unified model (EUCM with beta = 1)."""
     xi, alpha = distortion
     return _eucm((alpha, 1.0), X, Y, Z + xi * np.sqrt(X * X + Y * Y + Z * Z))
 
 
 def _omni(distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mei: (xi, k1, k2, p1, p2), Brown's model after the points moved by xi times their distance."""
+    """Omnidirectional model of Mei: (xi, k1, k2, p1, p2). Points are shifted along z by xi times their distance, and
+    then projected by Brown's model."""
     return _radtan(distortion[1:], X, Y, Z + distortion[0] * np.sqrt(X * X + Y * Y + Z * Z))
 
 
@@ -142,8 +149,8 @@ _PROJECTIONS = {
 
 
 def _rational_limit(distortion: tuple[float, ...]) -> float:
-    """Smallest positive r where r N(r^2) / D(r^2) stops growing or has a pole, as polynomials in r; infinity if
-    nowhere."""
+    """Smallest positive r at which r N(r^2) / D(r^2) has an extremum or a pole, from the roots of polynomials in r;
+    infinity if there is none."""
     k1, k2, _, _, k3, k4, k5, k6 = distortion
     above = np.array([k3, 0.0, k2, 0.0, k1, 0.0, 1.0, 0.0])
     below = np.array([k6, 0.0, k5, 0.0, k4, 0.0, 1.0])
@@ -154,7 +161,7 @@ def _rational_limit(distortion: tuple[float, ...]) -> float:
 
 
 def _first_extremum(coefficients: tuple[float, ...]) -> float:
-    """Smallest positive r where r (1 + k1 r^2 + k2 r^4 + ...) stops growing; infinity if nowhere."""
+    """Smallest positive r at which r (1 + k1 r^2 + k2 r^4 + ...) has an extremum; infinity if there is none."""
     slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)]
     roots = np.roots([*reversed(slope), 1.0])
     squares = roots[(np.abs(roots.imag) < 1e-12) & (roots.real > 0.0)].real

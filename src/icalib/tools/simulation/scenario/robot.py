@@ -1,4 +1,4 @@
-"""The motion of a robot through a room, and the points that its cameras track."""
+"""Settings of a robot's motion through a room, and of the points that its cameras track."""
 
 from __future__ import annotations
 
@@ -33,20 +33,21 @@ GROUND: tuple[DriveKind, ...] = (
 
 @dataclass(frozen=True)
 class Drive:
-    """How a robot moves through its room.
+    """Motion of a robot through its room.
 
-    free: smooth in all six directions. single-axis: as free, but turning about `axis_imu` only. recorded: along a
-    spline through the poses in the file `path` (TUM or EuRoC), the middle of its extent moved above the middle of the
-    room. All others are those of a wheel frame on the floor, which has no lateral and no vertical velocity: planar and
-    ramps (curves, over the flat floor and over the room's hills), straight-line (back and forth without turning),
-    constant-velocity, arc (constant speed and turning rate), spin (turning in place, to and fro) and standing.
+    free: smooth, in all six degrees of freedom. single-axis: as free, but with rotation about `axis_imu` only.
+    recorded: along a spline through the poses in the file `path` (TUM or EuRoC), shifted so that the middle of its
+    extent is above the middle of the room. The others are motions of a wheel frame on the floor, without lateral and
+    vertical velocity. They are planar and ramps (curves, on the flat floor and on the room's hills), straight-line
+    (back and forth without rotation), constant-velocity, arc (constant speed and yaw rate), spin (rotation on the spot,
+    back and forth) and standing.
 
-    sideslip_deg turns a wheel frame on the floor out of the direction in which it moves, to and fro at 0.5 to 2 Hz by
-    up to that angle: wheels that slide sideways.
+    sideslip_deg: largest angle between the wheel frame's x axis and its velocity, which oscillates at 0.5 to 2 Hz:
+    lateral slip of the wheels.
 
-    With `exact`, the true trajectory is the exact integral of body rates and specific forces that are constant between
-    readings, the means of the two, steered along the closed form (of a wheel frame it keeps the wheels' law to the
-    error of steering: it slides by up to 1 mm/s, 0.2 mm/s RMS); otherwise readings sample the closed form.
+    exact: the true trajectory is the exact integral of angular rates and specific forces that are constant between
+    readings, with the mean of the two readings. Feedback keeps it near the closed form. A wheel frame then slips by up
+    to 1 mm/s (0.2 mm/s RMS). Without `exact`, readings sample the closed form.
     """
 
     kind: DriveKind = "free"
@@ -54,7 +55,7 @@ class Drive:
     axis_imu: tuple[float, float, float] = (0.0, 0.0, 1.0)
     path: Path | None = None
     sideslip_deg: float = 0.0
-    seed: int | None = None  # None: drawn anew for each seed of the simulation
+    seed: int | None = None  # of the motion; None: the seed of the simulation
 
     def __post_init__(self) -> None:
         if (self.kind == "recorded") != (self.path is not None):
@@ -62,18 +63,18 @@ class Drive:
 
     @property
     def on_ground(self) -> bool:
-        """Whether wheels that roll without slipping could do it."""
+        """Whether it is a motion of a wheel frame on the floor."""
         return self.kind in GROUND
 
 
 @dataclass(frozen=True)
 class Features:
-    """Points on the room's surfaces, and the front end that follows them.
+    """Points on the room's surfaces, and settings of the front end that tracks them.
 
-    The first `persistent` of `count` points keep their number; any other has a new number when no camera saw it
-    for 1.5 periods of the slowest camera, or after longest_track_s. A camera follows at most per_image points, none
-    further away than range_m. The points are those of `seed`, whatever the seed of the simulation; they lie off their
-    surfaces by relief_m (standard deviation).
+    The first `persistent` of `count` points keep their feature number. Other points get a new number if no camera saw
+    them for 1.5 periods of the slowest camera, or after longest_track_s. A camera tracks at most per_image points, none
+    further away than range_m [m]. seed: of the points, independent of the seed of the simulation. relief_m: standard
+    deviation of their distance from the surfaces.
     """
 
     count: int = 1500

@@ -1,4 +1,4 @@
-"""The room that a robot moves through: walls, floor and ceiling, boxes, ramps, hills, and where a ray meets them.
+"""The room of a robot (walls, floor, ceiling, boxes, ramps, hills), and intersections of rays with it.
 
 World frame: z up, the origin in the middle of the floor.
 """
@@ -17,14 +17,14 @@ from icalib.base.compiled import njit
 from icalib.errors import RigError
 from icalib.tools.simulation.scenario.texture import Texture
 
-_STEPS = 1000  # of a ray's march over hills; one that grazes them for longer meets nothing
-_CLOSE_M = 1e-9  # to the ground, where the march ends
+_STEPS = 1000  # most steps of a ray over hills; a grazing ray that needs more meets nothing
+_CLOSE_M = 1e-9  # height above the ground at which a ray has met it
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A box, or with `ramp` a wedge that rises from nothing to size z along its own x. center (x, y) [m] of its base,
-    size (x, y, z) [m], turned by yaw_rad about the vertical."""
+    """A box, or with `ramp` a wedge whose height rises from 0 to size z along its x axis. center (x, y) of its base
+    [m], size (x, y, z) [m]; yaw_rad: rotation about the vertical."""
 
     center: tuple[float, float]
     size: tuple[float, float, float]
@@ -34,7 +34,8 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class Hills:
-    """A floor z(x, y) = sum a_i sin(k_i . (x, y) + phase_i): amplitude (W,) [m], wave (W, 2) [rad/m], phase (W,)."""
+    """A floor z(x, y) = sum a_i sin(k_i . (x, y) + phase_i). amplitude (W,): a_i [m]; wave (W, 2): k_i [rad/m]; phase
+    (W,) [rad]."""
 
     amplitude: tuple[float, ...]
     wave: tuple[tuple[float, float], ...]
@@ -42,23 +43,23 @@ class Hills:
 
     @property
     def depth(self) -> float:
-        """The floor stays within +-depth [m]."""
+        """Bound of the floor's height: |z| <= depth [m]."""
         return float(np.abs(self.amplitude).sum())
 
     @property
     def steepest(self) -> float:
-        """No slope is above this (a tangent): that of all waves together, at the worst of their phases."""
+        """Bound of the slope (tangent): that of all waves at the worst combination of their phases."""
         slopes = np.array(self.amplitude)[:, None] * np.array(self.wave)
         signs = np.array(list(product((-1.0, 1.0), repeat=len(slopes))))
         return float(np.linalg.norm(signs @ slopes, axis=1).max())
 
     def height(self, xy: np.ndarray) -> np.ndarray:
-        """(N,) z at xy (N, 2)."""
+        """(N,) height z at xy (N, 2), all in m."""
         return np.sin(xy @ np.array(self.wave).T + self.phase) @ np.array(self.amplitude)
 
 
 def hills_of_slope(slope_deg: float) -> Hills:
-    """Three waves of 6.3, 4.2 and 2.9 m in different directions, of which no slope is above `slope_deg`."""
+    """Hills of three waves of 6.3, 4.2 and 2.9 m in different directions, with slopes up to `slope_deg`."""
     waves, phases = ((0.97, 0.24), (-0.45, 1.43), (1.6, -1.45)), (0.3, 1.9, 4.0)
     shares = np.array([0.5, 0.35, 0.15]) / np.linalg.norm(waves, axis=1)
     scale = np.tan(np.deg2rad(slope_deg)) / Hills(tuple(shares), waves, phases).steepest
@@ -66,8 +67,8 @@ def hills_of_slope(slope_deg: float) -> Hills:
 
 
 class RoomSurfaces(NamedTuple):
-    """What rays meet. Faces are parallelograms origin + s u + t v, 0 <= s, t <= 1, or triangles (s + t <= 1), seen
-    from the side that the normal points to. Of the hills: see `Hills`."""
+    """Surfaces for ray casting: F faces and W waves of `Hills`. Faces are parallelograms origin + s u + t v,
+    0 <= s, t <= 1, or triangles (s + t <= 1), visible from the side of the normal."""
 
     plane: np.ndarray  # (F, 4) n, d: n . p = d
     along: np.ndarray  # (F, 4) a, a0: s = a . p - a0
@@ -80,8 +81,8 @@ class RoomSurfaces(NamedTuple):
 
 @dataclass(frozen=True)
 class Room:
-    """size (x, y, z) [m]. With hills there is no flat floor, and all else reaches down below them. texture: what images
-    show of it."""
+    """A room. size (x, y, z) [m]; blocks: boxes and ramps; hills: replace the flat floor, walls and blocks then reach
+    below them; texture: of all surfaces in images. Raises RigError if a block does not fit into the room."""
 
     size: tuple[float, float, float] = (12.0, 10.0, 3.2)
     blocks: tuple[Obstacle, ...] = ()
@@ -98,12 +99,13 @@ class Room:
 
     @property
     def base(self) -> float:
-        """Where walls and blocks begin [m]."""
+        """Height of the lower end of walls and blocks [m]."""
         return -self.hills.depth if self.hills else 0.0
 
     @cached_property
     def faces(self) -> np.ndarray:
-        """(F, 4, 3): origin, u, v and (1, 0, 0) of a triangle or zeros; u x v points into the open."""
+        """(F, 4, 3): origin, edges u and v [m], and (1, 0, 0) for a triangle or zeros. u x v points to the visible
+        side."""
         x, y, z = self.size
         low = np.array([-0.5 * x, -0.5 * y, self.base])
         ex, ey, ez = np.diag([x, y, z - self.base])
@@ -113,7 +115,7 @@ class Room:
 
     @property
     def planes(self) -> np.ndarray:
-        """(F, 4): normal, into the open, and d [m] of each face; n . p = d on it."""
+        """(F, 4): normal n, towards the visible side, and d [m] of each face, on which n . p = d."""
         return _with_offset(_normals(self.faces), self.faces[:, 0])
 
     @cached_property
@@ -121,7 +123,7 @@ class Room:
         return self.surfaces_with(np.empty((0, 4, 3)))
 
     def surfaces_with(self, others: np.ndarray) -> RoomSurfaces:
-        """The room's, and faces (n, 4, 3) of what else is in it."""
+        """Surfaces of the room and of further faces (n, 4, 3), in the form of `faces`."""
         faces = np.concatenate([self.faces, others])
         origin, u, v, mark = np.moveaxis(faces, 1, 0)
         normal = _normals(faces)
@@ -138,13 +140,13 @@ class Room:
         )
 
     def faces_of(self, blocks: Sequence[Obstacle]) -> np.ndarray:
-        """(n, 4, 3), as `faces`, of blocks that stand in it."""
+        """(n, 4, 3) faces of blocks in the room, in the form of `faces`."""
         found = [face for b in blocks for face in (_ramp if b.ramp else _box)(b, self.base)]
         return np.array(found).reshape(-1, 4, 3)
 
     def points(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """(count, 3) points spread over all surfaces by area, hills as if they were flat, and the surfaces' normals
-        there, upwards on hills."""
+        """Random points (count, 3) m, uniform over the area of all surfaces, and normals (count, 3) of the surfaces.
+        Hills have the area of a flat floor, and the normal (0, 0, 1)."""
         u, v, triangle = self.faces[:, 1], self.faces[:, 2], self.faces[:, 3, 0] > 0.0
         area = np.linalg.norm(np.cross(u, v), axis=1) * np.where(triangle, 0.5, 1.0)
         ground = self.size[0] * self.size[1] if self.hills else 0.0
@@ -167,7 +169,7 @@ def _normals(faces: np.ndarray) -> np.ndarray:
 
 
 def _with_offset(directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(F, 4): each direction (F, 3) with its product with the origin (F, 3)."""
+    """(F, 4): directions (F, 3), each followed by its scalar product with the origin (F, 3)."""
     return np.column_stack([directions, np.sum(directions * origin, axis=1)])
 
 
@@ -175,7 +177,7 @@ Face = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def _placed(block: Obstacle, base: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The lowest corner of a block, and its edges along its own x, y and z."""
+    """A lower corner of a block (3,) m, and its edges along the block's x, y and z axes."""
     c, s = np.cos(block.yaw_rad), np.sin(block.yaw_rad)
     ex, ey = block.size[0] * np.array([c, s, 0.0]), block.size[1] * np.array([-s, c, 0.0])
     ez = np.array([0.0, 0.0, block.size[2] - base])
@@ -201,7 +203,8 @@ def _ramp(block: Obstacle, base: float) -> list[Face]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest(surfaces, px, py, pz, dx, dy, dz):
-    """Distance t in units of d, and the face that p + t d meets first, -1: the hills. t = inf or NaN: nothing."""
+    """First intersection of the ray p + t d: t, and the number of the face, -1 for the hills. t is inf or NaN if the
+    ray meets nothing."""
     best, hit = np.inf, -1
     plane, along, across = surfaces.plane, surfaces.along, surfaces.across
     for f in range(len(plane)):
@@ -225,11 +228,11 @@ def nearest(surfaces, px, py, pz, dx, dy, dz):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def ground(surfaces, px, py, pz, dx, dy, dz, limit):
-    """t at which the ray meets the hills before `limit`, else inf; NaN where it takes too many steps.
+    """t < limit at which the ray p + t d meets the hills, else inf; NaN if it takes too many steps.
 
-    The height above the ground has a second derivative of at most `bend` along the ray. Each step ends where a parabola
-    of that curvature would meet the ground first: it never passes through, and near the end it is Newton's. A ray that
-    leaves from the ground does not meet it there.
+    The second derivative of the height above the ground along the ray is at most `bend`. Each step ends where a
+    parabola of this curvature would first meet the ground. It thus never passes through the ground, and converges like
+    Newton's method. A ray that starts on the ground and leaves it does not meet it there.
     """
     bend, highest = 0.0, 0.0
     for w in range(len(surfaces.amplitude)):
@@ -258,7 +261,8 @@ def ground(surfaces, px, py, pz, dx, dy, dz, limit):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def distances(surfaces, origins, directions, found):
-    """found (N,): distance, in units of each direction (N, 3), to what is met first from origins (N, 3)."""
+    """Fills found (N,) with the distance from origins (N, 3) to the first surface along directions (N, 3), in units of
+    each direction; inf or NaN if there is none."""
     for i in range(len(origins)):
         p, d = origins[i], directions[i]
         found[i], _ = nearest(surfaces, p[0], p[1], p[2], d[0], d[1], d[2])

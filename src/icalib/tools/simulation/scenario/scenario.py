@@ -1,4 +1,4 @@
-"""What to simulate: the rig's truth, the motion and every disturbance, as frozen dataclasses."""
+"""Description of a simulation, as frozen dataclasses: true rig, motion and all disturbances."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ _EUROC_T_IMU_CAM1 = (
 
 
 def _standing_board() -> np.ndarray:
-    """T_world_board: y nearly up, the tags facing -y of the world, yawed, leaning and rolled by a few degrees."""
+    """(4, 4) T_world_board of an almost upright board: its y nearly up, the tags facing -y of the world, yawed by 25
+    deg, leaning and rolled by a few degrees."""
     yaw, lean, roll = np.deg2rad([25.0, 6.0, 3.0])
     stand = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
@@ -63,13 +64,13 @@ def _standing_board() -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SimCamera:
-    """One true camera.
+    """A simulated camera, with its true parameters.
 
-    Image i is taken at phase_s + i / rate_hz (IMU clock), and stamped by the camera's own clock so that
-    t_imu = t_cam + time_offset_s, both counted from their clock's origin; stamps are rounded to ns, and the truth is
-    evaluated at the rounded stamp. intrinsics are (fx, fy, cx, cy) [px]. bloom_px moves each corner towards its
-    tag's centre, along the image direction of that centre at the corner. No target is seen during `dropouts`.
-    Raises RigError for an unknown model.
+    Image i is taken at phase_s + i / rate_hz on the IMU's clock, and stamped by the camera's clock. Its stamp follows
+    from t_imu = t_cam + time_offset_s, each since the origin of its clock. Stamps are rounded to ns, and the truth is
+    evaluated at the rounded stamp. intrinsics: fx, fy, cx, cy [px]. bloom_px: edge bloom, which moves each corner in
+    the image towards the centre of its tag. dropouts: there are no images in these intervals. Raises RigError for an
+    unknown model.
     """
 
     name: str
@@ -104,12 +105,13 @@ class SimCamera:
 
 @dataclass(frozen=True)
 class HandheldMotion:
-    """How the rig moves in front of the board: sums of sinusoids around a pose `distance_m` in front of its centre.
+    """Motion of the rig in front of the board: sums of sinusoids about a pose `distance_m` in front of its centre.
 
-    handheld: all axes. planar: yaw about the world's z and translation in its x and y. single_axis: rotation about
-    `axis_imu` only, translation in all axes. motionless: none. The scales multiply the amplitudes of about 1.1 rad/s
-    and 4.7 m/s^2 RMS. With `exact`, the true trajectory is the exact integral of body rates and specific forces that
-    are constant between readings, the means of the two; otherwise readings sample a trajectory in closed form.
+    handheld: all axes. planar: yaw about the world's z, and translation along its x and y. single_axis: rotation about
+    `axis_imu` only, translation along all axes. motionless: none. rotation_scale, translation_scale: factors on the
+    amplitudes, which give about 1.1 rad/s and 4.7 m/s^2 RMS. exact: the true trajectory is the exact integral of
+    angular rates and specific forces that are constant between readings, with the mean of the two readings. Without
+    `exact`, readings sample a trajectory in closed form.
     """
 
     kind: MotionKind = "handheld"
@@ -118,25 +120,25 @@ class HandheldMotion:
     rotation_scale: float = 1.0
     translation_scale: float = 1.0
     axis_imu: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    seed: int | None = None  # None: drawn anew for each seed of the simulation
+    seed: int | None = None  # of the motion; None: the seed of the simulation
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """Everything that `simulate` needs but the seed.
+    """All inputs of `simulate` but the seed.
 
-    T_world_bodies (bodies, 4, 4): where the bodies of a target of several stand; T_world_board is then what the motion
-    faces, and no board. None: the target is one body, at T_world_board. Bodies do not hide each other.
+    T_world_bodies (bodies, 4, 4): poses of the bodies of a target with several bodies; T_world_board is then only the
+    pose that the motion faces. None: the target is one body, at T_world_board. Bodies do not hide each other.
 
     imu_intrinsics (24,), Kalibr's scale-misalignment model: w_m = M_g C_g w + A_g f + b_g, a_m = M_a f + b_a, with
     M_a - I and M_g - I lower triangular (xx, yx, yy, zx, zy, zz), C_g = Exp(rotation vector), A_g row-major; in the
-    order M_a, M_g, C_g, A_g. bow (3,) [m]: the points of a body that bends lie at z = a x^2 + b x y + c y^2, with x
-    and y from -1 to 1 over its extent. Corner noise has sigma^2 = corner_noise_px^2 + (blur_s * image speed)^2, the
-    image speed being the RMS of its corners' in px/s; shift_px is the sigma of a 2D shift that all corners of an
-    image share. target_size: true lengths of the target over those that it states. Outliers are moved by up to
-    +-outlier_px on each axis.
+    order M_a, M_g, C_g, A_g. bow (3,) [m]: a, b, c of the shape z = a x^2 + b x y + c y^2 of a body that bends, with x
+    and y from -1 to 1 over its extent. Corner noise has sigma^2 = corner_noise_px^2 + (blur_s * image speed)^2, with
+    the RMS image speed of the corners of an image [px/s]. shift_px: sigma of a 2D shift that all corners of an image
+    share. target_size: true over stated length of the target. outlier_fraction: of the corners, which are moved by up
+    to +-outlier_px on each axis.
 
-    Raises RigError where bodies have no pose, or its parts do not go together.
+    Raises RigError if a body has no pose, or if motion, room and sensors are incompatible.
     """
 
     cameras: tuple[SimCamera, ...]
@@ -167,7 +169,7 @@ class Scenario:
     sensors: tuple[SimSensor, ...] = ()  # beside IMU and cameras
     image_faults: ImageFaults = ImageFaults()
     robot_noise_enabled: bool = True  # of tracks, and of `sensors`
-    seed: int = 0  # where none is asked for
+    seed: int = 0  # default seed of the simulation
 
     def __post_init__(self) -> None:
         _check_robot(self)
@@ -188,17 +190,17 @@ class Scenario:
         return *self.cameras, *self.sensors
 
     def of(self, kind: type[Kind]) -> tuple[Kind, ...]:
-        """The sensors of one kind."""
+        """The sensors of one kind, without cameras."""
         return tuple(sensor for sensor in self.sensors if isinstance(sensor, kind))
 
     def with_sensors(self, *sensors: SimSensor) -> Scenario:
-        """The same scenario with these `sensors`: in place of those of the same names, or beside the others."""
+        """The scenario with these `sensors`; they replace sensors of the same name."""
         named = {sensor.name: sensor for sensor in (*self.sensors, *sensors)}
         return replace(self, sensors=tuple(named.values()))
 
 
 def _check_robot(scenario: Scenario) -> None:
-    """Raises RigError where the parts of a scenario do not go together."""
+    """Raises RigError if motion, room and sensors of a scenario are incompatible."""
     drive, room = (scenario.motion if isinstance(scenario.motion, Drive) else None), scenario.room
     if (drive or scenario.features) and room is None:
         raise RigError("drives and features need a room; give the scenario one.")
@@ -217,7 +219,8 @@ def handheld(
     exact: bool = True,
     noiseless: bool = False,
 ) -> Scenario:
-    """The EuRoC sensor unit (two radtan cameras at 20 Hz, ADIS16448 at 200 Hz) waved in front of its AprilGrid.
+    """The EuRoC sensor unit (two radtan cameras at 20 Hz, ADIS16448 at 200 Hz), moved by hand in front of its
+    AprilGrid.
 
     asynchronous: cam1 takes its images half a period after cam0. imu "noisy": ten times the data sheet's densities.
     exact: see `HandheldMotion`. noiseless: neither corners nor IMU have noise, but `rig_for` still states the sigmas.
@@ -235,7 +238,7 @@ def handheld(
 
 
 def _euroc_cameras(phase_s: float) -> tuple[SimCamera, SimCamera]:
-    """Both cameras of the EuRoC sensor unit; phase_s [s]: by which cam1 takes its images after cam0."""
+    """Both cameras of the EuRoC sensor unit; phase_s: delay of cam1's images after those of cam0 [s]."""
     cam0 = SimCamera(
         "cam0",
         "pinhole-radtan",

@@ -1,4 +1,4 @@
-"""scenario.yaml -> Scenario. The format: docs/simulation.md."""
+"""Reads a scenario file; its format is described in docs/simulation.md."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from icalib.tools.simulation.scenario.size import refuse_large
 from icalib.tools.simulation.scenario.texture import Texture
 
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
-_START_NS = 1_700_000_000_000_000_000  # of all clocks, where the file gives none
-_MARGIN_S = 3600.0  # by which clocks of sensors may differ
+_START_NS = 1_700_000_000_000_000_000  # origin of all clocks if the file gives none
+_MARGIN_S = 3600.0  # largest difference between clocks of sensors
 _STEEPEST_DEG = 45.0
 
 Made = TypeVar("Made")
 
 
 def load_scenario(path: str | Path) -> Scenario:
-    """Read a scenario file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
+    """Reads a scenario file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
     root = read_yaml(Path(path), "scenario file")
     found = root.record(
         ("duration", "sensors", "room", "motion"), ("effects", "features", "target", "images", "seed", "start_ns")
@@ -70,7 +70,7 @@ def load_scenario(path: str | Path) -> Scenario:
 
 
 def _made(value: YamlValue, kind: Callable[..., Made], /, **fields: Any) -> Made:
-    """A `kind` of these fields; a RigError names the place of `value`."""
+    """kind(**fields); a RigError is raised again with file, line and field of `value`."""
     try:
         return kind(**fields)
     except RigError as error:
@@ -78,7 +78,7 @@ def _made(value: YamlValue, kind: Callable[..., Made], /, **fields: Any) -> Made
 
 
 def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
-    """The fields of `Scenario` that the sensors fill."""
+    """The fields of `Scenario` that the section `sensors` sets, by name."""
     kinds = simulated_kinds()
     types = tuple(kind for kind in SENSOR_KINDS if kind in kinds or kind in ("imu", "camera"))
     imus: list[dict[str, Any]] = []
@@ -194,7 +194,7 @@ def _motion(value: YamlValue, folder: Path) -> Drive:
 
 
 def _board(value: YamlValue) -> dict[str, Any]:
-    """The fields of `Scenario` that say which target there is, and its pose."""
+    """The fields of `Scenario` for the target and its pose, by name."""
     fields = value.entries()
     if "type" not in fields:
         value.fail(f"type is missing; add type: {', type: '.join(TARGETS)}.")

@@ -1,6 +1,6 @@
-"""Simulated sensors on the robot beside its IMU and its cameras: the base class of all kinds.
+"""Base class of simulated sensors other than IMU and cameras.
 
-Each kind has its own class in `icalib.sensors.KIND.simulate`, under the name `SIMULATED`.
+The class of a kind is `icalib.sensors.KIND.simulate.SIMULATED`.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from icalib.tools.simulation.scenario.robot import Drive
 from icalib.tools.simulation.scenario.room import Room
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 
-BagEvent = tuple[int, Callable[[BagWriter], Any]]  # when it is received, on the IMU's clock [ns]; what makes it
+BagEvent = tuple[int, Callable[[BagWriter], Any]]  # instant of reception on the IMU's clock [ns]; maker of the message
 
 
 @dataclass(frozen=True, eq=False)
 class SimScene:
-    """What sensors measure. imu_seconds (N,): instants of the IMU's readings, on its clock. noisy: whether sensors have
-    noise."""
+    """The world that sensors measure. trajectory: of the IMU; imu_seconds (N,): instants of its readings on its clock
+    since the origin; noisy: whether sensors have noise."""
 
     trajectory: TrueTrajectory
     imu_seconds: np.ndarray
@@ -38,7 +38,7 @@ class SimScene:
 
 
 class Report(NamedTuple):
-    """What a sensor measured, as a stream of `Measurements`, and the same without noise, in the form of its kind."""
+    """Measurements of a sensor, and their truth (without noise), in a class of its kind."""
 
     stream: Stream
     truth: Any = None
@@ -46,7 +46,7 @@ class Report(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BagTopic:
-    """The messages of one sensor. message: their type. events: in the order in which they are received."""
+    """The messages of one sensor. name: of the topic; message: their type; events: in order of reception."""
 
     name: str
     message: str
@@ -55,15 +55,15 @@ class BagTopic:
 
 @dataclass(frozen=True, eq=False)
 class SimSensor(ABC):
-    """One true sensor that is rigidly mounted beside the IMU, with a clock of its own.
+    """A simulated sensor that is rigidly mounted to the IMU and has a separate clock.
 
     T_imu_sensor (4, 4): p_imu = T_imu_sensor p_sensor. Measurement i is taken at phase_s + i / rate_hz on the IMU's
-    clock, and stamped by the sensor's clock, as images of `SimCamera` are.
+    clock, and stamped by the sensor's clock, as images of `SimCamera`.
 
-    Of a kind: sensor_type, as in the rig file; random_stream, number of the first sensor's stream of random numbers, by
-    at least 1000 apart from those of other kinds; measures, what its measurements are called; rolls, whether its frame
-    is what rolls on the floor where the motion is one on the ground; effects, fields that `effects` of a scenario file
-    change: name in the file -> name of the field, a ratio of true over stated lengths.
+    Class variables: sensor_type, as in the rig file; random_stream, number of the first sensor's random stream, at
+    least 1000 apart from those of other kinds; measures, noun for its measurements in messages; rolls, whether its
+    frame is the wheel frame of motions on the ground; effects, name in the section `effects` of a scenario file -> name
+    of the field that it sets, a ratio of true to stated length.
     """
 
     sensor_type: ClassVar[str]
@@ -82,15 +82,15 @@ class SimSensor(ABC):
     @classmethod
     @abstractmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimSensor:
-        """The sensor as a scenario file states it, all clocks starting at start_ns. Raises RigError naming file, line
-        and field."""
+        """The sensor from its section `value` of a scenario file; start_ns: origin of all clocks. Raises RigError
+        naming file, line and field."""
 
     def check(self, room: Room | None, drive: Drive | None) -> None:  # noqa: B027 - most kinds need nothing
-        """Raises RigError where it cannot measure in this room, or on this motion (None: handheld)."""
+        """Raises RigError if the sensor cannot measure in this room, or on this motion (None: handheld)."""
 
     @property
     def points(self) -> int:
-        """Points of one measurement; 0 where a measurement is a few numbers."""
+        """Number of points of one measurement; 0 for a sensor without points."""
         return 0
 
     def values(self) -> dict[str, np.ndarray]:
@@ -98,32 +98,34 @@ class SimSensor(ABC):
         return {}
 
     def drawn_values(self, rng: np.random.Generator, relative_error: float) -> dict[str, np.ndarray]:
-        """Guesses of `values`, drawn about the truth; relative_error: standard deviation of a factor."""
+        """Initial guesses of `values`, drawn about the truth; relative_error: standard deviation relative to the
+        value."""
         return {}
 
     def plain(self) -> dict[str, Any]:
-        """Its entries in truth.yaml, except type, extrinsics and time offset."""
+        """The sensor's entries in truth.yaml, except type, extrinsics and time offset."""
         return {}
 
     @abstractmethod
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
-        """What it measures; `seed` is that of its random numbers. Raises RigError where it measures less than twice."""
+        """Simulates the measurements; seed: of the sensor's random numbers. Raises RigError if there are fewer than two
+        measurements."""
 
     @abstractmethod
     def rig_entry(self) -> Sensor:
-        """The sensor as a user would write it in the rig, noise as simulated, with nothing known of its parameters."""
+        """The sensor as a user would write it in the rig, with the simulated noise and without known parameters."""
 
     @abstractmethod
     def write_table(self, folder: Path, stream: Any) -> None:
-        """Writes what it reported into its folder, to the path that `rig_entry` states."""
+        """Writes the measurements to the sensor's folder, as a table with the path in `rig_entry`."""
 
     @abstractmethod
     def bag_topic(self, stream: Any, offset_ns: int) -> BagTopic | str:
-        """The messages that its driver would send, or a sentence where there are none. offset_ns: what is to be added
-        to its stamps to get the IMU's."""
+        """The messages that the sensor's driver would send, or a sentence if it has none. offset_ns: to be added to the
+        sensor's stamps to get the IMU's clock [ns]."""
 
 
 def simulated_kinds() -> dict[str, type[SimSensor]]:
-    """The class of each kind by its type in the rig file, in the order of `SENSOR_KINDS`."""
+    """Classes of simulated sensors by their type in the rig file, in the order of `SENSOR_KINDS`."""
     modules = {kind: facet(kind, "simulate") for kind in SENSOR_KINDS}
     return {kind: module.SIMULATED for kind, module in modules.items() if module is not None}

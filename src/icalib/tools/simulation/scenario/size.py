@@ -1,4 +1,4 @@
-"""Refuses scenarios that measure more than fits in memory: the simulator holds all readings at once."""
+"""Refuses scenarios whose measurements do not fit in memory: the simulator keeps all of them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from math import ceil
 from icalib.errors import RigError
 from icalib.tools.simulation.scenario.scenario import Scenario
 
-# Of all sensors together. Either takes about 1 GB with intermediate arrays; twice the number takes twice the memory.
+# Limits for all sensors together. Each corresponds to about 1 GB with intermediate arrays; memory is proportional.
 MOST_INSTANTS = 5_000_000  # readings, images and scans: an IMU at 200 Hz for 7 h
 MOST_POINTS = 100_000_000  # corners, tracked points and points of scans: 16 rings of 1800 steps at 8 Hz for 7 min
-_LARGEST_COUNT = 1e18  # larger ones are cut to it, so that products stay finite
+_LARGEST_COUNT = 1e18  # larger counts are clipped, so that products stay finite
 
 
 @dataclass(frozen=True)
 class _Rate:
-    """How often a sensor measures, and how many points each time; `instants` and `points` are what these are called."""
+    """Amount of measurements of a sensor. rate_hz: measurements per second; count: points per measurement; instants,
+    points: nouns for the two in messages."""
 
     name: str
     rate_hz: float
@@ -27,7 +28,7 @@ class _Rate:
 
 
 def refuse_large(scenario: Scenario) -> None:
-    """Raises RigError, naming the largest sensor, if all together exceed `MOST_INSTANTS` or `MOST_POINTS`."""
+    """Raises RigError, naming the largest sensor, if all sensors together exceed `MOST_INSTANTS` or `MOST_POINTS`."""
     rates = list(_rates(scenario))
     instants = [min(r.rate_hz * scenario.duration_s, _LARGEST_COUNT) for r in rates]
     points = [n * r.count for n, r in zip(instants, rates, strict=True)]
@@ -36,7 +37,8 @@ def refuse_large(scenario: Scenario) -> None:
 
 
 def _refuse(counts: list[float], names: list[tuple[str, str]], of_all: str, most: int) -> None:
-    """counts: of each sensor; names: its name, and what it measures."""
+    """Raises RigError if the sum of `counts` exceeds `most`. counts: of each sensor; names: its name, and the noun for
+    what is counted; of_all: noun for all sensors."""
     total = sum(counts)
     if total <= most:
         return
@@ -49,7 +51,7 @@ def _refuse(counts: list[float], names: list[tuple[str, str]], of_all: str, most
 
 
 def _words(count: float) -> str:
-    """All digits of counts near the limits: rounded ones would look as large as the limits."""
+    """The count as text, with all digits below 1e9: rounded, counts near a limit would look equal to it."""
     return f"{ceil(count):,}" if count < 1e9 else f"{count:.2g}"
 
 

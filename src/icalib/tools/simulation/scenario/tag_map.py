@@ -1,4 +1,4 @@
-"""Tags on two walls and the floor of a room's corner, with or without a grid, and a rig waved in front of them."""
+"""Scenario with tags on two walls and the floor of a room's corner, and a handheld rig in front of them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from icalib.tools.simulation.scenario.scenario import Scenario, handheld
 
 _TAGS = Markers("tag36h11", 0.16, tuple(range(40, 76, 3)))
 _GRID = AprilGrid(3, 3, 0.1, 0.3)  # ids 0 to 8
-# Columns: x, y and normal of a surface in world. The walls are the planes x = 0 and y = 0, the floor is z = 0.
+# Rotations R_world_surface: columns are x, y and normal of a surface. Walls are the planes x = 0 and y = 0; the floor
+# is z = 0.
 _WALLS_AND_FLOOR = np.array([[(0, 0, 1), (1, 0, 0), (0, 1, 0)], [(-1, 0, 0), (0, 0, 1), (0, 1, 0)], np.eye(3)])
-# Where the middle of each tag is on its surface [m], and how the tag is turned there, against the clock [deg].
+# x, y of the middle of each tag on its surface [m], and its counter-clockwise rotation [deg].
 _PLACES = (
     ((0.20, 0.70, 4.0), (0.50, 0.30, 90.0), (0.45, 0.95, -12.0), (0.95, 1.05, 0.0)),
     ((-0.25, 0.40, -3.0), (-0.65, 0.30, 25.0), (-0.50, 0.85, 178.0), (-1.00, 0.65, 0.0)),
@@ -23,8 +24,8 @@ _GRID_PLACE = (1.00, 0.55, -15.0)  # on the first wall
 
 
 def tag_map(duration_s: float = 20.0, exact: bool = True, noiseless: bool = False, with_grid: bool = False) -> Scenario:
-    """The rig of `handheld`, waved 1.7 m in front of a room's corner with twelve tags of 0.16 m, each image showing at
-    least 3 of them. with_grid: the target is a scene of these `tags` and a `grid`."""
+    """The rig of `handheld`, moved by hand 1.7 m in front of a room's corner with twelve tags of 0.16 m. Each image
+    shows at least 3 tags. with_grid: the target is a scene of these tags ("tags") and an AprilGrid ("grid")."""
     T_world_bodies = np.stack([_pose(_TAGS, i, *place) for i in range(3) for place in _PLACES[i]])
     target: Target = _TAGS
     if with_grid:
@@ -36,7 +37,8 @@ def tag_map(duration_s: float = 20.0, exact: bool = True, noiseless: bool = Fals
 
 
 def _pose(sheet: Target, surface: int, x: float, y: float, turn_deg: float) -> np.ndarray:
-    """(4, 4) T_world_body of a sheet whose middle is at x, y of a surface, turned in its plane against the clock."""
+    """(4, 4) T_world_body of a sheet whose middle is at x, y of a surface [m], rotated in its plane counter-clockwise
+    by turn_deg."""
     c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
     T = np.eye(4)
     T[:3, :3] = _WALLS_AND_FLOOR[surface] @ [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
@@ -45,7 +47,7 @@ def _pose(sheet: Target, surface: int, x: float, y: float, turn_deg: float) -> n
 
 
 def _faced() -> np.ndarray:
-    """(4, 4): what the motion faces, in front of the room's corner, its z into the room and somewhat up."""
+    """(4, 4) pose in the world that the motion faces, near the room's corner; its z points into the room and up."""
     z = np.array([1.0, 1.0, 0.6]) / np.linalg.norm([1.0, 1.0, 0.6])
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)

@@ -1,8 +1,8 @@
-"""What the surfaces of a room look like: patches of all sizes, and plain regions between them.
+"""Textures of a room's surfaces: patches of all sizes, and plain regions between them.
 
-The patches are a dead leaves model (Lee, Mumford, Huang 2001): rectangles and ellipses over one another, their number
-falling with the cube of their size, so that every octave covers the same area. Each surface is a pyramid of averages
-over 2 x 2 texels (Williams 1983).
+The patches are a dead leaves model (Lee, Mumford, Huang 2001): rectangles and ellipses that occlude one another. Their
+number density falls with the cube of their size, so that every octave covers the same area. Each texture is stored as a
+mipmap, a pyramid of averages over 2 x 2 texels (Williams 1983).
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-_TEXEL_M = 0.004  # 1.8 px from 1 m at a focal length of 460 px
+_TEXEL_M = 0.004  # smallest texel: 1.8 px from 1 m at a focal length of 460 px
 _MOST_TEXELS = 40_000_000  # of all surfaces together, 110 MB with their pyramids; texels of larger rooms are larger
-_PANEL_M = 1.6  # regions that are plain or not
-_RADII_M = (0.012, 0.3)  # half the longer side of a patch
-_COVER = (0.1, 1.5)  # area of the patches of a region that is not plain, over its own: from sparse to crowded
+_PANEL_M = 1.6  # side of the regions, each with patches or plain
+_RADII_M = (0.012, 0.3)  # range of half the longer side of a patch
+_COVER = (0.1, 1.5)  # range of the total area of patches in a region, relative to the region's area
 _FULL = 65535.0  # a texel's value for white
 
 
 @dataclass(frozen=True)
 class Texture:
-    """How surfaces are covered. share: of the regions, of 1.6 m each, that carry patches; 0: all are plain. contrast:
-    of patches and surfaces, 1: from black to white. seed: the same seed gives the same surfaces."""
+    """Settings of the textures. share: fraction of the regions (1.6 m wide) with patches; 0: all are plain. contrast:
+    of patches and surfaces; 1: from black to white. seed: of the random textures."""
 
     seed: int = 0
     share: float = 0.65
@@ -34,8 +34,9 @@ class Texture:
 
 
 class Atlas(NamedTuple):
-    """Pyramids of T surfaces in one array. Texel (i, j) of level l covers 2^l i to 2^l (i + 1) texels of level 0 along
-    the surface's first edge, and so does j along its second. Texels at `first` + j `width` + i, 0: black, 65535: white.
+    """Mipmaps of T surfaces in one array. Texel (i, j) of level l covers the texels 2^l i to 2^l (i + 1) of level 0
+    along the surface's first edge; likewise j along its second edge. Its index is first + j width + i. Values are 0
+    (black) to 65535 (white).
     """
 
     texels: np.ndarray  # uint16
@@ -45,13 +46,13 @@ class Atlas(NamedTuple):
 
 
 def texel_size(area_m2: float) -> float:
-    """[m], for surfaces of this area together."""
+    """Width of a texel [m] for surfaces of this total area."""
     return max(_TEXEL_M, float(np.sqrt(area_m2 / _MOST_TEXELS)))
 
 
 def leaves(size: tuple[float, float], texel_m: float, texture: Texture, number: int) -> np.ndarray:
-    """(height, width) float32, 0 to 1: the texture of a surface of `size` [m]. number: of the surface, for its random
-    numbers."""
+    """Texture (height, width) float32, 0 to 1, of a surface of `size` (width, height) m. number: of the surface, for
+    its random numbers."""
     rng = np.random.default_rng([texture.seed, number])
     shape = tuple(max(int(np.ceil(side / texel_m)), 1) for side in size)
     canvas = np.full(shape[::-1], 0.5 + texture.contrast * rng.uniform(-0.25, 0.25), dtype=np.float32)
@@ -76,13 +77,15 @@ def leaves(size: tuple[float, float], texel_m: float, texture: Texture, number: 
 
 
 def _counts(cover: np.ndarray, size: tuple[float, float], area_m2: float) -> np.ndarray:
-    """Patches, of that area in the mean, of each region of a surface."""
+    """Number of patches in each region of a surface. cover: area of patches over that of the region; size: of the
+    surface (width, height) m; area_m2: mean area of a patch."""
     return np.rint(cover * size[0] * size[1] / (len(cover) * area_m2)).astype(np.int64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _paint(patches, rounded, canvas):
-    """One over another: x, y, half axes a, b [texels], cosine and sine of the angle, grey; edges one texel wide."""
+    """Paints patches (n, 7) on the canvas, later ones over earlier ones: x, y, half axes a, b [texels], cosine and sine
+    of the angle, grey. rounded (n,): ellipses instead of rectangles. Edges are one texel wide."""
     for k in range(len(patches)):
         x, y, a, b, c, s, grey = patches[k]
         reach_x, reach_y = abs(a * c) + abs(b * s) + 1.0, abs(a * s) + abs(b * c) + 1.0
@@ -99,7 +102,7 @@ def _paint(patches, rounded, canvas):
 
 
 def atlas_of(canvases: Sequence[np.ndarray]) -> Atlas:
-    """The pyramids of surfaces (height, width), 0 to 1 each, down to one texel."""
+    """The mipmaps of textures (height, width), 0 to 1, down to one texel."""
     levels = max(int(np.ceil(np.log2(max(canvas.shape)))) for canvas in canvases) + 1
     first, width, height = (np.zeros((len(canvases), levels), dtype=np.int64) for _ in range(3))
     stored: list[np.ndarray] = []
@@ -117,6 +120,6 @@ def atlas_of(canvases: Sequence[np.ndarray]) -> Atlas:
 
 
 def _halved(level: np.ndarray) -> np.ndarray:
-    """Means of 2 x 2; the last row and column are doubled where their number is odd."""
+    """Means over 2 x 2 texels; the last row or column is repeated if their number is odd."""
     even = np.pad(level, [(0, n % 2) for n in level.shape], mode="edge")
     return 0.25 * (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2])

@@ -1,4 +1,4 @@
-"""What is asked of the true trajectory of the IMU."""
+"""Protocols of the true trajectory of the IMU."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ import numpy as np
 
 
 class TrueTrajectory(Protocol):
-    """The pose of the IMU at any instant."""
+    """True poses and angular rates of the IMU at any instant."""
 
     def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """seconds (N,) since the IMU clock's origin -> R_world_imu (N, 3, 3), position, velocity (N, 3) in world."""
+        """R_world_imu (N, 3, 3), position (N, 3) m and velocity (N, 3) m/s in the world, at seconds (N,) since the IMU
+        clock's origin."""
         ...
 
     def rate_at(self, seconds: np.ndarray) -> np.ndarray:
-        """seconds (N,) -> angular rate (N, 3) [rad/s] in the imu frame."""
+        """Angular rate (N, 3) [rad/s] in the IMU frame at seconds (N,) since the IMU clock's origin."""
         ...
 
 
 class AnalyticTrajectory(TrueTrajectory, Protocol):
-    """A trajectory that an IMU can sample."""
+    """A trajectory in closed form, with the readings of an IMU without errors."""
 
     def readings_at(self, seconds: np.ndarray) -> np.ndarray:
-        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the imu frame."""
+        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the IMU frame at seconds (N,)."""
         ...

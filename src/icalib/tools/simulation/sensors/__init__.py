@@ -1,1 +1,1 @@
-"""What each sensor measures, by the obvious formula."""
+"""Simulated measurements of IMU and cameras, by direct formulas without approximations for speed."""

@@ -1,4 +1,4 @@
-"""What a camera reports: corners of the target, image by image, with everything that goes wrong with them."""
+"""Simulated corners of the target in each image, with noise, blur, bloom and outliers."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from icalib.tools.simulation.scenario.scenario import Scenario, SimCamera
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 from icalib.tools.simulation.sensors.imu import inside
 
-_MIN_CORNERS = 6
-_LEAD_S = 0.05  # images start and end this far inside the IMU's readings
-_DIFFERENCE_S = 1e-4
+_MIN_CORNERS = 6  # images with fewer are dropped
+_LEAD_S = 0.05  # images start this long after the IMU, and end this long before it
+_DIFFERENCE_S = 1e-4  # half a step of central differences for the image speed
 _RIM = 64  # points on the rim of a circle
 
 
 @dataclass(frozen=True, eq=False)
 class CornerTruth:
-    """seconds (M,): true instants of the images, IMU clock since its origin. Per corner: uv (N, 2) before noise and
-    outliers (bloom included), sigma (N,) [px] of the white noise, outlier (N,) bool."""
+    """Truth of M images and N corners. seconds (M,): instants of the images on the IMU's clock since its origin. uv
+    (N, 2): corners with bloom, before noise and outliers [px]; sigma (N,): of the white noise [px]; outlier (N,)
+    bool."""
 
     seconds: np.ndarray
     uv: np.ndarray
@@ -31,8 +32,8 @@ class CornerTruth:
 
 
 def board_surface(target: Target, bow: tuple[float, float, float], points: np.ndarray) -> np.ndarray:
-    """Points (n, 3), one for each of the flat target's, moved out of their bodies' planes by z = a x^2 + b x y + c y^2
-    (see `Scenario`) where these bend."""
+    """points (n, 3), one for each point of the target, moved out of the planes of bodies that bend by
+    z = a x^2 + b x y + c y^2. bow: (a, b, c) [m], see `Scenario`."""
     bent = points.copy()
     for body in np.flatnonzero(target.bends):
         own = target.body == body
@@ -43,7 +44,8 @@ def board_surface(target: Target, bow: tuple[float, float, float], points: np.nd
 
 
 def image_stamps(scenario: Scenario, camera: SimCamera, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps (M,) int64 ns on the camera's clock, and the instants (M,) [s] on the IMU's that these stamps mean."""
+    """Stamps (M,) int64 [ns] of the images on the camera's clock, and their true instants (M,) [s] on the IMU's clock
+    since its origin."""
     span = scenario.duration_s - 2.0 * _LEAD_S - camera.phase_s
     taken = _LEAD_S + camera.phase_s + np.arange(int(span * camera.rate_hz) + 1) / camera.rate_hz
     taken += rng.uniform(-camera.jitter_s, camera.jitter_s, len(taken))
@@ -56,7 +58,7 @@ def image_stamps(scenario: Scenario, camera: SimCamera, rng: np.random.Generator
 def see_corners(
     scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, rng: np.random.Generator
 ) -> tuple[CornerStream, CornerTruth]:
-    """Corners seen by one camera; images with fewer than 6 are dropped."""
+    """Measured corners of one camera, and their truth; images with fewer than 6 corners are dropped."""
     stamps, seconds = image_stamps(scenario, camera, rng)
     surface = board_surface(scenario.target, scenario.bow, scenario.target.points)
     points = _in_camera(scenario, camera, trajectory, seconds, surface)
@@ -84,7 +86,8 @@ def see_corners(
 def _in_camera(
     scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Points (n, 3), one for each of the target's as stated, in the camera frame at each instant, (M, n, 3)."""
+    """(M, n, 3) m: points (n, 3), one for each point of the target in the stated size, in the camera frame at M
+    instants. The true size is applied here."""
     rotation, position, _ = trajectory.pose_at(seconds)
     T_world_body = scenario.body_poses[scenario.target.body]
     world = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], scenario.target_size * points) + T_world_body[:, :3, 3]
@@ -95,7 +98,8 @@ def _in_camera(
 def _from_the_front(
     scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray
 ) -> np.ndarray:
-    """(M, n) bool: whether the camera is on the printed side of each point's body. Bodies do not hide each other."""
+    """(M, n) bool: whether the camera is on the printed side of the body of each of n points at M instants. Bodies do
+    not hide each other."""
     rotation, position, _ = trajectory.pose_at(seconds)
     lens = position + rotation @ camera.T_imu_sensor[:3, 3]
     origin, normal = scenario.body_poses[:, :3, 3], scenario.body_poses[:, :3, 2]
@@ -103,7 +107,7 @@ def _from_the_front(
 
 
 def _whole_tags(target: Target, seen: np.ndarray) -> np.ndarray:
-    """(M, n) bool: all of a free tag is seen, or none of it, for nothing beside it tells which tag it is."""
+    """(M, n) bool: False for points of a free tag that is not seen completely, as it then cannot be identified."""
     whole = np.ones_like(seen)
     for body in np.flatnonzero(~target.bends):
         own = target.body == body
@@ -114,9 +118,9 @@ def _whole_tags(target: Target, seen: np.ndarray) -> np.ndarray:
 def _towards_tag_center(
     scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """(M, N, 2) unit image direction from each corner towards the centre of its tag, which lies on the bent board.
+    """(M, N, 2) unit vectors in the image from each corner towards the centre of its tag, which lies on the bent board.
 
-    Zero on targets that do not bloom.
+    They are zero for targets without bloom.
     """
     if not scenario.target.blooms:
         return np.zeros((*points.shape[:2], 2))
@@ -128,8 +132,8 @@ def _towards_tag_center(
 def _to_ellipse_centres(
     scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, uv: np.ndarray
 ) -> np.ndarray:
-    """(M, N, 2) px from uv, the image of each circle's centre, to the centroid of the circle's image; zero on targets
-    without circles."""
+    """(M, N, 2) px: offset from the projected centre uv (M, N, 2) of each circle to the centroid of its image; zero for
+    targets without circles."""
     target = scenario.target
     if not target.radii.any():
         return np.zeros_like(uv)
@@ -153,7 +157,7 @@ def _to_ellipse_centres(
 def _corner_sigma(
     scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
-    """(M,) standard deviation [px] of the corners of each image."""
+    """(M,) standard deviation of the corner noise in each image [px]; seen (M, N) bool: visible corners."""
     if not scenario.corner_noise_enabled:
         return np.zeros(len(seconds))
     surface = board_surface(scenario.target, scenario.bow, scenario.target.points)

@@ -1,4 +1,4 @@
-"""A robot's motion through its room, in closed form: free, about a single axis, recorded, or on the ground."""
+"""Trajectories of a robot through its room, in closed form, for the kinds of motion in `Drive`."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from icalib.tools.simulation.sensors.ground import ground_motion
 from icalib.tools.simulation.sensors.motion import AnalyticTrajectory, Reference, Waves, basis_with_z
 from icalib.tools.simulation.sensors.recorded import recorded_motion
 
-_HEIGHT = 0.45  # of the room's, where a free motion has its middle
-_SHIFT = np.array([[0.20, 0.20, 0.12], [0.02, 0.02, 0.035]])  # slow, fast; shares of the room's sides
+_HEIGHT = 0.45  # height of the middle of a free motion, relative to the room's
+_SHIFT = np.array([[0.20, 0.20, 0.12], [0.02, 0.02, 0.035]])  # amplitudes, slow and fast, relative to the room's sides
 _SHIFT_HZ = np.array([[0.05, 0.08], [0.30, 0.45]])
 _ANGLES_RAD = np.array([[1.2, 0.22, 0.22], [0.30, 0.14, 0.14]])  # yaw, pitch, roll
 _ANGLES_HZ = np.array([[0.06, 0.10], [0.30, 0.50]])
 _AXIS_RAD = np.array([[1.2, 0.0, 0.0], [0.30, 0.0, 0.0]])
 _CHECK_S = 0.05
-_GROUND_BELOW_IMU = np.array([0.0, 0.0, -0.3])  # m, where a robot without wheels has its wheel frame
+_GROUND_BELOW_IMU = np.array([0.0, 0.0, -0.3])  # m, origin of the wheel frame in the IMU frame, if there are no wheels
 
 
 def drive_motion(
     drive: Drive, room: Room, T_imu_wheel: np.ndarray | None, duration_s: float, rng: np.random.Generator
 ) -> AnalyticTrajectory:
-    """The drive's motion, its phases drawn from `rng`. T_imu_wheel (4, 4): of what rolls on the floor.
+    """The trajectory of `drive`, with phases drawn from `rng`. T_imu_wheel (4, 4): pose of the wheel frame, None for a
+    frame 0.3 m below the IMU.
 
-    Raises RecordingError where a recorded motion cannot be read, is too short, or leaves the room.
+    Raises RecordingError if a recorded motion cannot be read, is too short, or leaves the room.
     """
     if drive.on_ground:
         if T_imu_wheel is None:

@@ -1,4 +1,4 @@
-"""Motions of a wheel frame over a floor, in closed form: it moves along the floor, and where it points to."""
+"""Trajectories of a wheel frame on a floor, in closed form: z is normal to the floor, and its velocity is along x."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from icalib.tools.simulation.scenario.robot import Drive
 from icalib.tools.simulation.scenario.room import Hills, Room
 from icalib.tools.simulation.sensors.motion import readings_of
 
-# x, y of the wheel frame's origin, and a horizontal vector of any length along its x axis
+# Function of time: x, y of the wheel frame's origin, and x, y of its heading as a vector of any length.
 Path = Callable[[Jet], tuple[Jet, Jet, Jet, Jet]]
 _LAP_S = 24.0
-_LAP_SHARE = 0.27  # of the room's sides, the half axes of a lap
-_SPEED, _RADIUS_M = 0.5, 1.8
-_WANDER_M = np.array([0.30, 0.05])  # slow, fast, beside the lap; with their frequencies below the robot never stops
+_LAP_SHARE = 0.27  # half axes of a lap, relative to the room's sides
+_SPEED, _RADIUS_M = 0.5, 1.8  # m/s; of an arc
+_WANDER_M = np.array([0.30, 0.05])  # amplitudes, slow and fast, of deviations from the lap: small enough not to stop
 _WANDER_HZ = np.array([[0.06, 0.10], [0.25, 0.35]])
 _SLIP_HZ = np.array([[0.5, 0.8], [1.4, 2.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class GroundMotion:
-    """A wheel frame that follows `path` on the floor, and the IMU fixed to it."""
+    """Trajectory of an IMU that is fixed to a wheel frame, which follows `path` on the floor."""
 
     path: Path
     hills: Hills | None
@@ -40,7 +40,7 @@ class GroundMotion:
         return rotation @ R, position, values(p_wheel, 1) + matrices(R_wheel, 1) @ lever
 
     def readings_at(self, seconds: np.ndarray) -> np.ndarray:
-        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the imu frame."""
+        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the IMU frame."""
         R_wheel, p_wheel = self._wheel(Jet.time(seconds, 3))
         R, lever = self.T_wheel_imu[:3, :3], self.T_wheel_imu[:3, 3]
         acceleration = values(p_wheel, 2) + matrices(R_wheel, 2) @ lever
@@ -51,7 +51,8 @@ class GroundMotion:
         return self.readings_at(seconds)[:, :3]
 
     def _wheel(self, time: Jet) -> tuple[Rows, tuple[Jet, Jet, Jet]]:
-        """R_world_wheel by rows and p_world_wheel; the rotation has one derivative less than `time`."""
+        """R_world_wheel by rows, and p_world_wheel [m]; the order of the rotation is lower by one than that of
+        `time`."""
         x, y, dx, dy = self.path(time)
         if self.sideslip is not None:
             sine, cosine = self.sideslip(time.shortened(len(dx.c) - 1)).sine_cosine()
@@ -65,7 +66,7 @@ class GroundMotion:
 
 
 def _floor(hills: Hills | None, x: Jet, y: Jet) -> tuple[Jet, Jet, Jet]:
-    """z(x, y), dz/dx and dz/dy."""
+    """Height z(x, y) of the floor, dz/dx and dz/dy; zeros without hills."""
     z = slope_x = slope_y = x.constant(0.0)
     if hills is None:
         return z, slope_x, slope_y
@@ -79,7 +80,7 @@ def _floor(hills: Hills | None, x: Jet, y: Jet) -> tuple[Jet, Jet, Jet]:
 def ground_motion(
     drive: Drive, room: Room, T_imu_wheel: np.ndarray, duration_s: float, rng: np.random.Generator
 ) -> GroundMotion:
-    """The drive's motion in the middle of the room, its phases and directions drawn from `rng`."""
+    """The trajectory of `drive` about the middle of the room, with phases and directions drawn from `rng`."""
     path = _steady(room, duration_s, rng) if drive.kind == "constant-velocity" else _PATHS[drive.kind](room, rng)
     slip = np.deg2rad(drive.sideslip_deg) * np.array([0.6, 0.4])
     sideslip = _wave(slip, _SLIP_HZ, rng) if drive.sideslip_deg else None
@@ -88,7 +89,7 @@ def ground_motion(
 
 
 def _wave(amplitude: np.ndarray, band_hz: np.ndarray, rng: np.random.Generator) -> Callable[[Jet], Jet]:
-    """A sum of sinusoids, one of each amplitude, its frequency drawn from its band."""
+    """A sum of sinusoids of the amplitudes (n,), with frequencies drawn from band_hz (n, 2) and random phases."""
     omega = 2.0 * np.pi * rng.uniform(band_hz[:, 0], band_hz[:, 1])
     phase = rng.uniform(0.0, 2.0 * np.pi, len(amplitude))
 
@@ -102,7 +103,7 @@ def _wave(amplitude: np.ndarray, band_hz: np.ndarray, rng: np.random.Generator) 
 
 
 def _curves(room: Room, rng: np.random.Generator) -> Path:
-    """Figures of eight about the room's middle that wander; the frame points along its path."""
+    """Figures of eight about the middle of the room with slow random deviations; the heading is along the path."""
     half_x, half_y = _LAP_SHARE * room.size[0], _LAP_SHARE * room.size[1]
     turn, start = rng.choice([-1.0, 1.0]) * 2.0 * np.pi / _LAP_S, rng.uniform(0.0, 2.0 * np.pi)
     wander_x, wander_y = (_wave(_WANDER_M, _WANDER_HZ, rng) for _ in range(2))
@@ -117,7 +118,7 @@ def _curves(room: Room, rng: np.random.Generator) -> Path:
 
 
 def _line(rng: np.random.Generator, way: Callable[[Jet], Jet]) -> Path:
-    """Without turning: `way` [m] along a line through the room's middle."""
+    """Motion without rotation along a line through the middle of the room; way: position on the line [m]."""
     heading = rng.uniform(-0.3, 0.3)
     c, s = float(np.cos(heading)), float(np.sin(heading))
 
@@ -133,7 +134,7 @@ def _to_and_fro(room: Room, rng: np.random.Generator) -> Path:
 
 
 def _steady(room: Room, duration_s: float, rng: np.random.Generator) -> Path:
-    """From one end of the room to the other at most, within the duration."""
+    """Constant velocity along a line, over at most 0.8 of the room's length within the duration."""
     speed = min(_SPEED, 0.8 * room.size[0] / duration_s)
     return _line(rng, lambda time: speed * time - 0.5 * speed * duration_s)
 

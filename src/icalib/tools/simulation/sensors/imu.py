@@ -1,4 +1,4 @@
-"""What the IMU reads: sensor model, biases that walk, white noise."""
+"""Simulated IMU readings: sensor model, bias random walk, white noise."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from icalib.tools.simulation.scenario.scenario import Interval, Scenario
 from icalib.tools.simulation.sensors.motion import skew
 
-_LOWER = ((0, 1, 1, 2, 2, 2), (0, 0, 1, 0, 1, 2))  # rows, columns of xx, yx, yy, zx, zy, zz
+_LOWER = ((0, 1, 1, 2, 2, 2), (0, 0, 1, 0, 1, 2))  # row and column indices of xx, yx, yy, zx, zy, zz
 
 
 @dataclass(frozen=True, eq=False)
 class ImuReadings:
-    """gyro, accel, and the biases in them, all (N, 3)."""
+    """Measured gyro [rad/s] and accel [m/s^2], and the true biases that they contain, all (N, 3)."""
 
     gyro: np.ndarray
     accel: np.ndarray
@@ -23,7 +23,7 @@ class ImuReadings:
 
 
 def inside(intervals: tuple[Interval, ...], seconds: np.ndarray) -> np.ndarray:
-    """(N,) whether each instant lies in one of the intervals, ends included."""
+    """(N,) bool: whether each instant in seconds (N,) is in one of the intervals, ends included."""
     hit = np.zeros(len(seconds), dtype=bool)
     for start, end in intervals:
         hit |= (seconds >= start) & (seconds <= end)
@@ -31,7 +31,7 @@ def inside(intervals: tuple[Interval, ...], seconds: np.ndarray) -> np.ndarray:
 
 
 def imu_stamps(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
-    """(N,) int64 ns since the IMU clock's origin; the first is 0."""
+    """Stamps (N,) int64 [ns] of the readings since the IMU clock's origin; the first is 0."""
     count = round(scenario.duration_s * scenario.imu_rate_hz) + 1
     seconds = np.arange(count) / scenario.imu_rate_hz
     seconds[1:] += rng.uniform(-scenario.imu_jitter_s, scenario.imu_jitter_s, count - 1)
@@ -39,7 +39,8 @@ def imu_stamps(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
 
 
 def distort(intrinsics: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """True rates and forces (N, 6) through Kalibr's scale-misalignment model (see `Scenario`), without bias."""
+    """(N, 6) readings without bias and noise of true angular rates [rad/s] and specific forces [m/s^2] (N, 6), by
+    Kalibr's scale-misalignment model. intrinsics (24,): see `Scenario`."""
     M_a, M_g = np.eye(3), np.eye(3)
     M_a[_LOWER] += intrinsics[:6]
     M_g[_LOWER] += intrinsics[6:12]
@@ -59,9 +60,9 @@ def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
 
 
 def read_imu(scenario: Scenario, seconds: np.ndarray, true: np.ndarray, rng: np.random.Generator) -> ImuReadings:
-    """Readings of true rates and forces (N, 6) at seconds (N,).
+    """Readings with bias and noise of true angular rates [rad/s] and specific forces [m/s^2] (N, 6) at seconds (N,).
 
-    A density d gives each reading a standard deviation d sqrt(rate); a walk density w adds w sqrt(dt) N(0, 1)
+    A noise density d gives each reading the standard deviation d sqrt(rate). A walk density w adds w sqrt(dt) N(0, 1)
     to the bias from one reading to the next.
     """
     noise = scenario.imu_noise

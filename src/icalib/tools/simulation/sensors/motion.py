@@ -1,6 +1,7 @@
-"""Where the IMU truly is: a reference in closed form, and the exact integral of piecewise constant readings.
+"""True trajectories of the IMU: a reference in closed form, and the exact integral of piecewise constant readings.
 
-Frames: world (z up), imu. Rates and specific forces are in the imu frame: R' = R [w]x, v' = R f + g, p' = v.
+Frames: world (z up), imu. Angular rates w and specific forces f are in the imu frame: R' = R [w]x, v' = R f + g,
+p' = v.
 """
 
 from __future__ import annotations
@@ -22,17 +23,18 @@ _AXIS_X, _AXIS_Y, _AXIS_Z = np.eye(3)
 
 
 def skew(w: np.ndarray) -> np.ndarray:
-    """(..., 3) -> (..., 3, 3) with skew(w) v = w x v."""
+    """(..., 3, 3) cross-product matrices of w (..., 3): skew(w) v = w x v."""
     W = np.zeros((*w.shape[:-1], 3, 3))
     W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
     return W - np.swapaxes(W, -1, -2)
 
 
 def increments(rate: np.ndarray, force: np.ndarray, dt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation (..., 3, 3), velocity (..., 3) and position (..., 3) gained over dt (...) [s] without gravity.
+    """Increments of rotation (..., 3, 3), velocity (..., 3) m/s and position (..., 3) m over dt (...) [s], without
+    gravity, in the body frame at the start.
 
-    rate (..., 3) [rad/s] and force (..., 3) [m/s^2] are constant in the body. They are the upper rows of
-    exp(A dt) with A = [[skew(rate), force, 0], [0, 0, 1], [0, 0, 0]], summed as a Taylor series.
+    rate (..., 3) [rad/s] and force (..., 3) [m/s^2] are constant in the body frame. The increments are the upper rows
+    of exp(A dt) with A = [[skew(rate), force, 0], [0, 0, 1], [0, 0, 0]], summed as a Taylor series.
     """
     A = np.zeros((*rate.shape[:-1], 5, 5))
     A[..., :3, :3], A[..., :3, 3], A[..., 3, 4] = skew(rate), force, 1.0
@@ -44,8 +46,8 @@ def increments(rate: np.ndarray, force: np.ndarray, dt: np.ndarray) -> tuple[np.
 
 
 def readings_of(rotation: np.ndarray, rotation_rate: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
-    """(N, 6) angular rate and specific force in the imu frame, of R_world_imu and its time derivative (N, 3, 3), and
-    of the acceleration (N, 3) in world."""
+    """(N, 6) angular rate [rad/s] and specific force [m/s^2] in the imu frame, from R_world_imu and its time derivative
+    (N, 3, 3), and the acceleration (N, 3) m/s^2 in the world."""
     spin = np.swapaxes(rotation, 1, 2) @ rotation_rate
     rate = 0.5 * np.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
     return np.concatenate([rate, np.einsum("nji,nj->ni", rotation, acceleration - GRAVITY_WORLD)], axis=1)
@@ -53,14 +55,14 @@ def readings_of(rotation: np.ndarray, rotation_rate: np.ndarray, acceleration: n
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """Channels, each a sum of sinusoids: amplitude, frequency [Hz], phase [rad], all (sinusoids, channels)."""
+    """Several channels, each a sum of sinusoids. amplitude, frequency [Hz], phase [rad]: all (sinusoids, channels)."""
 
     amplitude: np.ndarray
     frequency: np.ndarray
     phase: np.ndarray
 
     def derivative(self, order: int, seconds: np.ndarray) -> np.ndarray:
-        """(N, channels) `order`-th time derivative at seconds (N,)."""
+        """(N, channels) time derivative of the given order at seconds (N,)."""
         omega = 2.0 * np.pi * self.frequency
         angle = omega * seconds[:, None, None] + self.phase + 0.5 * np.pi * order
         return np.sum(self.amplitude * omega**order * np.sin(angle), axis=1)
@@ -68,7 +70,8 @@ class Waves:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Closed form: R_world_imu = left Rz(a0) Ry(a1) Rx(a2) right, p = center + axes s, angles a and shifts s waves."""
+    """Trajectory in closed form: R_world_imu = left Rz(a0) Ry(a1) Rx(a2) right, p_world_imu = center + axes s. Angles a
+    [rad] and shifts s [m] are `Waves`."""
 
     left: np.ndarray
     right: np.ndarray
@@ -85,10 +88,10 @@ class Reference:
         return rotation, position, self.shifts.derivative(1, seconds) @ self.axes.T
 
     def readings_at(self, seconds: np.ndarray) -> np.ndarray:
-        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the imu frame."""
+        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the IMU frame."""
         _, Ry, Rx = self._factors(seconds)
         da = self.angles.derivative(1, seconds)[:, :, None]
-        # Each angle's axis, seen through the rotations to its right.
+        # The axis of each angle, transformed by the rotations to its right.
         rate = da[:, 2] * _AXIS_X + da[:, 1] * (_AXIS_Y @ Rx) + da[:, 0] * (_AXIS_Z @ (Ry @ Rx))
         rotation, _, _ = self.pose_at(seconds)
         acceleration = self.shifts.derivative(2, seconds) @ self.axes.T
@@ -105,7 +108,7 @@ class Reference:
 
 
 def _turn(axis: int, angle: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) rotations by angle (N,) about a coordinate axis."""
+    """(N, 3, 3) rotations by angle (N,) rad about the coordinate axis number `axis`."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R = np.zeros((len(angle), 3, 3))
     R[:, axis, axis] = 1.0
@@ -121,7 +124,7 @@ def _waves(amplitude: np.ndarray, rng: np.random.Generator) -> Waves:
 
 
 def basis_with_z(axis: np.ndarray) -> np.ndarray:
-    """A rotation whose third column is the unit vector along `axis`."""
+    """(3, 3) rotation with the unit vector along `axis` (3,) as its third column."""
     z = axis / np.linalg.norm(axis)
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)
@@ -129,8 +132,8 @@ def basis_with_z(axis: np.ndarray) -> np.ndarray:
 
 
 def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
-    """The scenario's motion in closed form, around where the first camera looks at the board's centre, or at the
-    origin of T_world_board where there are several bodies."""
+    """The scenario's handheld motion in closed form. Its middle is the pose at which the first camera looks at the
+    board's centre, or at the origin of T_world_board if the target has several bodies."""
     motion = scenario.motion
     assert isinstance(motion, HandheldMotion)
     T_imu_cam = scenario.cameras[0].T_imu_sensor
@@ -164,7 +167,8 @@ def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
 
 @dataclass(frozen=True, eq=False)
 class ExactTrajectory:
-    """The exact integral of readings (N, 6), their means held constant between stamps seconds (N,)."""
+    """Exact integral of readings (N, 6) at seconds (N,); between two readings their mean is constant. rotation:
+    R_world_imu; position [m] and velocity [m/s] in the world."""
 
     seconds: np.ndarray
     readings: np.ndarray
@@ -173,17 +177,17 @@ class ExactTrajectory:
     velocity: np.ndarray  # (N, 3)
 
     def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `Trajectory.pose_at`; beyond the ends the outermost interval's rates go on."""
+        """See `TrueTrajectory.pose_at`; beyond the ends, the readings of the outermost interval are constant."""
         i, mean = self._interval(seconds)
         dt = seconds - self.seconds[i]
         return _advance((self.rotation[i], self.position[i], self.velocity[i]), mean, dt)
 
     def rate_at(self, seconds: np.ndarray) -> np.ndarray:
-        """See `Trajectory.rate_at`; at a reading, that of the interval which it begins."""
+        """See `TrueTrajectory.rate_at`; at a reading, the rate of the interval that begins there."""
         return self._interval(seconds)[1][:, :3]
 
     def _interval(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) the interval between readings that each instant lies in, and (N, 6) its rates and forces."""
+        """Number (N,) of the interval between readings that contains each instant, and its rates and forces (N, 6)."""
         i = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
         return i, 0.5 * (self.readings[i] + self.readings[i + 1])
 
@@ -191,7 +195,8 @@ class ExactTrajectory:
 def _advance(
     state: tuple[np.ndarray, np.ndarray, np.ndarray], mean: np.ndarray, dt: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation (..., 3, 3), position, velocity (..., 3) after dt (...) of constant rate and force, mean (..., 6)."""
+    """Rotation (..., 3, 3), position and velocity (..., 3) after dt (...) [s] from `state`, with constant angular rate
+    and specific force mean (..., 6)."""
     R, p, v = state
     dR, dv, dp = increments(mean[..., :3], mean[..., 3:], dt)
     dt = np.asarray(dt)[..., None]
@@ -203,10 +208,10 @@ def _advance(
 
 
 def exact_motion(reference: AnalyticTrajectory, seconds: np.ndarray) -> ExactTrajectory:
-    """Readings near the reference's, and their exact integral.
+    """Readings at seconds (N,) near those of the reference, and their exact integral.
 
-    The integral of means drifts from the reference by the trapezoid's error, so each reading is steered softly by
-    the error of the state one reading earlier: smooth, and the rig stays in front of the board.
+    The integral would drift from the reference by the error of the trapezoidal rule. Each reading is therefore
+    corrected by feedback of the state's error one reading earlier, so that the rig stays in front of the board.
     """
     R_ref, p_ref, v_ref = reference.pose_at(seconds)
     readings = reference.readings_at(seconds)

@@ -1,4 +1,4 @@
-"""A recorded trajectory as a motion: a smooth spline through the poses of a TUM or EuRoC file."""
+"""A motion from a recorded trajectory: a smoothing spline through the poses of a TUM or EuRoC file."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from icalib.errors import RecordingError
 from icalib.tools.simulation.scenario.jets import Jet, Rows, Vector, matrices, values
 from icalib.tools.simulation.sensors.motion import readings_of
 
-_KNOT_S = 0.1  # what is faster than a few Hz is taken for noise, and smoothed away
+_KNOT_S = 0.1  # interval of the knots: motion faster than a few Hz is smoothed away as noise
 _ORDER = 6  # quintic: the fourth derivative of position is continuous
-_STIFFNESS = 1e-6  # holds knots that lie in a gap of the file, against the 1 of each pose
+_STIFFNESS = 1e-6  # weight of the roughness, relative to 1 for each pose: determines control points in gaps of the file
 _LARGEST_GAP_S = 0.5
 # Coefficients of the uniform quintic B-spline: the value is (1, u, ... u^5) _BASIS (6 control points) / 120.
 _BASIS = (
@@ -33,9 +33,10 @@ _BASIS = (
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
-    """R_world_imu from a quaternion (x, y, z, w) and p_world_imu, both splines: control (C, 7), x y z qx qy qz qw.
+    """Quintic B-splines of p_world_imu and of a quaternion for R_world_imu. control (C, 7): x, y, z [m]; qx, qy, qz,
+    qw.
 
-    The quaternion's spline is not of unit length; the rotation is that of its direction.
+    The spline of the quaternion does not have unit length; the rotation is that of the normalised quaternion.
     """
 
     control: np.ndarray
@@ -46,7 +47,7 @@ class RecordedMotion:
         return matrices(rows, 0), values(position, 0), values(position, 1)
 
     def readings_at(self, seconds: np.ndarray) -> np.ndarray:
-        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the imu frame."""
+        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the IMU frame."""
         rows, position = self._jets(seconds, 2)
         return readings_of(matrices(rows, 0), matrices(rows, 1), values(position, 2))
 
@@ -63,8 +64,8 @@ class RecordedMotion:
 
 
 def _segment(seconds: np.ndarray, controls: int, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) the first of the six control points at each instant, and (order + 1, N, 6) the Taylor coefficients of the
-    basis there."""
+    """Number (N,) of the first of the six control points at each instant, and Taylor coefficients (order + 1, N, 6) of
+    the basis functions. controls: number of control points."""
     first = np.clip((seconds / _KNOT_S).astype(np.int64), 0, controls - _ORDER)
     u = seconds / _KNOT_S - first
     coefficients, power = _BASIS, []
@@ -76,7 +77,7 @@ def _segment(seconds: np.ndarray, controls: int, order: int) -> tuple[np.ndarray
 
 
 def _rotation(x: Jet, y: Jet, z: Jet, w: Jet) -> Rows:
-    """The rotation of a quaternion of any length, divided by the square of its length."""
+    """Rotation matrix of a quaternion of any length."""
     xx, yy, zz, ww = x * x, y * y, z * z, w * w
     rows = (
         (ww + xx - yy - zz, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -89,9 +90,10 @@ def _rotation(x: Jet, y: Jet, z: Jet, w: Jet) -> Rows:
 
 
 def recorded_motion(path: Path, duration_s: float, middle: np.ndarray) -> RecordedMotion:
-    """The motion in `path` from its first pose on, moved so that the middle of its extent is at `middle` (3,).
+    """The motion in the file `path` from its first pose on, shifted so that the middle of its extent is at middle (3,)
+    m.
 
-    Raises RecordingError naming the file where it cannot be read, or is too short or too sparse.
+    Raises RecordingError naming the file if it cannot be read, is too short, or has a gap.
     """
     seconds, poses = _read(path)
     if seconds[-1] < duration_s:
@@ -103,14 +105,15 @@ def recorded_motion(path: Path, duration_s: float, middle: np.ndarray) -> Record
     used = seconds <= duration_s + _KNOT_S
     seconds, poses = seconds[used], poses[used]
     poses[:, :3] += middle - 0.5 * (poses[:, :3].min(axis=0) + poses[:, :3].max(axis=0))
-    # q and -q are one rotation: each takes the sign that is nearer to the one before.
+    # q and -q are the same rotation: each quaternion gets the sign that is closer to its predecessor.
     turned = np.sum(poses[1:, 3:] * poses[:-1, 3:], axis=1) < 0.0
     poses[1:, 3:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
     return RecordedMotion(_fitted(seconds, poses))
 
 
 def _fitted(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Control points (C, 7) of the spline nearest to values (N, 7), in the least squares of values and roughness."""
+    """Control points (C, 7) of the smoothing spline of values (N, 7) at seconds (N,): least squares of residuals and of
+    the roughness."""
     controls = int(seconds[-1] / _KNOT_S) + _ORDER
     first, power = _segment(seconds, controls, 0)
     normal, right = np.zeros((controls, controls)), np.zeros((controls, values.shape[1]))
@@ -130,7 +133,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
             continue
         fields = [field.strip() for field in line.split(",")] if euroc else line.split()
         try:
-            # Seconds since 1970 with nine digits are no float64: they are read as whole nanoseconds.
+            # Seconds since 1970 with nine decimals exceed float64, so that they are read as integer nanoseconds.
             stamps.append(int(fields[0]) if euroc else _nanoseconds(fields[0]))
             x, y, z, a, b, c, d = (float(field) for field in fields[1:8])
         except ValueError:

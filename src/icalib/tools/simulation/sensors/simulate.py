@@ -1,4 +1,4 @@
-"""From a scenario to measurements and the truth behind them."""
+"""Simulates the measurements of a scenario, and their truth."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from icalib.tools.simulation.sensors.imu import imu_stamps, inside, read_imu
 from icalib.tools.simulation.sensors.motion import exact_motion, reference_motion
 from icalib.tools.simulation.sensors.tracks import SimulatedTracks, TrackTruth, follow
 
-Progress = Callable[[str, float], None]  # what is being done, and the share of all that is done
-_CAMERA_STREAM = 2  # of random numbers of the first camera; the next ones count from there
+Progress = Callable[[str, float], None]  # called with the current step, and the progress of the whole, 0 to 1
+_CAMERA_STREAM = 2  # number of the first camera's random stream; further cameras have the following ones
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What the measurements were made from.
+    """True values behind the measurements.
 
-    All instants are seconds on the IMU's clock since `imu_clock_origin_ns`. Arrays over the readings have one row per
-    reading in the measurements (readings lost in gaps have none). Dictionaries are by the sensor's name.
+    All instants are seconds on the IMU's clock since `imu_clock_origin_ns`. Arrays with N rows have one for each
+    reading in the measurements; lost readings have none. Dictionaries are by name of the sensor.
     """
 
     imu_clock_origin_ns: int
@@ -57,17 +57,17 @@ class Truth:
 
     @property
     def T_world_board(self) -> np.ndarray:
-        """(4, 4): of the first body."""
+        """(4, 4) pose of the first body of the target."""
         return self.T_world_bodies[0]
 
     def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Exact R_world_imu (N, 3, 3), position and velocity (N, 3) in world at seconds (N,)."""
+        """Exact R_world_imu (N, 3, 3), position (N, 3) m and velocity (N, 3) m/s in the world at seconds (N,)."""
         return self.trajectory.pose_at(np.asarray(seconds, dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """One simulated recording."""
+    """One simulated recording with its truth."""
 
     scenario: Scenario
     measurements: Measurements
@@ -75,16 +75,17 @@ class Simulation:
 
 
 def raw_time_offset(scenario: Scenario, sensor: SimCamera | SimSensor) -> float:
-    """Seconds to add to the sensor's raw stamps to get the IMU's: the offset and the distance of the clock origins."""
+    """Seconds to add to the sensor's raw stamps to get the IMU's clock: its time offset, plus the difference of the
+    clock origins."""
     return sensor.time_offset_s + (scenario.imu_clock_origin_ns - sensor.clock_origin_ns) * 1e-9
 
 
 def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, done: None) -> Simulation:
-    """Simulate one recording; the same scenario and seed give the same numbers.
+    """Simulates one recording; the same scenario and seed give the same numbers.
 
-    Motion, IMU noise and each sensor draw from streams of their own: changing one leaves the others as they are.
-    Raises RigError where a robot's sensor measures less than twice, RecordingError where a recorded motion cannot be
-    used.
+    Motion, IMU noise and each sensor have separate random streams, so that a change of one does not affect the others.
+    Raises RigError if a sensor of a robot has fewer than two measurements, RecordingError if a recorded motion cannot
+    be used.
     """
     progress("motion", 0.0)
     imu_rng = np.random.default_rng([seed, 1])
@@ -116,13 +117,14 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
 
 
 def true_values(scenario: Scenario, sensor: SimCamera | SimSensor) -> dict[str, np.ndarray]:
-    """The parameters of a sensor by their names in the rig."""
+    """True parameters of a sensor by their names in the rig, extrinsics and time offset included."""
     T, offset = sensor.T_imu_sensor, np.array([raw_time_offset(scenario, sensor)])
     return mounted(T[:3, :3], T[:3, 3], offset) | sensor.values()
 
 
 def _motion(scenario: Scenario, seed: int, seconds: np.ndarray) -> tuple[TrueTrajectory, np.ndarray]:
-    """The trajectory, and the rates and forces (N, 6) that an IMU without errors reads on it."""
+    """The true trajectory, and the readings (N, 6) of an IMU without errors at seconds (N,): angular rates [rad/s] and
+    specific forces [m/s^2]."""
     motion = scenario.motion
     rng = np.random.default_rng([seed if motion.seed is None else motion.seed, 0])
     reference: AnalyticTrajectory
@@ -157,7 +159,7 @@ def _tracks(scenario: Scenario, trajectory: TrueTrajectory, seed: int) -> Simula
 
 
 def _reports(scenario: Scenario, scene: SimScene, seed: int, progress: Progress) -> dict[str, Report]:
-    """What each of the sensors beside IMU and cameras reports, by name."""
+    """Measurements of the sensors other than IMU and cameras, by name."""
     reports, of_kind, share = {}, Counter[int](), 0.7 / max(len(scenario.sensors), 1)
     for i, sensor in enumerate(scenario.sensors):
         number = sensor.random_stream + of_kind[sensor.random_stream]
@@ -173,7 +175,7 @@ def _shared(progress: Progress, stage: str, before: float, share: float) -> Call
 
 
 def _motion_truth(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray) -> dict[str, Any]:
-    """The fields of `Truth` on where the IMU was at its readings."""
+    """The fields of `Truth` on the motion of the IMU; seconds (N,): of its readings."""
     rotation, position, velocity = trajectory.pose_at(seconds)
     return {
         "imu_clock_origin_ns": scenario.imu_clock_origin_ns,
@@ -186,7 +188,7 @@ def _motion_truth(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.nd
 
 
 def _rig_truth(scenario: Scenario) -> dict[str, Any]:
-    """The fields of `Truth` that the scenario states."""
+    """The fields of `Truth` that are copied from the scenario."""
     sensors = scenario.mounted
     return {
         "imu_intrinsics": scenario.imu_intrinsics,

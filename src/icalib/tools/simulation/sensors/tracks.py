@@ -1,4 +1,4 @@
-"""What a front end makes of the images: points of the room, followed from image to image and numbered."""
+"""Simulated feature tracks: points of the room that cameras track from image to image."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ _LOST_PERIODS = 1.5
 
 @dataclass(frozen=True, eq=False)
 class TrackTruth:
-    """seconds (M,): true instants of the images, IMU clock since its origin; uv (N, 2) before noise."""
+    """Truth of M images and N tracked points. seconds (M,): instants of the images on the IMU's clock since its origin;
+    uv (N, 2): image points without noise [px]."""
 
     seconds: np.ndarray
     uv: np.ndarray
@@ -29,7 +30,7 @@ class TrackTruth:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTracks:
-    """What all cameras followed. points (F, 3): where feature i truly is, in world."""
+    """Feature tracks of all cameras, and their truth. points (F, 3): position of each feature in the world [m]."""
 
     streams: tuple[TrackStream, ...]
     truths: tuple[TrackTruth, ...]
@@ -39,7 +40,8 @@ class SimulatedTracks:
 def follow(
     scenario: Scenario, room: Room, features: Features, trajectory: TrueTrajectory, seed: int
 ) -> SimulatedTracks:
-    """Tracks of all cameras. Images are those of the corners; noise is each camera's `corner_noise_px`."""
+    """Feature tracks of all cameras. The stamps of images are those of the corners; the noise of a camera is its
+    `corner_noise_px`."""
     rng = np.random.default_rng(features.seed)
     surface, normal = room.points(features.count, rng)
     points = surface + features.relief_m * rng.standard_normal((len(surface), 1)) * normal
@@ -75,8 +77,8 @@ def _view(
     rotation: np.ndarray,
     position: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the points that are in the picture and not hidden, which is judged where they would be without relief,
-    on the `surface`; and the pixels (N, 2) of all points."""
+    """Numbers of the visible points, and image points (N, 2) [px] of all points. A point is visible if it is in range,
+    in the image and not occluded. surface (N, 3): points without relief, for which occlusion is tested."""
     eye = position + rotation @ camera.T_imu_sensor[:3, 3]
     rays = points - eye
     local = rays @ (rotation @ camera.T_imu_sensor[:3, :3])
@@ -93,7 +95,7 @@ def _view(
 
 
 class _FrontEnd:
-    """Which points each camera follows, and under which number."""
+    """A tracking front end: chooses the points that each camera tracks, and their feature numbers."""
 
     def __init__(self, features: Features, slowest_hz: float, rng: np.random.Generator) -> None:
         self._features, self._rng = features, rng
@@ -106,9 +108,9 @@ class _FrontEnd:
         self._tracked: dict[int, np.ndarray] = {}
 
     def choose(self, camera: int, seconds: float, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of the points `seen` at an instant, those that the camera follows, and their numbers.
+        """Points among the visible ones `seen` that the camera tracks at an instant, and their feature numbers.
 
-        First those that it followed before, then those that another camera follows, then others.
+        Points that the camera tracked in its last image go first, then those that another camera tracks, then others.
         """
         alive = self._alive(seconds, seen)
         before = np.isin(seen, self._tracked.get(camera, np.empty(0, dtype=np.int64)))
@@ -123,13 +125,13 @@ class _FrontEnd:
         return chosen, self._number[chosen].copy()
 
     def _alive(self, seconds: float, points: np.ndarray) -> np.ndarray:
-        """Whether each point's number still holds."""
+        """(n,) bool: whether the feature numbers of `points` (n,) are still valid."""
         held = seconds - self._last[points] <= self._lost_after
         young = seconds - self._born[points] <= self._features.longest_track_s
         return (points < self._features.persistent) | (held & young)
 
     def point_of(self) -> np.ndarray:
-        """(F,) the point behind each number."""
+        """(F,) number of the point of each feature."""
         return np.array(self._points, dtype=np.int64)
 
 
