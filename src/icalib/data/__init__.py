@@ -1,1 +1,1 @@
-"""What was measured: streams of all sensors, and the recordings that they are read from."""
+"""Sensor data: streams of measurements, and readers of recordings (bags, folders of tables, images, videos)."""

@@ -1,8 +1,8 @@
 """Measurements from numpy arrays, for `icalib.calibrate_measurements`.
 
-Each function makes the stream of one sensor, which must have the sensor's name in the rig. Stamps are seconds (float)
-or nanoseconds (integers) of the sensor's own clock, strictly increasing. Integers keep all digits of a clock that
-counts from 1970; float seconds have a resolution of 0.2 us there. All functions raise RecordingError, one sentence.
+Each function returns the stream of one sensor; `name` is the sensor's name in the rig. Stamps are strictly increasing:
+seconds (float) or nanoseconds (integer) on the clock of the sensor. Integers are exact; float seconds since 1970 have a
+resolution of 0.2 us. All functions raise RecordingError for wrong shapes, types or values.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from icalib.sensors.stream import Stream
 
 
 def measurements(*streams: Stream, name: str = "") -> Measurements:
-    """What one recording holds: the streams of all its sensors, in any order. name: of the recording, for messages."""
+    """The streams of all sensors of one recording, in any order. name: of the recording, for error messages."""
     imus = [s for s in streams if isinstance(s, ImuStream)]
     if len(imus) > 1:
         raise RecordingError(f"{imus[1].name} is a second IMU beside {imus[0].name}; give one.")
@@ -35,27 +35,36 @@ def measurements(*streams: Stream, name: str = "") -> Measurements:
 
 
 def imu(name: str, stamps: Any, gyro: Any, accel: Any) -> ImuStream:
-    """stamps (N,); gyro (N, 3) rad/s; accel (N, 3) m/s^2, with gravity (specific force), in the frame of the IMU."""
+    """Readings of an IMU in its frame: stamps (N,), gyro (N, 3) [rad/s], accel (N, 3) specific force [m/s^2]."""
     return ImuStream(name, _stamps(name, stamps), _floats(name, "gyro", gyro), _floats(name, "accel", accel))
 
 
 def corners(name: str, stamps: Any, points: Sequence[Any], pixels: Sequence[Any]) -> CornerStream:
-    """Corners of the target that a camera saw. stamps (M,); for each image points (n,), indices into `target.points`,
-    and pixels (n, 2), of which (0, 0) is the centre of the top-left pixel."""
+    """Target corners detected by a camera, for M images with stamps (M,).
+
+    points: for each image (n,) indices into `target.points`. pixels: for each image (n, 2) px; (0, 0) is the centre of
+    the top-left pixel.
+    """
     start, index, uv = _grouped(name, stamps, points, pixels, 2)
     return CornerStream(name, _stamps(name, stamps), start, index, uv)
 
 
 def tracks(name: str, stamps: Any, features: Sequence[Any], pixels: Sequence[Any]) -> TrackStream:
-    """Points of the scene that a camera tracked. stamps (M,); for each image features (n,), numbers that are the same
-    for the same point in all images and cameras, and pixels (n, 2) as for `corners`."""
+    """Feature tracks of a camera, for M images with stamps (M,).
+
+    features: for each image (n,) ids; a scene point has the same id in all images and cameras. pixels: for each image
+    (n, 2) px, as for `corners`.
+    """
     start, index, uv = _grouped(name, stamps, features, pixels, 2)
     return TrackStream(name, _stamps(name, stamps), start, index, uv)
 
 
 def lidar(name: str, stamps: Any, xyz: Sequence[Any], offsets: Sequence[Any]) -> LidarStream:
-    """Scans of a LiDAR. stamps (S,); for each scan xyz (n, 3) m in the frame of the LiDAR at the instant of the point,
-    and offsets (n,) s, the instants of the points from the stamp of their scan."""
+    """S scans of a LiDAR with stamps (S,), without motion compensation.
+
+    xyz: for each scan (n, 3) m, each point in the LiDAR frame at the instant of that point. offsets: for each scan (n,)
+    s, instant of the point minus stamp of its scan.
+    """
     start, _, points = _grouped(name, stamps, [np.zeros(len(scan), np.int64) for scan in xyz], xyz, 3)
     seconds = [_floats(name, "offsets", offset) for offset in offsets]
     offset = np.concatenate([np.zeros(0), *seconds]).astype(np.float32)
@@ -71,14 +80,16 @@ def wheels(
     sampling: Literal["interval-mean", "instantaneous"] = "interval-mean",
     kind: Literal["pair", "steered", "twist"] = "pair",
 ) -> WheelStream:
-    """Wheels. stamps (N,); rate (N, 2): of kind "pair" rates of the left and right wheel [rad/s], of "steered" rate and
-    steering angle [rad], of "twist" speed [m/s] and yaw rate [rad/s]."""
+    """Wheel odometry with stamps (N,) and rate (N, 2), whose columns depend on `kind`.
+
+    pair: rates of the left and right wheel [rad/s]. steered: wheel rate [rad/s] and steering angle [rad]. twist: speed
+    [m/s] and yaw rate [rad/s]. sampling: whether rates are means over the interval or instantaneous.
+    """
     return WheelStream(name, _stamps(name, stamps), _floats(name, "rate", rate), sampling, kind)
 
 
 def poses(name: str, stamps: Any, rotation: Any, position: Any) -> PoseStream:
-    """Poses in a fixed frame. stamps (N,); rotation (N, 3, 3) R_frame_sensor, or a scipy Rotation; position (N, 3)
-    m."""
+    """Poses T_frame_sensor in a static frame: stamps (N,), rotation (N, 3, 3) or scipy Rotation, position (N, 3) m."""
     rotation = rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation
     R = _floats(name, "rotation", rotation)
     if R.shape[1:] == (3, 3) and not (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) < ROUNDING).all():
@@ -87,7 +98,7 @@ def poses(name: str, stamps: Any, rotation: Any, position: Any) -> PoseStream:
 
 
 def _stamps(name: str, stamps: Any) -> np.ndarray:
-    """(N,) int64 ns."""
+    """(N,) int64 ns. Raises RecordingError if stamps are not a vector of finite, strictly increasing numbers."""
     found = np.asarray(stamps)
     if found.ndim != 1 or len(found) == 0 or found.dtype.kind not in "iuf":
         raise RecordingError(f"{name}: stamps must be a vector of seconds, or of integer nanoseconds.")
@@ -113,7 +124,8 @@ def _floats(name: str, what: str, values: Any) -> np.ndarray:
 def _grouped(
     name: str, stamps: Any, index: Sequence[Any], values: Sequence[Any], columns: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """start (M + 1,), index (N,) int64 and values (N, columns) of all groups, one after the other."""
+    """Concatenates M groups: index (N,) int64 and values (N, columns); group k is rows start[k] to start[k + 1], start
+    (M + 1,)."""
     if not len(index) == len(values) == len(stamps):
         raise RecordingError(f"{name}: there are {len(stamps)} stamps, but {len(index)} and {len(values)} groups.")
     arrays = [_floats(name, "values", v).reshape(-1, columns) for v in values]

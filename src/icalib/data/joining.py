@@ -1,4 +1,4 @@
-"""Several recordings of one rig as one: their clocks are shifted so that they follow one another after a pause."""
+"""Joins several recordings of a rig: shifts their clocks so that the recordings follow one another with pauses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ PAUSE_NS = 10_000_000_000
 
 @dataclass(frozen=True)
 class Part:
-    """One recording among those that were joined, as it was measured.
+    """One recording of a joined set.
 
-    shift_ns: what was added to all its stamps; own: which stamps of each joined stream are its own, by the stream's
-    key; begin: its first stamp on the joined clock of the body [s].
+    measurements: as recorded, before the shift. shift_ns: added to all its stamps. own: by stream key, the stamps of
+    the joined stream that belong to this recording. begin: its first stamp of the reference sensor, in seconds from
+    that of the first recording on the joined clock.
     """
 
     measurements: Measurements
@@ -36,11 +37,13 @@ class Part:
 def join(
     rig: Rig, recordings: Sequence[Measurements], shifts_ns: Sequence[int] | None = None
 ) -> tuple[Measurements, tuple[Part, ...]]:
-    """All recordings as one, and where each stands in it; a single one stays as it is. shifts_ns: those of a join of
-    these and more streams, which the clock is to go by.
+    """The joined recording, and the place of each recording in it. A single recording stays unchanged.
 
-    All clocks of a recording are shifted alike, so that time offsets between raw clocks stay. Whatever these are, two
-    recordings stay apart as long as the streams of each overlap: the pause between them is longer than both.
+    shifts_ns: shifts from an earlier join with more streams, to use the same joined clock; default: computed here.
+
+    All clocks of a recording are shifted by the same amount, so that time offsets between sensors remain. The pause
+    between two recordings is longer than both. They thus do not overlap for any time offset for which the streams
+    within each recording overlap.
     """
     shifts = _shifts(rig, recordings) if shifts_ns is None else shifts_ns
     first, parts, ends = recordings[0].origin_ns, [], dict.fromkeys(recordings[0].streams, 0)
@@ -52,7 +55,7 @@ def join(
 
 
 def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
-    """What to add to the stamps of each recording [ns]. Raises RecordingError where a stream of one is empty."""
+    """Shift [ns] of the stamps of each recording. Raises RecordingError if several are given and a stream is empty."""
     for recording in recordings if len(recordings) > 1 else ():
         empty = [s.name for s in recording.streams.values() if not len(s.stamps_ns)]
         if empty:
@@ -69,7 +72,8 @@ def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
 
 
 def _length_ns(rig: Rig, measurements: Measurements) -> int:
-    """Of the longest stream; without an IMU from the first stamp of any sensor to the last: offsets are known then."""
+    """Length [ns] of the longest stream. Without an IMU, from the first stamp of all sensors to the last, corrected by
+    the time offsets of the rig."""
     streams = measurements.streams.values()
     spans = [(int(s.stamps_ns[0]), int(s.stamps_ns[-1])) for s in streams]
     if measurements.imu is not None:
@@ -90,7 +94,8 @@ def _joined(recordings: Sequence[Measurements], shifts: Sequence[int]) -> Measur
 
 
 def _disjoint(recordings: Sequence[Measurements]) -> list[dict[str, Stream]]:
-    """The streams of each recording, such that a number in two recordings is two things."""
+    """The streams of each recording by key, renumbered so that an id (such as of a feature) occurs in one recording
+    only."""
     found = [dict(m.streams) for m in recordings]
     for kind in dict.fromkeys(type(s) for s in recordings[0].streams.values()):
         for own, streams in zip(found, kind.disjoint([m.of(kind) for m in recordings]), strict=True):

@@ -1,4 +1,4 @@
-"""What one recording holds: the streams of its sensors."""
+"""`Measurements`: the sensor streams of one recording."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Measurements:
-    """What one recording holds of the sensors of a rig.
+    """The sensor streams of one recording.
 
-    streams: by `Stream.key`, sorted by kind of sensor in the order of `SENSOR_KINDS`; notes: what was dropped or
-    repaired while reading, one sentence each; name: of the recording, for sentences about one of several; warnings:
-    what is wrong with the streams, one sentence each.
+    streams: by `Stream.key`, sorted by kind of sensor in the order of `SENSOR_KINDS`. notes: data that were rejected or
+    repaired while reading, one sentence each. name: of the recording, for messages. warnings: faults of the streams,
+    one sentence each.
     """
 
     streams: Mapping[str, Stream] = field(default_factory=dict)
@@ -47,7 +47,7 @@ class Measurements:
 
     @classmethod
     def of_streams(cls, *streams: Stream, notes: tuple[str, ...] = (), name: str = "") -> Measurements:
-        """Raises RecordingError where a sensor has two streams of one kind."""
+        """Measurements of these streams. Raises RecordingError if two streams have the same key."""
         by_key = {s.key: s for s in streams}
         if len(by_key) < len(streams):
             twice = next(s.name for k, s in enumerate(streams) if s.key in [t.key for t in streams[:k]])
@@ -55,19 +55,19 @@ class Measurements:
         return cls(by_key, notes, name)
 
     def of(self, kind: type[S]) -> tuple[S, ...]:
-        """All streams of one class."""
+        """All streams of class `kind`."""
         return tuple(s for s in self.streams.values() if isinstance(s, kind))
 
     def only(self, *sensors: str) -> Measurements:
-        """The same of `sensors` alone, by name; a name without a stream counts for nothing."""
+        """A copy with the streams of `sensors` (names) only. Names without a stream are ignored."""
         return replace(self, streams={k: s for k, s in self.streams.items() if s.name in sensors})
 
     def without(self, *sensors: str) -> Measurements:
-        """The same without these sensors."""
+        """A copy without the streams of `sensors` (names)."""
         return replace(self, streams={k: s for k, s in self.streams.items() if s.name not in sensors})
 
     def with_streams(self, *streams: Stream) -> Measurements:
-        """The same with these streams in place of those with the same keys, or beside the others."""
+        """A copy with `streams` added, or in place of those with the same keys."""
         return replace(self, streams={**self.streams, **{s.key: s for s in streams}})
 
     @property
@@ -96,16 +96,18 @@ class Measurements:
 
     @property
     def origin_ns(self) -> int:
-        """The first stamp of the body's clock: the IMU's, or without one that of `body`."""
+        """First stamp [ns] of the IMU; without an IMU, that of `body`."""
         return self.body.origin_ns if self.imu is None else self.imu.origin_ns
 
     @property
     def body(self) -> CornerStream | TrackStream | PoseStream:
-        """Without an IMU: the stream of the sensor whose frame and clock are the body's. It is the first camera, or the
-        first pose sensor where cameras have nothing but feature tracks."""
+        """Stream of the reference sensor if there is no IMU: the first camera, or else the first pose sensor.
+
+        If the cameras have only feature tracks, it is the first pose sensor, or else the first camera.
+        """
         follow = bool(self.tracks) and not any(len(c.uv) for c in self.cameras)
         return (*self.poses, *self.tracks)[0] if follow else (*self.cameras, *self.poses)[0]
 
     def unassociated(self) -> Measurements:
-        """The same, of whose LiDARs' points nobody knows on what planes they lie."""
+        """A copy in which the association of LiDAR points with planes is unknown."""
         return self.with_streams(*(x.unassociated() for x in self.lidars))

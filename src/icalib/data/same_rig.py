@@ -1,4 +1,4 @@
-"""Whether measurements made in memory are those of the rig; what is read from files is so already."""
+"""Checks that measurements made in memory have a stream for each sensor of the rig. Readers of files ensure this."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from icalib.rig import Rig
 
 
 def streams_of_rig(rig: Rig, measurements: Measurements) -> Measurements:
-    """The same streams in the order of the rig's sensors. A camera has corners or tracks, or both. Positions far from
-    the origin of their frame, as in UTM, are counted from among them; the notes say so.
+    """The streams in the order of the rig's sensors. A camera has corners, feature tracks, or both.
 
-    Raises RecordingError where a sensor of the rig has no stream, or a stream is of no such sensor of the rig.
+    Positions far from the origin of their frame, such as UTM coordinates, are shifted close to it, with a note. Raises
+    RecordingError if a sensor has no stream, or a stream belongs to no sensor of its kind in the rig.
     """
     m, where = measurements, measurements.name or "the recording"
     for stream in m.streams.values():

@@ -1,7 +1,7 @@
-"""What a recording holds, and which part of it is a sensor's.
+"""Topics of a recording, and the choice of the topic of each sensor.
 
-Each kind of sensor declares in its `read` module what it is read from: `MESSAGES` and `UNREAD` are types of messages,
-`TABLES` files of a folder (`data.tables.files`). Several kinds may declare the same type.
+Each kind of sensor declares its data formats in its `read` module. `MESSAGES` lists ROS message types, `UNREAD` types
+that icalib cannot read, and `TABLES` files of a folder (`data.tables.files`). Several kinds may declare the same type.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ _MAX_LISTED = 20
 
 @dataclass(frozen=True)
 class MessageType:
-    """A type of messages that a kind of sensor is read from.
+    """A ROS message type that a kind of sensor is read from.
 
-    name: as ROS 2 writes it; kind: a word for what they hold, `TopicInfo.kind`. stamped: each has one stamp, in its
-    header. lasting: what the names of topics end with whose messages hold for the whole recording; None: of no topic.
-    parsers: by encoding (ros1, cdr), from the bytes of a message, where rosbags does not know the type; they raise
-    ValueError. read_as: the name by which rosbags knows it; ros1: its definition, where rosbags has it for ROS 2 only.
+    name: in ROS 2 notation. kind: the quantity that it contains, as `TopicInfo.kind`. stamped: the message has a header
+    with a stamp. lasting: ending of the names of topics whose messages are valid for the whole recording (latched);
+    None: no topic. parsers: by encoding (ros1, cdr), function from bytes to message for types unknown to rosbags; it
+    raises ValueError. read_as: name of the type in rosbags; empty: `name`. ros1: the definition, if rosbags has it for
+    ROS 2 only.
     """
 
     name: str
@@ -40,10 +41,10 @@ class MessageType:
 
 @dataclass(frozen=True)
 class UnreadType:
-    """Types of messages that hold what a sensor needs in a form that icalib does not read.
+    """Message types with the right quantity in a format that icalib cannot read.
 
-    pattern: a regular expression of their names; kind: what they would have to be; words: what they hold, and what to
-    do about it.
+    pattern: regular expression of type names. kind: the quantity, as `TopicInfo.kind`. words: for the error message,
+    the content of the messages and the remedy.
     """
 
     pattern: str
@@ -53,24 +54,24 @@ class UnreadType:
 
 @cache
 def message_types() -> dict[str, MessageType]:
-    """All that some kind of sensor declares, by name."""
+    """All message types that kinds of sensors declare, by name."""
     return {t.name: t for kind in SENSOR_KINDS for t in facet(kind, "read").MESSAGES}
 
 
 def type_not_read(name: str) -> tuple[str, str] | None:
-    """`UnreadType.kind` and its words, where a type of messages is declared as such; else None."""
+    """`kind` and `words` of the `UnreadType` that the message type `name` matches; None if there is none."""
     unread = (t for kind in SENSOR_KINDS for t in getattr(facet(kind, "read"), "UNREAD", ()))
     return next(((t.kind, t.words) for t in unread if re.fullmatch(t.pattern, name, re.IGNORECASE)), None)
 
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """One stream of a recording.
+    """One topic of a bag, or one table, image folder or video of a folder.
 
-    name: what `topic` (of a folder's tables: `path`) of a sensor in the rig file may be. type: of its messages, or what
-    it is in a folder. kind: a word for what it holds, as the kinds of sensors declare it; empty for what icalib does
-    not read. first_ns, last_ns: when the first and last message were
-    received in a bag, the first and last stamp in a folder; None where there are no messages.
+    name: value of `topic` (for tables: `path`) of a sensor in the rig file. type: message type, or kind of file. kind:
+    the quantity, such as "image" or "pose", as kinds of sensors declare it; empty if icalib cannot read it. count:
+    number of messages, rows or images. first_ns, last_ns: receive times of the first and last message of a bag, stamps
+    in a folder; None without messages.
     """
 
     name: str
@@ -82,10 +83,10 @@ class TopicInfo:
 
 
 def choose_topic(where: str, topics: Sequence[TopicInfo], sensor: str, given: str | None, *kinds: str) -> TopicInfo:
-    """The topic of one of `kinds` that is `sensor`'s: the one `given`, else the only one with the sensor's name in its
-    own, else the only one.
+    """The topic of a sensor, of one of `kinds`: `given`, else the only one whose name contains the name `sensor`, else
+    the only one.
 
-    Raises RecordingError naming the recording (`where`) and listing what there is.
+    where: the recording, for messages. Raises RecordingError listing the topics if none or several remain.
     """
     if given is not None:
         return _given(where, topics, given, kinds)
@@ -104,7 +105,7 @@ def choose_topic(where: str, topics: Sequence[TopicInfo], sensor: str, given: st
 
 
 def find_topic(where: str, topics: Sequence[TopicInfo], name: str) -> TopicInfo:
-    """The topic `name`, with or without its leading slash. Raises RecordingError listing the topics that there are."""
+    """The topic `name`, with or without leading slash. Raises RecordingError listing all topics if it is missing."""
     for topic in topics:
         if topic.name.lstrip("/") == name.lstrip("/"):
             return topic
@@ -112,7 +113,7 @@ def find_topic(where: str, topics: Sequence[TopicInfo], name: str) -> TopicInfo:
 
 
 def listing(topics: Sequence[TopicInfo]) -> str:
-    """The topics with their types, for a sentence."""
+    """The topics with their types, for an error message."""
     if not topics:
         return "it holds no topics"
     more = f" and {len(topics) - _MAX_LISTED} more" if len(topics) > _MAX_LISTED else ""
@@ -120,7 +121,8 @@ def listing(topics: Sequence[TopicInfo]) -> str:
 
 
 def _refuse_unreadable(missing: str, topics: Sequence[TopicInfo], kinds: Sequence[str]) -> None:
-    """Raises RecordingError where one of `topics` holds what is `missing` in a form that is not read."""
+    """Raises RecordingError if one of `topics` has one of `kinds` in a format that icalib cannot read. missing: start
+    of the message."""
     for topic in topics:
         if (held := type_not_read(topic.type)) and held[0] in kinds:
             raise RecordingError(f"{missing}: {topic.name} ({topic.type}) holds {held[1]}.")

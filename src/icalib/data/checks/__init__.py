@@ -1,1 +1,1 @@
-"""Whether readings can be what they say they are: units, axes, order, gaps."""
+"""Plausibility checks of readings."""

@@ -1,1 +1,1 @@
-"""Time stamps: clocks, jumps, gaps, copies."""
+"""Checks of timestamps: unit, order, duplicates, clock jumps; time windows."""

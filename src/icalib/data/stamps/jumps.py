@@ -1,7 +1,7 @@
-"""Clocks that jump forward: set by GPS or over the network while they run, or counting from 0 until then.
+"""Forward jumps of clocks, such as when GPS or the network sets a clock during the recording.
 
-Before and after a jump the stamps are good, but hours lie between. The time offset of a sensor is another one on each
-side, so one side is used; and nothing may be as large as the time between.
+Stamps before and after a jump are valid, but hours may lie between them. The time offset of a sensor differs before and
+after the jump, so only one segment is used. No array may grow with the time that a jump spans.
 """
 
 from __future__ import annotations
@@ -15,15 +15,18 @@ from icalib.data.stamps.clocks import usual_step
 from icalib.data.stamps.sections import S, Stamped, section
 from icalib.errors import RecordingError
 
-JUMP_S = 600.0  # longer steps are no pause of a recording
-LONGEST_S = 6 * 3600.0  # of a calibration: memory grows with the time between the first stamp and the last
-JUMP_STEPS = 1000.0  # usual steps: so long a pause of a stream of single instants is none
-_FARTHEST_NS = 2**62  # from zero: differences of stamps are int64
+JUMP_S = 600.0  # a longer step is a jump of the clock, not a pause
+LONGEST_S = 6 * 3600.0  # longest calibration: memory grows with the time between first and last stamp
+JUMP_STEPS = 1000.0  # a jump also exceeds this many typical steps, so that slow streams may have long pauses
+_FARTHEST_NS = 2**62  # largest absolute stamp, so that differences fit in int64
 
 
 class ClockJumps:
-    """Cuts the streams of one recording where clocks jump. The first that jumps keeps its longest part; those that jump
-    as often share its clock, and keep the same part. `notes` says what was cut. longest_s: no part may be longer."""
+    """Cuts the streams of one recording at clock jumps, and keeps one segment of each.
+
+    The first stream with jumps keeps its longest segment. Streams with the same number of jumps are assumed to share
+    its clock, and keep the segment of the same index. notes: sentences on cuts. longest_s: largest permitted length.
+    """
 
     def __init__(self, longest_s: float = np.inf) -> None:
         self.notes: tuple[str, ...] = ()
@@ -31,8 +34,10 @@ class ClockJumps:
         self._kept: dict[int, int] = {}  # which part, by how many there are
 
     def cut(self, stream: S, what: str) -> S:
-        """The part between two jumps; `what` names the stream. Raises RecordingError for stamps beyond 2^62 ns, and for
-        a part that is too long."""
+        """The kept segment of `stream`; the stream itself if its clock does not jump. what: its name in messages.
+
+        Raises RecordingError for stamps beyond +-2^62 ns, and for a segment longer than `longest_s`.
+        """
         _refuse_far(stream.stamps_ns, what)
         cuts = _cuts(stream.stamps_ns)
         parts = list(pairwise(cuts))
@@ -55,14 +60,14 @@ class ClockJumps:
 
 
 def longest_part(stamps_ns: np.ndarray) -> tuple[slice, int]:
-    """The longest part between jumps of stamps (N,), and how many jumps there are."""
+    """The longest segment without jumps of stamps (N,), and the number of jumps."""
     parts = list(pairwise(_cuts(stamps_ns)))
     best = max(parts, key=lambda part: stamps_ns[part[1] - 1] - stamps_ns[part[0]] if part[1] else 0)
     return slice(*best), len(parts) - 1
 
 
 def _cuts(stamps_ns: np.ndarray) -> list[int]:
-    """Where parts begin, and the number of stamps."""
+    """Indices at which segments without jumps begin, followed by the number of stamps N."""
     if len(stamps_ns) < 2:
         return [0, len(stamps_ns)]
     limit_ns = max(JUMP_S * 1e9, JUMP_STEPS * usual_step(stamps_ns))

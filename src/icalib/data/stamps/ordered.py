@@ -1,4 +1,4 @@
-"""Readings that are finite, in order of their stamps, and each there once."""
+"""Checks of readings: finite, ordered by stamp, without duplicates."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import numpy as np
 from icalib.data.stamps.clocks import rate_sentence
 from icalib.errors import RecordingError
 
-_CUT_SHARE = 0.3  # of readings with the stamp of another: these are cut stamps
-_MOST_DOUBTFUL, _LEAST_LEFT = 0.1, 3  # of readings, beyond one stamp: more are no single bad ones
+_CUT_SHARE = 0.3  # share of readings with a conflicting stamp above which stamps are reported as truncated
+_MOST_DOUBTFUL, _LEAST_LEFT = 0.1, 3  # largest tolerated share of conflicts; least readings beside a single conflict
 
 
 def kept_readings(
     stamps_ns: np.ndarray, values: np.ndarray, what: str, rate_hz: tuple[float, float], thing: str, own: str
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """(N,) bool: which of the readings (N, m) to keep, and notes on the others: those that repeat the one before, and
-    those that differ although they have one stamp.
+    """(N,) bool: readings to keep, of stamps_ns (N,) and values (N, m); and notes on the rejected ones.
 
-    what, thing, own: the words for the file, for one reading and for the advice on its stamps. Raises RecordingError
-    naming the instant: NaN, stamps out of order or often repeated with other values, a rate outside of `rate_hz`.
+    Rejected are exact repetitions, and all readings that share a stamp but differ in value. what, thing, own: words for
+    the file, one reading, and advice on stamps. rate_hz: slowest and fastest rate. Raises RecordingError with the
+    instant for NaN, unordered stamps, many conflicting readings of one stamp, or a rate outside `rate_hz`.
     """
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
@@ -47,8 +47,8 @@ def kept_readings(
 
 
 def _one_stamp(stamps_ns: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool each: which of the readings in order have the stamp of one with other values, and which others repeat
-    one before."""
+    """(N,) bool each: readings that share a stamp with a reading of other values, and other readings that repeat the
+    stamp before. Stamps are sorted."""
     same = np.diff(stamps_ns) == 0
     group = np.concatenate([[0], np.cumsum(~same)])
     unlike = same & (np.diff(values, axis=0) != 0).any(axis=1)
@@ -57,7 +57,7 @@ def _one_stamp(stamps_ns: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _refuse_many(differs: np.ndarray, stamps_ns: np.ndarray, what: str, thing: str, own: str) -> None:
-    """Raises RecordingError where the readings `differs` (N,) are not single bad ones."""
+    """Raises RecordingError if too many readings, `differs` (N,) bool, share a stamp with different ones."""
     share, n_stamps = differs.mean(), len(np.unique(stamps_ns[differs]))
     if n_stamps < 2 and (~differs).sum() >= _LEAST_LEFT:
         return
@@ -71,7 +71,7 @@ def _refuse_many(differs: np.ndarray, stamps_ns: np.ndarray, what: str, thing: s
 
 
 def longest_run(flag: np.ndarray) -> tuple[int, int]:
-    """Where the longest run of True in `flag` (N,) begins, and its length; (0, 0) without one."""
+    """Begin and length of the longest run of True in `flag` (N,) bool; (0, 0) if there is none."""
     edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
     begin, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
     if not len(begin):

@@ -1,4 +1,4 @@
-"""A part of a stream: some of its readings, images or scans in a row."""
+"""Section of a stream: consecutive readings, images or scans."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Stamped(Protocol):
-    """Any stream, checked or as it was written: a frozen dataclass of arrays, one of them stamps_ns (N,) int64."""
+    """A stream, checked or raw: a frozen dataclass of arrays, one of them stamps_ns (N,) int64."""
 
     @property
     def name(self) -> str: ...
@@ -21,7 +21,11 @@ S = TypeVar("S", bound=Stamped)
 
 
 def section(stream: S, begin: int, end: int) -> S:
-    """The readings, images or scans from `begin` to before `end`. What is between two stamps goes with both."""
+    """The stream with stamps `begin` to before `end` of its N stamps.
+
+    With an array `start` (N + 1,), the rows of stamp k are start[k] to start[k + 1]. Arrays of length N - 1 refer to
+    the intervals between stamps.
+    """
     n = len(stream.stamps_ns)
     if (begin, end) == (0, n):
         return stream
@@ -36,7 +40,7 @@ def section(stream: S, begin: int, end: int) -> S:
             changed[field.name] = value[begin:end]
         elif field.name == "start":
             changed[field.name] = value[begin : end + 1] - value[begin]
-        elif start is None:  # n - 1 of them, between stamps
+        elif start is None:  # (n - 1,): one for each interval between stamps
             changed[field.name] = value[begin : max(end - 1, begin)]
         else:
             changed[field.name] = value[rows]

@@ -1,4 +1,4 @@
-"""A part of a recording, in seconds from its start (`--from`, `--to`)."""
+"""Time window of a recording, in seconds from its start (`--from`, `--to`)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from icalib.data.stamps.sections import S, section
 from icalib.errors import RecordingError
 
 Span = tuple[int, int]  # first and last stamp, ns
-_LONGEST_NS = 86_400_000_000_000  # a stream over more than a day has a clock that jumps
+_LONGEST_NS = 86_400_000_000_000  # one day: the clock of a longer stream is assumed to jump
 
 
 @dataclass(frozen=True)
 class Window:
-    """From start_s on and before end_s, both from the start of the recording. Raises RecordingError where that is no
-    time."""
+    """Time window [start_s, end_s) from the start of the recording. Raises RecordingError for NaN, a negative start, or
+    an end that is not after the start."""
 
     start_s: float = 0.0
     end_s: float = inf
@@ -34,7 +34,7 @@ class Window:
         return self.start_s == 0.0 and self.end_s == inf
 
     def bounds(self, origin_ns: int) -> Span:
-        """The first stamp inside and the first beyond, where the recording starts at origin_ns."""
+        """First stamp [ns] in the window, and first after it, for a recording that starts at origin_ns."""
         end = origin_ns + round(self.end_s * 1e9) if self.end_s < inf else 2**63 - 1
         return origin_ns + round(self.start_s * 1e9), min(end, 2**63 - 1)
 
@@ -43,7 +43,7 @@ class Window:
         return f"{where}: only the part from {self.start_s:g} s after its start {end} is used."
 
     def refuse(self, what: str, length_s: float) -> RecordingError:
-        """The error of a part with nothing in it; length_s: what there is, from the start of the recording on."""
+        """The error for a window without data. length_s: length of the data from the start of the recording."""
         end = "the end" if self.end_s == inf else f"{self.end_s:g}"
         return RecordingError(
             f"{what}: there is nothing from {self.start_s:g} s to {end}, the whole lasts {length_s:.4g} s; "
@@ -55,8 +55,10 @@ WHOLE = Window()
 
 
 def cut(window: Window, stream: S, what: str, spans: Sequence[Span]) -> S:
-    """The part of a stream inside the window. Its seconds count from where the recording starts on its clock, see
-    `start_of`. Raises RecordingError where nothing is inside."""
+    """The section of `stream` in the window, counted from the start of the recording on its clock (`start_of`).
+
+    what: its name in messages. spans: of all streams of the recording. Raises RecordingError if the window is empty.
+    """
     if window.is_all or not len(stream.stamps_ns):
         return stream
     inside = np.flatnonzero(stamps_inside(window, stream.stamps_ns, what, spans))
@@ -64,7 +66,7 @@ def cut(window: Window, stream: S, what: str, spans: Sequence[Span]) -> S:
 
 
 def stamps_inside(window: Window, stamps_ns: np.ndarray, what: str, spans: Sequence[Span]) -> np.ndarray:
-    """(N,) bool. Raises RecordingError where none is inside."""
+    """(N,) bool: stamps in the window, as `cut`. Raises RecordingError if there are none."""
     own = int(stamps_ns.min()), int(stamps_ns.max())
     origin = start_of(own, spans)
     low, high = window.bounds(origin)
@@ -75,9 +77,10 @@ def stamps_inside(window: Window, stamps_ns: np.ndarray, what: str, spans: Seque
 
 
 def start_of(own: Span, spans: Sequence[Span]) -> int:
-    """The first stamp of all streams whose clocks go with that of one: their spans overlap, directly or by others.
+    """Start of the recording [ns] on the clock of a stream with the span `own`.
 
-    A stream whose clock jumps, or has another origin, starts at its own first stamp.
+    It is the first stamp of all streams whose spans overlap that span, directly or through other streams. A stream with
+    a clock jump (longer than a day), or with another clock, starts at its first stamp.
     """
     first, last = own
     if last - first > _LONGEST_NS:

@@ -1,1 +1,1 @@
-"""Tables of text: columns, and what each sensor has in them."""
+"""Text tables (CSV): parsing, identification of columns, tables of each kind of sensor."""

@@ -1,4 +1,4 @@
-"""Vectors in the axes that the rig file gives."""
+"""Permutation and signs of vector components as the rig file states."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from icalib.rig import Axes
 
 
 def in_axes(values: np.ndarray, axes: Axes | None) -> np.ndarray:
-    """Vectors (N, 3) of the columns that become x, y and z, with their signs; as they are without `axes`."""
+    """Vectors (N, 3) with components reordered and negated by `axes`, the source components of x, y and z, such as
+    ("y", "-x", "z"). Unchanged if `axes` is None."""
     if axes is None:
         return values
     columns = ["xyz".index(entry[-1]) for entry in axes]

@@ -1,4 +1,4 @@
-"""Which column of a table is which: by the names in its header, by the rig file, or by their order."""
+"""Identification of the columns of a table: by the names in its header, by the rig file, or by their order."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from icalib.rig import TimeUnit
 
 _UNIT = re.compile(r"\[[^]]*\]|\([^)]*\)")
 _CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
-# Where a column is from, not what it is: prefixes of rostopic, and of sensors.
+# Prefixes of column names without meaning: those of rostopic, and names of sensors.
 _FROM = re.compile(r"(field|msg|data|imu|imu\d+|odom|pose\d*|transform|twist|sensor|world)_(?=[a-z])")
 STAMP = (r"(header_)?stamp(_ns|_nsec)?", r"time_?stamp(_ns|_us|_ms|_s)?", r"(time|t|ts)(_ns|_us|_ms|_s)?")
-# A stamp in two columns, as of messages of ROS: whole seconds, and nanoseconds beyond them.
+# A stamp in two columns, as in ROS messages: whole seconds and remaining nanoseconds.
 _OF_STAMP = r"((header_)?stamp_|time_?stamp_|time_|ros_?time_)?"
 SECONDS = tuple(rf"{of}(secs?|seconds?)" for of in (r"(header_)?stamp_", _OF_STAMP))
 NANOSECONDS = tuple(rf"{of}(n_?secs?|nano_?secs?|nano_?seconds?)" for of in (r"(header_)?stamp_", _OF_STAMP))
@@ -24,12 +24,13 @@ NANOSECONDS = tuple(rf"{of}(n_?secs?|nano_?secs?|nano_?seconds?)" for of in (r"(
 
 @dataclass(frozen=True)
 class TableKind:
-    """The columns of a kind of table: whole numbers, the stamps first, whose names end in [ns]; then decimals.
+    """The columns of a kind of table.
 
-    known: for each of these regular expressions of names that headers give it, the most telling first; none: only the
-    order counts. rate_hz: the slowest and the fastest rate of stamps, by which their unit is told where it is not
-    `unit`; None: it is. more: whether further columns may follow that no header names. split: whether the first two
-    whole numbers are one stamp, its seconds and its nanoseconds.
+    integers: names of integer columns, stamps first; names of stamps end in [ns]. decimals: names of the float columns
+    that follow. known: for each column, regular expressions of header names, the most specific first; empty: columns
+    are identified by order only. rate_hz: slowest and fastest rate of stamps, to detect a unit other than `unit`; None:
+    the unit is `unit`. more: further columns, which are not read, may follow if columns are identified by order. split:
+    the first two integers are the seconds and nanoseconds of one stamp.
     """
 
     integers: tuple[str, ...]
@@ -46,19 +47,21 @@ class TableKind:
 
     @property
     def stamps(self) -> int:
-        """How many of the integers are stamps, or parts of a split one."""
+        """Number of integer columns that are stamps, or parts of a split stamp."""
         return 2 if self.split else sum(name.endswith("[ns]") for name in self.integers)
 
 
 def vector_names(quantities: str, axes: str = "xyz") -> tuple[tuple[str, ...], ...]:
-    """Names of the components of a vector; quantities: a regular expression of what it may be called."""
+    """Regular expressions of header names for each component of a vector, for `TableKind.known`. quantities: regular
+    expression of names of the vector."""
     return tuple((rf"({quantities})_?{axis}", rf"{axis}_?({quantities})") for axis in axes)
 
 
 def places_by_name(kind: TableKind, header: Sequence[str]) -> np.ndarray | None:
-    """(n,) where each column of the header goes, LEFT_OUT for others; None where the names do not tell.
+    """(n,) for each column of the header, the index in `kind.names`, or LEFT_OUT if it is not used.
 
-    One column without a known name is the one that is missing, where nothing else is left over.
+    None if the names are not sufficient. If exactly one column is missing and exactly one column has an unknown name,
+    they are matched.
     """
     if not kind.known or len(header) < len(kind.names):
         return None
@@ -74,7 +77,7 @@ def places_by_name(kind: TableKind, header: Sequence[str]) -> np.ndarray | None:
 
 
 def split_kind(kind: TableKind, header: Sequence[str]) -> TableKind | None:
-    """The kind with its stamp in two columns, where the header names both; None elsewhere."""
+    """`kind` with its stamp in two columns (`split`), if the header names both; else None."""
     words = [_plain(name) for name in header]
     if not kind.known or None in (_column(words, SECONDS), _column(words, NANOSECONDS)):
         return None
@@ -83,8 +86,8 @@ def split_kind(kind: TableKind, header: Sequence[str]) -> TableKind | None:
 
 
 def places_given(kind: TableKind, header: Sequence[str], columns: Sequence[str], n: int) -> np.ndarray | str:
-    """The same for `columns` in the order of the kind, names of the header or numbers from 1 on, of n columns; or a
-    sentence on what is wrong with them."""
+    """As `places_by_name`, from `columns` of the rig file: header names or numbers from 1 on, in the order of
+    `kind.names`. n: number of columns of the table. Returns text for an error message if they are wrong."""
     if len(columns) != len(kind.names):
         return f"needs {len(kind.names)} names, for {', '.join(kind.names)}, but has {len(columns)}"
     names = {name.strip(): at for at, name in enumerate(header)} or {str(k + 1): k for k in range(n)}
@@ -99,7 +102,7 @@ def places_given(kind: TableKind, header: Sequence[str], columns: Sequence[str],
 
 
 def contradicts(kind: TableKind, header: Sequence[str]) -> bool:
-    """Whether some name of the header is known for another column than the one in its place."""
+    """True if a header name belongs to a column at another position than in `kind`."""
     words = [_plain(name) for name in header]
     found = [_column(words, known) for known in kind.known]
     return any(at not in (None, k) for k, at in enumerate(found))
@@ -112,7 +115,7 @@ def _places(n: int, found: Sequence[int]) -> np.ndarray:
 
 
 def _column(words: Sequence[str], known: Sequence[str]) -> int | None:
-    """The only column with one of the names, the most telling that is there; None where there are none or several."""
+    """Index of the only word that matches the first pattern of `known` with any match; None if none or several do."""
     for name in known:
         found = [at for at, word in enumerate(words) if re.fullmatch(name, word)]
         if found:
@@ -121,12 +124,12 @@ def _column(words: Sequence[str], known: Sequence[str]) -> int | None:
 
 
 def _bare(name: str) -> str:
-    """Without unit and quotes."""
+    """The name without unit and quotes."""
     return _UNIT.sub("", name).strip().strip("\"'").strip()
 
 
 def _plain(name: str) -> str:
-    """A name in small letters and underscores, without its unit and what it is from."""
+    """The name in snake case, without unit and prefixes (`_FROM`)."""
     parts = re.split(r"[^A-Za-z0-9]+", _CAMEL.sub("_", _bare(name)))
     plain = "_".join(p.lower() for p in parts if p)
     while prefix := _FROM.match(plain):

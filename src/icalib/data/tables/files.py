@@ -1,4 +1,4 @@
-"""Files of a folder that sensors are read from, as each kind of sensor declares them in its `read` module."""
+"""Table files of folder recordings, as each kind of sensor declares them in its `read` module."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ StampsOfRows = Callable[[Path, TableLayout, Callable[[str], None]], tuple[dict[i
 
 @dataclass(frozen=True)
 class TableFile:
-    """A file that the folder of a sensor may hold.
+    """Declaration of a table file in the folder of a sensor.
 
-    name: of the file, or a pattern; it may be compressed besides (.gz). type, kind: as of `TopicInfo`. stamps: reads
-    its (N,) int64 ns, by a layout of the rig file. holds: whether a file of this name is one; None: it is, if no other
-    declaration says so of its own. beside: the columns by whose names a table beside the folders is told to be one.
-    rows: where images without stamps may take those of its rows, reads stamps [ns] by the row's number, and how many
-    rows there are.
+    name: file name or pattern; a compressed file with the additional suffix .gz also matches. type, kind: as of
+    `TopicInfo`. stamps: function that reads its stamps, (N,) int64 ns, with a layout of the rig file. holds: function
+    that tells from the content whether a file is of this type; None: it is, unless `holds` of another declaration is
+    true. beside: columns that identify a table of this type outside of sensor folders by its header; None: no such
+    table. rows: function that returns stamps [ns] by row number and the number of rows, if images without timestamps
+    may take the stamps of rows.
     """
 
     name: str
@@ -39,17 +40,17 @@ class TableFile:
 
 @cache
 def table_files() -> tuple[TableFile, ...]:
-    """All that kinds of sensors declare."""
+    """Declarations of all kinds of sensors."""
     return tuple(t for kind in SENSOR_KINDS for t in facet(kind, "read").TABLES)
 
 
 def rows_of(sensor_type: str) -> TableFile | None:
-    """The declaration by which images without stamps take those of a table of such a sensor; None for other types."""
+    """The declaration with `rows` of a sensor type, for images without timestamps; None if there is none."""
     return next((t for t in facet(sensor_type, "read").TABLES if t.rows is not None), None)
 
 
 def named_tables(folder: Path) -> list[tuple[Path, TableFile]]:
-    """The tables in `folder` itself whose headers name the columns of a declaration."""
+    """CSV files directly in `folder` whose header names the columns `beside` of a declaration, with the declaration."""
     declared = [t for t in table_files() if t.beside is not None]
     found = {}
     for path in sorted(folder.glob("*.csv")):
@@ -60,7 +61,7 @@ def named_tables(folder: Path) -> list[tuple[Path, TableFile]]:
 
 
 def files_in(folder: Path) -> list[tuple[Path, TableFile]]:
-    """The files of a sensor's folder that are declared, each with one declaration, in the order of these."""
+    """Declared files in the folder of a sensor, each with its declaration, in the order of `table_files`."""
     found: dict[Path, TableFile] = {}
     for table in table_files():
         for path in sorted({p for name in (table.name, f"{table.name}.gz") for p in folder.glob(name) if p.is_file()}):

@@ -1,6 +1,6 @@
-"""Stamps for images that have only numbers, from the rows of a table of poses (hand-eye calibration).
+"""Stamps for images without timestamps, from the rows of a pose table (hand-eye calibration).
 
-A robot stops, takes a picture, and writes a pose: picture and row belong together by order or by number.
+The robot stops, takes an image, and logs a pose. Images and rows are matched by order or by number.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _IMAGE_RATE_HZ = (1e-3, 1000.0)  # names are stamps only if they make an image r
 
 
 def numbered_pictures(folder: Path) -> list[tuple[int, Path]]:
-    """Number and file of each picture in `folder`, or in its `data`, by increasing number.
+    """Number and file of each image in `folder` or its subfolder `data`, sorted by number.
 
-    The number is the last one in the file's name. Empty where there are no pictures, where they have stamps
-    (`data.csv`, or names that are stamps), and where a name has no number.
+    The number is the last one in the file name. Empty without images, if they have stamps (`data.csv`, or names that
+    are stamps), or if a name has no number.
     """
     data = pictures_in(folder / "data")
     files = data or pictures_in(folder)
@@ -42,12 +42,12 @@ def numbered_pictures(folder: Path) -> list[tuple[int, Path]]:
 def stamped_by_rows(
     found: list[tuple[int, Path]], table: Path, read: Callable[[], tuple[dict[int, int], int]], note: Note
 ) -> list[tuple[int, Path]]:
-    """Stamp [ns] and file of each picture in `found`, as `numbered_pictures` gives them: that of its row of `table`.
+    """Stamp [ns] and file of each image of `found` (from `numbered_pictures`); the stamp is that of a row of `table`.
 
-    With as many pictures as rows, they belong together in order. Otherwise the number of a picture is its row, counted
-    from 0 if there is a picture 0, else from 1. `note` is told which. read: of the table, as `TableFile.rows`. Rows
-    that cannot be read are counted, and their pictures are left out with a note. Raises RecordingError where two
-    pictures have the same number, where one has no row, and where many rows cannot be read.
+    With as many images as rows, they are matched in order. Otherwise the number of an image is its row, counted from 0
+    if there is an image 0, else from 1. A note says which. read: returns stamps by row and the number of rows, as
+    `TableFile.rows`. Images of unreadable rows are rejected, with a note. Raises RecordingError for two images of the
+    same number, for an image without a row, and (by `read`) if many rows are unreadable.
     """
     folder, numbers = found[0][1].parent, [number for number, _ in found]
     _refuse_twice(found)
@@ -76,7 +76,7 @@ def stamped_by_rows(
 
 
 def _refuse_twice(found: list[tuple[int, Path]]) -> None:
-    """Raises RecordingError if two pictures, in order of their numbers, have the same number."""
+    """Raises RecordingError if two images, sorted by number, have the same number."""
     for (number, path), (other, second) in pairwise(found):
         if number == other:
             raise RecordingError(

@@ -1,4 +1,4 @@
-"""Numeric tables (csv, gzip or not): integer columns, then decimal columns, read exactly and fast."""
+"""Reader of numeric text tables (CSV, also gzip): exact integers and stamps, fast floats."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, TableLayout
 
 _GZIP_MAGIC = b"\x1f\x8b"
-_SEPARATORS = (",", ";", "\t", None)  # None: blanks
-_MOST_UNREADABLE = 0.1  # share of lines that may be left out; more of them are another format
+_SEPARATORS = (",", ";", "\t", None)  # None: whitespace
+_MOST_UNREADABLE = 0.1  # largest share of unreadable lines; with more, the file has another format
 _NS = 1_000_000_000
 _MOST_SECONDS = 2**62 // _NS
-_WHOLE_NS = -1  # a power: stamps must be whole nanoseconds
+_WHOLE_NS = -1  # in place of a power of ten: stamps must be whole nanoseconds
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of a table. integers (N, I) int64, decimals (N, D) float64. notes: sentences on what was left out.
+    """Rows of a table: integers (N, I) int64, decimals (N, D) float64. notes: sentences on rejected lines.
 
-    numbers (N,) int64: each row's number in the file, from 0 on. `written` is how many rows the file has. Both count
-    rows that were left out; neither counts the header, comments and blank lines.
+    numbers (N,) int64: index of each row in the file. written: number of rows in the file. Both include rejected rows,
+    but not header, comments and blank lines.
     """
 
     path: Path
@@ -48,7 +48,8 @@ class Table:
 
 @dataclass(frozen=True)
 class _Text:
-    """The rows of a table, from `line` of its file on, with commas between their `columns`, and the names of these."""
+    """Text of a table. rows: bytes from line `line` (from 1) on, with commas as separators. header: column names, empty
+    if unknown. columns: number of columns."""
 
     path: Path
     rows: bytes
@@ -58,13 +59,13 @@ class _Text:
 
 
 def read_table(path: Path, kind: TableKind, layout: TableLayout = PLAIN_TABLE, note: Note = ignore) -> Table:
-    """Read a table of this kind. Its columns are told by `layout`, the names in its header, or their order; they are
-    separated by commas, semicolons, tabs or blanks. Stamps become ns, from the unit that `layout` or their rate tells.
+    """Read the table at `path` with the columns of `kind`; stamps are converted to ns.
 
-    A stamp in two columns, seconds and nanoseconds, is joined where the header, or `layout`, names both. Blank lines,
-    those that start with #, and a header are skipped; single lines that cannot be read are left out.
-    `note` is told of these, and of stamps in another unit. Integers are exact; decimals are within 1 ulp or two of the
-    written number. Raises RecordingError naming file, line and column.
+    Columns are identified by `layout`, the header, or their order. Separators are commas, semicolons, tabs or blanks.
+    The unit of stamps is that of `layout`, or detected from their rate. A stamp in two columns, seconds and
+    nanoseconds, is joined if header or `layout` name both. Blank lines, comments (#) and the header are skipped; a few
+    unreadable lines are rejected. note: called with a sentence on rejected lines and on a detected unit. Integers are
+    exact; decimals are within 2 ulp of the text. Raises RecordingError naming file, line and column.
     """
     text = _text_of(path)
     table, unit = _joined(text, kind, layout), None
@@ -81,7 +82,7 @@ def read_table(path: Path, kind: TableKind, layout: TableLayout = PLAIN_TABLE, n
 
 
 def _joined(text: _Text, kind: TableKind, layout: TableLayout) -> Table | None:
-    """The rows, where their stamps are seconds and nanoseconds in two columns; None elsewhere."""
+    """The table, if its stamps are in two columns, seconds and nanoseconds; else None."""
     split = split_kind(kind, layout.columns or text.header)
     if split is None or (layout.columns and len(layout.columns) == len(kind.names)):
         return None
@@ -108,7 +109,8 @@ def _joined(text: _Text, kind: TableKind, layout: TableLayout) -> Table | None:
 
 
 def _in_ns(text: _Text, kind: TableKind, place: np.ndarray, given: TimeUnit | None) -> tuple[Table, TimeUnit | None]:
-    """The rows, and the unit of their stamps where only the rate tells it."""
+    """The table with stamps in ns, and the unit of the stamps in the file if it was detected from their rate, else
+    None."""
     if given:
         return _table(text, kind, place, POWERS_OF_NS[given]), None
     try:
@@ -124,13 +126,13 @@ def _in_ns(text: _Text, kind: TableKind, place: np.ndarray, given: TimeUnit | No
 
 
 def holds(path: Path, kind: TableKind) -> bool:
-    """Whether a table has the columns of this kind. Raises RecordingError as `read_table`."""
+    """True if header or number of columns of the table match `kind`. Raises RecordingError as `read_table`."""
     text = _text_of(path)
     return _names_all(kind, text.header) or text.columns == len(kind.names)
 
 
 def named(path: Path, kind: TableKind) -> bool:
-    """Whether the header of a table names the columns of this kind; not of what is no table at all."""
+    """True if the header of the table names the columns of `kind`; False also for a file that is no table."""
     try:
         return _names_all(kind, _text_of(path).header)
     except RecordingError:
@@ -147,7 +149,7 @@ def _text_of(path: Path) -> _Text:
     rows = content[begin:] if begin else content
     first = rows[: rows.find(b"\n") if b"\n" in rows else None].strip()
     if b";" in first:
-        rows = rows.translate(bytes.maketrans(b",;", b".,"))  # decimal commas are often beside them
+        rows = rows.translate(bytes.maketrans(b",;", b".,"))  # such files often have decimal commas
     elif b"," not in first and b"\t" in first:
         rows = rows.replace(b"\t", b",")
     elif b"," not in first:
@@ -178,8 +180,8 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _skip_header(content: bytes) -> tuple[int, int, list[str]]:
-    """Where the rows begin (offset and line), and the lines before: comments, and one line of column names without #,
-    which starts with a letter."""
+    """Offset [bytes] and line (from 1) of the first row, and the lines before it: comments, and at most one line of
+    column names without #."""
     begin, line, before, named = 0, 1, [], False
     while begin < len(content):
         end = content.find(b"\n", begin)
@@ -196,7 +198,7 @@ def _skip_header(content: bytes) -> tuple[int, int, list[str]]:
 
 
 def _names(before: Sequence[str], columns: int) -> tuple[str, ...]:
-    """The names of the columns: the last line with as many as there are columns, and no number among them."""
+    """Column names from the last of the lines `before` that splits into `columns` texts without numbers; else empty."""
     for text in reversed(before):
         for separator in _SEPARATORS:
             names = tuple(name.strip().strip("\"'") for name in text.split(separator))
@@ -214,7 +216,7 @@ def _is_number(text: bytes) -> bool:
 
 
 def _places(text: _Text, kind: TableKind, layout: TableLayout) -> np.ndarray:
-    """(n,) where each column goes, see `parse`. Raises RecordingError where that is not told."""
+    """(n,) `place` of each column for `parse`. Raises RecordingError if the columns cannot be identified."""
     wanted = len(kind.names)
     if layout.columns:
         place = places_given(kind, text.header, layout.columns, text.columns)
@@ -235,7 +237,7 @@ def _places(text: _Text, kind: TableKind, layout: TableLayout) -> np.ndarray:
 
 
 def _table(text: _Text, kind: TableKind, place: np.ndarray, power: int) -> Table:
-    """The rows, stamps times 10^power. Raises RecordingError where there are none, or too many cannot be read."""
+    """The table, with stamps multiplied by 10^power. Raises RecordingError without rows, or if many are unreadable."""
     capacity = text.rows.count(b"\n") + 1
     integers = np.empty((capacity, len(kind.integers)), dtype=np.int64)
     decimals, numbers = np.empty((capacity, len(kind.decimals))), np.empty(capacity, dtype=np.int64)
@@ -256,7 +258,7 @@ def _table(text: _Text, kind: TableKind, place: np.ndarray, power: int) -> Table
 
 
 def _unit(text: _Text, kind: TableKind, place: np.ndarray) -> TimeUnit | None:
-    """The unit of the stamps by the rate that it means, None where it does not tell."""
+    """The unit of the stamps, detected from their rate; None if ambiguous."""
     if kind.rate_hz is None:
         return None
     alone = TableKind((), kind.names[:1])
@@ -269,14 +271,14 @@ def _unit(text: _Text, kind: TableKind, place: np.ndarray) -> TimeUnit | None:
 
 
 def _instants(kind: TableKind, stamps: np.ndarray) -> np.ndarray:
-    """The stamps, those of rows of one image once."""
+    """The stamps. If a stamp may have several rows (such as corners of an image), repetitions are removed."""
     if len(kind.integers) == kind.stamps:
         return stamps
     return stamps[np.concatenate([[True], np.diff(stamps) != 0])]
 
 
 def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column: int) -> str:
-    """The sentence for a row that the kernel refused; it is read again here, where speed does not matter."""
+    """Error message for a row that the kernel could not parse: parses it again in Python."""
     row = text.rows.split(b"\n")[line - text.line].decode("utf-8", "replace").strip()
     fields = [f.strip() for f in row.split(",")]
     spot = f"{text.path}:{line}"

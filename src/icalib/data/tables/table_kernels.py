@@ -1,4 +1,4 @@
-"""The kernels of `table`: rows of numbers between commas, integers exactly, decimals within 1 ulp or two."""
+"""Kernels of `table`: parse comma-separated numbers, integers exactly, decimals within 2 ulp."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from icalib.base.compiled import njit
 
 POWERS = np.array([float(f"1e{k}") for k in range(309)])
-LEFT_OUT = -1  # of a column's place
+LEFT_OUT = -1  # `place` of a column that is not read
 
 
 @njit(cache=True, nogil=True)
@@ -21,12 +21,12 @@ def parse(
     decimals: np.ndarray,
     numbers: np.ndarray,
 ) -> tuple[int, int, int, int]:
-    """Fill the rows from byte and line `start`. place (n_columns,): where each column of the file goes, first all
-    integers, then all decimals, or LEFT_OUT. stamps: how many of the integers are stamps, and the power of ten to
-    multiply these by; whole numbers only where it is negative. numbers (n,) int64: filled with each row's number in the
-    file, from 0 on; lines that cannot be read are counted.
+    """Parse rows from `start` (byte, line) on. Returns the number of rows, the number of unreadable lines, and line and
+    column of the first of these (line 0: none).
 
-    Returns the number of rows, and of lines that cannot be read, with line and column of the first (line 0: none).
+    place (n_columns,): target column of each column of the file, first all integers, then all decimals, or LEFT_OUT.
+    stamps: number of integer columns that are stamps, and the power of ten to multiply them by; negative: stamps must
+    be integers. numbers (n,) int64: index of each row in the file, which includes unreadable lines.
     """
     at, line = start
     row, bad, bad_line, bad_column = 0, 0, 0, 0
@@ -35,7 +35,7 @@ def parse(
         if at >= buffer.size or buffer[at] == 10 or buffer[at] == 35:  # end, newline, #
             at = _next_line(buffer, at)
         else:
-            # int: the literal 0 would be a type of its own, for which all is compiled once more
+            # int(): the literal 0 is another numba type and would compile `_row` twice
             at, column = _row(buffer, at, int(row), stamps, place, powers, integers, decimals)
             if column == place.size:
                 numbers[row] = row + bad
@@ -60,7 +60,8 @@ def _row(
     integers: np.ndarray,
     decimals: np.ndarray,
 ) -> tuple[int, int]:
-    """Where the row ends, in its line, and how many of its columns could be read."""
+    """Position at the end of the row, in its line, and the number of columns that could be parsed. Fills `row` of
+    integers and decimals."""
     n, n_int = buffer.size, integers.shape[1]
     for column in range(place.size):
         to, ok = place[column], True
@@ -125,8 +126,8 @@ def _integer(buffer: np.ndarray, at: int) -> tuple[int, np.int64, bool]:
 
 @njit(cache=True, nogil=True, inline="always")
 def _stamp(buffer: np.ndarray, at: int, power: int) -> tuple[int, np.int64, bool | np.bool_]:
-    """Position after the number, the number times 10^power, rounded, and whether that is an int64. Digits of its
-    fraction that do not fit are left out."""
+    """Position after the number, the number times 10^power, rounded, and whether the result is an int64. Digits of the
+    fraction beyond int64 are ignored."""
     at, negative = _sign(buffer, _skip_blank(buffer, at))
     value, digits, fraction, ok, full = np.int64(0), 0, False, True, False
     while at < buffer.size:
@@ -155,7 +156,7 @@ def _stamp(buffer: np.ndarray, at: int, power: int) -> tuple[int, np.int64, bool
 
 @njit(cache=True, nogil=True, inline="always")
 def _shifted(value: np.int64, power: int) -> tuple[np.int64, bool]:
-    """value * 10^power of a value from 0 up, rounded, and whether it fits."""
+    """value * 10^power, rounded, for value >= 0, and whether it fits into int64."""
     while power > 0 and value > 0:
         if value > 9223372036854775807 // 10:
             return value, False
@@ -169,7 +170,7 @@ def _shifted(value: np.int64, power: int) -> tuple[np.int64, bool]:
 
 @njit(cache=True, nogil=True)
 def _decimal(buffer: np.ndarray, at: int, powers: np.ndarray) -> tuple[int, float, bool]:
-    """Position after the number, its value, and whether it is a finite number. Digits after the 18th only scale."""
+    """Position after the number, its value, and whether it is finite. Digits after the 18th count as zeros."""
     at, negative = _sign(buffer, _skip_blank(buffer, at))
     mantissa, exponent, digits, fraction = np.int64(0), 0, 0, False
     while at < buffer.size:
@@ -196,7 +197,7 @@ def _decimal(buffer: np.ndarray, at: int, powers: np.ndarray) -> tuple[int, floa
 
 @njit(cache=True, nogil=True)
 def _scale(mantissa: float, exponent: int, powers: np.ndarray) -> float:
-    """mantissa * 10^exponent; a division by an exact power rounds once, a product with its inverse twice."""
+    """mantissa * 10^exponent. Negative exponents divide by an exact power (one rounding; its inverse would add one)."""
     if mantissa == 0.0 or exponent < -616:
         return 0.0
     if exponent < -308:
