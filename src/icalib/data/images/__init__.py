@@ -1,1 +1,1 @@
-"""Images of recordings, and videos."""
+"""Images and videos of recordings: reading, checks, decoding."""

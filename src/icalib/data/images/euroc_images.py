@@ -1,5 +1,5 @@
-"""Images in a folder, as EuRoC has them: `cam0/data/*.png`, and `cam0/data.csv` with t [ns], file name; or as Kalibr's
-bagcreater takes them: `cam0/STAMP.png`."""
+"""Image folders in the format of EuRoC (`cam0/data/*.png`, and `cam0/data.csv` with t [ns], file name) or of Kalibr's
+bagcreater (`cam0/STAMP.png`)."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from icalib.rig import TimeUnit
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 _RATE_HZ = (1e-3, 1000.0)
-_STAMPED = re.compile(r"[^0-9]*?(?P<stamp>[0-9]{9,19}(\.[0-9]+)?)")  # of a file's name, behind a word such as left_
+_STAMPED = re.compile(r"[^0-9]*?(?P<stamp>[0-9]{9,19}(\.[0-9]+)?)")  # a word such as left_ may precede it
 
 
 def image_files(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
-    """Stamps [ns] and files of the images of `folder`, in the order of its data.csv; without one, by the files' names.
+    """Stamps [ns] and files of the images of a camera folder, in the order of data.csv; without one, sorted by stamp.
 
-    They lie in the folder `data`, or, where their names are dates, in `folder` itself. Empty where there are none.
-    `note` is told where names have another ending. Raises RecordingError naming the line that cannot be read.
+    The images are in the subfolder `data`, or in `folder` itself if their names are dates. Empty without images. note:
+    called if files have another suffix than data.csv says. Raises RecordingError naming an unreadable line.
     """
     data = folder / "data"
     there = pictures_in(data)
@@ -52,8 +52,10 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def stamped_by_name(files: Sequence[Path], names: Sequence[str] = ()) -> list[tuple[int, Path]] | None:
-    """Stamps [ns] and files, in order, where the names of all are instants since 1970 in one unit; None where not.
-    names: those parts of their names that say it, else what is before their ending."""
+    """Stamps [ns] and files, sorted by stamp, if all names are times since 1970 in the same unit; else None.
+
+    names: the part of each name that contains the stamp; default: the name without suffix.
+    """
     found = [_STAMPED.fullmatch(name) for name in names or [p.stem for p in files]]
     texts = [m["stamp"] for m in found if m]
     unit = unit_by_date([float(text) for text in texts]) if len(texts) == len(files) else None
@@ -63,9 +65,10 @@ def stamped_by_name(files: Sequence[Path], names: Sequence[str] = ()) -> list[tu
 
 
 def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iterator[Payload]:
-    """The images as files; empty and missing ones, and pointers of Git LFS, are left out, with a note at the end.
+    """Undecoded images of `files` (stamp [ns], path). Missing and empty files and Git LFS pointers are rejected, with a
+    note at the end.
 
-    Raises RecordingError where all are pointers.
+    Raises RecordingError if no file is left and some are pointers.
     """
     missing: list[Path] = []
     pointers: list[str] = []
@@ -88,7 +91,7 @@ def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iter
 
 
 def _listed(table: Path, data: Path) -> list[tuple[int, Path]]:
-    """What data.csv says: stamps [ns], of whatever unit, and files."""
+    """Stamps, converted to ns from the detected unit, and files of data.csv. Raises RecordingError naming the line."""
     rows: list[tuple[int, str, str]] = []
     try:
         lines = table.read_text(encoding="utf-8-sig").splitlines()
@@ -112,7 +115,8 @@ def _listed(table: Path, data: Path) -> list[tuple[int, Path]]:
 
 
 def unit_of_texts(stamps: Sequence[str]) -> TimeUnit:
-    """That in which the stamps are dates; else nanoseconds where these mean a possible rate; else the one that does."""
+    """Detected unit of stamps: that in which they are dates; else ns if integers in ns give an image rate from 1 mHz to
+    1 kHz; else the unit that does; ns by default."""
     numbers = np.array([float(stamp) for stamp in stamps])
     if dated := unit_by_date(numbers.tolist()):
         return dated
@@ -128,7 +132,7 @@ def _line_sentence(table: Path, number: int, line: str) -> str:
 def _with_other_endings(
     listed: list[tuple[int, Path]], there: Sequence[Path], table: Path, note: Note
 ) -> list[tuple[int, Path]]:
-    """The images under the names that they have, where those of the table differ in their ending."""
+    """`listed`, with file names corrected if all suffixes in the table differ from those of the files `there`."""
     if any(path.is_file() for _, path in listed):
         return listed
     by_stem = {p.stem: p for p in there}

@@ -1,4 +1,4 @@
-"""Is this stream of images one camera's, in order, and alive? What is left out is counted and noted."""
+"""Checks of image streams: one camera, ordered stamps, no frozen images. Rejected images are counted in notes."""
 
 from __future__ import annotations
 
@@ -20,22 +20,21 @@ from icalib.data.images.images import (
 from icalib.errors import RecordingError
 
 Note = Callable[[str], None]
-LOOK_AHEAD = 5  # images: what most of them have is the resolution
-ODD, ODD_SHARE = 2, 0.1  # images of another resolution, and of all before: more are of another camera
-_LATE_NS = 1_000_000_000  # beyond, images did not overtake each other: the clock was set back
+LOOK_AHEAD = 5  # number of first images; their most frequent resolution is that of the camera
+ODD, ODD_SHARE = 2, 0.1  # tolerated images of another resolution, as number or share; more: several cameras
+_LATE_NS = 1_000_000_000  # an image late by more means that the clock was set back
 
 
 def ignore(sentence: str) -> None:
-    """A `Note` that nobody reads."""
+    """A `Note` that discards the sentence."""
 
 
 def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Payload]:
-    """`payloads` with strictly increasing stamps and one resolution; a note on what was left out, at the end.
+    """Images of `payloads` with strictly increasing stamps and one resolution; a note on rejected images at the end.
 
-    Left out: files that are no pictures, images of zeros, exact repetitions of the image before (the camera froze),
-    images that come after a later one, single ones of another resolution than most of the first. Raises RecordingError
-    naming `where` and the image: an unknown encoding, many of another resolution, a clock that was set back, no usable
-    image.
+    Rejected are files that are no images, images of zeros, exact repetitions of the previous image (frozen camera),
+    late images, and a few of another resolution. Raises RecordingError, naming `where` and the image, for an unknown
+    encoding, many images of another resolution, a clock that was set back, or no usable image.
     """
     dropped = _Dropped()
     kept, odd = 0, 0
@@ -70,8 +69,8 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
 
 
 def _does_not_follow(last: Payload, payload: Payload, where: str) -> str:
-    """Why an image after the image `last` is left out; empty if it is not. Raises RecordingError if its clock was set
-    back."""
+    """Reason to reject an image that follows the image `last`; empty if there is none. Raises RecordingError if the
+    clock was set back."""
     _refuse_other_clock(last, payload, where)
     if payload.stamp_ns <= last.stamp_ns:
         return "are not later than their predecessor"
@@ -79,7 +78,7 @@ def _does_not_follow(last: Payload, payload: Payload, where: str) -> str:
 
 
 def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[DecodedImage]:
-    """The decoded images; those that are damaged are left out, with a note at the end.
+    """The decoded images. Damaged ones are rejected, with a note at the end.
 
     Raises RecordingError if all are damaged.
     """
@@ -99,7 +98,7 @@ def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Deco
 
 
 class _Dropped:
-    """What was left out: how many, for which reason, the first of them."""
+    """Rejected images by reason: their number, the first image, and the first error message."""
 
     def __init__(self) -> None:
         self.count: dict[str, int] = {}
@@ -117,7 +116,7 @@ class _Dropped:
 
 
 def _usual_size(payloads: Iterable[Payload]) -> tuple[tuple[int, int], Iterator[Payload]]:
-    """Width and height [px] of most of the first images, (0, 0) where none tells; and all payloads."""
+    """Most frequent width and height [px] of the first images, (0, 0) if unknown; and an iterator of all payloads."""
     rest = iter(payloads)
     first = list(islice(rest, LOOK_AHEAD))
     sizes = Counter((p.width, p.height) for p in first if p.width)

@@ -1,4 +1,4 @@
-"""Images as they were recorded, and their decoding to grey: a pure function, so that other processes can do it."""
+"""Recorded images and their decoding to greyscale, a pure function that can run in other processes."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from icalib.base.extras import load_cv2
 from icalib.errors import RecordingError
 from icalib.sensors.stream import which_image
 
-NO_PICTURE = "unknown"  # the encoding of a file that is no image
-FILE_FORMATS = ("jpeg", "png", "bmp", "tiff", "pnm", "webp")  # all that OpenCV decodes
-DARKEST, BRIGHTEST = 0.1, 99.9  # percentiles of more than 8 bits that become 0 and 255: hot and dead pixels are fewer
-PERCENTILE_PIXELS = 100_000  # of an image that percentiles are taken of
+NO_PICTURE = "unknown"  # encoding of a file that is no image
+FILE_FORMATS = ("jpeg", "png", "bmp", "tiff", "pnm", "webp")  # of image files, decoded by OpenCV
+DARKEST, BRIGHTEST = 0.1, 99.9  # percentiles of images above 8 bits that map to 0 and 255; excludes hot, dead pixels
+PERCENTILE_PIXELS = 100_000  # number of pixels, of an image, from which percentiles are computed
 Convert = Callable[[np.ndarray, Any], np.ndarray]
 
 
 class DamagedImageError(RecordingError):
-    """One image cannot be decoded; the others may be good."""
+    """One image cannot be decoded; other images of the stream may be valid."""
 
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """One image: stamp_ns on the camera's clock, image (height, width) uint8 grey."""
+    """A decoded image: stamp_ns on the clock of the camera, image (height, width) uint8, greyscale."""
 
     stamp_ns: int
     image: np.ndarray
@@ -35,11 +35,11 @@ class DecodedImage:
 
 @dataclass(frozen=True)
 class Payload:
-    """One image as it was recorded, undecoded; it can be sent to another process.
+    """One image as recorded, not decoded; it can be sent to another process.
 
-    source names the stream in sentences. encoding: that of sensor_msgs/Image, or of a file, one of `FILE_FORMATS`, then
-    after a blank the pixels' if these are a Bayer mosaic. width, height [px]: 0 where the file does not tell. step:
-    bytes in a row, 0 for files. name: of the file in a folder, else nothing.
+    source: name of the stream for messages. encoding: of sensor_msgs/Image, or one of `FILE_FORMATS`; for files with a
+    Bayer mosaic also the pixel encoding, after a blank. width, height [px]: 0 if the file header does not tell. step:
+    bytes per row, 0 for files. name: of the file, empty for images in bags.
     """
 
     stamp_ns: int
@@ -54,15 +54,15 @@ class Payload:
 
     @property
     def which(self) -> str:
-        """Tells the image from others of its stream, in sentences."""
+        """Identifies the image in messages, by file name or stamp."""
         return which_image(self.name, self.stamp_ns)
 
 
 def decode(payload: Payload) -> np.ndarray:
-    """The image (height, width) uint8, grey. More than 8 bits are scaled: 0.1 % of the pixels are 0, and 0.1 % 255.
+    """The greyscale image, (height, width) uint8. Images above 8 bits are scaled so that 0.1 % of pixels saturate at
+    each end.
 
-    Raises RecordingError naming the stream and the instant for an unknown encoding, DamagedImageError for data that are
-    too short or damaged.
+    Raises RecordingError for an unknown encoding, DamagedImageError for short or damaged data.
     """
     if is_file(payload.encoding):
         return _decode_file(payload)
@@ -74,17 +74,17 @@ def decode(payload: Payload) -> np.ndarray:
 
 
 def is_known(encoding: str) -> bool:
-    """Whether `decode` knows the encoding."""
+    """True if `decode` supports the encoding."""
     return encoding in _ENCODINGS or is_file(encoding)
 
 
 def is_file(encoding: str) -> bool:
-    """Whether the data are those of an image file."""
+    """True for the encoding of an image file, such as jpeg; False for raw pixels."""
     return encoding.split(" ")[0] in FILE_FORMATS
 
 
 def unknown_encoding(payload: Payload) -> str:
-    """The sentence for an encoding that `decode` does not know."""
+    """Error message for an encoding that `decode` does not support."""
     known = ", ".join(sorted(_ENCODINGS))
     return (
         f"{payload.source}: the image {payload.which} has the encoding {payload.encoding!r}, which icalib "
@@ -93,20 +93,21 @@ def unknown_encoding(payload: Payload) -> str:
 
 
 def file_payload(stamp_ns: int, source: str, data: bytes, described: str = "") -> Payload:
-    """The payload of an image file; its format is told by its content, or else as `described` by the recorder."""
+    """The payload of an image file. Its format is detected from the content, or else taken from `described`, the text
+    of the recorder (CompressedImage.format)."""
     words = described.replace(";", " ").lower().split()
     encoding = _file_format(data, words)
     if encoding in FILE_FORMATS and words and words[-1] in _BAYER:
         encoding = f"{encoding} {words[-1]}"
     width, height = file_size(data)
-    if encoding in ("tiff", "pnm", "webp"):  # few cameras record these: their headers have no reader
+    if encoding in ("tiff", "pnm", "webp"):  # rare formats: decoded, as there is no parser of their headers
         image = _decoded(data)
         height, width = (0, 0) if image is None else image.shape[:2]
     return Payload(stamp_ns, source, encoding, data, width, height)
 
 
 def file_size(data: bytes) -> tuple[int, int]:
-    """Width and height [px] by the header of a JPEG, PNG or BMP file, (0, 0) where it does not tell."""
+    """Width and height [px] in the header of a JPEG, PNG or BMP file; (0, 0) for other or damaged files."""
     if data.startswith(_PNG) and len(data) >= 24:
         return struct.unpack_from(">II", data, 16)
     if data.startswith(b"BM") and len(data) >= 26:
@@ -154,7 +155,7 @@ def _decode_file(payload: Payload) -> np.ndarray:
 
 
 def _decoded(data: bytes) -> np.ndarray | None:
-    """Grey, as many bits as there are; None where it is damaged."""
+    """Greyscale image with the bit depth of the file; None if it is damaged."""
     cv2 = load_cv2()
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -164,7 +165,7 @@ def _decoded(data: bytes) -> np.ndarray | None:
 
 
 def _rows(payload: Payload, pixel_bytes: int) -> np.ndarray:
-    """(height, width * pixel_bytes) uint8: the rows without their padding."""
+    """(height, width * pixel_bytes) uint8: image rows without padding. Raises DamagedImageError for too few bytes."""
     wanted = payload.width * pixel_bytes
     step = payload.step or wanted
     if step < wanted or len(payload.data) < step * payload.height or not wanted * payload.height:
@@ -177,7 +178,8 @@ def _rows(payload: Payload, pixel_bytes: int) -> np.ndarray:
 
 
 def _to_8_bits(image: np.ndarray) -> np.ndarray:
-    """Cameras of 10 or 12 bits fill only part of 16, thermal ones a few hundred levels, and a hot pixel all of it."""
+    """Scales by percentiles to 8 bits: cameras with 10 or 12 bits use only part of 16, thermal cameras a few hundred
+    levels, and a single hot pixel has the maximum."""
     if image.dtype == np.uint8:
         return image
     few = image.ravel()[:: max(image.size // PERCENTILE_PIXELS, 1)]
@@ -211,9 +213,9 @@ def _luma(first: int) -> Convert:
     return lambda rows, _: rows[:, first::2]
 
 
-# OpenCV names a mosaic by the pixels (1, 1) and (1, 2), ROS by its first row and second.
+# Names of Bayer mosaics: ROS uses the first two rows, OpenCV the pixels (1, 1) and (1, 2).
 _BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
-_ENCODINGS: dict[str, tuple[int, Convert]] = {  # bytes per pixel, and how the rows become grey
+_ENCODINGS: dict[str, tuple[int, Convert]] = {  # bytes per pixel, conversion of rows to greyscale
     **{name: (1, lambda rows, _: rows) for name in ("mono8", "8UC1")},
     **{name: (2, _sixteen_bits) for name in ("mono16", "16UC1")},
     **{name: (3, _colour("BGR", 3)) for name in ("bgr8", "8UC3")},

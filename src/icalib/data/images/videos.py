@@ -1,4 +1,4 @@
-"""Video files as recordings of one camera: frames in order, with the stamps of a table beside them, or their own."""
+"""Video files of one camera. Stamps of frames come from a table beside the video, or from the video itself."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ _TIME = re.compile(r"time|stamp|^t$|^t[_ ]?\[?(ns|us|ms|s)\]?$", re.IGNORECASE)
 
 
 def videos_in(folder: Path) -> list[Path]:
-    """The video files in `folder` and in the folders in it, by name."""
+    """Video files in `folder` and its direct subfolders, sorted by name."""
     return sorted(p for pattern in ("*", "*/*") for p in folder.glob(pattern) if is_video(p) and p.is_file())
 
 
 def video_topic(path: Path, name: str) -> TopicInfo:
-    """What is known of a video without decoding it; the count is the container's, and may be off by a few frames. A
-    file or a table that cannot be read counts as one frame: reading the video says what is wrong."""
+    """Topic of a video, without decoding it. The number of frames is that of the container, and may be off by a few.
+
+    For an unreadable video or table it is 1, so that later reading raises the error.
+    """
     try:
         if (times := frame_times(path)) is not None:
             return TopicInfo(name, VIDEO_FILE, "image", len(times), int(times[0]), int(times[-1]))
@@ -43,9 +45,9 @@ def video_topic(path: Path, name: str) -> TopicInfo:
 
 
 def frame_times(path: Path) -> np.ndarray | None:
-    """(N,) int64 ns: stamps of the frames, from the table of the video's name beside it (`cam0.csv` or `cam0.txt` of
-    `cam0.mp4`): the column that its header calls a time or a stamp, or the first. None where there is no table. Raises
-    RecordingError naming the line."""
+    """(N,) int64 ns: stamps of frames from the table beside the video (`cam0.csv` or `cam0.txt` of `cam0.mp4`); None
+    without a table. The column is the one whose header is a time or stamp, or else the first. Raises RecordingError
+    naming the line."""
     table = next((p for ending in _TABLES if (p := path.with_suffix(ending)).is_file()), None)
     if table is None:
         return None
@@ -71,16 +73,15 @@ def frame_times(path: Path) -> np.ndarray | None:
 
 
 def video_stamps(path: Path) -> np.ndarray:
-    """(N,) int64 ns of all frames. Raises RecordingError as `video_payloads`."""
+    """(N,) int64 ns: stamps of all frames. Raises RecordingError as `video_payloads`."""
     times = frame_times(path)
     return np.array([p.stamp_ns for p in video_payloads(path, str(path))], np.int64) if times is None else times
 
 
 def video_payloads(path: Path, where: str) -> Iterator[Payload]:
-    """The frames, grey, one at a time. Without a table of stamps they have those of the video, from 0 on.
+    """The frames in greyscale, one at a time. Without a table of stamps, stamps are those of the video, from 0 on.
 
-    Raises RecordingError for a file that cannot be decoded, and where the table has more or fewer stamps than there
-    are frames.
+    Raises RecordingError if the file cannot be decoded, or if the table has another number of stamps than frames.
     """
     cv2, times, n = load_cv2(), frame_times(path), 0
     with _opened(path) as video:
@@ -110,7 +111,8 @@ def _property(name: str) -> int:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The video, its frames not rotated: as the sensor read them. Raises RecordingError where it is none."""
+    """The opened video; frames are not rotated to the orientation in its metadata. Raises RecordingError if it is no
+    video."""
     cv2 = load_cv2()
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:

@@ -1,4 +1,4 @@
-"""Recordings: what was recorded -> images, and checked measurements."""
+"""Recordings of any format: access to images, and reading of checked measurements."""
 
 from icalib.data.images.images import DamagedImageError, DecodedImage, Payload, decode
 from icalib.data.recordings.bag import BagRecording

@@ -1,4 +1,4 @@
-"""Recordings that are bags of ROS 1 or ROS 2: one file, or a folder of them."""
+"""Recordings that are bags of ROS 1 or ROS 2: one file, or a folder of files."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from icalib.data.topics import MessageType, TopicInfo, choose_topic, find_topic,
 from icalib.errors import RecordingError
 from icalib.sensors.sensor import Sensor
 
-_SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
+_SWAPPED_NS = 1_000_000_000  # largest lateness by transport; more means that the clock was set back
 
 
 @final
 class BagRecording(Recording):
-    """A bag. Stamps are those of the messages' headers; where one is zero, when the message was received."""
+    """A bag. Stamps are those of message headers, or the receive time if the stamp is zero or there is no header."""
 
     has_messages = True
 
@@ -38,8 +38,8 @@ class BagRecording(Recording):
         self._received = self._received_ns()
 
     def _received_ns(self) -> Span:
-        """When the messages that are used were received, by the clock of the recorder. Raises RecordingError where
-        nothing was recorded then."""
+        """Range of receive times [ns] of the messages in the time window, by the clock of the recorder. Raises
+        RecordingError if the window begins after the last message."""
         found = self._spans()
         if self.window.is_all or not found:
             return -(2**63), 2**63 - 1
@@ -68,7 +68,7 @@ class BagRecording(Recording):
         return f"{self.root} {topic}"
 
     def find(self, path: str) -> Path | None:
-        """A table beside the bag."""
+        """Path of the table `path` in the folder of the bag; None if it does not exist."""
         found = self.root.parent / path
         return found if found.is_file() else None
 
@@ -128,7 +128,7 @@ class BagRecording(Recording):
             )
 
     def _note_damage(self, topic: str, damaged: list[tuple[int, ValueError]], total: int) -> None:
-        """`damaged`: when each was received [ns], and what is wrong. Raises RecordingError where these are all."""
+        """Note on `damaged` messages (receive time [ns], error). Raises RecordingError if all `total` are damaged."""
         first_ns, error = damaged[0]
         if len(damaged) == total:
             others = ", and so are all others" if total > 1 else ""
@@ -142,8 +142,8 @@ class BagRecording(Recording):
         )
 
     def _contents(self, topic: TopicInfo) -> Iterator[tuple[int, str, bytes]]:
-        """When it was received [ns], encoding and bytes of each message in the window; what does not change is often
-        sent once only, and counts always."""
+        """Receive time [ns], encoding and bytes of each message in the window. Latched messages (`MessageType.lasting`)
+        are included whenever they were received. Raises RecordingError if the window contains none."""
         low, high = self._received
         lasting = message_types()[topic.type].lasting
         always = lasting is not None and topic.name.endswith(lasting)
@@ -159,7 +159,8 @@ class BagRecording(Recording):
             raise self.window.refuse(f"{self.root} {topic.name}", (topic.last_ns - origin) * 1e-9)
 
     def by_stamp(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
-        """As they are where the clock was set back, which the checks refuse."""
+        """(N,) indices that sort readings by stamp, with a note. No change if a reading is late by more than 1 s: the
+        clock was set back, which later checks refuse."""
         back = np.diff(stamps_ns, prepend=stamps_ns[:1]) < 0
         late_ns = int((np.maximum.accumulate(stamps_ns) - stamps_ns).max()) if back.any() else 0
         if not 0 < late_ns <= _SWAPPED_NS:
@@ -205,7 +206,8 @@ def _payload(stamp_ns: int, where: str, message: Any) -> Payload:
 
 @cache
 def _stores() -> dict[str, Any]:
-    """How the bytes of each encoding become a message. The types that icalib reads have not changed in any release."""
+    """Deserializer of each encoding (ros1, cdr). The definitions of the types that icalib reads are the same in all ROS
+    releases."""
     typesys = load_typesys()
     ros1, ros2 = (typesys.get_typestore(s) for s in (typesys.Stores.ROS1_NOETIC, typesys.Stores.ROS2_HUMBLE))
     for known in message_types().values():
@@ -215,7 +217,7 @@ def _stores() -> dict[str, Any]:
 
 
 def _deserialise(encoding: str, content: bytes, known: MessageType) -> Any:
-    """Raises ValueError where the bytes are not such a message."""
+    """The message of type `known`. Raises ValueError if `content` is damaged or of another type."""
     if content.startswith(ZSTD_MAGIC):  # ROS 2 can compress message by message
         content = _decompress(content)
     try:

@@ -1,4 +1,4 @@
-"""What the rest of the program knows of a recording: this class and nothing else."""
+"""`Recording`: the interface of the program to recordings of all formats."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from icalib.sensors.stream import Stream
 
 
 class Cut(Protocol):
-    """Keeps a part of a stream that `what` names in sentences, between jumps of its clock."""
+    """Function that returns a segment of `stream` without clock jumps. what: name of the stream in messages."""
 
     def __call__(self, stream: S, what: str) -> S: ...
 
 
 class Recording(ABC):
-    """One recording: topics with messages, tables of sensors, images.
+    """One recording: topics with messages, tables of sensors, images. window: the part of it that is used.
 
-    A reader of a format derives from this class. It knows its format only: each kind of sensor makes its stream from
-    messages or a table (`read` in its folder), and checks what the numbers must satisfy.
+    Each format has a subclass, which does not depend on kinds of sensors. The `read` module of a kind of sensor
+    converts messages or tables to a stream and checks the values.
     """
 
-    has_messages: ClassVar[bool] = False  # whether sensors are read from messages; else from tables
+    has_messages: ClassVar[bool] = False  # True: sensors are read from messages; False: from tables
 
     def __init__(self, root: Path, window: Window = WHOLE) -> None:
         self.root = root
@@ -47,99 +47,101 @@ class Recording(ABC):
 
     @abstractmethod
     def topics(self) -> tuple[TopicInfo, ...]:
-        """What there is, by name."""
+        """All topics of the recording."""
 
     @abstractmethod
     def stamps(self, topic: str) -> np.ndarray:
-        """(N,) int64: the stamps of all messages of `topic`, as they were written; of corners, one for each image.
+        """(N,) int64 ns: raw stamps of all messages of `topic` in the window; for corners, one for each image.
 
-        Raises RecordingError where there is no such topic, icalib does not read its kind, or a message is damaged.
+        Raises RecordingError if the topic does not exist, icalib cannot read its type, or all messages are damaged.
         """
 
     def use_layouts(self, sensors: Sequence[Sensor]) -> None:
-        """Read tables as the rig file says: images without stamps may have theirs. Call this before images or stamps
-        are read."""
+        """Use the table layouts of `sensors` (rig file). Call this before reading images or stamps, as images without
+        timestamps may take the stamps of a table."""
         self._sensors = tuple(sensors)
 
     def topic(self, sensor: str, given: str | None, *kinds: str) -> TopicInfo:
-        """The topic of the sensor's messages, of one of `kinds`: the one `given`, else the one with the sensor's name,
+        """The topic of a sensor, of one of `kinds`: `given`, else the only one whose name contains the name `sensor`,
         else the only one.
 
-        Raises RecordingError listing what there is where that leaves none or several.
+        Raises RecordingError listing the topics if none or several remain.
         """
         return choose_topic(str(self.root), self.topics(), sensor, given, *kinds)
 
     def messages(
         self, topic: str, kind: str, convert: Callable[[Any], Any] = lambda message: message
     ) -> Iterator[tuple[int, Any]]:
-        """Stamp [ns] and content of each message of `topic`, in the order of the recording; the content has the fields
-        of the ROS type, or is what `convert` makes of the message. Messages that cannot be read, or of which `convert`
-        raises ValueError, are left out with a note.
+        """Stamp [ns] and `convert(message)` of each message of `topic`, in the order of the recording.
 
-        Raises RecordingError where the topic is missing or not of `kind` (see TopicInfo), and where all are damaged.
+        A message has the fields of its ROS type. Damaged messages, and those for which `convert` raises ValueError, are
+        rejected with a note. Raises RecordingError if the topic is missing or not of `kind` (`TopicInfo.kind`), or if
+        all messages are damaged. This default is for recordings without messages, and raises.
         """
         del convert
         raise RecordingError(f"{self.root} holds no messages, and {topic} should have some of {kind}; give a bag.")
 
     def by_stamp(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
-        """(N,) the order of readings by stamp, where the recording may hold them in another; a note says so."""
+        """(N,) indices that sort readings by stamp, with a note. This default, for formats with sorted data, changes
+        nothing."""
         del topic
         return np.arange(len(stamps_ns))
 
     @abstractmethod
     def find(self, path: str) -> Path | None:
-        """The table that the rig file gives as `path`; None where there is none."""
+        """The file of the table that the rig file gives as `path`; None if it does not exist."""
 
     @abstractmethod
     def table(self, sensor: Sensor, path: str, field: str = "path") -> Path:
-        """As `find`, and remembers it as read. Raises RecordingError, which names the rig file's `field`, where there
-        is none."""
+        """As `find`, and adds the file to `files()`. Raises RecordingError if the file does not exist.
+
+        field: the field of the rig file that the message names.
+        """
 
     def inside(self, stream: S, path: Path) -> S:
-        """What of the stream of the table at `path` is in the part of the recording that is used. Raises RecordingError
-        where nothing is."""
+        """The section of `stream`, read from the table at `path`, in the time window. Raises RecordingError if it is
+        empty."""
         return cut(self.window, stream, f"{path} ({stream.name})", () if self.window.is_all else self._spans())
 
     def place(self, topic: str) -> str:
-        """How a sentence names a topic."""
+        """Name of a topic in messages."""
         return f"{self.root}/{topic}"
 
     def where(self, sensor: Sensor) -> str:
-        """How a sentence names the place of the sensor's data, for example the file. Raises RecordingError where there
-        are none."""
+        """Name of the source of the sensor's data in messages, such as the file. Raises RecordingError without data."""
         return facet(sensor.sensor_type, "read").where(self, sensor)
 
     def image_topics(self) -> tuple[TopicInfo, ...]:
-        """Those of images."""
+        """Topics of kind "image"."""
         return tuple(t for t in self.topics() if t.kind == "image")
 
     def image_topic(self, camera: Camera) -> str:
-        """The topic of the camera's images, as `topic`."""
+        """Name of the topic with the images of `camera`, chosen as by `topic`. Raises RecordingError."""
         return self.topic(camera.name, camera.topic, "image").name
 
     @abstractmethod
     def payloads(self, topic: str) -> Iterator[Payload]:
         """The undecoded images of `topic` in order, one at a time; `images.decode` decodes one, in any process.
 
-        Stamps increase strictly and the resolution is one. Images of zeros, repeated or late ones are left out, which
-        the notes say once the last image was read. Raises RecordingError naming the topic, or the instant of an image.
+        Stamps are strictly increasing, and all images have the same resolution. Images of zeros and repeated or late
+        images are rejected; notes are added after the last image. Raises RecordingError as `checked_payloads`.
         """
 
     def images(self, topic: str) -> Iterator[DecodedImage]:
-        """The decoded images of `topic`, as `payloads`; damaged ones are left out, too, with a note."""
+        """The decoded images of `topic`, checked as by `payloads`. Damaged images are rejected with a note."""
         return frames(self.payloads(topic), self.place(topic), self.note)
 
     def files(self) -> list[Path]:
-        """The files that have been read so far, each once, in the order of reading."""
+        """Files read so far, without duplicates, in the order of reading."""
         return list(self._read)
 
     def note(self, sentence: str) -> None:
-        """Keep a sentence on what was left out or repaired, each once."""
+        """Add a sentence on rejected or repaired data to `notes()`, without duplicates."""
         if sentence not in self._notes:
             self._notes.append(sentence)
 
     def notes(self) -> tuple[str, ...]:
-        """What was left out or repaired so far, one sentence each."""
+        """Sentences on data that were rejected or repaired so far."""
         return tuple(self._notes)
 
     def _remember(self, path: Path) -> None:
@@ -147,23 +149,26 @@ class Recording(ABC):
             self._read.append(path)
 
     def _spans(self) -> list[Span]:
-        """First and last stamp of each topic."""
+        """First and last stamp [ns] of each topic with messages."""
         return [(t.first_ns, t.last_ns) for t in self.topics() if t.first_ns is not None and t.last_ns is not None]
 
     def _inside(self, stamps_ns: np.ndarray, where: str) -> np.ndarray:
-        """(N,) bool, as `inside`."""
+        """(N,) bool: stamps [ns] in the time window. Raises RecordingError if there are none."""
         return stamps_inside(self.window, stamps_ns, where, self._spans())
 
 
-ReadStream = tuple[Stream, tuple[str, ...]]  # and notes on it
+ReadStream = tuple[Stream, tuple[str, ...]]  # stream, notes on it
 FindCorners = Callable[[Recording, Camera], tuple[CornerStream, tuple[str, ...]]]
 FindTracks = Callable[[Recording, Sequence[Camera]], Sequence[tuple[TrackStream, tuple[str, ...]]]]
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How the sensors of `rig` are read. cut: applied to each stream; find, follow: find corners of one camera and
-    feature tracks of several in their images."""
+    """Functions for reading the sensors of `rig`.
+
+    cut: applied to each stream, removes clock jumps. find: detects target corners in the images of a camera. follow:
+    detects feature tracks in the images of several cameras.
+    """
 
     rig: Rig
     cut: Cut

@@ -1,4 +1,4 @@
-"""Recordings that are folders: tables `imu0/data.csv`, `cam0/corners.csv`, gzip or not, and EuRoC's images."""
+"""Recordings that are folders: tables such as `imu0/data.csv` and `cam0/corners.csv` (also gzip), images, videos."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from icalib.rig import PLAIN_TABLE, Camera, TableLayout
 from icalib.sensors.sensor import Sensor
 
 _MAX_LISTED = 12
-_OF_IMAGES = ("data.csv", "data.csv.gz")  # where a folder has images: their stamps
+_OF_IMAGES = ("data.csv", "data.csv.gz")  # tables of stamps, in folders with images
 
 
 @final
 class FolderRecording(Recording):
-    """A folder of tables and images; those of EuRoC's `mav0` are found, too.
+    """A folder with tables, images and videos, directly or in its subfolder `mav0` (EuRoC).
 
-    Each folder in it is of one sensor, and holds files that some kind of sensor declares (`data.tables.files`), such as
-    `data.csv` of an IMU. Images: the folder `data` beside a `data.csv` of t [ns], file name. Kalibr's
-    `cam0/STAMP.png` beside `imu0.csv` is found, too.
+    Each subfolder belongs to a sensor and contains files that kinds of sensors declare (`data.tables.files`), such as
+    `data.csv` of an IMU. Images are in its subfolder `data`, beside a `data.csv` with t [ns], file name. The layout of
+    Kalibr, `cam0/STAMP.png` and `imu0.csv`, is supported, too.
     """
 
     def __init__(self, root: Path, window: Window = WHOLE) -> None:
@@ -89,7 +89,7 @@ class FolderRecording(Recording):
         return checked_payloads(file_payloads(files, str(folder), self.note), str(folder), self.note)
 
     def _frames(self, video: Path) -> Iterator[Payload]:
-        """Those of a video in the window."""
+        """Checked frames of a video in the time window."""
         self._remember(video)
         found = video_payloads(video, str(video))
         if not self.window.is_all:
@@ -103,7 +103,7 @@ class FolderRecording(Recording):
         plain = path.removesuffix(".gz")
         names = (path, plain, plain + ".gz")
         if len(parts := Path(plain).parts) == 2 and parts[1] != "corners.csv":
-            names += (f"{parts[0]}.csv",)  # as Kalibr's bagcreater takes them
+            names += (f"{parts[0]}.csv",)  # layout of Kalibr's bagcreater
         return next(
             (p for folder in (self.root, self.root / "mav0") for n in names if (p := folder / n).is_file()), None
         )
@@ -114,7 +114,7 @@ class FolderRecording(Recording):
         return found
 
     def image_topics(self) -> tuple[TopicInfo, ...]:
-        """Images in folders and videos."""
+        """Topics of image folders and videos."""
         folders = sorted(p for base in self._bases() for p in base.iterdir() if p.is_dir())
         return (*(topic for p in folders if (topic := self._images(p)) is not None), *self._videos)
 
@@ -126,8 +126,8 @@ class FolderRecording(Recording):
         return TopicInfo(folder.name, "images", "image", len(stamps), min(stamps), max(stamps)) if stamps else None
 
     def _pictures(self, folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
-        """Stamps [ns] and files of the images of a folder. Pictures that have but numbers have the stamps of the rows
-        of the only table that may give some."""
+        """Stamps [ns] and files of the images of a folder. Images with numbers in place of stamps take the stamps of
+        the rows of a table, if exactly one table can provide them."""
         if numbered := numbered_pictures(folder):
             tables = self._tables_with_rows()
             if len(tables) == 1:
@@ -136,7 +136,8 @@ class FolderRecording(Recording):
         return image_files(folder, note)
 
     def _tables_with_rows(self) -> dict[Path, tuple[StampsOfRows, TableLayout]]:
-        """Those that are told by what they hold, and those of sensors of the rig file."""
+        """Tables whose rows can provide stamps for images, detected ones and those of the rig file: the function that
+        reads the stamps, and the layout."""
         tables = [found for base in self._bases() for found in named_tables(base)]
         for folder in (p for base in self._bases() for p in base.iterdir() if p.is_dir()):
             tables += files_in(folder)
@@ -145,13 +146,13 @@ class FolderRecording(Recording):
         return {path: (declared.rows, layout) for path, declared, layout in plain + given if declared.rows is not None}
 
     def _layouts(self) -> dict[Path, tuple[TableFile, TableLayout]]:
-        """Declaration and layout of each table of the sensors of `use_layouts` that may give stamps to images."""
+        """As `_tables_with_rows`, for tables of the sensors of `use_layouts`: declaration and layout."""
         tables = [(s.sensor_type, getattr(s, "path", ""), getattr(s, "layout", PLAIN_TABLE)) for s in self._sensors]
         found = [(self.find(path), rows, layout) for kind, path, layout in tables if (rows := rows_of(kind))]
         return {path: (declared, layout) for path, declared, layout in found if path is not None}
 
     def _stamps_of(self, path: Path, declared: TableFile) -> np.ndarray:
-        """(N,) int64 ns of a table."""
+        """(N,) int64 ns: stamps of a table."""
         declared, layout = self._layouts().get(path, (declared, PLAIN_TABLE))
         return declared.stamps(path, layout)
 

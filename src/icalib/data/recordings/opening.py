@@ -1,4 +1,4 @@
-"""A path -> the reader of what lies there."""
+"""Opens a recording: detects its format and chooses the reader."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ _OF_TABLES = ("*/*.csv", "*/*.csv.gz", "mav0", "*/data")
 
 
 def open_recording(path: str | Path, start_s: float = 0.0, end_s: float = inf) -> Recording:
-    """Open the recording at `path`: a folder of tables or EuRoC's, a bag, a folder of bags, or of pictures. Only what
-    lies from start_s to end_s after its start is read.
+    """Open the recording at `path`: a bag, or a folder of bags, of tables (also EuRoC's) or of images.
 
-    It is told by what is there, not by names. Raises RecordingError where it is missing, empty or none of these, and
-    for a part with nothing in it.
+    The format is detected from the content. start_s, end_s: time window, in seconds from the start of the recording.
+    Raises RecordingError if the path is missing or has no known format, or if the window is invalid.
     """
     root, window = Path(path), Window(start_s, end_s)
     if root.is_dir():
@@ -45,7 +44,7 @@ def open_recording(path: str | Path, start_s: float = 0.0, end_s: float = inf) -
 
 
 def _refuse_unreadable(folder: Path) -> None:
-    """Raises RecordingError where a file of `folder` is a pointer of Git LFS or git-annex."""
+    """Raises RecordingError if a file of `folder` is a pointer of Git LFS or git-annex, or a video without its suffix."""
     for path in sorted(p for p in folder.iterdir() if p.is_file() and not is_video(p)):
         with path.open("rb") as file:
             sentence = not_data(path, file.read(HEAD_BYTES))
@@ -54,7 +53,7 @@ def _refuse_unreadable(folder: Path) -> None:
 
 
 def _holds_bags(folder: Path) -> bool:
-    """Bags, and no tables: these may have been made from a bag that was left beside them."""
+    """True if `folder` has bags and no tables. Tables have priority: they may be extracted from the bag beside them."""
     return bool(bag_files(folder)) and not _holds_tables(folder)
 
 

@@ -1,7 +1,7 @@
-"""Recordings that are folders of pictures without clocks: a phone's, or those of cameras that were triggered by hand.
+"""Recordings that are folders of images without a table of timestamps, such as from a phone or a manual trigger.
 
-A picture's name says when it was taken: by its stamp since 1970, in s, ms, us or ns, or else by the last number in it.
-Pictures of the same stamp or number were taken together.
+The file name gives the time of an image: a stamp since 1970 in s, ms, us or ns, or else the last number in the name.
+Images with the same stamp or number were taken at the same time.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from icalib.errors import RecordingError
 from icalib.rig import Camera
 from icalib.sensors.sensor import Sensor
 
-APART_NS = 1_000_000_000  # from one number to the next
-MOST = 9_000_000_000  # beyond, nanoseconds do not fit
-MIXED = 0.75  # of the pictures have a number of their own: fewer are of several cameras
-_SIDES = {"0": "left", "1": "right"}  # by the end of a camera's name
+APART_NS = 1_000_000_000  # artificial stamps: interval from one number to the next
+MOST = 9_000_000_000  # largest number: its artificial stamp fits in int64
+MIXED = 0.75  # distinct numbers / images; below it, a folder mixes images of several cameras
+_SIDES = {"0": "left", "1": "right"}  # last character of a camera name -> word in file names
 
 
 def has_pictures(root: Path) -> bool:
-    """Whether `root` or a folder in it holds pictures."""
+    """True if `root` or a direct subfolder contains images."""
     return bool(_topics(root))
 
 
 @final
 class PictureFolder(Recording):
-    """A folder of pictures, or of one folder of pictures for each camera.
+    """A folder of images, or with one subfolder of images for each camera.
 
-    A topic is the name of such a folder, `.` for the root itself, or a pattern of files as `images/*_0.jpg`, in which
-    the star is the picture's number. A folder with several pictures of one number, left1.png and right1.png, is a topic
-    for each pattern.
+    A topic is the name of a subfolder, `.` for the root, or a file pattern such as `images/*_0.jpg`. The star stands
+    for the number of the image. If several images of a folder share a number, such as left1.png and right1.png,
+    each pattern is a topic.
     """
 
     def __init__(self, root: Path, window: Window = WHOLE) -> None:
@@ -59,7 +59,7 @@ class PictureFolder(Recording):
             return camera.topic
         topics = self.topics()
         patterns = [t.name for t in topics if "*" in t.name] if camera.topic is None else []
-        for word in (camera.name, _SIDES.get(camera.name[-1:], camera.name)):  # cam0 where files say left
+        for word in (camera.name, _SIDES.get(camera.name[-1:], camera.name)):  # such as cam0 for files named left
             named = [name for name in patterns if word in name.lower()]
             if len(named) == 1:
                 return named[0]
@@ -72,7 +72,7 @@ class PictureFolder(Recording):
         return checked_payloads(file_payloads(files, where, self.note), where, self.note)
 
     def find(self, path: str) -> None:
-        """There are no tables."""
+        """None: the recording has no tables."""
 
     def table(self, sensor: Sensor, path: str, field: str = "path") -> Path:
         del field
@@ -90,12 +90,12 @@ class PictureFolder(Recording):
     def _info(self, name: str) -> TopicInfo:
         try:
             stamps = [stamp for stamp, _ in self._files(name)]
-        except RecordingError:  # a pattern may tell apart what one folder mixes
+        except RecordingError:  # several cameras in a folder: a pattern in the rig file may separate them
             return TopicInfo(name, "pictures", "image", len(pictures_in(self.root / name)), None, None)
         return TopicInfo(name, "pictures", "image", len(stamps), stamps[0], stamps[-1])
 
     def _files_inside(self, topic: str) -> list[tuple[int, Path]]:
-        """Those of `_files` in the window."""
+        """As `_files`, for images in the time window."""
         files = self._files(topic)
         if self.window.is_all:
             return files
@@ -104,7 +104,7 @@ class PictureFolder(Recording):
         return [file for file, used in zip(files, inside.tolist(), strict=True) if used]
 
     def _files(self, topic: str) -> list[tuple[int, Path]]:
-        """Stamp and file of each picture, by number. Raises RecordingError where numbers are missing or repeat."""
+        """Stamp [ns] and file of each image, sorted. Raises RecordingError if a number is missing or repeated."""
         if "*" in topic:
             before, _, after = topic.partition("*")
             paths = [p for p in self.root.glob(topic) if p.suffix.lower() in SUFFIXES]
@@ -135,12 +135,13 @@ def _topics(root: Path) -> list[str]:
 
 
 def _mixed(root: Path, folder: str) -> list[str]:
-    """Patterns of the pictures of `folder` where several of them share their numbers; else the folder, or nothing."""
+    """Topics of `folder`: file patterns, if it mixes the images of several cameras with shared numbers; else `folder`;
+    empty without images."""
     paths = pictures_in(root / folder)
-    # The number may be the last in the names or the one before: that which leaves fewer patterns.
+    # The number is the last or the second last in the names, whichever gives fewer patterns.
     own = min((_patterns(paths, place) for place in (-1, -2)), key=len)
     numbers = [number for found in own.values() for number in found]
-    # Of two cameras nearly all numbers come twice; names of one camera that differ share hardly any.
+    # With two cameras nearly all numbers occur twice. Different names of one camera hardly share numbers.
     alike = len(own) > 1 and min(map(len, own.values())) > 1
     if alike and sum(map(len, own.values())) == len(paths) and len(set(numbers)) < MIXED * len(numbers):
         return sorted(pattern if folder == "." else f"{folder}/{pattern}" for pattern in own)
@@ -148,7 +149,8 @@ def _mixed(root: Path, folder: str) -> list[str]:
 
 
 def _patterns(paths: list[Path], place: int) -> dict[str, set[int]]:
-    """Numbers of pictures by pattern, the star in place of that number of their names."""
+    """Image numbers by file pattern, in which a star replaces the number. place: index of the number in the name, -1
+    for the last."""
     own: dict[str, set[int]] = {}
     for path in paths:
         found = [*re.finditer(r"\d+", path.stem)]

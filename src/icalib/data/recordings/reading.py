@@ -1,4 +1,4 @@
-"""A recording and a rig -> measurements that the rest of the program can trust."""
+"""Reads and checks the measurements of all sensors of a rig from a recording."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from icalib.sensors import SENSOR_KINDS, facet
 
 
 def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
-    """For recordings without images. Raises RecordingError."""
+    """Default detector for recordings without images: raises RecordingError, as the camera has images."""
     raise RecordingError(
         f"{recording.where(camera)} holds images, not corners; give a function that detects the target."
     )
 
 
 def track_tables_only(recording: Recording, cameras: Sequence[Camera]) -> Sequence[tuple[TrackStream, tuple[str, ...]]]:
-    """For recordings without images. Raises RecordingError."""
+    """Default detector for recordings without images: raises RecordingError, as the camera has images."""
     raise RecordingError(f"{recording.where(cameras[0])} holds images; give a function that tracks features in them.")
 
 
 def read_measurements(
     recording: Recording, rig: Rig, find: FindCorners = tables_only, follow: FindTracks = track_tables_only
 ) -> Measurements:
-    """Read what `rig` asks for from `recording`, and check it; `find` finds corners, and `follow` feature tracks, in
-    images. Of a clock that jumps one part is used.
+    """Read and check the streams of all sensors of `rig` from `recording`.
 
-    What was dropped or looks odd stands in the notes. Raises RecordingError, one sentence naming the file and the line
-    or instant, for data that are missing, unreadable, out of order, in other units, or not of this rig.
+    find, follow: detect target corners and feature tracks in images. Clock jumps split a stream; one segment is used.
+    Notes list rejected data. Raises RecordingError, naming the file and line or instant, for data that are missing,
+    unreadable, unordered, in wrong units, or not of this rig.
     """
     recording.use_layouts(tuple(rig.sensors.values()))
     jumps = ClockJumps(LONGEST_S)
@@ -47,9 +47,9 @@ def read_measurements(
 
 
 def without_jumps(rig: Rig, measurements: Measurements) -> Measurements:
-    """The same of measurements in memory. What was read from files has no jumps any more."""
+    """Measurements in memory without clock jumps, as `read_measurements` removes them from files."""
     m, jumps = measurements, ClockJumps(LONGEST_S)
-    if rig.cameras_alone:  # clocks only tell which images were taken together
+    if rig.cameras_alone:  # stamps only match images of different cameras
         return m
     streams = {key: jumps.cut(s, s.name) for key, s in m.streams.items()}
     return replace(m, streams=streams, notes=m.notes + jumps.notes) if jumps.notes else m

@@ -1,4 +1,4 @@
-"""Several recordings of one rig: opened, each with a name that tells it from the others."""
+"""Opens several recordings of a rig under unique names; adds names and notes to errors."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Source = Recording | str | Path
 
 
 def open_all(given: Source | Sequence[Source], start_s: float = 0.0, end_s: float = inf) -> dict[str, Recording]:
-    """One recording or several, by name. The name is that of the file or folder, or the whole path where two share it.
-    A `Recording` that is passed has a number for a name. start_s, end_s: as `open_recording`, of each.
+    """Opened recordings by name: the name of the file or folder, or the whole path if two share the name.
 
-    Raises RecordingError for no recording, one that cannot be read, one that is given twice, and a part of a
+    An already opened `Recording` is numbered. start_s, end_s: time window of each, as in `open_recording`. Raises
+    RecordingError for no recording, an unreadable one, a path given twice, and a time window with an opened
     `Recording`.
     """
     sources: Sequence[Source] = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
@@ -45,7 +45,7 @@ def open_all(given: Source | Sequence[Source], start_s: float = 0.0, end_s: floa
 
 @contextmanager
 def naming(name: str) -> Iterator[None]:
-    """Errors raised within begin with `name`, unless a path in them does or has it, or it is empty."""
+    """Context manager: prefixes errors raised within by `name`, unless it is empty or the message contains it."""
     try:
         yield
     except CalibrationError as error:
@@ -56,8 +56,8 @@ def naming(name: str) -> Iterator[None]:
 
 @contextmanager
 def noting(notes: Iterable[str]) -> Iterator[None]:
-    """Errors raised within carry `notes` on what was left out or repaired before, each once, in `__notes__`: it may
-    be the reason."""
+    """Context manager: adds `notes` on rejected or repaired data, a possible cause, to `__notes__` of errors raised
+    within."""
     try:
         yield
     except CalibrationError as error:

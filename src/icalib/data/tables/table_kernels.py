@@ -23,10 +23,9 @@ def parse(
 ) -> tuple[int, int, int, int]:
     """Parse rows from `start` (byte, line) on. Returns the number of rows, the number of unreadable lines, and line and
     column of the first of these (line 0: none).
-
     place (n_columns,): target column of each column of the file, first all integers, then all decimals, or LEFT_OUT.
-    stamps: number of integer columns that are stamps, and the power of ten to multiply them by; negative: stamps must
-    be integers. numbers (n,) int64: index of each row in the file, which includes unreadable lines.
+    stamps: number of stamp columns, and the power of ten to multiply stamps by; negative: stamps must be integers.
+    numbers (n,) int64: index of each row in the file, which includes unreadable lines.
     """
     at, line = start
     row, bad, bad_line, bad_column = 0, 0, 0, 0
