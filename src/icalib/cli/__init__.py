@@ -1,4 +1,4 @@
-"""The command line."""
+"""The command line program `icalib`."""
 
 from icalib.cli.commands import main
 

@@ -1,4 +1,4 @@
-"""The command line: it parses, calls the public function, and turns known errors into one line and exit code 1."""
+"""Commands of `icalib`: parse arguments, call a public function, turn errors into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from icalib.errors import CalibrationError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130 interrupted;
-    of `compare` 1 where something differs, 2 an error; of `check` 1 changed, 2 an error, 3 cannot say."""
+    """Entry point of the program `icalib`. arguments: default sys.argv. Returns the exit code.
+
+    0: success, 1: error, 2: wrong usage, 130: interrupted. `compare`: 1: different, 2: error. `check`: 1: calibration
+    changed, 2: error, 3: undecided. `calibrate --strict`: 3 to 5, by verdict.
+    """
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # names of files may have bytes that no encoding has
+        if isinstance(stream, io.TextIOWrapper):  # file names may contain bytes that cannot be encoded
             stream.reconfigure(errors="backslashreplace")
     options = _parser().parse_args(arguments)
     if arguments is None and not sys.warnoptions:
-        warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of which nobody at a terminal can make anything
+        warnings.simplefilter("ignore", RuntimeWarning)  # warnings of numpy do not help a user
     try:
         code = options.run(options)
     except CalibrationError as error:
@@ -31,10 +34,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"Note: {note}")
         print(f"icalib: {error}", file=sys.stderr)
         return getattr(options, "error_code", 1)
-    except (OSError, MemoryError) as error:  # what fails outside of the program, and nobody expected there
+    except (OSError, MemoryError) as error:  # failures of the system, such as a full disk, without specific handling
         print(f"icalib: {_outside(error)}", file=sys.stderr)
         return getattr(options, "error_code", 1)
-    except Exception as error:  # the last resort: a sentence says as much as a traceback does, to whoever reads it
+    except Exception as error:  # a bug: one line with its place, instead of a traceback
         print(f"icalib: {_fault(error)}", file=sys.stderr)
         return getattr(options, "error_code", 1)
     except KeyboardInterrupt as stop:

@@ -1,4 +1,4 @@
-"""What the command line shows: a progress bar while it works, and the result."""
+"""Output of the command line: progress bar and summary of the result."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from icalib.result import Calibration
 from icalib.result.quantities import chi2_words, dof_words, rms_words
 from icalib.result.verdict import NEXT, Usability
 
-LINE_EVERY_S = 30.0  # between lines of progress in logs
+LINE_EVERY_S = 30.0  # interval between progress lines if stderr is no terminal
 RESIDUALS = "Residuals: chi^2 per degree of freedom is 1 where noise is as stated; in brackets the degrees of freedom."
 NO_REDUNDANCY = "n/a: the recording cannot test this noise, so the value stated in the rig file is used as it is."
 VERDICT_STYLES: dict[Usability, str] = {
@@ -31,7 +31,10 @@ VERDICT_STYLES: dict[Usability, str] = {
 
 @contextmanager
 def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """A bar on standard error with the time left; if that is not a terminal, a line every 30 s; nothing if `quiet`."""
+    """Context manager that yields a function to show stage and completed fraction (0 to 1).
+
+    It shows a bar on standard error; if that is no terminal, a line at most every 30 s; nothing if `quiet`.
+    """
     console = Console(stderr=True)
     if quiet:
         yield lambda stage, done: None
@@ -52,7 +55,7 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
 
 
 def progress_lines(clock: Callable[[], float]) -> Callable[[str, float], None]:
-    """Prints stage and share of the work on standard error, at most every 30 s of `clock` [s], for logs and pipes."""
+    """Function that prints stage and completed fraction on standard error, at most every 30 s. clock: time [s]."""
     begin = last = clock()
 
     def show(stage: str, done: float) -> None:
@@ -66,7 +69,7 @@ def progress_lines(clock: Callable[[], float]) -> Callable[[str, float], None]:
 
 
 def print_result(calibration: Calibration, folder: Path) -> None:
-    """The table of parameters, what they rest on, and where the files are, on standard output."""
+    """Prints the result on standard output: parameters, residual statistics, notes, written files, verdict."""
     console, parameters = Console(), table(calibration)
     if parameters.row_count > console.height:
         _print_summary(calibration, console)
@@ -96,7 +99,7 @@ def print_result(calibration: Calibration, folder: Path) -> None:
 
 
 def _print_summary(calibration: Calibration, console: Console) -> None:
-    """Verdict and first reason, for a reader who does not see the end of a long output."""
+    """Prints verdict and first reason before an output that is longer than the terminal."""
     console.print(_verdict_line(calibration))
     count = len(calibration.reasons)
     for sentence in calibration.reasons[:1]:
@@ -105,7 +108,7 @@ def _print_summary(calibration: Calibration, console: Console) -> None:
 
 
 def print_verdict(calibration: Calibration, console: Console) -> None:
-    """The reasons, numbered, and as the last line the verdict with what to do next."""
+    """Prints the numbered reasons of the verdict, and as last line the verdict with advice."""
     for k, sentence in enumerate(calibration.reasons, 1):
         console.print(f"Reason {k}: {sentence}", markup=False, highlight=False)
     console.print(_verdict_line(calibration))
@@ -117,6 +120,6 @@ def _verdict_line(calibration: Calibration) -> Text:
 
 
 def print_warnings(calibration: Calibration) -> None:
-    """What `--quiet` leaves of it, on standard error: nothing where the result is usable."""
+    """Output of `--quiet` on standard error: reasons and verdict, or nothing if there are no reasons."""
     if calibration.reasons:
         print_verdict(calibration, Console(stderr=True))

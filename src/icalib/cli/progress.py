@@ -1,4 +1,4 @@
-"""A progress bar for Python: in a terminal, or below the cell of a notebook."""
+"""Progress bar for the Python API, in a terminal or a Jupyter notebook."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from typing import Any
 
 from icalib.cli import console
 
-EVERY_S = 0.2  # at most so often a notebook redraws
+EVERY_S = 0.2  # least interval between updates in a notebook
 
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """What `progress` of `icalib.calibrate` takes: `with icalib.progress_bar() as progress: ...`."""
+    """Yields the argument `progress` of `icalib.calibrate`: `with icalib.progress_bar() as progress: ...`."""
     if not in_notebook():
         with console.progress_bar(quiet=False) as show:
             yield show
@@ -39,7 +39,7 @@ def progress_bar() -> Iterator[Callable[[str, float], None]]:
 
 
 def in_notebook() -> bool:
-    """Whether this runs in a kernel of Jupyter, which loads IPython before anything else."""
+    """True in a Jupyter kernel, which always imports IPython first."""
     ipython: Any = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return getattr(shell, "kernel", None) is not None

@@ -1,4 +1,4 @@
-"""Commands that look at results and sensors: `icalib allan`, and what others do with a calibration."""
+"""The commands `allan`, `check`, `rig`, `export`, `compare` and `view`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from icalib.rig import AccelUnit, GyroUnit
 
 
 def add_result_commands(commands: argparse._SubParsersAction[CommandParser]) -> None:
-    """Adds the parsers to those of the other commands."""
+    """Adds the parsers of these commands to `commands`."""
     _add_allan(commands)
     _add_check(commands)
     _add_rig(commands)
@@ -98,7 +98,7 @@ def _export(options: argparse.Namespace) -> None:
     files, folder = found.files, options.output
     if options.to in ONE_FILE:
         files, folder = {options.output.name: next(iter(files.values()))}, options.output.parent
-    # A URDF that is named as input and output is to be updated in place.
+    # The same URDF as input and output: update in place.
     in_place = options.urdf is not None and options.output.resolve() == options.urdf.resolve()
     inputs = [*set_of(options.result), *([options.urdf] if options.urdf else [])]
     refuse_foreign((folder / name for name in files if not in_place), inputs, "choose another place")

@@ -1,4 +1,4 @@
-"""`icalib target`: a target as PDF."""
+"""The command `icalib target`: writes a calibration target as PDF for printing."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from icalib.cli.command_parser import CommandParser, add_command, count, examples, whole
 
-_MOST_IDS = 10_000  # more than any family has
+_MOST_IDS = 10_000  # limit; more than any tag family has
 _EXAMPLES = {
     "aprilgrid": "icalib target aprilgrid --rows 6 --cols 6 --tag-size 0.025 --tag-spacing 0.3 --output grid.pdf",
     "charuco": "icalib target charuco --squares-x 7 --squares-y 5 --square-size 0.035 --marker-size 0.026 "
@@ -38,7 +38,7 @@ _FIELDS = {
 
 
 def add_target_command(commands: argparse._SubParsersAction[CommandParser]) -> None:
-    """`icalib target TYPE`: its options are the fields of the rig file's target."""
+    """Adds the parser of `icalib target TYPE`, whose options are the fields of a target in the rig file."""
     about = "write a target as PDF, to print at true scale"
     t = add_command(commands, "target", about, _EXAMPLES["aprilgrid"], "icalib target aprilgrid --help")
     types = t.add_subparsers(required=True, metavar="TYPE", dest="type")
@@ -47,7 +47,7 @@ def add_target_command(commands: argparse._SubParsersAction[CommandParser]) -> N
 
 
 def _options() -> dict[str, dict[str, Any]]:
-    """By type of target: its fields, and how their text is parsed."""
+    """Fields of each type of target, with the function that parses the text of each field."""
     return {
         "aprilgrid": {"rows": count, "cols": count, "tag_size": _metres, "tag_spacing": _metres},
         "charuco": {
@@ -88,7 +88,7 @@ def _add_type(types: argparse._SubParsersAction[CommandParser], name: str, optio
 
 
 def _ids(text: str) -> tuple[int, ...]:
-    """Ids and ranges of ids, separated by commas."""
+    """Parses tag ids and ranges of ids, such as 0-11,20. Raises ArgumentTypeError."""
     ids: list[int] = []
     for part in text.split(","):
         first, _, last = part.partition("-")

@@ -1,1 +1,1 @@
-"""Bag files of ROS 1 and ROS 2 -> their messages, as bytes, in the order in which they were written."""
+"""Readers of bag files of ROS 1 and ROS 2: serialized messages in the order in which they were written."""

@@ -15,10 +15,10 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = 2, 3, 4, 5, 6, 7
 _RECORD = struct.Struct("<BQ")  # kind, length
 _MESSAGE_HEAD = struct.Struct("<HIqq")  # channel, sequence, log time, publish time
-_CHUNK_HEAD = struct.Struct("<QQQI")  # first and last log time, uncompressed size, crc
+_CHUNK_HEAD = struct.Struct("<QQQI")  # first and last log time, uncompressed size, CRC-32
 _INDEX_ENTRY = np.dtype([("log_time", "<i8"), ("offset", "<u8")])
-_LONGEST_NAME = 16  # of a compression; more is damage
-_RUN_BYTES = 1 << 20  # messages outside of chunks are read in runs of this size
+_LONGEST_NAME = 16  # bytes of the name of a compression; a longer one is damage
+_RUN_BYTES = 1 << 20  # messages outside of chunks are grouped into blocks of this size
 
 
 @final
@@ -27,7 +27,7 @@ class McapStorage(SpanStorage):
 
     def _scan(self, file: BinaryIO, size: int) -> None:
         self._schemas: dict[int, str] = {}
-        self._run: Span | None = None  # of messages outside of chunks, while it grows
+        self._run: Span | None = None  # current block of messages outside of chunks
         file.seek(len(MCAP_MAGIC))
         while (at := file.tell()) < size:
             try:
@@ -45,10 +45,10 @@ class McapStorage(SpanStorage):
                 file.seek(size)
                 raise DamageError
             file.seek(begin + length)
-        raise DamageError  # a whole file ends with its footer
+        raise DamageError  # no footer: the file is truncated
 
     def _note_record(self, kind: int, file: BinaryIO, at: int, length: int) -> None:
-        """Note the record that begins at `at`, whose content of `length` bytes lies ahead in `file`."""
+        """Register the record that begins at byte `at`. `file` is positioned at its content of `length` bytes."""
         begin = file.tell()
         if kind == _CHUNK:
             _, _, _, crc = _CHUNK_HEAD.unpack(file.read(_CHUNK_HEAD.size))
@@ -69,7 +69,8 @@ class McapStorage(SpanStorage):
             self._note_definition(kind, memoryview(file.read(length)))
 
     def _grow_run(self, at: int, end: int) -> Span:
-        """The run of messages outside of chunks that the record from `at` to `end` continues, or a new one."""
+        """The block of messages outside of chunks to which the record from byte `at` to `end` is added, current or
+        new."""
         run = self._run
         if run is None or run.offset + run.size != at or run.size > _RUN_BYTES:
             self._run = run = Span(at, 0)
@@ -106,13 +107,13 @@ class McapStorage(SpanStorage):
 
 
 def _refuse_cut_index(file: BinaryIO) -> None:
-    """All messages are there, but a whole file ends as it begins."""
+    """Raises DamageError if the file does not end with the magic bytes: its index is truncated, all messages exist."""
     file.seek(-len(MCAP_MAGIC), 2)
     if file.read() != MCAP_MAGIC:
         raise DamageError
 
 
 def _text(content: memoryview, at: int) -> tuple[str, int]:
-    """The text at `at`, and where it ends."""
+    """The text at byte `at`, and the position after it."""
     (n,) = struct.unpack_from("<I", content, at)
     return bytes(content[at + 4 : at + 4 + n]).decode(), at + 4 + n

@@ -1,4 +1,4 @@
-"""Which files make up a bag, and which reader each needs: told by what is in them, not by their names."""
+"""Finds the files of a bag, and chooses the reader of each by its content."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _SUFFIXES = (".bag", ".active", ".mcap", ".db3", ".zstd")
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """Bag files right in `folder`, in the order of their numbers: run_2.db3 before run_10.db3."""
+    """Bag files directly in `folder`, sorted by the numbers in their names: run_2.db3 before run_10.db3."""
     found = [p for p in folder.iterdir() if p.is_file() and p.suffix in _SUFFIXES]
     return sorted(found, key=lambda p: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", p.name)])
 
 
 def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
-    """The bag files of `path`, a file or a folder, and notes on those that cannot be read.
+    """Readers of the bag file or folder `path`, and notes on missing and unreadable files of a folder.
 
-    Raises RecordingError where a file is no bag, or none of a folder can be read.
+    Raises RecordingError if no file can be read.
     """
     if path.is_file():
         return [open_storage(path)], []
@@ -53,7 +53,8 @@ def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
 
 
 def open_storage(path: Path, name: Path | None = None) -> Storage:
-    """The bag file `path`, called `name` in sentences. Raises RecordingError where it is empty, damaged or no bag."""
+    """Reader of the bag file `path`. name: its name in messages; default: `path`. Raises RecordingError if the file is
+    empty, damaged or no bag."""
     name = name or path
     try:
         with path.open("rb") as file:
@@ -78,7 +79,7 @@ def open_storage(path: Path, name: Path | None = None) -> Storage:
 
 
 def _open_compressed(path: Path) -> Storage:
-    """A file that ROS 2 compressed as a whole: it is read from a copy, which goes when the reader does."""
+    """Reader of a file that ROS 2 compressed as a whole. It reads a temporary copy, deleted with the reader."""
     zstd = load_zstd()
     folder = tempfile.mkdtemp(prefix="icalib-")
     copy = Path(folder) / path.stem
@@ -89,7 +90,7 @@ def _open_compressed(path: Path) -> Storage:
         shutil.rmtree(folder)
         raise RecordingError(f"{path}: {error}; unpack it with zstd -d and check its content.") from error
     except (zstd.ZstdError, EOFError):
-        pass  # cut off: the reader of the copy says how much there is
+        pass  # truncated: the reader of the copy notes how much is readable
     except OSError:
         shutil.rmtree(folder)
         raise
@@ -105,7 +106,7 @@ def _open_compressed(path: Path) -> Storage:
 
 
 def _absent(folder: Path) -> list[str]:
-    """Files that metadata.yaml names and that are missing. The rest of it is not needed, so it may be damaged."""
+    """Names of missing files that metadata.yaml lists; empty if it is missing or damaged, as nothing else needs it."""
     try:
         about = read_yaml(folder / "metadata.yaml").entries()["rosbag2_bagfile_information"].entries()
         names = [Path(item.text()).name for item in about["relative_file_paths"].items()]

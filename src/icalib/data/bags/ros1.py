@@ -15,7 +15,7 @@ from icalib.errors import RecordingError
 ROS1_MAGIC = b"#ROSBAG V"
 _VERSION = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
-_LARGEST_HEADER = 1 << 20  # headers have some hundred bytes; more is damage
+_LARGEST_HEADER = 1 << 20  # bytes; headers have some hundred, a larger one is damage
 _INDEX_ENTRY = np.dtype([("secs", "<u4"), ("nsecs", "<u4"), ("offset", "<u4")])
 
 Fields = dict[bytes, bytes]
@@ -23,7 +23,7 @@ Fields = dict[bytes, bytes]
 
 @final
 class Ros1Storage(SpanStorage):
-    """A ROS 1 bag."""
+    """Reader of a ROS 1 bag."""
 
     def _scan(self, file: BinaryIO, size: int) -> None:
         if file.read(len(_VERSION)) != _VERSION:
@@ -45,11 +45,11 @@ class Ros1Storage(SpanStorage):
                 file.seek(size)
                 raise DamageError
             file.seek(length, 1)
-        if not 0 < index_at <= size:  # the recorder writes it last
+        if not 0 < index_at <= size:  # position of the index, which the recorder writes last
             raise DamageError
 
     def _note_record(self, kind: int, fields: Fields, file: BinaryIO, length: int) -> None:
-        """Note a record whose content of `length` bytes lies ahead in `file`; leaves the file where it is."""
+        """Register a record. `file` is positioned at its content of `length` bytes, before and after the call."""
         at = file.tell()
         if kind == _CHUNK:
             self.spans.append(Span(at, length, fields[b"compression"].decode()))
@@ -93,7 +93,7 @@ class Ros1Storage(SpanStorage):
 
 
 def _read_header(file: BinaryIO) -> tuple[Fields, int]:
-    """Fields of the next record, and the length of its content, where the file then stands."""
+    """Header fields of the next record, and the length of its content; leaves `file` positioned at the content."""
     (n,) = struct.unpack("<I", file.read(4))
     if n > _LARGEST_HEADER:
         raise struct.error

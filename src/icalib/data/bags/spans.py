@@ -1,4 +1,4 @@
-"""Bag files that are a row of blocks, each with its messages: what ROS 1 bags and MCAP files have in common."""
+"""Bag files that are sequences of blocks (chunks) of messages: common code for ROS 1 bags and MCAP files."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from icalib.errors import RecordingError
 
 
 class _UnknownCompressionError(Exception):
-    """A compression that the format does not have."""
+    """A compression that icalib does not support."""
 
 
 class DamageError(Exception):
-    """A record that is cut off or makes no sense."""
+    """A truncated or invalid record."""
 
 
 @dataclass
 class Span:
-    """A block: `size` bytes at `offset` of the file, which hold records; its messages by connection, once known."""
+    """A block of records: `size` bytes at `offset` of the file. tally: its messages by connection, once known."""
 
     offset: int
     size: int
     compression: str = ""
-    crc: int = 0  # 0: none was written
-    cut: bool = False  # the last of a file that was cut off, which has its own note
+    crc: int = 0  # CRC-32 of the unpacked block; 0: not checked
+    cut: bool = False  # last block of a truncated file, for which there is another note
     tally: dict[int, Tally] = field(default_factory=dict)
 
     def count(self, connection: int, received_ns: int) -> None:
@@ -41,8 +41,8 @@ class Span:
 
 
 class SpanStorage(ABC):
-    """A file of blocks. The trailing index is not needed: blocks are found one after the other, so a file that was
-    cut off is read up to the cut by the same code."""
+    """Reader of a file of blocks. It finds blocks sequentially, without the index at the end of the file. A truncated
+    file is thus read by the same code, up to the truncation."""
 
     def __init__(self, path: Path, name: Path) -> None:
         self.path = path
@@ -64,14 +64,17 @@ class SpanStorage(ABC):
 
     @abstractmethod
     def _scan(self, file: BinaryIO, size: int) -> None:
-        """Find the blocks of a file of `size` bytes, and connections outside of them.
+        """Find the blocks of a file of `size` bytes, and connections outside of blocks.
 
-        Raises DamageError where the file ends early; it then stands there.
+        Raises DamageError if the file is truncated or damaged, with `file` positioned there.
         """
 
     @abstractmethod
     def _walk(self, body: memoryview) -> Iterator[tuple[int, int, memoryview]]:
-        """Messages of a block; notes its connections. Raises DamageError at a broken record."""
+        """Messages of an unpacked block: connection, receive time [ns], content. Registers connections of the block.
+
+        Raises DamageError at an invalid record.
+        """
 
     def tally(self) -> dict[int, Tally]:
         total: dict[int, Tally] = {}
@@ -103,7 +106,7 @@ class SpanStorage(ABC):
                 self.notes.append(note)
 
     def _body(self, file: BinaryIO, span: Span) -> memoryview:
-        """The records of a block; of a block that was cut off, as far as it can be decompressed."""
+        """Unpacked records of a block; of a truncated block, as far as it can be unpacked. Raises DamageError."""
         file.seek(span.offset)
         stored = file.read(span.size)
         self._hash.saw(span.offset, stored, file)
@@ -113,7 +116,7 @@ class SpanStorage(ABC):
         return memoryview(body)
 
     def _scan_to_the_end(self, file: BinaryIO, size: int) -> int | None:
-        """Where the file is cut off, None if it is whole."""
+        """Byte at which the file is truncated; None if it is complete. Finds all blocks before it."""
         try:
             self._scan(file, size)
         except DamageError:

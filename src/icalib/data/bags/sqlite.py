@@ -1,4 +1,4 @@
-"""ROS 2's sqlite databases (.db3)."""
+"""Reader of SQLite bags of ROS 2 (.db3)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icalib.data.bags.storage import Connection, Tally, cut_note, full_type
 from icalib.errors import RecordingError
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
-# A damaged database may hold anything anywhere.
+# Types are checked, as a damaged database may contain any value.
 _TOPICS = (
     "SELECT id, name, type, serialization_format FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
 )
@@ -22,14 +22,14 @@ _TOPICS = (
 
 @final
 class SqliteStorage:
-    """A ROS 2 database. Rows are read in the order of their ids, which is that of writing: no index is needed."""
+    """Reader of a ROS 2 database. Rows are read in the order of ids, the order of writing, without an index."""
 
     def __init__(self, path: Path, name: Path) -> None:
         self.path = path
         self.name = name
         self.notes: list[str] = []
         self._tally: dict[int, Tally] = {}
-        self._last_id = -1  # of the messages that are used
+        self._last_id = -1  # id of the last usable message
         try:
             with closing(self._connect()) as database:
                 rows = database.execute(_TOPICS).fetchall()
@@ -58,18 +58,18 @@ class SqliteStorage:
     def _count(self) -> None:
         page_bytes = _page_bytes_of_cut(self.path)
         wrong = self._tally_rows("CASE typeof(data) WHEN 'blob' THEN x'' END", 0)
-        if wrong or page_bytes:  # the messages are read themselves: their later pages may be missing
+        if wrong or page_bytes:  # read all contents: later pages may be missing
             wrong = self._tally_rows("data", page_bytes) or "the last pages are missing"
             self.notes.append(cut_note(self.name, f"({wrong})", self._tally))
 
     def _tally_rows(self, data: str, doubtful_bytes: int) -> str:
-        """Tally the messages before the first damage; returns what is wrong there, empty if nothing is.
+        """Count the messages before the first damage. Returns a description of the damage, empty if there is none.
 
-        The last of them are left out, up to `doubtful_bytes`: they may lie in a page of which only a part is there, and
-        the database takes the rest for zeros.
+        data: SQL expression for the content. The last messages, up to `doubtful_bytes`, are not counted: they may lie
+        in a truncated page, whose missing part SQLite reads as zeros.
         """
         self._tally, self._last_id = {}, -1
-        doubtful: deque[tuple[int, int, int, int]] = deque()  # id, topic, when received, size
+        doubtful: deque[tuple[int, int, int, int]] = deque()  # id, topic, receive time [ns], size [bytes]
         total = 0
         try:
             with closing(self._connect()) as database:
@@ -88,22 +88,22 @@ class SqliteStorage:
         return ""
 
     def _connect(self) -> sqlite3.Connection:
-        # Without a write-ahead log nothing needs to be written beside the file, and it may lie on a read-only disk.
+        # Without a write-ahead log, `immutable` avoids writing beside the database, which may be on a read-only disk.
         log = self.path.with_name(self.path.name + "-wal")
         options = "mode=ro" if log.exists() and log.stat().st_size else "mode=ro&immutable=1"
-        # What is left half-read is closed by whichever thread collects the garbage; no two ever read at once.
+        # The garbage collector may close an unfinished query in another thread. Two threads never read at once.
         uri = f"{self.path.absolute().as_uri()}?{options}"
         database = sqlite3.connect(uri, uri=True, check_same_thread=False)
-        database.execute("PRAGMA writable_schema=ON")  # opens a file that is shorter than its header says
+        database.execute("PRAGMA writable_schema=ON")  # allows a file shorter than its header states
         return database
 
 
 def _page_bytes_of_cut(path: Path) -> int:
-    """The size of a page of a database that is shorter than its header says, 0 of a whole one."""
+    """Page size [bytes] if the database file is truncated (shorter than its header states), else 0."""
     with path.open("rb") as file:
         head = file.read(100)
     page_bytes = int.from_bytes(head[16:18]) if head[16:18] != b"\0\1" else 65536
-    pages = int.from_bytes(head[28:32]) if head[24:28] == head[92:96] else 0  # else no program kept the number
+    pages = int.from_bytes(head[28:32]) if head[24:28] == head[92:96] else 0  # else the count is invalid
     size = path.stat().st_size
     cut = size < pages * page_bytes or (page_bytes and size % page_bytes)
     return page_bytes if cut else 0

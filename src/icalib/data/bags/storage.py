@@ -1,4 +1,4 @@
-"""What the reader of a bag file must do, and what all of them share."""
+"""Interface of the readers of bag files, and common types."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icalib.errors import RecordingError
 
 @dataclass(frozen=True)
 class Connection:
-    """One source of messages in a bag file; `type` as in sensor_msgs/msg/Image, `encoding` of its bytes: ros1, cdr."""
+    """A topic of a bag file. type: such as sensor_msgs/msg/Image. encoding: serialization of messages, ros1 or cdr."""
 
     topic: str
     type: str
@@ -23,7 +23,7 @@ class Connection:
 
 @dataclass
 class Tally:
-    """How many messages, and when the first and the last of them were received [ns]."""
+    """Number of messages, and receive times [ns] of the first and last one."""
 
     count: int = 0
     first_ns: int = 2**63 - 1
@@ -40,32 +40,32 @@ class Tally:
 
 
 class Storage(Protocol):
-    """One bag file. Opening it raises RecordingError where nothing can be read; what is damaged stands in `notes`."""
+    """Reader of one bag file. Opening raises RecordingError if nothing can be read. notes: sentences on damage."""
 
-    name: Path  # for sentences; what is read may be a decompressed copy
+    name: Path  # for messages; the file that is read may be an unpacked copy
     connections: dict[int, Connection]
     notes: list[str]
 
     def tally(self) -> dict[int, Tally]:
-        """Messages by connection, without reading them all."""
+        """Number and receive times of messages by connection id."""
         ...
 
     def messages(self, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Messages of the connections `wanted`: connection, when it was received [ns], bytes; in the order of the file.
+        """Messages of the connections `wanted` in the order of the file: connection id, receive time [ns], bytes.
 
-        Memory is bounded whatever the length of the file.
+        Memory does not grow with the length of the file.
         """
         ...
 
 
 def full_type(name: str) -> str:
-    """The name of a type as ROS 2 writes it: sensor_msgs/Image -> sensor_msgs/msg/Image."""
+    """Name of a message type in ROS 2 notation: sensor_msgs/Image -> sensor_msgs/msg/Image."""
     package, _, message = name.partition("/")
     return name if "/" in message or not message else f"{package}/msg/{message}"
 
 
 def cut_note(name: Path, where: str, tally: dict[int, Tally]) -> str:
-    """The sentence for a file of which only the part before `where` can be read; RecordingError if that is nothing."""
+    """Note on a file that can be read only before the position `where`. Raises RecordingError if `tally` is empty."""
     count = sum(t.count for t in tally.values())
     if not count:
         raise RecordingError(

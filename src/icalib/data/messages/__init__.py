@@ -1,1 +1,1 @@
-"""Messages that several kinds of sensors are read from."""
+"""Readers of ROS messages that several kinds of sensors use."""

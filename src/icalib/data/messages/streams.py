@@ -1,4 +1,4 @@
-"""Messages that several kinds of sensors are read from, in arrays: poses, odometry, twists."""
+"""Arrays of poses, odometry and twists from ROS messages, for several kinds of sensors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icalib.errors import RecordingError
 
 
 class HasMessages(Protocol):
-    """The part of a bag that is needed here; see `BagRecording`."""
+    """Interface to the messages of a bag; see `BagRecording`."""
 
     root: Path
 
@@ -22,8 +22,8 @@ class HasMessages(Protocol):
 
 @dataclass(frozen=True)
 class PoseMessages:
-    """Poses T_frame_body: stamps_ns (N,) int64, position (N, 3) m, rotation (N, 3, 3), NaN where there is no unit
-    quaternion."""
+    """Poses T_frame_body: stamps_ns (N,) int64, position (N, 3) m, rotation (N, 3, 3) R_frame_body. Rotations are NaN
+    for messages without a unit quaternion."""
 
     frame: str
     stamps_ns: np.ndarray
@@ -33,7 +33,7 @@ class PoseMessages:
 
 @dataclass(frozen=True)
 class TwistStream:
-    """Velocities in the axes of `frame`: stamps_ns (N,) int64, linear (N, 3) m/s, angular (N, 3) rad/s."""
+    """Velocities in coordinates of `frame`: stamps_ns (N,) int64, linear (N, 3) m/s, angular (N, 3) rad/s."""
 
     frame: str
     stamps_ns: np.ndarray
@@ -43,7 +43,7 @@ class TwistStream:
 
 @dataclass(frozen=True)
 class OdometryStream:
-    """Poses of the body in the odometry's frame, and its velocities in its own axes, at the same instants."""
+    """Poses of the body in the odometry frame, and its velocities in body coordinates, with the same stamps."""
 
     pose: PoseMessages
     twist: TwistStream
@@ -51,7 +51,7 @@ class OdometryStream:
 
 def read_poses(bag: HasMessages, topic: str) -> PoseMessages:
     """All PoseStamped, PoseWithCovarianceStamped or TransformStamped of `topic`. Raises RecordingError as
-    `BagRecording.messages`, and for a frame that changes."""
+    `BagRecording.messages`, and if the frame changes."""
     stamps_ns, found = all_messages(bag, topic, "pose")
     if found and hasattr(found[0], "child_frame_id"):
         _frame(bag, topic, found, lambda m: m.child_frame_id)
@@ -60,7 +60,7 @@ def read_poses(bag: HasMessages, topic: str) -> PoseMessages:
 
 @dataclass(frozen=True)
 class _Placed:
-    """A transform by the names of a pose."""
+    """A transform with the field names of geometry_msgs/Pose."""
 
     position: Any
     orientation: Any
@@ -87,13 +87,13 @@ def read_odometry(bag: HasMessages, topic: str) -> OdometryStream:
 
 
 def read_odometry_twists(bag: HasMessages, topic: str) -> TwistStream:
-    """The velocities of all Odometry of `topic`, whatever its poses are. Raises RecordingError as `read_twists`."""
+    """Velocities of all Odometry messages of `topic`, poses unchecked. Raises RecordingError as `read_twists`."""
     stamps_ns, found = all_messages(bag, topic, "odometry")
     return _twists(_frame(bag, topic, found, lambda m: m.child_frame_id), stamps_ns, [m.twist.twist for m in found])
 
 
 def all_messages(bag: HasMessages, topic: str, kind: str) -> tuple[np.ndarray, list[Any]]:
-    """(N,) stamps [ns] and N messages. Raises RecordingError as `BagRecording.messages`."""
+    """(N,) int64 stamps [ns] and N messages of `topic`. Raises RecordingError as `BagRecording.messages`."""
     found = list(bag.messages(topic, kind))
     return np.array([stamp_ns for stamp_ns, _ in found], np.int64), [message for _, message in found]
 
@@ -122,13 +122,13 @@ def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, pose
 
 
 def unit_rotations(xyzw: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) of quaternions (N, 4) of about unit length; NaN where they are not `good` (N,)."""
+    """(N, 3, 3) rotation matrices of quaternions xyzw (N, 4), normalized first; NaN where `good` (N,) is False."""
     xyzw = np.where(good[:, None], xyzw, np.nan)
     return rotations(xyzw / np.linalg.norm(xyzw, axis=1)[:, None])
 
 
 def rotations(xyzw: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) of unit quaternions (N, 4)."""
+    """(N, 3, 3) rotation matrices of unit quaternions xyzw (N, 4)."""
     x, y, z, w = xyzw.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -44,7 +44,7 @@ def open_recording(path: str | Path, start_s: float = 0.0, end_s: float = inf) -
 
 
 def _refuse_unreadable(folder: Path) -> None:
-    """Raises RecordingError if a file of `folder` is a pointer of Git LFS or git-annex, or a video without its suffix."""
+    """Raises RecordingError if a file of `folder` is a pointer of Git LFS or git-annex, or a misnamed video."""
     for path in sorted(p for p in folder.iterdir() if p.is_file() and not is_video(p)):
         with path.open("rb") as file:
             sentence = not_data(path, file.read(HEAD_BYTES))
