@@ -1,4 +1,4 @@
-"""Detection: grey images -> corners of a target."""
+"""Detection of a target in grey images: the image positions of its corners."""
 
 from icalib.detection.boards.aprilgrid import AprilGridDetector
 from icalib.detection.boards.charuco import CharucoDetector

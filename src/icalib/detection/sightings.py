@@ -1,4 +1,4 @@
-"""What a search found of a target: sentences on it, and tags too rarely seen to be true left out."""
+"""Summaries of the detections of a target, and removal of tags that are seen too rarely to be real."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from icalib.detection.primitives.corners import KEPT, VERDICTS, ImageCorners
 from icalib.geometry.targets import Markers, Scene, Target
 
-LEAST_IMAGES = 3  # with a tag whose id nobody listed; fewer may be chance
-LEAST_IMAGE_SHARE = 0.01  # of all images: the same
-_SHOWN = 10  # ids in a sentence
+LEAST_IMAGES = 3  # least number of images with a tag whose id is not listed; fewer may be false detections
+LEAST_IMAGE_SHARE = 0.01  # the same, as a share of all images
+_SHOWN = 10  # ids in a sentence, at most
 Part = tuple[str, Target, int]  # name, target, number of its first point
 
 
@@ -24,16 +24,17 @@ def parts_of(target: Target) -> list[Part]:
 
 
 def seen_in(images: list[ImageCorners], part: Part) -> int:
-    """In how many images corners of the part were kept."""
+    """Number of images with kept corners of the part."""
     _, target, first = part
     return sum(bool((i.kept & (i.point >= first) & (i.point < first + len(target.points))).any()) for i in images)
 
 
 def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[ImageCorners], tuple[str, ...]]:
-    """The images without free tags that are in fewer than 3 of them, or fewer than 1 %, and sentences that name these.
+    """The images without free tags that fewer than LEAST_IMAGES or LEAST_IMAGE_SHARE of them show, and sentences that
+    name these tags.
 
-    Small families are sometimes read where there is nothing, and a tag of a map that is not there would be placed
-    somewhere. Tags whose ids are listed are all kept.
+    Small families have false detections, and a false tag would get a pose in the map. Tags whose ids are listed are
+    kept.
     """
     least = max(LEAST_IMAGES, ceil(LEAST_IMAGE_SHARE * len(images)))
     notes: list[str] = []
@@ -57,14 +58,14 @@ def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[
 
 
 def _without(image: ImageCorners, first: int, tags: np.ndarray) -> ImageCorners:
-    """Without the tags at these places in `Markers.known`, whose points begin at `first`."""
+    """The image without the tags with these indices into `Markers.known`, whose points begin at `first`."""
     rows = ~np.isin((image.point - first) // 4, tags)
     return ImageCorners(*(getattr(image, f.name)[rows] for f in dataclasses.fields(image)))
 
 
 def sightings(target: Target, images: list[ImageCorners]) -> tuple[str, ...]:
-    """How many images have the target, or each of several, how many corners were dropped, for which reasons; and which
-    of several targets is in none."""
+    """Sentences: how many images show each target, how many corners were dropped and why, and which targets are never
+    seen."""
     kept = sum(int(i.kept.sum()) for i in images)
     dropped = {name: sum(i.counts()[name] for i in images) for k, name in enumerate(VERDICTS) if k != KEPT}
     reasons = ", ".join(f"{n} {name}" for name, n in dropped.items() if n)

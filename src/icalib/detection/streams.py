@@ -1,7 +1,7 @@
-"""From a recording's images to the corners of the target: decoded and searched on all cores, and kept for the next run.
+"""Corners of the target in the images of a recording: detected on all cores, and cached for the next run.
 
-The images are read twice: once for the name under which their corners are kept, which is cheap, and once more where
-nothing is kept under it. Only a few are in memory at a time.
+The images are read twice: first for the cache key, which is cheap, then for the detection if the cache has no corners.
+Only a few images are in memory at a time.
 """
 
 from __future__ import annotations
@@ -36,22 +36,23 @@ from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.rig import Camera
 
-# Of a target's points, and of free tags' corners, an image on average: with fewer the tags may have another border.
+# Share of a target's points, and number of corners of free tags, found in an image on average. With fewer, the tags may
+# have another border or layout.
 POOR_SHARE, POOR_CORNERS = 0.5, 8
-# Images that a thread searches in turn, each where the ones before lead to expect the target. The first two are
-# searched wholly: a tag that appears apart from the others is missed for this long at most. Fewer of large images,
-# which wait in memory. Turns do not depend on the number of threads, and so neither does what is found.
+# Images of a batch, and their most bytes in memory. A thread searches a batch in order, each image where earlier ones
+# predict the target. The first two images are searched as a whole, so a tag that appears apart from the others is
+# missed for one batch at most. Batches, and so the results, do not depend on the number of threads.
 IN_TURN, BYTES_IN_TURN = 24, 32 << 20
-PACKED = 256  # images whose corners are put together
+PACKED = 256  # images whose corners are stored in common arrays
 
 
 def find_corners(
     recording: Recording, camera: Camera, target: Target, keep: bool = True, progress: Progress = lambda _: None
 ) -> tuple[CornerStream, tuple[str, ...]]:
-    """The target's corners in all images of `camera`, and sentences on those left out.
+    """The target's corners in all images of `camera`, and sentences on images, tags and corners that were left out.
 
-    With `keep`, what an earlier run found is used, and what is found is kept. Raises RecordingError, one sentence,
-    where there are no images of the camera, they are not of its resolution, cannot be read, or the target is in none.
+    With `keep`, corners of an earlier run are loaded from the cache, and new ones are saved. Raises RecordingError if
+    the camera has no images, their resolution is wrong, they cannot be read, or none shows the target.
     """
     topic, where = recording.image_topic(camera), recording.where(camera)
     files: dict[int, str] = {}
@@ -82,11 +83,12 @@ def find_corners(
 
 
 def _called(target: Target) -> str:
+    """The name of the target as subject of a sentence, with its verb."""
     return f"{' and '.join(target.names)} are" if isinstance(target, Scene) else "the target is"
 
 
 def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
-    """What to do about a target that is never found: by what the images show instead, where it has tags."""
+    """A sentence on the tags or the board that the images show instead of the target, with advice."""
     for _, part, _ in parts_of(target):
         if isinstance(part, Checkerboard) and (sentence := other_size(spread_images(recording, topic), part)):
             return sentence
@@ -98,8 +100,8 @@ def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
 
 
 def _other_border(recording: Recording, topic: str, target: Target, images: list[ImageCorners]) -> str:
-    """Where a part of the target is poorly seen, but in the images with the other width of border: what, and what to
-    do."""
+    """A sentence if a part of the target is poorly seen, but the images show its tags with a border of the other width;
+    else ""."""
     for name, part, first in parts_of(target):
         if not part.tags or isinstance(part, Charuco) or not _poorly_seen(part, first, images):
             continue
@@ -110,10 +112,10 @@ def _other_border(recording: Recording, topic: str, target: Target, images: list
 
 
 def _other_layout(recording: Recording, topic: str, target: Target, images: list[ImageCorners]) -> str:
-    """Where tags stand as on a board of another layout: that, and what to do.
+    """A sentence if the tags are arranged as on a board of another layout; else "".
 
-    AprilGrids of which enough is seen are not looked at: in a wrong layout no more than a row or two of tags agree. The
-    corners of a small ChArUco board are nearly all found in a wrong layout, too.
+    AprilGrids that are well seen are not checked: in a wrong layout, no more than a row or two of tags agree. ChArUco
+    boards always are, because nearly all corners of a small one are found in a wrong layout, too.
     """
     for name, part, first in parts_of(target):
         wrong = ""
@@ -127,9 +129,9 @@ def _other_layout(recording: Recording, topic: str, target: Target, images: list
 
 
 def _poorly_seen(part: Target, first: int, images: list[ImageCorners]) -> bool:
-    """Whether the images show, on average, less of the part than half its points (free tags: two tags).
+    """Whether the images show, on average, less than POOR_SHARE of the part's points (free tags: POOR_CORNERS corners).
 
-    The part's points are numbered from `first` on.
+    first: number of the part's first point in the target.
     """
     usual = POOR_CORNERS if isinstance(part, Markers) else POOR_SHARE * len(part.points)
     own = [i.kept & (i.point >= first) & (i.point < first + len(part.points)) for i in images]
@@ -139,7 +141,7 @@ def _poorly_seen(part: Target, first: int, images: list[ImageCorners]) -> bool:
 def _search(
     payloads: Iterable[Payload], detector: Detector, where: str, done: Callable[[int], None]
 ) -> tuple[np.ndarray, list[ImageCorners]]:
-    """Stamps (M,) and corners of all images that can be decoded. Raises RecordingError where none can."""
+    """Stamps (M,) and corners of all images that can be decoded. Raises RecordingError if there are none."""
     stamps: list[int] = []
     images: list[ImageCorners] = []
     damaged = ""
@@ -158,7 +160,8 @@ def _search(
 
 
 def _in_turn(payloads: list[Payload], detector: Detector) -> tuple[list[int], list[ImageCorners], str]:
-    """Stamps and corners of those images that can be decoded, and why the last that cannot be cannot."""
+    """Stamps and corners of the images of a batch that can be decoded, and the reason why the last other one cannot, or
+    ""."""
     stamps: list[int] = []
     found: list[ImageCorners] = []
     damaged = ""

@@ -1,6 +1,6 @@
-"""Numbers the points of rotationally symmetric targets alike in all images of a camera.
+"""Numbers the points of rotationally symmetric targets consistently over all images of a camera.
 
-One image does not show which of several turns of the sheet it sees. The image before it does, if the target moved
+One image does not show which of several rotations of the target it sees. The preceding image does, if the target moved
 little in between.
 """
 
@@ -18,9 +18,9 @@ from icalib.geometry.targets import Target
 def number_continuously(target: Target, images: Sequence[ImageCorners]) -> list[ImageCorners]:
     """The images, with the points of each symmetric target renumbered.
 
-    `images` are those of one camera in temporal order. In each the turn is chosen that moves the points least from the
-    last image that shows where the whole target is. The first image keeps its numbers: no turn of it is more right
-    than another.
+    `images` are those of one camera in temporal order. In each image, the rotation is chosen that moves the points
+    least from the last image with a known position of the whole target. The first image keeps its numbers, because no
+    rotation is preferred there.
     """
     images = list(images)
     for _, part, first in parts_of(target):
@@ -41,10 +41,11 @@ def number_continuously(target: Target, images: Sequence[ImageCorners]) -> list[
 def _nearest_turn(
     turns: Sequence[np.ndarray], previous_uv: np.ndarray | None, point: np.ndarray, uv: np.ndarray
 ) -> np.ndarray:
-    """The turn (n,) that moves points (m,) at uv (m, 2) px least, by the mean distance from where they were.
+    """The renumbering (n,) by a rotation for which points (m,) at uv (m, 2) px are nearest to their former positions,
+    on average.
 
-    previous_uv (n, 2) px: where all points of the target were, so that turns are compared by the same points. The first
-    turn where it is None.
+    previous_uv (n, 2) px: former positions of all points of the target, so that rotations are compared by the same
+    points. The first of `turns` if it is None.
     """
     if previous_uv is None:
         return turns[0]
@@ -52,10 +53,10 @@ def _nearest_turn(
 
 
 def _completed(board: np.ndarray, point: np.ndarray, uv: np.ndarray) -> np.ndarray | None:
-    """(n, 2) px: the points (m,) at uv (m, 2), and the other points of the board (n, 2) where they lead to expect them.
+    """(n, 2) px: the points (m,) at uv (m, 2), and the predicted positions of the other points of the board (n, 2).
 
-    The affine map of least squares places them. Its error under perspective is a small part of the board, and a wrong
-    turn is off by half of it. None where the points are on one line.
+    Predictions come from the least-squares affine map. Its error under perspective is a small fraction of the board's
+    size; with a wrong rotation, points are off by half of it. None if the points are on one line.
     """
     plane = np.concatenate([board - board.mean(axis=0), np.full((len(board), 1), np.ptp(board))], axis=1)
     affine, _, rank, _ = np.linalg.lstsq(plane[point], uv, rcond=1e-6)

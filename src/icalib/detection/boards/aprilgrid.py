@@ -1,4 +1,5 @@
-"""AprilGrid: tags found, grown over the grid, corners refined and compared with their neighbours."""
+"""AprilGrids: tags are decoded, further tags are found from these, corners are refined and compared with their
+neighbours."""
 
 from __future__ import annotations
 
@@ -19,16 +20,17 @@ from icalib.detection.primitives.tags import Tags, find_tags
 from icalib.errors import RecordingError
 from icalib.geometry.targets.families import APRILGRID_FAMILY
 
-_ON_BOARD = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)])  # corners in OpenCV's order, tag sizes
+# corners of a tag in OpenCV's order, in tag sizes
+_ON_BOARD = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
 
 
 @dataclass(frozen=True)
 class AprilGridDetector:
     """Finds the corners of an AprilGrid of `rows` x `cols` tags with gaps of `tag_spacing` tag sizes.
 
-    `border_bits` is the width of the tags' black border in cells: 2 for Kalibr's grids, 1 for plain tags. `squares`
-    says whether black squares fill the gaps between the tags' corners, as on Kalibr's grids. Raises RecordingError for
-    a family that is not known or has too few ids.
+    border_bits: width of the tags' black border in cells, 2 for Kalibr's grids, 1 for plain tags. squares: whether
+    black squares fill the gaps between the tags' corners, as on Kalibr's grids. first_id: id of the first tag. Raises
+    RecordingError if the family has too few ids, and RigError if it is unknown.
     """
 
     rows: int
@@ -49,11 +51,12 @@ class AprilGridDetector:
 
     @cached_property
     def _family(self) -> Family:
+        """The bit patterns of the tags."""
         return tag_family(self.family)
 
     @cached_property
     def tag_corners(self) -> np.ndarray:
-        """As `grid_tags`."""
+        """(n, 4, 2) corners of the tags, see `grid_tags`."""
         return grid_tags(self.rows, self.cols, self.tag_spacing)
 
     @property
@@ -74,19 +77,19 @@ class AprilGridDetector:
         return self.find(ImageWithQuads(image))
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        """As `detect`."""
+        """As `detect`, for an image whose quads may be known already."""
         for window in view.windows:
             for separate in (True, False):
                 tags = find_tags(view, self._family, self.border_bits, window, separate)
                 known, quads = self._seeds(tags)
                 if known.any():
-                    # From here on, nothing depends on how the tags were found.
+                    # Tags are located again, so that the result does not depend on how they were found.
                     confirm(view.image, known, quads, *self._cells, self._clear, self.squares)
                     return self._corners(view.image, known, quads)
         return no_corners()
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
-        """As `find`, from where corners are expected; None where some that should be in the image are not there."""
+        """As `find`, near predicted corners; None if some that should be in the image are not found."""
         n = self.rows * self.cols
         uv, seen = np.zeros((4 * n, 2)), np.zeros(4 * n, dtype=bool)
         uv[expected.point], seen[expected.point] = expected.uv, True
@@ -97,19 +100,19 @@ class AprilGridDetector:
         )
         if not known.any():
             return None
-        # A tag that the image cuts is sometimes found and sometimes not.
+        # Tags at the image border may be missing, so the margin is the side of a tag.
         side = float(np.linalg.norm(quads[known, 1] - quads[known, 0], axis=1).max())
         found = self._corners(view.image, known, quads)
         return found if expected.all_found(view.image, found, side) else None
 
     @cached_property
     def _cells(self) -> tuple[np.ndarray, int, int]:
-        """Patterns (n,) uint64 of the board's tags, cells along a side of them, and width of their border."""
+        """Patterns (n,) uint64 of the board's tags, data cells along a side, and width of their border in cells."""
         last = self.first_id + self.rows * self.cols
         return np.ascontiguousarray(self._family.codes[self.first_id : last, 0]), self._family.bits, self.border_bits
 
     def _seeds(self, tags: Tags) -> tuple[np.ndarray, np.ndarray]:
-        """(known (n,) bool, quads (n, 4, 2)) of the tags on the board that agree on where it is."""
+        """(known (n,) bool, quads (n, 4, 2)) of the tags of the board that predict each other's positions."""
         n = self.rows * self.cols
         known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))
         place = tags.ids - self.first_id
@@ -119,6 +122,7 @@ class AprilGridDetector:
         return largest_group(known, quads, self.tag_corners), quads
 
     def _corners(self, image: np.ndarray, known: np.ndarray, quads: np.ndarray) -> ImageCorners:
+        """Refined corners of the known tags, and of further tags that are found from these."""
         grow(image, known, quads, self.tag_corners, self.cols, *self._cells, self._clear, self.squares)
         tags = np.flatnonzero(known)
         if self.squares:

@@ -1,4 +1,4 @@
-"""Names the size of the board in the images where the rig file has another, and says what to write."""
+"""Names the board that the images show if its size or layout differs from that in the rig file."""
 
 from __future__ import annotations
 
@@ -18,26 +18,28 @@ from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.tags import find_tags
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 
-_SEARCHED_IMAGES = 5  # that are searched; the time grows with it
-_LEAST_IMAGES = 2  # that show a board of another size, of several; the cells of a tag may look like a board in one
-_LEAST_SIDE = 3  # inner corners along a side; the detector takes no smaller board
-_LEAST_TAGS_OF_A_LAYOUT = 6  # in an image; fewer may fit several layouts
-# Misfits, in sides of a tag. In a right layout they come from lens and noise; in a wrong one tags are a whole row or
-# column off.
-_MOST_RIGHT = 0.1  # at most: the stated layout is right, and no other is looked at
-_MOST_BEST = 0.3  # at most: the best layout may be the right one; a lens that bends the board much needs room
-_MOST_RATIO = 0.5  # of the best layout's misfit to the stated one's
+_SEARCHED_IMAGES = 5  # images that are searched; the time is proportional
+# images that must show the other board if there are several; in one, cells of a tag may look like a board
+_LEAST_IMAGES = 2
+_LEAST_SIDE = 3  # inner corners along a side, at least, as the detector demands
+_LEAST_TAGS_OF_A_LAYOUT = 6  # tags that an image must show; fewer may fit several layouts
+# Misfits in sides of a tag. In the right layout they come from distortion and noise; in a wrong one, tags are a whole
+# row or column off.
+_MOST_RIGHT = 0.1  # below it, the stated layout is right, and no other is tried
+_MOST_BEST = 0.3  # below it, the best layout may be right; large enough for strong distortion
+_MOST_RATIO = 0.5  # largest ratio of the best layout's misfit to that of the stated one
 
 
 def other_size(images: Iterable[np.ndarray], board: Checkerboard) -> str:
-    """A sentence on the checkerboard in images (h, w) uint8 in which none of the stated size was found.
+    """A sentence on a checkerboard of another size in images (h, w) uint8 that show none of the stated size; "" if
+    there is none.
 
-    "" where the first five images show none of another size either. Candidates are the board whose squares were counted
-    in place of its inner corners, and the largest that OpenCV finds.
+    Candidates are the board whose squares were counted instead of its inner corners, and the largest that OpenCV finds
+    in the first five images.
     """
     grey = [255 - i if board.inverted else i for i in islice(images, _SEARCHED_IMAGES)]
     stated = (min(board.rows, board.cols), max(board.rows, board.cols))
-    by_squares = (stated[0] - 1, stated[1] - 1)  # the true size where squares were counted
+    by_squares = (stated[0] - 1, stated[1] - 1)  # the true size if squares were counted
     sizes = ({by_squares} | {size for image in grey for size in _largest(image)}) - {stated}
     seen = {size: _count(grey, size) for size in sorted(sizes) if size[0] >= _LEAST_SIDE}
     if max(seen.values(), default=0) < min(_LEAST_IMAGES, len(grey)):
@@ -50,7 +52,8 @@ def other_size(images: Iterable[np.ndarray], board: Checkerboard) -> str:
 
 
 def checkerboard_in(images: Sequence[np.ndarray]) -> str:
-    """The largest checkerboard that at least two of the images (h, w) uint8 show, in words; "" for none."""
+    """Text with the size of the largest checkerboard that at least two of the images (h, w) uint8 show; "" if there is
+    none."""
     sizes = [size for image in images for size in _largest(image)]
     seen = {size: sizes.count(size) for size in set(sizes)}
     if max(seen.values(), default=0) < _LEAST_IMAGES:
@@ -60,26 +63,27 @@ def checkerboard_in(images: Sequence[np.ndarray]) -> str:
 
 
 def _largest(image: np.ndarray) -> list[tuple[int, int]]:
-    """Inner corners of the sides, the shorter first, of the largest checkerboard that OpenCV finds; [] if none."""
+    """Size of the largest checkerboard that OpenCV finds: inner corners of the shorter and the longer side; [] if there
+    is none."""
     cv2 = load_cv2()
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-    cv2.setRNGSeed(0)  # the search draws at random
+    cv2.setRNGSeed(0)  # the search is random
     found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST_SIDE, _LEAST_SIDE), flags)
     return [(min(meta.shape), max(meta.shape))] if found else []
 
 
 def _count(images: list[np.ndarray], size: tuple[int, int]) -> int:
-    """In how many images a checkerboard of `size` (rows, cols) inner corners is found."""
+    """Number of images with a checkerboard of `size` (rows, cols) inner corners."""
     detector = CheckerboardDetector(*size)
     return sum(bool(detector.detect(image).kept.any()) for image in images)
 
 
 def other_columns(images: Iterable[np.ndarray], board: AprilGrid | Charuco) -> str:
-    """A sentence where the tags in the images (h, w) uint8 stand as on a board with another number of columns.
+    """A sentence if the tags in the images (h, w) uint8 are arranged with another number of columns than stated; else
+    "".
 
-    "" where the first five images show the stated layout, or too few tags to tell. Each number of columns gives every
-    id a place on the board; the layout with the least misfit to a homography wins. Several win where the tags that are
-    seen do not tell them apart, as those of a single row; then the sentence names none.
+    The first five images are used. A number of columns gives each id a position on the board; the layout with the least
+    misfit to a homography is right. The sentence names no number if several layouts fit, as for tags of a single row.
     """
     across, down = ("cols", "rows") if isinstance(board, AprilGrid) else ("squares_x", "squares_y")
     stated, other = getattr(board, across), getattr(board, down)
@@ -88,7 +92,7 @@ def other_columns(images: Iterable[np.ndarray], board: AprilGrid | Charuco) -> s
     misfit = {stated: _misfit_of_columns(seen, board, stated, tags)}
     if not seen or misfit[stated] <= _MOST_RIGHT:
         return ""
-    for n in range(1, tags + 1):  # with more columns, all tags are in the first row
+    for n in range(1, tags + 1):  # more columns than tags give the same single row
         misfit[n] = _misfit_of_columns(seen, board, n, tags)
     least = min(misfit.values())
     if least > _MOST_BEST or misfit[stated] <= least / _MOST_RATIO:
@@ -102,15 +106,16 @@ def other_columns(images: Iterable[np.ndarray], board: AprilGrid | Charuco) -> s
 
 
 def _number_of_tags(board: AprilGrid | Charuco) -> int:
+    """Number of tags of the board."""
     if isinstance(board, AprilGrid):
         return board.rows * board.cols
     return int((~dark_squares(board.squares_y, board.squares_x, board.legacy)).sum())
 
 
 def _with_columns(board: AprilGrid | Charuco, n: int, tags: int) -> list[np.ndarray]:
-    """The boards that have n tags (AprilGrid) or squares (ChArUco) in a row: (., 4, 2) corners of at least `tags` tags.
+    """Boards with n tags (AprilGrid) or squares (ChArUco) in a row: (., 4, 2) corners of at least `tags` tags.
 
-    The unit is the tag's side or the square's. A ChArUco board has two layouts, OpenCV's today and its older one.
+    The unit is the side of a tag or of a square. A ChArUco board has two layouts, OpenCV's present and its older one.
     """
     if isinstance(board, AprilGrid):
         return [grid_tags(-(-tags // n), n, board.tag_spacing)]
@@ -120,7 +125,8 @@ def _with_columns(board: AprilGrid | Charuco, n: int, tags: int) -> list[np.ndar
 
 
 def _tags_of(view: ImageWithQuads, board: AprilGrid | Charuco, tags: int) -> tuple[np.ndarray, np.ndarray]:
-    """Ids (m,), from the board's first on, of its `tags` tags that the image shows once; corners (m, 4, 2) px."""
+    """Tags of the board that the image shows exactly once: ids (m,) counted from the first one, below `tags`, and
+    corners (m, 4, 2) px."""
     if isinstance(board, AprilGrid):
         found = find_tags(view, tag_family(board.family), board.border_bits, view.windows[0], board.squares)
         place = found.ids - board.first_id
@@ -135,14 +141,15 @@ def _tags_of(view: ImageWithQuads, board: AprilGrid | Charuco, tags: int) -> tup
 
 
 def _enough(images: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Those of the images, each as `_tags_of` gives it, that show six tags."""
+    """The images, as results of `_tags_of`, that show at least six tags."""
     return [(place, quads) for place, quads in images if len(place) >= _LEAST_TAGS_OF_A_LAYOUT]
 
 
 def _misfit_of_columns(
     seen: list[tuple[np.ndarray, np.ndarray]], board: AprilGrid | Charuco, n: int, tags: int
 ) -> float:
-    """The least median over images of `homography_misfit`, of the layouts with n columns; inf without images."""
+    """Misfit of the layout with n columns: median of `homography_misfit` over the images, the smaller one if there are
+    two such layouts; inf without images."""
     layouts = _with_columns(board, n, tags) if seen else []
     medians = [np.median([homography_misfit(corners[place], quads) for place, quads in seen]) for corners in layouts]
     return float(min(medians, default=np.inf))

@@ -1,4 +1,4 @@
-"""ChArUco boards: markers say which corner is which, the squares' corners are measured."""
+"""ChArUco boards: markers identify the corners of the squares, and these corners are measured."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
 
 _PREDICTING_MARKERS = 4  # markers that predict a corner
-_LEAST_TO_TELL = 6  # markers that show whether they stand as on this board
-_LEAST_MARKERS = 2  # that agree: small dictionaries are sometimes read where there is nothing
+_LEAST_TO_TELL = 6  # least number of markers that show whether the layout is right
+_LEAST_MARKERS = 2  # markers that must agree: small dictionaries have false detections
 
 
 @dataclass(frozen=True)
 class CharucoDetector:
-    """Finds the inner corners of a ChArUco board of `rows` x `cols` squares, the white ones with markers.
+    """Finds the inner corners of a ChArUco board of `rows` x `cols` squares, with markers in the white ones.
 
-    The markers' edges are `marker_ratio` squares long; `family` is their dictionary, with ids from 0 row by row, as
-    OpenCV numbers them. `legacy` is OpenCV's pattern before 4.6, which differs where the number of rows is even. Raises
-    RecordingError for a board that cannot be.
+    marker_ratio: edge of a marker over edge of a square. family: dictionary of the markers, with ids from 0 row by row,
+    as OpenCV numbers them. legacy: OpenCV's layout before 4.6, which differs if the number of rows is even. Raises
+    RecordingError if the dictionary has too few markers or the ratio is impossible, and RigError if the dictionary is
+    unknown.
     """
 
     rows: int
@@ -52,26 +53,28 @@ class CharucoDetector:
 
     @cached_property
     def _family(self) -> Family:
+        """The bit patterns of the markers."""
         return tag_family(self.family)
 
     @cached_property
     def _dark(self) -> np.ndarray:
+        """(rows, cols) bool, see `dark_squares`."""
         return dark_squares(self.rows, self.cols, self.legacy)
 
     @cached_property
     def tag_corners(self) -> np.ndarray:
-        """As `charuco_tags`."""
+        """(n, 4, 2) corners of the markers, see `charuco_tags`."""
         return charuco_tags(self._dark, self.marker_ratio)
 
     def detect(self, image: np.ndarray) -> ImageCorners:
-        """The board's inner corners in the image (h, w) uint8, numbered row by row from the top left, as OpenCV does.
+        """The board's inner corners in the image (h, w) uint8, numbered row by row from the top left, as in OpenCV.
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
         return self.find(ImageWithQuads(image))
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        """As `detect`."""
+        """As `detect`, for an image whose quads may be known already."""
         known, quads = self._seen(view)
         known = largest_group(known, quads, self.tag_corners / self.marker_ratio)
         if known.sum() < _LEAST_MARKERS:
@@ -80,8 +83,8 @@ class CharucoDetector:
         return square_corners(view.image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
-        """As `find`, from where corners are expected; None where some that should be in the image are not there, or not
-        half of the markers."""
+        """As `find`, near predicted corners. None if some that should be in the image are not found, or less than half
+        of the markers are."""
         nodes = self._nodes(expected)
         found = square_corners(view.image, nodes, self._dark, 0.5 * (1.0 - self.marker_ratio))
         if not len(found.point) or not expected.all_found(view.image, found):
@@ -93,20 +96,19 @@ class CharucoDetector:
         return found if there >= max(_LEAST_MARKERS, 0.5 * inside.sum()) else None
 
     def _nodes(self, corners: PredictedCorners) -> np.ndarray:
-        """(rows + 1, cols + 1, 2) px: the squares' corners, where the inner ones place them."""
+        """(rows + 1, cols + 1, 2) px: all corners of the squares, predicted from the inner ones in `corners`."""
         at = np.stack(np.divmod(corners.point, self.cols - 1), axis=1) + 1
         return predict_nodes(at, corners.uv, self.rows + 1, self.cols + 1)
 
     def misfit(self, view: ImageWithQuads) -> float:
-        """How far the markers' corners are from where one homography puts them, over the markers' size: the median over
-        the image, NaN where too few are seen to tell."""
+        """Misfit of the markers to the board, see `homography_misfit`; NaN if too few are seen."""
         known, quads = self._seen(view)
         if known.sum() < _LEAST_TO_TELL:
             return float("nan")
         return homography_misfit(self.tag_corners[known], quads[known])
 
     def _seen(self, view: ImageWithQuads) -> tuple[np.ndarray, np.ndarray]:
-        """Which markers (n,) are seen once, and the corners (n, 4, 2) of these [px]."""
+        """Which markers (n,) are seen exactly once, and their corners (n, 4, 2) px."""
         n = len(self.tag_corners)
         known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))
         tags = all_tags(view, self._family, 1)
@@ -116,7 +118,7 @@ class CharucoDetector:
         return known, quads
 
     def _expected(self, markers: np.ndarray, quads: np.ndarray) -> np.ndarray:
-        """(rows + 1, cols + 1, 2) px, the squares' corners where the nearest markers found place them.
+        """(rows + 1, cols + 1, 2) px: corners of the squares, predicted by the nearest markers found.
 
         markers (m, 4, 2) [squares], quads (m, 4, 2) px.
         """
@@ -131,7 +133,7 @@ class CharucoDetector:
 
 
 def dark_squares(rows: int, cols: int, legacy: bool) -> np.ndarray:
-    """(rows, cols) bool of a ChArUco board, row 0 at the top."""
+    """(rows, cols) bool: the dark squares of a ChArUco board, row 0 at the top."""
     row, col = np.indices((rows, cols))
     return (row + col + int(legacy and rows % 2 == 0)) % 2 == 0
 
@@ -146,7 +148,8 @@ def charuco_tags(dark: np.ndarray, marker_ratio: float) -> np.ndarray:
 
 
 def _in_squares(nodes: np.ndarray, markers: np.ndarray) -> np.ndarray:
-    """(n, 4, 2) px: the markers (n, 4, 2) [squares] between the corners (rows + 1, cols + 1, 2) px of the board."""
+    """(n, 4, 2) px: corners of the markers (n, 4, 2) [squares], by bilinear interpolation between the corners of the
+    squares, (rows + 1, cols + 1, 2) px."""
     col, row = np.floor(markers.mean(axis=1)).astype(np.int64).T
     s, t = (markers - np.stack([col, row], axis=1)[:, None, :]).transpose(2, 0, 1)[..., None]
     a, b, c, d = (

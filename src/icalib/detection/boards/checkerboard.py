@@ -1,4 +1,4 @@
-"""Checkerboards: the inner corners, in an order that does not depend on how the board is oriented."""
+"""Checkerboards: detection of the inner corners, in an order that does not depend on the orientation of the board."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
 
-_REDUCED_PX = 1000  # larger images are searched at a fraction of their size first; only the time depends on it
-_LEAST_SEEN_SHARE = 0.5  # of the corners inside the outermost, seen in rows and columns, for the thorough search
-_LEAST_SQUARE_PX = 4  # corners that are closer merge in the detectors' filters
-_LEAST_FOUND = 0.5  # of the corners that a search proposes, and of each side's: others are no checkerboard
+_REDUCED_PX = 1000  # larger images are first searched at a fraction of their size; only the time depends on it
+_LEAST_SEEN_SHARE = 0.5  # share of the corners without the outermost that must form a grid before the thorough search
+_LEAST_SQUARE_PX = 4  # corners that are closer together merge in the detectors' filters
+_LEAST_FOUND = 0.5  # share of all corners, and of those of each side, that must be found
 
 
 @dataclass(frozen=True)
 class CheckerboardDetector:
-    """Finds the inner corners, `rows` x `cols` of them, of a checkerboard that is wholly in the image.
+    """Finds the inner corners of a checkerboard that is wholly in the image: `rows` x `cols` corners.
 
-    Corners are numbered row by row, x along a row and y from row to row turning with the clock, and the square between
-    the first corners of the first two rows is dark. That is unique where rows + cols is odd. Where it is even the board
-    looks the same after half a turn, and where rows = cols is even, after a quarter: of these orders the one is taken
-    whose rows run most to the right.
+    Corners are numbered row by row. The directions along a row (x) and from row to row (y) turn clockwise. The square
+    between the first corners of the first two rows is dark. This order is unique if rows + cols is odd. If it is even,
+    the board looks the same after half a turn, and if rows = cols is even, after a quarter turn. Then the order is
+    taken whose rows run most to the right.
     """
 
     rows: int
@@ -49,7 +49,7 @@ class CheckerboardDetector:
         return self.find(ImageWithQuads(image))
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        """As `detect`."""
+        """As `detect`, for an image whose quads may be known already."""
         for grid in self._proposed(view.image):
             found = self._corners(view.image, grid)
             if self._is_whole(found):
@@ -57,21 +57,21 @@ class CheckerboardDetector:
         return no_corners()
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
-        """As `find`, from where corners are expected; None where some that should be in the image are not there. What
-        moved on by two squares looks the same but at its border."""
+        """As `find`, near predicted corners; None if some that should be in the image are not found. A board that moved
+        by two squares looks the same except at its border."""
         at = np.stack(np.divmod(expected.point, self.cols), axis=1)
         found = self._corners(view.image, predict_nodes(at, expected.uv, self.rows, self.cols))
         return found if self._is_whole(found) and expected.all_found(view.image, found) else None
 
     def _is_whole(self, found: ImageCorners) -> bool:
-        """Whether enough corners are where a board has them, on each of its four sides, too."""
+        """Whether enough corners of the board, and of each of its four sides, are found and consistent."""
         there = np.zeros(self.rows * self.cols, dtype=bool)
         there[found.point[found.verdict != INCONSISTENT]] = True
         there = there.reshape(self.rows, self.cols)
         return min(part.mean() for part in (there, there[0], there[-1], there[:, 0], there[:, -1])) >= _LEAST_FOUND
 
     def _corners(self, image: np.ndarray, grid: np.ndarray) -> ImageCorners:
-        """The corners of the board at the grid (rows, cols, 2) px; none where it is part of a larger board."""
+        """The corners of the board at the grid (rows, cols, 2) px; none if the grid is part of a larger board."""
         framed = _framed(grid)
         if continues_beyond(image, framed):
             return no_corners()
@@ -80,10 +80,10 @@ class CheckerboardDetector:
         return square_corners(image, _framed(grid), dark, np.inf)
 
     def _proposed(self, image: np.ndarray) -> Iterator[np.ndarray]:
-        """Grids (rows, cols, 2) px of OpenCV's detectors, to about a pixel; the quick search first.
+        """Grids (rows, cols, 2) px by OpenCV's detectors, accurate to about a pixel; the fast detector first.
 
-        The quick detector sometimes takes parts of other patterns for the board. The thorough one is a hundred times
-        as slow where there is no board, and is asked only about images with enough X-corners in rows and columns.
+        The fast detector sometimes takes parts of other patterns for the board. The thorough one is a hundred times as
+        slow if there is no board, so it is used only for images with enough X-corners in rows and columns.
         """
         if not self._fits(image.shape):
             return
@@ -93,7 +93,7 @@ class CheckerboardDetector:
             return
         cv2 = load_cv2()
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-        cv2.setRNGSeed(0)  # the search draws at random: what an image shows must not depend on those before it
+        cv2.setRNGSeed(0)  # the search is random: its result must not depend on earlier images
         found, corners = cv2.findChessboardCornersSB(image, (self.cols, self.rows), flags=flags)
         if found:
             yield self._grid(corners)
@@ -101,7 +101,7 @@ class CheckerboardDetector:
             yield from self._quick(image, 1)
 
     def _quick(self, image: np.ndarray, factor: int) -> Iterator[np.ndarray]:
-        """The grid that OpenCV's older detector finds in an image reduced by `factor`, in pixels of the whole one."""
+        """The grid that OpenCV's older detector finds in an image reduced by `factor`, in pixels of the full image."""
         if not self._fits(image.shape):
             return
         cv2 = load_cv2()
@@ -112,17 +112,19 @@ class CheckerboardDetector:
             yield factor * (self._grid(corners) + 0.5) - 0.5
 
     def _fits(self, shape: tuple[int, ...]) -> bool:
-        """Whether the squares along the board's shorter side can be told apart in an image of `shape` (h, w).
+        """Whether the squares along the board's shorter side can be resolved in an image of `shape` (h, w).
 
-        The smallest that fits is 16 px wide; OpenCV's older detector raises an error below 15 px.
+        The smallest image that fits is 16 px wide; OpenCV's older detector raises an error below 15 px.
         """
         return min(shape) >= _LEAST_SQUARE_PX * (min(self.rows, self.cols) + 1)
 
     def _grid(self, corners: np.ndarray) -> np.ndarray:
+        """OpenCV's corners as (rows, cols, 2) px."""
         return np.asarray(corners, dtype=np.float64).reshape(self.rows, self.cols, 2)
 
     def _ordered(self, image: np.ndarray, grid: np.ndarray) -> np.ndarray:
-        """The corners (rows, cols, 2) px with rows and columns reversed or exchanged where they must be."""
+        """The corners (rows, cols, 2) px, with rows and columns reversed or exchanged as the order of the class
+        demands."""
         if _turn(grid) < 0.0:
             grid = grid[:, ::-1]
         turns = [grid, grid[::-1, ::-1]]
@@ -133,7 +135,7 @@ class CheckerboardDetector:
 
 
 def _reduced(image: np.ndarray) -> tuple[np.ndarray, int]:
-    """The image at a fraction of its size where it is large, and by which factor it was reduced."""
+    """The image, reduced if it is large, and the factor by which it was reduced."""
     factor = -(-max(image.shape) // _REDUCED_PX)
     if factor == 1:
         return image, 1
@@ -144,13 +146,13 @@ def _reduced(image: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _turn(grid: np.ndarray) -> float:
-    """Positive where rows and columns of the grid (r, c, 2) turn with the clock in the image."""
+    """Positive if rows and columns of the grid (r, c, 2) turn clockwise in the image."""
     a, b = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0), grid[-1].mean(axis=0) - grid[0].mean(axis=0)
     return float(a[0] * b[1] - a[1] * b[0])
 
 
 def _is_dark(image: np.ndarray, grid: np.ndarray) -> bool:
-    """Whether the square between the first corners of the first two rows is darker than its neighbours."""
+    """Whether the square between the first corners of the first two rows is dark, by the mean of all such squares."""
     center = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
     grey = nearest_greys(image, center)
     even = np.indices(grey.shape).sum(axis=0) % 2 == 0
@@ -158,6 +160,7 @@ def _is_dark(image: np.ndarray, grid: np.ndarray) -> bool:
 
 
 def _framed(grid: np.ndarray) -> np.ndarray:
-    """The corners (r, c, 2) with one more row and column on each side, where the outer squares end."""
+    """The corners (r, c, 2) with one more row and column extrapolated on each side, the outer corners of the outer
+    squares."""
     grid = np.concatenate([2.0 * grid[:1] - grid[1:2], grid, 2.0 * grid[-1:] - grid[-2:-1]])
     return np.concatenate([2.0 * grid[:, :1] - grid[:, 1:2], grid, 2.0 * grid[:, -1:] - grid[:, -2:-1]], axis=1)

@@ -1,8 +1,8 @@
-"""Finds which dark ellipses of an image are the circles of a grid.
+"""Finds the dark ellipses of an image that are the circles of a grid.
 
-Each ellipse shows the affine map between target and image about its circle, up to a rotation. Its neighbours in the
-grid are therefore recognised in its own coordinates, however strong the perspective. From one circle and two neighbours
-the grid grows: each further circle is looked for where those nearest to it place it.
+Each ellipse shows the affine map between target and image about its circle, up to a rotation. Neighbours are therefore
+recognised in the coordinates of the ellipse, under any perspective. The grid grows from one circle and two neighbours:
+each further circle is searched at its prediction by the nearest known ones.
 """
 
 from __future__ import annotations
@@ -18,33 +18,39 @@ from icalib.detection.primitives.growth import fit_homography
 from icalib.detection.primitives.tags import LEAST_CONTRAST
 from icalib.geometry.targets import Circles
 
-_LEAST_DIAMETER_PX = 2.0 * LEAST_HALF_AXIS_PX  # no centre of a smaller one is kept
+_LEAST_DIAMETER_PX = 2.0 * LEAST_HALF_AXIS_PX  # smaller ellipses are not used
 _CIRCLE_CONTRAST = 0.5 * LEAST_CONTRAST  # grey levels below the local mean
-_MOST_OBLIQUE = 0.17  # least ratio of the axes: that of a circle seen at 80 degrees
-_LIKE_ELLIPSE = 0.1  # relative error of the area of an ellipse with the same second moments; a triangle is 0.2 off
-_OUTSIDE_PX, _AROUND = 3.0, 12  # how far from the edge, and in how many directions, the white around a circle is seen
-_NEIGHBOUR = (0.5, 1.8)  # of the step of the grid, in the coordinates of an ellipse: perspective changes it so much
-_RIGHT_ANGLE = 0.45  # of the step: how far the second neighbour may be from a quarter turn of the first
-# Of the step in the image, between a circle and where others place it; half a step is in between.
+_MOST_OBLIQUE = 0.17  # least ratio of the axes: a circle seen at 80 degrees from the normal
+# largest relative difference from the area of the ellipse with the same second moments; 0.2 for a triangle
+_LIKE_ELLIPSE = 0.1
+# distance from the edge, and number of directions, at which the white around a circle is sampled
+_OUTSIDE_PX, _AROUND = 3.0, 12
+# range of the distance of neighbours, over the step of the grid, in the coordinates of an ellipse: allows for
+# perspective
+_NEIGHBOUR = (0.5, 1.8)
+_RIGHT_ANGLE = 0.45  # of the step: largest distance of the second neighbour from a quarter turn of the first
+# Of the step in the image: largest distance of a circle from its prediction; at half a step it would be ambiguous.
 _MOST_CIRCLE_OFF = 0.4
-_PREDICTING_CIRCLES = 6  # known circles that place the next one; more reach where perspective and lens are others
-_LEAST_FOR_PERSPECTIVE = 5  # fewer place it by an affine map
+_PREDICTING_CIRCLES = 6  # known circles that predict the next one; with more, distortion matters
+_LEAST_FOR_PERSPECTIVE = 5  # fewer known circles predict the next one by an affine map
 
 Node = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Ellipses:
-    """Dark regions like ellipses: centre (m, 2) px; unit (m, 2, 2) 1/px, which maps each to the unit circle."""
+    """Dark regions that resemble ellipses: centre (m, 2) px; unit (m, 2, 2) 1/px, which maps each to the unit
+    circle."""
 
     centre: np.ndarray
     unit: np.ndarray
 
 
 def dark_ellipses(image: np.ndarray, window: int, step: float) -> Ellipses:
-    """Of the image (h, w) uint8; dark is what is darker than the mean of `window` x `window` px.
+    """Dark ellipses in the image (h, w) uint8, surrounded by brighter pixels. Pixels are dark if they are darker than
+    the mean of `window` x `window` px.
 
-    `step` is the distance of the nearest other circle, in radii.
+    step: distance of the nearest other circle, in radii.
     """
     cv2 = load_cv2()
     dark = cv2.adaptiveThreshold(
@@ -73,7 +79,8 @@ def dark_ellipses(image: np.ndarray, window: int, step: float) -> Ellipses:
 
 
 def _on_white(image: np.ndarray, found: Ellipses, step: float) -> Ellipses:
-    """Those of the ellipses that are darker than what surrounds them, on all sides, half-way to the next at most."""
+    """The ellipses that are darker than their surroundings in all directions, sampled at most half-way to the next
+    circle."""
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     to_edge = np.linalg.inv(found.unit) @ np.stack([np.cos(angle), np.sin(angle)])  # (m, 2, directions)
     outside = to_edge * np.minimum(1.0 + _OUTSIDE_PX / np.linalg.norm(to_edge, axis=1, keepdims=True), 0.5 * step)
@@ -83,9 +90,9 @@ def _on_white(image: np.ndarray, found: Ellipses, step: float) -> Ellipses:
 
 
 def find_grids(target: Circles, found: Ellipses) -> list[np.ndarray]:
-    """Centres (n, 2) px of the target's circles, once for each of its turns that no image shows.
+    """Centres (n, 2) px of the target's circles, in one array for each symmetric rotation of the target that fits.
 
-    None where the ellipses do not hold the whole grid, or where the grid is a part of a larger one.
+    Empty if the ellipses do not contain the whole grid, or if the grid is a part of a larger one.
     """
     step = step_of(target)
     wanted = _nodes_of(target)
@@ -106,9 +113,9 @@ def step_of(target: Circles) -> float:
 
 
 def _nodes_of(target: Circles) -> np.ndarray:
-    """(n, 2) int64: place of each circle in the grid of nearest neighbours.
+    """(n, 2) int64: index of each circle in the grid of nearest neighbours.
 
-    The second axis is a quarter turn from the first with the clock, as v is from u.
+    The second axis is the first one rotated clockwise by a quarter turn, as v is from u.
     """
     x, y = np.rint(target.points[:, 0] / target.spacing), np.rint(-target.points[:, 1] / target.spacing)
     nodes = np.stack([x + y, y - x], axis=1) / 2.0 if target.asymmetric else np.stack([x, y], axis=1)
@@ -116,15 +123,17 @@ def _nodes_of(target: Circles) -> np.ndarray:
 
 
 def _turned(nodes: np.ndarray, quarters: int) -> np.ndarray:
+    """Grid indices (n, 2), rotated clockwise by quarter turns."""
     for _ in range(quarters):
         nodes = np.stack([-nodes[:, 1], nodes[:, 0]], axis=1)
     return nodes
 
 
 def _matched(known: dict[Node, int], wanted: np.ndarray) -> list[int]:
-    """The ellipses at the grid points `wanted` (n, 2), moved to the one place where all of them are known.
+    """Rows of the ellipses at the grid indices `wanted` (n, 2), shifted to the only position at which all of them are
+    known.
 
-    [] where there is none, or several.
+    Empty if there is no such position, or more than one.
     """
     matches = []
     for a, b in known:
@@ -135,7 +144,7 @@ def _matched(known: dict[Node, int], wanted: np.ndarray) -> list[int]:
 
 
 def _grown(found: Ellipses, seed: int, step: float) -> dict[Node, int]:
-    """Ellipses by their grid point, from `seed` outwards; the seed alone where it has no two neighbours."""
+    """Rows of the ellipses by their grid index, from `seed` outwards; only the seed if it has no two neighbours."""
     known: dict[Node, int] = {(0, 0): seed}
     neighbours = _two_neighbours(found, seed, step)
     if neighbours is None:
@@ -154,7 +163,8 @@ def _grown(found: Ellipses, seed: int, step: float) -> dict[Node, int]:
 
 
 def _two_neighbours(found: Ellipses, seed: int, step: float) -> tuple[int, int] | None:
-    """The nearest ellipse in the coordinates of the seed, and the one a quarter turn from it."""
+    """Rows of the ellipse nearest to the seed, in the coordinates of the seed, and of the one a quarter turn from it.
+    None if their distances do not fit a grid."""
     v = (found.centre - found.centre[seed]) @ found.unit[seed].T
     distance = np.linalg.norm(v, axis=1)
     distance[seed] = np.inf
@@ -168,7 +178,7 @@ def _two_neighbours(found: Ellipses, seed: int, step: float) -> tuple[int, int] 
 
 
 def _frontier(known: dict[Node, int]) -> dict[Node, Node]:
-    """Unknown grid points beside known ones, each with one of the known."""
+    """Unknown grid indices beside known ones, each with one known neighbour."""
     beside = {}
     for a, b in known:
         for node in ((a + 1, b), (a, b + 1), (a - 1, b), (a, b - 1)):
@@ -178,7 +188,7 @@ def _frontier(known: dict[Node, int]) -> dict[Node, Node]:
 
 
 def _nearest_ellipse(centre: np.ndarray, free: np.ndarray, known: dict[Node, int], node: Node, beside: Node) -> int:
-    """The free ellipse where the nearest known ones place a grid point, -1 where there is none."""
+    """Row of the free ellipse nearest to the prediction of a grid index by known ones, -1 if it is too far."""
     nodes, rows = np.array(list(known)), np.array(list(known.values()))
     squared = ((nodes - node) ** 2).sum(axis=1)
     near = np.argsort(squared, kind="stable")[:_PREDICTING_CIRCLES]

@@ -1,6 +1,6 @@
-"""Grids of circles: dark ellipses that stand as in the grid, then a blurred ellipse is fitted to the edge of each.
+"""Grids of circles: dark ellipses are assigned to the grid, then a blurred ellipse is fitted to the edge of each.
 
-The centre of that ellipse is not the projected centre of the circle; `sensors/camera/circle_centres.py` corrects it.
+The centre of this ellipse is not the projected centre of the circle; `sensors/camera/circle_centres.py` corrects it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from icalib.detection.primitives.prediction import PredictedCorners
 from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.geometry.targets import Circles
 
-_LEAST_FOUND = 0.5  # of the circles, with an ellipse at a consistent place: otherwise it is no grid
+_LEAST_FOUND = 0.5  # share of the circles that need an ellipse at a consistent position; otherwise there is no grid
 
 
 @dataclass(frozen=True)
@@ -34,25 +34,26 @@ class CirclesDetector:
         return self.find(ImageWithQuads(image))
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        """As `detect`."""
+        """As `detect`, for an image whose quads may be known already."""
         for window in view.windows:
             grids = find_grids(self.target, dark_ellipses(view.image, window, step_of(self.target)))
             if grids:
-                # No image tells the turns apart: the one whose rows run most to the right is taken.
+                # The image does not distinguish the rotations: the one whose rows run most to the right is taken.
                 found = self._centres(view.image, max(grids, key=self._to_the_right))
                 if len(found.point):
                     return found
         return no_corners()
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
-        """As `find`, from where all centres are expected; None where one is not there."""
+        """As `find`, near predicted centres of all circles; None if one is not predicted or not found."""
         if len(expected.point) < len(self.target.points):
             return None
         found = self._centres(view.image, expected.uv)
         return found if expected.all_found(view.image, found) else None
 
     def _centres(self, image: np.ndarray, uv: np.ndarray) -> ImageCorners:
-        """The centres of the ellipses near uv (n, 2) px; none where hardly any is an ellipse at a consistent place."""
+        """Centres of the ellipses near uv (n, 2) px; none if fewer than _LEAST_FOUND of them are found and
+        consistent."""
         axes = _projected_radii(self.target.points[:, :2], self.target.diameter, uv)
         fine, quality = fit_ellipses(image, uv, axes)
         found = np.isfinite(quality[0])
@@ -72,8 +73,8 @@ class CirclesDetector:
 def _projected_radii(xy: np.ndarray, diameter: float, uv: np.ndarray) -> np.ndarray:
     """(n, 2, 2) px: in its rows, the images of each circle's radii along x and y of the target.
 
-    xy (n, 2) and `diameter` [m] are the target's; uv (n, 2) px are its centres in the image. The affine map about each
-    centre comes from the five centres nearest to it on the target.
+    xy (n, 2) and `diameter` [m]: of the target; uv (n, 2) px: centres in the image. The affine map about each centre is
+    fitted to the five centres nearest to it on the target.
     """
     out = np.empty((len(xy), 2, 2))
     for i in range(len(xy)):

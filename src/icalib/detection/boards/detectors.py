@@ -1,4 +1,4 @@
-"""The detector of each target."""
+"""Chooses the detector of each target."""
 
 from __future__ import annotations
 
@@ -20,43 +20,48 @@ from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 
-_SAME_PX = 3.0  # corners this close are one
+_SAME_PX = 3.0  # corners closer together are the same
 
 
 class Detector(Protocol):
     """Finds one target in images."""
 
     def detect(self, image: np.ndarray, before: Sequence[ImageCorners] = ()) -> ImageCorners:
-        """Corners in the image (h, w) uint8, indices into the target's points; faster where the last images
+        """Corners in the image (h, w) uint8, as indices into the target's points. Faster if the preceding images
         `before` show how the target moves."""
         ...
 
 
 class _Finder(Protocol):
+    """Finds a target by a search of the whole image."""
+
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        """Corners in the whole image, indices into the target's points."""
+        """Corners in the whole image, as indices into the target's points."""
         ...
 
 
 @runtime_checkable
 class _Follower(_Finder, Protocol):
+    """Finds a target also near predicted corners."""
+
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
-        """As `find`, where corners are expected; None where the whole image is to be searched."""
+        """As `find`, near predicted corners; None if the whole image is to be searched."""
         ...
 
 
 def detector_of(target: Target) -> Detector:
-    """The detector that finds `target`. Raises RigError for one that none finds in images."""
+    """The detector that finds `target`. Raises RigError for a target that cannot be found in images."""
     return _Detector(_finder_of(target))
 
 
 @dataclass(frozen=True, eq=False)
 class _Detector:
-    """Looks where motion leads `finder` to expect the target, and in the whole image where it is not there."""
+    """Uses `finder` near predicted corners, and in the whole image if the target is not found there."""
 
     finder: _Finder
 
     def detect(self, image: np.ndarray, before: Sequence[ImageCorners] = ()) -> ImageCorners:
+        """As `Detector.detect`."""
         view = ImageWithQuads(image)
         expected = predict_corners(before) if isinstance(self.finder, _Follower) else None
         if expected is not None and isinstance(self.finder, _Follower):
@@ -67,6 +72,7 @@ class _Detector:
 
 
 def _finder_of(target: Target) -> _Finder:
+    """The finder of a target. Raises RigError if there is none."""
     if isinstance(target, Scene):
         members, tagged = (
             tuple(_finder_of(t) for t in target.targets),
@@ -90,18 +96,23 @@ def _finder_of(target: Target) -> _Finder:
 
 
 def charuco_detector(board: Charuco) -> CharucoDetector:
-    """That of the board, black on white."""
+    """The detector of the board, for black on white."""
     ratio = board.marker_size / board.square_size
     return CharucoDetector(board.squares_y, board.squares_x, ratio, board.dictionary, board.legacy)
 
 
 @dataclass(frozen=True, eq=False)
 class _SceneDetector:
-    """Finds each target with its own of `members`; first (members,): a scene's number of its first point."""
+    """Finds each target of a scene with its detector in `members`. first (members,): number of its first point in the
+    scene.
+
+    A board without tags is dropped if it overlaps with a tagged target, whose squares may look like a small
+    checkerboard.
+    """
 
     members: tuple[_Finder, ...]
     first: np.ndarray
-    tagged: tuple[bool, ...]  # whether tags tell a member from others
+    tagged: tuple[bool, ...]  # whether tags identify the member
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
         found = [member.find(view) for member in self.members]
@@ -114,7 +125,7 @@ class _SceneDetector:
 
 @dataclass(frozen=True, eq=False)
 class _Inverted:
-    """Finds with `detector` what is white on black."""
+    """Finds with `detector` a board that is white on black."""
 
     detector: CharucoDetector | _Renumbered
 
@@ -127,7 +138,7 @@ class _Inverted:
 
 @dataclass(frozen=True, eq=False)
 class _Renumbered:
-    """What `detector` calls k is the target's point number[k]."""
+    """Converts the numbers of `detector` to those of the target: corner k is point number[k]."""
 
     detector: CheckerboardDetector
     number: np.ndarray
@@ -142,15 +153,16 @@ class _Renumbered:
 
 
 def _apart(uv: np.ndarray, others: np.ndarray) -> bool:
-    """Whether no corner of a board lies on another target's, whose squares may look like a small checkerboard."""
+    """Whether no corner uv (n, 2) px of a board coincides with a corner of the other targets, `others` (m, 2) px."""
     return not len(others) or bool((np.linalg.norm(uv[:, None] - others, axis=2) > _SAME_PX).all())
 
 
 def _from_the_bottom(rows: int, cols: int) -> np.ndarray:
-    """(rows cols,) the target's point of each of the detector's corners.
+    """(rows cols,) the target's point of each corner of the detector.
 
-    The target's y goes up the sheet, the detector's down. Both begin where the corner's square is dark: backwards along
-    an even side, the first square is dark again.
+    The target's y points up the sheet, the detector's down. In both orders the square at the first corner is dark. If
+    rows is odd and cols even, this holds for the order that reverses each row, else for the one that reverses the rows'
+    sequence.
     """
     number = np.arange(rows * cols).reshape(rows, cols)
     return (number[:, ::-1] if rows % 2 == 1 and cols % 2 == 0 else number[::-1]).ravel()

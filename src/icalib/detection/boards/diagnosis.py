@@ -1,4 +1,4 @@
-"""Why no target is found: tries other families, borders and ids, and says which tags the images show."""
+"""Explains why no target is found: tries other families, borders and ids, and names the tags that the images show."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from icalib.detection.primitives.tags import tags_at
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
 
-_DIAGNOSED_IMAGES = 5  # the time grows with it
-_SIZES = (50, 100, 250, 1000)  # of OpenCV's families; each starts with the smaller ones
+_DIAGNOSED_IMAGES = 5  # images that are searched; the time is proportional
+_SIZES = (50, 100, 250, 1000)  # numbers of tags of OpenCV's families; each contains the smaller ones
 _TRIED = ("tag36h11", "tag25h9", "tag16h5", "tag36h10", "aruco_original", "aruco_mip_36h12") + tuple(
     f"{n}x{n}_{size}" for n, size in ((4, 250), (5, 1000), (6, 1000), (7, 1000))
 )
 _BORDERS = (1, 2)
-_LEAST_TAGS = {4: 4}  # fewer tags of 4 x 4 cells may be chance
+_LEAST_TAGS = {4: 4}  # by data cells along a side; fewer tags may be false detections
 _LEAST_TAGS_USUALLY = 2
-_MANY_MORE = 4  # times the tags with the border that was stated
-_CLEARLY_BETTER = 0.5  # of the misfit in the layout that was stated
+_MANY_MORE = 4  # ratio of tags with the other border to those with the stated one, above which the border is wrong
+_CLEARLY_BETTER = 0.5  # ratio of misfits below which the other layout is right
 
 
 _How = Literal["", "mirrored", "inverted"]
@@ -34,19 +34,21 @@ _HOWS: tuple[_How, ...] = ("", "mirrored", "inverted")
 
 @dataclass(frozen=True)
 class _VisibleTags:
+    """Tags of one family that the images show, if the images are first mirrored or inverted as `how` says."""
+
     family: str
     border_bits: int
     how: _How
-    ids: np.ndarray  # all that were read, repeated ones too
+    ids: np.ndarray  # all decoded ids, with repetitions
 
 
 def what_is_seen(
     images: Iterable[np.ndarray], family: str, border_bits: int, ids: Sequence[int], field: str = "family"
 ) -> str:
-    """A sentence on the tags in the first images (h, w) uint8 of a recording, in which no target was found.
+    """A sentence on the tags in the first images (h, w) uint8 of a recording in which no target was found.
 
-    `family`, `border_bits` and `ids` are those of the target, `field` is where a rig file names the family. Raises
-    RecordingError for an image that is not grey.
+    family, border_bits, ids: of the target; field: name of the family's field in the rig file. Raises RecordingError
+    for an image that is not grey.
     """
     candidates = _candidates([ImageWithQuads(image).image for image in islice(images, _DIAGNOSED_IMAGES)])
     own_name = _largest(family)
@@ -60,16 +62,16 @@ def what_is_seen(
 
 
 def tags_in(images: Sequence[np.ndarray]) -> str:
-    """The tags of any known family that images (h, w) uint8 show, in words; "" for none."""
+    """Text on the tags of any known family that the images (h, w) uint8 show; "" if there are none."""
     seen = max(_candidates([ImageWithQuads(i).image for i in images]), key=lambda one: len(one.ids), default=None)
     return "" if seen is None else _words(seen)
 
 
 def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterable[TagSet]) -> str:
-    """A sentence where the first images (h, w) uint8 show the target's `tags` with a border of the other width, and
-    hardly any with their own; "" otherwise. `others` are tags that may stand beside them.
+    """A sentence if the first images (h, w) uint8 show the target's `tags` with the other border width, and hardly any
+    with the stated one; else "". others: tags that may be in the images, too.
 
-    A tag is sometimes read with the wrong width of border, and always at the wrong place.
+    A tag with the other border width is sometimes decoded, but with wrong corners.
     """
     swapped = TagSet(tags.family, 3 - tags.border_bits, tags.ids)
     ids = sorted(set(tags.ids) - {i for other in others for i in swapped.shared_with(other)})
@@ -87,11 +89,11 @@ def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterab
 
 
 def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
-    """A sentence where the markers in the first images (h, w) uint8 stand as on a board of the other layout; "" where
-    they do not. In the wrong layout the markers of every other row are a square away from where they should be, to the
-    left or to the right, and no homography puts both right."""
+    """A sentence if the markers in the first images (h, w) uint8 are arranged as on a board of the other layout; else
+    "". In the wrong layout, markers of every other row are off by one square to the left or right, and no homography
+    fits all markers."""
     if board.squares_y % 2:
-        return ""  # both layouts are the same
+        return ""  # both layouts are equal
     detectors = [charuco_detector(b) for b in (board, replace(board, legacy=not board.legacy))]
     views = [ImageWithQuads(255 - image if board.inverted else image) for image in islice(images, _DIAGNOSED_IMAGES)]
     misfits = np.array([[d.misfit(view) for d in detectors] for view in views]).reshape(-1, 2)
@@ -107,7 +109,7 @@ def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
 
 
 def _candidates(images: list[np.ndarray]) -> list[_VisibleTags]:
-    """What each family and border finds, where it is more than chance."""
+    """The tags of each family and border that are found in larger numbers than by chance."""
     found: dict[tuple[str, int, _How], list[np.ndarray]] = {}
     tried = [name for name in _TRIED if is_available(name)]
     for image, how in product(images, _HOWS):
@@ -121,6 +123,7 @@ def _candidates(images: list[np.ndarray]) -> list[_VisibleTags]:
 
 
 def _sentence(seen: _VisibleTags, family: str, border_bits: int, ids: Sequence[int], field: str = "family") -> str:
+    """A sentence on the tags `seen`, and the field of the rig file to correct."""
     what = _words(seen)
     if seen.how == "inverted":
         return f"the images show {what}, white on black; set inverted: true of a ChArUco board."
@@ -141,16 +144,17 @@ def _sentence(seen: _VisibleTags, family: str, border_bits: int, ids: Sequence[i
 
 
 def _words(seen: _VisibleTags) -> str:
+    """Text with the number, family and ids of the tags."""
     return f"{len(seen.ids)} tags of {_smallest(seen)} (ids {seen.ids.min()} to {seen.ids.max()})"
 
 
 def _largest(family: str) -> str:
-    """The family among those tried that holds all patterns of `family`."""
+    """The family in _TRIED that contains all patterns of `family`."""
     return next((name for name in _TRIED if name.split("_")[0] == family.split("_")[0] and "x" in family), family)
 
 
 def _smallest(seen: _VisibleTags) -> str:
-    """The smallest of OpenCV's families with the ids that were seen."""
+    """The smallest of OpenCV's families that has all ids seen."""
     start = seen.family.split("_")[0]
     fitting = (f"{start}_{size}" for size in _SIZES if size > seen.ids.max() and f"{start}_{size}" in FAMILIES)
     return next(fitting, seen.family) if "x" in start else seen.family

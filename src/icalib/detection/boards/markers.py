@@ -1,4 +1,4 @@
-"""Free markers: tags of a family that stand alone on white, four L-corners each."""
+"""Free markers: tags of a family that are surrounded by white, with four L-corners each."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from icalib.detection.primitives.refinement import refined_corners
 from icalib.detection.primitives.tags import Tags, tags_at
 from icalib.errors import RecordingError
 
-# icalib's number of each of OpenCV's corners: from the lower left of the tag's own picture, counterclockwise. OpenCV's
-# pictures of AprilTags are rotated by 180 deg.
+# Corner number in icalib (from the lower left of the tag's picture, counterclockwise) of each corner in OpenCV's order.
+# OpenCV's pictures of AprilTags are rotated by 180 deg.
 APRILTAG_CORNER = np.array([1, 0, 3, 2])
 ARUCO_CORNER = np.array([3, 2, 1, 0])
 
 
 def all_tags(view: ImageWithQuads, family: Family, border_bits: int) -> Tags:
-    """The tags that stand alone, large ones and small ones."""
+    """Tags of the family that are surrounded by white, of any size."""
     quads = np.concatenate([view.quads(window, False) for window in view.windows])
     return tags_at(view.image, quads, family, border_bits)
 
 
 @dataclass(frozen=True)
 class MarkerDetector:
-    """Finds tags of `family` that stand alone on white, with a black border of `border_bits` cells.
+    """Finds tags of `family` that are surrounded by white, with a black border of `border_bits` cells.
 
-    `ids` are those to look for; corner c of ids[i] is point 4 i + c. Corners count from the lower left of the tag's own
-    picture against the clock, as on an AprilGrid. Raises RecordingError for a family or id that is not known.
+    ids: those to find; corner c of ids[i] is point 4 i + c. Corners are numbered from the lower left of the tag's
+    picture counterclockwise, as on an AprilGrid. Raises RecordingError for an unknown or repeated id, and RigError for
+    an unknown family.
     """
 
     family: str
@@ -48,6 +49,7 @@ class MarkerDetector:
 
     @cached_property
     def _family(self) -> Family:
+        """The bit patterns of the tags."""
         return tag_family(self.family)
 
     def detect(self, image: np.ndarray) -> ImageCorners:
@@ -58,7 +60,7 @@ class MarkerDetector:
         return self.find(ImageWithQuads(image))
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        """As `detect`."""
+        """As `detect`, for an image whose quads may be known already."""
         tags = all_tags(view, self._family, self.border_bits)
         ids, count = np.unique(tags.ids, return_counts=True)
         rows = np.flatnonzero(np.isin(tags.ids, ids[count == 1]) & np.isin(tags.ids, self.ids))

@@ -1,6 +1,6 @@
 """Cache of detected corners: one file for each stream of images, named by its content and the settings.
 
-The folder is the user's cache folder, or $ICALIB_CACHE. A file that is damaged or of another format is no file.
+The folder is $ICALIB_CACHE, or the user's cache folder. A file that is damaged or of another format counts as absent.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from icalib.base.unpacking import load_arrays
 from icalib.data.recordings import Payload
 from icalib.detection.primitives.corners import ImageCorners
 
-DETECTOR_VERSION = 8  # of the detectors and of the format: whatever changes corners changes this
+DETECTOR_VERSION = 8  # of the detectors and of the file format; raise it with each change that changes corners
 _FIELDS = ("point", "uv", "sigma", "blur", "verdict", "edges")
 
 
@@ -32,7 +32,7 @@ def cache_folder() -> Path:
 
 
 def stream_key(payloads: Iterable[Payload], settings: str) -> str:
-    """Name of a stream of images: a hash of all its bytes and of the settings of the search."""
+    """Cache key of a stream of images: a hash of all its bytes and of the settings of the search."""
     digest = hashlib.blake2b(f"{DETECTOR_VERSION} {settings}".encode(), digest_size=20)
     for p in payloads:
         digest.update(f"{p.stamp_ns} {p.encoding} {p.width} {p.height} {p.step} {p.big_endian} {len(p.data)} ".encode())
@@ -41,7 +41,7 @@ def stream_key(payloads: Iterable[Payload], settings: str) -> str:
 
 
 def load_corners(key: str) -> tuple[np.ndarray, list[ImageCorners]] | None:
-    """Stamps (M,) and corners of the images under `key`, or None."""
+    """Stamps (M,) and corners of the images cached under `key`, or None."""
     arrays = load_kept(key, ("stamps_ns", "start", *_FIELDS))
     if arrays is None:
         return None
@@ -53,14 +53,14 @@ def load_corners(key: str) -> tuple[np.ndarray, list[ImageCorners]] | None:
 
 
 def keep_corners(key: str, stamps_ns: np.ndarray, images: list[ImageCorners]) -> None:
-    """Keeps what was found under `key`."""
+    """Caches stamps (M,) and corners of the images under `key`."""
     arrays: dict[str, Any] = {name: np.concatenate([getattr(i, name) for i in images]) for name in _FIELDS}
     arrays |= {"stamps_ns": stamps_ns, "start": np.concatenate([[0], np.cumsum([len(i.point) for i in images])])}
     keep_arrays(key, arrays)
 
 
 def load_kept(key: str, names: Iterable[str]) -> dict[str, np.ndarray] | None:
-    """The arrays kept under `key`, `names` among them, or None."""
+    """The arrays cached under `key`; None if there are none, or if one of `names` is missing."""
     try:
         arrays = load_arrays((cache_folder() / f"{key}.npz").read_bytes())
     except (OSError, ValueError, KeyError):
@@ -69,7 +69,7 @@ def load_kept(key: str, names: Iterable[str]) -> dict[str, np.ndarray] | None:
 
 
 def keep_arrays(key: str, arrays: Mapping[str, np.ndarray]) -> None:
-    """Keeps arrays under `key`. A folder that cannot be written keeps nothing: the next run looks again."""
+    """Caches arrays under `key`. If the folder cannot be written, nothing is cached and the next run searches again."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)

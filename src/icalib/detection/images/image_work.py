@@ -1,4 +1,4 @@
-"""Work on all images of a stream: on all cores, in order, a few batches in memory at a time."""
+"""Processes all images of a stream on all cores, in order, with a few batches in memory at a time."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from icalib.sensors.stream import which_image
 
 T = TypeVar("T")
 R = TypeVar("R")
-SPREAD = 5  # images that stand for a recording where all would take too long
-Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
+SPREAD = 5  # images that represent a recording if all of them would take too long
+Progress = Callable[[float], None]  # called with the share of processed images, 0 to 1
 
 
 def on_all_cores(batches: Iterable[T], work: Callable[[T], R]) -> Iterator[R]:
-    """work(batch) of each batch, in order, on threads: OpenCV and compiled code let each other run. One batch more than
-    there are cores is in memory at most."""
+    """work(batch) for each batch, in order, on threads: OpenCV and compiled code release the GIL. At most one batch
+    more than there are cores is in memory."""
     with _one_thread_in_opencv(), _pool() as pool:
         waiting: deque[Future[R]] = deque()
         for batch in batches:
@@ -38,7 +38,7 @@ def on_all_cores(batches: Iterable[T], work: Callable[[T], R]) -> Iterator[R]:
 
 
 def batches_of(payloads: Iterable[Payload], images: int, most_bytes: int) -> Iterator[list[Payload]]:
-    """The images in groups of `images`, or of fewer where these have `most_bytes`."""
+    """Groups of `images` payloads, or of fewer if these reach `most_bytes`."""
     batch: list[Payload] = []
     for p in payloads:
         batch.append(p)
@@ -50,7 +50,7 @@ def batches_of(payloads: Iterable[Payload], images: int, most_bytes: int) -> Ite
 
 
 def image_count(recording: Recording, topic: str) -> int:
-    """How many images there are about; 0 where that is not known."""
+    """About the number of images; 0 if unknown."""
     return next((t.count for t in recording.topics() if t.name == topic), 0)
 
 
@@ -63,7 +63,7 @@ def spread_images(recording: Recording, topic: str) -> Iterator[np.ndarray]:
 
 
 def with_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:
-    """The images. Raises RecordingError at the first that has not the camera's resolution."""
+    """The images. Raises RecordingError at the first whose resolution is not the camera's."""
     for p in payloads:
         if p.width and (p.width, p.height) != camera.resolution:
             raise RecordingError(
@@ -74,14 +74,14 @@ def with_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> 
 
 
 def recording_names(payloads: Iterable[Payload], files: dict[int, str]) -> Iterator[Payload]:
-    """The payloads; `files` gets the name of each by its stamp, "" of those that are no file."""
+    """The payloads. Fills `files` with the file name of each by its stamp, "" for those that come from no file."""
     for p in payloads:
         files[p.stamp_ns] = p.name
         yield p
 
 
 def words_on_damaged(damaged_ns: Sequence[int], files: Mapping[int, str]) -> tuple[str, ...]:
-    """A sentence on images with these stamps, which could not be decoded; none without any. files: names by stamp."""
+    """A sentence on damaged images with these stamps; empty without any. files: names by stamp."""
     if not len(damaged_ns):
         return ()
     first = which_image(files.get(damaged_ns[0], ""), damaged_ns[0])
@@ -89,12 +89,13 @@ def words_on_damaged(damaged_ns: Sequence[int], files: Mapping[int, str]) -> tup
 
 
 def core_count() -> int:
+    """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def _pool() -> Iterator[ThreadPoolExecutor]:
-    """A pool of threads that drops waiting work when it is interrupted."""
+    """A pool of threads that drops waiting work if it is interrupted."""
     pool = ThreadPoolExecutor(core_count(), thread_name_prefix="icalib-images")
     try:
         yield pool
@@ -104,7 +105,8 @@ def _pool() -> Iterator[ThreadPoolExecutor]:
 
 @contextmanager
 def _one_thread_in_opencv() -> Iterator[None]:
-    """One thread in OpenCV: its own threads and ours would compete for the cores."""
+    """Limits OpenCV to one thread within the context: its threads and those of `on_all_cores` would compete for the
+    cores."""
     cv2 = load_cv2()
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

@@ -1,4 +1,4 @@
-"""Compiled parts of the search for planes: moments of voxels, growing regions, points to planes."""
+"""Compiled parts of the search for planes: moments of voxels, growth of regions, association of points with planes."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-MOMENTS = 10  # 1; x, xx; y, yx, yy; z, zx, zy, zz
-LARGEST_TURN = 0.26  # rad between the normal of a voxel and its region: those of voxels are rough
-EXCLUSIVE_GATES = 1.6  # gates between a point and planes that are not its own
-REGION_REACH = 2.5  # standard deviations between a voxel's centre and the plane of its region
+MOMENTS = 10  # sums of 1; x, xx; y, yx, yy; z, zx, zy, zz
+LARGEST_TURN = 0.26  # rad: largest angle between the normals of a voxel, which is inaccurate, and of its region
+EXCLUSIVE_GATES = 1.6  # gates: least distance between a point and any other plane
+REGION_REACH = 2.5  # standard deviations: largest distance between a voxel's centre and the plane of its region
 
 
-OUTSIDE, NEAR, OWN = 0, 1, 2  # what a cell is to its plane
+OUTSIDE, NEAR, OWN = 0, 1, 2  # use of a cell by its plane
 
 
 class Voxels(NamedTuple):
-    """moments (V, 10) about the world's origin; normal (V, 3), towards whoever saw it; centre (V, 3); sigma (V,) [m]
-    across; neighbour (V, 26), -1: none; flat: whether it can belong to a region."""
+    """moments (V, 10): about the world's origin; normal (V, 3): towards the sensor; centre (V, 3) m; sigma (V,) m:
+    standard deviation of the points; neighbour (V, 26): indices, -1 for none; flat (V,): whether the voxel can belong
+    to a region."""
 
     moments: np.ndarray
     normal: np.ndarray
@@ -30,8 +31,12 @@ class Voxels(NamedTuple):
 
 
 class OccupancyGrid(NamedTuple):
-    """Where planes (P, 6) reach: squares of a grid along their axes (P, 2, 3) from `low` (P, 2), size (P, 2) of them;
-    those of plane q begin at first[q] of `use`: OUTSIDE, NEAR (it may be there: no other may take the points), OWN."""
+    """Cells of P planes (P, 6): normal and point. The cells of plane q are squares of edge edge_m on a grid along
+    axes[q] (2, 3). The grid starts at low[q] (2,) m from the point and has size[q] (2,) cells.
+
+    Entries of `use` from first[q] on: OUTSIDE the plane; NEAR, where the plane may be, so that no other plane gets the
+    points; OWN, cells whose points belong to the plane.
+    """
 
     planes: np.ndarray
     axes: np.ndarray
@@ -44,7 +49,8 @@ class OccupancyGrid(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def sum_voxels(points, seen_from, variance, which, moments, towards, total):
-    """Adds points (N, 3) to moments (V, 10), directions to whoever saw them (V, 3), and variances (V,)."""
+    """Adds the moments of points (N, 3) to moments (V, 10), unit vectors to the sensor to towards (V, 3), and variances
+    to total (V,). which (N,): voxel of each point."""
     for n in range(len(points)):
         v = which[n]
         x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
@@ -61,8 +67,8 @@ def sum_voxels(points, seen_from, variance, which, moments, towards, total):
 
 @njit(cache=True, nogil=True)
 def fit(moments, normal, centre):
-    """Least-squares plane of moments (10,): fills its centre and normal, whose side is kept. Returns the variance
-    across."""
+    """Least-squares plane of moments (10,): fills centre and normal, which keeps its side. Returns the variance along
+    the normal."""
     n = moments[0]
     for i, k in enumerate((1, 3, 6)):
         centre[i] = moments[k] / n
@@ -80,7 +86,7 @@ def fit(moments, normal, centre):
 
 @njit(cache=True, nogil=True)
 def _fits(v, voxels, normal, centre):
-    """Whether voxel v lies on the plane of a region, and its normal points to the same side."""
+    """Whether voxel v lies on the plane of a region, with its normal on the same side."""
     cosine, distance = 0.0, 0.0
     for i in range(3):
         cosine += normal[i] * voxels.normal[v, i]
@@ -90,7 +96,8 @@ def _fits(v, voxels, normal, centre):
 
 @njit(cache=True, nogil=True)
 def grow(voxels, seeds, region):
-    """Fills region (V,), -1: none, from `seeds` on in their order; returns how many there are."""
+    """Fills region (V,) with the region of each voxel, -1 for none, from `seeds` in their order; returns the number of
+    regions."""
     count, queue = 0, np.empty(len(region), np.int64)
     total, normal, centre = np.empty(MOMENTS), np.empty(3), np.empty(3)
     for s in seeds:
@@ -119,7 +126,7 @@ def grow(voxels, seeds, region):
 
 @njit(cache=True, nogil=True)
 def _reach(q, x, y, z, cells):
-    """The cell of plane q that a point is in, -1: outside."""
+    """Cell of plane q that contains the point, -1 if it is outside of the plane's cells."""
     p, k = cells.planes[q], 0
     for i in range(2):
         a = cells.axes[q, i]
@@ -133,15 +140,17 @@ def _reach(q, x, y, z, cells):
 
 @njit(cache=True, nogil=True)
 def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cell, distance):
-    """Associates each point with the plane within `gate` standard deviations that is seen from the point's side; -1: no
-    plane, or a second one is near, even in a grazing beam (the floor, at the foot of a far wall). Fills `cell` and
-    `distance` of each point.
+    """Associates each point with the plane within `gate` standard deviations that faces the sensor. The plane is -1 if
+    there is none, or if a second plane is near, even one that the beam grazes (the floor at the foot of a far wall).
+    Fills `plane`, `cell` and `distance` of each point.
 
-    The cell is that of the point where the beam meets the plane. The measured point itself would bias the plane: noise
-    along the beam moves points off an edge, or towards another plane, more often in one direction than in the other
-    (1.5 mm for small faces)."""
+    The cell is that of the intersection of beam and plane. The measured point would bias the plane by 1.5 mm for small
+    faces. Noise along the beam moves points across an edge, or towards another plane, more often in one direction than
+    in the other.
+    """
     count = len(cells.planes)
-    equation, r = np.empty((4, count)), np.empty(count)  # by rows: the loop over all planes is then a few instructions
+    # one row for each coefficient, so that the loop over planes is vectorised
+    equation, r = np.empty((4, count)), np.empty(count)
     for q in range(count):
         p = cells.planes[q]
         equation[0, q], equation[1, q], equation[2, q] = p[0], p[1], p[2]
@@ -181,7 +190,8 @@ def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cel
 
 @njit(cache=True, nogil=True)
 def sum_cells(points, variance, plane, cell, distance, stats, moments):
-    """Of each cell number, sum and sum of squares of whitened distances (C, 3); of each plane its moments (P, 10)."""
+    """Adds to stats (C, 3) number, sum and sum of squares of the whitened distances in each cell; and to moments (P,
+    10) the moments of each plane's points, weighted by the inverse variance."""
     for n in range(len(points)):
         q = plane[n]
         if q < 0:

@@ -1,9 +1,9 @@
 """Planes in a roughly registered point cloud, and the points that lie on each.
 
 Flat voxels grow into regions, regions of one plane are joined, and regions that bend are dropped. Points are then
-associated with a plane by their distance to it, within square cells on the plane: cells in space would cut a noisy wall
-into layers. Points near two planes, in grazing beams, or in cells that are not flat belong to no plane. A wall has two
-sides: a plane is seen from the side that its normal points to.
+associated with a plane by their distance to it, within square cells on the plane; voxels would cut a noisy wall into
+layers. Points near two planes, in grazing beams, or in cells that are not flat belong to no plane. Both sides of a wall
+are separate planes: a plane is seen only from the side that its normal points to.
 """
 
 from __future__ import annotations
@@ -29,26 +29,28 @@ from icalib.detection.planes.plane_kernels import (
 )
 from icalib.geometry.planes import plane_of, tangents
 
-MOST_POINTS = 2_000_000  # that the search looks at
-FEWEST_IN_VOXEL = 12  # points of a voxel or a cell
-FEWEST_BENT = 9  # voxels that show whether a region bends
-FIT_ROUNDS = 3  # of association and fit
-LEAST_ELONGATION = 0.25  # of a voxel's edge: what spreads less in its own plane is a line
-SAME_TURN = np.deg2rad(4.0)  # between regions of one plane
-MIXED_CELL_RMS = 1.35  # whitened RMS of a cell that does not hold one plane
-FINE_M = 1e-3  # out of place, or less: before, strays show nothing
-EVEN_CELLS = 0.1  # what most points lie on strays less, or nothing is said: poses or the times of points are wrong
-BENT_REGION = 0.4  # standard deviations of a point by which a region may bow: flat ones up to 0.32, hills from 0.4 on
-# By which the means of cells may stray, RMS: planes in a cloud 3 cm out of place up to 0.27, hills 0.48.
+MOST_POINTS = 2_000_000  # points that the search uses, at most
+FEWEST_IN_VOXEL = 12  # points of a voxel or a cell, at least
+FEWEST_BENT = 9  # voxels of a region whose bend is tested, at least
+FIT_ROUNDS = 3  # rounds of association and fit
+LEAST_ELONGATION = 0.25  # of a voxel's edge: points that spread less within their plane form a line
+SAME_TURN = np.deg2rad(4.0)  # largest angle between the normals of regions of one plane
+MIXED_CELL_RMS = 1.35  # whitened RMS above which a cell does not hold a single plane
+# registration error of the cloud, at most, to test for unevenness; with a larger one, the test shows nothing
+FINE_M = 1e-3
+# unevenness that most points must be below; otherwise poses or times of points are wrong, and no plane is rejected
+EVEN_CELLS = 0.1
+BENT_REGION = 0.4  # largest bow of a region, in standard deviations of a point: flat ones up to 0.32, hills from 0.4 on
+# Largest unevenness of a plane (`_unevenness`): planes in a cloud with 3 cm registration error up to 0.27, hills 0.48.
 UNEVEN_CELLS = 0.35
 
 
 @dataclass(frozen=True)
 class PlaneSearch:
-    """Settings of the search. noise_m: of a point. position_m, angle_rad: registration error of the cloud, the angle
-    about the sensor. voxel_m: edge of voxels and cells. smallest_m2: least area of a plane's cells together. gate:
-    largest distance from a point to its plane, in standard deviations.
-    """
+    """Settings of the search. noise_m: standard deviation of a point. position_m, angle_rad: registration error of the
+    cloud, the angle about the sensor. voxel_m: edge of voxels and cells. smallest_m2: least total area of a plane's
+    cells. gate: largest distance from a point to its plane, in standard deviations. least_cosine: of the angle between
+    beam and normal; beams below it are grazing."""
 
     noise_m: float = 0.03
     position_m: float = 0.01
@@ -59,38 +61,40 @@ class PlaneSearch:
     least_cosine: float = 0.1
 
     def variance(self, points: np.ndarray, seen_from: np.ndarray) -> np.ndarray:
-        """Variance (N,) m^2 of points (N, 3) seen from (N, 3): noise and registration error."""
+        """(N,) m^2: variance of points (N, 3) seen from sensor positions (N, 3), by noise and registration error."""
         range2 = ((points - seen_from) ** 2).sum(axis=1)
         return self.noise_m**2 + self.position_m**2 + self.angle_rad**2 * range2
 
 
 @dataclass(frozen=True)
 class FoundPlanes:
-    """cells: where planes are, the first `count` of them the planes found, the others surfaces that bend or are small
-    and only keep points from their neighbours."""
+    """cells: the cells of all surfaces. The first `count` surfaces are planes; the other ones bend or are small, and
+    only keep their points from being associated with neighbouring planes."""
 
     cells: OccupancyGrid
     count: int
 
     @property
     def planes(self) -> np.ndarray:
-        """(P, 6) normal, towards whoever saw it, and about the centroid, world frame."""
+        """(P, 6) normal, towards the sensor, and a point near the centroid [m], in the world frame."""
         return self.cells.planes[: self.count]
 
     @property
     def areas_m2(self) -> np.ndarray:
-        """(P,) of the cells of each."""
+        """(P,) total area of the cells of each plane."""
         edges = np.append(self.cells.first, len(self.cells.use))
         before = np.append(0, np.cumsum(self.cells.use == OWN))
         return np.diff(before[edges])[: self.count] * self.cells.edge_m**2
 
     def of_points(self, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
-        """(N,) int32, the plane of each of points (N, 3) seen from (N, 3), world; -1: none."""
+        """(N,) int32: plane of each of points (N, 3), seen from sensor positions (N, 3), in the world frame; -1 for
+        none."""
         return _associate(self.cells, points, seen_from, search.variance(points, seen_from), search)[0]
 
 
 def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch = PlaneSearch()) -> FoundPlanes:
-    """Planes of points (N, 3) seen from (N, 3), both in the world frame; the largest first."""
+    """Planes of points (N, 3) seen from sensor positions (N, 3), both in the world frame [m]; the plane with most cells
+    first."""
     step = max(1, len(points) // MOST_POINTS)
     points, seen_from = points[::step], seen_from[::step]
     if not len(points):
@@ -109,6 +113,7 @@ def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch =
 
 
 def _voxels(points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch) -> Voxels:
+    """Moments and local planes of all voxels that contain points. variance (N,) m^2: of the points."""
     ijk = np.floor(points / search.voxel_m).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
     shape = ijk.max(axis=0) + 2
@@ -133,7 +138,7 @@ def _voxels(points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, sea
 
 @dataclass(frozen=True)
 class _Region:
-    """Voxels (m,) on one plane."""
+    """Voxels (m,) on one plane, with its normal and centre; sigma: RMS standard deviation [m] of their points."""
 
     members: np.ndarray
     normal: np.ndarray
@@ -142,18 +147,20 @@ class _Region:
 
     @classmethod
     def of(cls, voxels: Voxels, members: np.ndarray) -> _Region:
+        """The region of the voxels `members` (m,), with the least-squares plane of their points."""
         normal, centre = voxels.normal[members].sum(axis=0), np.empty(3)
         fit(voxels.moments[members].sum(axis=0), normal, centre)
         return cls(members, normal, centre, float(np.sqrt((voxels.sigma[members] ** 2).mean())))
 
     def is_plane_of(self, other: _Region) -> bool:
-        """Whether the other may lie on the same plane."""
+        """Whether both regions may lie on the same plane."""
         gap = other.centre - self.centre
         near = max(abs(self.normal @ gap), abs(other.normal @ gap)) < self.sigma + other.sigma
         return bool(self.normal @ other.normal > np.cos(SAME_TURN) and near)
 
     def bends(self, voxels: Voxels) -> bool:
-        """Whether a quadratic surface through the voxels' centres bows."""
+        """Whether the quadratic surface fitted to the voxels' centres deviates from a plane by more than
+        BENT_REGION."""
         gap, axes = voxels.centre[self.members] - self.centre, tangents(self.normal)
         u, v = axes @ gap.T
         if len(u) < FEWEST_BENT:
@@ -167,14 +174,14 @@ class _Region:
         )
 
     def continues(self, voxels: Voxels, bent: np.ndarray) -> bool:
-        """Whether the region is the rest of a larger surface that bends; bent (V,): voxels of such surfaces."""
+        """Whether the region is a part of a larger surface that bends. bent (V,): voxels of such surfaces."""
         around = voxels.neighbour[self.members]
         alike = voxels.normal[around] @ self.normal > np.cos(LARGEST_TURN)
         return bool((alike & bent[around] & (around >= 0)).any())
 
 
 def _join(voxels: Voxels, members: list[np.ndarray]) -> list[_Region]:
-    """Regions of one plane merged into the largest of them."""
+    """Merges regions of one plane into the largest of them; returns the largest region first."""
     open_regions = sorted((_Region.of(voxels, m) for m in members), key=lambda r: -len(r.members))
     joined: list[_Region] = []
     for region in open_regions:
@@ -189,7 +196,8 @@ def _join(voxels: Voxels, members: list[np.ndarray]) -> list[_Region]:
 
 @dataclass(frozen=True)
 class _Patch:
-    """One plane (6,) and its cells `use` (i, j) on a grid along axes (2, 3) from `low` (2,) on."""
+    """A plane (6,) and its cells: use (i, j), a grid along axes (2, 3) that starts at `low` (2,) m from the plane's
+    point."""
 
     plane: np.ndarray
     axes: np.ndarray
@@ -198,15 +206,16 @@ class _Patch:
 
     @property
     def own(self) -> int:
+        """Number of cells that belong to the plane."""
         return int((self.use == OWN).sum())
 
     def unowned(self) -> _Patch:
-        """The same patch owning no cell: it takes no points, and keeps other planes from taking them."""
+        """The patch without cells of its plane: it gets no points, but keeps other planes from getting them."""
         return replace(self, use=np.minimum(self.use, NEAR))
 
 
 def _patches(regions: list[_Region], voxels: Voxels, search: PlaneSearch) -> list[_Patch]:
-    """The squares that the voxels of regions lie in, and those around them; bent regions own none."""
+    """The cells that contain voxels of the regions, and those around them. Bent regions get no cells of their plane."""
     patches, bent = [], np.zeros(len(voxels.centre), dtype=bool)
     for region in regions:
         across = tangents(region.normal)
@@ -226,7 +235,7 @@ def _patches(regions: list[_Region], voxels: Voxels, search: PlaneSearch) -> lis
 
 
 def _packed(patches: list[_Patch], edge_m: float) -> OccupancyGrid:
-    """Patches in the arrays of kernels, those that own cells first."""
+    """The patches as arrays for the kernels, those with most cells first."""
     patches = sorted(patches, key=lambda p: -p.own)
     first = np.cumsum([0, *(p.use.size for p in patches)])[:-1].astype(np.int64)
     return OccupancyGrid(
@@ -243,6 +252,7 @@ def _packed(patches: list[_Patch], edge_m: float) -> OccupancyGrid:
 def _associate(
     cells: OccupancyGrid, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Plane (N,), cell (N,) and distance (N,) m of each point, see `associate`."""
     n = len(points)
     plane, cell, distance = np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n)
     associate(points, seen_from, variance, cells, search.gate, search.least_cosine, plane, cell, distance)
@@ -268,8 +278,8 @@ def _refined(
     search: PlaneSearch,
     last: bool,
 ) -> list[_Patch]:
-    """Planes fitted to their own points, without cells that are empty or not flat; small ones own none any more, nor,
-    in the `last` round and where all is in place, those that are uneven."""
+    """Planes fitted again to their associated points, without cells that are empty or not flat. Planes that are too
+    small lose their cells; in the `last` round, if the cloud is well registered, uneven ones do, too."""
     patches = sorted(patches, key=lambda p: -p.own)
     cells = _packed(patches, search.voxel_m)
     plane, cell, distance = _associate_at_once(cells, points, seen_from, variance, search)
@@ -288,15 +298,15 @@ def _refined(
             continue
         normal, old, centre = patch.plane[:3].copy(), patch.plane[3:], np.empty(3)
         fit(sums, normal, centre)
-        # The cells stay where they are: the point moves along the normal only.
+        # The point moves only along the normal, so that the cells stay in place.
         at = old + normal * (normal @ (centre - old))
         refined.append(replace(patch, plane=np.append(normal, at), use=own))
     return refined
 
 
 def _uneven(stats: list[np.ndarray]) -> np.ndarray:
-    """Whether each plane (P,) is uneven while most points lie on even ones; stats (C, 3) of cells: see `sum_cells`.
-    A surface that waves within the noise does not bend as a whole, but has thousands of points that show it."""
+    """(P,) whether each plane is uneven, if most points lie on even ones; stats (C, 3) of the cells of each plane: see
+    `sum_cells`. A surface may wave within the noise without a bend as a whole, but thousands of points show it."""
     strays = np.array([_unevenness(s) for s in stats])
     points, order = np.array([s[:, 0].sum() for s in stats]), np.argsort(strays)
     usual = strays[order[np.searchsorted(np.cumsum(points[order]), 0.5 * points.sum())]] if len(stats) else 0.0
@@ -304,7 +314,7 @@ def _uneven(stats: list[np.ndarray]) -> np.ndarray:
 
 
 def _unevenness(stats: np.ndarray) -> float:
-    """Standard deviations of a point by which the means of cells (C, 3) stray from their plane, RMS over the points,
-    beyond what noise does."""
+    """RMS over the points of the deviation of cell means (C, 3) from their plane, in standard deviations of a point.
+    The part that noise causes is subtracted."""
     count, total, _ = stats.T
     return float(np.sqrt(max((total**2 / count).sum() - len(stats), 0.0) / count.sum())) if len(stats) else 0.0

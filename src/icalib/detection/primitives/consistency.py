@@ -1,4 +1,4 @@
-"""Consistency checks: do tags and corners lie where their neighbours predict them?"""
+"""Consistency checks: whether tags and corners lie where their neighbours predict them."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ from icalib.detection.primitives.decoding import mapped, unit_homography
 from icalib.detection.primitives.growth import fit_homography
 
 _PLACING_CORNERS = 12
-_MOST_CORNER_OFF = (1.0, 0.05)  # px, and of a side: how far a corner may lie from where its neighbours place it
-_OFF = (0.3, 0.01, 6.0)  # px, of a side, and times the median: the same, as far as the other corners agree
-_STRAIGHT_FOCAL = 1e4  # image widths, the focal length of a lens that does not bend
-_BENT = (0.1, 2.0)  # image widths, the focal lengths of lenses that do
-_SAME_LOG = 0.02  # focal lengths as near to each other leave the same distances
-_UNSURE = 0.2  # of the median distance that a lens's bend explains: how much of it may be left at single corners
-_MOST_ANGLE = 3.0  # rad, from the axis of a lens
+# px, and of a side, added: largest distance of a corner from its prediction by neighbours
+_MOST_CORNER_OFF = (1.0, 0.05)
+_OFF = (0.3, 0.01, 6.0)  # px and of a side, added, or times the median distance: the same, if most corners agree better
+_STRAIGHT_FOCAL = 1e4  # image widths: focal length of a lens without distortion
+_BENT = (0.1, 2.0)  # image widths: range of focal lengths of lenses with distortion
+_SAME_LOG = 0.02  # tolerance of the logarithm of the focal length
+# share of the median distance without distortion that the model of distortion may leave at single corners
+_UNSURE = 0.2
+_MOST_ANGLE = 3.0  # rad: largest angle from the axis of a lens
 _FAR_PX = 1e9
 _LEAST_DEPTH = 0.1  # cosine of the angle between a corner's ray and a neighbour's
-_GROWTH_BESIDE = 1.5  # of errors with the square of the distance from the neighbours, in units of their spread
-_LINK_OFF = 0.3  # of a tag: how far its centre may lie from where another tag predicts it, per tag of distance
+_GROWTH_BESIDE = 1.5  # growth of errors with the squared distance from the mean of the neighbours, over their variance
+_LINK_OFF = 0.3  # tag sides of error per tag of distance at which a tag still predicts the centre of another
 
 
 def largest_group(known: np.ndarray, quads: np.ndarray, board: np.ndarray) -> np.ndarray:
-    """(n,) bool, the largest set of known tags of which each is linked to another of it.
+    """(n,) bool: the largest group of known tags that are connected by links.
 
-    Two tags are linked where each predicts the other's centre. known (n,) bool; quads (n, 4, 2) px; board (n, 4, 2) in
-    tag sizes.
+    Two tags are linked if each predicts the other's centre. known (n,) bool; quads (n, 4, 2) px; board (n, 4, 2) in tag
+    sizes.
     """
     tags = np.flatnonzero(known)
     links = _links(quads[tags], board[tags])
@@ -72,13 +74,16 @@ def _links(quads, board):
 def consistent_corners(
     uv: np.ndarray, board: np.ndarray, found: np.ndarray, side: np.ndarray, shape: tuple[int, ...]
 ) -> np.ndarray:
-    """(N,) bool: which corners lie where the 12 nearest others place them, by a homography.
+    """(N,) bool: whether each corner lies where a homography of its 12 nearest neighbours predicts it. True for those
+    not found.
 
     The bound is 6 times the median distance, at least 0.3 px + 0.01 sides and at most 1 px + 0.05 sides. The worst
-    corner is left out first, as long as there is one. Where a straight lens places some elsewhere, a lens that bends is
-    tried, and counts where the median distance is smaller; the bound is then at least a fifth of the median distance
-    that it explains. uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px; shape (h, w) of the image, whose middle
-    is taken for the lens's.
+    corner is left out first, and the others are tested again. If some corners fail, a lens with distortion is tried,
+    and used if the median distance is smaller. The bound is then at least a fifth of the median distance without
+    distortion.
+
+    uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px; shape (h, w) of the image, whose centre is taken for the
+    principal point.
     """
     middle, width = 0.5 * np.array(shape[1::-1]), float(shape[1])
     straight = _agreeing(_rays(uv - middle, _STRAIGHT_FOCAL * width, False), board, found, side)
@@ -93,8 +98,8 @@ Rays = tuple[np.ndarray, np.ndarray]  # (N, 3) unit rays, (N,) px per radian
 
 
 def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, found: np.ndarray) -> Rays:
-    """Rays through the bent lens (of two models, any focal length) with which the corners found agree best with their
-    neighbours' predictions. uv (N, 2) px from the middle of the image."""
+    """Rays through the lens with distortion at which the corners agree best with their predictions by neighbours. Two
+    lens models and any focal length are tried. uv (N, 2) px from the image centre."""
     best: tuple[float, Rays] | None = None
     for equidistant in (False, True):
 
@@ -109,14 +114,14 @@ def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, found: np.ndarra
 
 
 def _usual(rays: Rays, board: np.ndarray, found: np.ndarray) -> float:
-    """The median distance of the corners found; a large one where there are too few."""
+    """Median distance [px] of found corners from their predictions; 1e9 if there are too few."""
     off = distance_from_neighbours(*rays, board, found, _PLACING_CORNERS)
     placed = found & np.isfinite(off)
     return float(np.median(off[placed])) if placed.any() else _FAR_PX
 
 
 def _agreeing(rays: Rays, board: np.ndarray, found: np.ndarray, side: np.ndarray, unsure: float = 0.0) -> np.ndarray:
-    """As `consistent_corners`, for one lens. `unsure` [px]: the least bound, for what is not known of the lens."""
+    """As `consistent_corners`, for one lens. unsure [px]: least bound, for the remaining error of the lens model."""
     used, most = found.copy(), _MOST_CORNER_OFF[0] + _MOST_CORNER_OFF[1] * side
     while True:
         off = distance_from_neighbours(*rays, board, used, _PLACING_CORNERS)
@@ -130,8 +135,8 @@ def _agreeing(rays: Rays, board: np.ndarray, found: np.ndarray, side: np.ndarray
 
 
 def _rays(uv: np.ndarray, focal: float, equidistant: bool) -> Rays:
-    """Rays of pixels uv (N, 2) from the middle of a lens of focal length `focal` [px]: stereographic, which is the
-    division model of distortion (Fitzgibbon 2001), or equidistant, as most fisheyes nearly are."""
+    """Rays of pixels uv (N, 2) from the principal point, for focal length `focal` [px]. The lens is stereographic,
+    which is the division model of distortion (Fitzgibbon 2001), or equidistant, as most fisheyes nearly are."""
     radius = np.hypot(uv[:, 0], uv[:, 1])
     r = radius / focal
     angle = np.minimum(r, _MOST_ANGLE) if equidistant else 2.0 * np.arctan(0.5 * r)
@@ -142,11 +147,12 @@ def _rays(uv: np.ndarray, focal: float, equidistant: bool) -> Rays:
 
 @njit(cache=True, nogil=True)
 def distance_from_neighbours(rays, scale, xy, used, n_near):
-    """(n,) px from each corner to where the nearest others on the board xy (n, 2) place it.
+    """(n,) px: distance of each corner from its prediction by the nearest corners on the board xy (n, 2); inf if fewer
+    than 6 can be used.
 
-    rays (n, 3) are the corners' in the camera, scale (n,) px per radian. Others are the n_near nearest that are `used`
-    (n,) bool; inf where there are fewer than 6. They are seen by a pinhole camera that looks at the corner. The
-    distance of a corner that lies beside its neighbours, not among them, is divided by how much errors grow on the way.
+    rays (n, 3): of the corners, in the camera; scale (n,): px per radian; used (n,) bool: corners that predict. The
+    n_near nearest of them are projected by a pinhole camera that looks at the corner, and a homography predicts it. If
+    the corner is beside its neighbours rather than among them, the distance is divided by the growth of errors there.
     """
     out, near = np.full(len(rays), np.inf), np.empty(len(rays))
     px, pu = np.empty((n_near, 2)), np.empty((n_near, 2))
@@ -172,7 +178,7 @@ def distance_from_neighbours(rays, scale, xy, used, n_near):
 
 @njit(cache=True, nogil=True)
 def _across(ray):
-    """Two unit vectors (3,) at right angles to a unit ray and to each other."""
+    """Two unit vectors (3,) orthogonal to a unit ray and to each other."""
     a = np.array([ray[2], 0.0, -ray[0]]) if abs(ray[1]) > 0.5 else np.array([0.0, ray[2], -ray[1]])
     a /= np.sqrt((a * a).sum())
     b = np.array([ray[1] * a[2] - ray[2] * a[1], ray[2] * a[0] - ray[0] * a[2], ray[0] * a[1] - ray[1] * a[0]])

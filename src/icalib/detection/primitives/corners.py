@@ -1,4 +1,4 @@
-"""The corners of one image as a detector returns them, and the rule by which corners are dropped."""
+"""The corners of one image as a detector returns them, and the rules by which corners are dropped."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.sensors.camera.stream import EDGE, NO_EDGES, CornerStream
 
-IMAGE_NOISE = 2.0  # grey levels, assumed of every image: the sigmas are right up to this common factor
-MODEL_SIGMA_PX = 0.02  # what sampling, printing and the lens add to the noise's share
-MOST_SIGMA_PX = 0.25
-# px per px that an L-corner lacks to the nearest other feature: on rendered tags of 12 to 28 px under three blurs
-# errors are 0.08 to 0.13 of it per axis, outwards: bits near an edge lighten its dark side. Beyond they grow faster.
+IMAGE_NOISE = 2.0  # grey levels, assumed for every image: sigmas are right up to a common factor
+MODEL_SIGMA_PX = 0.02  # standard deviation by sampling, printing and the lens, added to that by noise
+MOST_SIGMA_PX = 0.25  # corners with a larger sigma are faint
+# Sigma [px] of an L-corner for each px by which the nearest other feature is too near, up to MOST_LACKS_PX. On rendered
+# tags of 12 to 28 px under three blurs, errors are 0.08 to 0.13 px per px and axis, outwards, because bits near an edge
+# lighten its dark side. Beyond the limit they grow faster.
 CROWDED, MOST_LACKS_PX = 0.12, 1.25
-LEAST_ANGLE_DEG = 15.0  # between the edges that meet in a corner
+LEAST_ANGLE_DEG = 15.0  # angle between the edges of a corner, below which it is oblique
 
 VERDICTS = ("kept", "faint", "blurred", "oblique", "inconsistent")
 KEPT, FAINT, BLURRED, OBLIQUE, INCONSISTENT = range(5)
@@ -25,12 +26,11 @@ KEPT, FAINT, BLURRED, OBLIQUE, INCONSISTENT = range(5)
 
 @dataclass(frozen=True)
 class ImageCorners:
-    """Corners of the target in one image, those that were dropped among them, in the order of `point`.
+    """Corners of the target in one image, dropped ones included, in the order of `point`.
 
-    point (N,) int64, index into the target's points, each at most once; uv (N, 2) px, (0, 0) is the centre of the
-    top-left pixel; sigma (N,) px, the expected standard deviation per axis; blur (N,) px, of a Gaussian;
-    verdict (N,) int8, index into `VERDICTS`; edges (N, 2, EDGE) float32, as in `CornerStream`, zeros where they
-    are not given.
+    point (N,) int64: index into the target's points, each at most once; uv (N, 2) px: (0, 0) is the centre of the
+    top-left pixel; sigma (N,) px: expected standard deviation per axis; blur (N,) px: of a Gaussian; verdict (N,) int8:
+    index into `VERDICTS`; edges (N, 2, EDGE) float32: as in `CornerStream`, zeros if they are not given.
     """
 
     point: np.ndarray
@@ -46,29 +46,29 @@ class ImageCorners:
 
     @property
     def kept(self) -> np.ndarray:
-        """(N,) bool."""
+        """(N,) bool: whether each corner is kept."""
         return self.verdict == KEPT
 
     def renumbered(self, point: np.ndarray) -> ImageCorners:
-        """The same corners as points (N,) of the target, in their order."""
+        """The same corners with new indices point (N,) into the target's points, sorted by these."""
         order = np.argsort(point)
         values = {f.name: getattr(self, f.name)[order] for f in fields(self)}
         return ImageCorners(**values | {"point": point[order]})
 
     def counts(self) -> dict[str, int]:
-        """How many corners have each verdict of `VERDICTS`."""
+        """Number of corners with each verdict of `VERDICTS`."""
         return {name: int((self.verdict == k).sum()) for k, name in enumerate(VERDICTS)}
 
 
 def packed(images: Sequence[ImageCorners]) -> list[ImageCorners]:
-    """The same corners, those of all images in a few arrays: thousands of small ones leave holes in the memory."""
+    """The same corners, as slices of a few arrays for all images: thousands of small arrays fragment the memory."""
     ends = np.cumsum([0] + [len(image.point) for image in images])
     joined = [np.concatenate([getattr(image, f.name) for image in images]) for f in fields(ImageCorners)]
     return [ImageCorners(*(values[a:b] for values in joined)) for a, b in pairwise(ends)]
 
 
 def no_corners() -> ImageCorners:
-    """An image in which nothing was found."""
+    """An image without corners."""
     nothing = np.zeros(0)
     return ImageCorners(
         nothing.astype(np.int64), np.zeros((0, 2)), nothing.copy(), nothing.copy(), nothing.astype(np.int8)
@@ -84,12 +84,12 @@ def judged(
 ) -> ImageCorners:
     """Corners with sigma and verdict. The first of these rules that applies gives the verdict.
 
-    inconsistent: not where the neighbours place it. oblique: its edges meet at less than 15 degrees. blurred: the
-    nearest other feature is less than 1.5 px + 1.5 blurs away (L-corners: 1.5 px + 2.25 blurs; cells of a tag in the
-    dark field: 1 px + 1.5 blurs; markers in the white one: 0.5 px + 1.5 blurs), or less than 1.25 px below
-    that where `crowded` says how much sigma [px] each pixel that lacks adds. faint: sigma is above 0.25 px.
+    inconsistent: not at the position that neighbours predict. oblique: its edges meet at less than 15 degrees. blurred:
+    the nearest other feature is less than 1.5 px + 1.5 blurs away (L-corners: 1.5 px + 2.25 blurs; cells of a tag in
+    the dark field: 1 px + 1.5 blurs; markers in the white field: 0.5 px + 1.5 blurs). With `crowded`, sigma [px] for
+    each px below this limit, corners up to 1.25 px below it are kept. faint: sigma is above 0.25 px.
 
-    point (N,) int64; uv (N, 2) px; quality (5, N), or with edges (5 + 2 EDGE, N), as `refined_crossings` gives it;
+    point (N,) int64; uv (N, 2) px; quality (5, N), or with edges (5 + 2 EDGE, N), as `refined_crossings` returns it;
     consistent (N,) bool.
     """
     unit_sigma, blur, sine, room_px, _ = quality[:5]
@@ -109,9 +109,9 @@ def judged(
 
 
 def corner_stream(name: str, stamps_ns: np.ndarray, images: Sequence[ImageCorners]) -> CornerStream:
-    """The corners that were kept, of the images of camera `name` taken at stamps_ns (M,) int64, strictly increasing.
+    """The kept corners of the images of camera `name` at stamps_ns (M,) int64, strictly increasing.
 
-    Raises RecordingError where the stamps do not increase, or their number is not that of the images.
+    Raises RecordingError if the stamps do not increase, or if there is not one for each image.
     """
     stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
     if len(stamps_ns) != len(images):
@@ -131,7 +131,7 @@ def corner_stream(name: str, stamps_ns: np.ndarray, images: Sequence[ImageCorner
 
 
 def checked_image(image: np.ndarray) -> np.ndarray:
-    """The image as contiguous (h, w) uint8. Raises RecordingError for anything else than a grey image of 8 bits."""
+    """The image as contiguous (h, w) uint8. Raises RecordingError if it is not grey with 8 bits."""
     if image.ndim != 2 or image.dtype != np.uint8:
         raise RecordingError(
             f"an image has shape {image.shape} and type {image.dtype}; convert it to grey levels, (h, w) uint8."

@@ -1,8 +1,8 @@
-"""Compiled: the position of an X-corner, where two dark squares touch, by a fit of two crossing blurred steps.
+"""Compiled: position of an X-corner, where two dark squares touch, by a fit of two crossing blurred steps.
 
-An X-corner is point symmetric, however blurred, however oblique and whatever the camera's response to light, and so is
-the model: errors of the model cannot bias the point, as long as nothing else reaches into the window. Gradients alone
-(as in cornerSubPix) do not suffice: where the window is hardly wider than the blur, they point away from the corner.
+The image of an X-corner is point symmetric under blur, oblique views and any camera response, and so is the model.
+Errors of the model therefore do not bias the point, unless other features reach into the window. Gradients alone (as in
+cornerSubPix) do not suffice: if the window is hardly wider than the blur, they are biased away from the corner.
 """
 
 from __future__ import annotations
@@ -19,21 +19,23 @@ from icalib.sensors.camera.stream import EDGE
 _ITERATIONS = 12
 _CONVERGED_PX = 2e-3
 _MOST_STEP_PX = 0.7
-_MOST_WINDOW = (6.0, 4.0)  # px, and blurs: more would average the bend of a distorted edge into the corner
-LEAST_WINDOW_PX = 1.5  # half a window's width across the edges
-_SIZE = 6  # u, v, two angles, mean, contrast
+# px, and blurs: largest half width of the window; a larger one averages the curvature of distorted edges
+_MOST_WINDOW = (6.0, 4.0)
+LEAST_WINDOW_PX = 1.5  # px: least half width of the window across the edges
+_SIZE = 6  # parameters: u, v, angles of both edges, mean grey level, half the contrast
 
 
 @njit(cache=True, nogil=True)
 def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
-    """(u, v, sigma, contrast, edges (2, EDGE)) of the X-corner near (u, v); sigma is NaN where there is none within
+    """(u, v, sigma, contrast, edges (2, EDGE)) of the X-corner near (u, v); sigma is NaN if there is none within
     `most_move` px.
 
-    ea, eb (2,) px are the sides of the dark square that meet in the corner, blur_a, blur_b [px] the blur across them.
-    `surroundings` (3,), in units of the sides: how far the nearest other feature is across either edge, and how far
-    from both edges at once features begin in the dark fields and in the white ones, inf if there are none. sigma [px]
-    is the standard deviation per axis for a noise of one grey level, contrast the grey levels between dark and light;
-    edges as in `CornerStream`.
+    ea, eb (2,) px: sides of the dark square that meet in the corner; blur_a, blur_b [px]: blur across them.
+    surroundings (3,), in units of the sides: distance of the nearest other feature across either edge, and distances
+    from both edges at once at which features begin in the dark and in the white fields (inf if there are none).
+
+    sigma [px] is the standard deviation per axis for image noise of one grey level; contrast is in grey levels between
+    dark and light; edges as in `CornerStream`.
     """
     edges, blur = np.zeros((2, EDGE)), max(blur_a, blur_b)
     most = max(_MOST_WINDOW[0], _MOST_WINDOW[1] * blur)
@@ -67,7 +69,8 @@ def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
 
 @njit(cache=True, nogil=True)
 def _window(image, u, v, ea, eb, sa, sb, surroundings, margin):
-    """(x (n,), y (n,), grey (n,)) of the pixels in the window, `margin` away from what lies in its fields."""
+    """(x (n,), y (n,), grey (n,)) of the pixels in the window (half widths sa, sb in units of the sides) that are at
+    least `margin` away from features in the fields."""
     u0, u1, v0, v1 = window_bounds(u, v, ea, eb, sa, sb)
     det = ea[0] * eb[1] - ea[1] * eb[0]
     m = (u1 - u0 + 1) * (v1 - v0 + 1)
@@ -85,17 +88,18 @@ def _window(image, u, v, ea, eb, sa, sb, surroundings, margin):
 
 @njit(cache=True, nogil=True)
 def _fill_rows(rows, p, xs, ys, grey, turn, blur_a, blur_b):
-    """rows (9, n): the grey's derivatives by the parameters p (6,), its error, and by how much it changes with the
-    curvature [1 / px] of the edge along ea and of that along eb.
+    """Fills rows (9, n): derivatives of the grey level by the six parameters p, the residual, and derivatives by the
+    curvature [1 / px] of the edges along ea and eb.
 
-    An edge with curvature c lies off its tangent by c (t^2 + blur^2) / 2 at a distance t from the corner: blur moves it
-    towards its centre.
+    An edge with curvature c deviates from its tangent by c (t^2 + blur^2) / 2 at a distance t from the corner: blur
+    shifts it towards its centre of curvature.
     """
     cos_a, sin_a, cos_b, sin_b = cos(p[2]), sin(p[2]), cos(p[3]), sin(p[3])
     scale_a, scale_b = 1.0 / (sqrt(2.0) * blur_a), 1.0 / (sqrt(2.0) * blur_b)
     for i in range(len(xs)):
         x, y = xs[i] - p[0], ys[i] - p[1]
-        # Distance from the edge along ea towards eb, and from the one along eb towards ea; ways along both.
+        # la, lb: distance from the edge along ea towards eb, and from that along eb towards ea. ta, tb: position along
+        # both.
         la, lb = turn * (cos_a * y - sin_a * x), turn * (sin_b * x - cos_b * y)
         ta, tb = cos_a * x + sin_a * y, cos_b * x + sin_b * y
         Ea, da = error_function(la * scale_a)
@@ -105,15 +109,15 @@ def _fill_rows(rows, p, xs, ys, grey, turn, blur_a, blur_b):
         rows[2, i], rows[3, i] = -turn * da * ta, turn * db * tb
         rows[4, i], rows[5, i] = 1.0, -Ea * Eb
         rows[6, i] = grey[i] - p[4] + p[5] * Ea * Eb
-        # The curvature turns to the left, as la grows with `turn` 1, and lb with -1.
+        # Positive curvature turns left. la grows to the left if `turn` is 1, and lb if it is -1.
         rows[7, i] = turn * 0.5 * da * (ta * ta + blur_a * blur_a)
         rows[8, i] = -turn * 0.5 * db * (tb * tb + blur_b * blur_b)
 
 
 @njit(cache=True, nogil=True)
 def _gain(A, rows):
-    """(2, 2) px^2: by how much the point moves where the curvature [1 / px] of the edge along ea, or eb, is known: the
-    fit takes a curvature for a change of grey, and answers as normal equations do."""
+    """(2, 2) px^2: derivative of the point by the curvature [1 / px] of the edge along ea, and along eb. The fit takes
+    the change of grey by a curvature for one by its parameters, so the normal equations give the shift."""
     gain, by = np.empty((2, 2)), np.empty(_SIZE)
     for k in range(2):
         for j in range(_SIZE):
@@ -124,6 +128,7 @@ def _gain(A, rows):
 
 @njit(cache=True, nogil=True)
 def _fill_edges(edges, ea, sa, eb, sb, gain):
+    """Fills edges (2, EDGE) with ends and gain of both edges, as in `CornerStream`. The curvature stays zero."""
     for i in range(2):
         edges[0, i], edges[0, 2 + i], edges[0, 4 + i] = -sa * ea[i], sa * ea[i], gain[0, i]
         edges[1, i], edges[1, 2 + i], edges[1, 4 + i] = -sb * eb[i], sb * eb[i], gain[1, i]
@@ -131,7 +136,7 @@ def _fill_edges(edges, ea, sa, eb, sb, gain):
 
 @njit(cache=True, nogil=True)
 def _sigma(A):
-    """Standard deviation per axis of the point: the root of half the trace of its 2 x 2 block of A^-1."""
+    """Standard deviation per axis [px] of the point: root of half the trace of the 2 x 2 block of A^-1."""
     variance = 0.0
     for k in range(2):
         unit = np.zeros(_SIZE)

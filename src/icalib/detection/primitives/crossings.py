@@ -23,15 +23,15 @@ _SCALES = 3  # levels of the image pyramid; one more finds boards that are twice
 # Grey levels. A sharp corner of contrast c has up to 8 c. Doubled, a blurred board of the least contrast is missed.
 _LEAST_RESPONSE = 4 * LEAST_CONTRAST
 _PEAK_WINDOW_PX = 7  # width of the non-maximum suppression; corners less than 4 px apart merge
-_MOST_PEAKS = 500  # strongest of an image that are kept; the time grows with the square of it
+_MOST_PEAKS = 500  # strongest peaks of an image that are kept; the time grows with its square
 _NEIGHBOUR_PEAKS = 8  # peaks among which a corner's grid neighbours are looked for: four, and four diagonal ones
-# |p + q| of two opposite neighbours, at p and q from the corner, over the shorter of them: 0 but for perspective and
-# lens. Larger, peaks of random texture have opposite neighbours by chance.
+# Largest |p + q| / min(|p|, |q|) of two opposite neighbours at p and q from the corner: 0 without perspective and
+# distortion. If it were larger, random texture would have opposite neighbours by chance.
 _OPPOSITE = 0.25
-_LEAST_SINE = 0.3  # of the angle between rows and columns in the image: 17 degrees
-_MOST_MOVE = 0.2  # of a square's side, between a corner and its extrapolated place
-_CLEAR = 0.5  # of a square's side: the fitted window reaches no further
-_CONTINUED_SHARE = 0.5  # of the places beside one side of a board: with more X-corners there, the board is larger
+_LEAST_SINE = 0.3  # of the angle between rows and columns in the image, at least: 17 degrees
+_MOST_MOVE = 0.2  # of a square's side: largest distance of a corner from its extrapolated position
+_CLEAR = 0.5  # of a square's side: largest half width of the window
+_CONTINUED_SHARE = 0.5  # share of extrapolated positions beside a board with X-corners, above which the board is larger
 
 
 def shows_grid(image: np.ndarray, enough: float) -> bool:
@@ -54,7 +54,7 @@ def shows_grid(image: np.ndarray, enough: float) -> bool:
 
 
 def _largest_grid(at: np.ndarray) -> int:
-    """How many of the points at (n, 2) px are in the largest connected part of the graph of `_grid_links`."""
+    """Number of the points at (n, 2) px in the largest connected part of the graph of `_grid_links`."""
     if len(at) <= _NEIGHBOUR_PEAKS:
         return 0
     links = _grid_links(at)
@@ -66,9 +66,9 @@ def _largest_grid(at: np.ndarray) -> int:
 
 @njit(cache=True, nogil=True)
 def _grid_links(at):
-    """(n, n) bool: [i, j] where point i of at (n, 2) px has j as a neighbour in a grid.
+    """(n, n) bool: [i, j] is true if point j of at (n, 2) px is a grid neighbour of point i.
 
-    A point of a grid has two pairs of opposite neighbours, in two directions. Points without have no links of theirs.
+    A grid point has pairs of opposite neighbours in two directions. Points without two directions get no links.
     """
     n = len(at)
     links, distance = np.zeros((n, n), dtype=np.bool_), np.empty(n)
@@ -97,10 +97,10 @@ def _grid_links(at):
 
 
 def _chess_response(image: np.ndarray) -> np.ndarray:
-    """(h - 10, w - 10) float32: the ChESS response [grey levels] of the image (h, w) without its border of 5 px.
+    """(h - 10, w - 10) float32: ChESS response [grey levels] of the image (h, w), without a border of 5 px.
 
-    At an X-corner opposite samples are alike, those a quarter turn away differ, and the mean of the ring is that of the
-    middle: the response is the sum response less the difference and mean responses.
+    At an X-corner, opposite samples of the ring are equal, and samples a quarter turn apart differ. The mean of the
+    ring equals that of the centre. The response is the sum response minus the difference and mean responses.
     """
     grey = load_cv2().GaussianBlur(image, (0, 0), 1.0).astype(np.int16)
     h, w = grey.shape
@@ -118,10 +118,10 @@ def _chess_response(image: np.ndarray) -> np.ndarray:
 
 
 def continues_beyond(image: np.ndarray, framed: np.ndarray) -> bool:
-    """Whether the pattern continues beyond a side of the board: X-corners are at more than half of the places there.
+    """Whether the pattern continues beyond a side of the board: X-corners are at more than half of the extrapolated
+    positions there. A search for a small board must not accept a part of a larger one.
 
-    framed (rows + 2, cols + 2, 2) px: the inner corners, and a row or column extrapolated beyond each side. A search
-    for a small board must not take a part of a larger one for it.
+    framed (rows + 2, cols + 2, 2) px: the inner corners, and a row or column extrapolated beyond each side.
     """
     for turned in (framed, framed[::-1], framed.swapaxes(0, 1), framed.swapaxes(0, 1)[::-1]):
         beside, inner = turned[0], turned[1, 1:-1]
@@ -133,7 +133,7 @@ def continues_beyond(image: np.ndarray, framed: np.ndarray) -> bool:
 
 @njit(cache=True, nogil=True)
 def _crossings(image, at, ea, eb):
-    """How many X-corners are near the places at (n, 2) px; ea and eb (n, 2) px: along their edges, a square long."""
+    """Number of X-corners near the points at (n, 2) px; ea and eb (n, 2) px: along their edges, one square long."""
     count = 0
     for i in range(len(at)):
         most = _MOST_MOVE * min(hypot(ea[i, 0], ea[i, 1]), hypot(eb[i, 0], eb[i, 1])) + 1.0

@@ -1,4 +1,4 @@
-"""Compiled: reads the cells of a tag through a homography, and looks its pattern up."""
+"""Compiled: reads the cells of a tag through a homography, and looks up its pattern."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from icalib.base.compiled import njit
 
 _M1, _M2, _M4 = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333), np.uint64(0x0F0F0F0F0F0F0F0F)
 _SUM, _ONE, _TWO, _FOUR, _TOP = np.uint64(0x0101010101010101), np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
-_SPREAD = 0.2  # of a cell, between its centre and the other places where it is sampled
-_SHARPEN = 0.25  # times the Laplacian over cells, against the blur of small tags
+_SPREAD = 0.2  # of a cell: distance from its centre to the four other sampled points
+_SHARPEN = 0.25  # factor on the Laplacian over cells, which is added against the blur of small tags
 
 
 @njit(cache=True, nogil=True)
@@ -23,7 +23,7 @@ def popcount(x):
 
 @njit(cache=True, nogil=True)
 def least_distance(codes):
-    """Least number of cells by which two of the patterns (n, 4) uint64 differ, a pattern and its own turns included."""
+    """Least number of cells in which two of the patterns (n, 4) uint64 differ, rotations of one pattern included."""
     least = 64
     for i in range(len(codes)):
         for j in range(i, len(codes)):
@@ -35,7 +35,7 @@ def least_distance(codes):
 
 @njit(cache=True, nogil=True)
 def lookup(code, codes):
-    """(id, turn, wrong cells) of the pattern nearest to `code` (uint64)."""
+    """(id, turn, wrong cells) of the pattern nearest to `code` (uint64). codes (n, 4): patterns in four rotations."""
     best, best_id, best_turn = 65, -1, 0
     for i in range(len(codes)):
         for turn in range(4):
@@ -47,7 +47,7 @@ def lookup(code, codes):
 
 @njit(cache=True, nogil=True)
 def bilinear(image, u, v):
-    """Grey at (u, v), which must lie at least within the outermost pixel centres."""
+    """Grey level at (u, v) px by bilinear interpolation. (u, v) must lie within the outermost pixel centres."""
     x, y = int(u), int(v)
     x, y = min(x, image.shape[1] - 2), min(y, image.shape[0] - 2)
     a, b = u - x, v - y
@@ -57,14 +57,14 @@ def bilinear(image, u, v):
 
 
 def nearest_greys(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Grey levels (...) float64 of the image (h, w) in the pixels nearest to uv (..., 2) px, or the outermost ones."""
+    """Grey levels (...) float64 of the image (h, w) at the pixels nearest to uv (..., 2) px, clipped to the image."""
     u, v = np.moveaxis(np.rint(uv).astype(np.int64), -1, 0)
     return image[v.clip(0, image.shape[0] - 1), u.clip(0, image.shape[1] - 1)].astype(np.float64)
 
 
 @njit(cache=True, nogil=True)
 def unit_homography(quad):
-    """(3, 3) H from the unit square (0,0), (1,0), (1,1), (0,1) to the quad (4, 2)."""
+    """(3, 3) H from the unit square (0,0), (1,0), (1,1), (0,1) to the quad (4, 2); zeros if the quad is degenerate."""
     x0, y0, x1, y1 = quad[0, 0], quad[0, 1], quad[1, 0], quad[1, 1]
     x2, y2, x3, y3 = quad[2, 0], quad[2, 1], quad[3, 0], quad[3, 1]
     dx1, dx2, sx = x1 - x2, x3 - x2, x0 - x1 + x2 - x3
@@ -82,7 +82,7 @@ def unit_homography(quad):
 
 @njit(cache=True, nogil=True)
 def mapped(H, x, y):
-    """(u, v) of the point (x, y) under H; far outside every image where the point has no picture."""
+    """(u, v) of the point (x, y) under H; (-1e9, -1e9) if the point is not in front of the camera."""
     w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
     if w <= 1e-9:
         return -1e9, -1e9
@@ -91,7 +91,7 @@ def mapped(H, x, y):
 
 @njit(cache=True, nogil=True)
 def _sample(image, H, x, y, spread):
-    """Mean grey of five places about (x, y), NaN where one is outside the image."""
+    """Mean grey level of five points about (x, y), `spread` apart; NaN if one is outside the image."""
     total = 0.0
     for k in range(5):
         dx = spread * ((k == 1) - (k == 2))
@@ -105,9 +105,9 @@ def _sample(image, H, x, y, spread):
 
 @njit(cache=True, nogil=True)
 def cell_greys(image, H, n):
-    """(n + 2, n + 2) greys of the n x n cells of a tag and of the ring around it; NaN outside the image.
+    """(n + 2, n + 2) grey levels of the n x n cells of a tag and of the ring around it; NaN outside the image.
 
-    H takes the unit square to the tag. The ring is sampled half a cell outside the tag's edge.
+    H maps the unit square to the tag. The ring is sampled half a cell outside the tag's edge.
     """
     grey = np.empty((n + 2, n + 2))
     for row in range(n + 2):
@@ -118,7 +118,8 @@ def cell_greys(image, H, n):
 
 @njit(cache=True, nogil=True)
 def levels(grey, border):
-    """(black, white): mean of the cells of the tag's border, `border` wide, and of the ring without its corners."""
+    """(black, white): mean grey level of the tag's border, `border` cells wide, and of the ring around it without
+    corners."""
     n = len(grey) - 2
     black, n_black, white, n_white = 0.0, 0, 0.0, 0
     for row in range(n + 2):
@@ -140,7 +141,7 @@ def levels(grey, border):
 
 @njit(cache=True, nogil=True)
 def dark_in_ring(grey, threshold):
-    """How many places of the ring around the tag, without its corners, are not brighter than the threshold."""
+    """Number of samples of the ring around the tag, without its corners, that are not brighter than the threshold."""
     m, dark = len(grey) - 1, 0
     for k in range(1, m):
         dark += (not grey[0, k] > threshold) + (not grey[m, k] > threshold)
@@ -150,6 +151,7 @@ def dark_in_ring(grey, threshold):
 
 @njit(cache=True, nogil=True)
 def _sharpened(grey, row, col):
+    """Grey level of a cell with its negative Laplacian over cells added; the level itself beside unseen cells."""
     value, total = grey[row, col], 0.0
     total = grey[row - 1, col] + grey[row + 1, col] + grey[row, col - 1] + grey[row, col + 1]
     return value if np.isnan(total) else value + _SHARPEN * (4.0 * value - total)
@@ -157,7 +159,8 @@ def _sharpened(grey, row, col):
 
 @njit(cache=True, nogil=True)
 def read_cells(grey, border, threshold):
-    """(code, cells of the tag's border that are not black): data cells as uint64, unseen cells counted as black."""
+    """(code, wrong): data cells as uint64, row by row with white as 1, and the number of border cells that are white.
+    Cells outside the image count as black."""
     n = len(grey) - 2
     code, wrong = np.uint64(0), 0
     for row in range(1, n + 1):
@@ -173,7 +176,7 @@ def read_cells(grey, border, threshold):
 
 @njit(cache=True, nogil=True)
 def seen_cells(grey, border):
-    """uint64 with a one for each data cell that lies inside the image, packed as `read_cells` packs them."""
+    """uint64 with a one for each data cell inside the image, in the order of `read_cells`."""
     n = len(grey) - 2
     seen = np.uint64(0)
     for row in range(border + 1, n + 1 - border):

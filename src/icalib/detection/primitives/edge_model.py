@@ -1,7 +1,7 @@
-"""Compiled: the position of an L-corner, by a fit of a blurred step to each side and the sides' intersection.
+"""Compiled: position of an L-corner, by a fit of a blurred step to each side and the intersection of both.
 
-OpenCV's cornerSubPix pulls such corners inwards by 0.16 to 0.20 px under ordinary blur. A straight edge away from its
-ends is symmetric under blur, so its place is not biased, and neither is the point where two of them meet.
+OpenCV's cornerSubPix shifts such corners inwards by 0.16 to 0.20 px under ordinary blur. A straight edge away from its
+ends is symmetric under blur, so neither its position nor the intersection is biased.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from icalib.base.compiled import njit
 from icalib.sensors.camera.stream import EDGE
 
 _ITERATIONS = 10  # at most
-_CONVERGED_PX = 1e-3  # largest motion of the edge in the last step
-END_PX = 3.0  # left out at both ends of a side, where the corner's blur bends the edge
-_MOST_END = 0.25  # of the side
-_CURVED_FROM_PX = 24.0  # sides as long as that may be bent by the lens
-BLUR_RANGE_PX = (0.35, 6.0)  # below, the pixel's own width is the blur
-USUAL_BLUR_PX = 0.7  # standard deviation of a Gaussian, before it is measured; it only sets windows
+_CONVERGED_PX = 1e-3  # largest shift of the edge in the last step
+END_PX = 3.0  # length left out at both ends of a side, where the blurred corner bends the edge
+_MOST_END = 0.25  # of the side: the same, at most
+_CURVED_FROM_PX = 24.0  # length of a side from which its curvature is estimated, too
+BLUR_RANGE_PX = (0.35, 6.0)  # limits of the fitted blur; the least is about that of a pixel's width
+USUAL_BLUR_PX = 0.7  # standard deviation of the Gaussian before it is measured; it only sets windows
 LEAST_RISE = 4.0  # grey levels over 2 px at an edge
-_PER_UNIT = 128  # entries of the table of the error function: interpolated linearly, it is right to 2e-5
+_PER_UNIT = 128  # entries of the table of the error function per unit; linear interpolation is accurate to 2e-5
 _TABLE = np.array([(erf(k / _PER_UNIT), 2.0 / sqrt(pi) * np.exp(-((k / _PER_UNIT) ** 2))) for k in range(514)])
-_LEAST_SINE = 0.17  # of the angle between two sides: 10 degrees
+_LEAST_SINE = 0.17  # of the angle between two sides, at least: 10 degrees
 
 
 @njit(cache=True, nogil=True, inline="always")
 def error_function(z):
-    """(erf(z), its derivative), from a table: most of the time of a fit goes into them."""
+    """(erf(z), its derivative) from a table, because fits spend most of their time here."""
     at = abs(z) * _PER_UNIT
     if at >= 512.0:
         return (1.0 if z > 0.0 else -1.0), 0.0
@@ -41,7 +41,7 @@ def error_function(z):
 
 @njit(cache=True, nogil=True)
 def solve_small(A, b):
-    """x with A x = b for a small symmetric positive definite A (n, n); zeros where A is not."""
+    """x with A x = b for a small symmetric positive definite A (n, n); zeros if A is not positive definite."""
     n = len(b)
     L, x = np.zeros((n, n)), np.zeros(n)
     for i in range(n):
@@ -70,13 +70,16 @@ def solve_small(A, b):
 
 @njit(cache=True, nogil=True)
 def fit_step(image, u0, v0, u1, v1, end, half):
-    """(place (3,), blur, contrast, ends (2, 2)) of the edge from (u0, v0) to (u1, v1), bright on its left.
+    """(place (3,), blur, contrast, ends (2, 2)) of the edge from (u0, v0) to (u1, v1), with the bright side on its
+    left.
 
-    place are the coefficients of the offset [px] along the outward normal as a polynomial in the way along the side,
-    -1 to 1; the last, the bend, is zero for short sides. blur [px] is the Gaussian's. Pixels within `half` px of the
-    side are used, but not the last `end` px at both ends. ends: for each end the variance [px^2] of its offset for a
-    noise of one grey level where the bend is known, and the change of its offset where a bend that differs by 1 px from
-    the fitted one is known. NaN where there is no edge; contrast [grey levels] is zero there.
+    place: coefficients of the offset [px] along the outward normal, a quadratic polynomial of the position along the
+    side, -1 to 1. The quadratic one, the bend, is zero for short sides. blur [px]: of the Gaussian. contrast: grey
+    levels, zero if there is no edge. Pixels within `half` px of the side are used, except the last `end` px at both
+    ends.
+
+    ends, for each end of the side: first the variance [px^2] of its offset, for image noise of one grey level and a
+    known bend. Second, the change of its offset if the bend is fixed at 1 px more than fitted. NaN if there is no edge.
     """
     p, contrast, rows = _fitted_step(image, u0, v0, u1, v1, end, half)
     if contrast == 0.0:
@@ -86,16 +89,16 @@ def fit_step(image, u0, v0, u1, v1, end, half):
 
 @njit(cache=True, nogil=True)
 def step_blur(image, u0, v0, u1, v1, end, half):
-    """(blur, contrast) of `fit_step`."""
+    """(blur [px], contrast) of `fit_step`."""
     p, contrast, _ = _fitted_step(image, u0, v0, u1, v1, end, half)
     return p[2], contrast
 
 
 @njit(cache=True, nogil=True)
 def _fitted_step(image, u0, v0, u1, v1, end, half):
-    """(p (6,), contrast, rows (7, n)) of `fit_step`: parameters and, where they were fitted, the rows of the fit.
+    """(p (6,), contrast, rows (7, n)) of `fit_step`: the parameters, and the rows of `_fill_rows` from the last step.
 
-    Parameters: offset, slope, blur, low, high and, for a long side, bend.
+    Parameters: offset, slope, blur, low and high grey level, and for a long side the bend.
     """
     p = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     length = hypot(u1 - u0, v1 - v0)
@@ -125,7 +128,8 @@ def _fitted_step(image, u0, v0, u1, v1, end, half):
 
 @njit(cache=True, nogil=True)
 def _known_bend(rows):
-    """`ends` of `fit_step` from the rows of its fit: with the bend fixed, the other parameters follow it as -A^-1 a."""
+    """`ends` of `fit_step`, from the rows of its fit. If the bend changes, the other parameters change by -A^-1 a for
+    each px, where a are their products with the bend."""
     A, a, ends = np.zeros((5, 5)), np.empty(5), np.empty((2, 2))
     normal_equations(A, rows, rows[6])
     for j in range(5):
@@ -141,9 +145,9 @@ def _known_bend(rows):
 
 @njit(cache=True, nogil=True)
 def _strip(image, u0, v0, u1, v1, reach, half):
-    """(way, off, grey), each (n,), of the pixels within `reach` px along and `half` px across the side's middle.
+    """(t, off, grey), each (n,), of the pixels within `reach` px along and `half` px across the side's middle.
 
-    way is -1 to 1 from end to end, off [px] is positive on the left. None where the strip leaves the image.
+    t is -1 to 1 from end to end; off [px] is positive on the left. Empty if the strip leaves the image.
     """
     length = hypot(u1 - u0, v1 - v0)
     tu, tv = (u1 - u0) / length, (v1 - v0) / length
@@ -165,7 +169,7 @@ def _strip(image, u0, v0, u1, v1, reach, half):
 
 @njit(cache=True, nogil=True)
 def _fill_rows(rows, p, way, off, grey):
-    """rows (7, n): the grey's derivatives by the six parameters of the step at p (6,), and its error."""
+    """Fills rows (7, n): derivatives of the grey level by the six parameters p, and the residual."""
     contrast, blur = p[4] - p[3], p[2]
     for i in range(len(grey)):
         z = (off[i] - p[0] - way[i] * (p[1] + way[i] * p[5])) / blur
@@ -179,7 +183,7 @@ def _fill_rows(rows, p, way, off, grey):
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def row_product(a, b):
-    """a . b of (n,) each. The sum may be reordered: it is vectorised."""
+    """a . b of vectors (n,). The order of the sum is free, so that it is vectorised."""
     s = 0.0
     for i in range(len(a)):
         s += a[i] * b[i]
@@ -188,7 +192,8 @@ def row_product(a, b):
 
 @njit(cache=True, nogil=True)
 def normal_equations(A, rows, error):
-    """A (m, m) is filled from the first m of the rows (., n), the right side (m,) for the error (n,) returned."""
+    """Fills A (m, m), lower triangle, from the first m of the rows (., n); returns the right side (m,) for the
+    residuals `error` (n,)."""
     m = len(A)
     b = np.empty(m)
     for j in range(m):
@@ -201,7 +206,8 @@ def normal_equations(A, rows, error):
 
 @njit(cache=True, nogil=True)
 def _tangent(quad, k, place, u, v):
-    """(a, b, c), a u + b v = c: the tangent of the fitted side k of the quad, beside the point (u, v)."""
+    """(a, b, c) with a u + b v = c: tangent of the fitted side k of the quad, at the point nearest to (u, v) along the
+    side."""
     m = (k + 1) % 4
     length = hypot(quad[m, 0] - quad[k, 0], quad[m, 1] - quad[k, 1])
     tu, tv = (quad[m, 0] - quad[k, 0]) / length, (quad[m, 1] - quad[k, 1]) / length
@@ -216,20 +222,20 @@ def _tangent(quad, k, place, u, v):
 
 @njit(cache=True, nogil=True)
 def _sine(quad, k):
-    """Of the angle between the sides that meet in corner k of the quad."""
+    """Sine of the angle between the sides that meet in corner k of the quad."""
     a, b = quad[(k + 1) % 4] - quad[k], quad[(k + 3) % 4] - quad[k]
     return abs(a[0] * b[1] - a[1] * b[0]) / max(hypot(a[0], a[1]) * hypot(b[0], b[1]), 1e-12)
 
 
 @njit(cache=True, nogil=True)
 def _edge_row(quad, k, end, place, blur, gain, by_offset):
-    """(EDGE,) of side k of the quad, for the corner at its `end` (0: k, 1: k + 1); by_offset (2,): how the corner moves
-    with the side's offset there."""
+    """(EDGE,) of side k of the quad, as in `CornerStream`, for the corner at its `end` (0: k, 1: k + 1). by_offset
+    (2,): derivative of the corner by the side's offset there."""
     m, row = (k + 1) % 4, np.zeros(EDGE)
     eu, ev = quad[m, 0] - quad[k, 0], quad[m, 1] - quad[k, 1]
     square = eu * eu + ev * ev
     row[2 * (1 - end)], row[2 * (1 - end) + 1] = (eu, ev) if end == 0 else (-eu, -ev)
-    # Blur moves a bent edge towards its centre of curvature, by blur^2 / 2 times the curvature.
+    # Blur shifts a curved edge towards its centre of curvature, by blur^2 / 2 times the curvature.
     moved = gain * square / 8.0 - 0.5 * blur * blur
     row[4], row[5], row[6] = moved * by_offset[0], moved * by_offset[1], 8.0 * place[2] / square
     return row
@@ -237,12 +243,13 @@ def _edge_row(quad, k, end, place, blur, gain, by_offset):
 
 @njit(cache=True, nogil=True)
 def fit_corners(image, quad, end, half):
-    """(corners (4, 2), sigma (4,), blur (4,), edges (4, 2, EDGE)): the quad's corners where its fitted sides meet.
+    """(corners (4, 2), sigma (4,), blur (4,), edges (4, 2, EDGE)): intersections of the fitted sides of a dark quad.
 
-    The dark quad's corners run clockwise in the image and are right to about 1 px. Pixels within `half` px of a side
-    are used, but those less than `end` px from another side. sigma is the standard deviation [px] per axis for a noise
-    of one grey level where the sides' bends are known, NaN for a corner that was not found; blur [px] is the larger of
-    the two sides'; edges as in `CornerStream`.
+    The quad's corners are clockwise in the image and accurate to about 1 px. Pixels within `half` px of a side are
+    used, except those less than `end` px from another side.
+
+    sigma: standard deviation [px] per axis for image noise of one grey level and known bends of the sides, NaN if no
+    corner was found; blur [px]: the larger one of both sides; edges as in `CornerStream`.
     """
     place, ends, side_blur = np.empty((4, 3)), np.empty((4, 2, 2)), np.empty(4)
     for k in range(4):

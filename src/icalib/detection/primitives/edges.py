@@ -1,4 +1,4 @@
-"""Kernels that fit the edges of a dark quad: straight lines through edge points away from the corners."""
+"""Kernels that fit the sides of a dark quad: straight lines through edge points away from the corners."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.detection.primitives.decoding import bilinear
 
-_FROM_CORNER = 0.15  # of the side, left out at both ends of it
-_MAX_PROFILES = 24
-_OUTLIER_PX = 1.0
+_FROM_CORNER = 0.15  # of the side, left out at both ends
+_MAX_PROFILES = 24  # edge points of a side, at most
+_OUTLIER_PX = 1.0  # distance from the line above which an edge point is an outlier
 
 
 @njit(cache=True, nogil=True)
 def _edge_point(image, u, v, nu, nv, reach, least):
-    """Offset along (nu, nv) of the steepest rise of grey within `reach` px of (u, v); NaN if it is below `least`."""
+    """Offset [px] along (nu, nv) of the steepest rise of grey level within `reach` px of (u, v); NaN if it is below
+    `least`."""
     steps = int(2.0 * reach) + 1
     best, at, before, after, last = least, -1, 0.0, 0.0, 0.0
     for k in range(-steps, steps + 1):
@@ -38,7 +39,8 @@ def _edge_point(image, u, v, nu, nv, reach, least):
 
 @njit(cache=True, nogil=True)
 def _robust_line(t, d, used, bound):
-    """(offset, slope, fits) of d = offset + slope t over the points `used`; outliers are those further than `bound`."""
+    """(offset, slope, fits) of d = offset + slope t over the points `used`. Points farther than `bound` are outliers,
+    later those farther than _OUTLIER_PX."""
     offset, slope = np.median(d[used]), 0.0
     for _ in range(3):
         s, st, stt, sd, std = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -59,10 +61,10 @@ def _robust_line(t, d, used, bound):
 
 @njit(cache=True, nogil=True)
 def fit_side(image, u0, v0, u1, v1, reach, least):
-    """Line (a, b, c), a u + b v = c with (a, b) the outward normal, of the side from (u0, v0) to (u1, v1).
+    """Line (a, b, c) with a u + b v = c and outward normal (a, b), for the side from (u0, v0) to (u1, v1).
 
-    The dark side lies to the right of the way when v points down, as inside of a quad that is passed clockwise. All
-    are NaN where less than half of the profiles have a rise above `least` grey levels.
+    Seen from the first point, the dark region is on the right (v points down), as inside a quad with clockwise corners.
+    All are NaN if less than half of the profiles rise by more than `least` grey levels.
     """
     length = hypot(u1 - u0, v1 - v0)
     if length < 1e-6:
@@ -88,10 +90,10 @@ def fit_side(image, u0, v0, u1, v1, reach, least):
 
 @njit(cache=True, nogil=True)
 def fit_quad(image, quad, reach, least):
-    """(fits, quad (4, 2)): the quad's sides moved to the edges within `reach` px, intersected.
+    """(fits, quad (4, 2)): intersections of the quad's sides after each was moved to the edge within `reach` px.
 
-    The quad is dark, its corners clockwise in the image. It does not fit where a side has no edge, or where a corner
-    moves by more than twice `reach`.
+    The quad is dark, with clockwise corners in the image. fits is False if a side has no edge, or a corner moves by
+    more than twice `reach`, plus 1 px.
     """
     lines = np.empty((4, 3))
     for k in range(4):

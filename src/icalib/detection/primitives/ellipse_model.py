@@ -4,7 +4,7 @@
 
 c (2,) px is the centre; W (2, 2) 1/px maps the ellipse to the unit circle; Phi is the normal distribution function; d
 is the distance from the ellipse to first order (Sampson). The model is point symmetric about c. So is the image of an
-ellipse under blur and any response to light, which therefore do not bias the centre.
+ellipse under blur and any camera response, so that these do not bias the centre.
 
 The eight parameters are c (2), the shape S (S_00, S_11, S_01), blur [px], and the grey levels inside and outside. A
 step of the shape is W <- (I + S) W. S is symmetric because a rotation of the unit circle does not change the ellipse.
@@ -22,14 +22,16 @@ from icalib.detection.primitives.tags import LEAST_CONTRAST
 
 _SIZE = 8  # number of parameters
 _MOST_ELLIPSE_STEPS = 20  # at most; a fit that needs more counts as failed
-_CONVERGED_PX = 1e-3  # largest motion of the edge in the last step; far below the noise of a centre
-_MOST_STEP_PX = 1.0  # largest motion of the edge in one step: the model is linear about a blur's width
-_HALF_STRIP = (2.0, 3.0)  # px, and blurs, whichever is larger: half the width of the strip of pixels that is fitted
-_MOST_EDGE_STRIP = 0.6  # of the smaller half axis: the same, at most. More would take in the other side of the edge
-_FIRST_BLUR = 0.8  # px, start of the fit
-# Of the smaller half axis, and 1 px: from the start of the fit. Doubled, it may reach a neighbour.
+_CONVERGED_PX = 1e-3  # largest shift of the edge in the last step; far below the noise of a centre
+_MOST_STEP_PX = 1.0  # largest shift of the edge in one step: the model is linear over about the width of the blur
+_HALF_STRIP = (2.0, 3.0)  # px, and blurs, the larger of both: half width of the strip of fitted pixels
+_MOST_EDGE_STRIP = 0.6  # of the smaller half axis: the same, at most. More would include the opposite edge
+_FIRST_BLUR = 0.8  # px, start value
+# Largest shift of the centre from the start: this share of the smaller half axis, plus 1 px. Doubled, it may reach a
+# neighbour.
 _MOST_CENTRE_MOVE = 0.5
-LEAST_HALF_AXIS_PX = 2.5  # beside the blur; smaller ellipses have no plateau inside, and are called blurred
+# least half axis beyond the blur; smaller ellipses have no plateau inside, and are rejected as blurred
+LEAST_HALF_AXIS_PX = 2.5
 
 
 @njit(cache=True, nogil=True)
@@ -178,7 +180,8 @@ def _distance(W, x, y):
 
 @njit(cache=True, nogil=True)
 def _set_levels(image, p, W, half, x0, x1, y0, y1):
-    """Sets p[3], p[4] to the mean grey inside and outside, of the pixels of the strip furthest from the edge."""
+    """Sets p[3], p[4] to the mean grey levels inside and outside, from the pixels of the strip that are farthest from
+    the edge."""
     inside, n_inside, outside, n_outside = 0.0, 0, 0.0, 0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):

@@ -1,4 +1,4 @@
-"""Kernels that find the tags of a grid from those already found: each is looked for where its neighbours predict it."""
+"""Kernels that find further tags of a grid at the positions predicted by tags already found."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from icalib.detection.primitives.edges import fit_quad
 from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 
-_NEIGHBOURS = 3  # tags that predict another, none further than two tags away
-_LEAST_SEEN_CELLS = 12  # data cells of a tag that the image cuts
-_WRONG_CELLS = 0.15  # of the cells seen: the pattern is known, so many may be wrong
-_MOST_PREDICTION_ERROR = 0.12  # of a side: how far a corner may lie from where it is predicted
-LEAST_SIDE_PX = 6.0
+_NEIGHBOURS = 3  # tags that predict another, none farther than two rows or columns
+_LEAST_SEEN_CELLS = 12  # visible data cells of a tag that the image border cuts, at least
+_WRONG_CELLS = 0.15  # share of visible cells that may be wrong; it is large because the pattern is known
+_MOST_PREDICTION_ERROR = 0.12  # of a side: largest distance of a corner from its prediction
+LEAST_SIDE_PX = 6.0  # shortest side of a quad that is searched
 
 
 @njit(cache=True, nogil=True)
 def fit_homography(xy, uv, n):
-    """(3, 3) H from the first n >= 4 points xy (., 2) to uv (., 2), least squares after centring and scaling."""
+    """(3, 3) H from the first n >= 4 points xy (., 2) to uv (., 2): linear least squares after centring and scaling."""
     mx, my, mu, mv = xy[:n, 0].mean(), xy[:n, 1].mean(), uv[:n, 0].mean(), uv[:n, 1].mean()
     sx = 1.0 / max(np.abs(xy[:n, 0] - mx).max() + np.abs(xy[:n, 1] - my).max(), 1e-12)
     su = 1.0 / max(np.abs(uv[:n, 0] - mu).max() + np.abs(uv[:n, 1] - mv).max(), 1e-12)
@@ -52,10 +52,11 @@ def fit_homography(xy, uv, n):
 
 
 def homography_misfit(corners: np.ndarray, quads: np.ndarray) -> float:
-    """Median distance of the quads (m, 4, 2) px from where one homography puts the tags' corners (m, 4, 2) of a board.
+    """Median distance between the quads (m, 4, 2) px and the projected corners (m, 4, 2) of the tags, over the median
+    side of a quad.
 
-    It is in sides of a tag in the image. The homography is the least-squares one of all corners. A corner that it sees
-    from behind counts as infinitely far.
+    The projection is the least-squares homography of all corners. A corner that it maps behind the camera counts as
+    infinitely far.
     """
     xy, uv = np.ascontiguousarray(corners.reshape(-1, 2)), np.ascontiguousarray(quads.reshape(-1, 2))
     placed = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) @ fit_homography(xy, uv, len(xy)).T
@@ -67,6 +68,7 @@ def homography_misfit(corners: np.ndarray, quads: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True)
 def _product(A, B):
+    """A B of matrices (3, 3)."""
     C = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -77,9 +79,10 @@ def _product(A, B):
 
 @njit(cache=True, nogil=True)
 def predict(tag, known, quads, board, cols):
-    """(number of neighbours, quad (4, 2)) that the nearest known tags predict for a tag; 0 without neighbours.
+    """(number of neighbours, quad (4, 2) px): the quad of a tag, predicted by the nearest known tags; 0 without
+    neighbours.
 
-    board (n, 4, 2) are the corners on the board, quads those in the image, known (n,) bool.
+    board (n, 4, 2): corners on the board; quads (n, 4, 2) px; known (n,) bool.
     """
     xy, uv, n = np.empty((4 * _NEIGHBOURS, 2)), np.empty((4 * _NEIGHBOURS, 2)), 0
     row, col = tag // cols, tag % cols
@@ -101,13 +104,14 @@ def predict(tag, known, quads, board, cols):
 
 @njit(cache=True, nogil=True)
 def side_vectors(quad, k):
-    """The two sides (2,) px of the quad that leave its corner k."""
+    """The two sides (2,) px of the quad that start at its corner k."""
     return quad[(k + 1) % 4] - quad[k], quad[(k + 3) % 4] - quad[k]
 
 
 @njit(cache=True, nogil=True)
 def _fitted(image, quad, clear, crossing):
-    """(number of corners found, quad) near a predicted quad. Corners that are not found move on with the others."""
+    """(number of corners found, quad) near a predicted quad. Corners that are not found are shifted by the mean shift
+    of the others."""
     side = shortest_side(quad)
     if crossing:
         most, corners, n_found = _MOST_PREDICTION_ERROR * side + 1.0, quad.copy(), 0
@@ -129,7 +133,7 @@ def _fitted(image, quad, clear, crossing):
 
 @njit(cache=True, nogil=True)
 def _is_tag(image, quad, pattern, bits, border):
-    """Whether the cells inside the quad that the image shows are those of the pattern (uint64)."""
+    """Whether the visible cells inside the quad agree with the pattern (uint64)."""
     n = bits + 2 * border
     grey = cell_greys(image, unit_homography(quad), n)
     black, white = levels(grey, border)
@@ -143,9 +147,10 @@ def _is_tag(image, quad, pattern, bits, border):
 
 @njit(cache=True, nogil=True)
 def confirm(image, known, quads, patterns, bits, border, clear, crossing):
-    """(n,) bool: which of the `known` tags are where their quads (n, 4, 2) px, right to some pixels, expect them.
+    """(n,) bool: which of the `known` tags the image shows near their quads (n, 4, 2) px, which are accurate to some
+    pixels.
 
-    The quads of these are moved to what was found. The other arguments are those of `grow`.
+    Quads of confirmed tags are moved to the measured corners. The other arguments are those of `grow`.
     """
     there = np.zeros(len(known), dtype=np.bool_)
     for tag in range(len(known)):
@@ -158,7 +163,7 @@ def confirm(image, known, quads, patterns, bits, border, clear, crossing):
 
 @njit(cache=True, nogil=True)
 def markers_there(image, quads, patterns, bits, border):
-    """(n,) bool: at which of the quads (n, 4, 2) px the image shows the pattern (n,) uint64."""
+    """(n,) bool: whether the image shows pattern i (n,) uint64 inside quad i (n, 4, 2) px."""
     there = np.zeros(len(quads), dtype=np.bool_)
     for i in range(len(quads)):
         there[i] = _is_tag(image, quads[i], patterns[i], bits, border)
@@ -167,12 +172,13 @@ def markers_there(image, quads, patterns, bits, border):
 
 @njit(cache=True, nogil=True)
 def grow(image, known, quads, board, cols, patterns, bits, border, clear, crossing):
-    """Adds to known (n,) bool and quads (n, 4, 2) px the tags that are found where their neighbours predict them.
+    """Adds to known (n,) bool and quads (n, 4, 2) px the tags that are found at their predictions by neighbours.
 
-    patterns (n,) uint64 are those of the tags of the board. With `crossing` the tags' corners touch other dark squares,
-    and a tag that the image cuts is found by two of its corners.
+    patterns (n,) uint64: of the board's tags. bits, border: data cells along a side, and width of the black border in
+    cells. clear: distance of the nearest other feature, in sides. With `crossing` the tags' corners touch other dark
+    squares; then two corners suffice, so that a tag cut by the image border is found.
     """
-    tried = np.zeros(len(known), dtype=np.int64)  # with how many neighbours
+    tried = np.zeros(len(known), dtype=np.int64)  # number of neighbours at the last attempt
     changed = True
     while changed:
         changed = False

@@ -1,7 +1,7 @@
-"""Predicts where the corners of the next image are, and kernels that fill in the other corners of a board.
+"""Prediction of corners in the next image, and of the missing corners of a board from the known ones.
 
-Corners are extrapolated image by image: with constant acceleration [px / image^2] from three images, with constant
-velocity [px / image] from two.
+Corners are extrapolated from image to image: with constant acceleration from three images, with constant velocity from
+two.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class PredictedCorners(NamedTuple):
 
 
 def predict_corners(before: Sequence[ImageCorners]) -> PredictedCorners | None:
-    """The corners of the last image of `before` (oldest first), moved to where the next image should show them.
+    """The corners of the last image of `before` (oldest first), extrapolated to the next image.
 
-    The step of a corner needs its place in the last three images. A corner that one of them lacks takes the step of
-    the nearest corner that has one. Where three images share fewer than four corners, the last two are used. None
-    where these share fewer than four, too, or there are fewer than two images.
+    The step of a corner needs its position in the last three images. A corner that is missing in one of them gets the
+    step of the nearest corner that has one. If three images share fewer than four corners, the last two are used. None
+    if these share fewer than four as well, or if there are fewer than two images.
     """
     if len(before) < 2:
         return None
@@ -67,10 +67,10 @@ def predict_corners(before: Sequence[ImageCorners]) -> PredictedCorners | None:
 
 @njit(cache=True, nogil=True)
 def predict_nodes(at, uv, rows, cols):
-    """(rows, cols, 2) px: where all corners of a board are, from the known ones.
+    """(rows, cols, 2) px: positions of all corners of a board, from the known ones.
 
-    at (n, 2) int64: row and column of the known corners; uv (n, 2) px: where these are, which is kept. Each other one
-    is placed by the homography of the known corners nearest to it on the board.
+    at (n, 2) int64: row and column of the known corners; uv (n, 2) px: their positions, which are kept. Each other
+    corner is predicted by the homography of the known corners nearest to it on the board.
     """
     out, known = np.empty((rows, cols, 2)), np.zeros((rows, cols), dtype=np.bool_)
     on_board = at.astype(np.float64)

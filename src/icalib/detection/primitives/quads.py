@@ -1,4 +1,4 @@
-"""Dark quads in an image: candidates for tags."""
+"""Dark quads in an image, which are candidates for tags."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from icalib.base.extras import load_cv2
 from icalib.detection.primitives.corners import checked_image
 
-_QUAD_CONTRAST = 7  # grey levels below the local mean
-_LEAST_SIDE_PX = 7.0
-_LEAST_FILL = 0.75  # of the area of its quad that a contour covers
-_STRAIGHT_SIDE = 0.05  # of the perimeter: how far a contour may leave its polygon
-_WINDOW_SHARES = (0.08, 0.03, 0.2)  # of the width of the image
+_QUAD_CONTRAST = 7  # grey levels below the local mean at which a pixel is dark
+_LEAST_SIDE_PX = 7.0  # longer side of the bounding box, at least
+_LEAST_FILL = 0.75  # share of its quad's area that a contour covers, at least
+_STRAIGHT_SIDE = 0.05  # of the perimeter: largest distance of a contour from its polygon
+_WINDOW_SHARES = (0.08, 0.03, 0.2)  # widths of the windows of the local mean, as shares of the image's width
 
 
 @dataclass(frozen=True, eq=False)
 class ImageWithQuads:
-    """An image (h, w) uint8 and its dark quads: what one detector has worked out serves the next one.
+    """An image (h, w) uint8 with a cache of its dark quads, which several detectors share.
 
     Raises RecordingError for an image that is not grey with 8 bits.
     """
@@ -31,21 +31,22 @@ class ImageWithQuads:
 
     @property
     def windows(self) -> tuple[int, ...]:
-        """Those of `threshold_windows`."""
+        """Windows [px] of `threshold_windows` for this image."""
         return threshold_windows(self.image.shape[1])
 
     def quads(self, window: int, separate: bool) -> np.ndarray:
-        """As `dark_quads`."""
+        """`dark_quads` of the image, from the cache if known."""
         if (window, separate) not in self._quads:
             self._quads[window, separate] = dark_quads(self.image, window, separate)
         return self._quads[window, separate]
 
 
 def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
-    """(n, 4, 2) corners, clockwise in the image, of dark regions with about four straight sides, to about 2 px.
+    """(n, 4, 2) px: clockwise corners of dark regions with about four straight sides, accurate to about 2 px.
 
-    image (h, w) uint8; dark is what is darker than the mean of `window` x `window` px (odd). `separate` takes the
-    outermost pixel off all dark regions first, so that tags whose corners touch other dark squares come apart.
+    image (h, w) uint8. Pixels are dark if they are darker than the mean of `window` x `window` px (odd). With
+    `separate`, dark regions are first eroded by one pixel, so that tags whose corners touch other dark squares are
+    separated.
     """
     cv2 = load_cv2()
     dark = cv2.adaptiveThreshold(
@@ -66,6 +67,8 @@ def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
 
 
 def _quad(cv2, contour: np.ndarray) -> np.ndarray | None:
+    """The quad (4, 2) of a contour, clockwise; None if it is too small, has not four corners, or fills too little of
+    its quad."""
     _, _, width, height = cv2.boundingRect(contour)
     if max(width, height) < _LEAST_SIDE_PX or min(width, height) < 0.25 * _LEAST_SIDE_PX:
         return None
@@ -81,11 +84,11 @@ def _quad(cv2, contour: np.ndarray) -> np.ndarray | None:
 
 
 def _grown(quad: np.ndarray) -> np.ndarray:
-    """The quad with its corners one diagonal pixel further from its centre."""
+    """The quad with each corner moved outwards by one diagonal pixel."""
     out = quad - quad.mean(axis=0)
     return quad + np.sqrt(2.0) * out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
 def threshold_windows(width: int) -> tuple[int, ...]:
-    """Windows [px] for `dark_quads` in images of this width, the one that finds most tags first."""
+    """Windows [px] of `dark_quads` for images of this width, in the order in which they are tried."""
     return tuple(max(2 * int(0.5 * share * width) + 1, 11) for share in _WINDOW_SHARES)

@@ -1,4 +1,4 @@
-"""Kernels that refine the corners of many tags at once and measure what their quality follows from."""
+"""Kernels that refine the corners of many tags at once, and measure the quality of each corner."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from icalib.detection.primitives.saddles import MARGIN_BLURS
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 from icalib.sensors.camera.stream import EDGE
 
-_MOST_CORNER_MOVE = (2.0, 0.03)  # px, and of a side: how far a corner may lie from where it was found roughly
-_LEAST_STRIP_PX = 1.5  # fitted on each side of an edge
-_MOST_STRIP = (4.0, 3.0)  # px, and blurs: the same
-_STRIP_BLURS = 2.25  # how far, in blurs, the strip along an edge keeps away from other features
-_BLUR_STRIP = (2.5, 0.06)  # px, and of a side: fitted on each side of an edge where only the blur is wanted
-_LEAST_INSET_PX = (1.0, 0.5)  # as LEAST_WINDOW_PX, for features that lie in the dark and in the white fields
-_END_BLURS = 2.4  # left out at the ends of a side
-MEASURES = 5  # rows of `quality` before those of the edges
+# px, and of a side, the larger of both: largest distance of a corner from its rough position
+_MOST_CORNER_MOVE = (2.0, 0.03)
+_LEAST_STRIP_PX = 1.5  # least half width of the fitted strip along an edge
+_MOST_STRIP = (4.0, 3.0)  # px, and blurs: largest half width of the same strip
+_STRIP_BLURS = 2.25  # blurs between the strip along an edge and other features
+_BLUR_STRIP = (2.5, 0.06)  # px, and of a side: largest half width of the strip if only the blur is measured
+_LEAST_INSET_PX = (1.0, 0.5)  # as LEAST_WINDOW_PX, for features in the dark and in the white fields
+_END_BLURS = 2.4  # blurs left out at the ends of a side
+MEASURES = 5  # number of rows of `quality` before those of the edges
 
 
 @njit(cache=True, nogil=True)
@@ -35,13 +36,13 @@ def _shape(quad, k):
 
 @njit(cache=True, nogil=True)
 def _strip(least, blur, most):
-    """Half the width [px] of the strip along an edge, the nearest other feature being `least` px away."""
+    """Half width [px] of the strip along an edge, if the nearest other feature is `least` px away."""
     return min(max(least - _STRIP_BLURS * blur, _LEAST_STRIP_PX), most)
 
 
 @njit(cache=True, nogil=True)
 def _measured_blur(image, quad, k, least):
-    """Blur [px] across the sides k and k + 2 of the quad, NaN where neither has an edge."""
+    """Blur [px] across side k of the quad, or side k + 2 if k has no edge; NaN if neither has one."""
     most = max(_BLUR_STRIP[0], _BLUR_STRIP[1] * shortest_side(quad))
     for m in (k, k + 2):
         u0, v0, u1, v1 = quad[m, 0], quad[m, 1], quad[(m + 1) % 4, 0], quad[(m + 1) % 4, 1]
@@ -53,7 +54,7 @@ def _measured_blur(image, quad, k, least):
 
 @njit(cache=True, nogil=True)
 def _measured_blurs(image, quads, least):
-    """(n, 2) blur [px] across each quad's sides 0 and 1; where they have no edge, what is usual in this image."""
+    """(n, 2) blur [px] across each quad's sides 0 and 1; the median over the image if they have no edge."""
     blur = np.empty((len(quads), 2))
     for i in range(len(quads)):
         for k in range(2):
@@ -69,7 +70,7 @@ def _measured_blurs(image, quads, least):
 
 @njit(cache=True, nogil=True)
 def _shapes(quads, quality):
-    """Fills sine, height and side of `quality`; (n,) the least height [px] of each quad is returned."""
+    """Fills the rows sine, height and side of `quality`; returns (n,) the least height [px] of each quad."""
     least = np.empty(len(quads))
     for i in range(len(quads)):
         for k in range(4):
@@ -80,12 +81,11 @@ def _shapes(quads, quality):
 
 @njit(cache=True, nogil=True)
 def refined_crossings(image, quads, surroundings):
-    """(uv (n, 4, 2), quality (5 + 2 EDGE, n, 4)) of the X-corners of the quads (n, 4, 2).
+    """(uv (n, 4, 2) px, quality (5 + 2 EDGE, n, 4)) of the X-corners at the quads (n, 4, 2) px.
 
-    `surroundings` as in `fit_crossing`.
-    quality: sigma [px] per axis for a noise of one grey level, NaN where there is no corner; blur [px]; sine of the
-    angle between the edges; by how much the distance to the nearest other feature exceeds what the smallest window
-    needs [px]; shorter side [px]; what the two edges of the corner are, as in `CornerStream`.
+    surroundings: as in `fit_crossing`. Rows of quality: sigma [px] per axis for image noise of one grey level, NaN if
+    there is no corner; blur [px]; sine of the angle between the edges; distance to the nearest other feature minus the
+    distance that the smallest window needs [px]; shorter side [px]; both edges of the corner, as in `CornerStream`.
     """
     uv, quality = np.empty(quads.shape), np.empty((MEASURES + 2 * EDGE, len(quads), 4))
     blur = _measured_blurs(image, quads, surroundings.min() * _shapes(quads, quality))
@@ -110,9 +110,9 @@ def refined_crossings(image, quads, surroundings):
 
 @njit(cache=True, nogil=True)
 def refined_corners(image, quads, clear):
-    """As `refined_crossings`, of the L-corners of dark quads whose corners run clockwise in the image.
+    """As `refined_crossings`, for the L-corners of dark quads with clockwise corners in the image.
 
-    `clear` is the distance of the nearest other feature in units of the quad's sides.
+    clear: distance of the nearest other feature, in units of the quad's sides.
     """
     uv, quality = np.empty(quads.shape), np.empty((MEASURES + 2 * EDGE, len(quads), 4))
     least = clear * _shapes(quads, quality)

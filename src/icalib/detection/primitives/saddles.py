@@ -1,4 +1,4 @@
-"""Kernels about corners where two dark squares touch, X-corners: their windows, and where they roughly are."""
+"""Kernels for X-corners, where two dark squares touch: windows around them, and their rough positions."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.detection.primitives.decoding import bilinear
 
-_LEAST_HALF_PX = 2.0  # half the width of the window of `find_saddle`
-_MOST_HALF = (6.0, 0.1)  # px, and of a side: half the width of the same window
-MARGIN_BLURS = 1.5  # how far, in blurs, a neighbouring feature reaches into the window
+_LEAST_HALF_PX = 2.0  # least half width of the window of `find_saddle`
+_MOST_HALF = (6.0, 0.1)  # px, and of a side, the larger of both: largest half width of the same window
+MARGIN_BLURS = 1.5  # blurs between the window and a neighbouring feature
 _ITERATIONS = 12
 _CONVERGED_PX = 0.02
-_LEAST_ROOM_PX = 1.5  # half a window's width beside the image's border
-LEAST_SINE = 0.17  # of the angle between the edges: 10 degrees
+_LEAST_ROOM_PX = 1.5  # least half width of a window that the image border limits
+LEAST_SINE = 0.17  # of the angle between the edges, at least: 10 degrees
 
 
 @njit(cache=True, nogil=True)
 def window_frame(ea, eb, clear, blur, least, most):
-    """(sa, sb, sine): half a window's width in units of the sides ea, eb (2,) px that meet in the corner.
+    """(sa, sb, sine): half widths of a window in units of the sides ea, eb (2,) px that meet in the corner, and the
+    sine between the sides.
 
-    `clear` is the distance of the nearest other feature in the same units. The window keeps away from it by 1.5 times
-    the blur [px], but half of it is at least `least` px wide across the edges, and at most `most` px.
+    clear: distance of the nearest other feature, in the same units. The window keeps MARGIN_BLURS blurs [px] away from
+    it, but its half width across the edges is between `least` and `most` px.
     """
     la, lb = hypot(ea[0], ea[1]), hypot(eb[0], eb[1])
     sine = abs(ea[0] * eb[1] - ea[1] * eb[0]) / max(la * lb, 1e-12)
@@ -35,7 +36,7 @@ def window_frame(ea, eb, clear, blur, least, most):
 
 @njit(cache=True, nogil=True)
 def room_for(image, u, v, ea, eb, sa, sb):
-    """By what factor, at most 1, a window must be scaled so that all its pixels have neighbours in the image."""
+    """Factor, at most 1, by which a window must be scaled so that all its pixels have neighbours in the image."""
     ru = abs(ea[0]) * sa + abs(eb[0]) * sb
     rv = abs(ea[1]) * sa + abs(eb[1]) * sb
     room_u, room_v = min(u, image.shape[1] - 1.0 - u) - 1.0, min(v, image.shape[0] - 1.0 - v) - 1.0
@@ -44,7 +45,7 @@ def room_for(image, u, v, ea, eb, sa, sb):
 
 @njit(cache=True, nogil=True)
 def window_bounds(u, v, ea, eb, sa, sb):
-    """(u0, u1, v0, v1) of the pixels that the window may touch."""
+    """(u0, u1, v0, v1): bounding box of the window, in whole pixels."""
     ru = abs(ea[0]) * sa + abs(eb[0]) * sb
     rv = abs(ea[1]) * sa + abs(eb[1]) * sb
     return int(np.ceil(u - ru)), int(np.floor(u + ru)), int(np.ceil(v - rv)), int(np.floor(v + rv))
@@ -52,6 +53,7 @@ def window_bounds(u, v, ea, eb, sa, sb):
 
 @njit(cache=True, nogil=True)
 def _weight(du, dv, ea, eb, det, sa, sb):
+    """Weight of a pixel at (du, dv) from the corner: 1 there, 0 at the edge of the window."""
     s = (du * eb[1] - dv * eb[0]) / det / sa
     t = (ea[0] * dv - ea[1] * du) / det / sb
     s, t = 1.0 - s * s, 1.0 - t * t
@@ -60,7 +62,7 @@ def _weight(du, dv, ea, eb, det, sa, sb):
 
 @njit(cache=True, nogil=True)
 def _gradient(image, x, y):
-    """Central differences; float before the difference, for grey levels are unsigned."""
+    """Central differences (gu, gv). Grey levels are unsigned, so they are converted before the difference."""
     gu = 0.5 * (float(image[y, x + 1]) - float(image[y, x - 1]))
     gv = 0.5 * (float(image[y + 1, x]) - float(image[y - 1, x]))
     return gu, gv
@@ -68,16 +70,17 @@ def _gradient(image, x, y):
 
 @njit(cache=True, nogil=True)
 def _coarse_frame(ea, eb, clear, blur):
+    """`window_frame` with the limits of `find_saddle`."""
     most = max(_MOST_HALF[0], _MOST_HALF[1] * min(hypot(ea[0], ea[1]), hypot(eb[0], eb[1])))
     return window_frame(ea, eb, clear, blur, _LEAST_HALF_PX, most)
 
 
 @njit(cache=True, nogil=True)
 def find_saddle(image, u, v, ea, eb, clear, blur, max_move):
-    """(found, u, v): the point within `max_move` px of (u, v) towards which all gradients are perpendicular.
+    """(found, u, v): the point within `max_move` px of (u, v) to which the gradients around it are perpendicular.
 
-    ea, eb (2,) px are the sides of the dark square that meet in the corner, `clear` is how far, in units of them, the
-    nearest other feature is, blur [px] that of the image. Right to some tenths of a pixel, from some pixels away.
+    ea, eb (2,) px: sides of the dark square that meet in the corner; clear: distance of the nearest other feature, in
+    units of the sides; blur [px]: of the image. Accurate to some tenths of a pixel, from a start some pixels away.
     """
     sa, sb, sine = _coarse_frame(ea, eb, clear, blur)
     det = ea[0] * eb[1] - ea[1] * eb[0]
@@ -99,7 +102,8 @@ def find_saddle(image, u, v, ea, eb, clear, blur, max_move):
 
 @njit(cache=True, nogil=True)
 def _step(image, u, v, ea, eb, det, sa, sb):
-    """From (u, v) to the point that the gradients of the window about it are perpendicular to; NaN if there is none."""
+    """(du, dv): step from (u, v) to the point to which the gradients in the window are perpendicular; NaN if there is
+    none."""
     u0, u1, v0, v1 = window_bounds(u, v, ea, eb, sa, sb)
     a, b, c, p, q = 0.0, 0.0, 0.0, 0.0, 0.0
     for y in range(v0, v1 + 1):
@@ -121,7 +125,8 @@ def _step(image, u, v, ea, eb, det, sa, sb):
 
 @njit(cache=True, nogil=True)
 def crossing_contrast(image, u, v, ea, eb, clear, blur):
-    """Least white minus most black grey of the four fields about an X-corner; the dark one lies between ea and eb."""
+    """Least white minus most black grey level of the four fields about an X-corner, negative if it is none. The field
+    between ea and eb is dark."""
     sa, sb, _ = _coarse_frame(ea, eb, clear, blur)
     room = 0.6 * room_for(image, u, v, ea, eb, sa, sb)
     sa, sb = room * sa, room * sb

@@ -1,4 +1,4 @@
-"""Boards of black and white squares: their inner corners, each where two dark squares touch."""
+"""Boards of black and white squares: detection of their inner corners, in each of which two dark squares touch."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from icalib.detection.primitives.refinement import refined_crossings
 from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 
-_MOST_SQUARE_MOVE = 0.15  # of a side: how far a corner may lie from where it is expected
-_CLEAR = 0.5  # squares, from a corner to the nearest other feature: the next corner is as far from the same place
-_LEAST_CORNERS = 24  # found as corners of dark squares, two for most corners, that place the rest of the board
-_LEAST_CLEAR_PX = 3.0  # to the nearest other feature; nearer ones leave windows of the least size, whatever the sides
+_MOST_SQUARE_MOVE = 0.15  # of a side: largest distance of a corner from its expected position
+_CLEAR = 0.5  # squares: half the distance to the next corner, at which its window begins
+_LEAST_CORNERS = 24  # corners of dark squares (most corners have two) from which the whole board can be predicted again
+# distance of the nearest other feature, below which a second search would use windows of the least size, too
+_LEAST_CLEAR_PX = 3.0
 
 
 def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, inset: float) -> ImageCorners:
-    """Inner corners of a board of `rows` x `cols` squares, numbered row by row, each refined and judged.
+    """Inner corners of a board of `rows` x `cols` squares, numbered row by row, refined and with verdicts.
 
-    image (h, w) uint8. expected (rows + 1, cols + 1, 2) px, all corners of the squares, right to some 0.15 squares; its
-    columns and rows turn with the clock in the image. dark (rows, cols) bool. `inset` is how far from the edges of the
-    white squares markers begin [squares], inf without markers.
+    image (h, w) uint8. expected (rows + 1, cols + 1, 2) px: all corners of the squares, accurate to about 0.15 squares;
+    columns and rows turn clockwise in the image. dark (rows, cols) bool. inset: distance of markers from the edges of
+    the white squares [squares], inf without markers.
     """
     rows, cols = dark.shape
     uv, sigma, quality = np.zeros((rows + 1, cols + 1, 2)), np.full((rows + 1, cols + 1), np.nan), {}
@@ -37,7 +38,7 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
     clear = min(inset, _CLEAR)
     quads, found = _roughly(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
     if found.sum() >= _LEAST_CORNERS and clear * _usual_side(quads) >= _LEAST_CLEAR_PX:
-        # Once more from where the corners are, so that nothing depends on where they were expected.
+        # Search again from the corners found, so that the result does not depend on `expected`.
         expected = predict_nodes(at[found], quads[found], rows + 1, cols + 1)
         quads, found = _roughly(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
     usable = np.array([shortest_side(quad) >= LEAST_SIDE_PX for quad in quads], dtype=bool)
@@ -51,11 +52,13 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
 
 
 def _usual_side(quads: np.ndarray) -> float:
-    """The median side [px] of the quads (n, 4, 2)."""
+    """Median side [px] of the quads (n, 4, 2)."""
     return float(np.median(np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2)))
 
 
 def _judged(uv: np.ndarray, quality: dict, cols: int, shape: tuple[int, ...]) -> ImageCorners:
+    """Corners with verdicts. quality: measures of `refined_crossings` by (row, col) of the corner; shape: of the
+    image."""
     if not quality:
         return no_corners()
     where = np.array(sorted(quality), dtype=np.int64).reshape(-1, 2)
@@ -69,7 +72,8 @@ def _judged(uv: np.ndarray, quality: dict, cols: int, shape: tuple[int, ...]) ->
 
 @njit(cache=True, nogil=True)
 def _roughly(image, quads, inner, clear):
-    """(quads (n, 4, 2), found (n, 4)): dark squares, those of their corners that are `inner` moved to the saddles."""
+    """(quads (n, 4, 2), found (n, 4)): dark squares, with those corners that are `inner` moved to saddles, and whether
+    each was found."""
     out, found = quads.copy(), np.zeros(inner.shape, dtype=np.bool_)
     for i in range(len(quads)):
         for k in range(4):

@@ -14,15 +14,16 @@ from icalib.detection.primitives.families import Family
 from icalib.detection.primitives.quads import ImageWithQuads
 
 LEAST_CONTRAST = 16.0  # grey levels between black and white of a tag
-_WRONG_BORDER = 0.15  # of the cells of the black border
-_WRONG_RING = 0.15  # of the places in the white around the tag
+_WRONG_BORDER = 0.15  # share of the cells of the black border that may be white
+_WRONG_RING = 0.15  # share of the samples around the tag that may be dark
 
 
 @dataclass(frozen=True)
 class Tags:
-    """Tags in one image: ids (n,) int64; quads (n, 4, 2) px, to about 0.2 px; contrast (n,) grey levels.
+    """Tags in one image: ids (n,) int64; quads (n, 4, 2) px, accurate to about 0.2 px; contrast (n,) grey levels.
 
-    The corners run clockwise in the image of a tag that is not mirrored, from the top left of OpenCV's picture of it.
+    The corners of a tag that is not mirrored are clockwise in the image, from the top left corner of OpenCV's picture
+    of it.
     """
 
     ids: np.ndarray
@@ -33,8 +34,8 @@ class Tags:
 def find_tags(view: ImageWithQuads, family: Family, border_bits: int, window: int, separate: bool) -> Tags:
     """All tags of `family` with a black border of `border_bits` cells.
 
-    An id may appear more than once, and a tag that was found as two quads appears once. `window` and `separate` are
-    those of `dark_quads`.
+    An id may appear more than once; a tag that was found as two quads appears once. `window` and `separate` are those
+    of `dark_quads`.
     """
     return tags_at(view.image, view.quads(window, separate), family, border_bits)
 
@@ -47,7 +48,7 @@ def tags_at(image: np.ndarray, quads: np.ndarray, family: Family, border_bits: i
 
 
 def _first_of_each(ids: np.ndarray, quads: np.ndarray) -> np.ndarray:
-    """Rows of the tags that were read, without those that repeat one with the same id at the same place."""
+    """Rows of the decoded tags, without repetitions of one with the same id at the same position."""
     keep: list[int] = []
     for row in np.flatnonzero(ids >= 0):
         center = quads[row].mean(axis=0)
@@ -60,6 +61,7 @@ def _first_of_each(ids: np.ndarray, quads: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def _decode_all(image, quads, bits, border, codes, max_errors):
+    """(ids (n,), quads (n, 4, 2), contrast (n,)) of the quads after a fit of their sides; id -1 if a quad is no tag."""
     n = len(quads)
     ids, contrast = np.full(n, -1, dtype=np.int64), np.zeros(n)
     fitted = np.empty((n, 4, 2))
@@ -78,7 +80,7 @@ def _decode_all(image, quads, bits, border, codes, max_errors):
 
 @njit(cache=True, nogil=True)
 def shortest_side(quad):
-    """Length of the shortest side of the quad (4, 2)."""
+    """Length [px] of the shortest side of the quad (4, 2)."""
     least = 1e300
     for k in range(4):
         du, dv = quad[(k + 1) % 4, 0] - quad[k, 0], quad[(k + 1) % 4, 1] - quad[k, 1]
@@ -88,7 +90,8 @@ def shortest_side(quad):
 
 @njit(cache=True, nogil=True)
 def decode(image, quad, bits, border, codes, max_errors):
-    """(id, turn, contrast): the pattern inside the quad, id -1 if it is none; corner k of the tag is quad[k - turn]."""
+    """(id, turn, contrast): the tag inside the quad, id -1 if there is none. Corner k of the tag is quad[(k - turn) %
+    4]."""
     n = bits + 2 * border
     grey = cell_greys(image, unit_homography(quad), n)
     black, white = levels(grey, border)

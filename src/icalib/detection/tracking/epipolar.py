@@ -1,11 +1,12 @@
 """Compiled: the epipolar geometry of two images through an unknown lens.
 
-A pixel at (x, y) from the image's centre has the ray (x, y, 1 + lam (x^2 + y^2)): the division model of Fitzgibbon
-(Simultaneous linear estimation of multiple view geometry and lens distortion, 2001). Rays f, h of a static
-point satisfy h . F f = 0. F comes from eight points drawn at random; of many draws the one with the least quantile of
-errors is taken (least quantile of squares, Rousseeuw 1984). The quantile is above the median: F has enough freedom to
-fit a body that covers nearly half of the image and moves by itself. F absorbs the focal length, so the distortion `lam`
-is all that must be known of the lens.
+A pixel at (x, y) from the image centre has the ray (x, y, 1 + lam (x^2 + y^2)). This is the division model of
+Fitzgibbon (Simultaneous linear estimation of multiple view geometry and lens distortion, 2001). Rays f, h of a static
+point satisfy h . F f = 0. F absorbs the focal length, so only the distortion `lam` of the lens must be known.
+
+F is estimated from eight random points, in many draws. The one with the least quantile of errors is used (least
+quantile of squares, Rousseeuw 1984). The quantile is above the median: F is flexible enough to fit a moving body that
+covers nearly half of the image.
 """
 
 from __future__ import annotations
@@ -14,17 +15,18 @@ import numpy as np
 
 from icalib.base.compiled import njit
 
-MOST_DRAWS = 60  # at most; with 30 % of outliers, chance misses every clean sample once in 35 pairs of images
-FEWEST_DRAWS, MISSED = 12, 0.01  # drawing ends where chance has missed every clean sample with that probability
-QUANTILE, QUANTILE_OF_NORMAL = 0.65, 0.9346  # up to 35 % of the points may move; that quantile of |normal| errors
-REFITS, FITS_TIMES = 2, 3.0  # with all points whose errors are within so many quantiles
-FEWEST_MATCHED_POINTS = 16  # points; of fewer a quantile says little
+MOST_DRAWS = 60  # draws, at most; with 30 % of outliers, none is free of outliers for one in 35 pairs of images
+FEWEST_DRAWS, MISSED = 12, 0.01  # draws, at least; probability that no draw is free of outliers at which drawing ends
+# up to 35 % of the points may move; the same quantile of the absolute value of a standard normal variable
+QUANTILE, QUANTILE_OF_NORMAL = 0.65, 0.9346
+REFITS, FITS_TIMES = 2, 3.0  # refits to all points whose errors are within this multiple of the quantile
+FEWEST_MATCHED_POINTS = 16  # fewer points give an unreliable quantile
 
 
 def epipolar_errors(p: np.ndarray, q: np.ndarray, lam: float, seed: int) -> tuple[np.ndarray, float]:
-    """First-order distances (n,) of points p and q (n, 2) in two images from the epipolar geometry of most points, and
-    their standard deviation by the quantile. Units are those of p and q, counted from the images' centre; n is
-    FEWEST_MATCHED_POINTS at least."""
+    """First-order distances (n,) of points p and q (n, 2) in two images from the epipolar geometry of most of them, and
+    their standard deviation by the quantile. Units are those of p and q, relative to the image centres; n must be at
+    least FEWEST_MATCHED_POINTS."""
     rng = np.random.default_rng(seed)
     draws = rng.permuted(np.tile(np.arange(len(p)), (MOST_DRAWS, 1)), axis=1)[:, :8].copy()
     error = np.empty(len(p))
@@ -35,7 +37,7 @@ def epipolar_errors(p: np.ndarray, q: np.ndarray, lam: float, seed: int) -> tupl
 @njit(cache=True, nogil=True)
 def _least_quantile(p, q, lam, draws, least):
     """The least quantile of errors over all draws (m, 8) and refits to all points that fit; fills least (n,) with the
-    errors of that F."""
+    errors of this F."""
     n = len(p)
     f, h, error, used = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.bool_)
     for i in range(n):
@@ -63,7 +65,7 @@ def _least_quantile(p, q, lam, draws, least):
 
 @njit(cache=True, nogil=True)
 def _draws_needed(error, quantile):
-    """How many draws miss every sample of eight points that fit with probability MISSED."""
+    """Number of draws of eight points after which none is free of outliers with probability MISSED."""
     fits = 0
     for e in error:
         fits += e <= FITS_TIMES * quantile
@@ -73,7 +75,7 @@ def _draws_needed(error, quantile):
 
 @njit(cache=True, nogil=True)
 def _fundamental(f, h, used):
-    """F (3, 3), h . F f = 0 in least squares over the rays that are `used` (n,)."""
+    """F (3, 3) with h . F f = 0, by linear least squares over the rays with `used` (n,)."""
     A, row = np.zeros((9, 9)), np.empty(9)
     for i in range(len(f)):
         if not used[i]:
@@ -89,7 +91,8 @@ def _fundamental(f, h, used):
 
 @njit(cache=True, nogil=True)
 def _errors(f, h, lam, F, error):
-    """error (n,): Sampson's distance |h . F f| over the norm of its derivatives by the four pixel coordinates."""
+    """Fills error (n,) with Sampson's distance: |h . F f| over the norm of its derivatives by the four pixel
+    coordinates."""
     for i in range(len(f)):
         value, size = 0.0, 0.0
         l0, l1, l2 = 0.0, 0.0, 0.0  # F f

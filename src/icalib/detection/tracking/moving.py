@@ -1,4 +1,4 @@
-"""Features that do not fit the motion of the camera: people, other vehicles, wrong matches."""
+"""Detects features that do not fit the motion of the camera: people, other vehicles, wrong matches."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ import numpy as np
 from icalib.detection.tracking.epipolar import FEWEST_MATCHED_POINTS, epipolar_errors
 from icalib.sensors.camera.stream import shared_rows
 
-COMPARED_IMAGES = (1, 4)  # images: each is compared with these before it
-LENS_APART, LENS_PAIRS = 6, 8  # pairs of images that show how the lens distorts
-# At an image's corner; 0 is a lens without distortion, -1 one that sees half a sphere at its corners.
+COMPARED_IMAGES = (1, 4)  # each image is compared with those that are this many images earlier
+LENS_APART, LENS_PAIRS = 6, 8  # images apart, and number, of the pairs from which the distortion is estimated
+# Candidates of the distortion, for points in units of half the image diagonal; 0 is a lens without distortion, -1 one
+# that sees half a sphere at the image corners.
 LAMBDAS = (-1.2, -1.0, -0.8, -0.6, -0.45, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2)
-TIMES_SIGMA, LEAST_PX = 4.0, 1.0  # no point is rejected for a smaller error
-MOST_MISFIT_SHARE = 1.0 / 3.0  # of a feature's comparisons: one that moves fails most, a single wrong match four
+# standard deviations, and px, the larger of both: error above which a point does not fit
+TIMES_SIGMA, LEAST_PX = 4.0, 1.0
+# share of a feature's comparisons that may fail: a moving point fails most, a single wrong match up to four
+MOST_MISFIT_SHARE = 1.0 / 3.0
 
 
 def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
-    """(F,) bool, by number of the feature: whether it fails the epipolar geometry of most in many of its images.
+    """(F,) bool, by feature number: whether it does not fit the epipolar geometry of most points in more than a third
+    of its comparisons.
 
-    start (M + 1,), feature (N,), uv (N, 2) px as in `TrackStream`, features from 0 on; resolution (width, height).
+    start (M + 1,), feature (N,), uv (N, 2) px as in `TrackStream`, features numbered from 0; resolution (width,
+    height).
     """
     n = int(feature.max(initial=-1)) + 1
     xy, half_px = from_centre(uv, resolution)
@@ -36,20 +41,20 @@ def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, reso
 
 
 def from_centre(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """Pixels uv (n, 2) relative to the image's centre, in units of half its diagonal; and that unit [px]."""
+    """Pixels uv (n, 2) relative to the image centre, in units of half the image diagonal; and this unit [px]."""
     half_px = 0.5 * float(np.hypot(*resolution))
     return (uv - 0.5 * (np.array(resolution) - 1.0)) / half_px, half_px
 
 
 def misfits(p: np.ndarray, q: np.ndarray, lam: float, half_px: float, seed: int) -> tuple[np.ndarray, float]:
-    """(n,) bool: points p and q (n, 2), as `from_centre` gives them, that do not fit the epipolar geometry of most; and
-    the standard deviation [px] of those that do."""
+    """(n,) bool: points p and q (n, 2), as of `from_centre`, that do not fit the epipolar geometry of most; and the
+    standard deviation [px] of the errors."""
     error, sigma = epipolar_errors(p, q, lam, seed)
     return error > max(TIMES_SIGMA * sigma, LEAST_PX / half_px), sigma * half_px
 
 
 def _lambda(start: np.ndarray, feature: np.ndarray, xy: np.ndarray) -> float:
-    """The distortion (lambda of the division model) with which most points fit, in the mean over pairs of images."""
+    """The distortion (lambda of the division model) with the least mean error over LENS_PAIRS pairs of images."""
     firsts = np.unique(np.linspace(0, max(len(start) - 2 - LENS_APART, 0), LENS_PAIRS).astype(int))
     pairs = [
         shared_rows(start, feature, int(k), int(k) + LENS_APART) for k in firsts if k + LENS_APART < len(start) - 1
@@ -58,6 +63,6 @@ def _lambda(start: np.ndarray, feature: np.ndarray, xy: np.ndarray) -> float:
 
 
 def best_lambda(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """The distortion with the least mean error over pairs of images, of points (n, 2) in each; 0 without pairs."""
+    """The distortion with the least mean error over `pairs` of point arrays (n, 2) in two images; 0 without pairs."""
     size = [sum(epipolar_errors(p, q, lam, 0)[1] for p, q in pairs) for lam in LAMBDAS]
     return LAMBDAS[int(np.argmin(size))] if pairs else 0.0

@@ -1,9 +1,9 @@
 """Compiled: alignment of an image with the first view of each track.
 
-A point tracked only from image to image drifts: its errors add up, and the estimator cannot see that. Shi and
-Tomasi (Good Features to Track, 1994) therefore align each image with the first view under an affine map. The map is
-found by inverse compositional Gauss-Newton (Baker and Matthews, 2004) on grey levels whose mean and contrast are
-normalised, so that a change of exposure has no effect.
+A point tracked only from image to image drifts: its errors add up, and the estimator cannot detect that. Therefore each
+image is aligned with the first view under an affine map (Shi and Tomasi, Good Features to Track, 1994). The map is
+found by inverse compositional Gauss-Newton (Baker and Matthews, 2004). Grey levels are normalised by mean and contrast,
+so that a change of exposure has no effect.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from icalib.base.compiled import njit
 
 RADIUS = 7  # px; a patch has 15 x 15 px
 SIDE = 2 * RADIUS + 1
-CONVERGED_PX = 0.02  # of the last step
+CONVERGED_PX = 0.02  # shift by the last step, below which the alignment has converged
 MOST_ALIGNMENT_STEPS = 12
-LEAST_TEXTURE = 1.0  # grey levels (standard deviation) of a patch; less is noise
+LEAST_TEXTURE = 1.0  # least standard deviation of the grey levels of a patch; less is noise
 
 
 class Templates(NamedTuple):
-    """First views of n tracks.
+    """First views of n tracks, patches of SIDE x SIDE px.
 
     grey (n, SIDE, SIDE) float32: grey levels, mean 0 and standard deviation 1; slope (n, SIDE, SIDE, 2) float32: their
     derivatives by x and y, per px; inverse (n, 6, 6): inverse of the normal matrix of the affine map; spread (n,) px^2:
-    second moment of the patch along each axis, as the affine map weighs its points.
+    second moment of the patch along each axis, weighted as in the alignment.
     """
 
     grey: np.ndarray
@@ -35,14 +35,16 @@ class Templates(NamedTuple):
     spread: np.ndarray
 
     def some(self, kept: np.ndarray) -> Templates:
-        """Those in `kept`, indices or a mask."""
+        """The templates selected by `kept`, indices or a mask."""
         return Templates(*(column[kept] for column in self))
 
     def joined(self, other: Templates) -> Templates:
+        """These templates, followed by the `other` ones."""
         return Templates(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
 def no_templates() -> Templates:
+    """Templates of no tracks."""
     return Templates(
         np.zeros((0, SIDE, SIDE), np.float32),
         np.zeros((0, SIDE, SIDE, 2), np.float32),
@@ -52,8 +54,8 @@ def no_templates() -> Templates:
 
 
 def cut_templates(image: np.ndarray, uv: np.ndarray) -> tuple[Templates, np.ndarray]:
-    """Templates around whole pixels uv (n, 2) of an image (h, w) float32, and which of them (n,) have texture in two
-    directions. Each lies at least RADIUS + 1 px inside the image."""
+    """Templates around whole pixels uv (n, 2) of an image (h, w) float32, and a mask (n,) of those with texture in two
+    directions. Pixels must be at least RADIUS + 1 px inside the image."""
     n = len(uv)
     grey, slope = np.empty((n, SIDE, SIDE), np.float32), np.empty((n, SIDE, SIDE, 2), np.float32)
     normal = np.empty((n, 6, 6))
@@ -66,8 +68,8 @@ def cut_templates(image: np.ndarray, uv: np.ndarray) -> tuple[Templates, np.ndar
 
 
 def _spread(slope: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Second moment (n,) px^2 of each patch along an axis, as the affine map weighs its points: the shift that the map
-    takes for a displacement q(x) = x_a^2, averaged over both axes a and both components of q."""
+    """(n,) px^2: second moment of each patch along an axis, weighted as in the alignment. It is the shift that the
+    affine alignment estimates for a displacement q(x) = x_a^2, averaged over both axes a and both components of q."""
     y, x = np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1].astype(np.float64)
     by_x, by_y = slope[..., 0], slope[..., 1]
     rows = np.stack([by_x * x, by_x * y, by_y * x, by_y * y, by_x, by_y], axis=-1)
@@ -116,9 +118,11 @@ def _affine_row(slope, dy, dx, row):
 
 @njit(cache=True, nogil=True)
 def align(image, templates, uv, A, ncc):
-    """Moves uv (n, 2) and A (n, 2, 2) to where the image (h, w) float32 shows each first view: uv + A x shows what
-    the first view has at x. ncc (n,): correlation of both, -1 where the patch leaves the image, has too
-    little contrast, or the steps do not converge.
+    """Aligns the image (h, w) float32 with the templates, from the start values uv (n, 2) px and A (n, 2, 2), which are
+    updated.
+
+    The point x of a template is at uv + A x in the image. Fills ncc (n,): correlation of both, or -1 if the patch
+    leaves the image, has too little contrast, or the iteration does not converge.
     """
     seen, row, b, step = np.empty((SIDE, SIDE)), np.empty(6), np.empty(6), np.empty(6)
     for n in range(len(uv)):
@@ -148,8 +152,8 @@ def align(image, templates, uv, A, ncc):
 
 @njit(cache=True, nogil=True)
 def _sample(image, uv, A, template, seen):
-    """Fills `seen` (SIDE, SIDE) with normalised grey levels of the mapped patch, scaled to fit the template best.
-    Returns the correlation with the template, or -1 outside of the image."""
+    """Fills `seen` (SIDE, SIDE) with the grey levels of the mapped patch, normalised to fit the template best. Returns
+    the correlation with the template, -1 if the patch leaves the image or has too little contrast."""
     h, w = image.shape
     reach_x = RADIUS * (abs(A[0, 0]) + abs(A[0, 1]))
     reach_y = RADIUS * (abs(A[1, 0]) + abs(A[1, 1]))
@@ -175,7 +179,7 @@ def _sample(image, uv, A, template, seen):
     variance = square / SIDE**2 - mean * mean
     if not (variance > LEAST_TEXTURE**2 and product > 0.0):
         return -1.0
-    # Scaled by the projection on the template: what noise adds to the contrast would shrink it otherwise.
+    # Scaled by the projection on the template: noise adds to the contrast, so a scale by contrast would be too small.
     scale = SIDE**2 / product
     for i in range(SIDE):
         for j in range(SIDE):
@@ -185,7 +189,8 @@ def _sample(image, uv, A, template, seen):
 
 @njit(cache=True, nogil=True)
 def _compose(uv, A, step):
-    """The map (uv, A) after the inverse of the small map `step`; returns how far uv moves, -1 where it folds."""
+    """Replaces the map (uv, A) by its composition with the inverse of the small map `step`. Returns the shift of uv
+    [px], -1 if the step changes areas by a factor of four or more."""
     b00, b01, b10, b11 = 1.0 + step[0], step[1], step[2], 1.0 + step[3]
     determinant = b00 * b11 - b01 * b10
     if not 0.25 < determinant < 4.0:

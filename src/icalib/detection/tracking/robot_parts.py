@@ -1,22 +1,22 @@
-"""Points on the robot itself, or on the lens: they stay in place in the image while the scene moves through it."""
+"""Detects points on the robot itself, or on the lens: they stay in place in the image while the scene moves."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import KDTree
 
-SCENE_MOVES_PX = 10.0  # over a track's life, all points alike, as they do where the camera turns
-STAYS_PX = 1.0  # what a point in place moves at most, by noise and vibration
-NEAR_ROBOT_PX = 64.0  # a track that does not move so near to a point in place is in place, too
+SCENE_MOVES_PX = 10.0  # least motion of the scene over a track, common to all points, as if the camera turns
+STAYS_PX = 1.0  # largest motion of a point in place, by noise and vibration
+NEAR_ROBOT_PX = 64.0  # a short track without motion is in place, too, if it is this near to a point in place
 
 
 def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Whether each feature (F,) stays in place in the image, from its first view to its last, while the scene moves.
+    """(F,) whether each feature stays in place in the image, from its first view to its last, while the scene moves.
 
-    start (M + 1,), feature (N,) and uv (N, 2) as in `TrackStream`, features numbered from 0. The image moves by the
-    median motion of its points, each component by itself: a turn of the camera moves all points alike, while a camera
-    that moves forwards has a median near zero, and points straight ahead are not taken for the robot's. Tracks too
-    short to tell are in place where others are.
+    start (M + 1,), feature (N,) and uv (N, 2) px as in `TrackStream`, features numbered from 0. The motion of the scene
+    is the median motion of the points, for each component. A rotation of the camera moves all points alike. Forward
+    motion has a median near zero, so that points straight ahead are not mistaken for points on the robot. Tracks that
+    are too short to decide are in place if they are near others in place.
     """
     n = int(feature.max(initial=-1)) + 1
     image = np.repeat(np.arange(len(start) - 1), np.diff(start))
@@ -42,7 +42,7 @@ def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.
 
 
 def _ends(feature: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) the first and the last row of each feature in feature (N,), which is sorted; row 0 for one without rows."""
+    """(n,) the first and the last row of each feature in the sorted feature (N,); row 0 for a feature without rows."""
     begin, end = np.searchsorted(feature, np.arange(n)), np.searchsorted(feature, np.arange(n), side="right")
     seen = end > begin
     return np.where(seen, begin, 0), np.where(seen, end - 1, 0)

@@ -1,8 +1,8 @@
 """Stereo matching: a feature that two cameras see at about the same time becomes one feature of both.
 
-Lucas-Kanade tracking leads from a pixel of one image to the other image, and back; the patch is then aligned as from
-image to image. This finds pairs of cameras that look the same way. Matches that do not fit the epipolar geometry of the
-pair, which is the same in all images, are left out.
+Lucas-Kanade tracks each point from one image to the other and back; the patch is then aligned as between images of one
+camera. This works for pairs of cameras with similar views. Matches that do not fit the epipolar geometry of the pair,
+which is the same in all images, are left out.
 """
 
 from __future__ import annotations
@@ -24,18 +24,20 @@ from icalib.detection.tracking.patches import RADIUS, align, cut_templates
 from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, MIN_NCC, WINDOW_PX, prepared
 from icalib.rig import Camera
 
-MATCHED_EVERY_S = 0.25  # between images that are matched; features live about a second
-MOST_APART_S = 0.05  # between both images at most
-STEREO_PYRAMID_LEVEL = 4  # of the pyramid: disparities of up to 160 px
-FEWEST_MATCHES = 100  # in a recording; fewer may be chance
-LEAST_SHARED_FEATURES = 0.1  # of the features that were tried
-# Of matches from their epipolar lines; above are wrong matches, or two lenses of different kinds.
+MATCHED_EVERY_S = 0.25  # between matched images; features are tracked for about a second
+MOST_APART_S = 0.05  # between both images, at most
+STEREO_PYRAMID_LEVEL = 4  # for disparities of up to 160 px
+FEWEST_MATCHES = 100  # in a recording, at least; fewer may be wrong matches
+LEAST_SHARED_FEATURES = 0.1  # least share of the tried features
+# Largest standard deviation of matches from their epipolar lines. It is larger for wrong matches, or for two lenses of
+# different kinds.
 MOST_EPIPOLAR_SIGMA_PX = 1.0
 
 
 @dataclass(frozen=True)
 class _Matches:
-    """Rows of the first camera's stream, images of the second's, and uv (N, 2) px there; tried: how many rows."""
+    """Matches of two cameras: row (N,) in the stream of the first; image (N,) of the second, and uv (N, 2) px there;
+    tried: number of rows that were tried."""
 
     row: np.ndarray
     image: np.ndarray
@@ -44,9 +46,10 @@ class _Matches:
 
 
 def matched(recording: Recording, cameras: Sequence[Camera], streams: Sequence[TrackStream]) -> tuple[TrackStream, ...]:
-    """The streams with observations added that each camera has of the others' features; before, no number is shared.
+    """The streams, with observations of features of other cameras added. Before, the streams must not share feature
+    numbers.
 
-    Only pairs of cameras of one resolution are tried. A pair that shares hardly any features gains none.
+    Only pairs of cameras of equal resolution are tried. Pairs that share hardly any features stay unchanged.
     """
     found = list(streams)
     for i, j in combinations(range(len(cameras)), 2):
@@ -58,6 +61,8 @@ def matched(recording: Recording, cameras: Sequence[Camera], streams: Sequence[T
 def _with_features_of(
     recording: Recording, cameras: tuple[Camera, Camera], streams: tuple[TrackStream, TrackStream], into: TrackStream
 ) -> TrackStream:
+    """The stream `into` of the second camera, with its observations of the first camera's features added. streams: of
+    both cameras, as tracked."""
     pairs = _pairs(*streams)
     payloads = _payload_pairs(recording, cameras, streams, pairs)
     parts = list(on_all_cores(payloads, lambda job: _match(*job, streams[0])))
@@ -72,7 +77,7 @@ def _with_features_of(
 
 
 def _pairs(first: TrackStream, second: TrackStream) -> list[tuple[int, int]]:
-    """Images of both cameras that are near in time, one pair each MATCHED_EVERY_S."""
+    """Indices of images of both cameras that are near in time, one pair every MATCHED_EVERY_S."""
     at = first.stamps_ns
     j = np.clip(np.searchsorted(second.stamps_ns, at), 1, max(len(second.stamps_ns) - 1, 1))
     j = np.where(np.abs(second.stamps_ns[j - 1] - at) <= np.abs(second.stamps_ns[j] - at), j - 1, j)
@@ -80,7 +85,7 @@ def _pairs(first: TrackStream, second: TrackStream) -> list[tuple[int, int]]:
     slot = np.floor((at - at[0]) * 1e-9 / MATCHED_EVERY_S).astype(np.int64)
     chosen = np.flatnonzero(near)
     chosen = chosen[np.unique(slot[chosen], return_index=True)[1]]
-    chosen = chosen[np.unique(j[chosen], return_index=True)[1]]  # a feature is in an image once
+    chosen = chosen[np.unique(j[chosen], return_index=True)[1]]  # an image has a feature once
     return [(int(i), int(j[i])) for i in chosen]
 
 
@@ -90,7 +95,7 @@ def _payload_pairs(
     streams: tuple[TrackStream, TrackStream],
     pairs: list[tuple[int, int]],
 ) -> Iterator[tuple[Payload, Payload, int, int]]:
-    """The images of the pairs, and their numbers."""
+    """The images of the pairs, and their indices."""
     first, second = (
         _with_stamps(recording, camera, {int(stream.stamps_ns[pair[k]]) for pair in pairs})
         for k, (camera, stream) in enumerate(zip(cameras, streams, strict=True))
@@ -100,11 +105,12 @@ def _payload_pairs(
 
 
 def _with_stamps(recording: Recording, camera: Camera, stamps_ns: set[int]) -> Iterator[Payload]:
+    """The images of the camera with these stamps."""
     return (p for p in recording.payloads(recording.image_topic(camera)) if p.stamp_ns in stamps_ns)
 
 
 def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matches:
-    """Features of image i of `stream`, which is `a`, found in `b`, image j of the other camera."""
+    """Features of image i of `stream`, whose data are `a`, found in image j of the other camera, whose data are `b`."""
     cv2: Any = load_cv2()
     rows = np.arange(stream.start[i], stream.start[i + 1])
     none = _Matches(rows[:0], rows[:0], np.zeros((0, 2)), len(rows))
@@ -138,7 +144,7 @@ def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matc
 
 
 def _consistent(p: np.ndarray, q: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
-    """(n,) bool: matches that fit the one epipolar geometry of the pair of cameras."""
+    """(n,) bool: matches that fit the common epipolar geometry of the pair of cameras."""
     if len(p) < FEWEST_MATCHED_POINTS:
         return np.zeros(len(p), dtype=bool)
     (x, half_px), (y, _) = from_centre(p, resolution), from_centre(q, resolution)
@@ -149,7 +155,8 @@ def _consistent(p: np.ndarray, q: np.ndarray, resolution: tuple[int, int]) -> np
 def _inserted(
     stream: TrackStream, image: np.ndarray, feature: np.ndarray, uv: np.ndarray, source: TrackStream, row: np.ndarray
 ) -> TrackStream:
-    """The stream with further observations; views and spread are those of the camera that tracked the features."""
+    """The stream with further observations added; their views and spread are those of the camera that tracked the
+    features."""
     images = np.concatenate([stream.image, image])
     order = np.argsort(images, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(images, minlength=len(stream.stamps_ns)))]).astype(np.int64)

@@ -1,7 +1,7 @@
-"""From a recording's images to feature tracks: decoded and tracked on all cores, and kept for the next run.
+"""Feature tracks from the images of a recording: tracked on all cores, and cached for the next run.
 
-Images are tracked in segments, each on one core; tracks end where a segment ends. Segments depend on the recording
-only, so that the tracks do not depend on the number of cores.
+Images are tracked in segments, each on one core; tracks end at the end of a segment. Segments depend only on the
+recording, so the tracks do not depend on the number of cores.
 """
 
 from __future__ import annotations
@@ -31,22 +31,24 @@ from icalib.detection.tracking.tracker import Observations, Tracker
 from icalib.errors import RecordingError
 from icalib.rig import Camera
 
-TRACKER_VERSION = 3  # of the tracker: whatever changes tracks changes this
-SEGMENT_IMAGES, SEGMENT_BYTES = 120, 128 << 20  # images that are tracked in one go; of larger ones none wait in memory
-LEAST_APART_NS = 35_000_000  # between images with observations; those between serve to track, and add little
-FEWEST_VIEWS = 3  # of a track; two images of one point are met by almost any pose
-FEWEST_IN_IMAGE = 12  # in an image, below which it says little of the camera's motion
-NOTED = 0.05  # of the tracks; fewer that are left out get no note
+TRACKER_VERSION = 3  # of the tracker and of the cache; raise it with each change that changes tracks
+# images of a segment, and most bytes of a segment that waits in memory; larger ones are tracked on one core
+SEGMENT_IMAGES, SEGMENT_BYTES = 120, 128 << 20
+LEAST_APART_NS = 35_000_000  # least interval between images with observations; images in between only help to track
+FEWEST_VIEWS = 3  # images of a track, at least; two views of one point constrain the poses very little
+FEWEST_IN_IMAGE = 12  # tracked points of an image, at least; fewer constrain the motion of the camera little
+NOTED = 0.05  # share of rejected tracks above which a note tells of them
 _COLUMNS = ("stamps_ns", "start", "feature", "uv", "views", "spread", "damaged_ns")
 _COUNTS = ("moving", "in_place")
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Tracks of some images: stamps_ns (M,), start (M + 1,), feature, views, spread (N,) and uv (N, 2).
+    """Tracks of some images, in the form of `TrackStream`: stamps_ns (M,), start (M + 1,), feature, views, spread (N,)
+    and uv (N, 2).
 
-    moving: how many features do not fit the motion of the camera; in_place: how many stay in place; damaged_ns (D,):
-    stamps of images that cannot be decoded; error: why the last of them cannot, or "".
+    moving: number of features that do not fit the motion of the camera; in_place: number of those that stay in place;
+    damaged_ns (D,): stamps of images that cannot be decoded; error: the reason for the last of them, or "".
     """
 
     stamps_ns: np.ndarray
@@ -64,8 +66,8 @@ class _Found:
 def find_all_tracks(
     recording: Recording, cameras: Sequence[Camera], keep: bool = True, progress: Progress = lambda _: None
 ) -> list[tuple[TrackStream, tuple[str, ...]]]:
-    """Feature tracks of each of the cameras, and sentences on what was left out. The same number is the same point in
-    all of them; cameras that look the same way share some. Raises RecordingError as `find_tracks`."""
+    """Feature tracks of each of the cameras, and sentences on rejected points. A feature number is the same point in
+    all cameras; pairs of cameras with a common field of view share features. Raises RecordingError as `find_tracks`."""
     found = []
     for k, camera in enumerate(cameras):
         found.append(find_tracks(recording, camera, keep, lambda done, k=k: progress((k + done) / len(cameras))))
@@ -77,10 +79,10 @@ def find_all_tracks(
 def find_tracks(
     recording: Recording, camera: Camera, keep: bool = True, progress: Progress = lambda _: None
 ) -> tuple[TrackStream, tuple[str, ...]]:
-    """Feature tracks of all images of `camera`, numbered from 0, and sentences on what was left out.
+    """Feature tracks of all images of `camera`, numbered from 0, and sentences on images and points that were left out.
 
-    With `keep`, what an earlier run found is used, and what is found is kept. Raises RecordingError, one sentence,
-    where there are no images of the camera, they are not of its resolution, cannot be read, or show nothing to track.
+    With `keep`, tracks of an earlier run are loaded from the cache, and new ones are saved. Raises RecordingError if
+    the camera has no images, their resolution is wrong, they cannot be read, or they show nothing to track.
     """
     topic, where = recording.image_topic(camera), recording.where(camera)
     files: dict[int, str] = {}
@@ -106,6 +108,7 @@ def find_tracks(
 
 
 def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
+    """Tracks of all images, in segments. done: called with the number of images so far."""
     parts: list[_Found] = []
     first = next(payloads, None)
     if first is None:
@@ -122,14 +125,13 @@ def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
 
 
 def _as_they_are_read(payloads: Iterator[Payload]) -> Iterator[_Found]:
-    """Segments of images that are too large to wait in memory, on one core."""
+    """Tracks of segments whose images are too large to wait in memory, on one core."""
     for first in payloads:
         yield _track_segment(chain([first], islice(payloads, SEGMENT_IMAGES - 1)))
 
 
 def _track_segment(payloads: Iterable[Payload]) -> _Found:
-    """Tracks of images that are tracked in one go. Features that moved, stayed in place, or were seen too rarely, are
-    left out."""
+    """Tracks of one segment, without features that move, stay in place, or are in fewer than FEWEST_VIEWS images."""
     tracker, error, size = Tracker(), "", (1, 1)
     stamps, seen, damaged = [], [], []
     for p in payloads:
@@ -171,14 +173,14 @@ def _observed(stamps_ns: list[int], found: list[Observations], damaged_ns: list[
 
 
 def _some(found: _Found, kept: np.ndarray) -> _Found:
-    """The observations kept (N,)."""
+    """The observations selected by the mask kept (N,)."""
     start = np.concatenate([[0], np.cumsum(kept)])[found.start].astype(np.int64)
     columns = {name: getattr(found, name)[kept] for name in ("feature", "uv", "views", "spread")}
     return replace(found, start=start, **columns)
 
 
 def _joined(parts: Sequence[_Found]) -> _Found:
-    """One after another; features are numbered on."""
+    """Tracks of the `parts` in sequence, with features renumbered to be unique."""
     none = np.zeros(0, np.int64)
     first = np.cumsum([0, *(int(p.feature.max(initial=-1)) + 1 for p in parts)])
     begin = np.cumsum([0, *(len(p.feature) for p in parts)])
@@ -197,7 +199,8 @@ def _joined(parts: Sequence[_Found]) -> _Found:
 
 
 def _stream(name: str, found: _Found, where: str) -> TrackStream:
-    """Images without any observation are left out. Raises RecordingError where hardly anything was tracked."""
+    """The tracks as a stream, without images that have no observation. Raises RecordingError if less than half of the
+    images have FEWEST_IN_IMAGE tracked points."""
     count = np.diff(found.start)
     enough = int((count >= FEWEST_IN_IMAGE).sum())
     if 2 * enough < len(count):
@@ -213,6 +216,7 @@ def _stream(name: str, found: _Found, where: str) -> TrackStream:
 
 
 def _notes(found: _Found, files: dict[int, str]) -> Iterator[str]:
+    """Sentences on damaged images, and on points that were rejected because they move or stay in place."""
     yield from words_on_damaged(found.damaged_ns.tolist(), files)
     tracks = len(np.unique(found.feature)) + found.moving + found.in_place
     if found.moving > NOTED * tracks:

@@ -1,7 +1,7 @@
-"""One camera's tracker: corners of the scene, tracked through its images in order.
+"""Tracks corners of the scene through the images of one camera, in order.
 
-Each image: contrast equalisation, pyramidal Lucas-Kanade forward and backward, alignment with the first view of each
-track, new corners in empty cells.
+For each image: contrast equalisation, pyramidal Lucas-Kanade forward and backward, alignment with the first view of
+each track, new corners in empty cells.
 """
 
 from __future__ import annotations
@@ -14,23 +14,24 @@ import numpy as np
 from icalib.base.extras import load_cv2
 from icalib.detection.tracking.patches import RADIUS, Templates, align, cut_templates, no_templates
 
-TRACKED_CELLS = 100  # of an image; each begins one track at a time
-MOST_VIEWS = 30  # of a track; later views differ too much from the first, and long tracks cost the estimator time
-WINDOW_PX, PYRAMID_LEVEL = 21, 3  # of Lucas-Kanade: motions of up to 80 px between images
-LK_ENDS = 10, 0.05  # steps, and px of the last: the alignment that follows is finer
+TRACKED_CELLS = 100  # cells of an image; a new track starts only in a cell without one
+# images of a track, at most; later views differ too much from the first, and long tracks take the estimator longer
+MOST_VIEWS = 30
+WINDOW_PX, PYRAMID_LEVEL = 21, 3  # of Lucas-Kanade, for motions of up to 80 px between images
+LK_ENDS = 10, 0.05  # steps at most, and px of the last step; the alignment that follows is finer
 CLAHE_CLIP, TILES = 3.0, (8, 8)  # of the equalisation (CLAHE)
-BLUR_PX = 0.8  # before alignment: grey levels between pixels are then linear enough
-BACK_PX = 0.7  # forward and backward must meet
-ALIGNED_PX = 2.0  # of Lucas-Kanade's place: alignment goes no further
-MIN_NCC = 0.8  # correlation with the first view
-LEAST_QUALITY = 5e-4  # smallest eigenvalue of a corner (OpenCV's, grey levels of 0 to 1)
-REFINED_WITHIN_PX = 3  # of a corner found at half the resolution
+BLUR_PX = 0.8  # standard deviation of a Gaussian before alignment; interpolation between pixels is then accurate enough
+BACK_PX = 0.7  # largest distance between start and end of forward and backward tracking
+ALIGNED_PX = 2.0  # largest shift by the alignment from Lucas-Kanade's result
+MIN_NCC = 0.8  # correlation with the first view, at least
+LEAST_QUALITY = 5e-4  # smaller eigenvalue of a corner, at least (OpenCV's cornerMinEigenVal, grey levels of 0 to 1)
+REFINED_WITHIN_PX = 3  # search radius about a corner found at half the resolution
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Observations of one image: feature (n,) int64, uv (n, 2) px, views (n,) int64: how many images showed the feature
-    before; spread (n,) px^2: as `TrackStream` has it."""
+    """Features in one image: feature (n,) int64; uv (n, 2) px; views (n,) int64: number of earlier images with the
+    feature; spread (n,) px^2: as in `TrackStream`."""
 
     feature: np.ndarray
     uv: np.ndarray
@@ -43,8 +44,9 @@ _COLUMNS = ("feature", "uv", "flow", "A", "views")
 
 @dataclass(frozen=True)
 class _Tracks:
-    """Tracks alive, n of each: feature (n,); uv (n, 2) px; flow (n, 2) px: the last motion, NaN in the first view; A
-    (n, 2, 2): affine map of the first view; views (n,): images that showed the feature before; and the first views."""
+    """The n current tracks: feature (n,); uv (n, 2) px; flow (n, 2) px: the last motion, NaN in the first view; A (n,
+    2, 2): affine map from the first view; views (n,): number of earlier images with the feature; first: the first
+    views."""
 
     feature: np.ndarray
     uv: np.ndarray
@@ -55,22 +57,25 @@ class _Tracks:
 
     @classmethod
     def new(cls, feature: np.ndarray, uv: np.ndarray, first: Templates) -> _Tracks:
+        """Tracks that begin at uv (n, 2) px."""
         n = len(feature)
         A = np.tile(np.eye(2), (n, 1, 1))
         return cls(feature, uv.astype(np.float64), np.full((n, 2), np.nan), A, np.zeros(n, np.int64), first)
 
     def some(self, kept: np.ndarray) -> _Tracks:
+        """The tracks selected by `kept`, indices or a mask."""
         columns = {name: getattr(self, name)[kept] for name in _COLUMNS}
         return replace(self, first=self.first.some(kept), **columns)
 
     def joined(self, other: _Tracks) -> _Tracks:
+        """These tracks, followed by the `other` ones."""
         columns = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _COLUMNS}
         return replace(self, first=self.first.joined(other.first), **columns)
 
 
 def prepared(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The image (h, w) uint8 with its contrast equalised by regions, uint8, for Lucas-Kanade and new corners; and
-    smoothed, float32, for alignment."""
+    """The image (h, w) uint8 with its contrast equalised by regions, uint8, for Lucas-Kanade and new corners; and the
+    image smoothed, float32, for alignment."""
     cv2 = load_cv2()
     even = cv2.createCLAHE(CLAHE_CLIP, TILES).apply(image)
     return even, cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
@@ -86,11 +91,12 @@ class Tracker:
         self._next_id = 0
 
     def pass_over(self, image: np.ndarray) -> None:
-        """Tracks through the next image (h, w) uint8, which counts as no view of the features."""
+        """Tracks through the next image (h, w) uint8 without observations; it does not count as a view of the
+        features."""
         self._advance(image)
 
     def add(self, image: np.ndarray) -> Observations:
-        """Tracks through the next image (h, w) uint8, and returns the observations in it."""
+        """Tracks through the next image (h, w) uint8, starts new tracks, and returns the observations in the image."""
         even, smooth = self._advance(image)
         self._alive = self._alive.some(self._alive.views < _most_views(self._alive.feature))
         self._add_features(even, smooth)
@@ -100,7 +106,7 @@ class Tracker:
         return Observations(alive.feature, alive.uv, alive.views, spread)
 
     def _advance(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Moves the tracks to the next image; returns what `prepared` makes of it."""
+        """Moves the tracks to the next image; returns the result of `prepared`."""
         even, smooth = prepared(image)
         if len(self._alive.feature):
             self._move_tracks(even, smooth)
@@ -108,7 +114,7 @@ class Tracker:
         return even, smooth
 
     def _move_tracks(self, even: np.ndarray, smooth: np.ndarray) -> None:
-        """Lucas-Kanade and alignment with the first views; tracks that are lost end."""
+        """Moves the tracks by Lucas-Kanade and alignment with the first views; lost tracks end."""
         cv2, alive = self._cv2, self._alive
         before = alive.uv.astype(np.float32)
         size, end = (WINDOW_PX, WINDOW_PX), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, *LK_ENDS)
@@ -139,15 +145,15 @@ class Tracker:
         self._alive = replace(alive, uv=uv, flow=uv - before, A=A).some(good)
 
     def _predicted(self) -> np.ndarray:
-        """(n, 2) px float32: how far each track moves if it moves on as the image did: its own last motion, or the
-        median motion of all where it has just begun."""
+        """(n, 2) px float32: predicted motion of each track, equal to its last motion, or to the median of all for new
+        tracks."""
         flow = self._alive.flow
         known = np.isfinite(flow[:, 0])
         median = np.median(flow[known], axis=0) if known.any() else np.zeros(2)
         return np.where(known[:, None], flow, median).astype(np.float32)
 
     def _add_features(self, even: np.ndarray, smooth: np.ndarray) -> None:
-        """New tracks at the strongest corner of each cell that has none."""
+        """Starts a track at the strongest corner of each cell without tracks."""
         uv = self._corners(even)
         first, good = cut_templates(smooth, uv)
         feature = self._next_id + np.arange(int(good.sum()))
@@ -155,8 +161,8 @@ class Tracker:
         self._alive = self._alive.joined(_Tracks.new(feature, uv[good], first.some(good)))
 
     def _corners(self, even: np.ndarray) -> np.ndarray:
-        """(n, 2) whole pixels: the strongest corner of each empty cell, apart from tracks. Corners are sought at half
-        the resolution, which takes a quarter of the time, and then around the place found."""
+        """(n, 2) whole pixels: the strongest corner of each empty cell, away from tracks. Corners are searched at half
+        the resolution, which takes a quarter of the time, and then refined at the full one."""
         cv2 = self._cv2
         half = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         (h, w), at = half.shape, np.rint(0.5 * self._alive.uv).astype(int)
@@ -179,7 +185,7 @@ class Tracker:
         return np.array([self._strongest_near(even, x, y) for x, y in found.tolist()]).reshape(-1, 2)
 
     def _strongest_near(self, even: np.ndarray, x: int, y: int) -> tuple[int, int]:
-        """The strongest corner REFINED_WITHIN_PX around a pixel that lies RADIUS inside."""
+        """The strongest corner within REFINED_WITHIN_PX of a pixel, which must be at least RADIUS inside the image."""
         part = even[y - RADIUS : y + RADIUS + 1, x - RADIUS : x + RADIUS + 1]
         inner = slice(RADIUS - REFINED_WITHIN_PX, RADIUS + REFINED_WITHIN_PX + 1)
         dy, dx = np.divmod(
@@ -189,7 +195,7 @@ class Tracker:
 
 
 def _most_views(feature: np.ndarray) -> np.ndarray:
-    """(n,) views of each feature at most, half to all of MOST_VIEWS: tracks that began together must not all end in one
-    image."""
+    """(n,) most views of each feature, half to all of MOST_VIEWS: tracks that began together must not all end in the
+    same image."""
     half = MOST_VIEWS // 2
     return half + feature % (half + 1)
