@@ -14,8 +14,8 @@ HOUR_S = 3600.0  # s between the streams, above which they count as recorded at 
 
 @contextmanager
 def naming_recording_times(recordings: Sequence[Measurements]) -> Iterator[None]:
-    """A context in which an EstimationError is replaced by one that names two streams of a recording more than an hour
-    apart, if there are any. Such streams do not show the same motion."""
+    """A context for errors of streams that were not recorded together. An EstimationError is replaced by one that names
+    two streams of a recording more than an hour apart, if there are any."""
     try:
         yield
     except EstimationError as error:

@@ -130,8 +130,8 @@ def _by(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contra
 def _shown(
     inputs: Inputs, state: State, block: Block, step: np.ndarray, sigma: np.ndarray, factor: float
 ) -> Contradiction:
-    """The difference between the stated value of `block` and the value that `step` (B,) leads to from `state`. sigma
-    (B,): formal standard deviations, which `factor` multiplies."""
+    """The difference between the stated value of `block` and the value at `state` plus `step` (B,). sigma (B,): formal
+    standard deviations, which `factor` multiplies."""
     sensor = (inputs.asked or inputs.rig).sensors[block.sensor]
     parameter: Parameter = getattr(sensor, block.name)
     assert parameter.value is not None

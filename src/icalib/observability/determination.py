@@ -93,9 +93,9 @@ def scatter(known: np.ndarray, noise: np.ndarray, fixed_directions: np.ndarray) 
     """(B, B) covariance in tolerance units if the information J^T J is `known` + `noise`, with zero variance along
     `fixed_directions` (B, m).
 
-    J^T r scatters by all of J^T J, but the estimate responds by the inverse of `known` alone (errors in variables;
-    Fuller, Measurement Error Models, 1987, chapter 1). Negative eigenvalues of the noise, from few draws, are clipped:
-    noise never reduces the variance.
+    J^T r scatters by all of J^T J, but the estimate responds by the inverse of `known` alone. Such are errors in
+    variables (Fuller, Measurement Error Models, 1987, chapter 1). Negative eigenvalues of the noise, from few draws,
+    are clipped: noise never reduces the variance.
     """
     whitened = restricted_root(known, fixed_directions)
     values, vectors = eigh(whitened.T @ noise @ whitened)

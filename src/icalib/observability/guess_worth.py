@@ -1,8 +1,8 @@
-"""Unobservable directions: the prior mean that they are fixed at, and the consider covariance of everything else.
+"""Unobservable directions: the prior mean at which they are fixed, and the consider covariance of all other parameters.
 
 A fixed direction has the value of the guesses of all parameters that it moves. Independent errors of these guesses give
-its prior covariance. Each principal axis is moved by one standard deviation and everything else is solved again; the
-shift of the other parameters is their sensitivity to the fixed ones.
+the prior covariance of the fixed directions. Each principal axis is moved by one standard deviation, and all other
+parameters are solved again. Their shift is the sensitivity to the fixed directions.
 """
 
 from __future__ import annotations
@@ -128,8 +128,9 @@ def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
 
 
 def _guess_covariance(inputs: Inputs, problem: Problem, state: State, fixed_directions: np.ndarray) -> np.ndarray:
-    """(m, m) prior covariance of the guess along `fixed_directions` (B, m), in tolerance units: for the weighted reset
-    of `moved_to_worth` if the rig file has priors there, else for the orthogonal projection of `moved_to_guess`."""
+    """(m, m) prior covariance of the guess along `fixed_directions` (B, m), in tolerance units. It is that of the
+    weighted reset of `moved_to_worth` if the rig file has priors there, else that of the orthogonal projection of
+    `moved_to_guess`."""
     if _is_weighed(inputs, fixed_directions):
         scaled = fixed_directions * (problem.tolerance / _weights(inputs, state))[:, None]
         return np.linalg.inv(scaled.T @ scaled)

@@ -66,8 +66,8 @@ class Relaxed:
         return t * step, t * np.sqrt((root**2).sum(axis=1))
 
     def without(self, freed: Collection[Key]) -> tuple[Outcome, np.ndarray]:
-        """The outcome without the priors on the groups `freed`, from which noise in the Jacobian can be estimated, and
-        the gradient (B,) of the calibration parameters."""
+        """The outcome without the priors on the groups `freed`, and the gradient (B,) of the calibration parameters.
+        Noise in the Jacobian can be estimated from this outcome."""
         pull, known = self._priors_of(freed)
         problem = self.problem.without([p for p in self.problem.priors if p.block.key in freed])
         found = outcome_of(problem, self.state, 0.0, self.residuals, 0.0, [], self.solution)

@@ -70,6 +70,6 @@ def _empirical_variance(found: Estimate, parts: Segments | None, white: np.ndarr
 
 
 def few_factor(parts: int) -> float:
-    """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within: quantile of
-    Student's t with parts - 1 degrees of freedom."""
+    """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within. It is a
+    quantile of Student's t with parts - 1 degrees of freedom."""
     return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0

@@ -38,9 +38,11 @@ class _ClockJump:
 def refuse_clock_jumps(
     imu: ImuData, name: str, rates: SensorRates, offset: float, unexplained: UnexplainedShare
 ) -> None:
-    """Raises EstimationError if a gap is a jump of a clock: on one side of it both sensors turn alike at the `offset`
-    [s], on the other only at an offset that differs by the length of the gap. unexplained(rates, offset): share of the
-    angular rate that the IMU does not explain, from 0 to 1."""
+    """Raises EstimationError if a gap is a jump of a clock. On one side of such a gap both sensors turn alike at the
+    `offset` [s], on the other side only at an offset that differs by the length of the gap.
+
+    unexplained(rates, offset): share of the angular rate that the IMU does not explain, from 0 to 1.
+    """
     for jump in _possible_jumps(imu, name, rates, offset):
         for side, shift in ((rates.start < jump.before, -jump.growth), (rates.start >= jump.after, jump.growth)):
             one_side, other_side = _selected(rates, side), _selected(rates, ~side)

@@ -103,8 +103,9 @@ def has_guesses(sensor: Sensor, known: dict[Key, np.ndarray]) -> bool:
 
 
 def merged_translation(given: np.ndarray, found: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """The guess `given` of a translation (3,) m, replaced by the estimate `found`, of `covariance` (3, 3) m^2, along
-    some principal axes: those along which the estimate is more certain than a guess, and contradicts it."""
+    """The guess `given` of a translation (3,) m, corrected by the estimate `found` of covariance (3, 3) m^2. Components
+    along principal axes of the covariance are replaced if the estimate is more certain than a guess, and contradicts
+    it."""
     variance, axes = np.linalg.eigh(covariance)
     deviation = axes.T @ (found - given)
     sigma = TRANSLATION.prior_sigma

@@ -37,8 +37,8 @@ class GyroRotation:
         return self.rotation[j] @ so3.exp_many(self.rate[j] * (t - self.imu.seconds[j])[:, None])
 
     def carry(self, t: np.ndarray, rotation: np.ndarray, to: np.ndarray) -> np.ndarray:
-        """Rotations R_any_imu (n, 3, 3) at times `to` (n,) s: each is the nearest of the known rotations (m, 3, 3), at
-        increasing t (m,), times the gyroscope's rotation since."""
+        """Rotations R_any_imu (n, 3, 3) at times `to` (n,) s, from known ones (m, 3, 3) at increasing t (m,) s. Each is
+        propagated from the nearest known one by the gyroscope."""
         after = np.clip(np.searchsorted(t, to), 1, len(t) - 1)
         near = after - (to - t[after - 1] < t[after] - to)
         start = self.at(t)[near]

@@ -98,8 +98,8 @@ def solve_camera_lever_arm(
     Raises EstimationError if too few images can be used."""
     ok = poses.ok & (times >= imu.seconds[1]) & (times <= imu.seconds[-2])
     t, p = times[ok], poses.position[ok]
-    # Errors of rotation and position of one image are correlated: unsmoothed, they bias the lever arm towards the
-    # target.
+    # Errors of rotation and position of one image are correlated. Without smoothing, these errors bias the lever arm
+    # towards the target.
     R_bi = gyro.smoothed(t, poses.rotation[ok] @ R_imu_cam.T)
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
     triples = _image_triples(t, imu.gaps)
@@ -141,9 +141,12 @@ def _solve(rows: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scale_by_accelerometer(rows: np.ndarray, rhs: np.ndarray, force_rows: np.ndarray) -> tuple[float, float]:
-    """True size of the target, or of a trajectory, over the stated one, and its standard deviation. It is the inverse
-    of a factor on the accelerometer's part of the equations; a factor on the noisy positions would be biased towards
-    zero. rows (n, 3, m), rhs (n, 3): of the linear system; force_rows (n, 3): the accelerometer's part of rhs."""
+    """True size of the target, or of a trajectory, over the stated one, and its standard deviation.
+
+    It is the inverse of an estimated factor on the accelerometer's part of the equations. A factor on the noisy
+    positions would be biased towards zero. rows (n, 3, m), rhs (n, 3): of the linear system; force_rows (n, 3): the
+    accelerometer's part of rhs.
+    """
     A = np.concatenate([rows, force_rows[:, :, None]], axis=2).reshape(force_rows.size, -1)
     b = rhs.ravel()
     information = A.T @ A + 1e-9 * np.eye(A.shape[1])

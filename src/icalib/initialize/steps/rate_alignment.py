@@ -76,7 +76,7 @@ def _first_match(
     imu: ImuData, tried: Sequence[tuple[SensorRates, RateAlignment]]
 ) -> tuple[tuple[SensorRates, RateAlignment], float]:
     """The first of the alignments `tried` whose unexplained rate is small enough, or the best one if it is clearly
-    better; and the duration [s] of the means that were compared.
+    better. Also returns the duration [s] of the means that were compared.
 
     If none matches over RATE_MEAN_S, means over LONG_RATE_MEAN_S are compared: noise shrinks at least with the root of
     the duration, a different motion does not. If none matches then, returns the first.

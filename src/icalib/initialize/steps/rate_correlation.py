@@ -18,7 +18,7 @@ MAX_SLOW_STEP_S = 2.0  # s: longest step of any stream
 MIN_RATE_OVERLAP_S = 4.0  # s: a shorter overlap correlates by chance
 MIN_RATE_CORRELATION = 0.7  # of angular speeds that match
 MAX_OFFSET_PEAKS = 5  # peaks of the correlation that are tried
-MIN_PEAK_DISTANCE_S = 0.25  # s between two of them
+MIN_PEAK_DISTANCE_S = 0.25  # s between two such peaks
 RATE_MEAN_S = 0.25  # s: duration of the means that are compared
 MAX_ANGLE_MISFIT = 0.5  # RMS difference over the spread of rotation angles in long intervals
 
@@ -141,8 +141,8 @@ def _peaks_of_means(imu: ImuData, rates: SensorRates, count: int) -> list[Correl
 def _rate_size_on_grid(
     t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Norms of rates (n, 3) on a regular grid from 0 to t[-1], each of a mean over `count` grid points; and a mask of
-    the points at which all of these are covered."""
+    """Norms of rates (n, 3) on a regular grid from 0 to t[-1], after means over `count` grid points. Also returns a
+    mask of the means whose points are all covered."""
     grid = np.arange(int(t[-1] * CORRELATION_GRID_HZ) + 1) / CORRELATION_GRID_HZ
     count = min(count, len(grid))
     known = np.interp(grid, t, covered.astype(float)) > 0.99

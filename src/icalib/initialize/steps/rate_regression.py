@@ -101,11 +101,12 @@ def matching_track_rates(imu: ImuData, stream: TrackStream, model: CameraModel, 
 def _rates_and_score(
     imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray, step: float
 ) -> list[tuple[float, SensorRates]]:
-    """Tries two choices of starts for each relative pose: no translation, or this and the previous interval's pose.
-    Returns score and rates of the second if they match the gyroscope clearly better, else of the first.
+    """Tries two choices of starts for each relative pose: no translation, or this and the pose of the previous
+    interval. Returns score and rates of the second choice if these match the gyroscope clearly better, else of the
+    first.
 
-    If a camera moves far sideways, a start without translation often leads to a local minimum, and the previous
-    interval's does not. With a guessed lens it may be the other way round.
+    If a camera moves far to the side, a start without translation often ends in a local minimum, unlike the previous
+    pose. With a guessed lens, the previous pose may be the worse start.
     """
     found = []
     for chained in (False, True):

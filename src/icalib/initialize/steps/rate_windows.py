@@ -24,9 +24,11 @@ def rotation_noise(rotation: np.ndarray) -> float:
 
 
 def rate_window(seconds: np.ndarray, rotation: np.ndarray, shortest: float, longest_step: float) -> float:
-    """The shortest window [s] over which the noise of the rates is below MAX_RATE_NOISE_SHARE of their variation; if
-    none is, the one with the smallest share. rotation (n, 3, 3) at seconds (n,); shortest: of all windows [s];
-    longest_step: see `window_rates`."""
+    """The shortest window [s] over which the noise of the rates is below MAX_RATE_NOISE_SHARE of their variation. If
+    there is none, the window with the smallest share.
+
+    rotation (n, 3, 3) at seconds (n,); shortest: the first window that is tried [s]; longest_step: see `window_rates`.
+    """
     noise, shares = rotation_noise(rotation), []
     windows = [shortest, *(shortest * k for k in WINDOW_FACTORS)]
     for window in windows:

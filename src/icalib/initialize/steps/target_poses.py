@@ -321,8 +321,8 @@ def flat_poses(
 
 
 def usable_rays(uv: np.ndarray, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit rays (N, 3) of corners at uv (N, 2); pixels per unit of x / z and y / z there (N,), the geometric mean over
-    directions; and whether the ray is far enough from the image plane (N,)."""
+    """Unit rays (N, 3) of corners at uv (N, 2) px; pixels per unit of x / z and y / z at each (N,), the geometric mean
+    over directions; and a mask (N,) of rays that are far enough from the image plane."""
     rays, valid = model.unproject(params, uv)
     good = valid & (rays[:, 2] > MIN_RAY_COSINE)
     J = model.project_with_jacobians(params, rays)[2]

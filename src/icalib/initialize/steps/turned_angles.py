@@ -48,9 +48,11 @@ class ChainedRates:
 
 
 def offsets_by_angle(imu: ImuData, start: np.ndarray, end: np.ndarray, rate: np.ndarray) -> list[tuple[float, float]]:
-    """Time offsets [s] at which rotation angles over intervals match those of the IMU, the best first, each with its
-    misfit: RMS difference over the spread of the angles. start, end (n,): of the intervals [s]; rate (n, 3): rotation
-    vectors over their length [rad/s]."""
+    """Time offsets [s] at which rotation angles over intervals match those of the IMU, the best first. Each comes with
+    its misfit: RMS difference over the spread of the angles.
+
+    start, end (n,): of the intervals [s]; rate (n, 3): rotation vectors over the length of the interval [rad/s].
+    """
     chosen = np.unique(np.linspace(0, len(start) - 1, min(len(start), MAX_COMPARED_INTERVALS)).astype(np.int64))
     start, end = start[chosen], end[chosen]
     angle = np.linalg.norm(rate[chosen], axis=1) * (end - start)

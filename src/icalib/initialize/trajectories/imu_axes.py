@@ -108,7 +108,7 @@ def _in_axes(values: np.ndarray, axes: Axes) -> np.ndarray:
 
 
 def _composed(given: Axes, own: Axes) -> list[str]:
-    """The axes of the rig file that are equal to applying `given` first and then `own`."""
+    """The axes of the rig file after the axes `own` are applied to those in `given`."""
     columns = [(given["xyz".index(entry[-1])], entry.startswith("-")) for entry in own]
     return [f"{'-' if name.startswith('-') != turned else ''}{name[-1]}" for name, turned in columns]
 

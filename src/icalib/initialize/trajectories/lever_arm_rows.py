@@ -168,9 +168,9 @@ def unexplained_displacement(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarr
 
 
 def is_mirrored(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> bool:
-    """Whether the sensor moved opposite to the solution R_is, x (m,). Rates in left-handed axes equal those of axes
-    rotated by 180 deg, so they fit. Displacements then have the wrong sign, and the residual is about twice as large as
-    they are."""
+    """Whether the sensor moved opposite to the solution R_is, x (m,). Rates in left-handed axes equal those in axes
+    rotated by 180 deg, so such rates fit. Displacements then have the wrong sign, and the residual is about twice as
+    large as the displacements."""
     return unexplained_displacement(rows, R_is, x) > MIN_MIRRORED_SHARE
 
 
