@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
+from icalib.initialize.steps.initializer import OtherMotionError
 
 FIRST_UNIX_NS = 10**18  # September 2001; earlier stamps are no Unix time and are not compared
 HOUR_S = 3600.0  # s between the streams, above which they count as recorded at different times
@@ -14,11 +15,11 @@ HOUR_S = 3600.0  # s between the streams, above which they count as recorded at 
 
 @contextmanager
 def naming_recording_times(recordings: Sequence[Measurements]) -> Iterator[None]:
-    """A context for errors of streams that were not recorded together. An EstimationError is replaced by one that names
-    two streams of a recording more than an hour apart, if there are any."""
+    """A context for errors of streams that were not recorded together. An OtherMotionError is replaced by one that
+    names two streams of a recording more than an hour apart, if there are any."""
     try:
         yield
-    except EstimationError as error:
+    except OtherMotionError as error:
         for recording in recordings:
             if (found := furthest_apart(recording)) is not None:
                 raise EstimationError(_sentence(*found)) from error

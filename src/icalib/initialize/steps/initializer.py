@@ -32,6 +32,10 @@ InitialGuess = tuple[Inputs, State, Values]  # inputs, start state, values to wh
 BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = range(6)
 
 
+class OtherMotionError(EstimationError):
+    """Measurements of a sensor do not follow the motion that other sensors show, or do not overlap with it in time."""
+
+
 class Initializer(Generic[S]):
     """The interface of one kind of sensor to the initial guess. `sensors` are those of this kind, in the order of the
     rig file."""

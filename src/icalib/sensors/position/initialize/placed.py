@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.initialize.steps.cross_correlation import best_shifts
+from icalib.initialize.steps.initializer import OtherMotionError
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
 from icalib.motion.sweep import EstimatedMotion
@@ -67,7 +67,7 @@ def place(motion: EstimatedMotion, name: str, fix: Fix, known: KnownPlace) -> Pl
     if min((x.misfit for x in found), default=np.inf) > MAX_POSITION_MISFIT and known.offset is None:
         found += [x for offset in _scanned_offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
     if not found:
-        raise EstimationError(
+        raise OtherMotionError(
             f"{name}: too few of its fixes fall within the motion that the other sensors show; check that the clocks "
             "overlap, or the time_offset in the rig file."
         )
@@ -78,7 +78,7 @@ def place(motion: EstimatedMotion, name: str, fix: Fix, known: KnownPlace) -> Pl
             hint += ", and that its positions are in the frame that the rig file names"
         elif known.levelled:
             hint += ", or write frame: tilted if z of its frame does not point up"
-        raise EstimationError(
+        raise OtherMotionError(
             f"{name}: its fixes do not follow the motion that the other sensors show: at the best time offset the "
             f"median residual is {best.misfit:.0%} of their spread; {hint}."
         )

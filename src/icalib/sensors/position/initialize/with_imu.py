@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.initialize.steps.initializer import OtherMotionError
 from icalib.initialize.steps.lever_arm import Triples
 from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
@@ -105,7 +106,7 @@ def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: 
         raise _motionless(name, rms) if rms is not None else _contradicting(imu, name, 1.0, False)
     found = [one for x in offsets if (one := _fit_at_offset(imu, fix, triples, x, gravity, known)) is not None]
     if not found:
-        raise EstimationError(
+        raise OtherMotionError(
             f"{name}: too few of its fixes fall within the recording of {imu.name}; check that both come from the same "
             "recording, or the time_offset in the rig file."
         )
@@ -129,7 +130,7 @@ def _contradicting(imu: ImuData, name: str, misfit: float, mirrored: bool) -> Es
             f"{told}, but does where east and north are swapped; correct the order of latitude and longitude, or of x "
             "and y, by `columns: [...]` in the rig file."
         )
-    return EstimationError(
+    return OtherMotionError(
         f"{told}; check that both are on the same vehicle, and units and axes of {imu.name} (accel_unit, gyro_unit)."
     )
 
