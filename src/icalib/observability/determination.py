@@ -68,17 +68,21 @@ class Determined:
         """(B, B) with priors: covariance of the observable directions plus the consider covariance of the fixed
         ones."""
         t = self.estimate.problem.tolerance
-        known = t[:, None] * self.estimate.outcome.information * t - self.noise
-        return t[:, None] * scatter(known, self.noise, self.fixed_directions) * t + self.shifts.T @ self.shifts
+        return t[:, None] * scatter(self._known, self.noise, self.fixed_directions) * t + self.shifts.T @ self.shifts
 
     @property
     def prior_variance(self) -> np.ndarray:
         """(B,) contribution of the priors on nuisance parameters to the diagonal of the covariance. Information that
         noise in the Jacobian adds is subtracted first, as in `scatter`."""
-        problem, outcome = self.estimate.problem, self.estimate.outcome
-        t = problem.tolerance
-        root = t[:, None] * restricted_root(t[:, None] * outcome.information * t - self.noise, self.fixed_directions)
-        return variance_of_priors(root @ root.T, nuisance_priors(problem), outcome.state)
+        problem = self.estimate.problem
+        root = problem.tolerance[:, None] * restricted_root(self._known, self.fixed_directions)
+        return variance_of_priors(root @ root.T, nuisance_priors(problem), self.estimate.outcome.state)
+
+    @property
+    def _known(self) -> np.ndarray:
+        """(B, B) information with priors, in tolerance units, without what noise in the Jacobian adds."""
+        t = self.estimate.problem.tolerance
+        return t[:, None] * self.estimate.outcome.information * t - self.noise
 
     @property
     def spread(self) -> np.ndarray:

@@ -57,7 +57,8 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     that other faults of the estimate may follow from them."""
     found = determined.estimate
     outcome, state = found.outcome, found.outcome.state
-    seen, names = _observed(inputs, determined), _column_names(inputs)
+    names = _column_names(inputs)
+    seen = _observed(inputs, determined, names)
     parts = Segments.of(found.problem, outcome, inputs.rig.settings.segments)
     groups = _groups(inputs, determined, seen, VarianceParts.of(determined, parts))
     judged = _sensor_fits([f for f in fits(found.problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
@@ -98,13 +99,13 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     )
 
 
-def _observed(inputs: Inputs, determined: Determined) -> Observability:
+def _observed(inputs: Inputs, determined: Determined, names: tuple[str, ...]) -> Observability:
     """Formal covariance, verdicts, and sentences on unobservable combinations of parameters."""
     state = determined.estimate.outcome.state
     tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
     axes = hardly_turned(state.seconds, state.rotation, inputs.rig.reference)
     on_wheels = any(s.drives for s in inputs.rig.mounted)
-    return observe(determined, _column_names(inputs), _column_specs(inputs), on_wheels, tracking, axes)
+    return observe(determined, names, _column_specs(inputs), on_wheels, tracking, axes)
 
 
 def _notes(assessed: AssessedEstimate) -> Iterator[str]:
