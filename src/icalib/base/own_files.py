@@ -26,10 +26,11 @@ _RERUN_HEAD = 4096  # bytes at the begin of a Rerun file that contain the name o
 
 
 def sealed(content: bytes) -> bytes:
-    """`content` with a seal at its end, in place of an earlier one.
+    """`content` of a file with a seal appended: a comment with its sha256, by which `is_ours` recognizes the file.
 
-    content: npz, XML, HTML, PDF, JSON (an object, or a list that ends with one), or text whose comments begin with #.
-    A binary file that allows bytes after its end, such as PNG, gets the seal of a text.
+    The seal replaces an earlier one. content: npz, XML, HTML, PDF, JSON (an object, or a list that ends with one), or
+    text whose comments begin with #. All other formats get the comment of a text, so they must allow bytes after their
+    end, as PNG does.
     """
     content = _COMMENT.sub(b"", content)  # an earlier seal: the content comes from a file of icalib
     if content.startswith(_ZIP):  # npz by numpy has no comment: its last 2 bytes are the length 0
@@ -49,7 +50,7 @@ def sealed(content: bytes) -> bytes:
 
 
 def sealed_texts(texts: dict[str, str]) -> dict[str, str]:
-    """`texts` (name -> content) with a seal each. Bytes that are not UTF-8 are preserved (surrogateescape)."""
+    """`texts` (name -> content), each `sealed`. Bytes that are not UTF-8 are preserved (surrogateescape)."""
     return {
         name: sealed(text.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
         for name, text in texts.items()
@@ -57,7 +58,10 @@ def sealed_texts(texts: dict[str, str]) -> dict[str, str]:
 
 
 def is_ours(path: Path) -> bool:
-    """True if the file has a valid seal. A database or Rerun file is recognized by its header, even if changed since.
+    """True if icalib wrote the file and nobody changed it since, so that it may be replaced or deleted.
+
+    The sha256 in the seal must match the file. A database or a Rerun file has no seal: its header suffices, and changes
+    are not noticed.
 
     Raises OSError.
     """

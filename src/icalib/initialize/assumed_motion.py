@@ -77,7 +77,11 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
-    """As `guess_with_assumed_motion`, without trying other conventions of the poses."""
+    """As `guess_with_assumed_motion`, without trying other conventions of the poses.
+
+    Poses of the body are smoothed to a trajectory. The rig gets an assumed IMU in the body, the trajectory is sampled
+    at keyframes, and all other sensors are aligned to it.
+    """
     motion = _BodyMotion.by(motion_kinds(rig)[0], rig, recordings)
     for kind in kinds_of(rig):
         if (still := kind.start_at_rest(rig, recordings, motion.body, motion.values)) is not None:
@@ -92,14 +96,18 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
                 f"{where}{rig.reference} has a pose at only {len(poses.seconds)} instants; record more."
             )
     paths = _smoothed(motion.body)
-    # A wide window would smooth away motion and underestimate the densities.
+    # The noise densities of the assumed IMU are those of the motion. A wide window would smooth away motion and
+    # underestimate the densities.
     body = _with_assumption(rig, recordings, _smoothed(motion.body, narrow=True))
     inputs = replace(inputs_for(body, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
+    # The estimate gets an IMU that reads zero. Alignment needs one that reads the motion of the smoothed trajectory.
     ideal = _with_ideal_readings(body, recordings, paths, inputs)
     found = motion.values if motion.odometry is None else with_stated_values(inputs, motion.odometry, motion.values)
+    # Keyframes at a sensor's measurements need its time offset, so such a sensor is aligned before keyframes exist.
     if _keyframe_hosts(body) and not found:
         found = _place_hosts(body, recordings, motion.body, paths)
     moving, turned = _keyframe_motion(inputs, motion.body, found)
+    # The biases are minus the rate and acceleration of the body, because the assumed IMU reads zero.
     others = [s for s in body.mounted if (s.name, "rotation") not in moving.values]
     values = place_sensors(ideal, moving, others) | moving.values
     return inputs, replace(moving, bias=-turned, values=values), values

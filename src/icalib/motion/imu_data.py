@@ -58,13 +58,15 @@ class ImuData:
 
     @classmethod
     def build(cls, stream: ImuStream, noise: ImuNoise, forwards: bool = False) -> ImuData:
-        """Readings of `stream`. In gaps, noise includes the spread of the motion over the recording, and the bias
-        random walk."""
+        """Readings of `stream`. In gaps, noise includes the variance of the readings over the recording, as the motion
+        in a gap is unknown, and the bias random walk. forwards: see the class."""
         t = stream.seconds
         dt = np.diff(t)
+        # Columns as in `ImuData`: the third one is the deviation from the mean force within an interval.
         variance = np.tile([noise.gyro**2, noise.accel**2, WITHIN_INTERVAL_SHARE * noise.accel**2], (len(dt), 1))
         gap = dt > max(MIN_GAP_S, MIN_GAP_PERIODS * _period(t))
         gyro, accel = stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0
+        # A first-order process of this correlation time and variance, as white noise of the same density.
         variance[gap] += 2.0 * MOTION_CORRELATION_S * np.array([gyro, accel, accel])
         # Biases are constant within an integration step; their random walk over a gap becomes white noise.
         walked = np.array([noise.gyro_walk, noise.accel_walk, noise.accel_walk]) * dt[gap][:, None]

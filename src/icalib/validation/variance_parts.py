@@ -33,7 +33,8 @@ class VarianceParts(NamedTuple):
 
     @classmethod
     def of(cls, determined: Determined, parts: Segments | None) -> VarianceParts:
-        """The parts of the estimate `determined`. parts: segments, or None if the recording is not split."""
+        """Variance shares and empirical factors of the estimate `determined`. parts: estimates from segments, or None
+        if the recording is not split."""
         found = determined.estimate
         whole, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
         prior = np.clip(determined.prior_variance, 0.0, whole - guess)

@@ -107,7 +107,8 @@ class McapStorage(SpanStorage):
 
 
 def _refuse_cut_index(file: BinaryIO) -> None:
-    """Raises DamageError if the file does not end with the magic bytes: its index is truncated, all messages exist."""
+    """Raises DamageError if the file does not end with the magic bytes. Then its index is truncated, but the index
+    stands behind all messages, so none of them is lost."""
     file.seek(-len(MCAP_MAGIC), 2)
     if file.read() != MCAP_MAGIC:
         raise DamageError

@@ -106,9 +106,11 @@ def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch =
     members = [
         np.flatnonzero(region == k) for k in np.flatnonzero(np.bincount(region[region >= 0], minlength=count) > 2)
     ]
+    # regions of three or more voxels become patches: a plane with a grid of cells that its points occupy
     patches = _patches(_join(voxels, members), voxels, search)
     for k in range(FIT_ROUNDS):
         patches = _refined(patches, points, seen_from, variance, search, k == FIT_ROUNDS - 1)
+    # bent, uneven and small surfaces have lost the cells that belong to them, and do not count as planes
     return FoundPlanes(_packed(patches, search.voxel_m), sum(p.own > 0 for p in patches))
 
 

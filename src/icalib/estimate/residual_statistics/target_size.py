@@ -34,8 +34,8 @@ class TargetSize:
 
 
 def target_size(problem: Problem, state: State) -> TargetSize | None:
-    """Size of the target, from the state at the end of the solver. None without a target or an IMU, or if the size is
-    unobservable."""
+    """True over stated size of the target by the accelerometer, with its standard deviation. None without a target or
+    an IMU, or if the size is unobservable. state: the solution with the stated size."""
     seen = any(f.sees_target for f in of_type(problem.factors, TargetFactor))
     if not seen or not problem.framed or not isinstance(problem.chain, ImuFactor):
         return None
@@ -74,8 +74,8 @@ def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Pro
 
 
 def _least_cost(problem: Problem, state: State, pieces: tuple[Piece, ...], scratch: Residuals) -> float:
-    """Half the robust chi^2 at `state`, less the decrease that one step of all parameters predicts. Overwrites `pieces`
-    and `scratch`."""
+    """Approximate minimum over all parameters of half the robust chi^2: its value at `state`, less the decrease that
+    one Newton step predicts. Overwrites `pieces` and `scratch`."""
     cost = problem.linearise(state, pieces, scratch, curved=True)
     return (
         cost - solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions).decrease

@@ -41,8 +41,10 @@ class Checkerboard(Target):
 
     @cached_property
     def turns(self) -> tuple[np.ndarray, ...]:
-        """See `Target.turns`. Half a turn if rows and cols are both even or both odd; also quarter turns if they are
-        equal and even. Only the identity if `upright`, or if one is even and the other odd."""
+        """Rotations in the plane that leave the pattern unchanged, see `Target.turns`.
+
+        Half a turn if rows and cols are both even or both odd; also quarter turns if they are equal and even. Only the
+        identity if `upright`, or if one is even and the other odd."""
         number = np.arange(self.rows * self.cols).reshape(self.rows, self.cols)
         if self.upright or (self.rows + self.cols) % 2 == 1:
             return (number.ravel(),)

@@ -84,7 +84,9 @@ def dof_used_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateD
         spent[camera.name, FEATURES] = own + float(((slope * root[:, None])[u] ** 2).sum())
         if len(on := factor.on_planes_of(i)):
             slope = (there.off.residual - at.off.residual)[on] / along.share * at.off.root[on]
-            # All rows of one patch have the weight of one row together: chi^2 counts each row by `weight`.
+            # A row takes 1 - E[chi^2]: w = weight / sigma^2, v is the point's variance along the normal by the cameras,
+            # and s = w v / (1 + w v) the share. The fit of the point leaves E[chi^2] = w (1 - s)^2 (v + sigma^2).
+            # weight < 1: all rows of one patch together have the weight of one row.
             left, weight = 1.0 - at.off.share[on], factor.on.weight[on]
             own = float((1.0 - left * (left * weight + at.off.share[on])).sum())
             spent[camera.name, ON_PLANES] = own + float((slope**2).sum())

@@ -193,8 +193,9 @@ def drive_guess(
 
 
 def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
-    """l_2 [m], radii and baseline of a pair. w (n,): yaw rate [rad/s]; ahead (n,): speed of the IMU along e_1 [m/s];
-    rate (n, 2): mean rates of the wheels."""
+    """Lateral lever arm l_2 [m] of p_imu_wheel = l_1 e_1 + l_2 e_2 (e_1 forwards), radii and baseline of a pair.
+
+    w (n,): yaw rate [rad/s]; ahead (n,): speed of the IMU along e_1 [m/s]; rate (n, 2): mean rates of the wheels."""
     left, right = (_robust_fit(np.column_stack([ahead, w]), rate[:, k]) for k in range(2))
     if left[0] <= 0.0 or right[0] <= 0.0:
         raise EstimationError(
@@ -211,7 +212,10 @@ def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tupl
 
 
 def _twist(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
-    """l_2 [m] and scales of a twist. w, ahead: see `_pair`; rate (n, 2): mean speed and yaw rate of the twist."""
+    """Lateral lever arm l_2 [m], see `_pair`, and scales of a twist, whose speed and yaw rate are fitted to the IMU's.
+
+    w (n,) rad/s, ahead (n,) m/s: yaw rate and forward speed of the IMU. rate (n, 2): mean speed and yaw rate of the
+    twist."""
     along = _robust_fit(np.column_stack([ahead, w]), rate[:, 0])
     # The constant column absorbs the bias of the gyroscope.
     turned = _robust_fit(np.column_stack([w, np.ones(len(w))]), rate[:, 1])
@@ -231,8 +235,8 @@ def _twist(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tup
 
 
 def _steered(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
-    """l_2 [m], radius, wheelbase and steering offset. w, ahead: see `_pair`; rate (n, 3 or more): mean rate of the
-    wheel, and mean cos and sin of the steering angle.
+    """Lateral lever arm l_2 [m], see `_pair`, radius, wheelbase and steering offset. w, ahead: see `_pair`; rate (n, 3
+    or more): mean rate of the wheel, and mean cos and sin of the steering angle.
 
     v sin(d) = L w cos(d) is linearised in the offset and solved repeatedly (Gauss-Newton).
     """
