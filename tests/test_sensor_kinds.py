@@ -80,7 +80,7 @@ def test_no_module_outside_of_the_folders_of_sensors_names_a_kind():
         ("from icalib.sensors import pose", {"pose"}),
         ("names = [w.name for w in inputs.rig.wheels]", {"rig.wheels"}),
         ("poses = poses_at(m.poses, found.poses)", {"m.poses"}),
-        ("from icalib.sensors import ask\nfrom icalib.geometry import pose", set()),
+        ("from icalib.sensors import call_kind\nfrom icalib.geometry import pose", set()),
     ],
 )
 def test_the_check_finds_what_is_named(source: str, named: set[str]):

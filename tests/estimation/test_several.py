@@ -51,7 +51,7 @@ def test_all_clocks_of_a_recording_are_shifted_alike(rig, recordings):
     joined, (first, second) = join(rig, recordings)
     assert first.shift_ns == 0
     for stream, part in zip((joined.imu, *joined.cameras), (None, 0, 1), strict=True):
-        own = second.own[not_none(stream).key]
+        own = second.rows[not_none(stream).key]
         raw = recordings[1].imu if part is None else recordings[1].cameras[part]
         np.testing.assert_array_equal(not_none(stream).stamps_ns[own] - second.shift_ns, raw.stamps_ns)
         assert (np.diff(not_none(stream).stamps_ns) > 0).all()
@@ -78,7 +78,7 @@ def test_streams_that_outlast_each_other_stay_apart(rig, recordings):
         c.stamps_ns[-1] += 60 * 10**9
     joined, parts = join(rig, [late, second])
     for offset_ns in (0, 30 * 10**9):
-        images = joined.cameras[0].stamps_ns[parts[0].own["cam0"]] + offset_ns
+        images = joined.cameras[0].stamps_ns[parts[0].rows["cam0"]] + offset_ns
         assert images.max() < second.imu.stamps_ns[0] + parts[1].shift_ns
 
 
@@ -86,8 +86,8 @@ def test_without_an_imu_given_offsets_keep_recordings_apart(rig, recordings):
     cameras = (rig.cameras[0], dataclasses.replace(rig.cameras[1], time_offset=fixed(np.array([500.0]))))
     alone = [m.without("imu0") for m in recordings]
     joined, parts = join(rig.with_(imu=None, cameras=cameras), alone)
-    before = joined.cameras[1].stamps_ns[parts[0].own["cam1"]] + 500 * 10**9
-    assert before.max() < joined.cameras[0].stamps_ns[parts[1].own["cam0"]].min()
+    before = joined.cameras[1].stamps_ns[parts[0].rows["cam1"]] + 500 * 10**9
+    assert before.max() < joined.cameras[0].stamps_ns[parts[1].rows["cam0"]].min()
 
 
 def test_keyframes_and_images_stay_off_the_seam(rig, recordings):

@@ -99,12 +99,12 @@ def poses(name: str, stamps: Any, rotation: Any, position: Any) -> PoseStream:
 
 def _stamps(name: str, stamps: Any) -> np.ndarray:
     """(N,) int64 ns. Raises RecordingError if stamps are not a vector of finite, strictly increasing numbers."""
-    found = np.asarray(stamps)
-    if found.ndim != 1 or len(found) == 0 or found.dtype.kind not in "iuf":
+    values = np.asarray(stamps)
+    if values.ndim != 1 or len(values) == 0 or values.dtype.kind not in "iuf":
         raise RecordingError(f"{name}: stamps must be a vector of seconds, or of integer nanoseconds.")
-    if found.dtype.kind == "f" and not np.isfinite(found).all():
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
         raise RecordingError(f"{name}: stamps have entries that are NaN or infinite; remove these readings.")
-    ns = np.round(found * 1e9).astype(np.int64) if found.dtype.kind == "f" else found.astype(np.int64)
+    ns = np.round(values * 1e9).astype(np.int64) if values.dtype.kind == "f" else values.astype(np.int64)
     if (np.diff(ns) <= 0).any():
         where = int(np.argmax(np.diff(ns) <= 0)) + 1
         raise RecordingError(f"{name}: stamps must increase, but entry {where} does not; sort them, without repeats.")
@@ -113,12 +113,12 @@ def _stamps(name: str, stamps: Any) -> np.ndarray:
 
 def _floats(name: str, what: str, values: Any) -> np.ndarray:
     try:
-        found = np.asarray(values, dtype=np.float64)
+        array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise RecordingError(f"{name}: {what} must be an array of numbers.") from error
-    if not np.isfinite(found).all():
+    if not np.isfinite(array).all():
         raise RecordingError(f"{name}: {what} has entries that are NaN or infinite; remove these readings.")
-    return found
+    return array
 
 
 def _grouped(

@@ -19,14 +19,14 @@ PAUSE_NS = 10_000_000_000
 class Part:
     """One recording of a joined set.
 
-    measurements: as recorded, before the shift. shift_ns: added to all its stamps. own: by stream key, the stamps of
+    measurements: as recorded, before the shift. shift_ns: added to all its stamps. rows: by stream key, the stamps of
     the joined stream that belong to this recording. begin: its first stamp of the reference sensor, in seconds from
     that of the first recording on the joined clock.
     """
 
     measurements: Measurements
     shift_ns: int
-    own: Mapping[str, slice]
+    rows: Mapping[str, slice]
     begin: float
 
     @property
@@ -48,9 +48,9 @@ def join(
     shifts = _shifts(rig, recordings) if shifts_ns is None else shifts_ns
     first, parts, ends = recordings[0].origin_ns, [], dict.fromkeys(recordings[0].streams, 0)
     for m, shift in zip(recordings, shifts, strict=True):
-        own = {key: slice(ends[key], ends[key] + len(s.stamps_ns)) for key, s in m.streams.items()}
-        ends = {key: rows.stop for key, rows in own.items()}
-        parts.append(Part(m, shift, own, (m.origin_ns + shift - first) * 1e-9))
+        rows = {key: slice(ends[key], ends[key] + len(s.stamps_ns)) for key, s in m.streams.items()}
+        ends = {key: part.stop for key, part in rows.items()}
+        parts.append(Part(m, shift, rows, (m.origin_ns + shift - first) * 1e-9))
     return (_joined(recordings, shifts) if len(recordings) > 1 else recordings[0]), tuple(parts)
 
 
@@ -88,16 +88,16 @@ def _joined(recordings: Sequence[Measurements], shifts: Sequence[int]) -> Measur
     notes, warnings = (
         tuple(f"{m.name}: {words}" for m in recordings for words in getattr(m, kind)) for kind in ("notes", "warnings")
     )
-    found = _disjoint(recordings)
-    streams = {k: type(s).joined([own[k] for own in found], shifts) for k, s in found[0].items()}
+    disjoint = _disjoint(recordings)
+    streams = {k: type(s).joined([by_key[k] for by_key in disjoint], shifts) for k, s in disjoint[0].items()}
     return Measurements(streams, notes, warnings=warnings)
 
 
 def _disjoint(recordings: Sequence[Measurements]) -> list[dict[str, Stream]]:
     """The streams of each recording by key, renumbered so that an id (such as of a feature) occurs in one recording
     only."""
-    found = [dict(m.streams) for m in recordings]
+    by_recording = [dict(m.streams) for m in recordings]
     for kind in dict.fromkeys(type(s) for s in recordings[0].streams.values()):
-        for own, streams in zip(found, kind.disjoint([m.of(kind) for m in recordings]), strict=True):
-            own.update({s.key: s for s in streams})
-    return found
+        for by_key, streams in zip(by_recording, kind.disjoint([m.of(kind) for m in recordings]), strict=True):
+            by_key.update({s.key: s for s in streams})
+    return by_recording

@@ -96,11 +96,11 @@ class Measurements:
 
     @property
     def origin_ns(self) -> int:
-        """First stamp [ns] of the IMU; without an IMU, that of `body`."""
-        return self.body.origin_ns if self.imu is None else self.imu.origin_ns
+        """First stamp [ns] of the IMU; without an IMU, that of `reference`."""
+        return self.reference.origin_ns if self.imu is None else self.imu.origin_ns
 
     @property
-    def body(self) -> CornerStream | TrackStream | PoseStream:
+    def reference(self) -> CornerStream | TrackStream | PoseStream:
         """Stream of the reference sensor if there is no IMU: the first camera, or else the first pose sensor.
 
         If the cameras have only feature tracks, it is the first pose sensor, or else the first camera.

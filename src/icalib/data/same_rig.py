@@ -29,6 +29,6 @@ def streams_of_rig(rig: Rig, measurements: Measurements) -> Measurements:
         raise RecordingError(
             f"{where} has no data of {' and '.join(missing)}; add the measurements, or remove it from the rig."
         )
-    found = [s.near_origin() for name in rig.sensors for s in m.streams.values() if s.name == name]
-    notes = sum((words for _, words in found), m.notes)
-    return replace(m, streams={s.key: s for s, _ in found}, notes=notes)
+    shifted = [s.near_origin() for name in rig.sensors for s in m.streams.values() if s.name == name]
+    notes = sum((words for _, words in shifted), m.notes)
+    return replace(m, streams={s.key: s for s, _ in shifted}, notes=notes)

@@ -23,17 +23,17 @@ _MAX_LISTED = 20
 class MessageType:
     """A ROS message type that a kind of sensor is read from.
 
-    name: in ROS 2 notation. kind: the quantity that it contains, as `TopicInfo.kind`. stamped: the message has a header
-    with a stamp. lasting: ending of the names of topics whose messages are valid for the whole recording (latched);
-    None: no topic. parsers: by encoding (ros1, cdr), function from bytes to message for types unknown to rosbags; it
-    raises ValueError. read_as: name of the type in rosbags; empty: `name`. ros1: the definition, if rosbags has it for
-    ROS 2 only.
+    name: in ROS 2 notation. kind: the quantity that it contains, as `TopicInfo.kind`. stamped: the message has a
+    header with a stamp. latched_suffix: ending of the names of topics whose messages are valid for the whole
+    recording (latched); None: no topic. parsers: by encoding (ros1, cdr), function from bytes to message for types
+    unknown to rosbags; it raises ValueError. read_as: name of the type in rosbags; empty: `name`. ros1: the
+    definition, if rosbags has it for ROS 2 only.
     """
 
     name: str
     kind: str
     stamped: bool = True
-    lasting: str | None = None
+    latched_suffix: str | None = None
     parsers: Mapping[str, Callable[[bytes], Any]] = field(default_factory=dict)
     read_as: str = ""
     ros1: str = ""
@@ -90,9 +90,9 @@ def choose_topic(where: str, topics: Sequence[TopicInfo], sensor: str, given: st
     """
     if given is not None:
         return _given(where, topics, given, kinds)
-    found = [t for t in topics if t.kind in kinds and t.count]
-    named = [t for t in found if sensor in (*t.name.split("/"), PurePosixPath(t.name).stem)]
-    candidates = named or found
+    usable = [t for t in topics if t.kind in kinds and t.count]
+    named = [t for t in usable if sensor in (*t.name.split("/"), PurePosixPath(t.name).stem)]
+    candidates = named or usable
     if len(candidates) == 1:
         return candidates[0]
     if not candidates:
@@ -124,8 +124,8 @@ def _refuse_unreadable(missing: str, topics: Sequence[TopicInfo], kinds: Sequenc
     """Raises RecordingError if one of `topics` has one of `kinds` in a format that icalib cannot read. missing: start
     of the message."""
     for topic in topics:
-        if (held := type_not_read(topic.type)) and held[0] in kinds:
-            raise RecordingError(f"{missing}: {topic.name} ({topic.type}) holds {held[1]}.")
+        if (unread := type_not_read(topic.type)) and unread[0] in kinds:
+            raise RecordingError(f"{missing}: {topic.name} ({topic.type}) holds {unread[1]}.")
 
 
 def _given(where: str, topics: Sequence[TopicInfo], given: str, kinds: Sequence[str]) -> TopicInfo:

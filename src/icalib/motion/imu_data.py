@@ -111,7 +111,7 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
 
 def _is_dense(measurements: Measurements) -> bool:
     """True if poses, of a rig without an IMU, are so dense that rates may jump at keyframes."""
-    return float(np.median(np.diff(measurements.body.seconds))) <= MAX_DENSE_PERIOD_S
+    return float(np.median(np.diff(measurements.reference.seconds))) <= MAX_DENSE_PERIOD_S
 
 
 def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> ImuData | None:

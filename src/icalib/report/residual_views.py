@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.result import Calibration, RowResiduals
-from icalib.sensors import answer
+from icalib.sensors import call_kind
 from icalib.sensors.records import Residuals
 
 
@@ -37,7 +37,7 @@ class ResidualCloud:
 def curves(c: Calibration, r: Residuals) -> Iterator[ResidualCurve]:
     """Curves of one residual record as its kind of sensor defines them; by default one whitened curve for each column
     of `RowResiduals`."""
-    own = answer(c.rig["sensors"][r.sensor]["type"], "show", "curves", r)
+    own = call_kind(c.rig["sensors"][r.sensor]["type"], "show", "curves", r)
     if own is not None:
         yield from own
     elif isinstance(r, RowResiduals):

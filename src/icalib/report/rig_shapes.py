@@ -6,7 +6,7 @@ import numpy as np
 
 from icalib.geometry.targets import Target
 from icalib.result import Calibration
-from icalib.sensors import SENSOR_KINDS, answer, facet
+from icalib.sensors import SENSOR_KINDS, call_kind, facet
 
 PEN_UP = np.full((1, 3), np.nan)  # separates two polylines: a row of NaN
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 41)
@@ -28,7 +28,7 @@ def spread(c: Calibration) -> float:
 
 def shape(c: Calibration, name: str) -> np.ndarray | None:
     """(n, 3) polylines of a sensor's shape in the sensor frame [m]; None if its kind has no shape."""
-    return answer(c.rig["sensors"][name]["type"], "show", "shape", c, name, spread(c))
+    return call_kind(c.rig["sensors"][name]["type"], "show", "shape", c, name, spread(c))
 
 
 def legends(c: Calibration) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from icalib.result import Calibration, relative_poses
 from icalib.result.quantities import chi2_words, dof_words, rms_words, rows, rpy_deg, shown
 from icalib.result.verdict import Usability, worst
-from icalib.sensors import ask
+from icalib.sensors import call_all_kinds
 
 TRUST: dict[Usability, str] = {
     "usable": "good",
@@ -161,4 +161,4 @@ def size_words(c: Calibration) -> str:
     several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
     span = sum(r.end - r.start for r in c.recordings) if several else whole
     parts = [f"{several}{span:.1f} s"]
-    return ", ".join([*parts, *ask("show", "amounts", c), f"{len(c.trajectory.seconds)} keyframes"])
+    return ", ".join([*parts, *call_all_kinds("show", "amounts", c), f"{len(c.trajectory.seconds)} keyframes"])

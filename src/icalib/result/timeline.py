@@ -39,7 +39,7 @@ class Timeline:
 
     def recordings_of(self, stream: str) -> np.ndarray:
         """(N,) index of the recording of each stamp of the stream with the key `stream`."""
-        counts = [p.own[stream].stop - p.own[stream].start for p in self.parts]
+        counts = [p.rows[stream].stop - p.rows[stream].start for p in self.parts]
         return np.repeat(np.arange(len(counts)), counts)
 
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ class Timeline:
 
 def _extent(part: Part, image_times: list[np.ndarray], body: str) -> tuple[float, float]:
     """Times of the first and the last measurement of a recording, on the joined clock [s]."""
-    own = [part.own[c.key] for c in part.measurements.cameras]
+    own = [part.rows[c.key] for c in part.measurements.cameras]
     images = [t[rows] for t, rows in zip(image_times, own, strict=True)]
     if not images or part.measurements.imu is not None:  # else the clock is that of a camera
         images.append(part.begin + part.measurements.streams[body].seconds)

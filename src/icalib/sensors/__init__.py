@@ -5,7 +5,7 @@ Three things of a kind are registered elsewhere. A kind that gives the motion ne
 a free `random_stream`; `CONTRIBUTING.md` lists those taken.
 
 A facet is a module or package of a fixed name in the folder of a kind that serves one stage of the program: see
-`FACETS`. Each stage calls functions of its facet for all kinds of sensors (`ask`, `answer`).
+`FACETS`. Each stage calls functions of its facet for all kinds of sensors (`call_all_kinds`, `call_kind`).
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ SENSOR_KINDS = ("imu", "camera", "lidar", "wheels", "pose", "position")
 FACETS = ("spec", "record", "stream", "read", "model", "initialize", "assess", "show", "simulate", "inspect")
 
 
-def ask(name: str, question: str, *arguments: Any) -> Iterator[Any]:
-    """Yields all items that the functions named `question` in the facets named `name` yield, kind by kind."""
+def call_all_kinds(name: str, function: str, *arguments: Any) -> Iterator[Any]:
+    """Calls `function` in the facet `name` of every kind that has it, and yields the items that it yields."""
     for kind in SENSOR_KINDS:
-        yield from answer(kind, name, question, *arguments) or ()
+        yield from call_kind(kind, name, function, *arguments) or ()
 
 
-def answer(kind: str, name: str, question: str, *arguments: Any) -> Any:
-    """The return value of the function `question` in the facet `name` of one kind; None if it has no such function."""
-    function = getattr(facet(kind, name), question, None)
-    return None if function is None else function(*arguments)
+def call_kind(kind: str, name: str, function: str, *arguments: Any) -> Any:
+    """Calls `function` in the facet `name` of one kind. Returns its value, or None if the kind has no such function."""
+    called = getattr(facet(kind, name), function, None)
+    return None if called is None else called(*arguments)
 
 
 def facet(kind: str, name: str) -> Any:

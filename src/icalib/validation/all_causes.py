@@ -19,7 +19,7 @@ from icalib.result import ParameterGroup, SensorFit
 from icalib.result.timeline import Timeline
 from icalib.result.verdict import AUXILIARY
 from icalib.rig import LENS
-from icalib.sensors import answer
+from icalib.sensors import call_kind
 from icalib.sensors.camera.assess import plane_warnings
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.validation.cameras import mixed_up, other_lens
@@ -93,7 +93,7 @@ def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple
     said = {(camera, name) for camera, *_ in lenses for name in LENS}
     # `scale_causes` has named the sizes already, such as wheel radii.
     sensors = inputs.rig.sensors.values() if scales else ()
-    said |= {(s.name, name) for s in sensors for name in answer(s.sensor_type, "assess", "sizes", s) or ()}
+    said |= {(s.name, name) for s in sensors for name in call_kind(s.sensor_type, "assess", "sizes", s) or ()}
     against = tuple(c for c in against if c.key not in said)
     causes += _contradicted(judged, against, scale, certain or given, None if given else stated)
     return causes, (*notes, *scale_notes(inputs, size))

@@ -39,7 +39,7 @@ from icalib.result.timeline import Timeline
 from icalib.result.verdict import by_size
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
-from icalib.sensors import SENSOR_KINDS, ask, facet
+from icalib.sensors import SENSOR_KINDS, call_all_kinds, facet
 from icalib.sensors.camera.image_times import image_times
 from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.cross_validation import cross_validation
@@ -93,7 +93,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         rates=_rates(inputs),
         versions=versions(),
         recordings=timeline.spans,
-        planes=tuple(ask("assess", "planes", inputs, state)),
+        planes=tuple(call_all_kinds("assess", "planes", inputs, state)),
         cross_validation=validation,
         wrong=wrong,
     )
@@ -280,7 +280,7 @@ def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
-    yield from ask("assess", "warnings", inputs, found)
+    yield from call_all_kinds("assess", "warnings", inputs, found)
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.geometry import so3
 from icalib.geometry.vectors import is_near
 from icalib.rig import Rig
-from icalib.sensors import answer
+from icalib.sensors import call_kind
 
 NEAR_RAD = 0.15  # rad: largest difference between a rotation in another convention and the estimate
 NEARLY = 0.1  # relative difference between a value in another unit and the estimate
@@ -44,7 +44,7 @@ def looks_like(
         for size in IMAGE_SIZES:
             if is_near(found[:2], size * value[:2], NEARLY):
                 return f" The focal length is {size:g} times that: was it of images of another size?"
-    own = None if sensor is None else answer(sensor.sensor_type, "assess", "looks_like", sensor, name, value, found)
+    own = None if sensor is None else call_kind(sensor.sensor_type, "assess", "looks_like", sensor, name, value, found)
     return own or ""
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.result.timeline import Timeline
-from icalib.sensors import ask
+from icalib.sensors import call_all_kinds
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
@@ -17,4 +17,4 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
         name = number if span.name == number else f"{number}, {span.name}"
         yield f"{name}: {span.end - span.start:.1f} s from {span.origin_ns} ns on."
     yield from inputs.measurements.notes
-    yield from ask("assess", "notes", inputs, found, timeline)
+    yield from call_all_kinds("assess", "notes", inputs, found, timeline)

@@ -12,7 +12,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.residual_statistics.target_size import TargetSize, target_size
 from icalib.model.bodies import SIZE
 from icalib.result import ParameterGroup
-from icalib.sensors import answer
+from icalib.sensors import call_kind
 from icalib.validation.causes import Cause
 
 WRONG = 0.02  # relative error of the size: larger than that of a ruler or a good accelerometer
@@ -70,7 +70,7 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
     target = rig.has_target and bool(rig.cameras)
     has_imu = rig.imu is not None and not rig.imu.assumed
     sources = ["the size of the target"] if target else []
-    found = (answer(sensor.sensor_type, "assess", "length", sensor, rig) for sensor in rig.mounted)
+    found = (call_kind(sensor.sensor_type, "assess", "length", sensor, rig) for sensor in rig.mounted)
     sources += [source for source in found if source]
     if has_imu and (size is not None or not target):
         sources.append("the accelerometer")

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.estimate.problem.inputs import Inputs
 from icalib.observability.contradictions import Contradiction
 from icalib.result import ParameterGroup
-from icalib.sensors import answer
+from icalib.sensors import call_kind
 from icalib.validation.looks_like import looks_like
 
 
@@ -19,7 +19,7 @@ def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequ
     named = {c.key[0] for c in against}
     for sensor in inputs.rig.sensors.values():
         if sensor.name not in named:
-            yield from answer(sensor.sensor_type, "assess", "absurd", sensor, found) or ()
+            yield from call_kind(sensor.sensor_type, "assess", "absurd", sensor, found) or ()
 
 
 def stated_words(inputs: Inputs, c: Contradiction) -> str:

@@ -55,8 +55,8 @@ class McapStorage(SpanStorage):
             (letters,) = struct.unpack("<I", file.read(4))
             compression = file.read(min(letters, _LONGEST_NAME)).decode()
             (stored,) = struct.unpack("<Q", file.read(8))
-            there = max(0, length - (file.tell() - begin))
-            self.spans.append(Span(file.tell(), min(stored, there), compression, crc if stored <= there else 0))
+            available = max(0, length - (file.tell() - begin))
+            self.spans.append(Span(file.tell(), min(stored, available), compression, crc if stored <= available else 0))
         elif kind == _INDEX and self.spans:
             channel, size = struct.unpack("<HI", file.read(6))
             size = min(size, length - 6)

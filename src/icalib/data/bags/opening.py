@@ -26,8 +26,8 @@ _SUFFIXES = (".bag", ".active", ".mcap", ".db3", ".zstd")
 
 def bag_files(folder: Path) -> list[Path]:
     """Bag files directly in `folder`, sorted by the numbers in their names: run_2.db3 before run_10.db3."""
-    found = [p for p in folder.iterdir() if p.is_file() and p.suffix in _SUFFIXES]
-    return sorted(found, key=lambda p: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", p.name)])
+    paths = [p for p in folder.iterdir() if p.is_file() and p.suffix in _SUFFIXES]
+    return sorted(paths, key=lambda p: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", p.name)])
 
 
 def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
@@ -112,5 +112,5 @@ def _absent(folder: Path) -> list[str]:
         names = [Path(item.text()).name for item in about["relative_file_paths"].items()]
     except (RigError, KeyError):
         return []
-    there = {path.name for path in folder.iterdir()}
-    return [n for n in names if not {n, n + ".zstd"} & there]
+    present = {path.name for path in folder.iterdir()}
+    return [n for n in names if not {n, n + ".zstd"} & present]

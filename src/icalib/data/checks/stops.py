@@ -32,5 +32,5 @@ def moved(rotation: np.ndarray, position: np.ndarray, a: np.ndarray, b: np.ndarr
     """
     turn = so3.log_many(np.ascontiguousarray(rotation[a].transpose(0, 2, 1) @ rotation[b]))
     spread = float(np.linalg.norm(position - np.median(position, axis=0), axis=1).max(initial=0.0))
-    way = np.linalg.norm(position[b] - position[a], axis=1) / max(spread, 1e-9)
-    return np.linalg.norm(turn, axis=1) + way
+    distance = np.linalg.norm(position[b] - position[a], axis=1) / max(spread, 1e-9)
+    return np.linalg.norm(turn, axis=1) + distance

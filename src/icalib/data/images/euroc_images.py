@@ -30,21 +30,21 @@ def image_files(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
     called if files have another suffix than data.csv says. Raises RecordingError naming an unreadable line.
     """
     data = folder / "data"
-    there = pictures_in(data)
-    if not there:
+    paths = pictures_in(data)
+    if not paths:
         return stamped_by_name(pictures_in(folder)) or []
     table = folder / "data.csv"
     if table.is_file():
-        return _with_other_endings(_listed(table, data), there, table, note)
-    if named := stamped_by_name(there):
+        return _with_other_endings(_listed(table, data), paths, table, note)
+    if named := stamped_by_name(paths):
         return named
-    unnamed = next((p for p in there if not (p.stem.isdecimal() and int(p.stem) < 2**63)), None)
+    unnamed = next((p for p in paths if not (p.stem.isdecimal() and int(p.stem) < 2**63)), None)
     if unnamed:
         raise RecordingError(
             f"{folder} has no data.csv, and the name of {unnamed.name} is not a stamp in ns; write data.csv with "
             "lines t [ns],file name."
         )
-    return sorted((int(p.stem), p) for p in there)
+    return sorted((int(p.stem), p) for p in paths)
 
 
 def pictures_in(folder: Path) -> list[Path]:
@@ -56,8 +56,8 @@ def stamped_by_name(files: Sequence[Path], names: Sequence[str] = ()) -> list[tu
 
     names: the part of each name that contains the stamp; default: the name without suffix.
     """
-    found = [_STAMPED.fullmatch(name) for name in names or [p.stem for p in files]]
-    texts = [m["stamp"] for m in found if m]
+    matches = [_STAMPED.fullmatch(name) for name in names or [p.stem for p in files]]
+    texts = [m["stamp"] for m in matches if m]
     unit = unit_by_date([float(text) for text in texts]) if len(texts) == len(files) else None
     if unit is None or not files:
         return None
@@ -130,18 +130,18 @@ def _line_sentence(table: Path, number: int, line: str) -> str:
 
 
 def _with_other_endings(
-    listed: list[tuple[int, Path]], there: Sequence[Path], table: Path, note: Note
+    listed: list[tuple[int, Path]], paths: Sequence[Path], table: Path, note: Note
 ) -> list[tuple[int, Path]]:
-    """`listed`, with file names corrected if all suffixes in the table differ from those of the files `there`."""
+    """`listed`, with file names corrected if all suffixes in the table differ from those of the files `paths`."""
     if any(path.is_file() for _, path in listed):
         return listed
-    by_stem = {p.stem: p for p in there}
-    found = [(stamp, by_stem.get(path.stem, path)) for stamp, path in listed]
+    by_stem = {p.stem: p for p in paths}
+    renamed = [(stamp, by_stem.get(path.stem, path)) for stamp, path in listed]
     same = sum(path.stem in by_stem for _, path in listed)
-    names = f"{table} names {listed[0][1].name}, and {table.parent / 'data'} holds {there[0].name}"
+    names = f"{table} names {listed[0][1].name}, and {table.parent / 'data'} holds {paths[0].name}"
     if not same:
         raise RecordingError(
             f"{names}: none of its {len(listed)} images is there; correct the names, or copy the images."
         )
     note(f"{names}: {same} images were found under the same name with another ending.")
-    return found
+    return renamed

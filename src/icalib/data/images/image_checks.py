@@ -41,14 +41,9 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
     last: Payload | None = None
     size, ahead = _usual_size(payloads)
     for payload in ahead:
-        if not np.frombuffer(payload.data, np.uint8).any():
-            dropped.add("consist of zeros", payload)
+        if (fault := _content_fault(payload)) is not None:
+            dropped.add(fault[0], payload, fault[1])
             continue
-        if payload.encoding == NO_PICTURE:
-            dropped.add("are not images", payload, unknown_encoding(payload))
-            continue
-        if not is_known(payload.encoding):
-            raise RecordingError(unknown_encoding(payload))
         if size and payload.width and (payload.width, payload.height) != size:
             odd += 1
             error = _other_size(payload, size, where)
@@ -66,6 +61,18 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
         raise RecordingError(dropped.first_error)
     _refuse_too_few(kept, dropped, where)
     dropped.note(where, note)
+
+
+def _content_fault(payload: Payload) -> tuple[str, str] | None:
+    """Reason to reject a payload without image content, and the error message in case no image remains; None for an
+    image. Raises RecordingError for an unknown encoding."""
+    if not np.frombuffer(payload.data, np.uint8).any():
+        return "consist of zeros", ""
+    if payload.encoding == NO_PICTURE:
+        return "are not images", unknown_encoding(payload)
+    if not is_known(payload.encoding):
+        raise RecordingError(unknown_encoding(payload))
+    return None
 
 
 def _does_not_follow(last: Payload, payload: Payload, where: str) -> str:

@@ -87,12 +87,12 @@ def video_payloads(path: Path, where: str) -> Iterator[Payload]:
     with _opened(path) as video:
         while True:
             good, image = video.read()
-            own_ns = round(1e6 * float(video.get(_property("POS_MSEC"))))
+            video_ns = round(1e6 * float(video.get(_property("POS_MSEC"))))
             if not good or (times is not None and n >= len(times)):
                 break
             grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
             height, width = grey.shape
-            stamp_ns = own_ns if times is None else int(times[n])
+            stamp_ns = video_ns if times is None else int(times[n])
             yield Payload(stamp_ns, where, "mono8", grey.tobytes(), width, height, width, name=f"frame {n}")
             n += 1
     if not n:

@@ -52,10 +52,10 @@ class OdometryStream:
 def read_poses(bag: HasMessages, topic: str) -> PoseMessages:
     """All PoseStamped, PoseWithCovarianceStamped or TransformStamped of `topic`. Raises RecordingError as
     `BagRecording.messages`, and if the frame changes."""
-    stamps_ns, found = all_messages(bag, topic, "pose")
-    if found and hasattr(found[0], "child_frame_id"):
-        _frame(bag, topic, found, lambda m: m.child_frame_id)
-    return _poses(bag, topic, _frame(bag, topic, found), stamps_ns, [_pose_of(m) for m in found])
+    stamps_ns, messages = all_messages(bag, topic, "pose")
+    if messages and hasattr(messages[0], "child_frame_id"):
+        _frame(bag, topic, messages, lambda m: m.child_frame_id)
+    return _poses(bag, topic, _frame(bag, topic, messages), stamps_ns, [_pose_of(m) for m in messages])
 
 
 @dataclass(frozen=True)
@@ -74,34 +74,35 @@ def _pose_of(message: Any) -> Any:
 
 def read_twists(bag: HasMessages, topic: str) -> TwistStream:
     """All TwistStamped of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
-    stamps_ns, found = all_messages(bag, topic, "twist")
-    return _twists(_frame(bag, topic, found), stamps_ns, [m.twist for m in found])
+    stamps_ns, messages = all_messages(bag, topic, "twist")
+    return _twists(_frame(bag, topic, messages), stamps_ns, [m.twist for m in messages])
 
 
 def read_odometry(bag: HasMessages, topic: str) -> OdometryStream:
     """All Odometry of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
-    stamps_ns, found = all_messages(bag, topic, "odometry")
-    pose = _poses(bag, topic, _frame(bag, topic, found), stamps_ns, [m.pose.pose for m in found])
-    body = _frame(bag, topic, found, lambda m: m.child_frame_id)
-    return OdometryStream(pose, _twists(body, stamps_ns, [m.twist.twist for m in found]))
+    stamps_ns, messages = all_messages(bag, topic, "odometry")
+    pose = _poses(bag, topic, _frame(bag, topic, messages), stamps_ns, [m.pose.pose for m in messages])
+    body = _frame(bag, topic, messages, lambda m: m.child_frame_id)
+    return OdometryStream(pose, _twists(body, stamps_ns, [m.twist.twist for m in messages]))
 
 
 def read_odometry_twists(bag: HasMessages, topic: str) -> TwistStream:
     """Velocities of all Odometry messages of `topic`, poses unchecked. Raises RecordingError as `read_twists`."""
-    stamps_ns, found = all_messages(bag, topic, "odometry")
-    return _twists(_frame(bag, topic, found, lambda m: m.child_frame_id), stamps_ns, [m.twist.twist for m in found])
+    stamps_ns, messages = all_messages(bag, topic, "odometry")
+    frame = _frame(bag, topic, messages, lambda m: m.child_frame_id)
+    return _twists(frame, stamps_ns, [m.twist.twist for m in messages])
 
 
 def all_messages(bag: HasMessages, topic: str, kind: str) -> tuple[np.ndarray, list[Any]]:
     """(N,) int64 stamps [ns] and N messages of `topic`. Raises RecordingError as `BagRecording.messages`."""
-    found = list(bag.messages(topic, kind))
-    return np.array([stamp_ns for stamp_ns, _ in found], np.int64), [message for _, message in found]
+    stamped = list(bag.messages(topic, kind))
+    return np.array([stamp_ns for stamp_ns, _ in stamped], np.int64), [message for _, message in stamped]
 
 
 def _frame(
-    bag: HasMessages, topic: str, found: list[Any], of: Callable[[Any], str] = lambda m: m.header.frame_id
+    bag: HasMessages, topic: str, messages: list[Any], of: Callable[[Any], str] = lambda m: m.header.frame_id
 ) -> str:
-    frames = list(dict.fromkeys(of(m) for m in found))
+    frames = list(dict.fromkeys(of(m) for m in messages))
     if len(frames) > 1:
         raise RecordingError(
             f"{bag.root} {topic} mixes the frames {', '.join(frames)}; record each under its own name."

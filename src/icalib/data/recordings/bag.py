@@ -17,7 +17,7 @@ from icalib.data.bags.storage import Tally
 from icalib.data.images.image_checks import checked_payloads
 from icalib.data.images.images import Payload, file_payload
 from icalib.data.recordings.base import Recording
-from icalib.data.stamps.window import WHOLE, Span, Window
+from icalib.data.stamps.window import WHOLE_RECORDING, Span, Window
 from icalib.data.topics import MessageType, TopicInfo, choose_topic, find_topic, message_types
 from icalib.errors import RecordingError
 from icalib.sensors.sensor import Sensor
@@ -31,7 +31,7 @@ class BagRecording(Recording):
 
     has_messages = True
 
-    def __init__(self, root: Path, window: Window = WHOLE) -> None:
+    def __init__(self, root: Path, window: Window = WHOLE_RECORDING) -> None:
         super().__init__(root, window)
         self._storages, self._notes = open_storages(root)
         self._topics = self._list_topics()
@@ -40,10 +40,10 @@ class BagRecording(Recording):
     def _received_ns(self) -> Span:
         """Range of receive times [ns] of the messages in the time window, by the clock of the recorder. Raises
         RecordingError if the window begins after the last message."""
-        found = self._spans()
-        if self.window.is_all or not found:
+        spans = self._spans()
+        if self.window.is_all or not spans:
             return -(2**63), 2**63 - 1
-        origin, last = min(first for first, _ in found), max(last for _, last in found)
+        origin, last = min(first for first, _ in spans), max(last for _, last in spans)
         low, high = self.window.bounds(origin)
         if low > last:
             raise self.window.refuse(str(self.root), (last - origin) * 1e-9)
@@ -61,25 +61,25 @@ class BagRecording(Recording):
 
     def payloads(self, topic: str) -> Iterator[Payload]:
         where = f"{self.root} {topic}"
-        found = (_payload(stamp, where, message) for stamp, message in self.messages(topic, "image"))
-        return checked_payloads(found, where, self.note)
+        images = (_payload(stamp, where, message) for stamp, message in self.messages(topic, "image"))
+        return checked_payloads(images, where, self.note)
 
     def place(self, topic: str) -> str:
         return f"{self.root} {topic}"
 
     def find(self, path: str) -> Path | None:
         """Path of the table `path` in the folder of the bag; None if it does not exist."""
-        found = self.root.parent / path
-        return found if found.is_file() else None
+        table = self.root.parent / path
+        return table if table.is_file() else None
 
     def table(self, sensor: Sensor, path: str, field: str = "path") -> Path:
-        if (found := self.find(path)) is None:
+        if (table := self.find(path)) is None:
             raise RecordingError(
                 f"{self.root.parent / path} does not exist, and a bag holds no such table; put the table beside the "
                 f"bag, or correct `{field}` of {sensor.name} in the rig file."
             )
-        self._remember(found)
-        return found
+        self._remember(table)
+        return table
 
     def files(self) -> list[Path]:
         return [*(storage.name for storage in self._storages), *super().files()]
@@ -142,19 +142,19 @@ class BagRecording(Recording):
         )
 
     def _contents(self, topic: TopicInfo) -> Iterator[tuple[int, str, bytes]]:
-        """Receive time [ns], encoding and bytes of each message in the window. Latched messages (`MessageType.lasting`)
-        are included whenever they were received. Raises RecordingError if the window contains none."""
+        """Receive time [ns], encoding and bytes of each message in the window, and of latched messages
+        (`MessageType.latched_suffix`) at any time. Raises RecordingError if the window contains none."""
         low, high = self._received
-        lasting = message_types()[topic.type].lasting
-        always = lasting is not None and topic.name.endswith(lasting)
-        found = self.window.is_all
+        suffix = message_types()[topic.type].latched_suffix
+        is_latched = suffix is not None and topic.name.endswith(suffix)
+        is_any_inside = self.window.is_all
         for storage in self._storages:
             wanted = {k for k, c in storage.connections.items() if (c.topic, c.type) == (topic.name, topic.type)}
             for key, received_ns, content in storage.messages(wanted):
-                if always or low <= received_ns < high:
-                    found = True
+                if is_latched or low <= received_ns < high:
+                    is_any_inside = True
                     yield received_ns, storage.connections[key].encoding, content
-        if not found and topic.count and topic.first_ns is not None and topic.last_ns is not None:
+        if not is_any_inside and topic.count and topic.first_ns is not None and topic.last_ns is not None:
             origin = min(first for first, _ in self._spans())
             raise self.window.refuse(f"{self.root} {topic.name}", (topic.last_ns - origin) * 1e-9)
 

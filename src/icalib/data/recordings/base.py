@@ -14,7 +14,7 @@ from icalib.data.images.image_checks import frames
 from icalib.data.images.images import DecodedImage, Payload
 from icalib.data.measurements import CornerStream, TrackStream
 from icalib.data.stamps.sections import S
-from icalib.data.stamps.window import WHOLE, Span, Window, cut, stamps_inside
+from icalib.data.stamps.window import WHOLE_RECORDING, Span, Window, cut, stamps_inside
 from icalib.data.topics import TopicInfo, choose_topic
 from icalib.errors import RecordingError
 from icalib.rig import Camera, Rig
@@ -38,7 +38,7 @@ class Recording(ABC):
 
     has_messages: ClassVar[bool] = False  # True: sensors are read from messages; False: from tables
 
-    def __init__(self, root: Path, window: Window = WHOLE) -> None:
+    def __init__(self, root: Path, window: Window = WHOLE_RECORDING) -> None:
         self.root = root
         self.window = window
         self._read: list[Path] = []

@@ -15,7 +15,7 @@ from icalib.data.images.images import Payload
 from icalib.data.images.unreadable import VIDEO_FILE
 from icalib.data.images.videos import video_payloads, video_stamps, video_topic, videos_in
 from icalib.data.recordings.base import Recording
-from icalib.data.stamps.window import WHOLE, Window
+from icalib.data.stamps.window import WHOLE_RECORDING, Window
 from icalib.data.tables.files import StampsOfRows, TableFile, files_in, named_tables, rows_of
 from icalib.data.tables.numbered import numbered_pictures, stamped_by_rows
 from icalib.data.topics import TopicInfo, choose_topic, find_topic
@@ -36,22 +36,22 @@ class FolderRecording(Recording):
     Kalibr, `cam0/STAMP.png` and `imu0.csv`, is supported, too.
     """
 
-    def __init__(self, root: Path, window: Window = WHOLE) -> None:
+    def __init__(self, root: Path, window: Window = WHOLE_RECORDING) -> None:
         super().__init__(root, window)
         if not window.is_all:
             self.note(window.note(str(root)))
 
     def topics(self) -> tuple[TopicInfo, ...]:
-        found: list[TopicInfo] = []
+        topics: list[TopicInfo] = []
         for folder in sorted(p for base in self._bases() for p in base.iterdir() if p.is_dir()):
             images = self._images(folder)
-            found += [] if images is None else [images]
+            topics += [] if images is None else [images]
             for path, declared in files_in(folder):
                 if images is None or path.name not in _OF_IMAGES:
-                    found.append(self._info(path, f"{folder.name}/{path.name.removesuffix('.gz')}", declared))
+                    topics.append(self._info(path, f"{folder.name}/{path.name.removesuffix('.gz')}", declared))
         for base in self._bases():
-            found += [self._info(path, path.name, declared) for path, declared in named_tables(base)]
-        return (*found, *self._videos)
+            topics += [self._info(path, path.name, declared) for path, declared in named_tables(base)]
+        return (*topics, *self._videos)
 
     def stamps(self, topic: str) -> np.ndarray:
         stamps_ns = self._all_stamps(topic)
@@ -91,13 +91,13 @@ class FolderRecording(Recording):
     def _frames(self, video: Path) -> Iterator[Payload]:
         """Checked frames of a video in the time window."""
         self._remember(video)
-        found = video_payloads(video, str(video))
+        frames = video_payloads(video, str(video))
         if not self.window.is_all:
             stamps_ns = video_stamps(video)
             inside = self._inside(stamps_ns, str(video))
             used = set(stamps_ns[inside].tolist())
-            found = (p for p in found if p.stamp_ns in used)
-        return checked_payloads(found, str(video), self.note)
+            frames = (p for p in frames if p.stamp_ns in used)
+        return checked_payloads(frames, str(video), self.note)
 
     def find(self, path: str) -> Path | None:
         plain = path.removesuffix(".gz")
@@ -109,9 +109,9 @@ class FolderRecording(Recording):
         )
 
     def table(self, sensor: Sensor, path: str, field: str = "path") -> Path:
-        found = self._locate(path, field)
-        self._remember(found)
-        return found
+        table = self._locate(path, field)
+        self._remember(table)
+        return table
 
     def image_topics(self) -> tuple[TopicInfo, ...]:
         """Topics of image folders and videos."""
@@ -138,7 +138,7 @@ class FolderRecording(Recording):
     def _tables_with_rows(self) -> dict[Path, tuple[StampsOfRows, TableLayout]]:
         """Tables whose rows can provide stamps for images, detected ones and those of the rig file: the function that
         reads the stamps, and the layout."""
-        tables = [found for base in self._bases() for found in named_tables(base)]
+        tables = [named for base in self._bases() for named in named_tables(base)]
         for folder in (p for base in self._bases() for p in base.iterdir() if p.is_dir()):
             tables += files_in(folder)
         plain = [(path, declared, PLAIN_TABLE) for path, declared in tables]
@@ -148,8 +148,8 @@ class FolderRecording(Recording):
     def _layouts(self) -> dict[Path, tuple[TableFile, TableLayout]]:
         """As `_tables_with_rows`, for tables of the sensors of `use_layouts`: declaration and layout."""
         tables = [(s.sensor_type, getattr(s, "path", ""), getattr(s, "layout", PLAIN_TABLE)) for s in self._sensors]
-        found = [(self.find(path), rows, layout) for kind, path, layout in tables if (rows := rows_of(kind))]
-        return {path: (declared, layout) for path, declared, layout in found if path is not None}
+        layouts = [(self.find(path), rows, layout) for kind, path, layout in tables if (rows := rows_of(kind))]
+        return {path: (declared, layout) for path, declared, layout in layouts if path is not None}
 
     def _stamps_of(self, path: Path, declared: TableFile) -> np.ndarray:
         """(N,) int64 ns: stamps of a table."""
@@ -167,8 +167,8 @@ class FolderRecording(Recording):
         return tuple(video_topic(p, str(p.relative_to(self.root))) for p in files)
 
     def _locate(self, path_hint: str, field: str = "path") -> Path:
-        if found := self.find(path_hint):
-            return found
+        if table := self.find(path_hint):
+            return table
         plain = path_hint.removesuffix(".gz")
         raise RecordingError(
             f"{self.root} has no {plain} (nor {plain}.gz); {self._listing()}; set `{field}` of the sensor in the rig "
@@ -176,8 +176,8 @@ class FolderRecording(Recording):
         )
 
     def _listing(self) -> str:
-        found = sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*") if p.is_file())
-        if not found:
+        names = sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*") if p.is_file())
+        if not names:
             return "the folder holds no files"
-        more = f" and {len(found) - _MAX_LISTED} more" if len(found) > _MAX_LISTED else ""
-        return f"it holds {', '.join(found[:_MAX_LISTED])}{more}"
+        more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+        return f"it holds {', '.join(names[:_MAX_LISTED])}{more}"

@@ -17,7 +17,7 @@ from icalib.data.images.euroc_images import SUFFIXES, file_payloads, pictures_in
 from icalib.data.images.image_checks import checked_payloads
 from icalib.data.images.images import Payload
 from icalib.data.recordings.base import Recording
-from icalib.data.stamps.window import WHOLE, Window
+from icalib.data.stamps.window import WHOLE_RECORDING, Window
 from icalib.data.topics import TopicInfo, choose_topic
 from icalib.errors import RecordingError
 from icalib.rig import Camera
@@ -43,7 +43,7 @@ class PictureFolder(Recording):
     each pattern is a topic.
     """
 
-    def __init__(self, root: Path, window: Window = WHOLE) -> None:
+    def __init__(self, root: Path, window: Window = WHOLE_RECORDING) -> None:
         super().__init__(root, window)
         if not window.is_all:
             self.note(window.note(str(root)))
@@ -114,52 +114,52 @@ class PictureFolder(Recording):
             keys = [p.stem for p in paths]
         if not paths:
             raise RecordingError(f"{self.root} has no images {topic}; correct `topic` of the camera in the rig file.")
-        found = stamped_by_name(paths, keys)
-        what = "number" if found is None else "stamp"
-        if found is None and not self.window.is_all:
+        images = stamped_by_name(paths, keys)
+        what = "number" if images is None else "stamp"
+        if images is None and not self.window.is_all:
             raise RecordingError(
                 f"{self.root} holds images without timestamps, so --from and --to cannot be used; leave them out."
             )
-        found = found or sorted((_number(key, p), p) for key, p in zip(keys, paths, strict=True))
-        for (a, first), (b, second) in zip(found, found[1:], strict=False):
+        images = images or sorted((_number(key, p), p) for key, p in zip(keys, paths, strict=True))
+        for (a, first), (b, second) in zip(images, images[1:], strict=False):
             if a == b:
                 raise RecordingError(
                     f"{first} and {second.name} have the same {what}, {a}; give each image of a camera its own."
                 )
-        return [(at * (APART_NS if what == "number" else 1), path) for at, path in found]
+        return [(at * (APART_NS if what == "number" else 1), path) for at, path in images]
 
 
 def _topics(root: Path) -> list[str]:
     folders = sorted(p.name for p in root.iterdir() if p.is_dir() and pictures_in(p)) if root.is_dir() else []
-    return [name for folder in (".", *folders) for name in _mixed(root, folder)]
+    return [name for folder in (".", *folders) for name in _patterns_of_cameras(root, folder)]
 
 
-def _mixed(root: Path, folder: str) -> list[str]:
+def _patterns_of_cameras(root: Path, folder: str) -> list[str]:
     """Topics of `folder`: file patterns, if it mixes the images of several cameras with shared numbers; else `folder`;
     empty without images."""
     paths = pictures_in(root / folder)
     # The number is the last or the second last in the names, whichever gives fewer patterns.
-    own = min((_patterns(paths, place) for place in (-1, -2)), key=len)
-    numbers = [number for found in own.values() for number in found]
+    patterns = min((_patterns(paths, place) for place in (-1, -2)), key=len)
+    numbers = [number for group in patterns.values() for number in group]
     # With two cameras nearly all numbers occur twice. Different names of one camera hardly share numbers.
-    alike = len(own) > 1 and min(map(len, own.values())) > 1
-    if alike and sum(map(len, own.values())) == len(paths) and len(set(numbers)) < MIXED * len(numbers):
-        return sorted(pattern if folder == "." else f"{folder}/{pattern}" for pattern in own)
+    alike = len(patterns) > 1 and min(map(len, patterns.values())) > 1
+    if alike and sum(map(len, patterns.values())) == len(paths) and len(set(numbers)) < MIXED * len(numbers):
+        return sorted(pattern if folder == "." else f"{folder}/{pattern}" for pattern in patterns)
     return [folder] if paths else []
 
 
 def _patterns(paths: list[Path], place: int) -> dict[str, set[int]]:
     """Image numbers by file pattern, in which a star replaces the number. place: index of the number in the name, -1
     for the last."""
-    own: dict[str, set[int]] = {}
+    patterns: dict[str, set[int]] = {}
     for path in paths:
-        found = [*re.finditer(r"\d+", path.stem)]
-        if len(found) >= -place:
-            a, b = found[place].span()
-            own.setdefault(f"{path.stem[:a]}*{path.stem[b:]}{path.suffix}", set()).add(int(path.stem[a:b]))
+        digits = [*re.finditer(r"\d+", path.stem)]
+        if len(digits) >= -place:
+            a, b = digits[place].span()
+            patterns.setdefault(f"{path.stem[:a]}*{path.stem[b:]}{path.suffix}", set()).add(int(path.stem[a:b]))
         else:
-            own.setdefault(path.name, set()).add(0)
-    return own
+            patterns.setdefault(path.name, set()).add(0)
+    return patterns
 
 
 def _number(key: str, path: Path) -> int:

@@ -37,13 +37,13 @@ def read_measurements(
     """
     recording.use_layouts(tuple(rig.sensors.values()))
     jumps = ClockJumps(LONGEST_S)
-    reading = Reading(rig, _whole if rig.cameras_alone else jumps.cut, find, follow)
-    found = []
+    reading = Reading(rig, _uncut if rig.cameras_alone else jumps.cut, find, follow)
+    streams = []
     for kind in SENSOR_KINDS:
         sensors = [s for s in rig.sensors.values() if s.sensor_type == kind]
-        found += facet(kind, "read").read(recording, sensors, reading) if sensors else []
-    notes = sum((own for _, own in found), recording.notes() + jumps.notes)
-    return Measurements.of_streams(*(stream for stream, _ in found), notes=notes)
+        streams += facet(kind, "read").read(recording, sensors, reading) if sensors else []
+    notes = sum((sentences for _, sentences in streams), recording.notes() + jumps.notes)
+    return Measurements.of_streams(*(stream for stream, _ in streams), notes=notes)
 
 
 def without_jumps(rig: Rig, measurements: Measurements) -> Measurements:
@@ -55,6 +55,6 @@ def without_jumps(rig: Rig, measurements: Measurements) -> Measurements:
     return replace(m, streams=streams, notes=m.notes + jumps.notes) if jumps.notes else m
 
 
-def _whole(stream: S, what: str) -> S:
+def _uncut(stream: S, what: str) -> S:
     del what
     return stream

@@ -31,16 +31,16 @@ def open_all(given: Source | Sequence[Source], start_s: float = 0.0, end_s: floa
     if twice:
         raise RecordingError(f"the recording {twice[0]} is given twice; give each recording once.")
     names = Counter(path.name for path in paths)
-    found: dict[str, Recording] = {}
+    opened: dict[str, Recording] = {}
     for k, source in enumerate(sources, 1):
         if isinstance(source, (str, Path)):
             path = Path(source).resolve()
-            found[path.name if names[path.name] == 1 else str(path)] = open_recording(source, start_s, end_s)
+            opened[path.name if names[path.name] == 1 else str(path)] = open_recording(source, start_s, end_s)
         elif (start_s, end_s) != (0.0, inf):
             raise RecordingError("start_s and end_s do not apply to an opened recording; give them to open_recording.")
         else:
-            found[f"recording {k}"] = source
-    return found
+            opened[f"recording {k}"] = source
+    return opened
 
 
 @contextmanager

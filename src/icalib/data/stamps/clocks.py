@@ -47,7 +47,7 @@ def unit_of_stamps(stamps: np.ndarray, slowest_hz: float, fastest_hz: float) -> 
     ]
     dated: list[TimeUnit] = [u for u in possible if _DATES_S[0] <= size * seconds[u] <= _DATES_S[1]]
     usual: list[TimeUnit] = [u for u in possible if _USUAL_S[0] <= step * len(stamps) * seconds[u] < _USUAL_S[1]]
-    return next((found[0] for found in (dated, possible, usual) if len(found) == 1), None)
+    return next((units[0] for units in (dated, possible, usual) if len(units) == 1), None)
 
 
 def unit_by_date(numbers: Sequence[float]) -> TimeUnit | None:

@@ -51,7 +51,7 @@ class Window:
         )
 
 
-WHOLE = Window()
+WHOLE_RECORDING = Window()
 
 
 def cut(window: Window, stream: S, what: str, spans: Sequence[Span]) -> S:
@@ -67,26 +67,26 @@ def cut(window: Window, stream: S, what: str, spans: Sequence[Span]) -> S:
 
 def stamps_inside(window: Window, stamps_ns: np.ndarray, what: str, spans: Sequence[Span]) -> np.ndarray:
     """(N,) bool: stamps in the window, as `cut`. Raises RecordingError if there are none."""
-    own = int(stamps_ns.min()), int(stamps_ns.max())
-    origin = start_of(own, spans)
+    span = int(stamps_ns.min()), int(stamps_ns.max())
+    origin = start_of(span, spans)
     low, high = window.bounds(origin)
     inside = (stamps_ns >= low) & (stamps_ns < high)
     if not inside.any():
-        raise window.refuse(what, (own[1] - origin) * 1e-9)
+        raise window.refuse(what, (span[1] - origin) * 1e-9)
     return inside
 
 
-def start_of(own: Span, spans: Sequence[Span]) -> int:
-    """Start of the recording [ns] on the clock of a stream with the span `own`.
+def start_of(span: Span, spans: Sequence[Span]) -> int:
+    """Start of the recording [ns] on the clock of a stream with the span `span`.
 
     It is the first stamp of all streams whose spans overlap that span, directly or through other streams. A stream with
     a clock jump (longer than a day), or with another clock, starts at its first stamp.
     """
-    first, last = own
+    first, last = span
     if last - first > _LONGEST_NS:
         return first
     waiting = [s for s in spans if s[1] - s[0] <= _LONGEST_NS]
-    while found := [s for s in waiting if s[0] <= last and s[1] >= first]:
-        first, last = min(first, *(s[0] for s in found)), max(last, *(s[1] for s in found))
-        waiting = [s for s in waiting if s not in found]
+    while overlapping := [s for s in waiting if s[0] <= last and s[1] >= first]:
+        first, last = min(first, *(s[0] for s in overlapping)), max(last, *(s[1] for s in overlapping))
+        waiting = [s for s in waiting if s not in overlapping]
     return first

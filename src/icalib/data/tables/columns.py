@@ -66,14 +66,14 @@ def places_by_name(kind: TableKind, header: Sequence[str]) -> np.ndarray | None:
     if not kind.known or len(header) < len(kind.names):
         return None
     words = [_plain(name) for name in header]
-    found = [_column(words, known) for known in kind.known]
-    missing = [k for k, at in enumerate(found) if at is None]
-    left = [at for at in range(len(words)) if at not in found]
+    places = [_column(words, known) for known in kind.known]
+    missing = [k for k, at in enumerate(places) if at is None]
+    left = [at for at in range(len(words)) if at not in places]
     if len(missing) == 1 and len(left) == 1:
-        found[missing[0]], missing = left[0], []
-    if missing or len(set(found)) < len(found):
+        places[missing[0]], missing = left[0], []
+    if missing or len(set(places)) < len(places):
         return None
-    return _places(len(header), [at for at in found if at is not None])
+    return _places(len(header), [at for at in places if at is not None])
 
 
 def split_kind(kind: TableKind, header: Sequence[str]) -> TableKind | None:
@@ -92,34 +92,34 @@ def places_given(kind: TableKind, header: Sequence[str], columns: Sequence[str],
         return f"needs {len(kind.names)} names, for {', '.join(kind.names)}, but has {len(columns)}"
     names = {name.strip(): at for at, name in enumerate(header)} or {str(k + 1): k for k in range(n)}
     plain = {_bare(name): at for name, at in names.items()}
-    found = [names.get(c.strip(), plain.get(_bare(c))) for c in columns]
-    if None in found:
+    places = [names.get(c.strip(), plain.get(_bare(c))) for c in columns]
+    if None in places:
         have = ", ".join(names) if header else f"no header, only columns 1 to {n}"
-        return f"has {columns[found.index(None)]!r}, but the table has {have}"
-    if len(set(found)) < len(found):
+        return f"has {columns[places.index(None)]!r}, but the table has {have}"
+    if len(set(places)) < len(places):
         return "has a column twice"
-    return _places(n, [at for at in found if at is not None])
+    return _places(n, [at for at in places if at is not None])
 
 
 def contradicts(kind: TableKind, header: Sequence[str]) -> bool:
     """True if a header name belongs to a column at another position than in `kind`."""
     words = [_plain(name) for name in header]
-    found = [_column(words, known) for known in kind.known]
-    return any(at not in (None, k) for k, at in enumerate(found))
+    places = [_column(words, known) for known in kind.known]
+    return any(at not in (None, k) for k, at in enumerate(places))
 
 
-def _places(n: int, found: Sequence[int]) -> np.ndarray:
+def _places(n: int, places: Sequence[int]) -> np.ndarray:
     place = np.full(n, LEFT_OUT, np.int64)
-    place[list(found)] = np.arange(len(found))
+    place[list(places)] = np.arange(len(places))
     return place
 
 
 def _column(words: Sequence[str], known: Sequence[str]) -> int | None:
     """Index of the only word that matches the first pattern of `known` with any match; None if none or several do."""
     for name in known:
-        found = [at for at, word in enumerate(words) if re.fullmatch(name, word)]
-        if found:
-            return found[0] if len(found) == 1 else None
+        matches = [at for at, word in enumerate(words) if re.fullmatch(name, word)]
+        if matches:
+            return matches[0] if len(matches) == 1 else None
     return None
 
 

@@ -52,21 +52,21 @@ def rows_of(sensor_type: str) -> TableFile | None:
 def named_tables(folder: Path) -> list[tuple[Path, TableFile]]:
     """CSV files directly in `folder` whose header names the columns `beside` of a declaration, with the declaration."""
     declared = [t for t in table_files() if t.beside is not None]
-    found = {}
+    declarations = {}
     for path in sorted(folder.glob("*.csv")):
         table = next((t for t in declared if t.beside is not None and named(path, t.beside)), None)
         if table is not None:
-            found[path] = table
-    return list(found.items())
+            declarations[path] = table
+    return list(declarations.items())
 
 
 def files_in(folder: Path) -> list[tuple[Path, TableFile]]:
     """Declared files in the folder of a sensor, each with its declaration, in the order of `table_files`."""
-    found: dict[Path, TableFile] = {}
+    declarations: dict[Path, TableFile] = {}
     for table in table_files():
         for path in sorted({p for name in (table.name, f"{table.name}.gz") for p in folder.glob(name) if p.is_file()}):
             if table.holds is None:
-                found.setdefault(path, table)
+                declarations.setdefault(path, table)
             elif table.holds(path):
-                found[path] = table
-    return list(found.items())
+                declarations[path] = table
+    return list(declarations.items())

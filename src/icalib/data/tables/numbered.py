@@ -33,51 +33,51 @@ def numbered_pictures(folder: Path) -> list[tuple[int, Path]]:
     groups = [re.findall(r"\d+", path.stem) for path in files]
     if not all(groups):
         return []
-    found = sorted((int(own[-1]), path) for own, path in zip(groups, files, strict=True))
-    numbers = np.array([number for number, _ in found], dtype=object)
+    images = sorted((int(digits[-1]), path) for digits, path in zip(groups, files, strict=True))
+    numbers = np.array([number for number, _ in images], dtype=object)
     stamps = data and all(path.stem.isdecimal() for path in files) and numbers[-1] < 2**63
-    return [] if stamps and is_rate(numbers.astype(np.int64), *_IMAGE_RATE_HZ) else found
+    return [] if stamps and is_rate(numbers.astype(np.int64), *_IMAGE_RATE_HZ) else images
 
 
 def stamped_by_rows(
-    found: list[tuple[int, Path]], table: Path, read: Callable[[], tuple[dict[int, int], int]], note: Note
+    images: list[tuple[int, Path]], table: Path, read: Callable[[], tuple[dict[int, int], int]], note: Note
 ) -> list[tuple[int, Path]]:
-    """Stamp [ns] and file of each image of `found` (from `numbered_pictures`); the stamp is that of a row of `table`.
+    """Stamp [ns] and file of each image of `images` (from `numbered_pictures`); the stamp is that of a row of `table`.
 
     With as many images as rows, they are matched in order. Otherwise the number of an image is its row, counted from 0
     if there is an image 0, else from 1. A note says which. read: returns stamps by row and the number of rows, as
     `TableFile.rows`. Images of unreadable rows are rejected, with a note. Raises RecordingError for two images of the
     same number, for an image without a row, and (by `read`) if many rows are unreadable.
     """
-    folder, numbers = found[0][1].parent, [number for number, _ in found]
-    _refuse_twice(found)
+    folder, numbers = images[0][1].parent, [number for number, _ in images]
+    _refuse_twice(images)
     stamp_of, count = read()
     in_order = len(numbers) == count
     first = min(1, numbers[0])  # the number of the first row
     rows = list(range(len(numbers))) if in_order else [n - first for n in numbers]
     if rows[-1] >= count:
         raise RecordingError(
-            f"{folder} holds {len(found)} images without timestamps, up to number {numbers[-1]}, and {table} "
+            f"{folder} holds {len(images)} images without timestamps, up to number {numbers[-1]}, and {table} "
             f"has {count} rows; number each image as the row of its pose, or use stamps as file names."
         )
     how = "in order" if in_order else f"by number, {first} being that of the first row"
     note(
-        f"{folder}: {len(found)} images have no timestamps. Each takes that of its row of {table}, {how}: "
-        f"image {found[0][1].name} belongs to row {rows[0] + 1}."
+        f"{folder}: {len(images)} images have no timestamps. Each takes that of its row of {table}, {how}: "
+        f"image {images[0][1].name} belongs to row {rows[0] + 1}."
     )
-    own = [path for _, path in found]
-    lost = [path for row, path in zip(rows, own, strict=True) if row not in stamp_of]
+    paths = [path for _, path in images]
+    lost = [path for row, path in zip(rows, paths, strict=True) if row not in stamp_of]
     if lost:
         note(
-            f"{folder}: {len(lost)} of {len(found)} images are ignored, the first is {lost[0].name}: the row "
+            f"{folder}: {len(lost)} of {len(images)} images are ignored, the first is {lost[0].name}: the row "
             f"of its pose in {table} cannot be read."
         )
-    return [(stamp_of[row], path) for row, path in zip(rows, own, strict=True) if row in stamp_of]
+    return [(stamp_of[row], path) for row, path in zip(rows, paths, strict=True) if row in stamp_of]
 
 
-def _refuse_twice(found: list[tuple[int, Path]]) -> None:
+def _refuse_twice(images: list[tuple[int, Path]]) -> None:
     """Raises RecordingError if two images, sorted by number, have the same number."""
-    for (number, path), (other, second) in pairwise(found):
+    for (number, path), (other, second) in pairwise(images):
         if number == other:
             raise RecordingError(
                 f"{path} and {second.name} have the same number, {number}; number each image as the row of its pose."

@@ -27,7 +27,7 @@ _SEPARATORS = (",", ";", "\t", None)  # None: whitespace
 _MOST_UNREADABLE = 0.1  # largest share of unreadable lines; with more, the file has another format
 _NS = 1_000_000_000
 _MOST_SECONDS = 2**62 // _NS
-_WHOLE_NS = -1  # in place of a power of ten: stamps must be whole nanoseconds
+_INTEGER_NS = -1  # in place of a power of ten: stamps must be whole nanoseconds
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _in_ns(text: _Text, kind: TableKind, place: np.ndarray, given: TimeUnit | No
     if given:
         return _table(text, kind, place, POWERS_OF_NS[given]), None
     try:
-        table = _table(text, kind, place, _WHOLE_NS if kind.unit == "ns" else POWERS_OF_NS[kind.unit])
+        table = _table(text, kind, place, _INTEGER_NS if kind.unit == "ns" else POWERS_OF_NS[kind.unit])
         if kind.rate_hz is None or is_rate(_instants(kind, table.integers[:, 0]), *kind.rate_hz):
             return table, None
         unit = _unit(text, kind, place)
@@ -263,7 +263,7 @@ def _unit(text: _Text, kind: TableKind, place: np.ndarray) -> TimeUnit | None:
         return None
     alone = TableKind((), kind.names[:1])
     try:
-        table = _table(text, alone, np.where(place == 0, 0, LEFT_OUT), _WHOLE_NS)
+        table = _table(text, alone, np.where(place == 0, 0, LEFT_OUT), _INTEGER_NS)
     except RecordingError:
         return None
     stamps = _instants(kind, table.decimals[:, 0])
@@ -288,14 +288,14 @@ def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column
         advice = "name those to be read by `columns` in the rig file" if others else "correct or remove it"
         return f"{spot}: the line has {len(fields)} columns instead of {wanted}; {advice}."
     name, written = kind.names[place[column]], fields[column]
-    shown = written if len(written) <= 40 else written[:40] + "..."
+    excerpt = written if len(written) <= 40 else written[:40] + "..."
     try:
         number = float(written)
     except ValueError:
-        return f"{spot}: {name} is {shown!r}, which is not a number; correct or remove the line."
+        return f"{spot}: {name} is {excerpt!r}, which is not a number; correct or remove the line."
     if not isfinite(number):
-        return f"{spot}: {name} is {shown!r}, which is not a finite number; remove the line."
+        return f"{spot}: {name} is {excerpt!r}, which is not a finite number; remove the line."
     if place[column] < len(kind.integers):
         hint = " (stamps in seconds are `time_unit: s` in the rig file)" if name.endswith("[ns]") else ""
-        return f"{spot}: {name} is {shown}, but must be a whole number below 2^63{hint}; correct the line."
-    return f"{spot}: {name} is {shown!r}, which is not written as a plain decimal number; correct the line."
+        return f"{spot}: {name} is {excerpt}, but must be a whole number below 2^63{hint}; correct the line."
+    return f"{spot}: {name} is {excerpt!r}, which is not written as a plain decimal number; correct the line."

@@ -160,7 +160,7 @@ def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: 
     Early (coarse) passes leave out the corrections of circle centres and edge curvature, which need a good lens."""
     rig, state, imu = at.rig, at.state, at.imu
     scheme = rig.settings.scheme if imu is not None else "inertial"
-    times, images = instants(stream, state.values), [part.own[camera.name] for part in at.parts]
+    times, images = instants(stream, state.values), [part.rows[camera.name] for part in at.parts]
     keyframe = keyframes_of(scheme, state, times, images, imu)
     used = are_used(imu, times, state.seconds[keyframe], rig.settings.max_gap_s)
     factor = CornerFactor(

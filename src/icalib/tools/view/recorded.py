@@ -15,7 +15,7 @@ from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import CalibrationError, RecordingError
 from icalib.result import Calibration, RecordingSpan
 from icalib.rig import Camera, ImuSensor, Rig
-from icalib.sensors import answer
+from icalib.sensors import call_kind
 from icalib.sensors.camera.read import has_corners, image_topics, sees
 from icalib.sensors.imu.read import read_imu
 from icalib.sensors.sensor import Sensor
@@ -169,7 +169,7 @@ class Recorded:
         return notes + _thinned(name, count, MOST_IMAGES, "images")
 
     def _scans(self, s: RerunStream, sensor: Sensor) -> list[str]:
-        stream: ShownScans = answer(sensor.sensor_type, "read", "scans", self.recording, sensor)
+        stream: ShownScans = call_kind(sensor.sensor_type, "read", "scans", self.recording, sensor)
         seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
         inside = self._during(sensor.name, seconds)
         heights, path = None, CubicPath.of(self.calibration)

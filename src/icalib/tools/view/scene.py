@@ -11,7 +11,7 @@ from icalib.report.ellipsoids import SIGMAS, VERDICT_COLORS, ellipsoids, magnifi
 from icalib.report.plot import COLORS
 from icalib.report.residual_views import ResidualCloud
 from icalib.result import Calibration, RecordingSpan
-from icalib.sensors import ask
+from icalib.sensors import call_all_kinds
 from icalib.tools.view.colors import by_value, rgb
 from icalib.tools.view.stream import RerunStream
 
@@ -108,7 +108,7 @@ def log_target(s: RerunStream, c: Calibration) -> None:
 def log_planes(s: RerunStream, c: Calibration) -> None:
     """Sends the measured points that belong to planes, coloured by the size of their residuals."""
     cloud: ResidualCloud
-    for cloud in ask("show", "clouds", c):
+    for cloud in call_all_kinds("show", "clouds", c):
         of, size = c.recording_of(cloud.seconds), cloud.size
         top = _WORST_OF_SCALE * float(np.sqrt(np.mean(size**2))) if len(size) else 1.0
         for k, span in enumerate(spans(c)):

@@ -24,7 +24,7 @@ from icalib.sensors.sensor import TableLayout
 MESSAGES = (
     MessageType("sensor_msgs/msg/Image", "image"),
     MessageType("sensor_msgs/msg/CompressedImage", "image"),
-    MessageType("sensor_msgs/msg/CameraInfo", "camera info", lasting=""),
+    MessageType("sensor_msgs/msg/CameraInfo", "camera info", latched_suffix=""),
 )
 UNREAD = (
     UnreadType(

@@ -35,7 +35,7 @@ from icalib.sensors.pose.spec import PoseSensor
 from icalib.sensors.sensor import TableLayout
 
 _TRANSFORMS = MessageType(
-    MESSAGE_TYPE, TRANSFORMS, stamped=False, lasting="tf_static", read_as=MESSAGE_TYPE, ros1=MESSAGE
+    MESSAGE_TYPE, TRANSFORMS, stamped=False, latched_suffix="tf_static", read_as=MESSAGE_TYPE, ros1=MESSAGE
 )
 MESSAGES = (
     MessageType("geometry_msgs/msg/PoseStamped", "pose"),
