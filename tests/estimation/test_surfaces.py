@@ -27,7 +27,7 @@ def surfaces(room) -> Surfaces:
     recording = np.zeros(len(room.planes), dtype=np.int64)
     planes = np.array([room.state.values[key] for key in room.planes])
     clouds = [points_on_planes(room.motion(room.state), room.stream, room.plane)]
-    return Surfaces.seen(room.planes, recording, planes, clouds, NOISE, False)
+    return Surfaces.of_clouds(room.planes, recording, planes, clouds, NOISE, False)
 
 
 @pytest.fixture(scope="module")

@@ -32,19 +32,19 @@ MANY_REJECTED_SHARE = 0.05  # of the corners or tracks of a camera, above which 
 FEW_ON_PLANES_SHARE = 0.1
 
 
-def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[CornerResiduals | TrackResiduals]:
+def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[CornerResiduals | TrackResiduals]:
     """Yields the corner residuals of each camera, then the track residuals of each camera if there are tracks."""
-    yield from _corner_residuals(found, timeline)
-    yield from _track_residuals(found, timeline)
+    yield from _corner_residuals(estimate, timeline)
+    yield from _track_residuals(estimate, timeline)
 
 
-def _corner_residuals(found: Estimate, timeline: Timeline) -> Iterator[CornerResiduals]:
+def _corner_residuals(estimate: Estimate, timeline: Timeline) -> Iterator[CornerResiduals]:
     """Yields the corner residuals of each camera. A camera that saw no target has images without corners."""
-    for i, (camera, corners) in enumerate(pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)):
+    for i, (camera, corners) in enumerate(pairs_of(estimate.problem.factors, estimate.outcome.residuals, CornerFactor)):
         stream = camera.stream
         yield CornerResiduals(
             camera.name,
-            _seconds(found, timeline, i),
+            _seconds(estimate, timeline, i),
             stream.start,
             stream.point,
             stream.uv,
@@ -54,20 +54,20 @@ def _corner_residuals(found: Estimate, timeline: Timeline) -> Iterator[CornerRes
         )
 
 
-def _track_residuals(found: Estimate, timeline: Timeline) -> Iterator[TrackResiduals]:
+def _track_residuals(estimate: Estimate, timeline: Timeline) -> Iterator[TrackResiduals]:
     """Yields the track residuals of each camera; nothing if there are no tracks."""
-    pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
+    pairs = pairs_of(estimate.problem.factors, estimate.outcome.residuals, FeatureFactor)
     if not pairs:
         return
-    factor, left = pairs[0]
+    factor, out = pairs[0]
     for i, (camera, stream) in enumerate(zip(factor.cameras, factor.streams, strict=True)):
-        unused = (left.root[i] == 0.0)[:, None]
-        residual = np.where(unused, np.nan, left.residual[i]).astype(np.float32)
-        own = np.linalg.norm(left.points[factor.tracks.camera == i], axis=1)
+        unused = (out.root[i] == 0.0)[:, None]
+        residual = np.where(unused, np.nan, out.residual[i]).astype(np.float32)
+        distance = np.linalg.norm(out.points[factor.tracks.camera == i], axis=1)
         yield TrackResiduals(
             camera.name,
-            float(np.median(own)) if len(own) else None,
-            _seconds(found, timeline, i),
+            float(np.median(distance)) if len(distance) else None,
+            _seconds(estimate, timeline, i),
             stream.start,
             stream.feature,
             stream.uv,
@@ -77,39 +77,39 @@ def _track_residuals(found: Estimate, timeline: Timeline) -> Iterator[TrackResid
         )
 
 
-def _seconds(found: Estimate, timeline: Timeline, index: int) -> np.ndarray:
+def _seconds(estimate: Estimate, timeline: Timeline, index: int) -> np.ndarray:
     """(M,) instants [s] of the images of camera `index`, on the time axis of the result."""
-    stream = of_type(found.problem.factors, CornerFactor)[index].stream
-    return timeline.shown(instants(stream, found.outcome.state.values), timeline.recordings_of(stream.key))
+    stream = of_type(estimate.problem.factors, CornerFactor)[index].stream
+    return timeline.shown(instants(stream, estimate.outcome.state.values), timeline.recordings_of(stream.key))
 
 
-def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """Sentences on noise and outliers of corners and tracks, and on images that are left out."""
     if words := words_on_left_out(inputs.bodies):
         yield words
-    factors = of_type(found.problem.factors, CornerFactor)
-    yield from _outside_imu_notes(inputs, found, factors)
-    noise: list[CameraNoise] = [found.judged.noise[c.name] for c in inputs.rig.cameras]
-    for camera, factor, own in zip(inputs.rig.cameras, factors, noise, strict=True):
-        yield from _corner_notes(camera, factor, own.model, own.late, found)
-    if words := late_words(factors, [own.late for own in noise]):
+    factors = of_type(estimate.problem.factors, CornerFactor)
+    yield from _outside_imu_notes(inputs, estimate, factors)
+    noise: list[CameraNoise] = [estimate.judged.noise[c.name] for c in inputs.rig.cameras]
+    for camera, factor, camera_noise in zip(inputs.rig.cameras, factors, noise, strict=True):
+        yield from _corner_notes(camera, factor, camera_noise.model, camera_noise.late, estimate)
+    if words := late_words(factors, [camera_noise.late for camera_noise in noise]):
         yield words
-    yield from _feature_notes(found)
+    yield from _feature_notes(estimate)
 
 
-def _outside_imu_notes(inputs: Inputs, found: Estimate, factors: Sequence[CornerFactor]) -> Iterator[str]:
+def _outside_imu_notes(inputs: Inputs, estimate: Estimate, factors: Sequence[CornerFactor]) -> Iterator[str]:
     """Sentences on images that were taken while the IMU was not running."""
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
     for camera in factors:
-        t = instants(camera.stream, found.outcome.state.values)
+        t = instants(camera.stream, estimate.outcome.state.values)
         left_out = int((~usable(inputs.imu, t, inputs.rig.settings.max_gap_s)).sum())
         if left_out:
             yield f"{left_out} images of {camera.name} are left out: {inputs.imu.name} was not running then."
 
 
 def _corner_notes(
-    camera: Camera, factor: CornerFactor, model: NoiseModel, late: np.ndarray, found: Estimate
+    camera: Camera, factor: CornerFactor, model: NoiseModel, late: np.ndarray, estimate: Estimate
 ) -> Iterator[str]:
     """Sentences on noise, outliers and circle centres of one camera. late (M,) bool: images rejected as a whole."""
     if not len(factor.stream.uv):
@@ -118,7 +118,7 @@ def _corner_notes(
     if words := _rejected_words(factor.keep[~late[factor.stream.image]]):
         yield f"{camera.name}: {words}"
     if factor.bodies.target.radii.any():
-        size = np.linalg.norm(centre_shifts(factor, found.outcome.state), axis=1)
+        size = np.linalg.norm(centre_shifts(factor, estimate.outcome.state), axis=1)
         yield (
             f"{camera.name}: ellipses have their centres {np.sqrt((size**2).mean()):.3f} px (RMS, {size.max():.2f} px "
             "at most) beside the projected centres of their circles; the estimate takes it into account."
@@ -173,9 +173,9 @@ def _noise_words(model: NoiseModel) -> str:
     return words
 
 
-def _feature_notes(found: Estimate) -> Iterator[str]:
+def _feature_notes(estimate: Estimate) -> Iterator[str]:
     """Sentences on the number of feature tracks, their planes and their noise; none without tracks."""
-    pairs = pairs_of(found.problem.factors, found.outcome.residuals, FeatureFactor)
+    pairs = pairs_of(estimate.problem.factors, estimate.outcome.residuals, FeatureFactor)
     if not pairs:
         return
     factor, out = pairs[0]
@@ -199,9 +199,9 @@ def _feature_notes(found: Estimate) -> Iterator[str]:
         yield f"{camera.name}: track noise {noise.sigma:.3f} px{grows}; {share} observations of tracks are in use."
 
 
-def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """A sentence if `points_on_planes_m` is set, but no or few tracked points lie on planes of LiDARs."""
-    yield from plane_warnings(inputs.rig, found.problem.factors)
+    yield from plane_warnings(inputs.rig, estimate.problem.factors)
 
 
 def plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[str]:

@@ -17,9 +17,9 @@ def with_bloom(factor: CornerFactor, state: State) -> CornerFactor:
     inwards = target.tag_centers - target.points
     params = factor.lens(state)
     direction = memory.mmap_zeros(factor.stream.uv.shape, np.float32)
-    for own, X, R_cam_body in factor.in_camera(state):
-        towards = np.einsum("nij,nj->ni", R_cam_body, inwards[factor.stream.point[own]])
-        direction[own] = bloom_direction(factor.model, params, X, towards)
+    for rows, X, R_cam_body in factor.in_camera(state):
+        towards = np.einsum("nij,nj->ni", R_cam_body, inwards[factor.stream.point[rows]])
+        direction[rows] = bloom_direction(factor.model, params, X, towards)
     return factor.with_direction(direction)
 
 

@@ -40,9 +40,9 @@ def centre_shifts(factor: CornerFactor, state: State) -> np.ndarray:
     """
     shift, radii = np.zeros((len(factor.stream.uv), 2)), factor.bodies.target.radii
     params = factor.lens(state)
-    for own, X, R_cam_body in factor.in_camera(state):
-        radius = radii[factor.stream.point[own]]
-        shift[own] = ellipse_shift(factor.model, params, X, R_cam_body[:, :, :2], radius)
+    for rows, X, R_cam_body in factor.in_camera(state):
+        radius = radii[factor.stream.point[rows]]
+        shift[rows] = ellipse_shift(factor.model, params, X, R_cam_body[:, :, :2], radius)
     return shift
 
 
@@ -57,10 +57,10 @@ def ellipse_shift(
     """
     uv, valid, J_point, _ = model.project_with_jacobians(params, X)
     rim = X[:, None] + radius[:, None, None] * np.einsum("nij,kj->nki", plane, UNIT_CIRCLE)
-    contour, seen = model.project(params, rim.reshape(-1, 3))
+    contour, projects = model.project(params, rim.reshape(-1, 3))
     contour = contour.reshape(len(X), N_CONTOUR_POINTS, 2)
     shape = radius[:, None, None] * (J_point @ plane)
-    known = valid & seen.reshape(len(X), -1).all(axis=1) & (np.abs(np.linalg.det(shape)) > 0.0)
+    known = valid & projects.reshape(len(X), -1).all(axis=1) & (np.abs(np.linalg.det(shape)) > 0.0)
     contour, centre = contour[known], uv[known]
     W = np.linalg.inv(shape[known])  # 1/px; maps the ellipse to the unit circle
     arc = np.linalg.norm(np.roll(contour, -1, axis=1) - np.roll(contour, 1, axis=1), axis=2)

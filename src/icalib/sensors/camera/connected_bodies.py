@@ -75,16 +75,16 @@ def _check_cameras(target: Target, streams: Sequence[CornerStream], used: Sequen
 
     used: indices of these; imu: whether the rig has an IMU."""
     for name in dict.fromkeys(s.name for s in streams):
-        seen = np.unique(np.concatenate([target.body[s.point] for s in streams if s.name == name]))
-        if len(seen) and not np.isin(seen, used).any():
+        bodies = np.unique(np.concatenate([target.body[s.point] for s in streams if s.name == name]))
+        if len(bodies) and not np.isin(bodies, used).any():
             how = (
                 "calibrate the cameras without the IMU, whose images may be synchronised"
                 if imu
                 else ("take images of all cameras at the same instants")
             )
-            own, first = _listed([target.bodies[k] for k in seen]), target.bodies[used[0]]
+            names, first = _listed([target.bodies[k] for k in bodies]), target.bodies[used[0]]
             raise EstimationError(
-                f"{name} sees {own} only, and fewer than {MIN_SHARED_IMAGES} images determine its pose relative "
+                f"{name} sees {names} only, and fewer than {MIN_SHARED_IMAGES} images determine its pose relative "
                 f"to {first}; show both in the same images, or {how}."
             )
 
@@ -93,23 +93,23 @@ def _together(body: np.ndarray, stream: CornerStream, n: int) -> np.ndarray:
     """(n, n) number of images of `stream` that show both bodies of a pair."""
     pairs = np.unique(stream.image * n + body[stream.point])
     image, which = np.divmod(pairs, n)
-    seen = np.zeros((len(stream.stamps_ns), n), dtype=np.float32)
-    seen[image, which] = 1.0
-    return np.rint(seen.T @ seen).astype(np.int64)
+    shows = np.zeros((len(stream.stamps_ns), n), dtype=np.float32)
+    shows[image, which] = 1.0
+    return np.rint(shows.T @ shows).astype(np.int64)
 
 
 def _at_once(body: np.ndarray, rig: Rig, recording: Measurements, n: int) -> np.ndarray:
     """(n, n) number of instants at which one camera sees body i while another camera sees body j."""
-    found, seen = np.zeros((n, n), dtype=np.int64), []
+    count, shows = np.zeros((n, n), dtype=np.int64), []
     for stream in recording.cameras:
         rows = np.zeros((len(stream.stamps_ns), n), dtype=np.int64)
         rows[stream.image, body[stream.point]] = 1
-        seen.append(rows)
+        shows.append(rows)
     times = camera_times(rig, recording, recording.origin_ns)
-    for a, b in permutations(range(len(seen)), 2):
+    for a, b in permutations(range(len(shows)), 2):
         i, j = taken_at_once(times[a], times[b])
-        found += seen[a][i].T @ seen[b][j]
-    return found
+        count += shows[a][i].T @ shows[b][j]
+    return count
 
 
 def camera_times(rig: Rig, recording: Measurements, origin_ns: int) -> list[np.ndarray]:

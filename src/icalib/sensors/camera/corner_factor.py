@@ -176,8 +176,8 @@ class CornerFactor(FactorDefaults):
         X, R_cb = np.empty((start[-1] - start[0], 3)), np.empty_like(R_cw)
         for first, end, recording in self.parts(v0, v1):
             a, b = first - v0, end - v0
-            world, own = self.world_points(state, recording), X[start[a] - start[0] : start[b] - start[0]]
-            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, own)
+            world, part = self.world_points(state, recording), X[start[a] - start[0] : start[b] - start[0]]
+            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, part)
             R_cb[a:b] = R_cw[a:b] @ _scene(state, recording) @ R_sb[body[a:b]]
         return X, R_cb
 
@@ -197,10 +197,10 @@ class CornerFactor(FactorDefaults):
 
     def residual(self, state: State, v0: int, v1: int) -> np.ndarray:
         """(n, 2) px: predicted - measured for the corners of views v0..v1, without the common error."""
-        own, (X, _) = self.corners_of(v0, v1), self.points_in_camera(state, v0, v1)
+        rows, (X, _) = self.corners_of(v0, v1), self.points_in_camera(state, v0, v1)
         params = self.lens(state)
-        uv = self.model.project(params, X)[0] - self.stream.uv[own]
-        return uv + state.values[self.name, "bloom"] * self.direction[own] if len(self.direction) else uv
+        uv = self.model.project(params, X)[0] - self.stream.uv[rows]
+        return uv + state.values[self.name, "bloom"] * self.direction[rows] if len(self.direction) else uv
 
     def output(self, dtype: type = np.float32) -> CornerOutput:
         """Arrays that `accumulate` fills, residuals and weights in `dtype`. Its sums do not depend on `dtype`."""
@@ -210,9 +210,9 @@ class CornerFactor(FactorDefaults):
         """(N, 2) px: predicted - measured, with the common error of each view in the prediction."""
         error = np.empty((len(out.root), 2), np.float32)
         for v0, v1 in self.blocks():
-            own = self.corners_of(v0, v1)
-            shared = self.noise.field[own, None, :] * out.shared[self.views.of_corners(v0, v1)]
-            error[own] = out.residual[own] + shared.sum(axis=2)
+            rows = self.corners_of(v0, v1)
+            shared = self.noise.field[rows, None, :] * out.shared[self.views.of_corners(v0, v1)]
+            error[rows] = out.residual[rows] + shared.sum(axis=2)
         return error
 
     def chi2(self, out: CornerOutput) -> float:
@@ -259,7 +259,7 @@ class CornerFactor(FactorDefaults):
         pars = np.flatnonzero(model >= 0)
         bloom = self.layout.columns(self.name, "bloom") if len(self.direction) else model[:0]
         direct = np.concatenate([model[pars], bloom])
-        chained_of_all, direct_of_all = (np.tile(own, (len(body), 1)) for own in (chained, direct))
+        chained_of_all, direct_of_all = (np.tile(part, (len(body), 1)) for part in (chained, direct))
         return np.concatenate([chained_of_all, pose, direct_of_all, shape], axis=1), pars
 
     def accumulate(
@@ -271,8 +271,8 @@ class CornerFactor(FactorDefaults):
             images, noise, direct, motion = self._arguments(state, v0, v1, recording, curved)
             if out is None:
                 first, end = int(images.start[0]), int(images.start[-1])
-                own = CornerOutput.empty(end - first, v1 - v0, len(self.noise.tau))
-                kept = CornerResidualArrays(first, own.residual, own.root, own.shared)
+                block = CornerOutput.empty(end - first, v1 - v0, len(self.noise.tau))
+                kept = CornerResidualArrays(first, block.residual, block.root, block.shared)
             else:
                 kept = CornerResidualArrays(0, out.residual, out.root, out.shared[v0:v1])
             for a, b, projection in self._chunks(state, images, motion, recording, sums):

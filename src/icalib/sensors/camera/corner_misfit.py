@@ -74,6 +74,6 @@ def _cells(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 def _strips(x: np.ndarray, used: np.ndarray, count: int) -> np.ndarray:
     """(N,) int16 from 0 to `count` - 1: number of the interval of x (N,), when `count` equal ones span the `used` x."""
-    own = x[used]
-    low, size = own.min(), np.ptp(own) + 1e-9
+    used_x = x[used]
+    low, size = used_x.min(), np.ptp(used_x) + 1e-9
     return np.clip((x - low) / size * count, 0, count - 1).astype(np.int16)

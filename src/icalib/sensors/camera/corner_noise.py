@@ -155,10 +155,10 @@ def estimate_noise(
             "translation, time_offset, intrinsics and distortion in the rig file, or remove them so that they "
             "are estimated."
         )
-    shown = residual_noise(factor, out, settings, speed)
+    estimate = residual_noise(factor, out, settings, speed)
     if camera.corner_noise_px is not None:
-        return NoiseModel(camera.corner_noise_px, shown.exposure, tau), shown.lens_misfit_is_large
-    return NoiseModel(shown.base, shown.exposure, tau, shown.lens.rms), shown.lens_misfit_is_large
+        return NoiseModel(camera.corner_noise_px, estimate.exposure, tau), estimate.lens_misfit_is_large
+    return NoiseModel(estimate.base, estimate.exposure, tau, estimate.lens.rms), estimate.lens_misfit_is_large
 
 
 def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float, ...]:

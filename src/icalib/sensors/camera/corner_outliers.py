@@ -75,20 +75,20 @@ def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.
     uv, residual (N, 2) [px]: corners of all images together. tag (N,) int: a number for each tag in each image; corners
     with the same number share errors, and are no neighbours. Neighbours are the nearest corners in the image plane.
     """
-    own = np.flatnonzero(suspect)
-    if not len(own):
+    suspects = np.flatnonzero(suspect)
+    if not len(suspects):
         return np.zeros(len(uv), dtype=bool)
-    near = KDTree(uv).query(uv[own], min(N_NEIGHBOURS + CORNERS_PER_TAG, len(uv)))[1].reshape(len(own), -1)
-    difference = np.linalg.norm(residual[near] - residual[own, None], axis=2)
-    similar = difference < SIMILAR_RATIO * np.linalg.norm(residual[own], axis=1)[:, None]
-    similar &= tag[near] != tag[own, None]
+    near = KDTree(uv).query(uv[suspects], min(N_NEIGHBOURS + CORNERS_PER_TAG, len(uv)))[1].reshape(len(suspects), -1)
+    difference = np.linalg.norm(residual[near] - residual[suspects, None], axis=2)
+    similar = difference < SIMILAR_RATIO * np.linalg.norm(residual[suspects], axis=1)[:, None]
+    similar &= tag[near] != tag[suspects, None]
     # A graph with a vertex for each suspect corner; vertex 0 stands for all corners that are not suspect.
-    keyframe = np.zeros(len(uv), dtype=np.int64)
-    keyframe[own] = 1 + np.arange(len(own))
+    vertex = np.zeros(len(uv), dtype=np.int64)
+    vertex[suspects] = 1 + np.arange(len(suspects))
     row, column = np.nonzero(similar)
-    ends = keyframe[own][row], keyframe[near[row, column]]
-    graph = coo_array((np.ones(len(row)), ends), shape=(len(own) + 1, len(own) + 1))
+    ends = vertex[suspects][row], vertex[near[row, column]]
+    graph = coo_array((np.ones(len(row)), ends), shape=(len(suspects) + 1, len(suspects) + 1))
     component = connected_components(graph, directed=False)[1]
     out = np.zeros(len(uv), dtype=bool)
-    out[own[component[1:] != component[0]]] = True
+    out[suspects[component[1:] != component[0]]] = True
     return out

@@ -18,11 +18,11 @@ CORNERS = "corners"  # kind of residual
 
 def corner_squares(camera: CornerFactor, out: CornerOutput) -> dict[FitKey, Squares]:
     """Number and chi^2 of the corners, and of the coefficients of each common error."""
-    found = {(camera.name, CORNERS): Squares(2 * int(np.count_nonzero(out.root)), camera.chi2(out))}
+    squares = {(camera.name, CORNERS): Squares(2 * int(np.count_nonzero(out.root)), camera.chi2(out))}
     for k, tau in enumerate(camera.noise.tau):
         rows = out.shared[:, :, k] / tau
-        found[camera.name, f"common error {k}"] = Squares(rows.size, float((rows**2).sum()))
-    return found
+        squares[camera.name, f"common error {k}"] = Squares(rows.size, float((rows**2).sum()))
+    return squares
 
 
 def image_rows(
@@ -44,22 +44,22 @@ def rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
 
 def dof_used_by_corners(camera: CornerFactor, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
     """See `Factor.dof_used`."""
-    found = in_parallel(partial(_dof_used_by_views, camera, out, along), camera.blocks())
-    return {(camera.name, kind): sum(one[kind] for one in found) for kind in (found[0] if found else ())}
+    dof = in_parallel(partial(_dof_used_by_views, camera, out, along), camera.blocks())
+    return {(camera.name, kind): sum(block[kind] for block in dof) for kind in (dof[0] if dof else ())}
 
 
 def _dof_used_by_views(
     camera: CornerFactor, at: CornerOutput, step: StateDifference, views: tuple[int, int]
 ) -> dict[str, float]:
     """|J x|^2 of the range `views` by kind of residual, for the step x; the mean over common errors given x."""
-    own, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
+    rows, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
     up, down = (camera.residual(state, *views) for state in (step.end, step.start))
-    root, view = at.root[own], camera.views.of_corners(*views) - views[0]
+    root, view = at.root[rows], camera.views.of_corners(*views) - views[0]
     along = (up - down) / step.share * root[:, None]
     if m == 0:
         return {CORNERS: float((along**2).sum())}
     # The common error c minimises |along + f c|^2 + |c / tau|^2; its covariance about the minimum is M^-1, per axis.
-    f = camera.noise.field[own] * root[:, None]
+    f = camera.noise.field[rows] * root[:, None]
     M, rhs = np.zeros((n, m, m)), np.zeros((n, m, 2))
     np.add.at(M, view, f[:, :, None] * f[:, None, :])
     np.add.at(rhs, view, -f[:, :, None] * along[:, None, :])

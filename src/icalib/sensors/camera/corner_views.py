@@ -25,14 +25,14 @@ class Views:
 
         body (n_points,): index of the body of each target point."""
         if not body.any():
-            seen = np.flatnonzero(np.diff(stream.start))
-            start = np.append(stream.start[seen], stream.start[-1])
-            return cls(start, seen, np.zeros(len(seen), dtype=np.int64))
-        own, image = body[stream.point], stream.image
-        fresh = np.ones(len(own), dtype=bool)
-        fresh[1:] = (np.diff(image) != 0) | (np.diff(own) != 0)
+            images = np.flatnonzero(np.diff(stream.start))
+            start = np.append(stream.start[images], stream.start[-1])
+            return cls(start, images, np.zeros(len(images), dtype=np.int64))
+        body_of_corner, image = body[stream.point], stream.image
+        fresh = np.ones(len(body_of_corner), dtype=bool)
+        fresh[1:] = (np.diff(image) != 0) | (np.diff(body_of_corner) != 0)
         first = np.flatnonzero(fresh)
-        return cls(np.append(first, len(own)).astype(np.int64), image[first], own[first])
+        return cls(np.append(first, len(body_of_corner)).astype(np.int64), image[first], body_of_corner[first])
 
     def of_corners(self, v0: int, v1: int) -> np.ndarray:
         """(n,) index of the view of each corner of views v0..v1."""

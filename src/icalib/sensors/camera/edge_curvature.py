@@ -31,12 +31,12 @@ def with_bent_edges(factor: CornerFactor, state: State) -> CornerFactor:
         return factor
     uv = factor.stream.uv.copy()
     params = factor.lens(state)
-    for own, X, R_cam_body in factor.in_camera(state):
+    for rows, X, R_cam_body in factor.in_camera(state):
         plane = R_cam_body[:, :, :2]
-        for edge in factor.stream.edges[own].transpose(1, 0, 2):
+        for edge in factor.stream.edges[rows].transpose(1, 0, 2):
             fitted = edge.astype(np.float64)
             curvature, known = predicted_curvature(factor.model, params, X, plane, fitted[:, :4].reshape(-1, 2, 2))
-            uv[own] += np.where(known, curvature - fitted[:, 6], 0.0)[:, None] * fitted[:, 4:6]
+            uv[rows] += np.where(known, curvature - fitted[:, 6], 0.0)[:, None] * fitted[:, 4:6]
     return replace(factor, stream=replace(factor.stream, uv=uv))
 
 

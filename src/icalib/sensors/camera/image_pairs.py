@@ -32,10 +32,10 @@ def not_simultaneous(
     for camera, out in zip(cameras, outputs, strict=True):
         size = np.linalg.norm(camera.errors(out), axis=1)  # common errors of views included
         medians = grouped_quantiles(size, camera.stream.image, len(camera.keyframe), 0.5)
-        own = shared[camera.keyframe] & np.isfinite(medians)
-        if own.any():
-            limit = max(MAX_MEDIAN_RATIO * float(np.median(medians[own])), settings.outlier_min_px)
-            bad[camera.keyframe[own & (medians > limit)]] = True
+        tested = shared[camera.keyframe] & np.isfinite(medians)
+        if tested.any():
+            limit = max(MAX_MEDIAN_RATIO * float(np.median(medians[tested])), settings.outlier_min_px)
+            bad[camera.keyframe[tested & (medians > limit)]] = True
     if bad.sum() > MAX_REJECTED_SHARE * shared.sum():
         bad[:] = False
     return [bad[camera.keyframe] for camera in cameras]

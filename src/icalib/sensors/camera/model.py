@@ -92,9 +92,9 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
         noise, tracks = {}, {t.name: t for t in measurements.tracks}
         for camera, stream in zip(sensors, measurements.cameras, strict=True):
             model, keep = first_noise(camera), np.ones(len(stream.uv), dtype=bool)
-            own = TrackSelection.first(camera, tracks[camera.name]) if tracks else None
+            selection = TrackSelection.first(camera, tracks[camera.name]) if tracks else None
             late = np.zeros(len(stream.stamps_ns), dtype=bool)
-            noise[camera.name] = CameraNoise(model, model.noise(stream, camera, rig.settings), keep, late, own)
+            noise[camera.name] = CameraNoise(model, model.noise(stream, camera, rig.settings), keep, late, selection)
         return noise
 
     def next_noises(
@@ -104,15 +104,15 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
 
         Rejects outliers and images that are not simultaneous. Estimates noise that the rig file does not state."""
         pairs, settings = pairs_of(end.factors, end.residuals, CornerFactor), end.rig.settings
-        late, found = _late_images(pairs, end), _next_tracks(sensors, noise, end)
+        late, next_noise = _late_images(pairs, end), _next_tracks(sensors, noise, end)
         estimated = _noise_is_estimated(sensors, [c.stream for c, _ in pairs], bool(of_tracks(end.factors)), settings)
         for camera, (factor, out), apart in zip(sensors, pairs, late, strict=True):
             keep = inliers(factor, out, settings) & ~apart[factor.stream.image]
-            found[camera.name] = replace(found[camera.name], keep=keep, late=apart)
+            next_noise[camera.name] = replace(next_noise[camera.name], keep=keep, late=apart)
             if estimated:
                 model, corners = _next_corner_noise(camera, factor, out, end)
-                found[camera.name] = replace(found[camera.name], model=model, corners=corners)
-        return found
+                next_noise[camera.name] = replace(next_noise[camera.name], model=model, corners=corners)
+        return next_noise
 
     def passes(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> int:
         """Passes needed to estimate noise and inliers: two with common errors of an image, else one, or zero.
@@ -139,7 +139,7 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
     ) -> tuple[FeatureFactor, ...]:
         """One factor of the feature tracks of all cameras; none without tracks."""
         cameras = tuple(f for f in factors if isinstance(f, CornerFactor))
-        tracks = [own for s in sensors if (own := noise[s.name].tracks) is not None]
+        tracks = [selection for s in sensors if (selection := noise[s.name].tracks) is not None]
         return (feature_factor(cameras, tracks, at),) if tracks else ()
 
     def uses_more(self, used: Mapping[FactorKey, Factor], rebuilt: Callable[[], Mapping[FactorKey, Factor]]) -> bool:
@@ -166,7 +166,7 @@ def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: 
     factor = CornerFactor(
         stream, camera_model(camera.model), imu, rig.gravity, scheme, stream.seconds, keyframe,
         noise.keep & np.repeat(used, np.diff(stream.start)), noise.corners, NO_BLOOM, at.bodies, at.layout,
-        len(state.seconds), tuple(own.start for own in images[1:]),
+        len(state.seconds), tuple(recording_images.start for recording_images in images[1:]),
     )  # fmt: skip
     factor = factor if at.coarse else with_circle_centres(with_bent_edges(factor, state), state)
     return with_bloom(factor, state) if rig.blooms else factor
@@ -180,14 +180,14 @@ def feature_factor(cameras: tuple[CornerFactor, ...], selected: Sequence[TrackSe
     streams = tuple(
         with_curved_patches(t, c.model, c.lens(state)) for t, c in zip(at.measurements.tracks, cameras, strict=True)
     )
-    seen = observed_at_keyframes(cameras, at.measurements.tracks, state, settings.max_gap_s)
-    keep = tuple(own.keep & s for own, s in zip(selected, seen, strict=True))
-    loss, noise = (settings.loss, settings.loss_scale), tuple(own.noise for own in selected)
+    observed = observed_at_keyframes(cameras, at.measurements.tracks, state, settings.max_gap_s)
+    keep = tuple(selection.keep & s for selection, s in zip(selected, observed, strict=True))
+    loss, noise = (settings.loss, settings.loss_scale), tuple(selection.noise for selection in selected)
     cuts = chain_cuts(len(state.seconds))
     if at.coarse:
         cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / COARSE_TRACK_S)))))
     factor = FeatureFactor.build(cameras, streams, noise, keep, loss, state, cuts, state.starts[1:], _surfaces(at))
-    factor = replace(factor, outliers=tuple(own.outliers for own in selected))
+    factor = replace(factor, outliers=tuple(selection.outliers for selection in selected))
     return factor.coarse(state) if at.coarse else factor
 
 
@@ -202,9 +202,9 @@ def _surfaces(at: Pass) -> Surfaces | None:
     if not clouds.count or noise == 0.0:
         return None
     planes = np.array([at.state.values[key] for key in clouds.keys])
-    found = (model_of(s).points_on_planes(s, streams[s.name], at) for s in at.rig.mounted)
-    seen = (points for points in found if points is not None)
-    return Surfaces.seen(clouds.keys, clouds.recording, planes, seen, noise, at.coarse)
+    clouds_of_sensors = (model_of(s).points_on_planes(s, streams[s.name], at) for s in at.rig.mounted)
+    points_on_planes = (points for points in clouds_of_sensors if points is not None)
+    return Surfaces.of_clouds(clouds.keys, clouds.recording, planes, points_on_planes, noise, at.coarse)
 
 
 def _late_images(pairs: Sequence[tuple[CornerFactor, CornerOutput]], end: PassEnd) -> list[np.ndarray]:
@@ -219,13 +219,13 @@ def _late_images(pairs: Sequence[tuple[CornerFactor, CornerOutput]], end: PassEn
 
 def _next_tracks(cameras: Sequence[Camera], noise: Mapping[str, CameraNoise], end: PassEnd) -> dict[str, CameraNoise]:
     """The present noise of each camera, with the track selection of the next pass."""
-    found = {c.name: noise[c.name] for c in cameras}
+    next_noise = {c.name: noise[c.name] for c in cameras}
     for factor, out in pairs_of(end.factors, end.residuals, FeatureFactor):
-        now = [own for c in cameras if (own := noise[c.name].tracks) is not None]
+        now = [selection for c in cameras if (selection := noise[c.name].tracks) is not None]
         tracks = next_selections(cameras, factor, out, now, end.state, end.rig.settings, end.is_first)
-        for camera, own in zip(cameras, tracks, strict=True):
-            found[camera.name] = replace(found[camera.name], tracks=own)
-    return found
+        for camera, selection in zip(cameras, tracks, strict=True):
+            next_noise[camera.name] = replace(next_noise[camera.name], tracks=selection)
+    return next_noise
 
 
 def _next_corner_noise(

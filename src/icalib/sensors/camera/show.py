@@ -14,7 +14,7 @@ from icalib.report.tables import Html, element, html
 from icalib.result import Calibration, ImageResiduals, rms_of_images
 
 LEGEND = "pyramids are fields of view"
-_SEEN = {"corners": "corners", "observations": "observations of points that were followed"}
+_KIND_WORDS = {"corners": "corners", "observations": "observations of points that were followed"}
 _IMAGE_WORDS = (
     "Predicted - measured, of corners of the target and of tracked points of the scene. A good calibration leaves a"
     " round cloud about zero, and arrows without a pattern. What was rejected stays in the data and is red. At most"
@@ -63,15 +63,15 @@ def _projection_section(c: Calibration) -> Section:
     A camera with a fixed lens has a sentence instead."""
     figures, parts = {}, []
     for i, name in enumerate(c.cameras):
-        size, seen = c.rig["sensors"][name]["resolution"], [r for r in c.image_residuals if r.sensor == name]
-        own = []
+        size, residuals = c.rig["sensors"][name]["resolution"], [r for r in c.image_residuals if r.sensor == name]
+        maps = []
         for k, m in enumerate(projection_figures.projection_maps(c, name)):
             place = f"projection-{i}-{k}"
-            figures[place] = projection_figures.projection_figure(m, seen, size)
+            figures[place] = projection_figures.projection_figure(m, residuals, size)
             title = element("h3", f"{name}: {projection_figures.title(m).lower()}")
-            own.append(element("div", [title, element("p", projection_figures.words(m)), plot_place(place)]))
+            maps.append(element("div", [title, element("p", projection_figures.words(m)), plot_place(place)]))
         fixed = f"{name}: intrinsics and distortion are fixed by the rig file, and taken as exact."
-        parts.append(element("div", own, "pair") if own else element("p", fixed, "quiet"))
+        parts.append(element("div", maps, "pair") if maps else element("p", fixed, "quiet"))
     return Section("projection", "How well each lens is known", _LENS_WORDS, Html("".join(parts)), figures)
 
 
@@ -86,9 +86,9 @@ def amounts(c: Calibration) -> Iterator[str]:
     """Text with the numbers of images, corners and track observations."""
     if c.cameras:
         images = sum(len(r.seconds) for r in c.corner_residuals)
-        counts = {kind: sum(len(r.uv) for r in c.image_residuals if r.kind == kind) for kind in _SEEN}
-        seen = " and ".join(f"{n} {_SEEN[kind]}" for kind, n in counts.items() if n)
-        yield f"{images} images with {seen or 'nothing in them'}"
+        counts = {kind: sum(len(r.uv) for r in c.image_residuals if r.kind == kind) for kind in _KIND_WORDS}
+        words = " and ".join(f"{n} {_KIND_WORDS[kind]}" for kind, n in counts.items() if n)
+        yield f"{images} images with {words or 'nothing in them'}"
 
 
 def shape(c: Calibration, name: str, spread: float) -> np.ndarray:

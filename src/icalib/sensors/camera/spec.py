@@ -113,20 +113,20 @@ class Camera(MountedSensor):
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Camera:
         options = ("path", "topic", "corner_noise", "tracks", "track_noise", *TABLE, *parameter_fields(cls))
-        found = value.record(("type", "model", "resolution"), options)
-        model = found["model"].choice("camera model", tuple(CAMERA_MODELS))
-        groups = parameters(found, cls(name, "", model, (0, 0)).specs())
-        _refuse_negative_focal_length(found, groups)
+        fields = value.record(("type", "model", "resolution"), options)
+        model = fields["model"].choice("camera model", tuple(CAMERA_MODELS))
+        groups = parameters(fields, cls(name, "", model, (0, 0)).specs())
+        _refuse_negative_focal_length(fields, groups)
         return cls(
             name=name,
-            path=path_or(found, f"{name}/corners.csv"),
+            path=path_or(fields, f"{name}/corners.csv"),
             model=model,
-            resolution=_resolution(found["resolution"]),
-            corner_noise_px=found["corner_noise"].positive() if "corner_noise" in found else None,
-            topic=topic_or_none(found),
-            tracks=found["tracks"].text() if "tracks" in found else None,
-            track_noise_px=found["track_noise"].positive() if "track_noise" in found else None,
-            layout=table_layout(found),
+            resolution=_resolution(fields["resolution"]),
+            corner_noise_px=fields["corner_noise"].positive() if "corner_noise" in fields else None,
+            topic=topic_or_none(fields),
+            tracks=fields["tracks"].text() if "tracks" in fields else None,
+            track_noise_px=fields["track_noise"].positive() if "track_noise" in fields else None,
+            layout=table_layout(fields),
             **groups,
         )
 
@@ -161,10 +161,10 @@ class Camera(MountedSensor):
             )
 
 
-def _refuse_negative_focal_length(found: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
+def _refuse_negative_focal_length(fields: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
     value = groups["intrinsics"].value if "intrinsics" in groups else None
     if value is not None and (value[:2] <= 0).any():
-        found["intrinsics"].fail("fx and fy of [fx, fy, cx, cy] must be above 0 px; correct them.")
+        fields["intrinsics"].fail("fx and fy of [fx, fy, cx, cy] must be above 0 px; correct them.")
 
 
 def _resolution(value: YamlValue) -> tuple[int, int]:

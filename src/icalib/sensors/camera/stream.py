@@ -135,6 +135,6 @@ def shared_rows(start: np.ndarray, feature: np.ndarray, i: int, j: int) -> tuple
     """Rows (n,) of image i and rows (n,) of image j that observe the same features.
 
     start (M + 1,), feature (N,): see `TrackStream`."""
-    own, other = feature[start[i] : start[i + 1]], feature[start[j] : start[j + 1]]
-    _, p, q = np.intersect1d(own, other, return_indices=True)
+    features, other = feature[start[i] : start[i + 1]], feature[start[j] : start[j + 1]]
+    _, p, q = np.intersect1d(features, other, return_indices=True)
     return p + start[i], q + start[j]

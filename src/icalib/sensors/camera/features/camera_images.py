@@ -43,10 +43,10 @@ class CameraImages:
 
     def _part(self, a: int, b: int) -> CameraImages:
         """The images a..b of these, counted from the first."""
-        observed, own = self.observed, slice(a, b)
-        observed = observed._replace(start=observed.start[a : b + 1], keyframe=observed.keyframe[own])
+        observed, images = self.observed, slice(a, b)
+        observed = observed._replace(start=observed.start[a : b + 1], keyframe=observed.keyframe[images])
         return replace(
-            self, first=self.first + a, observed=observed, poses=self.poses.part(own), columns=self.columns[own]
+            self, first=self.first + a, observed=observed, poses=self.poses.part(images), columns=self.columns[images]
         )
 
     def in_camera(self, points: np.ndarray, track: int) -> np.ndarray:
@@ -60,8 +60,8 @@ class CameraImages:
 
     def projection(self, X: np.ndarray) -> TrackProjection:
         """Projection, with Jacobians, of the points X (n, 3) m of all n observations, in the camera frame."""
-        found = self.camera.model.project_with_jacobians(self.params, X)
-        return TrackProjection(int(self.observed.start[0]), *found, self.pars)
+        projection = self.camera.model.project_with_jacobians(self.params, X)
+        return TrackProjection(int(self.observed.start[0]), *projection, self.pars)
 
     def add_to_points(self, track: int, loss: Loss, points: PointSearch) -> None:
         """Adds the observations of points that have not converged to their normal equations in `points`.

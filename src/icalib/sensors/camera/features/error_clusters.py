@@ -70,12 +70,12 @@ def _target_regions(camera: CornerFactor) -> np.ndarray:
     target = camera.bodies.target
     region, count = np.zeros(len(target.points), dtype=np.int32), 0
     for k in camera.bodies.used:
-        own = target.body == k
-        xy = target.points[own, :2]
+        points = target.body == k
+        xy = target.points[points, :2]
         low, high = xy.min(axis=0), xy.max(axis=0) + 1e-9
         sides = TARGET_REGIONS if target.bends[k] else 1
         cell = ((xy - low) / (high - low) * sides).astype(int)
-        region[own] = count + cell[:, 1] * sides + cell[:, 0]
+        region[points] = count + cell[:, 1] * sides + cell[:, 0]
         count += sides**2
     return region[camera.stream.point]
 

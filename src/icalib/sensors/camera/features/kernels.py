@@ -83,16 +83,16 @@ def in_camera(R_cam_world, p_world_cam, point, x):
 
 
 @njit(cache=True, nogil=True)
-def held_back(own, gradient):
+def predicted_decrease(A_points, gradient):
     """Twice the decrease of cost that Gauss-Newton steps of the points would predict: sum of g^T A^-1 g over points.
 
-    own (T, 3, 3), gradient (T, 3): normal equations A and g of the points. The sum is above zero if the border of an
-    image stops a point before its minimum; the solver must not count this decrease as gain of a step. Directions
+    A_points (T, 3, 3), gradient (T, 3): normal equations A and g of the points. The sum is above zero if the border of
+    an image stops a point before its minimum; the solver must not count this decrease as gain of a step. Directions
     without information, as for a point at the camera's centre, add nothing.
     """
     A, values, vectors, total = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), 0.0
-    for t in range(len(own)):
-        A[:] = own[t]
+    for t in range(len(A_points)):
+        A[:] = A_points[t]
         eigen3(A, values, vectors)
         for k in range(3):
             if values[k] > MIN_EIGENVALUE_RATIO * values[2]:

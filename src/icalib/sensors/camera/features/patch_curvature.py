@@ -32,10 +32,10 @@ def with_curved_patches(stream: TrackStream, model: CameraModel, params: np.ndar
         return stream
     # Four points at this distance from the observation have the same second moment as the patch.
     reach = np.sqrt(2.0 * stream.spread)[:, None]
-    mean, seen = np.zeros((len(stream.uv), 3)), np.ones(len(stream.uv), dtype=bool)
+    mean, has_rays = np.zeros((len(stream.uv), 3)), np.ones(len(stream.uv), dtype=bool)
     for direction in _AROUND:
         ray, valid = model.unproject(params, stream.uv + reach * direction)
         mean += ray
-        seen &= valid
-    uv, valid = model.project(params, np.where(seen[:, None], mean, [0.0, 0.0, 1.0]))
-    return replace(stream, uv=np.where((seen & valid)[:, None], uv, stream.uv))
+        has_rays &= valid
+    uv, valid = model.project(params, np.where(has_rays[:, None], mean, [0.0, 0.0, 1.0]))
+    return replace(stream, uv=np.where((has_rays & valid)[:, None], uv, stream.uv))

@@ -26,8 +26,8 @@ class PointSearch(NamedTuple):
 
     anchor (T, 3) m: position of each point's anchor camera, from which inverse depth is counted. xyz, trial (T, 3) m:
     accepted and trial points; all three in the world frame. cost, trial_cost (T,): half the robust chi^2; A (T, 3, 3)
-    and b (T, 3), trial_A and trial_b: normal equations; shown, trial_shown (T,): number of valid observations; damping
-    (T,); moves (T,) bool: not converged yet."""
+    and b (T, 3), trial_A and trial_b: normal equations; n_valid, trial_n_valid (T,): number of valid observations;
+    damping (T,); moves (T,) bool: not converged yet."""
 
     anchor: np.ndarray
     xyz: np.ndarray
@@ -38,8 +38,8 @@ class PointSearch(NamedTuple):
     b: np.ndarray
     trial_A: np.ndarray
     trial_b: np.ndarray
-    shown: np.ndarray
-    trial_shown: np.ndarray
+    n_valid: np.ndarray
+    trial_n_valid: np.ndarray
     damping: np.ndarray
     moves: np.ndarray
 
@@ -106,7 +106,7 @@ def add_to_points(observed, t0, R_cam_world, image, which, uv, valid, J_point, l
         w /= variance
         less = (1.0 - curvature) / (e[0] * e[0] + e[1] * e[1]) if curvature < 1.0 else 0.0
         points.trial_cost[t] += cost
-        points.trial_shown[t] += 1
+        points.trial_n_valid[t] += 1
         for a in range(3):
             slope = J[0, a] * e[0] + J[1, a] * e[1]
             points.trial_b[t, a] += w * slope
@@ -153,9 +153,9 @@ def _take_trial(points, t, start):
     """Accepts the trial of point t at the `start`, or if it does not raise the cost; then updates the damping.
 
     A point could lower its cost by leaving an image, so the number of valid observations must not fall."""
-    stays = points.trial_shown[t] >= points.shown[t]
+    stays = points.trial_n_valid[t] >= points.n_valid[t]
     if start or (stays and points.trial_cost[t] <= points.cost[t]):
-        points.shown[t] = points.trial_shown[t]
+        points.n_valid[t] = points.trial_n_valid[t]
         points.xyz[t], points.cost[t] = points.trial[t], points.trial_cost[t]
         points.A[t], points.b[t] = points.trial_A[t], points.trial_b[t]
         points.damping[t] *= 0.1
@@ -172,7 +172,7 @@ def _clear_trial(points, t):
         points.trial_b[t, a] = 0.0
         for k in range(3):
             points.trial_A[t, a, k] = 0.0
-    points.trial_cost[t], points.trial_shown[t] = 0.0, 0
+    points.trial_cost[t], points.trial_n_valid[t] = 0.0, 0
 
 
 @njit(cache=True, nogil=True)

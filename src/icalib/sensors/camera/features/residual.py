@@ -30,7 +30,7 @@ from icalib.optim.state import Layout, State
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.camera_images import CameraImages
 from icalib.sensors.camera.features.cluster_kernels import accumulate_clusters
-from icalib.sensors.camera.features.kernels import PieceStart, TrackObservations, accumulate, held_back
+from icalib.sensors.camera.features.kernels import PieceStart, TrackObservations, accumulate, predicted_decrease
 from icalib.sensors.camera.features.point_search import PointSearch, add_rays, take_trials
 from icalib.sensors.camera.features.statistics import (
     FeatureOutput,
@@ -149,23 +149,24 @@ class FeatureFactor(FactorDefaults):
             rays, valid = view.camera.model.unproject(view.params, view.observed.uv)
             at = view.poses
             add_rays(view.observed, 0, at.R_sensor_world, at.p_world_sensor, rays, valid, A, b)
-        found = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n), None)
-        points = self._in_anchors(views, found.xyz, slice(0, n))
+        search = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n), None)
+        points = self._in_anchors(views, search.xyz, slice(0, n))
         distance = np.linalg.norm(points, axis=1)
-        information = np.linalg.eigvalsh(found.A)[:, 0]
-        seen = sum(
+        information = np.linalg.eigvalsh(search.A)[:, 0]
+        n_used = sum(
             (np.bincount(t[(t >= 0) & k], minlength=n) for t, k in zip(self.tracks.track, self.keep, strict=True)),
             np.zeros(n, dtype=np.int64),
         )
-        square = found.cost / np.maximum(seen, 1)
-        whole = found.shown == seen
-        fits = square <= MAX_RESIDUAL_RATIO**2 * np.median(square[whole] if whole.any() else 0.0) + MAX_RESIDUAL_RATIO
+        square = search.cost / np.maximum(n_used, 1)
+        all_valid = search.n_valid == n_used
+        typical = np.median(square[all_valid] if all_valid.any() else 0.0)
+        fits = square <= MAX_RESIDUAL_RATIO**2 * typical + MAX_RESIDUAL_RATIO
         certain = information * (MAX_RELATIVE_SIGMA * distance) ** 2 > 1.0
-        good = np.isfinite(points).all(axis=1) & whole & fits & certain
+        good = np.isfinite(points).all(axis=1) & all_valid & fits & certain
         if self.surfaces is None:
             return points, good, OnPlanes.none(int(good.sum()))
         recording = np.searchsorted(state.starts, self.tracks.stretch_of()[good], side="right") - 1
-        return points, good, self.surfaces.under(found.xyz[good], found.A[good], recording)
+        return points, good, self.surfaces.under(search.xyz[good], search.A[good], recording)
 
     def coarse(self, state: State) -> FeatureFactor:
         """The same tracks with the noise of each camera raised to the median residual at `state`.
@@ -259,11 +260,11 @@ class FeatureFactor(FactorDefaults):
         for view in views:
             i, loss = view.index, self._loss(curved)
             for part, images in view.chunks():
-                own = slice(begin + images.start, begin + images.stop)
-                mine = features._replace(pose=features.pose[own], next_pose=features.next_pose[own])
+                rows = slice(begin + images.start, begin + images.stop)
+                part_sums = features._replace(pose=features.pose[rows], next_pose=features.next_pose[rows])
                 X = part.in_camera(points.xyz, tracks.start)
                 total += accumulate(
-                    X, part.observed, base, part.poses, part.columns, part.projection(X), loss, into, mine,
+                    X, part.observed, base, part.poses, part.columns, part.projection(X), loss, into, part_sums,
                     out.residual[i], out.root[i],
                 )  # fmt: skip
             begin += len(view.observed.keyframe)
@@ -271,7 +272,7 @@ class FeatureFactor(FactorDefaults):
             loss, off = self._loss(curved), out.off.of(tracks)
             total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
         if sums and piece.features is not None:
-            piece.calib[-1, -1] += held_back(features.own, features.side[:, :, -1])
+            piece.calib[-1, -1] += predicted_decrease(features.own, features.side[:, :, -1])
         return total
 
     def accumulate_clusters(
@@ -285,12 +286,12 @@ class FeatureFactor(FactorDefaults):
         views, base = self._views(state, piece.first, self._stop(piece)), PieceStart(tracks.start, pairs.start)
         points, side = self._from_anchors(views, tracks, at.points[tracks]), piece.features.sums.side
         for view in views:
-            loss, own = self._loss(False), cluster[view.index]
+            loss, clusters = self._loss(False), cluster[view.index]
             for part, _ in view.chunks():
                 X = part.in_camera(points, tracks.start)
                 accumulate_clusters(
-                    X, part.observed, base, part.poses, part.columns, part.projection(X), loss, own, n_clusters, column,
-                    piece.sums(True), side,
+                    X, part.observed, base, part.poses, part.columns, part.projection(X), loss, clusters, n_clusters,
+                    column, piece.sums(True), side,
                 )  # fmt: skip
 
     def _planes(self, state: State) -> Planes | None:
@@ -345,8 +346,8 @@ class FeatureFactor(FactorDefaults):
         lens = self.layout.columns(camera.name, "intrinsics", "distortion")
         pars = np.flatnonzero(lens >= 0)
         clocks = range(len(state.values[camera.name, "time_offset"]))
-        own = np.array([np.concatenate([camera.kinematics.columns(k), lens[pars]]) for k in clocks])
-        columns = own[clock_numbers(state, camera.name, camera.keyframe[i0:i1])]
+        columns_of_clocks = np.array([np.concatenate([camera.kinematics.columns(k), lens[pars]]) for k in clocks])
+        columns = columns_of_clocks[clock_numbers(state, camera.name, camera.keyframe[i0:i1])]
         return CameraImages(camera, index, i0, camera.lens(state), observed, camera.poses(state, i0, i1), columns, pars)
 
     def _descend(self, views: list[CameraImages], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> PointSearch:
@@ -372,19 +373,19 @@ class FeatureFactor(FactorDefaults):
         """(n, 3) m in the world frame, from `points` (n, 3) m of `tracks` in the frames of their anchor cameras."""
         out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
-            own = np.flatnonzero(camera == view.index)
-            i = image[tracks][own] - view.first
-            turned = np.einsum("nji,nj->ni", view.poses.R_sensor_world[i], points[own])
-            out[own] = turned + view.poses.position[i]
+            rows = np.flatnonzero(camera == view.index)
+            i = image[tracks][rows] - view.first
+            turned = np.einsum("nji,nj->ni", view.poses.R_sensor_world[i], points[rows])
+            out[rows] = turned + view.poses.position[i]
         return out
 
     def _in_anchors(self, views: list[CameraImages], points: np.ndarray, tracks: slice) -> np.ndarray:
         """(n, 3) m in the frames of the anchor cameras, from `points` (n, 3) m of `tracks` in the world frame."""
         out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
-            own = np.flatnonzero(camera == view.index)
-            i = image[tracks][own] - view.first
-            out[own] = np.einsum("nij,nj->ni", view.poses.R_sensor_world[i], points[own] - view.poses.position[i])
+            rows = np.flatnonzero(camera == view.index)
+            i = image[tracks][rows] - view.first
+            out[rows] = np.einsum("nij,nj->ni", view.poses.R_sensor_world[i], points[rows] - view.poses.position[i])
         return out
 
 

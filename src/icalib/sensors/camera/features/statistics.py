@@ -33,38 +33,38 @@ class FeatureOutput:
 
 def feature_squares(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, Squares]:
     """Number and chi^2 of the tracks of each camera, and of its points on planes if there are any."""
-    found, off = {}, out.off
+    squares, off = {}, out.off
     for i, (camera, residual, root) in enumerate(zip(factor.cameras, out.residual, out.root, strict=True)):
         chi2 = float(((residual * root[:, None]) ** 2).sum())
-        found[camera.name, FEATURES] = Squares(2 * int((root > 0.0).sum()), chi2)
-        if len(own := factor.on_planes_of(i)):
-            chi2 = float(((off.residual * off.root)[own] ** 2).sum())
-            found[camera.name, ON_PLANES] = Squares(len(own), chi2)
-    return found
+        squares[camera.name, FEATURES] = Squares(2 * int((root > 0.0).sum()), chi2)
+        if len(on_planes := factor.on_planes_of(i)):
+            chi2 = float(((off.residual * off.root)[on_planes] ** 2).sum())
+            squares[camera.name, ON_PLANES] = Squares(len(on_planes), chi2)
+    return squares
 
 
 def feature_sizes(factor: FeatureFactor, out: FeatureOutput) -> dict[FitKey, RawSize]:
     """RMS of the tracks of each camera, and of its points on planes.
 
     Outliers count as rejected, but observations of tracks that are left out do not."""
-    found = {}
+    sizes = {}
     for i, camera in enumerate(factor.cameras):
         rejected = int(factor.outliers[i].sum()) if factor.outliers else 0
-        found[camera.name, FEATURES] = RawSize(rms_px(out.residual[i], out.root[i]), "px", rejected)
-        if len(own := factor.on_planes_of(i)):
-            found[camera.name, ON_PLANES] = RawSize(float(np.sqrt(np.mean(out.off.residual[own] ** 2))), "m")
-    return found
+        sizes[camera.name, FEATURES] = RawSize(rms_px(out.residual[i], out.root[i]), "px", rejected)
+        if len(on_planes := factor.on_planes_of(i)):
+            sizes[camera.name, ON_PLANES] = RawSize(float(np.sqrt(np.mean(out.off.residual[on_planes] ** 2))), "m")
+    return sizes
 
 
 def feature_rows(factor: FeatureFactor, out: FeatureOutput, state: State) -> list[ResidualRows]:
     """Residuals of the tracks of each camera."""
-    found = []
+    rows = []
     for camera, stream, sigma, residual, root in zip(
         factor.cameras, factor.streams, factor.sigmas, out.residual, out.root, strict=True
     ):
         seconds = camera.instants(state)[stream.image]
-        found.append(image_rows(camera.name, FEATURES, seconds, residual, sigma, root))
-    return found
+        rows.append(image_rows(camera.name, FEATURES, seconds, residual, sigma, root))
+    return rows
 
 
 def dof_used_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
@@ -72,22 +72,22 @@ def dof_used_by_features(factor: FeatureFactor, at: FeatureOutput, along: StateD
 
     Each point takes three degrees of freedom: its plane's share from the plane residual, the rest from the cameras in
     proportion to their observations."""
-    there, count = output_at(factor, along.end), np.zeros(factor.tracks.count)
+    end, count = output_at(factor, along.end), np.zeros(factor.tracks.count)
     used = [root > 0.0 for root in at.root]
     for track, u in zip(factor.tracks.track, used, strict=True):
         count += np.bincount(track[u], minlength=len(count))
     spent = {}
     for i, camera in enumerate(factor.cameras):
         root, u = at.root[i], used[i]
-        slope = (there.residual[i] - at.residual[i]) / along.share
-        own = float(((3.0 - at.off.share) / np.maximum(count, 1))[factor.tracks.track[i][u]].sum())
-        spent[camera.name, FEATURES] = own + float(((slope * root[:, None])[u] ** 2).sum())
+        slope = (end.residual[i] - at.residual[i]) / along.share
+        point_dof = float(((3.0 - at.off.share) / np.maximum(count, 1))[factor.tracks.track[i][u]].sum())
+        spent[camera.name, FEATURES] = point_dof + float(((slope * root[:, None])[u] ** 2).sum())
         if len(on := factor.on_planes_of(i)):
-            slope = (there.off.residual - at.off.residual)[on] / along.share * at.off.root[on]
+            slope = (end.off.residual - at.off.residual)[on] / along.share * at.off.root[on]
             # A row takes 1 - E[chi^2]: w = weight / sigma^2, v is the point's variance along the normal by the cameras,
             # and s = w v / (1 + w v) the share. The fit of the point leaves E[chi^2] = w (1 - s)^2 (v + sigma^2).
             # weight < 1: all rows of one patch together have the weight of one row.
             left, weight = 1.0 - at.off.share[on], factor.on.weight[on]
-            own = float((1.0 - left * (left * weight + at.off.share[on])).sum())
-            spent[camera.name, ON_PLANES] = own + float((slope**2).sum())
+            point_dof = float((1.0 - left * (left * weight + at.off.share[on])).sum())
+            spent[camera.name, ON_PLANES] = point_dof + float((slope**2).sum())
     return spent

@@ -94,7 +94,7 @@ class Surfaces:
     noise: float
 
     @classmethod
-    def seen(
+    def of_clouds(
         cls,
         keys: tuple[Key, ...],
         recording: np.ndarray,
@@ -133,8 +133,8 @@ class Surfaces:
         may[i, k] = np.isin(_codes(self.plane, k, points[i]), self.cells)
         lies = np.zeros_like(may)
         for k in np.flatnonzero(may.sum(axis=0) >= MIN_POINTS_ON_PLANE):
-            own = np.flatnonzero(may[:, k])
-            lies[own, k] = most_alike(off[own, k], np.sqrt(across[own, k] + self.noise**2))
+            candidates = np.flatnonzero(may[:, k])
+            lies[candidates, k] = most_alike(off[candidates, k], np.sqrt(across[candidates, k] + self.noise**2))
         plane = np.where(lies.sum(axis=1) == 1, lies.argmax(axis=1), -1)
         on, part = np.flatnonzero(plane >= 0), np.ones(len(points))
         patches = _codes(self.plane, plane[on], points[on], PATCH_M)

@@ -60,7 +60,7 @@ def next_selections(
     pass, which has a laxer test."""
     noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(cameras))
     if settings.outlier_std <= 0.0:
-        return [replace(own, noise=n) for own, n in zip(now, noise, strict=True)]
+        return [replace(selection, noise=n) for selection, n in zip(now, noise, strict=True)]
     # All observations are tested again with the final poses of the pass. Its first poses may have left out good tracks,
     # and its first lens may have turned inliers into outliers.
     observed = observed_at_keyframes(factor.cameras, factor.streams, state, settings.max_gap_s)
@@ -106,9 +106,9 @@ def variance_growth(square: np.ndarray, views: np.ndarray) -> float:
     group = np.floor(np.log2(views + 1.0)).astype(int)
     rows = []
     for k in np.unique(group):
-        own = group == k
-        if own.sum() >= MIN_GROUP_OBSERVATIONS:
-            rows.append((float(views[own].mean()), median_variance(square[own]), float(own.sum())))
+        in_group = group == k
+        if in_group.sum() >= MIN_GROUP_OBSERVATIONS:
+            rows.append((float(views[in_group].mean()), median_variance(square[in_group]), float(in_group.sum())))
     if len(rows) < 2:
         return 0.0
     v, variance, count = np.array(rows).T

@@ -98,11 +98,11 @@ class ObservationTable:
 
     def in_order(self, label: np.ndarray) -> np.ndarray:
         """The labels (N,), renumbered in the order of first keyframes; -1 for tracks with too few observations."""
-        seen = label >= 0
+        labelled = label >= 0
         n = int(label.max(initial=-1)) + 1
         first = np.full(n, np.iinfo(np.int64).max)
-        np.minimum.at(first, label[seen], self.keyframe[seen])
-        left = np.bincount(label[seen], minlength=n) >= MIN_TRACK_OBSERVATIONS
+        np.minimum.at(first, label[labelled], self.keyframe[labelled])
+        left = np.bincount(label[labelled], minlength=n) >= MIN_TRACK_OBSERVATIONS
         order = np.argsort(first, kind="stable")
         number = np.full(n + 1, -1)
         number[order[left[order]]] = np.arange(int(left.sum()))
@@ -110,8 +110,8 @@ class ObservationTable:
 
     def tracks(self, label: np.ndarray, edges: np.ndarray) -> Tracks:
         """The tracks of labels (N,) as `in_order` returns them, with all initial points at zero."""
-        seen, n = np.flatnonzero(label >= 0), int(label.max(initial=-1)) + 1
-        pairs = seen[np.argsort(self.keyframe[seen], kind="stable")]
+        labelled, n = np.flatnonzero(label >= 0), int(label.max(initial=-1)) + 1
+        pairs = labelled[np.argsort(self.keyframe[labelled], kind="stable")]
         pair = np.full(len(label), -1)
         pair[pairs] = np.arange(len(pairs))
         lives = pairs[np.argsort(label[pairs], kind="stable")]
@@ -119,9 +119,9 @@ class ObservationTable:
         middle = lives[begins + np.bincount(label[lives], minlength=n) // 2]
         tracks_from = np.searchsorted(self.keyframe[lives[begins]], edges)
         camera = np.repeat(np.arange(len(self.counts)), self.counts)
-        own_track, own_pair = (tuple(np.split(a, np.cumsum(self.counts)[:-1])) for a in (label, pair))
+        track_by_camera, pair_by_camera = (tuple(np.split(a, np.cumsum(self.counts)[:-1])) for a in (label, pair))
         return Tracks(
-            own_track, own_pair, label[pairs], camera[pairs], self.image[pairs], edges, tracks_from,
+            track_by_camera, pair_by_camera, label[pairs], camera[pairs], self.image[pairs], edges, tracks_from,
             np.searchsorted(self.keyframe[pairs], edges), camera[middle], self.image[middle], np.zeros((n, 3)),
         )  # fmt: skip
 

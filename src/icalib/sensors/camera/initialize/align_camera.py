@@ -26,23 +26,25 @@ from icalib.sensors.camera.initialize.guess import relative_offset
 from icalib.sensors.sensor import TIME_OFFSET
 
 
-def chosen_offset(camera: Camera, rates: SensorRates, imu: ImuData, given: float | None, found: RateAlignment) -> float:
-    """The time offset [s] to start from: the value `given` by the rig file, or the estimate in `found`.
+def chosen_offset(
+    camera: Camera, rates: SensorRates, imu: ImuData, given: float | None, alignment: RateAlignment
+) -> float:
+    """The time offset [s] to start from: the value `given` by the rig file, or the estimate in `alignment`.
 
     Both are t_imu - t_camera, with each clock counted from its first stamp. A fixed value, or one with a prior, is
     kept. An initial guess far from the estimate is replaced only if the angular `rates` of the camera contradict it,
     because slow motion hardly determines an offset.
     """
     if given is None:
-        return found.offset
-    far = is_contradicted(TIME_OFFSET, np.array([given]), np.array([found.offset]))
+        return alignment.offset
+    far = is_contradicted(TIME_OFFSET, np.array([given]), np.array([alignment.offset]))
     if known_value(camera.time_offset) is not None or not far:
         return given
     try:
-        at_given = alignment_as_stated(imu, camera.name, rates, given, found.rotation)
+        at_given = alignment_as_stated(imu, camera.name, rates, given, alignment.rotation)
     except EstimationError:  # the clocks do not overlap
-        return found.offset
-    return found.offset if rates_contradict(imu, rates, at_given) else given
+        return alignment.offset
+    return alignment.offset if rates_contradict(imu, rates, at_given) else given
 
 
 def align_camera(
@@ -53,18 +55,20 @@ def align_camera(
     Values of the rig file that are fixed or have a prior take precedence over the estimate. An initial guess of the rig
     file is used if the motion does not determine the value. Raises EstimationError if neither determines it.
     """
-    found = _aligned_by_rates(camera, stream, rates, imu, measurements)
+    alignment = _aligned_by_rates(camera, stream, rates, imu, measurements)
     offset, rotation = camera.time_offset.value, camera.rotation.value
-    if rotation is None or (known_value(camera.rotation) is None and turns_about_two_axes(imu, rates, found)):
-        return found
-    at_given = alignment_as_stated(imu, camera.name, rates, found.offset, rotation)
+    if rotation is None or (known_value(camera.rotation) is None and turns_about_two_axes(imu, rates, alignment)):
+        return alignment
+    at_given = alignment_as_stated(imu, camera.name, rates, alignment.offset, rotation)
     if offset is not None and known_value(camera.time_offset) is None:
         at_given = better_at_offset(imu, camera.name, rates, at_given, relative_offset(offset, stream, measurements))
-    if known_value(camera.rotation) is not None or found.given or not rates_contradict(imu, rates, at_given):
+    if known_value(camera.rotation) is not None or alignment.given or not rates_contradict(imu, rates, at_given):
         return at_given
     # The rates determine the rotation except about one axis. Only that component is taken from the guess.
-    nearest = nearest_about_axis(main_axis(rates.rate), rotation, found.rotation)
-    return better_alignment(imu, rates, at_given, alignment_as_stated(imu, camera.name, rates, found.offset, nearest))
+    nearest = nearest_about_axis(main_axis(rates.rate), rotation, alignment.rotation)
+    return better_alignment(
+        imu, rates, at_given, alignment_as_stated(imu, camera.name, rates, alignment.offset, nearest)
+    )
 
 
 def _aligned_by_rates(
@@ -80,18 +84,18 @@ def _aligned_by_rates(
     rotation, on_wheels = camera.rotation.value, bool(measurements.wheels)
     try:
         offset = None if known is None else relative_offset(known, stream, measurements)
-        found = align_rates(imu, camera.name, rates, offset)
+        alignment = align_rates(imu, camera.name, rates, offset)
         if rotation is None:
-            check_two_axes(imu, rates, found, camera.name, on_wheels)
+            check_two_axes(imu, rates, alignment, camera.name, on_wheels)
     except EstimationError:
         if given is None:
             raise
         offset = relative_offset(given, stream, measurements)
         if rotation is None:
-            found = align_rates(imu, camera.name, rates, offset)
-            check_two_axes(imu, rates, found, camera.name, on_wheels)
+            alignment = align_rates(imu, camera.name, rates, offset)
+            check_two_axes(imu, rates, alignment, camera.name, on_wheels)
         else:
-            found = alignment_as_stated(imu, camera.name, rates, offset, rotation)
-            if rates_contradict(imu, rates, found):
+            alignment = alignment_as_stated(imu, camera.name, rates, offset, rotation)
+            if rates_contradict(imu, rates, alignment):
                 raise
-    return found
+    return alignment

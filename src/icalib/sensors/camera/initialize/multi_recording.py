@@ -87,15 +87,15 @@ def _with_fixed_calibration(rig: Rig, guess: Guess, recording: Measurements) -> 
     Time offsets of clocks that restart are not changed.
     """
 
-    def camera(c: Camera, found: CameraGuess, origin_ns: int) -> Camera:
-        offset = found.offset - (origin_ns - recording.origin_ns) * 1e-9
+    def camera(c: Camera, estimate: CameraGuess, origin_ns: int) -> Camera:
+        offset = estimate.offset - (origin_ns - recording.origin_ns) * 1e-9
         return dataclasses.replace(
             c,
-            rotation=fixed(found.rotation),
-            translation=fixed(found.position),
+            rotation=fixed(estimate.rotation),
+            translation=fixed(estimate.position),
             time_offset=c.time_offset if c.clock_restarts else fixed(np.array([offset])),
-            intrinsics=fixed(found.params[:4]),
-            distortion=fixed(found.params[4:]),
+            intrinsics=fixed(estimate.params[:4]),
+            distortion=fixed(estimate.params[4:]),
         )
 
     pairs = zip(rig.cameras, recording.cameras, strict=True)
@@ -121,10 +121,10 @@ def _check_clocks(rig: Rig, scene: TargetScene, guess: Guess, reference: Measure
             rates = camera_rates(stream, poses)
         except EstimationError as error:
             raise EstimationError(f"{recording.name}: {error}") from error
-        found = contradicting_offset(imu, camera.name, rates, expected)
-        if found is not None:
+        offset = contradicting_offset(imu, camera.name, rates, expected)
+        if offset is not None:
             raise EstimationError(
-                f"{recording.name}: the time offset of {camera.name} differs by {found - expected:+.3f} s from "
+                f"{recording.name}: the time offset of {camera.name} differs by {offset - expected:+.3f} s from "
                 f"that in {reference.name}. If a clock was set or restarted in between, write clock_restarts: "
                 "true for the sensor in the rig file; else calibrate this recording alone."
             )

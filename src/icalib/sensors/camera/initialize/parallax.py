@@ -26,7 +26,7 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
     It names the camera with the largest ratio of parallax to noise. Also None if a recording has no IMU data, or the
     intrinsics of a camera are not found.
     """
-    found: list[tuple[float, float, str]] = []
+    ratios: list[tuple[float, float, str]] = []
     for m in recordings:
         imu = imu_data(rig, m)
         for k, (camera, stream) in enumerate(zip(rig.cameras, m.tracks, strict=True)):
@@ -39,10 +39,10 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
             pairs = [_parallax(pair) for pair in shared_rays(k, stream, camera_model(camera.model), lens)]
             if pairs:
                 parallax, error = np.median(pairs, axis=0).tolist()
-                found.append((parallax, error, camera.name))
-    if not found:
+                ratios.append((parallax, error, camera.name))
+    if not ratios:
         return None
-    parallax, error, name = max(found, key=lambda x: x[0] / x[1])
+    parallax, error, name = max(ratios, key=lambda x: x[0] / x[1])
     if parallax > MIN_PARALLAX_RATIO * error:
         return None
     return EstimationError(

@@ -122,12 +122,12 @@ class _TargetViews:
         stream = self.measurements.cameras[k]
         return align_camera(self.rig.cameras[k], stream, camera_rates(stream, self.poses[k]), imu, self.measurements)
 
-    def _offset(self, imu: ImuData, k: int, found: RateAlignment) -> float:
-        """The time offset [s] of camera `k` from the rig file or `found`, with clocks counted from first stamps."""
+    def _offset(self, imu: ImuData, k: int, aligned: RateAlignment) -> float:
+        """The time offset [s] of camera `k` from the rig file or `aligned`, with clocks counted from first stamps."""
         camera, stream = self.rig.cameras[k], self.measurements.cameras[k]
         raw = camera.time_offset.value
         given = None if raw is None else relative_offset(raw, stream, self.measurements)
-        return chosen_offset(camera, camera_rates(stream, self.poses[k]), imu, given, found)
+        return chosen_offset(camera, camera_rates(stream, self.poses[k]), imu, given, aligned)
 
     def _arm(self, imu: ImuData, k: int, aligned: RateAlignment, gyro: GyroRotation) -> LeverArm:
         """Lever arm, gravity and accelerometer bias from the poses of camera `k`."""

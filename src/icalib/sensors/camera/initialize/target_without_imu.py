@@ -64,22 +64,22 @@ def _extrinsics(rig: Rig, times: list[np.ndarray], poses: list[TargetPoses]) -> 
     The tree grows by the pair of cameras with most simultaneous images. times: (M,) [s] instants of the images of each
     camera on the body's clock; poses: T_target_cam. Raises EstimationError if a camera is not connected.
     """
-    found: dict[int, Pose] = {0: (np.eye(3), np.zeros(3))}
+    extrinsics: dict[int, Pose] = {0: (np.eye(3), np.zeros(3))}
     for i, c in enumerate(rig.cameras[1:], 1):
         if c.rotation.value is not None and c.translation.value is not None:
-            found[i] = c.rotation.value, c.translation.value
-    while len(found) < len(rig.cameras):
-        pairs = [(a, b) for a in found for b in range(len(rig.cameras)) if b not in found]
+            extrinsics[i] = c.rotation.value, c.translation.value
+    while len(extrinsics) < len(rig.cameras):
+        pairs = [(a, b) for a in extrinsics for b in range(len(rig.cameras)) if b not in extrinsics]
         relative_poses = {(a, b): _relative_poses(times[a], poses[a], times[b], poses[b]) for a, b in pairs}
         (a, b), relative = max(relative_poses.items(), key=lambda item: len(item[1]))
         if not relative:
-            raise _not_connected(rig, found)
+            raise _not_connected(rig, extrinsics)
         R, p = _medoid(relative)
-        found[b] = found[a][0] @ R, found[a][1] + found[a][0] @ p
+        extrinsics[b] = extrinsics[a][0] @ R, extrinsics[a][1] + extrinsics[a][0] @ p
     for i, c in enumerate(rig.cameras[1:], 1):
         R, p = c.rotation.value, c.translation.value
-        found[i] = (found[i][0] if R is None else R, found[i][1] if p is None else p)
-    return [found[i] for i in range(len(rig.cameras))]
+        extrinsics[i] = (extrinsics[i][0] if R is None else R, extrinsics[i][1] if p is None else p)
+    return [extrinsics[i] for i in range(len(rig.cameras))]
 
 
 def _relative_poses(ta: np.ndarray, a: TargetPoses, tb: np.ndarray, b: TargetPoses) -> list[Pose]:
@@ -99,10 +99,10 @@ def _medoid(poses: list[Pose]) -> Pose:
     return poses[int(np.argmin(np.median(distance, axis=1)))]
 
 
-def _not_connected(rig: Rig, found: dict[int, Pose]) -> EstimationError:
-    """The error, not raised, that no simultaneous images connect some cameras to those in `found`."""
-    lost = ", ".join(c.name for i, c in enumerate(rig.cameras) if i not in found)
-    known = ", ".join(c.name for i, c in enumerate(rig.cameras) if i in found)
+def _not_connected(rig: Rig, connected: dict[int, Pose]) -> EstimationError:
+    """The error, not raised, that no simultaneous images connect some cameras to those in `connected`."""
+    lost = ", ".join(c.name for i, c in enumerate(rig.cameras) if i not in connected)
+    known = ", ".join(c.name for i, c in enumerate(rig.cameras) if i in connected)
     return EstimationError(
         f"{lost} and {known} never saw the target at the same instant, and there is no IMU to connect them; "
         "show it to both at once with synchronised stamps, add the IMU, or give rotation and translation in "

@@ -124,11 +124,13 @@ def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -
     tables = {c.name: tracks(recording, c) for c in cameras if c.tracks is not None and not c.tracks_images}
     image_topics(recording, pictured)
     above = 1 + max((int(t.feature.max(initial=-1)) for t in tables.values()), default=-1)
-    seen = reading.follow(recording, pictured) if pictured else ()
-    of_images = {stream.name: (replace(stream, feature=stream.feature + above), notes) for stream, notes in seen}
+    of_recording = reading.follow(recording, pictured) if pictured else ()
+    of_images = {
+        stream.name: (replace(stream, feature=stream.feature + above), notes) for stream, notes in of_recording
+    }
     by_name = {name: (stream, ()) for name, stream in tables.items()} | of_images
-    found = [by_name[c.name] for c in cameras if c.name in by_name]
-    return [(reading.cut(stream, f"the tracks of {stream.name}"), notes) for stream, notes in found]
+    streams = [by_name[c.name] for c in cameras if c.name in by_name]
+    return [(reading.cut(stream, f"the tracks of {stream.name}"), notes) for stream, notes in streams]
 
 
 def _corners(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadStream]:
@@ -139,11 +141,11 @@ def _corners(recording: Recording, cameras: Sequence[Camera], reading: Reading) 
     image_topics(recording, pictured)
     streams = []
     for camera in seeing:
-        found, notes = (
+        detected, notes = (
             reading.find(recording, camera) if camera in pictured else (corners(recording, camera, target), ())
         )
         where = recording.where(camera)
-        cut = reading.cut(found, f"{where} ({camera.name})")
+        cut = reading.cut(detected, f"{where} ({camera.name})")
         stream, dropped = checked_corners(cut, where, camera.resolution)
         streams.append((stream, notes + dropped))
     return streams

@@ -64,19 +64,19 @@ def in_image(uv: np.ndarray, resolution: tuple[int, int], margin_px: float) -> n
 
 
 def outside_note(
-    stream: CornerStream | TrackStream, inside: np.ndarray, thing: str, what: str, resolution: tuple[int, int]
+    stream: CornerStream | TrackStream, inside: np.ndarray, point: str, what: str, resolution: tuple[int, int]
 ) -> str:
-    """A note on points that are not `inside` (N,) bool the image, at least one. `thing`: text that names the first.
+    """A note on points that are not `inside` (N,) bool the image, at least one. `point`: text that names the first.
 
     Raises RecordingError if many points are outside."""
     first, count = int(np.argmin(inside)), int((~inside).sum())
     (u, v), (width, height) = stream.uv[first], resolution
     which = stream.which(int(stream.stamps_ns[stream.image[first]]))
-    words = f"{thing} lies at ({u:.1f}, {v:.1f}), outside the image of {width} x {height} px"
-    told = f"{what}: in the image {which}, {words}"
+    words = f"{point} lies at ({u:.1f}, {v:.1f}), outside the image of {width} x {height} px"
+    sentence = f"{what}: in the image {which}, {words}"
     if count > _MAX_OUTSIDE_SHARE * len(inside):
-        raise RecordingError(f"{told}; check the camera's resolution [width, height] in the rig file.")
-    return f"{told}; {count} of {len(inside)} such points were left out."
+        raise RecordingError(f"{sentence}; check the camera's resolution [width, height] in the rig file.")
+    return f"{sentence}; {count} of {len(inside)} such points were left out."
 
 
 def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream, tuple[str, ...]]:

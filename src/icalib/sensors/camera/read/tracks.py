@@ -49,17 +49,17 @@ def read_tracks(
     if not inside.all():
         first = stream.feature[np.argmin(inside)]
         note(outside_note(stream, inside, f"feature {first}", what, resolution))
-        stream = _those(stream, inside)
+        stream = _selected(stream, inside)
     _check(stream, what)
     return stream
 
 
-def _those(stream: TrackStream, kept: np.ndarray) -> TrackStream:
+def _selected(stream: TrackStream, kept: np.ndarray) -> TrackStream:
     """The observations that `kept` (N,) bool selects; images without such observations are left out."""
     count = np.bincount(stream.image[kept], minlength=len(stream.stamps_ns))
-    seen = count > 0
-    start = np.concatenate([[0], np.cumsum(count[seen])]).astype(np.int64)
-    return TrackStream(stream.name, stream.stamps_ns[seen], start, stream.feature[kept], stream.uv[kept])
+    has_rows = count > 0
+    start = np.concatenate([[0], np.cumsum(count[has_rows])]).astype(np.int64)
+    return TrackStream(stream.name, stream.stamps_ns[has_rows], start, stream.feature[kept], stream.uv[kept])
 
 
 def _check(stream: TrackStream, what: str) -> None:

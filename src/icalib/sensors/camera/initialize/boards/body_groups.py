@@ -44,7 +44,7 @@ def register_groups(
     not connected to the first group; EstimationError if images are mirrored, or cameras are not rigidly connected.
     """
     used = tied_by_images(bodies, recordings)
-    groups = [_Group.of(rig, replace(bodies, used=own), recordings, params) for own in used]
+    groups = [_Group.of(rig, replace(bodies, used=indices), recordings, params) for indices in used]
     values, frames = dict(groups[0].scene.values), {0: Frame(np.eye(3), np.zeros(3))}
     while len(frames) < len(groups):
         tied = [(g, h, _tied(groups[g], groups[h])) for g in frames for h in range(len(groups)) if h not in frames]
@@ -52,8 +52,8 @@ def register_groups(
         if len(best.pairs.p_body) < MIN_SHARED_IMAGES:
             lost = [x.scene.bodies.names for k, x in enumerate(groups) if k not in frames]
             raise UnconnectedBodiesError(tuple(name for names in lost for name in names))
-        found = _solved(best, rig.cameras)
-        frames[h] = Frame(frames[g].R @ found.R, frames[g].p + frames[g].R @ found.p)
+        T_g_h = _solved(best, rig.cameras)
+        frames[h] = Frame(frames[g].R @ T_g_h.R, frames[g].p + frames[g].R @ T_g_h.p)
         values |= groups[h].values_at(frames[h])
     return TargetScene(bodies, values, params)
 
@@ -75,26 +75,27 @@ class _Group:
         """The group of `bodies`, with camera poses in all `recordings`.
 
         params: (P,) intrinsics and distortion by camera name."""
-        own = [restrict(bodies, r) for r in recordings]
+        restricted = [restrict(bodies, r) for r in recordings]
         models = [camera_model(c.model) for c in rig.cameras]
         scene = TargetScene(bodies)
         if bodies.several:
-            seeing = [i for i in range(len(models)) if any(len(r.cameras[i].point) for r in own)]
-            streams = [CornerStream.joined([r.cameras[i] for r in own]) for i in seeing]
+            seeing = [i for i in range(len(models)) if any(len(r.cameras[i].point) for r in restricted)]
+            streams = [CornerStream.joined([r.cameras[i] for r in restricted]) for i in seeing]
             scene = place_bodies(bodies, streams, [models[i] for i in seeing], params)
-        times = [camera_times(rig, r, whole.origin_ns) for r, whole in zip(own, recordings, strict=True)]
+        times = [camera_times(rig, r, recording.origin_ns) for r, recording in zip(restricted, recordings, strict=True)]
         poses = [
-            [scene_poses(s, m, params[s.name], scene) for s, m in zip(r.cameras, models, strict=True)] for r in own
+            [scene_poses(s, m, params[s.name], scene) for s, m in zip(r.cameras, models, strict=True)]
+            for r in restricted
         ]
         return cls(scene, times, poses)
 
     def values_at(self, frame: Frame) -> dict[Key, np.ndarray]:
         """Poses T_scene_body of the bodies as in a state, for the pose `frame` of the group in the scene."""
         R, p = self.scene.bodies.poses(self.scene.values)
-        found: dict[Key, np.ndarray] = {}
+        values: dict[Key, np.ndarray] = {}
         for k, name in zip(self.scene.bodies.used, self.scene.bodies.names, strict=True):
-            found[name, "rotation"], found[name, "translation"] = frame.R @ R[k], frame.R @ p[k] + frame.p
-        return found
+            values[name, "rotation"], values[name, "translation"] = frame.R @ R[k], frame.R @ p[k] + frame.p
+        return values
 
 
 @dataclass(frozen=True)
@@ -114,13 +115,13 @@ def _tied(g: _Group, h: _Group) -> _Tied:
 
 def _pairs(g: _Group, h: _Group, a: int, b: int) -> PosePairs:
     """Simultaneous poses of camera `a` in group `g` and of camera `b` in group `h`, from all recordings."""
-    found = []
+    poses = []
     for times_g, poses_g, times_h, poses_h in zip(g.times, g.poses, h.times, h.poses, strict=True):
         i, j = taken_at_once(times_g[a], times_h[b])
         good = poses_g[a].ok[i] & poses_h[b].ok[j]
         i, j = i[good], j[good]
-        found.append((poses_g[a].rotation[i], poses_g[a].position[i], poses_h[b].rotation[j], poses_h[b].position[j]))
-    return PosePairs(*(np.concatenate(x) for x in zip(*found, strict=True)))
+        poses.append((poses_g[a].rotation[i], poses_g[a].position[i], poses_h[b].rotation[j], poses_h[b].position[j]))
+    return PosePairs(*(np.concatenate(x) for x in zip(*poses, strict=True)))
 
 
 def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
@@ -128,14 +129,14 @@ def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
 
     Raises EstimationError if the cameras are not rigidly connected."""
     a, b = cameras[tied.a], cameras[tied.b]
-    found = hand_eye(tied.pairs, _given(a, b, tied.a == 0, tied.b == 0), (False, False))
-    if (left := unexplained_motion(tied.pairs, found)) > MAX_UNEXPLAINED_MOTION:
+    solution = hand_eye(tied.pairs, _given(a, b, tied.a == 0, tied.b == 0), (False, False))
+    if (left := unexplained_motion(tied.pairs, solution)) > MAX_UNEXPLAINED_MOTION:
         raise EstimationError(
             f"{a.name} and {b.name} see different bodies of the target and do not move alike: {left:.0%} of "
             "the motion is unexplained; check that the bodies stand still, and that one clock stamps both "
             "cameras."
         )
-    return found.frame
+    return solution.frame
 
 
 def _given(a: Camera, b: Camera, a_is_body: bool, b_is_body: bool) -> Extrinsics | None:

@@ -40,18 +40,18 @@ def with_hand_eye_guess(rig: Rig, camera_inputs: Inputs, others: Inputs, state: 
 
     def with_guess(number: int, camera: Camera) -> Camera:
         best = int(np.argmax([len(r.cameras[number].uv) for r in recordings]))
-        stream, own = recordings[best].cameras[number], single_recording(others, best)
+        stream, inputs = recordings[best].cameras[number], single_recording(others, best)
         poses = scene_poses(stream, camera_model(camera.model), intrinsics_of(camera, stream, rig.target, scene), scene)
         ok, stamps = poses.ok, stream.stamps_ns[poses.ok]
         seconds = seconds_since(stamps, int(stamps[0]))
         path = SensorTrajectory(seconds, poses.rotation[ok], poses.position[ok], np.ones(len(stamps), dtype=bool))
-        assert own.imu is not None
+        assert inputs.imu is not None
         with naming_recording(others, best):
-            found, _ = extrinsics_on_trajectory(
-                own.imu, camera.name, path, state_of_recording(others, best, state), KnownExtrinsics()
+            extrinsics, _ = extrinsics_on_trajectory(
+                inputs.imu, camera.name, path, state_of_recording(others, best, state), KnownExtrinsics()
             )
-        offset = found.offset - 1e-9 * (int(stamps[0]) - recordings[best].origin_ns)
-        guess = mounted(found.rotation, found.position, np.array([offset]))
+        offset = extrinsics.offset - 1e-9 * (int(stamps[0]) - recordings[best].origin_ns)
+        guess = mounted(extrinsics.rotation, extrinsics.position, np.array([offset]))
         return replace(
             camera, **{k: Parameter("free", v) for k, v in guess.items() if getattr(camera, k).value is None}
         )

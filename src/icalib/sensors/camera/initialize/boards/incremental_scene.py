@@ -163,7 +163,7 @@ class _GrowingScene:
         m, b = int(begins[-1]), len(bodies.target.bodies)
         eye = np.eye(3)
         state = SceneState(np.tile(eye, (m, 1, 1)), np.zeros((m, 3)), np.tile(eye, (b, 1, 1)), np.zeros((b, 3)), ())
-        found = cls(
+        scene = cls(
             bodies,
             streams,
             views,
@@ -173,12 +173,12 @@ class _GrowingScene:
             posed=np.zeros(m, dtype=bool),
             seed=0,
         )
-        by_view = found._poses_by_view()
+        by_view = scene._poses_by_view()
         good = np.concatenate([q.ok[:, 0] for q in by_view])
-        found.seed = int(np.argmax(np.bincount(views.image, good, m)))
-        found.posed[found.seed] = True
-        found._place_bodies(by_view)
-        return found
+        scene.seed = int(np.argmax(np.bincount(views.image, good, m)))
+        scene.posed[scene.seed] = True
+        scene._place_bodies(by_view)
+        return scene
 
     def extend(self) -> bool:
         """Finds poses of further images, then of further bodies. Returns False if none were found."""
@@ -263,8 +263,8 @@ class _GrowingScene:
         first = int(placed[0])
         R0, p0 = self.state.R_body[first], self.state.p_body[first]
         known = replace(self.bodies, used=tuple(placed.tolist()))
-        found = ReconstructedScene(self.state, self.placed, np.empty(0))
-        scene = TargetScene(known, found.in_frame_of(first, self.bodies), {})
+        reconstruction = ReconstructedScene(self.state, self.placed, np.empty(0))
+        scene = TargetScene(known, reconstruction.in_frame_of(first, self.bodies), {})
         poses = [
             multi_body_poses(s, lens.model, lens.params, scene)
             for s, lens in zip(self.streams, self.state.lenses, strict=True)
@@ -307,17 +307,17 @@ class _GrowingScene:
 
     def _costs(self, views: np.ndarray, R: np.ndarray, p: np.ndarray) -> np.ndarray:
         """(n,) mean squared error [px^2] in `views` of one body for each of its candidate poses R, p (n, ...)."""
-        seen = self.views.select(np.isin(np.arange(len(self.views.image)), views))
-        n, corners = len(R), len(seen.uv)
-        image = np.tile(seen.image, n)
-        lengths = np.tile(np.diff(seen.start), n)
+        observed = self.views.select(np.isin(np.arange(len(self.views.image)), views))
+        n, corners = len(R), len(observed.uv)
+        image = np.tile(observed.image, n)
+        lengths = np.tile(np.diff(observed.start), n)
         repeated = SceneViews(
             np.concatenate([[0], np.cumsum(lengths)]),
             image,
-            np.repeat(np.arange(n), len(seen.image)),
-            np.tile(seen.points, (n, 1)),
-            np.tile(seen.uv, (n, 1)),
-            seen.camera,
+            np.repeat(np.arange(n), len(observed.image)),
+            np.tile(observed.points, (n, 1)),
+            np.tile(observed.uv, (n, 1)),
+            observed.camera,
         )
         error = reprojection_errors(repeated, replace(self.state, R_body=R, p_body=p))
         return (error.reshape(n, corners) ** 2).mean(axis=1)

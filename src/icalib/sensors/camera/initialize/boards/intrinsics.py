@@ -60,16 +60,18 @@ def camera_params(camera: Camera, stream: CornerStream, target: Target) -> np.nd
         return guess_intrinsics(*_one_body_per_image(stream, target), model, camera.resolution, stated)
     images, points = _one_body_per_image(stream, target)
     trial = _spread_images(images, FOCAL_TRIAL_IMAGES)
-    found: list[np.ndarray] = []
+    candidates: list[np.ndarray] = []
     for known in (stated, fixed):
         with suppress(EstimationError):
             is_complete = not np.isnan(known).any()
-            found.append(known if is_complete else guess_intrinsics(images, points, model, camera.resolution, known))
-            if _median_rms(trial, model, found[-1], points) < MAX_INTRINSICS_RMS_PX:
-                return found[-1]
-    if not found:
+            candidates.append(
+                known if is_complete else guess_intrinsics(images, points, model, camera.resolution, known)
+            )
+            if _median_rms(trial, model, candidates[-1], points) < MAX_INTRINSICS_RMS_PX:
+                return candidates[-1]
+    if not candidates:
         return guess_intrinsics(images, points, model, camera.resolution, fixed)
-    return min(found, key=lambda params: _median_rms(trial, model, params, points))
+    return min(candidates, key=lambda params: _median_rms(trial, model, params, points))
 
 
 def _stated(camera: Camera, with_guesses: bool) -> np.ndarray:
@@ -165,7 +167,7 @@ def _candidates(
 
     For each start distortion the adjustments begin at the best focal lengths.
     """
-    trial, found = _spread_images(stream, FOCAL_TRIAL_IMAGES), []
+    trial, candidates = _spread_images(stream, FOCAL_TRIAL_IMAGES), []
     for starts in starts_by_distortion:
         good = _good_starts(trial, model, starts, target)
         if len(model.start_distortions) == 1:  # the cost has one minimum: the best after a rough fit leads to it
@@ -173,9 +175,9 @@ def _candidates(
         for start in good:
             with suppress(np.linalg.LinAlgError):
                 params = _adjusted(images, model, start, target, free)
-                if not any(np.allclose(params, other, rtol=1e-2, atol=1e-3) for other in found):
-                    found.append(params)
-    return found
+                if not any(np.allclose(params, other, rtol=1e-2, atol=1e-3) for other in candidates):
+                    candidates.append(params)
+    return candidates
 
 
 def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, target: FlatPoints) -> np.ndarray:

@@ -117,9 +117,11 @@ def _renumbered(rig: Rig, part: Part, params: ParamsByCamera, measured: Measurem
     symmetries = _Symmetries.of(target)
     streams = []
     chosen = _chosen_symmetries(rig, measured, views, symmetries)
-    for stream, own, symmetry in zip(measured.cameras, views, chosen, strict=True):
+    for stream, camera_views, symmetry in zip(measured.cameras, views, chosen, strict=True):
         point = stream.point.copy()
-        point[own.rows] = first + symmetries.number[symmetry[own.images.image], own.images.point]
+        point[camera_views.rows] = (
+            first + symmetries.number[symmetry[camera_views.images.image], camera_views.images.point]
+        )
         order = np.lexsort((point, stream.image))
         renumbered = replace(stream, point=point)
         streams.append(renumbered.of_rows(order, stream.stamps_ns, np.diff(stream.start)))
@@ -153,7 +155,7 @@ def _chosen_symmetries(
         mounted = _mounted_by_images(measured, views, cameras, symmetries)
     else:
         mounted, gyro = _mounted_by_imu(imu, measured, views, cameras)
-    chosen = [np.zeros(len(own.images.stamps_ns), dtype=int) for own in views]
+    chosen = [np.zeros(len(camera_views.images.stamps_ns), dtype=int) for camera_views in views]
     t, camera, image = _in_temporal_order(views, mounted)
     R_start_body, section = _attitudes(gyro, t)
     last = -1
@@ -179,8 +181,8 @@ def _in_temporal_order(
 
     Returns instants on the body's clock [s], camera numbers and image numbers, (V,) each."""
     t = [views[k].images.seconds + mount.offset for k, mount in mounted.items()]
-    camera = [np.full(len(own), k) for k, own in zip(mounted, t, strict=True)]
-    image = [np.arange(len(own)) for own in t]
+    camera = [np.full(len(seconds), k) for k, seconds in zip(mounted, t, strict=True)]
+    image = [np.arange(len(seconds)) for seconds in t]
     t, camera, image = (np.concatenate(x) if x else np.zeros(0, dtype=int) for x in (t, camera, image))
     order = np.argsort(t, kind="stable")
     return t[order], camera[order], image[order]
@@ -206,9 +208,15 @@ def _mounted_by_imu(
     """
     aligned = {}
     for k in cameras:
-        own = views[k]
+        camera_views = views[k]
         with suppress(EstimationError):
-            aligned[k] = align_camera(own.camera, own.images, camera_rates(own.images, own.poses), imu, measured)
+            aligned[k] = align_camera(
+                camera_views.camera,
+                camera_views.images,
+                camera_rates(camera_views.images, camera_views.poses),
+                imu,
+                measured,
+            )
     biases = [a.gyro_bias for a in aligned.values()]
     gyro = GyroRotation.integrate(imu, biases[0]) if biases else None
     return {k: _CameraOnBody(a.rotation, a.offset) for k, a in aligned.items()}, gyro
@@ -221,24 +229,24 @@ def _mounted_by_images(
 
     Empty if none is connected, because one camera alone does not show how the target moved between its images.
     """
-    given = [own.camera.time_offset.value for own in views]
+    given = [camera_views.camera.time_offset.value for camera_views in views]
     offsets = [
-        relative_offset(np.zeros(1) if g is None else g, own.images, measured)
-        for g, own in zip(given, views, strict=True)
+        relative_offset(np.zeros(1) if g is None else g, camera_views.images, measured)
+        for g, camera_views in zip(given, views, strict=True)
     ]
-    found = {k: np.eye(3) for k in cameras[:1]}
-    while len(found) < len(cameras):
+    R_body_cam = {k: np.eye(3) for k in cameras[:1]}
+    while len(R_body_cam) < len(cameras):
         pairs = {
             (a, b): _simultaneous(views[a], offsets[a], views[b], offsets[b])
-            for a in found
+            for a in R_body_cam
             for b in cameras
-            if b not in found
+            if b not in R_body_cam
         }
         (a, b), best = max(pairs.items(), key=lambda item: len(item[1]))
         if not len(best):
             break
-        found[b] = found[a] @ _common_rotation(views[a].poses, views[b].poses, best, symmetries)
-    return {k: _CameraOnBody(R, offsets[k]) for k, R in found.items()} if len(found) > 1 else {}
+        R_body_cam[b] = R_body_cam[a] @ _common_rotation(views[a].poses, views[b].poses, best, symmetries)
+    return {k: _CameraOnBody(R, offsets[k]) for k, R in R_body_cam.items()} if len(R_body_cam) > 1 else {}
 
 
 def _simultaneous(a: _Views, offset_a: float, b: _Views, offset_b: float) -> np.ndarray:

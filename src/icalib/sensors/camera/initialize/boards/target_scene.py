@@ -124,11 +124,11 @@ def _best_poses(
 
     Candidates are the poses T_body_cam of the views, R_bc, p_bc, ok (V, 2, ...), composed with T_scene_body, R_sb,
     p_sb. The candidate with the least error over all corners of the image is refined on all of them."""
-    points, seen = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
+    points, observed = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     R, t, trial_R, trial_t = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     R_sc, p_sc = np.empty((3, 3)), np.empty(3)
     for i in range(len(start) - 1):
-        count = select_corners(start[i], start[i + 1], point, rays, density, good, scene_points, points, seen)
+        count = select_corners(start[i], start[i + 1], point, rays, density, good, scene_points, points, observed)
         best = NO_POSE_RMS_PX
         for v in range(first[i], first[i + 1]):
             for side in range(R_bc.shape[1]):
@@ -143,12 +143,12 @@ def _best_poses(
                         for c in range(3):
                             R_sc[a, b] += R_sb[k, a, c] * R_bc[v, side, c, b]
                 camera_in_target(R_sc, p_sc, trial_R, trial_t)
-                error = refine_pose(points[:count], seen[:count], trial_R.copy(), trial_t.copy(), 1)
+                error = refine_pose(points[:count], observed[:count], trial_R.copy(), trial_t.copy(), 1)
                 if error < best:
                     best = error
                     R[:], t[:] = trial_R, trial_t
         if best < NO_POSE_RMS_PX:
-            rms[i] = refine_pose(points[:count], seen[:count], R, t, POSE_ITERATIONS)
+            rms[i] = refine_pose(points[:count], observed[:count], R, t, POSE_ITERATIONS)
             if rms[i] < NO_POSE_RMS_PX:
                 camera_in_target(R, t, rotation[i], position[i])
             else:

@@ -306,8 +306,8 @@ def extrinsics_on_motion(
             f"{pairs.name}: too few of its images fall within the trajectory of the other sensors; check its clock."
         )
     best = sorted(tried, key=_mean_cost)[:MAX_REFINED_STARTS]
-    found = [(*s.minimise(fixed), len(s.f)) for s in best]
-    camera, result, _ = min(found, key=lambda x: x[1].cost / x[2])  # cost per ray, because the numbers of rays differ
+    refined = [(*s.minimise(fixed), len(s.f)) for s in best]
+    camera, result, _ = min(refined, key=lambda x: x[1].cost / x[2])  # cost per ray, because the numbers of rays differ
     for n in REFINEMENT_SUBSAMPLING:
         camera, result = _PairResiduals.of(pairs.every(n), motion, camera).minimise(fixed)
     _check(_PairResiduals.of(pairs, motion, camera), result, fixed)

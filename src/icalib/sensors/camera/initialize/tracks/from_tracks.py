@@ -54,11 +54,11 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     _check_units(imu, rig.gravity)
     motion = solve_linear_motion(gyro, rays, [a.rotation for a in aligned], arms, rig.gravity)
     cameras = {}
-    for k, (camera, stream, found) in enumerate(zip(rig.cameras, measurements.cameras, aligned, strict=True)):
+    for k, (camera, stream, alignment) in enumerate(zip(rig.cameras, measurements.cameras, aligned, strict=True)):
         raw = camera.time_offset.value
         given = None if raw is None else relative_offset(raw, stream, measurements)
-        offset = chosen_offset(camera, rates[k], imu, given, found)
-        R = merged_value(ROTATION, camera.rotation, camera.rotation.value, found.rotation)
+        offset = chosen_offset(camera, rates[k], imu, given, alignment)
+        R = merged_value(ROTATION, camera.rotation, camera.rotation.value, alignment.rotation)
         p = motion.arms[k] if camera.translation.value is None else camera.translation.value
         cameras[camera.name] = CameraGuess(params[k], offset, R, p, _poses(motion, stream.seconds + offset, R, p))
     return Guess(cameras, gyro_bias=aligned[0].gyro_bias, accel_bias=motion.accel_bias, R_world_board=np.eye(3))

@@ -136,9 +136,9 @@ def _normal_equations(
     no_directions = np.zeros((len(f), 0, 3))  # intrinsics are fixed
     rotation_information_of_pairs(f, h, no_directions, no_directions, begin, R, H, g, np.empty(m))
     for c in range(len(start)):
-        own = camera == c
-        J[own, :, 4 * c : 4 * c + 3] = R[own] - np.eye(3)
-        J[own, :, 4 * c + 3] = np.einsum("nij,nj->ni", R_ci[own], rotations.J_offset[own])
+        rows = camera == c
+        J[rows, :, 4 * c : 4 * c + 3] = R[rows] - np.eye(3)
+        J[rows, :, 4 * c + 3] = np.einsum("nij,nj->ni", R_ci[rows], rotations.J_offset[rows])
     J[:, :, n:] = R_ci @ rotations.J_bias
     flat = J.reshape(3 * m, n + 3)
     return flat.T @ (H @ J).reshape(3 * m, n + 3), flat.T @ g.ravel()

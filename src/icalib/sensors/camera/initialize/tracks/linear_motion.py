@@ -145,8 +145,8 @@ def solve_linear_motion(
             N[:3, :3] += np.outer(down, down) / GRAVITY_NORM_SIGMA**2
             r[:3] += gravity * down / GRAVITY_NORM_SIGMA**2
         local, common = _solve_windows(systems, N, r)
-    arms_found = common[N_COMMON:].reshape(-1, 3)
-    return WindowMotion(gyro, edges[:-1], local[:, :3], local[:, 3:] + common[:3], common[3:6], arms_found)
+    estimated_arms = common[N_COMMON:].reshape(-1, 3)
+    return WindowMotion(gyro, edges[:-1], local[:, :3], local[:, 3:] + common[:3], common[3:6], estimated_arms)
 
 
 def _common_prior(arms: list[np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:

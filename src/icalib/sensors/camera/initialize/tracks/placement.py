@@ -51,14 +51,16 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
         return values | known
 
     with ThreadPoolExecutor(N_THREADS) as pool:  # not the solver's pool: tasks may wait for its threads
-        return {k: v for own in pool.map(values_of, range(len(inputs.rig.cameras))) for k, v in own.items()}
+        parts = pool.map(values_of, range(len(inputs.rig.cameras)))
+        return {k: v for part in parts for k, v in part.items()}
 
 
 def _start_lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
     """(P,) start values of the intrinsics and distortion of camera `number`, from the recording number `recording`."""
-    own = single_recording(inputs, recording)
-    assert own.imu is not None
-    return start_intrinsics(inputs.rig.cameras[number], own.measurements.tracks[number], own.imu, own.measurements)
+    single = single_recording(inputs, recording)
+    assert single.imu is not None
+    stream = single.measurements.tracks[number]
+    return start_intrinsics(inputs.rig.cameras[number], stream, single.imu, single.measurements)
 
 
 def _estimated_values(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
@@ -69,14 +71,15 @@ def _estimated_values(inputs: Inputs, state: State, number: int, lens: np.ndarra
     camera, best = inputs.rig.cameras[number], fullest_recording(inputs, inputs.measurements.tracks[number].key)
     estimate_in = partial(_estimate_in, inputs, state, number, lens)
     with naming_recording(inputs, best):
-        found, lens = estimate_in(best)
+        extrinsics, lens = estimate_in(best)
     if camera.clock_restarts:
         offset = offset_of_each_clock(
-            inputs, camera.name, lambda k: estimate_in(k, found)[0].offset, {best: found.offset}
+            inputs, camera.name, lambda k: estimate_in(k, extrinsics)[0].offset, {best: extrinsics.offset}
         )
     else:
-        offset = np.array([converted_offset(found.offset, camera.name, single_recording(inputs, best), inputs)])
-    values = mounted(found.rotation, found.position, offset) | {"intrinsics": lens[:4], "distortion": lens[4:]}
+        offset = np.array([converted_offset(extrinsics.offset, camera.name, single_recording(inputs, best), inputs)])
+    values = mounted(extrinsics.rotation, extrinsics.position, offset)
+    values |= {"intrinsics": lens[:4], "distortion": lens[4:]}
     return {(camera.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 
@@ -86,26 +89,26 @@ def _estimate_in(
     """Extrinsics, and intrinsics with distortion (P,), of camera `number` from the recording number `recording`.
 
     known: rotation and translation to keep, or None; lens: (P,) start values."""
-    own, camera = single_recording(inputs, recording), inputs.rig.cameras[number]
-    assert own.imu is not None
-    stream, model = own.measurements.tracks[number], camera_model(camera.model)
-    fixed = {name: value for (_, name), value in stated_values(own, camera).items()}
+    single, camera = single_recording(inputs, recording), inputs.rig.cameras[number]
+    assert single.imu is not None
+    stream, model = single.measurements.tracks[number], camera_model(camera.model)
+    fixed = {name: value for (_, name), value in stated_values(single, camera).items()}
     if known is not None:
         fixed |= {"rotation": known.rotation, "translation": known.position}
     offsets = [float(fixed["time_offset"][0])] if "time_offset" in fixed else None
-    same_clock = relative_offset(np.zeros(1), own.measurements.cameras[number], own.measurements)
+    same_clock = relative_offset(np.zeros(1), single.measurements.cameras[number], single.measurements)
     pairs = ImagePairs.of(stream, model, lens, _free_directions(camera, lens))
     lens_step = np.zeros(len(pairs.lens_directions))
-    rates = matching_track_rates(own.imu, stream, model, lens)
+    rates = matching_track_rates(single.imu, stream, model, lens)
     starts = [
         CameraExtrinsics(fixed.get("rotation", a.rotation), fixed.get("translation", np.zeros(3)), a.offset, lens_step)
-        for a in rough_alignments(own.imu, camera.name, rates, offsets, same_clock)
+        for a in rough_alignments(single.imu, camera.name, rates, offsets, same_clock)
     ]
-    motion = motion_of(own, state_of_recording(inputs, recording, state))
+    motion = motion_of(single, state_of_recording(inputs, recording, state))
     is_fixed = np.repeat([name in fixed for name in MOUNTED_NAMES], [3, 3, 1])
-    axis = None if "rotation" in fixed else main_axis(own.imu.gyro)
-    found = extrinsics_on_motion(pairs, motion, starts, axis, is_fixed)
-    return found, pairs.lens_of(found)
+    axis = None if "rotation" in fixed else main_axis(single.imu.gyro)
+    extrinsics = extrinsics_on_motion(pairs, motion, starts, axis, is_fixed)
+    return extrinsics, pairs.lens_of(extrinsics)
 
 
 def _free_directions(camera: Camera, lens: np.ndarray) -> np.ndarray:

@@ -84,14 +84,14 @@ def find_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, offset: f
     model = camera_model(FREE_MODEL if stated is None else camera.model)
     distortion = model.start_distortions[0] if stated is None else stated
     rough = _rough(stream, imu, model, _starts(camera, distortion, model), offset)
-    found = _refined(stream, imu, model, rough, offset is not None, N_FREE_DISTORTION if stated is None else 0)
-    if not found.sigma < MAX_LOG_FOCAL_SIGMA:
+    fit = _refined(stream, imu, model, rough, offset is not None, N_FREE_DISTORTION if stated is None else 0)
+    if not fit.sigma < MAX_LOG_FOCAL_SIGMA:
         raise EstimationError(
             f"{camera.name}: the rotation in the recording does not determine the focal length; turn the rig "
             "about axes perpendicular to the optical axis, or give intrinsics: [fx, fy, cx, cy] in the rig "
             "file."
         )
-    return found.lens if stated is not None else _in_model(camera, stream, imu, model, found, offset is not None)
+    return fit.lens if stated is not None else _in_model(camera, stream, imu, model, fit, offset is not None)
 
 
 def _starts(camera: Camera, distortion: np.ndarray | tuple[float, ...], model: CameraModel) -> list[np.ndarray]:
@@ -115,7 +115,7 @@ def _rough(
         shifts = [(x, k) for k, r in enumerate(rates) for x in best_regressions(imu, r)[:1]]
         if not shifts:
             raise no_overlap(imu, stream.name)
-        shift, best = max(shifts, key=lambda found: found[0].score)
+        shift, best = max(shifts, key=lambda candidate: candidate[0].score)
         offset = shift.offset
     lens, camera_rates = starts[best], rates[best]
     aligned, scale, unexplained = _scaled(imu, camera_rates, offset, stream.name)
@@ -144,10 +144,10 @@ def _scaled(imu: ImuData, rates: SensorRates, offset: float, name: str) -> tuple
     if not inside.any():
         raise no_overlap(imu, name)
     gyro = MeanRates.of(imu).over(rates.start[inside] + offset, rates.end[inside] + offset)
-    found = [
+    candidates = [
         (*_robust_rotation(gyro, rates.rate[inside] * [scale, scale, 1.0]), float(scale)) for scale in FOCAL_SCALES
     ]
-    error, R, bias, scale = min(found, key=lambda x: x[0])
+    error, R, bias, scale = min(candidates, key=lambda x: x[0])
     spread = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1)))
     return RateAlignment(offset, R, bias), scale, error / max(spread, 1e-9)
 
@@ -249,7 +249,7 @@ def _in_model(
     wanted = camera_model(camera.model)
     uv = stream.uv[:: max(1, len(stream.uv) // MAX_FITTED_RAYS)]
     rays, valid = model.unproject(fit.lens, uv)
-    rays, uv, found = rays[valid], uv[valid], []
+    rays, uv, fitted = rays[valid], uv[valid], []
     for distortion in wanted.start_distortions:
         start = np.array([*fit.lens[:4], *distortion])
         start[:2] *= model.central_scale(fit.lens) / wanted.central_scale(start)
@@ -257,15 +257,15 @@ def _in_model(
         if visible.sum() > MIN_RAYS_PER_PARAMETER * len(start):
             with suppress(np.linalg.LinAlgError):
                 params = fit_rays(wanted, start, rays[visible], uv[visible], 1e-3)
-                if not any(np.allclose(params, other, rtol=2e-2, atol=1e-2) for other in found):
-                    found.append(params)
-    if not found:
+                if not any(np.allclose(params, other, rtol=2e-2, atol=1e-2) for other in fitted):
+                    fitted.append(params)
+    if not fitted:
         raise EstimationError(
             f"{camera.name}: its lens is too wide for {camera.model}; choose a fisheye model, or give intrinsics in "
             "the rig file."
         )
-    errors = [_fit_error(wanted, params, rays, uv) for params in found]
-    good = [params for params, error in zip(found, errors, strict=True) if error < EQUAL_FIT_PX + min(errors)]
+    errors = [_fit_error(wanted, params, rays, uv) for params in fitted]
+    good = [params for params, error in zip(fitted, errors, strict=True) if error < EQUAL_FIT_PX + min(errors)]
     if len(good) == 1:
         return good[0]
     n_distortion = len(good[0]) - 4
