@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.optim.robust_weights import LOSSES, robust_weights
 from icalib.rig import Settings
 from icalib.sensors.camera.assess import late_words
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
@@ -24,24 +25,31 @@ def cameras(unlike, setup_of, factor_of) -> list[CornerFactor]:
     return [replace(first, stream=stream, keyframe=keyframe) for stream in streams]
 
 
-def output(camera: CornerFactor, late: tuple[int, ...], common: bool) -> tuple[CornerFactor, CornerOutput]:
-    """Normal errors, and 5 px more in `late` images, as a common error or as part of the residuals."""
-    n, rng = len(camera.stream.uv), np.random.default_rng(3)
-    camera = replace(camera, noise=CornerNoise(np.full(n, 0.2), np.ones(1), np.ones((n, 1))))
+def output(camera: CornerFactor, late: tuple[int, ...], tau: float) -> tuple[CornerFactor, CornerOutput]:
+    """Normal errors, and 5 px more in `late` images; with a common error per image of `tau` px, none if it is zero."""
+    n, m, rng = len(camera.stream.uv), 1 if tau else 0, np.random.default_rng(3)
+    camera = replace(camera, noise=CornerNoise(np.full(n, 0.2), np.full(m, tau), np.ones((n, m))))
     out = camera.output(np.float64)
-    out.root[:] = 1.0
     out.residual[:] = NOISE_PX * rng.standard_normal((n, 2))
-    if common:
-        out.shared[np.isin(camera.views.image, late), 0] = 5.0
-    else:
-        out.residual[np.isin(camera.stream.image, late), 0] += 5.0
+    out.residual[np.isin(camera.stream.image, late), 0] += 5.0
+    noise, keep = camera.noise, np.ones(n, dtype=bool)
+    for v, shared in enumerate(out.shared):
+        rows = camera.corners_of(v, v + 1)
+        robust_weights(
+            out.residual[rows], keep[rows], noise.field[rows], noise.tau**-2.0, noise.sigma[rows], LOSSES[noise.loss],
+            noise.loss_scale, out.root[rows], shared,
+        )  # fmt: skip
     return camera, out
 
 
-@pytest.mark.parametrize("common", [False, True])
+@pytest.mark.parametrize("tau", [0.0, 1.0])
 @pytest.mark.parametrize("late", [(), (0,), (5,)])
-def test_late_images_are_found_whether_or_not_a_common_error_takes_them_up(cameras, late, common):
-    pairs = [output(camera, late if k == 2 else (), common) for k, camera in enumerate(cameras)]
+def test_late_images_are_found_whether_or_not_a_common_error_compensates_them(cameras, late, tau):
+    """With tau of 1 px, the common error compensates nearly all of the 5 px."""
+    pairs = [output(camera, late if k == 2 else (), tau) for k, camera in enumerate(cameras)]
+    if tau and late:
+        camera, out = pairs[2]
+        assert np.abs(camera.errors(out)[camera.stream.image == late[0]]).max() < 1.0
     apart = not_simultaneous([c for c, _ in pairs], [out for _, out in pairs], Settings())
     assert [np.flatnonzero(bad).tolist() for bad in apart] == [list(late)] * 3
 

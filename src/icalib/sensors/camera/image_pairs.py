@@ -30,7 +30,7 @@ def not_simultaneous(
     shared = _shared_keyframes(cameras)
     bad = np.zeros(len(shared), dtype=bool)
     for camera, out in zip(cameras, outputs, strict=True):
-        size = np.linalg.norm(camera.errors(out), axis=1)  # common errors of views included
+        size = np.linalg.norm(out.residual, axis=1)  # a common error would compensate the shift of a late image
         medians = grouped_quantiles(size, camera.stream.image, len(camera.keyframe), 0.5)
         tested = shared[camera.keyframe] & np.isfinite(medians)
         if tested.any():
