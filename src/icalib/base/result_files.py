@@ -52,9 +52,11 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def read_file(folder: Path, name: str) -> bytes:
-    """Content of the file `name` of the valid set. Raises CalibrationError if it is missing or cannot be read."""
+    """Content of the result file `name`: the new one if a writer was killed while it moved its files. Raises
+    CalibrationError if it is missing or cannot be read."""
     if not folder.is_dir():
         raise CalibrationError(f"{folder} is not a folder; give the folder that a calibration was written to.")
+    # After such a crash, `.icalib-commit` still holds the new files that were not moved.
     committed = [] if _commit(folder) is None else [folder / COMMIT / name]
     for path in (*committed, folder / name):
         with contextlib.suppress(FileNotFoundError), _errors_named(path, "read"):

@@ -163,16 +163,18 @@ class _ImuDraws:
         return r.size, r.size - float(spent), float((r**2).sum())
 
     def size(self, kind: str) -> float:
-        """sqrt(chi^2 / degrees of freedom) of `kind`. With too few degrees of freedom it is a lower bound, at least
-        1."""
+        """sqrt(chi^2 / degrees of freedom) of `kind`, 1 if the noise is as assumed.
+
+        If the fit leaves too few degrees of freedom, their number is increased to a floor. The result is then a lower
+        bound of the size, and not below 1."""
         count, dof, chi2 = self._left(kind)
         least = MIN_DOF_RATIO * np.sqrt(count)
         size = float(np.sqrt(chi2 / max(dof, least)))
         return size if dof > least else max(size, 1.0)
 
     def correlation(self, kind: str) -> float:
-        """Absolute autocorrelation of `kind`, averaged over N_LAGS lags and corrected for the fit, over the allowed
-        one."""
+        """Absolute autocorrelation of `kind`, averaged over N_LAGS lags and corrected for the fit, divided by the
+        allowed one; above 1 it is no white noise."""
         columns, (count, dof, chi2) = self.rows[kind], self._left(kind)
         total = 0.0
         for lag in range(1, N_LAGS + 1):
@@ -183,8 +185,10 @@ class _ImuDraws:
         return abs(total) / N_LAGS / dof / max(MAX_CORRELATION, CHANCE_SIGMAS * np.sqrt(count / N_LAGS) / dof)
 
     def variation(self, kind: str) -> float:
-        """Largest absolute log ratio of a segment's chi^2 per degree of freedom to that of the recording, over the
-        allowed one."""
+        """How much the variance of `kind` changes over the recording; above 1 it is no constant noise.
+
+        It is the largest |log(chi^2 per degree of freedom of a segment / that of the recording)|, divided by the
+        largest value that is allowed."""
         _, dof, chi2 = self._left(kind)
         worst, whole = 0.0, chi2 / max(dof, 1.0)
         for own in np.array_split(np.arange(len(self.residual)), N_NOISE_SEGMENTS):

@@ -4,7 +4,7 @@ The three tangent parameters are two angles, which rotate the normal towards `ta
 normal. With the centroid of its measurements as the point, these parameters hardly correlate. With the world's origin
 instead, distance and angles of a far wall would correlate almost perfectly.
 
-"The paper" below uses the closest point d n instead (equations as numbered in docs/estimator.md). It is singular for
+The iCalib paper uses the closest point d n instead (equations as numbered in docs/estimator.md). It is singular for
 planes through the origin, and its residual (24) changes sign if the plane is behind the sensor.
 """
 
@@ -64,15 +64,15 @@ def difference(to: np.ndarray, plane: np.ndarray) -> np.ndarray:
 
 
 def closest_point(plane: np.ndarray) -> np.ndarray:
-    """(3,) point of `plane` (6,) closest to the origin [m], p_pi = d n in the paper."""
+    """(3,) point of `plane` (6,) closest to the origin [m], p_pi = d n in the iCalib paper."""
     return (plane[:3] @ plane[3:]) * plane[:3]
 
 
 def closest_point_residual(
     p_pi: np.ndarray, R_world_lidar: np.ndarray, p_world_lidar: np.ndarray, xyz: np.ndarray
 ) -> np.ndarray:
-    """(N,) residuals (24) and (25) of the paper [m], of points xyz (N, 3) in the LiDAR frame. p_pi (3,): closest point
-    of the plane in the world frame.
+    """(N,) residuals (24) and (25) of the iCalib paper [m], of points xyz (N, 3) in the LiDAR frame. p_pi (3,): closest
+    point of the plane in the world frame.
 
     The residual is n . p - d if sensor and origin are on the same side of the plane, and its negative otherwise. It is
     undefined for a plane through the origin or the sensor. The reason is that (24) uses p_pi / |p_pi| as n, which is -n

@@ -1,4 +1,4 @@
-"""One step of the closed-form integration, with Jacobians and covariance (ACI^2, paper (16)-(18)).
+"""One step of the closed-form integration, with Jacobians and covariance (ACI^2, iCalib paper (16)-(18)).
 
 Body rate w and specific force f are constant over dt. With phi = w dt and G_m(phi) = sum_n hat(phi)^n / (n + m)!, the
 increments since the start of the interval become, exactly,
@@ -199,7 +199,7 @@ def _times_cross(R, g):
 
 @njit(cache=True, nogil=True)
 def _scaled(s, m):
-    """s m of a matrix."""
+    """The matrix m, a tuple of 9 numbers, times the scalar s."""
     return s * m[0], s * m[1], s * m[2], s * m[3], s * m[4], s * m[5], s * m[6], s * m[7], s * m[8]
 
 
@@ -232,7 +232,11 @@ def _fill_row(o, s, by_rate, t, by_force, C_f, C_w, C_wf, run):
 
 @njit(cache=True, nogil=True)
 def carry(turn, by_turn, dt, width, x):
-    """Propagates the rows of J in x through one step; the step's own contribution is added elsewhere."""
+    """Multiplies J (9, width), which x holds at AT_J, from the left by the transition matrix of one step.
+
+    turn: Exp(phi) of the step; by_turn: derivatives of the increments of velocity and position by a rotation before the
+    step. The derivatives of the step itself are added later, by `_add_biases` and `_add_intrinsics`.
+    """
     E0, E1, E2, E3, E4, E5, E6, E7, E8 = turn
     A0, A1, A2, A3, A4, A5, A6, A7, A8 = by_turn[0]
     B0, B1, B2, B3, B4, B5, B6, B7, B8 = by_turn[1]
@@ -252,7 +256,7 @@ def carry(turn, by_turn, dt, width, x):
 
 @njit(cache=True, nogil=True)
 def _add_biases(run):
-    """Adds the step's own contribution to the bias columns of J."""
+    """Adds the derivatives of the step itself by the biases to their columns of J."""
     for i in range(9):
         for j in range(6):
             run[AT_J + J_STRIDE * i + j] += run[AT_STEP + STEP_STRIDE * i + 6 + j]
@@ -290,7 +294,7 @@ def fill_intrinsics(rate, force, by, run):
 
 @njit(cache=True, nogil=True)
 def _add_intrinsics(run):
-    """Adds the step's own contribution to the intrinsics columns of J."""
+    """Adds the derivatives of the step itself by the IMU intrinsics to their columns of J."""
     for i in range(9):
         o, d = J_STRIDE * i + 6, AT_STEP + STEP_STRIDE * i
         a, b, c = run[d], run[d + 1], run[d + 2]

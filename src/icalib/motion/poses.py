@@ -1,8 +1,8 @@
 """Pose of the IMU at the time of a measurement: three schemes behind one function, `poses_at`.
 
     inertial    IMU readings integrated from the nearest keyframe to t, forwards or backwards
-    kinematic   constant angular rate and velocity from the nearest keyframe, paper (8)-(9)
-    pose        between the two neighbouring keyframes, paper (10)-(12); position interpolated linearly
+    kinematic   constant angular rate and velocity from the nearest keyframe, iCalib paper (8)-(9)
+    pose        between the two neighbouring keyframes, iCalib paper (10)-(12); position interpolated linearly
 
 A measurement stays assigned to its keyframe while the solver runs; only its time moves with the time offset.
 """

@@ -1,6 +1,6 @@
 """Estimated quantities: inertial states at the keyframes, and the calibration parameters.
 
-A keyframe is (R_world_imu, p, v, b_g, b_a): 15 tangent dimensions in this order (paper (2)).
+A keyframe is (R_world_imu, p, v, b_g, b_a): 15 tangent dimensions in this order (iCalib paper (2)).
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ class Settings:
     """Settings of the estimator, as in the rig file (docs/rig-file.md). The defaults suit every rig."""
 
     scheme: Scheme = "inertial"  # interpolation of poses between keyframes
-    keyframes: Keyframes = "every-image"  # which images get a keyframe; first-camera: as in the paper
+    keyframes: Keyframes = "every-image"  # which images get a keyframe; first-camera: as in the iCalib paper
     loss: Loss = "huber"  # robust loss on corners
     loss_scale: float = 2.5  # residuals above this many standard deviations are down-weighted
     outlier_std: float = 4.0  # reject corners this many sigmas above the mean error of their image; 0: none

@@ -276,7 +276,8 @@ def _residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[
 
 
 def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...]) -> Iterator[str]:
-    """Warnings on convergence, measurements and sensors, and on bloom that no light explains."""
+    """Warnings on convergence, measurements and sensors, and on edge bloom that is too large for overexposure or
+    ink."""
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings

@@ -1,4 +1,5 @@
-"""The least-squares problem of one pass: sums of all factors and priors over the pieces of the chain (paper (15))."""
+"""The least-squares problem of one pass: sums of all factors and priors over the pieces of the chain (iCalib paper
+(15))."""
 
 from __future__ import annotations
 

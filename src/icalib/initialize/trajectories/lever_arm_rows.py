@@ -98,6 +98,7 @@ def system_from_trajectory(
     hat_u = so3.hat_many(u)
 
     def rows(R_is: np.ndarray, p_is: np.ndarray) -> LeverArmRows:
+        """First (hand-eye) equation of the module, linearised at R_is; it is linear in p_imu_sensor."""
         del p_is
         R = R_imu[i] @ R_is
         A = np.concatenate([R @ hat_u, R_imu[j] - R_imu[i]], axis=2)
@@ -122,13 +123,15 @@ def system_from_readings(
     velocity_changes = second(position)
 
     def rows(R_is: np.ndarray, p_is: np.ndarray) -> LeverArmRows:
+        """Second equation of the module, A[p_map_sensor] = ..., linearised at R_is, p_is. Columns: d, p_imu_sensor,
+        gravity, accelerometer bias."""
         R_at_poses = rotation @ R_is.T
         R = carry(R_at_poses)
         force = np.einsum("nij,nj->ni", R, imu.accel)
         # R_map_sensor is measured, so R_imu_sensor Exp(d) rotates the force by -d in the sensor's axes.
         J_force_d = so3.hat_many(force) @ R @ R_is
         x = np.concatenate([force, R.reshape(-1, 9), J_force_d.reshape(-1, 9)], axis=1)
-        D = SignalIntegrals.of(imu, x).at(seconds)[1]
+        D = SignalIntegrals.of(imu, x).at(seconds)[1]  # double integrals: of force, of R_map_imu, of J_force_d
         A = np.zeros((n, 3, 12))
         A[:, :, :3] = second(rotation @ so3.hat_many((R_is.T @ p_is)[None])[0] + D[:, 12:].reshape(-1, 3, 3))
         A[:, :, 3:6] = second(R_at_poses)

@@ -231,16 +231,19 @@ def _next_tracks(cameras: Sequence[Camera], noise: Mapping[str, CameraNoise], en
 def _next_corner_noise(
     camera: Camera, factor: CornerFactor, out: CornerOutput, end: PassEnd
 ) -> tuple[NoiseModel, CornerNoise]:
-    """The corner noise of the next pass, estimated from the residuals `out` of this pass."""
+    """The corner noise of the next pass, estimated from the residuals `out` of this pass: its model, and the noise of
+    each corner. Unchanged if the camera sees no target."""
     settings = end.rig.settings
     if not factor.sees_target:
         return first_noise(camera), factor.noise
     speed = image_speed(factor, end.state)
+    # tau: standard deviations of the error that all corners of an image have in common
     tau = (INITIAL_COMMON_ERROR_PX,) * N_COMMON_ERRORS if settings.common_error else ()
     if len(factor.noise.tau):
         common = [f for kind, f in end.of(camera.name).fits.items() if kind.startswith("common")]
         tau = scale_common_errors(tuple(factor.noise.tau), common)
     model, large = estimate_noise(camera, settings, factor, out, speed, tau)
+    # A large misfit of the lens model makes good corners look like outliers.
     model = replace(model, wide_loss=large and end.rig.cameras_alone)
     return model, model.noise(factor.stream, camera, settings, speed)
 

@@ -1,5 +1,5 @@
 """The IMU factor: readings between neighbouring keyframes, preintegrated once per pass (equations (16)-(19) of the
-paper).
+iCalib paper).
 
 Rows of an interval: rotation 3 [rad], velocity 3 [m/s], position 3 [m], change of gyroscope bias 3 [rad/s] and of
 accelerometer bias 3 [m/s^2]; see `ImuFactor`.

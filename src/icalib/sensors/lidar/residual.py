@@ -1,4 +1,4 @@
-"""The factor of points of one LiDAR on planes: equations (23)-(26) of the paper.
+"""The factor of points of one LiDAR on planes: equations (23)-(26) of the iCalib paper.
 
     residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d    for each point x at its instant t
 

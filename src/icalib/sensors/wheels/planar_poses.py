@@ -1,5 +1,5 @@
 """Relative planar poses of a differential drive, preintegrated from its wheel angles: z_W of equation (27) of the
-paper.
+iCalib paper.
 
 Poses are in the wheel frame at the first stamp of an interval. Rates are assumed constant from stamp to stamp, so that
 each step is an arc. With d_l, d_r the angles that the wheels turn and psi the yaw before the step:

@@ -1,8 +1,8 @@
 """Propagated IMU noise in recorded relative poses of wheels whose end points lie between keyframes.
 
 The pose of each end point is propagated by the IMU from its keyframe. The lateral noise of relative poses by equation
-(27) of the paper is tiny, as its model has no slip: 0.01 mm, as much as 20 ms of propagation. The noise of a relative
-pose therefore includes that of the propagation.
+(27) of the iCalib paper is tiny, as its model has no slip: 0.01 mm, as much as 20 ms of propagation. The noise of a
+relative pose therefore includes that of the propagation.
 """
 
 from __future__ import annotations

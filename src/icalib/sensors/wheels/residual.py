@@ -2,7 +2,7 @@
 
 `IncrementFactor`, the default, compares the angles that the wheels turned, or integrals of speed and yaw rate. Lateral
 and vertical motion are modelled as slip noise. `RelativePoseFactor` compares a planar pose integrated from a left and a
-right wheel: equations (27)-(28) of the paper.
+right wheel: equations (27)-(28) of the iCalib paper.
 
 Both use intervals between two stamps of the wheels' clock (`wheel_intervals`). The time offset shifts these stamps on
 the clock of the IMU, and so changes the poses of the trajectory that they are compared with.
@@ -175,7 +175,7 @@ class IncrementFactor(RowFactor):
 
 @dataclass(frozen=True)
 class RelativePoseFactor(RowFactor):
-    """Relative planar poses of the wheels over n intervals, equations (27)-(28) of the paper, whitened jointly:
+    """Relative planar poses of the wheels over n intervals, equations (27)-(28) of the iCalib paper, whitened jointly:
 
         e_3 Log(R_wheel(k)_wheel(k+1)) - yaw
         Lambda [R_wheel_imu R_imu(k)_world (p(k+1) + R_world_imu(k+1) p_imu_wheel - p(k)) + p_wheel_imu] - (x, y)

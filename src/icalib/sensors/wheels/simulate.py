@@ -1,5 +1,5 @@
 """Simulated wheels: wheel rates, speed and yaw rate, a steering angle, or relative poses by equation (27) of the
-paper."""
+iCalib paper."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ class SimWheels(SimSensor):
     reports: type of the readings, sampled by `sampling` as in `WheelStream`. v_x and w_z are speed and yaw rate of the
     wheel frame. rates: (v_x -+ baseline/2 w_z) / radius, left and right. twist: v_x and w_z divided by `scales`.
     steering: v_x / radius for the driven wheel, and the direction of motion of a point a wheelbase ahead, minus
-    steering_offset [rad]. poses: relative poses by equation (27) of the paper, one for every `poses_every` readings,
-    with the noise of integrated readings.
+    steering_offset [rad]. poses: relative poses by equation (27) of the iCalib paper, one for every `poses_every`
+    readings, with the noise of integrated readings.
     """
 
     sensor_type: ClassVar[str] = "wheels"
@@ -306,7 +306,7 @@ def _means(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray, i
 
 
 def relative_poses(wheels: SimWheels, trajectory: TrueTrajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative poses (K, 3) without noise between consecutive instants (K + 1,) by equation (27) of the paper:
+    """Relative poses (K, 3) without noise between consecutive instants (K + 1,) by equation (27) of the iCalib paper:
     yaw = e3 . Log(R_W(k)_W(k+1)) [rad], and x, y of p_W(k)_W(k+1) [m]. Also the covariance (K, 3, 3) that they would
     have if they were integrated from noisy readings."""
     each = _CHUNK // (2 * _SUBSTEPS + 1)

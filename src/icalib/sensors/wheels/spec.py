@@ -152,7 +152,7 @@ class Wheels(MountedSensor):
     steering_noise: float = 1e-3  # rad/sqrt(Hz): half a degree for each angle at 70 Hz
     lateral_slip: float = 5e-3  # m/sqrt(s)
     vertical_slip: float = 5e-3  # m/sqrt(s), off the ground
-    factor: WheelFactor = "increments"  # relative-poses: equation (27) of the paper
+    factor: WheelFactor = "increments"  # relative-poses: equation (27) of the iCalib paper
     measures: WheelMeasure = "rates"
     sampling: Literal["interval-mean", "instantaneous"] = "interval-mean"
     counts_per_turn: float | None = None  # ticks per turn of the wheel

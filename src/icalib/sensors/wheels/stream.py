@@ -38,8 +38,8 @@ class WheelStream(Stream):
 
 @dataclass(frozen=True)
 class WheelPoses(Stream):
-    """Relative planar poses of the wheels' frame between consecutive stamps, z_W of equation (27) of
-    the paper.
+    """Relative planar poses of the wheels' frame between consecutive stamps (z_W in equation (27) of the
+    iCalib paper).
 
     stamps_ns (K + 1,) int64, strictly increasing; pose (K, 3): yaw [rad], x, y [m] of the frame at stamp k+1 in the
     frame at stamp k; covariance (K, 3, 3) of these.

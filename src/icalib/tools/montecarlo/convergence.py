@@ -1,5 +1,5 @@
-"""Error and 3 sigma bound of each calibration parameter against the solver's iterations, as in the paper's Figures 2
-and 3. Axes are logarithmic, as errors fall by orders of magnitude."""
+"""Error and 3 sigma bound of each calibration parameter against the solver's iterations, as in Figures 2 and 3
+of the iCalib paper. Axes are logarithmic, as errors fall by orders of magnitude."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class PanelRow:
 
 def rows(records: Sequence[RunRecord]) -> tuple[PanelRow, ...]:
     """Panels of the first MOST_RUNS runs that did not fail, a row for each block. Of the cameras only the first is
-    shown, as in the paper."""
+    shown, as in the iCalib paper."""
     runs = [r for r in sorted(records, key=lambda r: r.seed) if not r.failure][:MOST_RUNS]
     blocks = {b.key: b for r in runs for b in r.blocks}
     lenses = [b.sensor for b in blocks.values() if b.name == "distortion"]

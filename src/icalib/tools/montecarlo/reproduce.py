@@ -1,4 +1,5 @@
-"""Reproduces the simulations of the paper: the robot of Table II in 3D and planar motion, and Figures 2 and 3."""
+"""Reproduces the simulations of the iCalib paper: the robot of Table II in 3D and planar motion, and Figures 2 and
+3."""
 
 from __future__ import annotations
 

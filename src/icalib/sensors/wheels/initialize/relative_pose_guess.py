@@ -1,4 +1,4 @@
-"""Initial guess of wheels that report relative planar poses (equation (27) of the paper).
+"""Initial guess of wheels that report relative planar poses (equation (27) of the iCalib paper).
 
 The time offset follows from correlation, the extrinsics from linear least squares. Over a short interval, with u and w
 the velocity and rate of the IMU in its own axes, and r_k the columns of R_imu_wheel,
