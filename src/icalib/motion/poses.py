@@ -89,9 +89,9 @@ def assign_keyframes(scheme: Scheme, keyframes: np.ndarray, times: np.ndarray, f
 
 @njit(cache=True, nogil=True)
 def _velocity(i, R, run, force, g, at, moving):
-    """Fills entry i of `moving` from increments `run` (see `integration_step`), the rotation R of the keyframe, and the
-    specific `force` at the instant."""
-    first = 0 * i
+    """Fills entry i of `moving`: acceleration, and Jacobians of the velocity, at instant i of `at`. run: increments
+    since the keyframe (see `integration_step`); R: rotation of the keyframe; force: specific force at the instant."""
+    first = 0 * i  # first row of the Jacobians; not a literal, see `_fill_pose`
     _fill_start(i, first, R, run, AT_J + 3 * J_STRIDE, moving.J_keyframe, moving.J_imu)
     _fill_turn(i, first, R, run, AT_V, moving.J_keyframe)
     for a in range(3):

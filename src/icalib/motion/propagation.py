@@ -86,7 +86,7 @@ def integrate_from_keyframe(keyframe, t0, t1, first, bias, readings, by, carried
 
 @njit(cache=True, nogil=True)
 def empty_prefix():
-    """Initial `carried` of `integrate_from_keyframe`."""
+    """Initial `carried` of `integrate_from_keyframe`: the identifier -1, of no keyframe, so that it starts anew."""
     carried = np.zeros(RUN_SIZE + 3)
     carried[RUN_SIZE] = -1.0
     return carried

@@ -155,6 +155,7 @@ def assemble(
     factors = _measured(inputs, noise, pass_at(inputs, state, coarse))
     return Problem(
         inputs.layout, keyed((_chain(inputs, state), *factors)), _priors(inputs), inputs.tolerance, fixed_directions,
+        # framed: whether the world frame is defined; levelled: whether gravity is known to point down in it
         rig.has_target or rig.imu is None or (rig.assumes_motion and rig.moves_by_poses), not rig.assumes_motion,
     )  # fmt: skip
 

@@ -362,10 +362,10 @@ def minimise(
     STALLED_DECREASE means that another pass follows: the outcome has no information and no draws. second_order: whether
     steps that raise the cost are corrected, see `_Descent._corrected`.
 
-    leaves: whether to stop early, given the relative cost decrease so far and the information (B, B) of the calibration
-    parameters. It is asked if the predicted decrease is below EARLY_STOP_DECREASE, if a step near that fails, or if
-    convergence is slow. priors_to_drop: gets the same before `leaves`, if the predicted decrease is below
-    EARLY_STOP_DECREASE. room: pieces of an outcome with the same features, reused as workspace.
+    leaves: whether to stop early (rank deficient or out of date), given the relative cost decrease so far and the
+    information (B, B) of the calibration parameters. It is called if the predicted decrease is below
+    EARLY_STOP_DECREASE, if a step near that fails, or if convergence is slow. priors_to_drop: priors to remove, given
+    the same, before `leaves` is called. room: pieces of an outcome with the same features, reused as workspace.
 
     Raises EstimationError if no step can be computed at all.
     """
@@ -376,15 +376,15 @@ def minimise(
         if at.free and solution.decrease < EARLY_STOP_DECREASE:
             gone = priors_to_drop(relative_decrease(at.steps, at.cost), solution.information)
             solution = at.let_go(gone, solution) if gone else solution
-        creeps = at.creeps(solution)
+        creeps = at.creeps(solution)  # converges slowly, as along an unobservable direction
         low = creeps or (at.free and solution.decrease < RESTING_RATIO * EARLY_STOP_DECREASE)
         asked = low and leaves is not None and leaves(relative_decrease(at.steps, at.cost), solution.information)
         if asked and (creeps or solution.decrease < EARLY_STOP_DECREASE) and (at.free or at.early):
             return replace(at.outcome(solution) if at.free else at.end(on_visit), stopped_early=True)
-        if at.has_ended(solution):
+        if at.has_ended(solution):  # the step would only change rounding errors
             at.note(solution, True)
             return at.outcome(solution)
-        if (left := at.last_step(solution)) is not None:
+        if (left := at.last_step(solution)) is not None:  # a step without new normal equations suffices
             on_visit(Visit(at.state, solution.information))
             return at.outcome(solution, left)
         taken, converged = at.step(solution, second_order)
@@ -392,7 +392,7 @@ def minimise(
             break
         if taken:
             continue
-        if asked:
+        if asked:  # the step failed near EARLY_STOP_DECREASE
             return replace(at.end(on_visit), stopped_early=True)
         if not at.tries_again(solution):
             break

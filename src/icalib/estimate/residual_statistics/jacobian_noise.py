@@ -129,6 +129,7 @@ class _Noise:
         pieces = self.outcome.room or problem.pieces()
         problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
         factors = solve(pieces, problem.n_keyframes, problem.tolerance).factors
+        # Zero steps of the calibration parameters, then factor 1 of the gradient, see `Factors.back`.
         calib = np.append(np.zeros(problem.layout.size), 1.0)[:, None]
         return factors.back(calib, [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
 

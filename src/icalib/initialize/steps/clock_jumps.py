@@ -64,8 +64,10 @@ def refuse_clock_jumps(
 
 
 def _possible_jumps(imu: ImuData, name: str, rates: SensorRates, offset: float) -> list[_ClockJump]:
-    """Gaps of the IMU and of the rates that are long enough for a jump."""
+    """Gaps of the IMU's readings and of the rates that are longer than MIN_CLOCK_JUMP_S. offset [s]: time of the IMU
+    minus time of the rates."""
     step = float(np.median(np.diff(imu.seconds)))
+    # A jump of the IMU's clock adds to the time offset, one of the other clock reduces it.
     found = [_ClockJump(imu.name, b - a - step, b - offset, a - offset, b - a - step) for a, b in imu.gaps]
     size = rates.start[1:] - np.maximum.accumulate(rates.end)[:-1] - float(np.median(np.diff(rates.start)))
     for k in np.flatnonzero(size > MIN_CLOCK_JUMP_S):

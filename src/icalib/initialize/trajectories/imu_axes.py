@@ -36,7 +36,8 @@ class AxisConvention:
         return replace(imu, gyro=_in_axes(imu.gyro, self.gyro), accel=_in_axes(imu.accel, self.accel))
 
     def fields(self, sensor: ImuSensor) -> str:
-        """The fields to set in the rig file, if it has the axes of `sensor` so far."""
+        """Text with the fields `gyro_axes` and `accel_axes` to set in the rig file, whose present axes are those of
+        `sensor`."""
         found = []
         for name, given, own in (
             ("gyro_axes", sensor.gyro_axes, self.gyro),

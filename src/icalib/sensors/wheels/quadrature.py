@@ -34,6 +34,7 @@ def quadrature(seconds: np.ndarray, intervals: StampIntervals, change: np.ndarra
     """
     begin = seconds[intervals.first]
     length = seconds[intervals.last] - begin
+    # Each half of an interval is split into panels. Its instants are begin, two Gauss points per panel, and end.
     panels = np.maximum(np.ceil(0.5 * length / PANEL_S - 1e-6), 1.0).astype(np.int64)  # in half an interval
     start = np.concatenate([[0], np.cumsum(2 + 4 * panels)])
     interval = np.repeat(np.arange(len(begin)), np.diff(start))
@@ -44,6 +45,7 @@ def quadrature(seconds: np.ndarray, intervals: StampIntervals, change: np.ndarra
     weight = 0.5 * width
     change = begin + 0.5 * length if change is None else change
     keyframe = intervals.keyframe[interval] + (times > change[interval])
+    # begin and end of the intervals have no weight: only poses are evaluated there
     times[start[:-1]], times[start[1:] - 1] = begin, seconds[intervals.last]
     keyframe[start[:-1]], keyframe[start[1:] - 1] = intervals.keyframe, intervals.keyframe + 1
     weight[start[:-1]] = weight[start[1:] - 1] = 0.0
