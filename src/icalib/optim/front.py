@@ -67,7 +67,8 @@ class Eliminated:
 
 
 def _sizes(plan: Plan, n_calib: int) -> Sizes:
-    """Block sizes of every step, and where its factors start in the workspace."""
+    """Numbers of rows and columns that the factors of every step have, see `Sizes`, and where they start in the
+    workspace. The shapes are those in `step_factors`."""
     coupled = np.add.reduceat(np.append(plan.coupled[plan.keyframes.values], 0), plan.keyframes.start[:-1])
     counts = np.diff(plan.keyframes.start)
     coupled[counts == 0] = 0

@@ -320,8 +320,11 @@ def _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
 
 @njit(cache=True, nogil=True)
 def eliminate_all(plan, sizes, sums, chain, room, front, carry):
-    """All steps. Factors remain in `room`, the system of the kept keyframe in `carry`, that of the calibration
-    parameters in `front`. Returns False if the sums are not positive definite."""
+    """Eliminates the groups of keyframes of a piece one after the other, with the features that no later group sees.
+
+    Factors remain in `room`, the system of the kept keyframe in `carry`, that of the calibration parameters in `front`.
+    Returns False if the sums are not positive definite.
+    """
     n_b, old_wide = chain.side.shape[2], 0
     row = np.zeros((len(chain.diagonal), KEYFRAME_DIM), dtype=np.int64)
     for g in range(len(plan.after)):
@@ -333,7 +336,7 @@ def eliminate_all(plan, sizes, sums, chain, room, front, carry):
             U[:], Wr[:], Wc[:] = 0.0, 0.0, 0.0
             _places(g, plan, a, row)
             _fill_keyframes(g, plan, chain, row, U, Wr, Wc)
-            _fill_carry(g, plan, row, carry, U, Wc, a)
+            _fill_carry(g, plan, row, carry, U, Wc, a)  # what the previous step left
             carry[:] = 0.0
         _fill_pairs(g, plan, sums, chain, row, a, n_b, Wc, carry)
         if a + c:

@@ -159,6 +159,8 @@ class Rig:
         return self.with_sensors(dataclasses.replace(self.sensors[part], **fields))
 
     def _with_own(self, fields: dict[str, Any]) -> Rig:
+        """A copy with `fields` of the rig replaced. Names in _SHORT, such as "cameras", replace all sensors of a
+        type."""
         own = {name: value for name, value in fields.items() if name not in _SHORT}
         check_fields("the rig", self, own)
         sensors = list(self.sensors.values())

@@ -55,7 +55,11 @@ def _count(clusters: Mapping[FactorKey, Any]) -> int:
 def _cluster_gradients(
     problem: Problem, outcome: Outcome, kinds: Sequence[Mapping[FactorKey, Any]]
 ) -> list[np.ndarray]:
-    """Gradient of each cluster, (clusters, B) for each of `kinds`; chain and points are marginalised."""
+    """Gradient of each cluster, (clusters, B) for each of `kinds`; chain and points are marginalised.
+
+    Each cluster gets a column beside the calibration parameters, with its gradient as the right-hand side. Eliminating
+    the chain and the points then marginalises all gradients at once.
+    """
     counts = [_count(kind) for kind in kinds]
     B, state, at = problem.layout.size, outcome.state, problem.reusable_output(outcome.residuals)
     starts = B + np.cumsum([0, *counts])

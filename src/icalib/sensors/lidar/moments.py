@@ -146,9 +146,10 @@ def _moved_by_twist(x, y, z, dt, rate, velocity):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums):
-    """Adds the weighted points begin:end of one step and plane to sums (13,), see N_SUMS.
+    """Adds the weighted points begin:end, of one time step of a scan and one plane, to sums (13,), see N_SUMS.
 
-    R, p: pose of the step at the centre of its bin; rate, velocity: twist; m (4,): distance from the plane, see
+    R, p: pose of the LiDAR in the middle of the step, relative to that in the middle of its bin; rate, velocity: its
+    twist; m (4,): distance from the plane, see
     `_fill_distance_at`. The loop holds scalars only, so that the compiler vectorises it.
     """
     xs, ys, zs, dts = points[0, begin:end], points[1, begin:end], points[2, begin:end], points[3, begin:end]

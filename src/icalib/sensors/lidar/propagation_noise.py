@@ -40,7 +40,7 @@ class NoiseSums(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def empty_noise_sums(width, n_planes):
-    """Sums of zero, for `width` columns that act through the pose."""
+    """`NoiseSums` of zero. width: number of columns that act through the pose; n_planes: of planes."""
     by_plane = np.zeros((n_planes, 3, PLANE_DIM))
     return NoiseSums(
         np.zeros((3, 3)), np.zeros((3, width + 1)), by_plane, np.zeros(n_planes, np.int64), np.zeros(1, np.int64)

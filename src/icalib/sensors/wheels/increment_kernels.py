@@ -148,7 +148,8 @@ def _fill_drive(i, q, J_gX, J_gT, X, T, rows):
 
 @njit(cache=True, nogil=True)
 def increment_rows(start, weights, samples, velocities, wheels, coefficients, measured, rows):
-    """Fills the four rows of each of n increments, not whitened; see `drive_rows`.
+    """Fills the four rows g_X X + g_T T - measured of each of n increments, not whitened; see the module and
+    `drive_rows`.
 
     start (n + 1,), weights (m,) s: see `Instants`; samples, velocities: the motion of the IMU at these m instants;
     measured (n, 4). Jacobians are skipped if those of `rows` are empty.
@@ -165,7 +166,7 @@ def increment_rows(start, weights, samples, velocities, wheels, coefficients, me
             _add_displacement(j, weights[j], samples, velocities, D, J_own, J_calib, with_jacobians)
         theta = _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians)
         Y = D + _cross(theta, wheels.p)
-        _add(wheels.R, Y, 1.0, -1, X)
+        _add(wheels.R, Y, 1.0, -1, X)  # -1: R transposed
         _add(wheels.R, theta, 1.0, -1, T)
         for q in range(4):
             gX, gT = coefficients.g_X[g, q], coefficients.g_T[g, q]
