@@ -271,7 +271,7 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
 
 
 def _reduce_all(piece: Piece) -> Eliminated | bool:
-    """Eliminates a piece in place. Raises NotDefiniteError."""
+    """Eliminates all keyframes of a piece in place; see `_reduce` for the result. Raises NotDefiniteError."""
     done = _reduce(piece, False)
     if not done:
         raise NotDefiniteError(NOT_DEFINITE)

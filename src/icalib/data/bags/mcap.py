@@ -26,6 +26,7 @@ class McapStorage(SpanStorage):
     """An MCAP file, with or without chunks, index, summary and footer, of any profile."""
 
     def _scan(self, file: BinaryIO, size: int) -> None:
+        """See `SpanStorage`. A truncated chunk is noted, too, as its first messages can be read."""
         self._schemas: dict[int, str] = {}
         self._run: Span | None = None  # current block of messages outside of chunks
         file.seek(len(MCAP_MAGIC))

@@ -77,6 +77,7 @@ class SpanStorage(ABC):
         """
 
     def tally(self) -> dict[int, Tally]:
+        """By connection: number of messages in the file, and their first and last receive time."""
         total: dict[int, Tally] = {}
         for span in self.spans:
             for key, part in span.tally.items():
@@ -127,6 +128,7 @@ class SpanStorage(ABC):
         return None
 
     def _tally_by_walking(self, file: BinaryIO, span: Span) -> None:
+        """Counts the messages of a block without a usable index, by reading all of it."""
         span.tally = {}
         for connection, received_ns, _ in self._messages_of(file, span):
             span.count(connection, received_ns)

@@ -56,7 +56,7 @@ class Circles(Target):
 
     @cached_property
     def turns(self) -> tuple[np.ndarray, ...]:
-        """See `Target.turns`.
+        """Rotations in the plane that leave the pattern unchanged, see `Target.turns`.
 
         Symmetric grids: half a turn, and quarter turns if rows = cols. Asymmetric grids: half a turn if rows are even,
         otherwise only the identity.

@@ -244,12 +244,13 @@ def _columns(a, b, body, camera, begins, columns, local):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_views(matrix, gradient, a, b, columns, local, S, g, diagonal, C, H_pose, g_pose):
-    """Adds the terms of views a..b of one image to the normal equations.
+    """Adds the terms of views a..b of one image to the normal equations. columns, local (n,): see `_columns`.
 
     S, g, diagonal: of body poses and camera parameters; H_pose (6, 6), g_pose (6,): of the image's pose; C (6, n): the
     block between both."""
     n = C.shape[1]
     for v in range(a, b):
+        # View v depends on the six columns of its own body and on those of the camera, which follow all bodies.
         first = 6 * (v - a)
         for j in range(n):
             if first <= j < first + 6 or j >= 6 * (b - a):
