@@ -67,9 +67,9 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
     try:
         return _guess(rig, recordings)
     except MotionContradictedError as error:
-        for words, others in motion_kinds(rig)[0].rewritten(recordings):
+        for words, converted in motion_kinds(rig)[0].rewritten(recordings):
             try:
-                _guess(rig, others)
+                _guess(rig, converted)
             except EstimationError:
                 continue
             raise EstimationError(words) from error
@@ -98,19 +98,23 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
     paths = _smoothed(motion.body)
     # The noise densities of the assumed IMU are those of the motion. A wide window would smooth away motion and
     # underestimate the densities.
-    body = _with_assumption(rig, recordings, _smoothed(motion.body, narrow=True))
-    inputs = replace(inputs_for(body, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
+    rig_with_imu = _with_assumption(rig, recordings, _smoothed(motion.body, narrow=True))
+    inputs = replace(
+        inputs_for(rig_with_imu, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), asked=rig
+    )
     # The estimate gets an IMU that reads zero. Alignment needs one that reads the motion of the smoothed trajectory.
-    ideal = _with_ideal_readings(body, recordings, paths, inputs)
-    found = motion.values if motion.odometry is None else with_stated_values(inputs, motion.odometry, motion.values)
+    ideal = _with_ideal_readings(rig_with_imu, recordings, paths, inputs)
+    sensor_values = (
+        motion.values if motion.odometry is None else with_stated_values(inputs, motion.odometry, motion.values)
+    )
     # Keyframes at a sensor's measurements need its time offset, so such a sensor is aligned before keyframes exist.
-    if _keyframe_hosts(body) and not found:
-        found = _place_hosts(body, recordings, motion.body, paths)
-    moving, turned = _keyframe_motion(inputs, motion.body, found)
+    if _keyframe_hosts(rig_with_imu) and not sensor_values:
+        sensor_values = _place_hosts(rig_with_imu, recordings, motion.body, paths)
+    start, rates = _keyframe_motion(inputs, motion.body, sensor_values)
     # The biases are minus the rate and acceleration of the body, because the assumed IMU reads zero.
-    others = [s for s in body.mounted if (s.name, "rotation") not in moving.values]
-    values = place_sensors(ideal, moving, others) | moving.values
-    return inputs, replace(moving, bias=-turned, values=values), values
+    unplaced = [s for s in rig_with_imu.mounted if (s.name, "rotation") not in start.values]
+    values = place_sensors(ideal, start, unplaced) | start.values
+    return inputs, replace(start, bias=-rates, values=values), values
 
 
 @dataclass(frozen=True)
@@ -126,13 +130,15 @@ class _BodyMotion:
     def by(cls, source: Initializer[Any], rig: Rig, recordings: Sequence[Measurements]) -> _BodyMotion:
         """Poses of the body by the sensors of `source`. If these are no cameras but the body is, the cameras are
         aligned to them first."""
-        paths, found = source.body_poses(rig, recordings)
+        paths, values = source.body_poses(rig, recordings)
         if initializer_of(rig.sensors[rig.reference]) is source:
-            return cls(paths, found)
+            return cls(paths, values)
         (name,) = source.sources(rig)
-        values = _place_cameras(rig, recordings, name, paths)
+        camera_values = _place_cameras(rig, recordings, name, paths)
         return cls(
-            camera_poses(rig, recordings, name, paths, values), relative_to_first_camera(rig, name, values), name
+            camera_poses(rig, recordings, name, paths, camera_values),
+            relative_to_first_camera(rig, name, camera_values),
+            name,
         )
 
 
@@ -148,71 +154,83 @@ def _keyframe_hosts(rig: Rig) -> list[Sensor]:
 
 
 def _place_hosts(
-    body: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], paths: Sequence[SmoothTrajectory]
+    rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], paths: Sequence[SmoothTrajectory]
 ) -> Values:
-    """Values of the sensors that host keyframes, aligned to the motion of the first pose sensor of `body`."""
-    hosts = _keyframe_hosts(body)
-    blind = body.without(*(s.name for s in hosts))
-    unseen = [m.only(*blind.sensors) for m in recordings]
-    alone = _with_ideal_readings(blind, unseen, paths, inputs_for(blind, _with_assumed_readings(unseen, paths)))
-    ideal = _with_ideal_readings(body, recordings, paths, inputs_for(body, _with_assumed_readings(recordings, paths)))
-    return place_sensors(ideal, _keyframe_motion(alone, shown, {})[0], hosts)
+    """Values of the sensors that host keyframes, aligned to the motion of the first pose sensor of `rig`."""
+    hosts = _keyframe_hosts(rig)
+    rig_without_hosts = rig.without(*(s.name for s in hosts))
+    recordings_without_hosts = [m.only(*rig_without_hosts.sensors) for m in recordings]
+    inputs = _with_ideal_readings(
+        rig_without_hosts,
+        recordings_without_hosts,
+        paths,
+        inputs_for(rig_without_hosts, _with_assumed_readings(recordings_without_hosts, paths)),
+    )
+    ideal = _with_ideal_readings(rig, recordings, paths, inputs_for(rig, _with_assumed_readings(recordings, paths)))
+    return place_sensors(ideal, _keyframe_motion(inputs, body_poses, {})[0], hosts)
 
 
 def _place_cameras(rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses]) -> Values:
     """Values of cameras with feature tracks, aligned to the planar trajectories `paths` of `sensor`. Raises
     EstimationError if the motion does not determine them."""
-    blank = with_pose_sensor(rig, sensor)
+    rig_with_poses = with_pose_sensor(rig, sensor)
     streams = pose_streams(recordings, sensor, paths)
-    posed = [m.only(*(c.name for c in rig.cameras)).with_streams(s) for m, s in zip(recordings, streams, strict=True)]
+    recordings_with_poses = [
+        m.only(*(c.name for c in rig.cameras)).with_streams(s) for m, s in zip(recordings, streams, strict=True)
+    ]
     smooth = _smoothed(paths)
     try:
-        return _place_hosts(_with_assumption(blank, posed, smooth), posed, paths, smooth)
+        return _place_hosts(
+            _with_assumption(rig_with_poses, recordings_with_poses, smooth), recordings_with_poses, paths, smooth
+        )
     except EstimationError as error:
-        said = str(error).rstrip(".")
+        reason = str(error).rstrip(".")
         raise EstimationError(
-            f"{said}. Without IMU, target and pose sensor, {sensor} determines the motion on a flat floor only."
+            f"{reason}. Without IMU, target and pose sensor, {sensor} determines the motion on a flat floor only."
         ) from error
 
 
 def _with_ideal_readings(
-    rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory], like: Inputs
+    rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory], time_base: Inputs
 ) -> Inputs:
-    """Inputs with the readings that an ideal IMU in the body would have. like: inputs whose time base is kept."""
-    ideal = inputs_for(rig, _with_assumed_readings(recordings, paths), like)
+    """Inputs with the readings that an ideal IMU in the body would have. time_base: inputs whose time base is kept."""
+    ideal = inputs_for(rig, _with_assumed_readings(recordings, paths), time_base)
     assert ideal.imu is not None
     return replace(ideal, imu=replace(ideal.imu, forwards=False))
 
 
-def _keyframe_motion(inputs: Inputs, shown: Sequence[BodyPoses], found: Values) -> tuple[State, np.ndarray]:
+def _keyframe_motion(
+    inputs: Inputs, body_poses: Sequence[BodyPoses], sensor_values: Values
+) -> tuple[State, np.ndarray]:
     """The trajectory of the body at keyframes, without biases, and its angular rate and acceleration (K, 6) there.
-    found: known values of sensors."""
-    values = start_values(inputs, found | _body_identities(inputs))
+    sensor_values: known values of sensors."""
+    values = start_values(inputs, sensor_values | _body_identities(inputs))
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     starts = first_keyframes(inputs.imu, keyframes)
     parts = np.split(keyframes, starts[1:])
-    trajectories = [poses.at(t - part.begin) for poses, t, part in zip(shown, parts, inputs.parts, strict=True)]
+    trajectories = [poses.at(t - part.begin) for poses, t, part in zip(body_poses, parts, inputs.parts, strict=True)]
     R, p, v, rate, force = (
         np.concatenate([getattr(trajectory, name) for trajectory in trajectories])
         for name in ("rotation", "position", "velocity", "rate", "acceleration")
     )
-    still = np.zeros((len(keyframes), 6))
-    return State(keyframes, R, p, v, still, values, starts), np.concatenate([rate, force], axis=1)
+    zero_bias = np.zeros((len(keyframes), 6))
+    return State(keyframes, R, p, v, zero_bias, values, starts), np.concatenate([rate, force], axis=1)
 
 
 def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory]) -> Rig:
     """The rig with the assumed IMU, which coincides with the body. Its noise densities are those of the motion."""
     turning, jerking = (
-        np.sqrt(np.mean(np.concatenate([_changes_over_lag(p, what) for p in paths]) ** 2) / DENSITY_LAG_S) + MIN_DENSITY
-        for what in ("rate", "acceleration")
+        np.sqrt(np.mean(np.concatenate([_changes_over_lag(p, field) for p in paths]) ** 2) / DENSITY_LAG_S)
+        + MIN_DENSITY
+        for field in ("rate", "acceleration")
     )
     noise = ImuNoise(REGULARISING_STEP_S * turning, turning, REGULARISING_STEP_S * jerking, jerking, ASSUMED_IMU)
-    here = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
+    identity = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
     imu = ImuSensor(ASSUMED_IMU, "", noise, Parameter("fixed"), assumed=True)
     if not motion_kinds(rig)[0].hosts_keyframes:
         motion = SmoothMotion(paths, float(turning), float(jerking))
         imu = replace(imu, pose_keyframes_s=keyframe_spacing(rig, recordings, motion))
-    return rig.with_sensors(imu, replace(rig.sensors[rig.reference], **here), gravity=0.0)
+    return rig.with_sensors(imu, replace(rig.sensors[rig.reference], **identity), gravity=0.0)
 
 
 def keyframe_spacing(rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
@@ -222,10 +240,10 @@ def keyframe_spacing(rig: Rig, recordings: Sequence[Measurements], motion: Smoot
     return float(np.clip(longest, MIN_KEYFRAME_SPACING_S, max(rig.settings.keyframe_spacing_s, MIN_KEYFRAME_SPACING_S)))
 
 
-def _changes_over_lag(path: SmoothTrajectory, what: str) -> np.ndarray:
-    """Changes (n, 3) of the attribute `what` over DENSITY_LAG_S, between instants with poses nearby."""
+def _changes_over_lag(path: SmoothTrajectory, field: str) -> np.ndarray:
+    """Changes (n, 3) of the attribute `field` over DENSITY_LAG_S, between instants with poses nearby."""
     n = round(DENSITY_LAG_S / ASSUMED_IMU_STEP_S)
-    x = getattr(path, what)
+    x = getattr(path, field)
     return (x[n:] - x[:-n])[path.near[n:] & path.near[:-n]]
 
 
@@ -247,12 +265,12 @@ def _with_assumed_readings(
 def _within_short_gaps(path: SmoothTrajectory, max_gap_s: float) -> np.ndarray:
     """(m,) whether poses are nearby, or the gap between poses is at most `max_gap_s`. Over longer gaps the assumption
     does not constrain the motion."""
-    known_s = path.seconds[path.near]
-    if not len(known_s):
+    pose_s = path.seconds[path.near]
+    if not len(pose_s):
         return np.zeros(len(path.seconds), dtype=bool)
-    after, ends = np.searchsorted(known_s, path.seconds), np.concatenate([[-np.inf], known_s, [np.inf]])
-    before, behind = ends[after], ends[after + 1]
-    return path.near | (behind - before <= max_gap_s)
+    after, ends = np.searchsorted(pose_s, path.seconds), np.concatenate([[-np.inf], pose_s, [np.inf]])
+    previous_s, next_s = ends[after], ends[after + 1]
+    return path.near | (next_s - previous_s <= max_gap_s)
 
 
 def _body_identities(inputs: Inputs) -> Values:

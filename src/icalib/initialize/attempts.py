@@ -55,8 +55,8 @@ class Attempt:
         """The largest ratio, over all kinds of residuals, of their RMS to the stated noise; infinite if not
         converged."""
         outcome = self.solution.estimate.outcome
-        shown = chi2_by_kind(outcome.problem, outcome.residuals).values()
-        return max((np.sqrt(chi2 / max(n, 1)) for n, chi2 in shown), default=0.0) if outcome.converged else np.inf
+        statistics = chi2_by_kind(outcome.problem, outcome.residuals).values()
+        return max((np.sqrt(chi2 / max(n, 1)) for n, chi2 in statistics), default=0.0) if outcome.converged else np.inf
 
 
 def attempt(
@@ -78,18 +78,18 @@ def attempt(
         with refusing_far_off():
             first, failed = _attempt_or_error(rig, make)
     except FarOffError as error:
-        if (other := _contradicting_attempt(rig, make)) is not None:
-            return replace(other, error=error)
+        if (fallback := _contradicting_attempt(rig, make)) is not None:
+            return replace(fallback, error=error)
         first, failed = _attempt_or_error(rig, make)
     misfit = np.inf if first is None else first.misfit
     if first is not None and misfit < POOR_FIT_RATIO:
         return first
-    other = _without_guesses(rig, make)
-    if other is not None and other.misfit < CLEARLY_BETTER_RATIO * misfit:
-        return other
-    other = _contradicting_attempt(rig, make)
-    if other is not None and other.misfit < CLEARLY_BETTER_RATIO * misfit:
-        return replace(other, error=failed) if first is None else replace(first, against=other.against)
+    fallback = _without_guesses(rig, make)
+    if fallback is not None and fallback.misfit < CLEARLY_BETTER_RATIO * misfit:
+        return fallback
+    fallback = _contradicting_attempt(rig, make)
+    if fallback is not None and fallback.misfit < CLEARLY_BETTER_RATIO * misfit:
+        return replace(fallback, error=failed) if first is None else replace(first, against=fallback.against)
     if first is None:
         assert failed is not None
         raise explained_failure(rig, recordings, make, failed)
@@ -129,32 +129,32 @@ def _make_attempt(
     with ExitStack() as explaining:
         for kind in kinds_of(rig):
             explaining.enter_context(kind.explaining(inputs))
-        found = determine(inputs, state, on_step, partial(on_visit, inputs), guess)
-    return Attempt(inputs, found)
+        solution = determine(inputs, state, on_step, partial(on_visit, inputs), guess)
+    return Attempt(inputs, solution)
 
 
 def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     """The estimate without guesses. If parameters are unobservable then, guesses that agree with it are used after all.
     None if the rig has no guesses, or the estimate fails."""
-    found = _without_values(rig, make, lambda p: p.mode == "free") if _has_values(rig, "free") else None
-    if found is None:
+    fallback = _without_values(rig, make, lambda p: p.mode == "free") if _has_values(rig, "free") else None
+    if fallback is None:
         return None
-    values = found.solution.estimate.outcome.state.values
+    values = fallback.solution.estimate.outcome.state.values
 
     def agreeing(sensor: Sensor, name: str, p: Parameter) -> Parameter:
         if p.mode != "free" or p.value is None or name == "time_offset":
             return Parameter() if p.mode == "free" else p
-        other = values.get((sensor.name, name), p.value)
-        return Parameter() if is_contradicted(sensor.spec(name), p.value, other) else p
+        estimate = values.get((sensor.name, name), p.value)
+        return Parameter() if is_contradicted(sensor.spec(name), p.value, estimate) else p
 
-    kept = with_groups(rig, agreeing)
+    agreeing_rig = with_groups(rig, agreeing)
     if (
-        found.solution.fixed_directions.size
-        and _has_values(kept, "free")
-        and (other := _converged_attempt(kept, make)) is not None
+        fallback.solution.fixed_directions.size
+        and _has_values(agreeing_rig, "free")
+        and (refined := _converged_attempt(agreeing_rig, make)) is not None
     ):
-        found = other
-    return replace(found, inputs=replace(found.inputs, asked=rig))
+        fallback = refined
+    return replace(fallback, inputs=replace(fallback.inputs, asked=rig))
 
 
 def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[[Parameter], bool]) -> Attempt | None:
@@ -169,8 +169,8 @@ def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[
             ),
         )
 
-    found = _converged_attempt(bare(False), make)
-    return found if found is not None or rig.has_target else _converged_attempt(bare(True), make)
+    fallback = _converged_attempt(bare(False), make)
+    return fallback if fallback is not None or rig.has_target else _converged_attempt(bare(True), make)
 
 
 def _contradicting_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
@@ -178,11 +178,11 @@ def _contradicting_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt 
     rig file has none, the estimate fails, or it contradicts none."""
     if not (_has_values(rig, "fixed") or _has_values(rig, "prior")):
         return None
-    found = _without_values(rig, make, lambda p: True)
-    if found is None:
+    fallback = _without_values(rig, make, lambda p: True)
+    if fallback is None:
         return None
-    against = contradicted_by(replace(found.inputs, asked=rig), found.solution)
-    return replace(found, against=against) if against else None
+    against = contradicted_by(replace(fallback.inputs, asked=rig), fallback.solution)
+    return replace(fallback, against=against) if against else None
 
 
 def _has_values(rig: Rig, mode: str) -> bool:
@@ -193,7 +193,7 @@ def _has_values(rig: Rig, mode: str) -> bool:
 def _converged_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     """The attempt if it converges, else None."""
     try:
-        found = make(rig)
+        result = make(rig)
     except EstimationError:
         return None
-    return found if found.converged else None
+    return result if result.converged else None

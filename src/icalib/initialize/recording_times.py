@@ -21,8 +21,8 @@ def naming_recording_times(recordings: Sequence[Measurements]) -> Iterator[None]
         yield
     except OtherMotionError as error:
         for recording in recordings:
-            if (found := furthest_apart(recording)) is not None:
-                raise EstimationError(_sentence(*found)) from error
+            if (streams := furthest_apart(recording)) is not None:
+                raise EstimationError(_sentence(*streams)) from error
         raise
 
 
@@ -43,8 +43,8 @@ def furthest_apart(recording: Measurements) -> tuple[str, str, float] | None:
 
 def _sentence(first: str, second: str, gap: float) -> str:
     days, hours = gap / 86400.0, gap / HOUR_S
-    told = f"{days:.1f} days" if days >= 2.0 else f"{hours:.1f} hours"
+    delay = f"{days:.1f} days" if days >= 2.0 else f"{hours:.1f} hours"
     return (
-        f"{second} was recorded {told} after {first}, by the stamps of both, and does not show the same motion; give "
+        f"{second} was recorded {delay} after {first}, by the stamps of both, and does not show the same motion; give "
         "the files of one recording."
     )

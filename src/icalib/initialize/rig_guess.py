@@ -50,59 +50,58 @@ def guess_of_rig(
 def _guess(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None]) -> InitialGuess:
     """As `guess_of_rig`, for recordings whose target bodies are all connected."""
     if rig.imu is None and not rig.cameras_alone:
-        found = guess_with_assumed_motion(rig, recordings)
+        guess = guess_with_assumed_motion(rig, recordings)
         lap("first guess")
-        return found
+        return guess
     for kind in kinds_of(rig):
         recordings = [kind.cleaned(m) for m in recordings]
-    whole = inputs_for(rig, recordings)
-    source, source_inputs, state = _trajectory(whole, recordings, motion_kinds(rig))
+    inputs = inputs_for(rig, recordings)
+    source, source_inputs, state = _trajectory(inputs, recordings, motion_kinds(rig))
     lap("first guess")
-    if source_inputs is whole and not source.refined_alone:
-        return whole, state, state.values
-    found = _place_others(whole, source, *source.refined(source_inputs, state))
+    if source_inputs is inputs and not source.refined_alone:
+        return inputs, state, state.values
+    guess = _align_to_trajectory(inputs, source, *source.refined(source_inputs, state))
     lap("other sensors")
-    return found
+    return guess
 
 
 def _trajectory(
-    whole: Inputs, recordings: Sequence[Measurements], kinds: Sequence[Initializer[Any]]
+    inputs: Inputs, recordings: Sequence[Measurements], kinds: Sequence[Initializer[Any]]
 ) -> tuple[Initializer[Any], Inputs, State]:
     """The first of `kinds` whose sensors show the motion, their inputs, and a state with the trajectory. There is no
     fallback for cameras that see a target: their error is raised. Raises EstimationError if no kind shows the motion.
     """
     if not kinds:
         raise EstimationError("no sensor of the rig shows its motion; add a camera, a LiDAR or a pose sensor.")
-    kind, *others = kinds
-    source_inputs = inputs_of_sensors(whole, recordings, kind.sources(whole.rig))
+    kind, *fallbacks = kinds
+    source_inputs = inputs_of_sensors(inputs, recordings, kind.sources(inputs.rig))
 
-    def other() -> tuple[Inputs, State]:
-        return _trajectory(whole, recordings, others)[1:]
+    def fallback() -> tuple[Inputs, State]:
+        return _trajectory(inputs, recordings, fallbacks)[1:]
 
     try:
-        return kind, source_inputs, kind.trajectory(source_inputs, other)
+        return kind, source_inputs, kind.trajectory(source_inputs, fallback)
     except EstimationError:
-        if source_inputs.rig.has_target or not others:
+        if source_inputs.rig.has_target or not fallbacks:
             raise
-    return _trajectory(whole, recordings, others)
+    return _trajectory(inputs, recordings, fallbacks)
 
 
-def _place_others(
-    whole: Inputs, source: Initializer[Any], source_inputs: Inputs, state: State, guess: Values
+def _align_to_trajectory(
+    inputs: Inputs, source: Initializer[Any], source_inputs: Inputs, state: State, guess: Values
 ) -> InitialGuess:
-    """The whole initial guess, from the trajectory in `state` by the sensors of `source_inputs`. All others
-    are aligned to it."""
-    inputs = source.adopted(whole, source_inputs)
-    known = {s.name for s in source_inputs.rig.mounted}
-    others = [s for s in whole.rig.mounted if s.name not in known]
-    hosts = [s for s in others if initializer_of(s).hosts_keyframes]
-    found = place_sensors(inputs, state, hosts)
+    """The initial guess for all sensors of `inputs`, from the trajectory in `state` by the sensors of `source_inputs`.
+    All other sensors are aligned to it. guess: of the parameters in `state`."""
+    rig, inputs = inputs.rig, source.adopted(inputs, source_inputs)
+    unplaced = [s for s in rig.mounted if s.name not in source_inputs.rig.sensors]
+    hosts = [s for s in unplaced if initializer_of(s).hosts_keyframes]
+    placed = place_sensors(inputs, state, hosts)
     if hosts or source.moves_keyframes:
-        values = start_values(inputs, state.values | found)
+        values = start_values(inputs, state.values | placed)
         state = resample(replace(state, values=values), keyframes_for(inputs, keyframe_times(inputs, values)), inputs)
-    found |= place_sensors(inputs, state, [s for s in others if s not in hosts])
-    state, guess = replace(state, values=state.values | found), guess | found
-    for kind in kinds_of(whole.rig):
+    placed |= place_sensors(inputs, state, [s for s in unplaced if s not in hosts])
+    state, guess = replace(state, values=state.values | placed), guess | placed
+    for kind in kinds_of(rig):
         if kind is not source:
             inputs, state, changed = kind.associated(inputs, state)
             guess = guess | changed

@@ -68,12 +68,12 @@ def _possible_jumps(imu: ImuData, name: str, rates: SensorRates, offset: float) 
     minus time of the rates."""
     step = float(np.median(np.diff(imu.seconds)))
     # A jump of the IMU's clock adds to the time offset, one of the other clock reduces it.
-    found = [_ClockJump(imu.name, b - a - step, b - offset, a - offset, b - a - step) for a, b in imu.gaps]
+    jumps = [_ClockJump(imu.name, b - a - step, b - offset, a - offset, b - a - step) for a, b in imu.gaps]
     size = rates.start[1:] - np.maximum.accumulate(rates.end)[:-1] - float(np.median(np.diff(rates.start)))
     for k in np.flatnonzero(size > MIN_CLOCK_JUMP_S):
         begin = float(rates.start[k + 1])
-        found.append(_ClockJump(name, float(size[k]), begin, begin, -float(size[k])))
-    return [x for x in found if x.size > MIN_CLOCK_JUMP_S]
+        jumps.append(_ClockJump(name, float(size[k]), begin, begin, -float(size[k])))
+    return [x for x in jumps if x.size > MIN_CLOCK_JUMP_S]
 
 
 def _selected(rates: SensorRates, kept: np.ndarray) -> SensorRates:

@@ -23,29 +23,31 @@ MAX_GUESS_SIGMAS = 4.0  # prior standard deviations of a guess: a larger deviati
 FACTOR_PRIOR_SIGMA = 0.1  # prior standard deviation of the logarithm of a guessed length or factor
 
 
-def is_contradicted(spec: ParameterSpec, guess: np.ndarray, found: np.ndarray) -> bool:
-    """Whether a `guess` deviates from the estimate `found` by more than MAX_GUESS_SIGMAS prior standard deviations."""
-    return largest_deviation(spec, guess, found) > MAX_GUESS_SIGMAS
+def is_contradicted(spec: ParameterSpec, guess: np.ndarray, estimate: np.ndarray) -> bool:
+    """Whether a `guess` deviates from the `estimate` by more than MAX_GUESS_SIGMAS prior standard deviations."""
+    return largest_deviation(spec, guess, estimate) > MAX_GUESS_SIGMAS
 
 
-def largest_deviation(spec: ParameterSpec, guess: np.ndarray, found: np.ndarray) -> float:
+def largest_deviation(spec: ParameterSpec, guess: np.ndarray, estimate: np.ndarray) -> float:
     """The largest deviation of a guess from an estimate, over the prior standard deviation of a guess. Infinite if a
     length or factor is not positive."""
     if spec.manifold == "rotation":
-        return float(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ found)))) / spec.prior_sigma
+        return float(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ estimate)))) / spec.prior_sigma
     if spec.is_positive:
-        if (guess <= 0.0).any() or (found <= 0.0).any():
+        if (guess <= 0.0).any() or (estimate <= 0.0).any():
             return np.inf
-        return float(np.abs(np.log(found / guess)).max()) / FACTOR_PRIOR_SIGMA
-    return float(np.abs(found - guess).max()) / spec.prior_sigma
+        return float(np.abs(np.log(estimate / guess)).max()) / FACTOR_PRIOR_SIGMA
+    return float(np.abs(estimate - guess).max()) / spec.prior_sigma
 
 
-def merged_value(spec: ParameterSpec, parameter: Parameter, given: np.ndarray | None, found: np.ndarray) -> np.ndarray:
-    """Start value of a parameter: `given`, the value of the rig file in the form that a state has. It is `found`
-    instead if the rig file has no value, or only a guess that `found` contradicts."""
-    if given is None or (parameter.mode == "free" and is_contradicted(spec, given, found)):
-        return found
-    return given
+def merged_value(
+    spec: ParameterSpec, parameter: Parameter, stated: np.ndarray | None, estimate: np.ndarray
+) -> np.ndarray:
+    """Start value of a parameter: `stated`, the value of the rig file in the form that a state has. It is `estimate`
+    instead if the rig file has no value, or only a guess that `estimate` contradicts."""
+    if stated is None or (parameter.mode == "free" and is_contradicted(spec, stated, estimate)):
+        return estimate
+    return stated
 
 
 _REFUSES_FAR_OFF = ContextVar("_REFUSES_FAR_OFF", default=False)
@@ -69,26 +71,30 @@ def refusing_far_off() -> Iterator[None]:
         _REFUSES_FAR_OFF.reset(token)
 
 
-def refuse_far_off(sensor: Sensor, found: dict[Key, np.ndarray]) -> None:
-    """Raises FarOffError if a fixed length or lever arm of the sensor contradicts the estimate `found`. Needs the
-    context `refusing_far_off`."""
-    for (_, name), value in found.items() if _REFUSES_FAR_OFF.get() else ():
+def refuse_far_off(sensor: Sensor, estimates: dict[Key, np.ndarray]) -> None:
+    """Raises FarOffError if a fixed length or lever arm of the sensor contradicts its estimate. Needs the context
+    `refusing_far_off`."""
+    for (_, name), value in estimates.items() if _REFUSES_FAR_OFF.get() else ():
         stated, spec = getattr(sensor, name), sensor.spec(name)
         checked = spec.is_positive or spec == TRANSLATION
         if checked and stated.mode == "fixed" and is_contradicted(spec, stated.value, value):
             raise FarOffError(f"{sensor.name}: {name} in the rig file contradicts the data.")
 
 
-def merged_values(sensor: Sensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
-    """Start values of a sensor: `known` values of the rig file, completed by `found` ones. An estimate in `found`
-    replaces a guess that it contradicts. It also replaces a prior on a length or factor, as the solver may not recover
-    from a wrong one."""
-    leaves = {
+def merged_values(
+    sensor: Sensor, stated: dict[Key, np.ndarray], estimates: dict[Key, np.ndarray]
+) -> dict[Key, np.ndarray]:
+    """Start values of a sensor: `stated` values of the rig file, completed by `estimates`. An estimate replaces a guess
+    that it contradicts. It also replaces a prior on a length or factor, as the solver may not recover from a wrong
+    one."""
+    replaced = {
         key
-        for key, value in known.items()
-        if key in found and _is_replaceable(sensor, key[1]) and is_contradicted(sensor.spec(key[1]), value, found[key])
+        for key, value in stated.items()
+        if key in estimates
+        and _is_replaceable(sensor, key[1])
+        and is_contradicted(sensor.spec(key[1]), value, estimates[key])
     }
-    return found | {key: value for key, value in known.items() if key not in leaves}
+    return estimates | {key: value for key, value in stated.items() if key not in replaced}
 
 
 def _is_replaceable(sensor: Sensor, name: str) -> bool:
@@ -97,27 +103,26 @@ def _is_replaceable(sensor: Sensor, name: str) -> bool:
     return mode == "free" or (mode == "prior" and sensor.spec(name).is_positive)
 
 
-def has_guesses(sensor: Sensor, known: dict[Key, np.ndarray]) -> bool:
-    """Whether some of the `known` values are guesses: neither fixed nor with a prior."""
-    return any(getattr(sensor, name).mode == "free" for _, name in known)
+def has_guesses(sensor: Sensor, stated: dict[Key, np.ndarray]) -> bool:
+    """Whether some of the `stated` values are guesses: neither fixed nor with a prior."""
+    return any(getattr(sensor, name).mode == "free" for _, name in stated)
 
 
-def merged_translation(given: np.ndarray, found: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """The guess `given` of a translation (3,) m, corrected by the estimate `found` of covariance (3, 3) m^2. Components
-    along principal axes of the covariance are replaced if the estimate is more certain than a guess, and contradicts
-    it."""
+def merged_translation(guess: np.ndarray, estimate: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """The `guess` of a translation (3,) m, corrected by the `estimate` of covariance (3, 3) m^2. Components along
+    principal axes of the covariance are replaced if the estimate is more certain than a guess, and contradicts it."""
     variance, axes = np.linalg.eigh(covariance)
-    deviation = axes.T @ (found - given)
+    deviation = axes.T @ (estimate - guess)
     sigma = TRANSLATION.prior_sigma
-    return given + axes @ np.where(
+    return guess + axes @ np.where(
         (variance < sigma**2) & (np.abs(deviation) > MAX_GUESS_SIGMAS * sigma), deviation, 0.0
     )
 
 
-def nearest_about_axis(axis: np.ndarray, guess: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """The rotation found Exp(t axis), over all t, that is nearest to the `guess` (3, 3). axis (3,): unit vector, about
+def nearest_about_axis(axis: np.ndarray, guess: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """The `rotation` Exp(t axis), over all t, that is nearest to the `guess` (3, 3). axis (3,): unit vector, about
     which the data do not show the rotation."""
-    turn = guess.T @ found
+    turn = guess.T @ rotation
     sine = axis @ np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     cosine = np.trace(turn) - axis @ turn @ axis
-    return found @ so3.exp(-np.arctan2(sine, cosine) * axis)
+    return rotation @ so3.exp(-np.arctan2(sine, cosine) * axis)

@@ -44,17 +44,17 @@ def best_shifts(
     saa, sbb = correlate(a * a * ma, mb), correlate(ma, b * b * mb)
     covariance = correlate(a * ma, b * mb) - sa * sb / count
     variance = np.maximum(saa - sa**2 / count, 0.0) * np.maximum(sbb - sb**2 / count, 0.0)
-    whole = min(mask_a.sum(), mask_b.sum())
-    enough = count > min(least, 0.5 * whole)
+    fewer = min(mask_a.sum(), mask_b.sum())
+    enough = count > min(least, 0.5 * fewer)
     # The floor, a share of the whole variance, keeps a short overlap with little motion from winning.
     floor = 1e-3 * (a[mask_a].var() * b[mask_b].var()) * count**2
     r = np.where(enough, covariance / np.sqrt(variance + floor), 0.0)
     score = np.arctanh(np.clip(r, 0.0, 0.999999)) * np.sqrt(count)
-    found = []
+    peaks = []
     for _ in range(most):
         k = int(np.argmax(score))
-        found.append(CorrelationPeak(k - (len(b) - 1), float(r[k]), float(r.max())))
+        peaks.append(CorrelationPeak(k - (len(b) - 1), float(r[k]), float(r.max())))
         score[max(k - apart, 0) : k + apart + 1] = -np.inf
         if not np.isfinite(score).any():
             break
-    return found
+    return peaks

@@ -79,8 +79,8 @@ def _epipolar_row(g, h, c, J_f_lens, J_h_lens, R, t, a, b, J):
         # t . (R J_f x h + R f x J_h), with m = h x t and t x R f.
         J[5 + j] = 0.0
         for r in range(3):
-            turned = R[r, 0] * J_f_lens[j, 0] + R[r, 1] * J_f_lens[j, 1] + R[r, 2] * J_f_lens[j, 2]
-            J[5 + j] += turned * (m0 if r == 0 else m1 if r == 1 else m2)
+            R_J_f = R[r, 0] * J_f_lens[j, 0] + R[r, 1] * J_f_lens[j, 1] + R[r, 2] * J_f_lens[j, 2]
+            J[5 + j] += R_J_f * (m0 if r == 0 else m1 if r == 1 else m2)
             p, q = (r + 1) % 3, (r + 2) % 3
             J[5 + j] += J_h_lens[j, r] * (t[p] * g[q] - t[q] * g[p])
 
@@ -223,40 +223,40 @@ def track_rates(
     interval. Raises EstimationError if fewer than MIN_TRACK_RATES pairs share enough points.
     """
     rays, valid = model.unproject(params, stream.uv)
-    t, found, noise, before = stream.seconds, [], [], None
+    t, rows, noise, previous = stream.seconds, [], [], None
     every = max(1, int(THINNED_STEP_SHARE * step / float(np.median(np.diff(t))))) if thinned else 1
     for i, j in image_pairs(stream, step)[::every]:
         p, q = shared_points(stream, valid, i, j)
         if len(p) < MIN_SHARED_POINTS:
             continue
         f, h = rays[p], rays[q]
-        cost, R, direction = _best_relative_pose(f, h, before)
+        cost, R, direction = _best_relative_pose(f, h, previous)
         if np.isfinite(cost):
-            before = (R, direction) if chained else None
-            found.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
-            if len(found) % NOISE_EVERY == 0:
+            previous = (R, direction) if chained else None
+            rows.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
+            if len(rows) % NOISE_EVERY == 0:
                 noise.append(rotation_error(f, h, R, direction)[0] / (t[j] - t[i]))
-    if len(found) < MIN_TRACK_RATES:
+    if len(rows) < MIN_TRACK_RATES:
         raise EstimationError(
-            f"{stream.name}: only {len(found)} pairs of images {step:.2g} s apart share {MIN_SHARED_POINTS} "
+            f"{stream.name}: only {len(rows)} pairs of images {step:.2g} s apart share {MIN_SHARED_POINTS} "
             "tracked points or more; record for longer, or with longer feature tracks."
         )
-    rows = np.array(found)
-    start, end, rate = rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2:].copy()
+    columns = np.array(rows)
+    start, end, rate = columns[:, 0].copy(), columns[:, 1].copy(), columns[:, 2:].copy()
     return SensorRates(start, end, rate, MIN_TRACK_RATE_CORRELATION, noise=float(np.median(noise)))
 
 
 def _best_relative_pose(
-    f: np.ndarray, h: np.ndarray, before: tuple[np.ndarray, np.ndarray] | None
+    f: np.ndarray, h: np.ndarray, previous: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Cost, rotation and direction of the better of two refinements: from a pure rotation, and from the relative pose
-    `before` if there is one."""
-    found = []
-    for start in (rotation_without_translation(f, h), before):
+    `previous` if there is one."""
+    refined = []
+    for start in (rotation_without_translation(f, h), previous):
         if start is not None:
             R, t = start[0].copy(), start[1].copy()
-            found.append((refine_relative_pose(f, h, R, t), R, t))
-    return min(found, key=lambda x: x[0])
+            refined.append((refine_relative_pose(f, h, R, t), R, t))
+    return min(refined, key=lambda x: x[0])
 
 
 def rotation_error(f: np.ndarray, h: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[float, float]:

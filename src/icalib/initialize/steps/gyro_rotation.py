@@ -51,8 +51,8 @@ class GyroRotation:
         Use them where rotations are coefficients of unknowns: noise in coefficients biases least squares towards zero
         (errors in variables).
         """
-        turned = self.at(t)
-        start = rotation @ turned.transpose(0, 2, 1)
+        R_start_imu = self.at(t)
+        start = rotation @ R_start_imu.transpose(0, 2, 1)
         total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(start, axis=0)])
         part = np.searchsorted([gap for gap, _ in self.imu.gaps], t)
         low = np.maximum(np.searchsorted(t, t - SMOOTHING_HALF_WINDOW_S), np.searchsorted(part, part))
@@ -60,4 +60,4 @@ class GyroRotation:
             np.searchsorted(t, t + SMOOTHING_HALF_WINDOW_S, side="right"), np.searchsorted(part, part, side="right")
         )
         U, _, Vt = np.linalg.svd(total[high] - total[low])
-        return U @ Vt @ turned
+        return U @ Vt @ R_start_imu

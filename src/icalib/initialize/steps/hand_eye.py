@@ -80,8 +80,8 @@ def hand_eye(pairs: PosePairs, start: Extrinsics | None, fixed: tuple[bool, bool
     if start is not None and not fixed[0]:
         rotations.append(start.R)
     p = np.zeros(3) if start is None else start.p
-    found = [_gauss_newton(pairs, Extrinsics(R, p), fixed) for R in rotations]
-    return min(found, key=lambda f: _cost(f.residual))
+    fits = [_gauss_newton(pairs, Extrinsics(R, p), fixed) for R in rotations]
+    return min(fits, key=lambda f: _cost(f.residual))
 
 
 def relative_motions(pairs: PosePairs) -> RelativeMotions:
@@ -99,14 +99,14 @@ def relative_motions(pairs: PosePairs) -> RelativeMotions:
     return RelativeMotions(*turns, *displacements)
 
 
-def unexplained_motion(pairs: PosePairs, found: HandEye) -> float:
+def unexplained_motion(pairs: PosePairs, fit: HandEye) -> float:
     """Median residual over the median relative motion, the larger ratio of rotation and position."""
     motions = relative_motions(pairs)
-    turned = max(_median_norm(motions.turn_body), _median_norm(motions.turn_sensor), MIN_COMPARED_TURN_RAD)
-    moved = max(
+    angle = max(_median_norm(motions.turn_body), _median_norm(motions.turn_sensor), MIN_COMPARED_TURN_RAD)
+    distance = max(
         _median_norm(motions.displacement_body), _median_norm(motions.displacement_sensor), MIN_COMPARED_DISPLACEMENT_M
     )
-    return max(_median_norm(found.residual[:, :3]) / turned, _median_norm(found.residual[:, 3:]) / moved)
+    return max(_median_norm(fit.residual[:, :3]) / angle, _median_norm(fit.residual[:, 3:]) / distance)
 
 
 def outlier_pairs(residual: np.ndarray) -> np.ndarray:
@@ -119,12 +119,12 @@ def outlier_pairs(residual: np.ndarray) -> np.ndarray:
 def _start_rotations(motions: RelativeMotions) -> list[np.ndarray]:
     """Candidates of R_body_sensor, from which Gauss-Newton starts."""
     by_turns = _robust_kabsch(motions.turn_body, motions.turn_sensor)
-    found = [by_turns, _robust_kabsch(motions.displacement_body, motions.displacement_sensor)]
+    candidates = [by_turns, _robust_kabsch(motions.displacement_body, motions.displacement_sensor)]
     _, spread, axes = np.linalg.svd(motions.turn_sensor, full_matrices=False)
     if spread[1] < SINGLE_AXIS_TURN_RATIO * spread[0]:
         angles = 2.0 * np.pi * np.arange(1, HAND_EYE_CANDIDATES) / HAND_EYE_CANDIDATES
-        found += [by_turns @ turn for turn in so3.exp_many(angles[:, None] * axes[0])]
-    return found
+        candidates += [by_turns @ turn for turn in so3.exp_many(angles[:, None] * axes[0])]
+    return candidates
 
 
 def _robust_kabsch(a: np.ndarray, b: np.ndarray) -> np.ndarray:

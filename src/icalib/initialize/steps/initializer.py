@@ -55,9 +55,9 @@ class Initializer(Generic[S]):
         """Names of the sensors that show the motion; by default all sensors of this kind."""
         return tuple(s.name for s in rig.mounted if initializer_of(s) is self)
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
+    def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         """A state with the trajectory and a guess of the sensors, from their measurements and the IMU's. inputs: of
-        `sources` and the IMU alone. other: returns inputs and trajectory by the next kind in rank.
+        `sources` and the IMU alone. fallback: returns inputs and trajectory by the next kind in rank.
 
         Raises EstimationError if the sensors do not show the motion.
         """
@@ -68,11 +68,11 @@ class Initializer(Generic[S]):
         state, and the guess to which unobservable parameters are reset."""
         raise NotImplementedError
 
-    def adopted(self, whole: Inputs, own: Inputs) -> Inputs:
-        """`whole`, the inputs of all sensors, with the changes that `refined` made in `own`, the inputs of
+    def adopted(self, inputs: Inputs, source_inputs: Inputs) -> Inputs:
+        """`inputs`, the inputs of all sensors, with the changes that `refined` made in `source_inputs`, the inputs of
         `sources`."""
-        del own
-        return whole
+        del source_inputs
+        return inputs
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[S]) -> Values:
         """Calibration parameters of `sensors` and of their frames: values of the rig file, or values that align them to
@@ -108,11 +108,11 @@ class Initializer(Generic[S]):
         del recording
 
     def start_at_rest(
-        self, rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], found: Values
+        self, rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], values: Values
     ) -> InitialGuess | None:
         """The whole initial guess if all measurements were taken at rest, so that no motion is assumed; else None.
-        body, found: results of `body_poses`."""
-        del rig, recordings, body, found
+        body_poses, values: results of `body_poses`."""
+        del rig, recordings, body_poses, values
         return None
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
@@ -181,13 +181,13 @@ def place_sensors(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Va
     return out
 
 
-def inputs_of_sensors(whole: Inputs, recordings: Sequence[Measurements], names: Sequence[str]) -> Inputs:
-    """Inputs of the sensors `names` and the IMU alone, on the time base of `whole`."""
-    rig = whole.rig
+def inputs_of_sensors(inputs: Inputs, recordings: Sequence[Measurements], names: Sequence[str]) -> Inputs:
+    """Inputs of the sensors `names` and the IMU alone, on the time base of `inputs`."""
+    rig = inputs.rig
     if len(names) == len(rig.mounted):
-        return whole
+        return inputs
     imus = [] if rig.imu is None else [rig.imu.name]
-    some = rig.only(*imus, *names)
-    if not some.cameras:
-        some = some.only(*some.sensors, target=NoTarget())
-    return inputs_for(some, [m.only(*some.sensors) for m in recordings], whole)
+    chosen = rig.only(*imus, *names)
+    if not chosen.cameras:
+        chosen = chosen.only(*chosen.sensors, target=NoTarget())
+    return inputs_for(chosen, [m.only(*chosen.sensors) for m in recordings], inputs)

@@ -49,15 +49,15 @@ class Triples(NamedTuple):
         """Triples of the instants i, j, k (n,) among increasing times t (N,) s."""
         return cls(i, j, k, t[j] - t[i], t[k] - t[j])
 
-    def some(self, kept: np.ndarray) -> Triples:
-        """The triples selected by `kept`, a mask or indices (n,)."""
-        return Triples(*(x[kept] for x in self))
+    def some(self, chosen: np.ndarray) -> Triples:
+        """The triples selected by `chosen`, a mask or indices (n,)."""
+        return Triples(*(x[chosen] for x in self))
 
     def second(self, x: np.ndarray) -> np.ndarray:
         """A[x] (n, ...) of x (N, ...) at the instants: difference of its mean slopes, see the module's equation."""
         flat, h1, h2 = x.reshape(len(x), -1), self.h1[:, None], self.h2[:, None]
-        found = (flat[self.k] - flat[self.j]) / h2 - (flat[self.j] - flat[self.i]) / h1
-        return found.reshape(-1, *x.shape[1:])
+        differences = (flat[self.k] - flat[self.j]) / h2 - (flat[self.j] - flat[self.i]) / h1
+        return differences.reshape(-1, *x.shape[1:])
 
     @property
     def half(self) -> np.ndarray:

@@ -65,33 +65,35 @@ def align_rates(imu: ImuData, name: str, rates: SensorRates, given_offset: float
     best, *others = likely_offsets(imu, name, rates) if given_offset is None else [given_offset]
     offsets = [best, *(x for x in others if covered(imu, rates, x).any())]
     # In a short recording angular speeds may match better at a wrong offset, but directions do not.
-    (alike, found), averaged = _first_match(imu, [_align_near(imu, name, rates, x, keep) for x in offsets])
-    refuse_clock_jumps(imu, name, alike, found.offset, lambda part, offset: _unexplained_at(imu, part, found, offset))
-    _check_offset(imu, name, _unexplained(imu, alike, found, averaged), keep)
-    _check_scale(imu, name, rates, found, averaged)
-    return found
+    (alike, alignment), averaged = _first_match(imu, [_align_near(imu, name, rates, x, keep) for x in offsets])
+    refuse_clock_jumps(
+        imu, name, alike, alignment.offset, lambda part, offset: _unexplained_at(imu, part, alignment, offset)
+    )
+    _check_offset(imu, name, _unexplained(imu, alike, alignment, averaged), keep)
+    _check_scale(imu, name, rates, alignment, averaged)
+    return alignment
 
 
 def _first_match(
-    imu: ImuData, tried: Sequence[tuple[SensorRates, RateAlignment]]
+    imu: ImuData, candidates: Sequence[tuple[SensorRates, RateAlignment]]
 ) -> tuple[tuple[SensorRates, RateAlignment], float]:
-    """The first of the alignments `tried` whose unexplained rate is small enough, or the best one if it is clearly
-    better. Also returns the duration [s] of the means that were compared.
+    """The first of the `candidates` whose unexplained rate is small enough, or the best one if it is clearly better.
+    Also returns the duration [s] of the means that were compared.
 
     If none matches over RATE_MEAN_S, means over LONG_RATE_MEAN_S are compared: noise shrinks at least with the root of
     the duration, a different motion does not. If none matches then, returns the first.
     """
-    unexplained = [_unexplained(imu, *one) for one in tried]
+    unexplained = [_unexplained(imu, *candidate) for candidate in candidates]
     alike = [k for k, share in enumerate(unexplained) if share <= MAX_UNEXPLAINED_RATE]
     if alike:
         best = int(np.argmin(unexplained))
         is_clear = unexplained[best] < MAX_UNEXPLAINED_RATIO_OF_OTHER * unexplained[alike[0]]
-        return tried[best if is_clear else alike[0]], RATE_MEAN_S
-    for one in tried:
-        share = min(MAX_UNEXPLAINED_RATE, np.sqrt(RATE_MEAN_S / LONG_RATE_MEAN_S) * _unexplained(imu, *one))
-        if _unexplained(imu, *one, LONG_RATE_MEAN_S) <= share:
-            return one, LONG_RATE_MEAN_S
-    return tried[0], RATE_MEAN_S
+        return candidates[best if is_clear else alike[0]], RATE_MEAN_S
+    for candidate in candidates:
+        share = min(MAX_UNEXPLAINED_RATE, np.sqrt(RATE_MEAN_S / LONG_RATE_MEAN_S) * _unexplained(imu, *candidate))
+        if _unexplained(imu, *candidate, LONG_RATE_MEAN_S) <= share:
+            return candidate, LONG_RATE_MEAN_S
+    return candidates[0], RATE_MEAN_S
 
 
 def _align_near(
@@ -137,20 +139,20 @@ def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> N
         )
 
 
-def _unexplained(imu: ImuData, rates: SensorRates, found: RateAlignment, averaged: float = RATE_MEAN_S) -> float:
+def _unexplained(imu: ImuData, rates: SensorRates, alignment: RateAlignment, averaged: float = RATE_MEAN_S) -> float:
     """Median difference between the rates of IMU and sensor, over the median rate, of means over `averaged` s. The
     known noise of the sensor's rates is subtracted."""
-    gyro, sensor = _side_by_side(imu, rates, found.offset, averaged)
-    gyro, sensor = gyro - found.gyro_bias, sensor @ found.rotation.T
+    gyro, sensor = _side_by_side(imu, rates, alignment.offset, averaged)
+    gyro, sensor = gyro - alignment.gyro_bias, sensor @ alignment.rotation.T
     unexplained = float(np.median(np.linalg.norm(gyro - sensor, axis=1)))
     unexplained = np.sqrt(max(unexplained**2 - (MEDIAN_NORM * rate_difference_noise(imu, rates, averaged)) ** 2, 0.0))
     return float(unexplained / np.median(np.linalg.norm(gyro, axis=1)))
 
 
-def _unexplained_at(imu: ImuData, rates: SensorRates, found: RateAlignment, offset: float) -> float:
+def _unexplained_at(imu: ImuData, rates: SensorRates, alignment: RateAlignment, offset: float) -> float:
     """The unexplained share of `rates` at another offset; infinite if the IMU was not running."""
-    there = replace(found, offset=offset)
-    return _unexplained(imu, rates, there) if covered(imu, rates, offset).any() else np.inf
+    shifted = replace(alignment, offset=offset)
+    return _unexplained(imu, rates, shifted) if covered(imu, rates, offset).any() else np.inf
 
 
 def _side_by_side(
@@ -177,8 +179,8 @@ def contradicting_offset(imu: ImuData, name: str, rates: SensorRates, expected: 
         return None
     if not covered(imu, rates, expected).any():
         return alignment.offset
-    there = _unexplained(imu, rates, _alignment_at_offset(expected, *_side_by_side(imu, rates, expected)))
-    return alignment.offset if _unexplained(imu, rates, alignment) < MAX_UNEXPLAINED_RATIO_OF_OTHER * there else None
+    at_expected = _alignment_at_offset(expected, *_side_by_side(imu, rates, expected))
+    return alignment.offset if better_alignment(imu, rates, at_expected, alignment) is alignment else None
 
 
 def rms_rates(imu: ImuData, rates: SensorRates) -> tuple[float, float]:
@@ -253,10 +255,10 @@ def _refine(imu: ImuData, rates: SensorRates, rough: RateAlignment, keep_offset:
     return RateAlignment(offset, R, bias)
 
 
-def turns_about_two_axes(imu: ImuData, rates: SensorRates, found: RateAlignment) -> bool:
+def turns_about_two_axes(imu: ImuData, rates: SensorRates, alignment: RateAlignment) -> bool:
     """Whether sensor and IMU both turned about more than one axis. Both are checked, as a camera far from the target
     measures rotations that are noise. If not, the rotation about this axis is unobservable."""
-    middle = (0.5 * (rates.start + rates.end) + found.offset)[covered(imu, rates, found.offset)]
+    middle = (0.5 * (rates.start + rates.end) + alignment.offset)[covered(imu, rates, alignment.offset)]
     gyro = interpolated(imu.seconds, imu.gyro, middle)
     return all(_second_axis(w) >= MIN_SECOND_AXIS_RATIO for w in (rates.rate, gyro))
 
@@ -285,10 +287,10 @@ def main_axis(rate: np.ndarray) -> np.ndarray:
     return _spread_axes(rate)[1][0]
 
 
-def check_two_axes(imu: ImuData, rates: SensorRates, found: RateAlignment, name: str, on_wheels: bool) -> None:
+def check_two_axes(imu: ImuData, rates: SensorRates, alignment: RateAlignment, name: str, on_wheels: bool) -> None:
     """Raises OneAxisError if the sensor turned about one axis only. on_wheels: whether it is on a vehicle, which turns
     about other axes on slopes only."""
-    if not turns_about_two_axes(imu, rates, found):
+    if not turns_about_two_axes(imu, rates, alignment):
         axes = other_axes(imu.name, main_axis(imu.gyro))
         motion = "drive over ramps" if on_wheels else f"turn the rig about {axes} as well"
         raise OneAxisError(
@@ -297,20 +299,24 @@ def check_two_axes(imu: ImuData, rates: SensorRates, found: RateAlignment, name:
         )
 
 
-def better_at_offset(imu: ImuData, name: str, rates: SensorRates, found: RateAlignment, offset: float) -> RateAlignment:
-    """`found`, or the alignment at a guessed `offset` [s] if rates match clearly better there. Rates about one axis
+def better_at_offset(
+    imu: ImuData, name: str, rates: SensorRates, alignment: RateAlignment, offset: float
+) -> RateAlignment:
+    """The `alignment`, or the one at a guessed `offset` [s] if rates match clearly better there. Rates about one axis
     also match a rotation that is reversed."""
     if not covered(imu, rates, offset).any():
-        return found
-    return better_alignment(imu, rates, found, alignment_as_stated(imu, name, rates, offset, found.rotation))
+        return alignment
+    return better_alignment(imu, rates, alignment, alignment_as_stated(imu, name, rates, offset, alignment.rotation))
 
 
-def better_alignment(imu: ImuData, rates: SensorRates, found: RateAlignment, other: RateAlignment) -> RateAlignment:
-    """`found`, or `other` if its unexplained rate is clearly smaller."""
+def better_alignment(
+    imu: ImuData, rates: SensorRates, alignment: RateAlignment, alternative: RateAlignment
+) -> RateAlignment:
+    """`alignment`, or `alternative` if its unexplained rate is clearly smaller."""
     return (
-        other
-        if _unexplained(imu, rates, other) < MAX_UNEXPLAINED_RATIO_OF_OTHER * _unexplained(imu, rates, found)
-        else found
+        alternative
+        if _unexplained(imu, rates, alternative) < MAX_UNEXPLAINED_RATIO_OF_OTHER * _unexplained(imu, rates, alignment)
+        else alignment
     )
 
 
@@ -329,10 +335,10 @@ def alignment_as_stated(
     return RateAlignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0), given=True)
 
 
-def rates_contradict(imu: ImuData, rates: SensorRates, given: RateAlignment) -> bool:
-    """Whether the sensors turned, but not as the alignment `given` predicts."""
-    (_, found), averaged = _first_match(imu, [(rates, given)])
-    return not is_still(*rms_rates(imu, rates)) and _unexplained(imu, rates, found, averaged) > MAX_UNEXPLAINED_RATE
+def rates_contradict(imu: ImuData, rates: SensorRates, alignment: RateAlignment) -> bool:
+    """Whether the sensors turned, but not as the `alignment` predicts."""
+    (_, compared), averaged = _first_match(imu, [(rates, alignment)])
+    return not is_still(*rms_rates(imu, rates)) and _unexplained(imu, rates, compared, averaged) > MAX_UNEXPLAINED_RATE
 
 
 def no_overlap(imu: ImuData, name: str) -> EstimationError:
@@ -356,9 +362,9 @@ def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, sensor: np.ndarray
         )
 
 
-def _check_scale(imu: ImuData, name: str, rates: SensorRates, found: RateAlignment, averaged: float) -> None:
+def _check_scale(imu: ImuData, name: str, rates: SensorRates, alignment: RateAlignment, averaged: float) -> None:
     """Raises EstimationError if the norms of the rates differ by more than a quarter."""
-    ratio = _rate_ratio(found, *_side_by_side(imu, rates, found.offset, averaged))
+    ratio = _rate_ratio(alignment, *_side_by_side(imu, rates, alignment.offset, averaged))
     if not 0.8 < ratio < 1.25:
         raise EstimationError(
             f"{imu.name} turns {ratio:.3g} times as fast as {name}; check its units, or give the intrinsics in "
@@ -366,10 +372,10 @@ def _check_scale(imu: ImuData, name: str, rates: SensorRates, found: RateAlignme
         )
 
 
-def _rate_ratio(found: RateAlignment, gyro: np.ndarray, camera: np.ndarray) -> float:
+def _rate_ratio(alignment: RateAlignment, gyro: np.ndarray, camera: np.ndarray) -> float:
     """Rate of the gyroscope over that of the sensor, both (n, 3) about their medians, which hold the bias. The sensor's
     rate is projected on the gyroscope's, so that its noise averages out. 1 if the rates do not correlate."""
-    gyro, camera = gyro - np.median(gyro, axis=0), (camera - np.median(camera, axis=0)) @ found.rotation.T
+    gyro, camera = gyro - np.median(gyro, axis=0), (camera - np.median(camera, axis=0)) @ alignment.rotation.T
     size = np.linalg.norm(gyro, axis=1)
     fast = size > np.median(size)
     along = np.median(np.einsum("na,na->n", gyro, camera)[fast] / size[fast])

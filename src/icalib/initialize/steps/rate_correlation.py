@@ -47,14 +47,14 @@ class SensorRates:
         return self.longest_step_s > MAX_RATE_STEP_S
 
 
-def max_rate_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = MAX_SLOW_STEP_S) -> float:
+def max_rate_step(name: str, seconds: np.ndarray, noun: str, slowest_s: float = MAX_SLOW_STEP_S) -> float:
     """The longest step [s] between neighbours of increasing instants (n,) s that gives an angular rate; a longer step
-    is a gap. what: plural noun for the sensor's measurements. Raises EstimationError if the median step exceeds
+    is a gap. noun: plural, for the sensor's measurements. Raises EstimationError if the median step exceeds
     `slowest_s`."""
     usual = float(np.median(np.diff(seconds)))
     if usual > slowest_s:
         raise EstimationError(
-            f"{name}: the rate of {1.0 / usual:.2g} {what} per second is too low to follow its motion, at "
+            f"{name}: the rate of {1.0 / usual:.2g} {noun} per second is too low to follow its motion, at "
             f"least {1.0 / slowest_s:g} are needed; record at a higher rate."
         )
     return min(max(MAX_RATE_STEP_S, MAX_USUAL_STEPS * usual), slowest_s)
@@ -80,8 +80,8 @@ def likely_offsets(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
 
 def _offsets_of_slow_rates(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
     """As `likely_offsets`, for long intervals: by rotation angles. Raises EstimationError if no offset matches."""
-    found = offsets_by_angle(imu, rates.start, rates.end, rates.rate)
-    alike = [offset for offset, misfit in found if misfit < MAX_ANGLE_MISFIT]
+    candidates = offsets_by_angle(imu, rates.start, rates.end, rates.rate)
+    alike = [offset for offset, misfit in candidates if misfit < MAX_ANGLE_MISFIT]
     if not alike:
         in_radians = replace(imu, gyro=np.deg2rad(imu.gyro))
         if any(
@@ -91,7 +91,11 @@ def _offsets_of_slow_rates(imu: ImuData, name: str, rates: SensorRates) -> list[
                 f"the angular rate of {imu.name} matches {name} if it is in deg/s; set gyro_unit: deg/s of "
                 f"{imu.name} in the rig file."
             )
-        misfit = f"at best {found[0][1]:.0%} of the rotation is unexplained" if found else "they do not overlap in time"
+        misfit = (
+            f"at best {candidates[0][1]:.0%} of the rotation is unexplained"
+            if candidates
+            else "they do not overlap in time"
+        )
         raise EstimationError(
             f"the rotation of {name}, {MAX_USUAL_STEPS / rates.longest_step_s:.2g} poses per second, does not "
             f"match that of {imu.name} at any time offset ({misfit}). Check that both come from the same "
@@ -124,12 +128,13 @@ def _correlation_peaks(imu: ImuData, rates: SensorRates) -> list[list[Correlatio
 def _peaks_of_means(imu: ImuData, rates: SensorRates, count: int) -> list[CorrelationPeak]:
     """Peaks of the correlation with gyroscope rates, both averaged over `count` grid points. The gyroscope's median,
     which holds its bias and any steady rotation, is subtracted if that correlates better."""
-    known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
+    covered = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < rates.longest_step_s
     sensor_speed = _rate_size_on_grid(middle, rates.rate, near, count)
     gyro_speeds = (
-        _rate_size_on_grid(imu.seconds, imu.gyro - about, known, count) for about in (0.0, np.median(imu.gyro, axis=0))
+        _rate_size_on_grid(imu.seconds, imu.gyro - about, covered, count)
+        for about in (0.0, np.median(imu.gyro, axis=0))
     )
     least, apart = MIN_RATE_OVERLAP_S * CORRELATION_GRID_HZ, round(MIN_PEAK_DISTANCE_S * CORRELATION_GRID_HZ)
     return max(
@@ -145,9 +150,9 @@ def _rate_size_on_grid(
     mask of the means whose points are all covered."""
     grid = np.arange(int(t[-1] * CORRELATION_GRID_HZ) + 1) / CORRELATION_GRID_HZ
     count = min(count, len(grid))
-    known = np.interp(grid, t, covered.astype(float)) > 0.99
+    on_grid = np.interp(grid, t, covered.astype(float)) > 0.99
     fine = interpolated(t, rate, grid)
-    return np.linalg.norm(moving_means(fine, count), axis=1), moving_means(np.tile(known[:, None], 3), count)[
+    return np.linalg.norm(moving_means(fine, count), axis=1), moving_means(np.tile(on_grid[:, None], 3), count)[
         :, 0
     ] > 0.99
 
@@ -163,6 +168,6 @@ def moving_means(values: np.ndarray, count: int) -> np.ndarray:
     return (total[count:] - total[:-count]) / count
 
 
-def interpolated(known: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """(n, 3) values at `seconds` (n,), by linear interpolation of values (N, 3) at `known` (N,) s."""
-    return np.stack([np.interp(seconds, known, values[:, k]) for k in range(3)], axis=1)
+def interpolated(t: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """(n, 3) values at `seconds` (n,), by linear interpolation of values (N, 3) at `t` (N,) s."""
+    return np.stack([np.interp(seconds, t, values[:, k]) for k in range(3)], axis=1)

@@ -54,23 +54,23 @@ def best_regressions(imu: ImuData, rates: SensorRates) -> list[Regression]:
     length = float(np.median(rates.end - rates.start))
     step = length / GRID_POINTS_PER_INTERVAL
     middle = 0.5 * (rates.start + rates.end)
-    camera, camera_known = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
+    camera, camera_mask = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
     start = np.arange(0.0, imu.seconds[-1] - length, step)
-    gyro, gyro_known = MeanRates.of(imu).over(start, start + length), clear_of(imu.gaps, start, start + length)
-    if not gyro_known.any() or not camera_known.any():
+    gyro, gyro_mask = MeanRates.of(imu).over(start, start + length), clear_of(imu.gaps, start, start + length)
+    if not gyro_mask.any() or not camera_mask.any():
         return []
-    explained, count = _explained_share(gyro, gyro_known, camera, camera_known)
-    enough = count > min(MIN_RATE_OVERLAP_S / step, 0.5 * min(gyro_known.sum(), camera_known.sum()))
+    explained, count = _explained_share(gyro, gyro_mask, camera, camera_mask)
+    enough = count > min(MIN_RATE_OVERLAP_S / step, 0.5 * min(gyro_mask.sum(), camera_mask.sum()))
     score = np.where(
         enough, -0.5 * count / GRID_POINTS_PER_INTERVAL * np.log(1.0 - np.minimum(explained, 1.0 - 1e-9)), -np.inf
     )
-    found: list[Regression] = []
+    peaks: list[Regression] = []
     apart = round(MIN_PEAK_DISTANCE_S / step)
-    while len(found) < MAX_OFFSET_PEAKS and np.isfinite(score).any():
+    while len(peaks) < MAX_OFFSET_PEAKS and np.isfinite(score).any():
         k = int(np.argmax(score))
-        found.append(Regression((k - (len(camera) - 1)) * step + 0.5 * length - float(middle[0]), float(score[k])))
+        peaks.append(Regression((k - (len(camera) - 1)) * step + 0.5 * length - float(middle[0]), float(score[k])))
         score[max(k - apart, 0) : k + apart + 1] = -np.inf
-    return found
+    return peaks
 
 
 def matching_track_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray) -> SensorRates:
@@ -83,19 +83,19 @@ def matching_track_rates(imu: ImuData, stream: TrackStream, model: CameraModel, 
     period = float(np.median(np.diff(stream.seconds)))
     steps = [s for s in RATE_STEPS_S if s > MIN_STEP_PERIODS * period] or [period]
     failed: EstimationError | None = None
-    found: list[tuple[float, SensorRates]] = []
+    candidates: list[tuple[float, SensorRates]] = []
     for step in steps:
         try:
-            found += _rates_and_score(imu, stream, model, lens, step)
+            candidates += _rates_and_score(imu, stream, model, lens, step)
         except EstimationError as error:
             failed = failed or error
             continue
-        if found[-1][1].offsets:
+        if candidates[-1][1].offsets:
             break
-    if not found:
+    if not candidates:
         assert failed is not None
         raise failed
-    return max(found, key=lambda x: x[0])[1]
+    return max(candidates, key=lambda x: x[0])[1]
 
 
 def _rates_and_score(
@@ -108,14 +108,14 @@ def _rates_and_score(
     If a camera moves far to the side, a start without translation often ends in a local minimum, unlike the previous
     pose. With a guessed lens, the previous pose may be the worse start.
     """
-    found = []
+    candidates = []
     for chained in (False, True):
         rates = track_rates(stream, model, lens, step, chained=chained)
         shifts = best_regressions(imu, rates)
         likely = tuple(s.offset for s in shifts if s.score > MIN_REGRESSION_SCORE)
-        found.append((max((s.score for s in shifts), default=-np.inf), replace(rates, offsets=likely)))
-    (plain, _), (score, _) = found
-    return found[1:] if score > MIN_SCORE_RATIO * plain else found[:1]
+        candidates.append((max((s.score for s in shifts), default=-np.inf), replace(rates, offsets=likely)))
+    (plain, _), (score, _) = candidates
+    return candidates[1:] if score > MIN_SCORE_RATIO * plain else candidates[:1]
 
 
 def rate_difference_noise(imu: ImuData, rates: SensorRates, averaged: float = 0.0) -> float:
@@ -133,11 +133,11 @@ def no_match_error(imu: ImuData, name: str, rates: SensorRates) -> EstimationErr
     length = float(np.median(rates.end - rates.start))
     start = np.arange(0.0, imu.seconds[-1] - length, length / GRID_POINTS_PER_INTERVAL)
     gyro = MeanRates.of(imu).over(start, start + length)
-    turned = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1))) / MEDIAN_NORM
-    if turned < MIN_RATE_TO_NOISE * rate_difference_noise(imu, rates):
+    variation = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1))) / MEDIAN_NORM
+    if variation < MIN_RATE_TO_NOISE * rate_difference_noise(imu, rates):
         return EstimationError(
             f"{imu.name} and {name} turn too slowly or too steadily for a time offset: the angular rate varies "
-            f"by {np.rad2deg(turned):.2g} deg/s, and the images show it to {np.rad2deg(rates.noise):.2g} "
+            f"by {np.rad2deg(variation):.2g} deg/s, and the images show it to {np.rad2deg(rates.noise):.2g} "
             "deg/s. Turn the rig faster, back and forth about all axes, or give rotation and time_offset in "
             "the rig file."
         )
@@ -151,12 +151,12 @@ def _on_grid(t: np.ndarray, rate: np.ndarray, near: np.ndarray, step: float) -> 
     """Rates (n, 3) at increasing t (n,), interpolated on a grid of `step` s from 0; and a mask: between neighbours
     whose step is `near` (n - 1,)."""
     grid = np.arange(int(t[-1] / step) + 1) * step
-    known = near[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(near) - 1)]
-    return np.stack([np.interp(grid, t, rate[:, k]) for k in range(3)], axis=1), known
+    mask = near[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(near) - 1)]
+    return np.stack([np.interp(grid, t, rate[:, k]) for k in range(3)], axis=1), mask
 
 
 def _explained_share(
-    a: np.ndarray, known_a: np.ndarray, b: np.ndarray, known_b: np.ndarray
+    a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """R^2 of the regression of a (n, 3) on b (m, 3), at shifts of b by -(m - 1) to n - 1 samples, and the number of
     samples that are known in both; each (n + m - 1,). By FFT, as in masked cross-correlation."""
@@ -170,8 +170,8 @@ def _explained_share(
         product = np.fft.irfft(x * np.conj(y), size)
         return np.concatenate([product[size - (len(b) - 1) :], product[: len(a)]])
 
-    a, b = a * known_a[:, None], b * known_b[:, None]
-    ma, mb, fa, fb = (transformed(x) for x in (known_a.astype(float), known_b.astype(float), a, b))
+    a, b = a * mask_a[:, None], b * mask_b[:, None]
+    ma, mb, fa, fb = (transformed(x) for x in (mask_a.astype(float), mask_b.astype(float), a, b))
     count = np.maximum(correlated(ma, mb), 1e-9)
     sa, sb = (
         np.stack([correlated(*p) for p in pairs], axis=1)

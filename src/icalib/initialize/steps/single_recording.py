@@ -94,10 +94,10 @@ def states_from_best(
     values, name = dict(states[best].values), sensor.name
     for k, recording in enumerate(recordings):
         if k != best:
-            there = None if restarts else _offset_between(states[best], name, recordings[best], recording)
+            offset = None if restarts else _offset_between(states[best], name, recordings[best], recording)
             with naming_recording(inputs, k):
                 states[k] = state_of(
-                    recording, KnownExtrinsics(values.get((name, "rotation")), values[name, "translation"], there)
+                    recording, KnownExtrinsics(values.get((name, "rotation")), values[name, "translation"], offset)
                 )
     clocks = range(len(recordings)) if restarts else (best,)
     offsets = [_offset_between(states[k], name, recordings[k], inputs) for k in clocks]
@@ -115,11 +115,11 @@ def offset_of_each_clock(
 ) -> np.ndarray:
     """(R,) time offsets [s] of a clock that restarts, one for each recording. find(k): the offset of recording k alone;
     it is not called for recordings in `known`."""
-    found = dict(known or {})
+    offsets = dict(known or {})
     for k in range(len(inputs.parts)):
-        if k not in found:
+        if k not in offsets:
             with naming_recording(inputs, k):
-                found[k] = find(k)
+                offsets[k] = find(k)
     return np.array(
-        [converted_offset(found[k], sensor, single_recording(inputs, k), inputs) for k in range(len(inputs.parts))]
+        [converted_offset(offsets[k], sensor, single_recording(inputs, k), inputs) for k in range(len(inputs.parts))]
     )

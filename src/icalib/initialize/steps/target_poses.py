@@ -246,8 +246,8 @@ def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, t
     """Poses of the camera in the frame of the one body that each image shows, from up to MAX_POSE_CORNERS
     corners each."""
     fewest = np.full(len(stream.stamps_ns), target.fewest)
-    found = flat_poses(stream, stream.start, fewest, model, params, target.points, 1)
-    return TargetPoses(found.rotation[:, 0], found.position[:, 0], found.ok[:, 0], found.rms_px[:, 0])
+    poses = flat_poses(stream, stream.start, fewest, model, params, target.points, 1)
+    return TargetPoses(poses.rotation[:, 0], poses.position[:, 0], poses.ok[:, 0], poses.rms_px[:, 0])
 
 
 def camera_rates(stream: CornerStream, poses: TargetPoses) -> SensorRates:

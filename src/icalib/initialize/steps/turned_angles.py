@@ -28,7 +28,7 @@ class ChainedRates:
     """Rotation vectors of an IMU over intervals, divided by their length: exact also where the axis changes within an
     interval."""
 
-    turned: GyroRotation
+    rotation: GyroRotation
 
     @classmethod
     def of(cls, imu: ImuData) -> ChainedRates:
@@ -37,7 +37,7 @@ class ChainedRates:
 
     def over(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Rates (n, 3) rad/s over intervals from start to end (n,), in s on the IMU's clock."""
-        a, b = self.turned.at(start), self.turned.at(end)
+        a, b = self.rotation.at(start), self.rotation.at(end)
         return so3.log_many(np.ascontiguousarray(a.transpose(0, 2, 1) @ b)) / (end - start)[:, None]
 
     def slope(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -56,9 +56,9 @@ def offsets_by_angle(imu: ImuData, start: np.ndarray, end: np.ndarray, rate: np.
     chosen = np.unique(np.linspace(0, len(start) - 1, min(len(start), MAX_COMPARED_INTERVALS)).astype(np.int64))
     start, end = start[chosen], end[chosen]
     angle = np.linalg.norm(rate[chosen], axis=1) * (end - start)
-    turned = GyroRotation.integrate(imu, np.zeros(3))
+    rotation = GyroRotation.integrate(imu, np.zeros(3))
     grid = np.arange(imu.seconds[0], imu.seconds[-1], OFFSET_GRID_S)
-    R = turned.at(grid).reshape(-1, 9)
+    R = rotation.at(grid).reshape(-1, 9)
     begin, length = (np.round(x / OFFSET_GRID_S).astype(np.int64) for x in (start, end - start))
     known = clear_of(imu.gaps, grid, grid)
     unknown = np.concatenate([[0], np.cumsum(~known)])
@@ -69,15 +69,15 @@ def offsets_by_angle(imu: ImuData, start: np.ndarray, end: np.ndarray, rate: np.
             for s in np.array_split(shifts, 1 + len(shifts) // OFFSETS_PER_BATCH)
         ]
     )
-    found: list[tuple[float, float]] = []
+    offsets: list[tuple[float, float]] = []
     apart = round(MIN_OFFSET_DISTANCE_S / OFFSET_GRID_S)
     for _ in range(MAX_ANGLE_OFFSETS):
         k = int(np.argmin(misfit))
         if not np.isfinite(misfit[k]):
             break
-        found.append((float(shifts[k] * OFFSET_GRID_S + grid[0]), float(misfit[k])))
+        offsets.append((float(shifts[k] * OFFSET_GRID_S + grid[0]), float(misfit[k])))
         misfit[max(k - apart, 0) : k + apart + 1] = np.inf
-    return found
+    return offsets
 
 
 def _angle_misfit(

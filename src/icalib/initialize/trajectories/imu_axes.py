@@ -38,14 +38,14 @@ class AxisConvention:
     def fields(self, sensor: ImuSensor) -> str:
         """Text with the fields `gyro_axes` and `accel_axes` to set in the rig file, whose present axes are those of
         `sensor`."""
-        found = []
-        for name, given, own in (
+        fields = []
+        for name, stated, axes in (
             ("gyro_axes", sensor.gyro_axes, self.gyro),
             ("accel_axes", sensor.accel_axes, self.accel),
         ):
-            if own != UNCHANGED_AXES:
-                found.append(f"{name}: [{', '.join(_composed(given or UNCHANGED_AXES, own))}]")
-        return " and ".join(found)
+            if axes != UNCHANGED_AXES:
+                fields.append(f"{name}: [{', '.join(_composed(stated or UNCHANGED_AXES, axes))}]")
+        return " and ".join(fields)
 
 
 def axis_conventions() -> Iterator[AxisConvention]:
@@ -76,21 +76,23 @@ def refuse_other_axes(
     if sensor.assumed:
         return
     now = _unexplained_or_inf(unexplained, imu)
-    found = sorted(
+    ranked = sorted(
         (
             (_unexplained_or_inf(unexplained, convention.of(imu)), k, convention)
             for k, convention in enumerate(axis_conventions())
         ),
         key=lambda x: x[:2],
     )
-    best, _, convention = found[0]
+    best, _, convention = ranked[0]
     if best < min(MAX_GOOD_UNEXPLAINED, MAX_UNEXPLAINED_RATIO * now):
-        other = (
-            f" (or {found[1][2].fields(sensor)}, which fits as well)" if best > _UNIQUE_BEST_RATIO * found[1][0] else ""
+        alternative = (
+            f" (or {ranked[1][2].fields(sensor)}, which fits as well)"
+            if best > _UNIQUE_BEST_RATIO * ranked[1][0]
+            else ""
         )
         raise EstimationError(
             f"{sensor.name} {convention.words}: its readings fit the cameras only then; set "
-            f"{convention.fields(sensor)}{other} of {sensor.name} in the rig file."
+            f"{convention.fields(sensor)}{alternative} of {sensor.name} in the rig file."
         ) from failed
 
 
@@ -108,10 +110,10 @@ def _in_axes(values: np.ndarray, axes: Axes) -> np.ndarray:
     return np.ascontiguousarray(values[:, ["xyz".index(entry[-1]) for entry in axes]] * sign)
 
 
-def _composed(given: Axes, own: Axes) -> list[str]:
-    """The axes of the rig file after the axes `own` are applied to those in `given`."""
-    columns = [(given["xyz".index(entry[-1])], entry.startswith("-")) for entry in own]
-    return [f"{'-' if name.startswith('-') != turned else ''}{name[-1]}" for name, turned in columns]
+def _composed(stated: Axes, axes: Axes) -> list[str]:
+    """The axes of the rig file after the axes `axes` are applied to those in `stated`."""
+    columns = [(stated["xyz".index(entry[-1])], entry.startswith("-")) for entry in axes]
+    return [f"{'-' if name.startswith('-') != is_negated else ''}{name[-1]}" for name, is_negated in columns]
 
 
 def _flipped(*which: int) -> Axes:

@@ -60,10 +60,10 @@ def extrinsics_on_trajectory(
     R, p = imu_poses_at(state, GyroRotation.integrate(imu, state.bias[:, :3].mean(axis=0)), t)
     prior = lever_arm_prior(np.zeros(0), rates.rate, DISPLACEMENT_SIGMA_M, known.rotation is not None, known.position)
     system = system_from_trajectory(R, p, t, path.rotation, path.position)
-    found = solve_lever_arm(system, prior, aligned.rotation, rates.rate)
-    if found is None:
+    solution = solve_lever_arm(system, prior, aligned.rotation, rates.rate)
+    if solution is None:
         raise too_few_poses(name)
-    return ExtrinsicsGuess(found[0], found[1][3:6], aligned.offset), unexplained_displacement(system, *found)
+    return ExtrinsicsGuess(solution[0], solution[1][3:6], aligned.offset), unexplained_displacement(system, *solution)
 
 
 def imu_poses_at(state: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

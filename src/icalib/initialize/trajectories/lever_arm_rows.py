@@ -71,19 +71,19 @@ class GaussianPrior:
 
 
 def lever_arm_prior(
-    others: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_known: bool, known: np.ndarray | None
+    sigmas: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_known: bool, arm: np.ndarray | None
 ) -> GaussianPrior:
-    """The prior of a system with unknowns of standard deviation `others` (k,) after d and p. rates (n, 3) rad/s: of the
-    sensor; row_sigma: of a row; rotation_known: whether d is fixed at zero; known (3,) m: the lever arm if it is known.
+    """The prior of a system with unknowns of standard deviation `sigmas` (k,) after d and p. rates (n, 3) rad/s: of the
+    sensor; row_sigma: of a row; rotation_known: whether d is fixed at zero; arm (3,) m: the lever arm if it is known.
     """
     d = FIXED_SIGMA if rotation_known else UNKNOWN_SIGMA
-    arm = LEVER_ARM_PRIOR_M if known is None else FIXED_SIGMA
-    mean = np.concatenate([np.zeros(3), np.zeros(3) if known is None else known, np.zeros(len(others))])
+    arm_sigma = LEVER_ARM_PRIOR_M if arm is None else FIXED_SIGMA
+    mean = np.concatenate([np.zeros(3), np.zeros(3) if arm is None else arm, np.zeros(len(sigmas))])
     w = rates - rates.mean(axis=0)
     information = (w**2).sum() * np.eye(3) - w.T @ w
     return GaussianPrior(
         mean,
-        np.concatenate([[d] * 3, [arm] * 3, others]) / row_sigma,
+        np.concatenate([[d] * 3, [arm_sigma] * 3, sigmas]) / row_sigma,
         information * (row_sigma / SENSOR_RATE_SIGMA_RAD_S) ** 2,
     )
 

@@ -20,16 +20,18 @@ def align_trajectory(imu: ImuData, name: str, rates: SensorRates, known: KnownEx
     """Alignment from the angular rates of the sensor `name`; `known` values are kept. Raises EstimationError if the
     rates do not determine it, or contradict the known values."""
     if known.rotation is not None and known.offset is not None:
-        found = alignment_as_stated(imu, name, rates, known.offset, known.rotation)
-        if rates_contradict(imu, rates, found):
+        alignment = alignment_as_stated(imu, name, rates, known.offset, known.rotation)
+        if rates_contradict(imu, rates, alignment):
             raise EstimationError(
                 f"{name} does not turn as {imu.name} does with the rotation and time_offset in the rig file; "
                 "correct them, or remove them so that they are estimated."
             )
-        return found
+        return alignment
     _check_turning(imu, name, rates)
-    found = align_rates(imu, name, rates, known.offset)
-    return found if known.rotation is None else alignment_as_stated(imu, name, rates, found.offset, known.rotation)
+    alignment = align_rates(imu, name, rates, known.offset)
+    return (
+        alignment if known.rotation is None else alignment_as_stated(imu, name, rates, alignment.offset, known.rotation)
+    )
 
 
 def _check_turning(imu: ImuData, name: str, rates: SensorRates) -> None:

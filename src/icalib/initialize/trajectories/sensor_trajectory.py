@@ -27,13 +27,12 @@ class SensorTrajectory:
 @dataclass(frozen=True)
 class ExtrinsicsGuess:
     """rotation: R_imu_sensor (3, 3); position: p_imu_sensor (3,) m; offset: t_imu - t_sensor [s], both since their
-    clocks' first stamps; turned: whether the sensor turned about more than one axis, which makes its rotation
-    observable."""
+    clocks' first stamps; rotation_observable: whether the sensor turned about more than one axis."""
 
     rotation: np.ndarray
     position: np.ndarray
     offset: float
-    turned: bool = False
+    rotation_observable: bool = False
 
     def values(self, name: str) -> dict[Key, np.ndarray]:
         """The guess as calibration parameters of the sensor `name`."""

@@ -61,16 +61,16 @@ def fit_imu_trajectory(
     rotation_known = known.rotation is not None
     prior = lever_arm_prior(sigmas, rates.rate, VELOCITY_CHANGE_SIGMA_M_S, rotation_known, known.position)
     system = system_from_readings(imu, carry, t, path.rotation, path.position)
-    found = solve_lever_arm(system, prior, aligned.rotation, rates.rate)
-    if found is None:
+    solution = solve_lever_arm(system, prior, aligned.rotation, rates.rate)
+    if solution is None:
         return None
-    R_is, x = found
+    R_is, x = solution
     R_world_map, R_map_imu = _levelling_rotation(x[6:9]), path.rotation @ R_is.T
     position = (path.position - R_map_imu @ x[3:6]) @ R_world_map.T
     velocity = np.zeros_like(position)
     start = ImuTrajectory(gyro, t, R_world_map @ R_map_imu, position, velocity, aligned.gyro_bias, x[9:12], gravity)
-    turned = only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is None
-    guess = ExtrinsicsGuess(R_is, x[3:6], aligned.offset, turned)
+    rotation_observable = only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is None
+    guess = ExtrinsicsGuess(R_is, x[3:6], aligned.offset, rotation_observable)
     unexplained = unexplained_displacement(system, R_is, x)
     return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), R_world_map, unexplained)
 

@@ -44,9 +44,9 @@ class CameraInitializer(Initializer[Camera]):
             return BY_TARGET
         return None if rig.imu is None else BY_TRACKS
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
+    def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         """See `Initializer`: the trajectory interpolated between camera poses, and the guess of all cameras."""
-        return initial_state(inputs, *_guesses_by_recording(inputs, other))
+        return initial_state(inputs, *_guesses_by_recording(inputs, fallback))
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
         """See `Initializer`: refines the trajectory by the first pass of the estimator."""
@@ -78,11 +78,11 @@ class CameraInitializer(Initializer[Camera]):
         return None if rig.has_target else no_parallax(rig, recordings)
 
 
-def _guesses_by_recording(inputs: Inputs, other: Callable[[], InputsWithMotion]) -> tuple[Guess, ...]:
+def _guesses_by_recording(inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> tuple[Guess, ...]:
     """The initial guess of each recording.
 
     A rig that rotated about one axis only leaves the camera's rotation about that axis unobservable from angular rates.
-    That rotation then comes from hand-eye calibration with the trajectory that `other` returns, of the next kind of
+    That rotation then comes from hand-eye calibration with the trajectory that `fallback` returns, of the next kind of
     sensor. Raises OneAxisError if this fails, too; EstimationError if a recording gives no guess.
     """
     rig, recordings = inputs.rig, [m.measurements for m in inputs.motions]
@@ -92,7 +92,7 @@ def _guesses_by_recording(inputs: Inputs, other: Callable[[], InputsWithMotion])
         if not rig.has_target:
             raise
         try:
-            rig = with_hand_eye_guess(rig, inputs, *other())
+            rig = with_hand_eye_guess(rig, inputs, *fallback())
         except EstimationError:
             raise error from None
         return initial_guesses(rig, inputs.bodies, recordings)

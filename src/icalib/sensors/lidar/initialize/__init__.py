@@ -26,8 +26,8 @@ class LidarInitializer(Initializer[Lidar]):
     def motion_rank(self, rig: Rig) -> int | None:
         return BY_SCANS if rig.lidars else None
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
-        del other
+    def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
+        del fallback
         return state_from_lidar(inputs)
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
@@ -35,9 +35,13 @@ class LidarInitializer(Initializer[Lidar]):
         inputs, associated, changed = self.associated(inputs, state)
         return inputs, associated, state.values | changed
 
-    def adopted(self, whole: Inputs, own: Inputs) -> Inputs:
-        measured = replace(whole.measurements.with_streams(*own.measurements.lidars), notes=own.measurements.notes)
-        return replace(with_clouds(replace(whole, measurements=measured), own.clouds), guess=own.guess)
+    def adopted(self, inputs: Inputs, source_inputs: Inputs) -> Inputs:
+        measured = replace(
+            inputs.measurements.with_streams(*source_inputs.measurements.lidars), notes=source_inputs.measurements.notes
+        )
+        return replace(
+            with_clouds(replace(inputs, measurements=measured), source_inputs.clouds), guess=source_inputs.guess
+        )
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Lidar]) -> Values:
         del sensors

@@ -84,9 +84,9 @@ def _single_state(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
     # Rotation and offset from angular rates are more accurate than a guess, which would make planes too thick to
     # detect.
-    names = ("translation", *known_names(lidar)) if guess.turned else MOUNTED_NAMES
+    names = ("translation", *known_names(lidar)) if guess.rotation_observable else MOUNTED_NAMES
     own, known = guess.values(lidar.name), stated_values(inputs, lidar, names)
-    values = start_values(inputs, merged_values(lidar, known, own) if guess.turned else own | known)
+    values = start_values(inputs, merged_values(lidar, known, own) if guess.rotation_observable else own | known)
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
     keyframes = keyframes_for(inputs, keyframe_times(inputs, hosts)[:1])
     rotation, position, velocity = motion.at(keyframes)

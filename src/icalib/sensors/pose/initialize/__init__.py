@@ -33,8 +33,8 @@ class PoseInitializer(Initializer[PoseSensor]):
     def sources(self, rig: Rig) -> tuple[str, ...]:
         return (rig.poses[0].name,)
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
-        del other
+    def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
+        del fallback
         return state_from_poses(inputs)
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
@@ -60,13 +60,13 @@ class PoseInitializer(Initializer[PoseSensor]):
             check_rate(stream)
 
     def start_at_rest(
-        self, rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], found: Values
+        self, rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], values: Values
     ) -> tuple[Inputs, State, Values] | None:
         """Initial guess by hand-eye calibration from pairs of poses, if the robot stood still at each pose; else
         None."""
-        if not is_stop_and_go(rig, recordings, body):
+        if not is_stop_and_go(rig, recordings, body_poses):
             return None
-        return state_from_pairs(rig, recordings, body, found)
+        return state_from_pairs(rig, recordings, body_poses, values)
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         return motion.spacing_for_poses(*pose_noise([m.poses[0] for m in recordings]))

@@ -51,8 +51,8 @@ class PositionInitializer(Initializer[PositionSensor]):
     def sources(self, rig: Rig) -> tuple[str, ...]:
         return (self._own_frames(rig)[0].name,)
 
-    def trajectory(self, inputs: Inputs, other: Callable[[], InputsWithMotion]) -> State:
-        del other
+    def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
+        del fallback
         sensor = inputs.rig.of(PositionSensor)[0]
         state = states_from_best(inputs, sensor, fullest_recording(inputs, sensor.name), _state_of_one)
         frames = _frames(inputs, sensor, [(np.eye(3), np.zeros(3))] * len(inputs.parts))
