@@ -54,7 +54,7 @@ class ResidualStatistics:
 
     def variance_factors(self) -> dict[str, float]:
         """chi^2 over degrees of freedom by kind: 1 if the noise is as assumed. Kinds with too few degrees of freedom
-        are left out."""
+        are left out. At rest, FEW_DOF degrees of freedom are subtracted (see there)."""
         known = {kind: f for kind, f in self.fits.items() if f.dof > LEAST_DOF_SHARE * f.count}
         return {k: f.chi2 / (max(f.dof - FEW_DOF, 1.0) if self.at_rest else f.dof) for k, f in known.items()}
 

@@ -44,7 +44,7 @@ class Contradiction:
 
     @property
     def away(self) -> np.ndarray:
-        """(n,) difference in standard deviations of both values together."""
+        """(n,) absolute difference over its standard deviation, which combines those of `found` and of the prior."""
         stated = 0.0 if self.parameter.sigma is None else self.parameter.sigma
         return np.abs(self.off) / np.maximum(np.sqrt(self.sigma**2 + stated**2), 1e-300)
 
@@ -119,7 +119,11 @@ def contradicted_by(inputs: Inputs, without: Determined) -> tuple[Contradiction,
 
 
 def _by(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contradiction]:
-    """Differences between the stated values of the groups `keys` and an estimate in which these are free."""
+    """Differences between the stated values of the groups `keys` and the estimate `without`, in which these are free.
+
+    Standard deviations are multiplied by the root of the largest chi^2 per degree of freedom of any residuals, so that
+    a misfit alone makes no contradiction.
+    """
     outcome, layout = without.estimate.outcome, without.estimate.problem.layout
     ratios = [f.chi2 / f.dof for f in fits(outcome.problem, outcome) if f.dof > np.sqrt(f.count)]
     factor = float(np.sqrt(max([1.0, *ratios])))

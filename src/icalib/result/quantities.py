@@ -77,7 +77,8 @@ def rpy_deg(R: np.ndarray) -> np.ndarray:
 
 
 def shown(value: float, digits: int = 2) -> str:
-    """`value` with `digits` significant digits, without an exponent if it is in 1e-5 to 1e6."""
+    """`value` with `digits` significant digits, without an exponent if it is in 1e-5 to 1e6; "unknown" for NaN,
+    "infinite" for infinity."""
     if not isfinite(value):
         return "unknown" if np.isnan(value) else "infinite"
     if value == 0.0 or not 1e-5 <= abs(value) < 1e6:

@@ -53,7 +53,8 @@ def _second_imu(rig: Rig) -> Iterator[Lack]:
 
 
 def _unknown_frames(rig: Rig) -> Iterator[Lack]:
-    """Sensors that report in the frame of another sensor or of the target, if that frame does not exist."""
+    """Sensors that report in the frame of another sensor or of the target, if that frame does not exist. A target of
+    several bodies has no frame."""
     for sensor in rig.mounted:
         name, where = sensor.shared_frame, ("sensors", sensor.name, "frame")
         if name == TARGET_FRAME and len(rig.target.bodies) > 1:

@@ -75,7 +75,7 @@ def log_uncertainty(s: RerunStream, c: Calibration) -> None:
 
 
 def log_motion(s: RerunStream, c: Calibration) -> None:
-    """Sends the pose of the body at each keyframe, and the whole trajectory of each recording."""
+    """Sends the pose of the reference sensor at each keyframe, and the whole trajectory of each recording."""
     path = c.trajectory
     s.still("world", s.rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     s.over(

@@ -26,7 +26,9 @@ _MAX_OUTLIERS = 0.1  # share of all poses; if there are more, none is a single o
 
 
 def single_outliers(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(N,) bool: whether each pose is a single outlier."""
+    """(N,) bool: poses that are far from the motion between their neighbours, while the neighbours are not.
+
+    All False with fewer than _MEDIAN_WINDOW poses, or if more than a share of _MAX_OUTLIERS were outliers."""
     n = len(seconds)
     wrong = np.zeros(n, dtype=bool)
     if n < _MEDIAN_WINDOW:
