@@ -164,7 +164,7 @@ class _Search:
 
     def settle(self) -> None:
         """Estimates again, with the null space fixed, until it no longer changes. The guess acts as a prior until then,
-        but not in the last estimate."""
+        but not in the last estimate. LATE rounds and later accept more fixed directions, see `_is_settled`."""
         for k in range(MOST_ROUNDS):
             found, seen = self.found, self.seen
             settled = _is_settled(seen.undetermined, found.problem.fixed_directions, k >= LATE)
@@ -182,8 +182,8 @@ class _Search:
             self._estimate(state, fixed_directions, led=not settled and k + 1 < MOST_ROUNDS)
 
     def weigh(self) -> None:
-        """Resets the fixed directions to the mean of the priors that the rig file states, and re-solves all other
-        parameters."""
+        """Resets the state along the fixed directions to the mean of the priors that the rig file states, and
+        re-solves all other parameters. Repeated until the state stays there; does nothing without such priors."""
         for _ in range(MOST_ROUNDS):
             problem, state = self.found.problem, self.found.outcome.state
             moving = astray(self.inputs, problem, state, self.guess, problem.fixed_directions, self.seen.asked)
@@ -279,10 +279,12 @@ def judge(
     problem, information, state = outcome.problem, outcome.information, outcome.state
     columns = np.arange(len(information)) if columns is None else columns
     among, t = np.ix_(columns, columns), problem.tolerance[columns]
+    # Without the priors of the rig file, as these must not hide what the data leave unobservable.
     counted = {p.block.key for p in problem.priors}
     given = [p for p in given_priors(inputs) if p.block.key in counted]
     asked = t[:, None] * without_priors(information, given, state)[among] * t
     is_essential = np.isin(columns, problem.layout.essential)
+    # Classifies the directions once the noise in the Jacobian is known. Drawing stops when no direction is in doubt.
     shown = partial(_shown, asked, t, is_essential)
     own = np.ix_(is_essential, is_essential)
     if before is not None and _are_alike(before.asked[own], asked[own]):
@@ -290,6 +292,7 @@ def judge(
     else:
         spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any(), columns)
     seen, noise = shown(spurious), spurious.mean
+    # Also without the priors of the model, except those on nuisance parameters.
     bounded = [p for p in problem.priors if not p.block.is_nuisance]
     data = without_priors(information, bounded, state)[among] - noise
     undetermined = seen.vectors[:, seen.nothing | seen.in_doubt]

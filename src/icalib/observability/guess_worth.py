@@ -128,9 +128,12 @@ def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
 
 
 def _guess_covariance(inputs: Inputs, problem: Problem, state: State, fixed_directions: np.ndarray) -> np.ndarray:
-    """(m, m) prior covariance of the guess along `fixed_directions` (B, m), in tolerance units. It is that of the
-    weighted reset of `moved_to_worth` if the rig file has priors there, else that of the orthogonal projection of
-    `moved_to_guess`."""
+    """(m, m) prior covariance of the guess along `fixed_directions` (B, m), in tolerance units.
+
+    With V = `fixed_directions` and S the diagonal matrix of the prior variances, it is (V^T S^-1 V)^-1 if the rig file
+    has priors there. The state is then reset by weighted least squares (`moved_to_worth`). Without priors it is V^T S
+    V, and the reset is an orthogonal projection (`moved_to_guess`).
+    """
     if _is_weighed(inputs, fixed_directions):
         scaled = fixed_directions * (problem.tolerance / _weights(inputs, state))[:, None]
         return np.linalg.inv(scaled.T @ scaled)

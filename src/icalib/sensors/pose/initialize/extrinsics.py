@@ -238,6 +238,7 @@ def _check_scale(
     gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), trajectory.seconds + aligned.offset
 
     def rows_at(position: np.ndarray) -> LeverArmRows:
+        """Equations of lever arm, gravity and accelerometer bias, as if the sensor had measured `position` (n, 3)."""
         carry = partial(gyro.carry, t, to=imu.seconds)
         return system_from_readings(imu, carry, t, trajectory.rotation, position)(
             found.guess.rotation, found.guess.position
