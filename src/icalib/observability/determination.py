@@ -284,7 +284,8 @@ def judge(
     given = [p for p in given_priors(inputs) if p.block.key in counted]
     asked = t[:, None] * without_priors(information, given, state)[among] * t
     is_essential = np.isin(columns, problem.layout.essential)
-    # Classifies the directions once the noise in the Jacobian is known. Drawing stops when no direction is in doubt.
+    # Classifies the directions once the noise in the Jacobian is known. Drawing stops when no direction is possibly
+    # rank deficient.
     shown = partial(_shown, asked, t, is_essential)
     own = np.ix_(is_essential, is_essential)
     if before is not None and _are_alike(before.asked[own], asked[own]):
