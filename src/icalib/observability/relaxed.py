@@ -98,7 +98,11 @@ def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
 
 
 def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
-    """Groups that the original rig file fixes or gives a prior, and that have columns in `layout`."""
+    """Groups that the original rig file fixes or gives a prior, and that have columns in `layout`.
+
+    Without a real IMU the pose of the reference sensor defines the body frame, so it is no stated value. With assumed
+    motion neither is its time offset.
+    """
     asked, used = inputs.asked or inputs.rig, {s.name for s in inputs.rig.mounted}
     body = () if inputs.rig.imu is not None and not inputs.rig.assumes_motion else ("rotation", "translation")
     if inputs.rig.assumes_motion:
