@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from icalib.base.text_files import write_texts
-from icalib.result.quantities import shown
+from icalib.result.quantities import format_number
 from icalib.sensors.parameter_spec import shown_unit
 from icalib.tools.montecarlo.record import from_json
 from icalib.tools.montecarlo.statistics import Nees
@@ -40,7 +40,7 @@ def block_table(found: dict[str, Any]) -> str:
         if block["nees"] is None:
             continue
         unit, scale = shown_unit(block["unit"])
-        sizes = [f"{shown(scale * block[name], 3)} {unit}".strip() for name in ("rmse", "mean_sigma")]
+        sizes = [f"{format_number(scale * block[name], 3)} {unit}".strip() for name in ("rmse", "mean_sigma")]
         name = f"{block['sensor']} {block['name'].replace('_', ' ')}"
         rows.append(f"| {name} | {' | '.join(sizes)} | {_nees(Nees(**block['nees']))} |")
     return "\n".join([*rows, f"| all together | | | {_nees(Nees(**found['whole']))} |"]) + "\n"

@@ -27,7 +27,7 @@ from icalib.result import (
     projection_uncertainty,
     working_distance,
 )
-from icalib.result.quantities import dof_words, rows, rpy_deg, shown
+from icalib.result.quantities import dof_words, format_number, rows, rpy_deg
 
 VOID = {"meta", "link", "br", "img", "hr"}
 FIGURES = {"rig", "histogram", "imu-residuals", "trajectory", "motion", "convergence", "correlation", "held-out"} | {
@@ -165,9 +165,12 @@ def test_maps_of_projection_say_what_they_show(calibration: Calibration, text: s
     assert drawn[0]["zmax"] <= 6.0 * m.median_seen and drawn[0]["contours"]["size"] <= drawn[0]["zmax"] / 9
     assert drawn[1]["name"] == "corners" and 500 < len(drawn[1]["x"]) <= projection_figures.MOST_DOTS
     size, u, v = m.worst
-    assert f"Known to {shown(m.median_seen)} px where it saw points (median), to {shown(size)} px" in page.words
+    assert (
+        f"Known to {format_number(m.median_seen)} px where it saw points (median), to {format_number(size)} px"
+        in page.words
+    )
     assert f"at pixel ({u:.0f}, {v:.0f})" in page.words
-    assert f"cam1: points {shown(distance)} m away" in page.words
+    assert f"cam1: points {format_number(distance)} m away" in page.words
 
 
 def test_a_fixed_lens_has_no_map_but_a_sentence(calibration: Calibration):
@@ -278,7 +281,7 @@ def test_rpy_is_that_of_the_rig_file(calibration: Calibration):
     [(0.0123456, "0.012"), (123.4, "123"), (0.0, "0"), (2e-7, "2.0e-07"), (np.inf, "infinite"), (np.nan, "unknown")],
 )
 def test_shown(value: float, words: str):
-    assert shown(value) == words
+    assert format_number(value) == words
 
 
 @pytest.mark.parametrize(("dof", "words"), [(19800.5, "19800"), (0.6, "1"), (-12.3, "0")])

@@ -10,14 +10,14 @@ from icalib.report.tables import Html, badge, element, html, table
 from icalib.result import Calibration, RelativePose, SensorFit, Verdict, relative_poses
 from icalib.result.body_frame import in_body_frame
 from icalib.result.excess import FAR_BEYOND, excess, times
-from icalib.result.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
+from icalib.result.quantities import Row, chi2_words, format_number, nontrivial_groups, rms_words, rows
 from icalib.result.verdict import AUXILIARY, by_size, lens_projection_px, lens_verdict, tolerance, worst
 from icalib.rig import LENS
 
 
 def sensor_cards(c: Calibration) -> Html:
     """Cards of all sensors with parameters or residuals, in the order of the rig file; the IMU comes last."""
-    known = {g.sensor for g in shown_groups(in_body_frame(c))} | {f.sensor for f in c.fits}
+    known = {g.sensor for g in nontrivial_groups(in_body_frame(c))} | {f.sensor for f in c.fits}
     names = sorted((n for n in c.rig["sensors"] if n in known), key=lambda n: n == c.imu)
     return Html("".join(_card(c, name) for name in names))
 
@@ -25,17 +25,17 @@ def sensor_cards(c: Calibration) -> Html:
 def camera_pairs(c: Calibration) -> Html:
     """Table of camera pairs: baseline, and standard deviation of the relative rotation. Empty for fewer than two
     cameras."""
-    found = [r for r in relative_poses(c) if {r.frame, r.sensor} <= set(c.cameras)]
-    if not found:
+    pairs = [r for r in relative_poses(c) if {r.frame, r.sensor} <= set(c.cameras)]
+    if not pairs:
         return Html("")
     body = [
         (
             f"{r.frame} to {r.sensor}",
-            f"{1e3 * r.distance:.2f} ± {shown(1e3 * r.distance_std)} mm",
-            f"± {shown(float(np.rad2deg(r.std[:3].max())))} deg",
+            f"{1e3 * r.distance:.2f} ± {format_number(1e3 * r.distance_std)} mm",
+            f"± {format_number(float(np.rad2deg(r.std[:3].max())))} deg",
             badge(_pair_verdict(c, r)),
         )
-        for r in found
+        for r in pairs
     ]
     return table(("camera pair", "baseline", "rotation", "verdict"), body)
 
@@ -50,25 +50,25 @@ def _card(c: Calibration, sensor: str) -> Html:
     """Card of one sensor. Red: a component is undetermined, residuals are at least `FAR_BEYOND` times the stated noise,
     or an error in the rig file or recording names the sensor. Amber: a component is weak, or residuals exceed the
     stated noise."""
-    is_camera, own = sensor in c.cameras, [f for f in c.fits if f.sensor == sensor]
-    groups = [g for g in shown_groups(in_body_frame(c)) if g.sensor == sensor and g.name not in AUXILIARY]
-    judged: list[Verdict] = [v for g in groups if not (is_camera and g.name in LENS) for v in g.verdict]
-    verdict = worst((*judged, *((lens_verdict(c, sensor),) if is_camera else ())))
-    fit = max((excess(f) for f in own), default=1.0)
+    is_camera, fits = sensor in c.cameras, [f for f in c.fits if f.sensor == sensor]
+    groups = [g for g in nontrivial_groups(in_body_frame(c)) if g.sensor == sensor and g.name not in AUXILIARY]
+    verdicts: list[Verdict] = [v for g in groups if not (is_camera and g.name in LENS) for v in g.verdict]
+    verdict = worst((*verdicts, *((lens_verdict(c, sensor),) if is_camera else ())))
+    fit = max((excess(f) for f in fits), default=1.0)
     named = any(re.search(rf"(?<!\w){re.escape(sensor)}(?!\w)", sentence) for sentence in c.wrong)
     css = verdict
     if named or fit >= FAR_BEYOND:
         css = "undetermined"
     elif fit > 1.0 and verdict != "undetermined":
         css = "weak"
-    marks = [w for w, shown in (("poor fit", fit > 1.0), ("see the reasons", named and fit == 1.0)) if shown]
+    marks = [w for w, applies in (("poor fit", fit > 1.0), ("see the reasons", named and fit == 1.0)) if applies]
     badges = [element("span", mark, f"badge {css}") for mark in marks]
     kind = c.rig["sensors"][sensor]["type"]
     head = element("h3", [html(sensor), element("small", f" {kind} "), badge(verdict), *badges])
-    lines = [element("li", _fit_words(f), "poor" if excess(f) > 1.0 else "") for f in own]
-    fits = [element("ul", lines)] if lines else []
+    lines = [element("li", _fit_words(f), "poor" if excess(f) > 1.0 else "") for f in fits]
+    fit_lists = [element("ul", lines)] if lines else []
     table = [_components(c, sensor, is_camera)] if groups else []
-    return element("article", [head, *table, *fits], f"card {css}")
+    return element("article", [head, *table, *fit_lists], f"card {css}")
 
 
 def _components(c: Calibration, sensor: str, is_camera: bool) -> Html:
@@ -76,11 +76,11 @@ def _components(c: Calibration, sensor: str, is_camera: bool) -> Html:
     uncertainty."""
     hidden = {"fx", "fy", "cx", "cy", *_lens_labels(c, sensor)} if is_camera else set()
     hidden |= set(AUXILIARY)
-    found = [r for r in rows(c) if r.sensor == sensor and r.name not in hidden]
-    body = [(r.name, r.value, _std(r), badge(r.verdict)) for r in found]
+    components = [r for r in rows(c) if r.sensor == sensor and r.name not in hidden]
+    body = [(r.name, r.value, _std(r), badge(r.verdict)) for r in components]
     if is_camera:
         sigma, verdict = lens_projection_px(c, sensor), lens_verdict(c, sensor)
-        size = "" if sigma is None else f"± {shown(sigma)} px"
+        size = "" if sigma is None else f"± {format_number(sigma)} px"
         body.append(("lens, projection" if size else "lens", "", size, badge(verdict)))
     return table(("", "value", "std", ""), body, ("value", "std"))
 

@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.result import Calibration, relative_poses
-from icalib.result.quantities import rows, rpy_deg, shown
+from icalib.result.quantities import format_number, rows, rpy_deg
 from icalib.result.summary import body_name, reference_name
 from icalib.result.verdict import UNDETERMINED, tolerance
 from icalib.rig.kinds import ALL_SPECS
@@ -24,13 +24,13 @@ def table(calibration: Calibration) -> Table:
     for header in ("sensor", "parameter", "value", "std", "unit", "verdict"):
         out.add_column(header, justify="right" if header in ("value", "std") else "left", no_wrap=True)
     sensors = calibration.rig["sensors"]  # sensors come first, parameters of the target last
-    found = sorted(
+    table_rows = sorted(
         (r for r in rows(calibration) if r.sensor not in calibration.bodies),
         key=lambda r: r.sensor not in sensors,
     )
-    for i, row in enumerate(found):
-        first = i == 0 or found[i - 1].sensor != row.sensor
-        last = i + 1 == len(found) or found[i + 1].sensor != row.sensor
+    for i, row in enumerate(table_rows):
+        first = i == 0 or table_rows[i - 1].sensor != row.sensor
+        last = i + 1 == len(table_rows) or table_rows[i + 1].sensor != row.sensor
         cells = (row.sensor if first else "", row.name, row.value, row.std, row.unit)
         verdict = Text(row.verdict, style=STYLES[row.verdict])
         out.add_row(*map(Text, cells), verdict, end_section=last)
@@ -46,8 +46,8 @@ def bodies_words(calibration: Calibration) -> str:
     turn = max(float(calibration.group(b, "rotation").std.max()) for b in placed)
     shift = max(float(calibration.group(b, "translation").std.max()) for b in placed)
     return (
-        f"{len(placed)} bodies placed in the frame of {calibration.bodies[0]}, std up to {shown(np.rad2deg(turn))} "
-        f"deg, {shown(1e3 * shift)} mm; poses are in calibration.yaml."
+        f"{len(placed)} bodies placed in the frame of {calibration.bodies[0]}, std up to "
+        f"{format_number(np.rad2deg(turn))} deg, {format_number(1e3 * shift)} mm; poses are in calibration.yaml."
     )
 
 
@@ -57,11 +57,11 @@ def relative_words(calibration: Calibration) -> list[str]:
     lines = []
     for r in relative_poses(calibration):
         turn, move = np.rad2deg(r.std[:3]), 1e3 * r.std[3:]
-        x, y, z = (f"{v:.1f} +- {shown(s)}" for v, s in zip(1e3 * r.T[:3, 3], move, strict=True))
-        a, b, c = (f"{v:.3f} +- {shown(s)}" for v, s in zip(rpy_deg(r.T[:3, :3]), turn, strict=True))
+        x, y, z = (f"{v:.1f} +- {format_number(s)}" for v, s in zip(1e3 * r.T[:3, 3], move, strict=True))
+        a, b, c = (f"{v:.3f} +- {format_number(s)}" for v, s in zip(rpy_deg(r.T[:3, :3]), turn, strict=True))
         baseline = ""
         if {r.frame, r.sensor} <= set(calibration.cameras):
-            baseline = f"baseline {1e3 * r.distance:.2f} +- {shown(1e3 * r.distance_std)} mm; "
+            baseline = f"baseline {1e3 * r.distance:.2f} +- {format_number(1e3 * r.distance_std)} mm; "
         lines.append(f"{r.name}: {baseline}x, y, z {x}, {y}, {z} mm; roll, pitch, yaw {a}, {b}, {c} deg")
     return lines
 

@@ -29,25 +29,27 @@ class Ellipsoid:
 
 def ellipsoids(c: Calibration) -> list[Ellipsoid]:
     """Uncertainty ellipsoids of all estimated translations."""
-    found = []
+    shapes = []
     for name in c.mounted:
         group = c.group(name, "translation")
         if group.columns is None:
             continue
         values, axes = np.linalg.eigh(joint_covariance(c, [group]))
         axes[:, 0] *= np.sign(np.linalg.det(axes))
-        found.append(Ellipsoid(name, worst(group.verdict), axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))))
-    return found
+        shapes.append(Ellipsoid(name, worst(group.verdict), axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))))
+    return shapes
 
 
 def magnification(c: Calibration) -> float:
     """Largest power of ten, at least 1, by which all determined ellipsoids can be magnified and stay smaller than the
     rig. If none is determined, the smallest ellipsoid is used."""
     sizes = [(e.verdict, float(e.half_sizes.max())) for e in ellipsoids(c)]
-    shown = [size for verdict, size in sizes if verdict == "determined"] or [min((x for _, x in sizes), default=0.0)]
-    if not 0.0 < max(shown) < np.inf:
+    reference_sizes = [size for verdict, size in sizes if verdict == "determined"] or [
+        min((x for _, x in sizes), default=0.0)
+    ]
+    if not 0.0 < max(reference_sizes) < np.inf:
         return 1.0
-    return max(1.0, 10.0 ** float(np.floor(np.log10(_LARGEST * rig_shapes.spread(c) / max(shown)))))
+    return max(1.0, 10.0 ** float(np.floor(np.log10(_LARGEST * rig_shapes.spread(c) / max(reference_sizes)))))
 
 
 def outline(e: Ellipsoid, factor: float) -> np.ndarray:

@@ -50,8 +50,8 @@ def residual_plane(r: ImageResiduals) -> Figure:
 def residuals_over_time(r: ImageResiduals) -> Figure:
     """Length of each residual and RMS of each image over time [px]."""
     size = np.linalg.norm(r.residual, axis=1)
-    used, gone = np.flatnonzero(r.used), np.flatnonzero(_measured(r))
-    some, few = used[thin(len(used), MOST_DOTS)], gone[thin(len(gone), MOST_DOTS)]
+    used, rejected = np.flatnonzero(r.used), np.flatnonzero(_measured(r))
+    some, few = used[thin(len(used), MOST_DOTS)], rejected[thin(len(rejected), MOST_DOTS)]
     rms, keep = rms_of_images(r), thin(len(r.seconds), MOST_DOTS)
     top = 1.5 * float(size[used].max(initial=1e-3))
     seconds, clipped = r.seconds[image_of(r)], "rejected (clipped to the frame)"
@@ -91,10 +91,10 @@ def residuals_over_image(r: ImageResiduals, resolution: tuple[int, int]) -> Figu
         "colorbar": {"title": {"text": "RMS [px]"}, "thickness": 10},
         "hovertemplate": "RMS %{z} px<extra></extra>",
     }
-    gone = r.uv[r.rejected][thin(int(r.rejected.sum()), MOST_DOTS)]
+    rejected = r.uv[r.rejected][thin(int(r.rejected.sum()), MOST_DOTS)]
     traces = [heat, *_arrows(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2), mean)]
-    if len(gone):
-        traces.append(dots(gone[:, 0], gone[:, 1], "rejected", REJECTED))
+    if len(rejected):
+        traces.append(dots(rejected[:, 0], rejected[:, 1], "rejected", REJECTED))
     return figure(
         traces,
         400,

@@ -77,8 +77,8 @@ def _board(c: Calibration) -> list[dict]:
     target, stands = target_from_plain(c.rig), rig_shapes.scene_in_worlds(c)
     if target is None or not stands:
         return []
-    shown = c.bodies or target.bodies
-    outline = np.concatenate([_outline(c, target, target.bodies.index(body)) for body in shown])
+    bodies = c.bodies or target.bodies
+    outline = np.concatenate([_outline(c, target, target.bodies.index(body)) for body in bodies])
     return [path_3d(outline @ R.T, name, "#be185d") for name, R in stands]
 
 

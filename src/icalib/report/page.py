@@ -18,7 +18,7 @@ from icalib.result import Calibration
 from icalib.result.summary import body_name, reference_name
 from icalib.result.verdict import NEXT
 
-_NOT_HELD_OUT = (
+_NO_CROSS_VALIDATION = (
     "No cross-validation: the recording is too short for segments, or segments are off in the rig file, or its halves "
     "have no parameter in common that both know."
 )
@@ -82,7 +82,7 @@ def document(title: str, body: str, figures: dict[str, Figure]) -> str:
 
 def _figures(c: Calibration) -> dict[str, Figure]:
     """Figures that are not about one kind of sensor, by the id of their HTML element."""
-    found = {
+    figures = {
         "rig": rig_figures.rig_picture(c),
         "histogram": normalised_histogram(c),
         "trajectory": motion_figures.trajectory(c),
@@ -91,24 +91,24 @@ def _figures(c: Calibration) -> dict[str, Figure]:
         "correlation": rig_figures.correlation(c),
     }
     if c.imu is None:
-        del found["motion"]
+        del figures["motion"]
     if c.cross_validation is not None:
-        found["held-out"] = cross_validation_figures.moved_without_parts(c, c.cross_validation)
-    return found
+        figures["held-out"] = cross_validation_figures.jackknife_shifts(c, c.cross_validation)
+    return figures
 
 
 def _cross_validation_section(c: Calibration) -> Html:
     """Sentences, table and place for the figure of the cross-validation."""
-    held = c.cross_validation
-    if held is None:
-        return element("p", _NOT_HELD_OUT, "quiet")
-    rise, verdict, parts = cross_validation_figures.words(c, held)
-    found = [
+    cross_validation = c.cross_validation
+    if cross_validation is None:
+        return element("p", _NO_CROSS_VALIDATION, "quiet")
+    rise, verdict, parts = cross_validation_figures.words(c, cross_validation)
+    paragraphs = [
         element("p", verdict, "answer"),
         element("p", f"{rise} {parts}"),
-        cross_validation_figures.predicted_fits(held),
+        cross_validation_figures.predicted_fits(cross_validation),
     ]
-    return Html("".join((*found, element("h3", "Parameters without each part"), plot_place("held-out"))))
+    return Html("".join((*paragraphs, element("h3", "Parameters without each part"), plot_place("held-out"))))
 
 
 def script_json(figures: dict[str, Figure]) -> str:

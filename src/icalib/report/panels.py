@@ -6,14 +6,14 @@ from icalib.report.plot import COLORS, Figure, figure, line, stacked_axes, thin,
 from icalib.result import RowResiduals
 
 MOST_ROWS = 2500  # rows in one figure; more are thinned out
-SHOWN_UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
+DISPLAY_UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 
 
 def panels(r: RowResiduals) -> Figure:
     """Residuals over time, one panel for each column, with a common time axis. Units with rad and m are shown in mrad
     and mm."""
     keep = thin(len(r.seconds), MOST_ROWS)
-    shown = [SHOWN_UNITS.get(unit, (unit, 1.0)) for unit in r.units]
+    units = [DISPLAY_UNITS.get(unit, (unit, 1.0)) for unit in r.units]
     traces = [
         line(
             r.seconds[keep],
@@ -23,7 +23,7 @@ def panels(r: RowResiduals) -> Figure:
             yaxis=y_of(k),
             line={"color": COLORS[k % len(COLORS)], "width": 1},
         )
-        for k, (label, (_, scale)) in enumerate(zip(r.labels, shown, strict=True))
+        for k, (label, (_, scale)) in enumerate(zip(r.labels, units, strict=True))
     ]
-    titles = [f"{label} [{unit}]" for label, (unit, _) in zip(r.labels, shown, strict=True)]
+    titles = [f"{label} [{unit}]" for label, (unit, _) in zip(r.labels, units, strict=True)]
     return figure(traces, 130 * len(titles) + 90, **stacked_axes(titles))

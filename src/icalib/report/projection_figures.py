@@ -9,12 +9,12 @@ import numpy as np
 
 from icalib.report.plot import Figure, axis, dots, figure, numbers, thin
 from icalib.result import Calibration, ImageResiduals, ProjectionMap, projection_uncertainty, working_distance
-from icalib.result.quantities import shown
+from icalib.result.quantities import format_number
 
 MOST_DOTS = 1500
 WIDEST = 6.0  # end of the colour scale, in medians over the seen cells, so that edges without data do not set it
 LEVELS = 9  # least number of contours
-NOT_SEEN = 3.0  # worst over median sigma, above which the page asks for observations near the worst pixel
+UNOBSERVED_RATIO = 3.0  # worst over median sigma, above which the page asks for observations near the worst pixel
 
 
 def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
@@ -26,8 +26,8 @@ def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
     return [m for m in maps if m is not None]
 
 
-def projection_figure(m: ProjectionMap, seen: Sequence[ImageResiduals], resolution: tuple[int, int]) -> Figure:
-    """Standard deviation over the image with contours [px], and the observations `seen` of the camera. resolution:
+def projection_figure(m: ProjectionMap, residuals: Sequence[ImageResiduals], resolution: tuple[int, int]) -> Figure:
+    """Standard deviation over the image with contours [px], and the observations in `residuals`. resolution:
     width and height [px]."""
     width, height = resolution
     top = float(min(np.nanmax(m.sigma), WIDEST * m.median_seen))
@@ -47,7 +47,7 @@ def projection_figure(m: ProjectionMap, seen: Sequence[ImageResiduals], resoluti
     }
     heat["contours"] |= {"coloring": "heatmap", "labelfont": {"size": 10, "color": "#111827"}}
     traces = [heat]
-    for r in seen:
+    for r in residuals:
         used = r.uv[r.used]
         used = used[thin(len(used), MOST_DOTS)]
         marker = {"color": "#b45309", "size": 2.5, "opacity": 0.35}
@@ -70,18 +70,18 @@ def _round(step: float) -> float:
 
 def title(m: ProjectionMap) -> str:
     """Title of a map: the distance of the points."""
-    return "Points far away" if np.isinf(m.range_m) else f"Points {shown(m.range_m)} m away, like those it saw"
+    return "Points far away" if np.isinf(m.range_m) else f"Points {format_number(m.range_m)} m away, like those it saw"
 
 
 def words(m: ProjectionMap) -> str:
     """Text on a map: the median and the largest standard deviation, and what they mean."""
     size, u, v = m.worst
     where = "where it saw points" if m.seen.any() else "over the image"
-    moved = "turned" if np.isinf(m.range_m) else "turned and moved"
+    motion = "turned" if np.isinf(m.range_m) else "turned and moved"
     text = (
-        f"Known to {shown(m.median_seen)} px {where} (median), to {shown(size)} px at the worst, at pixel "
-        f"({u:.0f}, {v:.0f}): by so much, one standard deviation, this camera disagrees with the true one that is "
-        f"{moved} to fit it best."
+        f"Known to {format_number(m.median_seen)} px {where} (median), to {format_number(size)} px at the worst, at "
+        f"pixel ({u:.0f}, {v:.0f}): by so much, one standard deviation, this camera disagrees with the true one that "
+        f"is {motion} to fit it best."
     )
-    worse = size > NOT_SEEN * m.median_seen and m.seen.any()
+    worse = size > UNOBSERVED_RATIO * m.median_seen and m.seen.any()
     return text + (" Let it see points there, too, and the lens is known there." if worse else "")

@@ -37,9 +37,9 @@ class ResidualCloud:
 def curves(c: Calibration, r: Residuals) -> Iterator[ResidualCurve]:
     """Curves of one residual record as its kind of sensor defines them; by default one whitened curve for each column
     of `RowResiduals`."""
-    own = call_kind(c.rig["sensors"][r.sensor]["type"], "show", "curves", r)
-    if own is not None:
-        yield from own
+    kind_curves = call_kind(c.rig["sensors"][r.sensor]["type"], "show", "curves", r)
+    if kind_curves is not None:
+        yield from kind_curves
     elif isinstance(r, RowResiduals):
         for k, label in enumerate(r.labels):
             yield ResidualCurve(label, r.seconds, r.whitened[:, k : k + 1], (f"{label}, whitened",))

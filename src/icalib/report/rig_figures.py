@@ -55,12 +55,12 @@ def _uncertainty(e: Ellipsoid, origin: np.ndarray, factor: float) -> dict[str, A
 def correlation(c: Calibration) -> Figure:
     """Correlation coefficients of all estimated parameters except scene planes, from the formal covariance."""
     planes = {p.name for p in c.planes}
-    own = [i for i, name in enumerate(c.covariance_names) if name.rsplit(".", 2)[0] not in planes]
-    covariance = c.covariance[np.ix_(own, own)]
+    columns = [i for i, name in enumerate(c.covariance_names) if name.rsplit(".", 2)[0] not in planes]
+    covariance = c.covariance[np.ix_(columns, columns)]
     std = np.sqrt(np.diag(covariance))
     scale = np.where(std > 0.0, std, 1.0)
     rho = covariance / np.outer(scale, scale)
-    names = [c.covariance_names[i].replace("time_offset.time_offset", "time_offset") for i in own]
+    names = [c.covariance_names[i].replace("time_offset.time_offset", "time_offset") for i in columns]
     heat = {
         "type": "heatmap",
         "z": numbers(np.round(rho, 3)),

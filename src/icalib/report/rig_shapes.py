@@ -33,8 +33,8 @@ def shape(c: Calibration, name: str) -> np.ndarray | None:
 
 def legends(c: Calibration) -> list[str]:
     """Explanations of the shapes of all kinds of sensors in the rig."""
-    own = (getattr(facet(kind, "show"), "LEGEND", "") for kind in SENSOR_KINDS if c.of_type(kind))
-    return [legend for legend in own if legend]
+    texts = (getattr(facet(kind, "show"), "LEGEND", "") for kind in SENSOR_KINDS if c.of_type(kind))
+    return [legend for legend in texts if legend]
 
 
 def body_outline(target: Target, body: int) -> np.ndarray:

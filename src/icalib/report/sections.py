@@ -33,20 +33,22 @@ class Section:
 def sections(c: Calibration) -> list[Section]:
     """Sections of all kinds of sensors in the order of `SENSOR_KINDS`, with the IMU last. A kind without a `sections`
     function gets those of `row_sections`."""
-    found = []
+    all_sections = []
     for kind in (*SENSOR_KINDS[1:], SENSOR_KINDS[0]):
-        own = facet(kind, "show")
-        found += own.sections(c) if hasattr(own, "sections") else row_sections(c, kind, kind, kind.capitalize(), "")
-    return found
+        module = facet(kind, "show")
+        all_sections += (
+            module.sections(c) if hasattr(module, "sections") else row_sections(c, kind, kind, kind.capitalize(), "")
+        )
+    return all_sections
 
 
 def row_sections(c: Calibration, kind: str, name: str, title: str, words: str) -> Iterator[Section]:
     """One section with `panels` of each sensor of type `kind` that has `RowResiduals`; none if no sensor has any. name:
     HTML id; words: added to the introduction."""
-    own = [r for r in c.residuals.values() if isinstance(r, RowResiduals) and r.sensor in c.of_type(kind)]
-    if own:
-        figures = {f"{name}-{i}": panels(r) for i, r in enumerate(own)}
-        parts = [element("h3", r.sensor) + plot_place(place) for place, r in zip(figures, own, strict=True)]
+    residuals = [r for r in c.residuals.values() if isinstance(r, RowResiduals) and r.sensor in c.of_type(kind)]
+    if residuals:
+        figures = {f"{name}-{i}": panels(r) for i, r in enumerate(residuals)}
+        parts = [element("h3", r.sensor) + plot_place(place) for place, r in zip(figures, residuals, strict=True)]
         yield Section(name, title, f"Predicted - measured. {words}".strip(), Html("".join(parts)), figures)
 
 

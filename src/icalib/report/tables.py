@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from icalib.result import Calibration, relative_poses
-from icalib.result.quantities import chi2_words, dof_words, rms_words, rows, rpy_deg, shown
+from icalib.result.quantities import chi2_words, dof_words, format_number, rms_words, rows, rpy_deg
 from icalib.result.verdict import Usability, worst
 from icalib.sensors import call_all_kinds
 
@@ -76,8 +76,10 @@ def trust(c: Calibration) -> str:
 def parameters(c: Calibration) -> Html:
     """Table of all parameters except poses of the target's rigid bodies; sensors come first."""
     headers = ("sensor", "parameter", "value", "std", "unit", "formal std", "factor", "verdict")
-    own = sorted((r for r in rows(c) if r.sensor not in c.bodies), key=lambda r: r.sensor not in c.rig["sensors"])
-    body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in own]
+    table_rows = sorted(
+        (r for r in rows(c) if r.sensor not in c.bodies), key=lambda r: r.sensor not in c.rig["sensors"]
+    )
+    body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in table_rows]
     return table(headers, body, ("value", "std", "formal std", "factor"))
 
 
@@ -96,14 +98,14 @@ def _body_row(c: Calibration, body: str) -> list[object]:
     values = [f"{1e3 * x:.2f}" for x in move.value] + [f"{x:.3f}" for x in rpy_deg(turn.value)]
     if turn.columns is None:
         return [*values, "", "", badge("fixed")]
-    std = [shown(1e3 * float(move.std.max())), shown(float(np.rad2deg(turn.std.max())))]
+    std = [format_number(1e3 * float(move.std.max())), format_number(float(np.rad2deg(turn.std.max())))]
     return [*values, *std, badge(worst((*turn.verdict, *move.verdict)))]
 
 
 def poses(c: Calibration) -> Html:
     """T_body_sensor of each sensor as a 4x4 matrix, as text to copy."""
-    shown = c.mounted if c.body == c.reference else c.on_body
-    return element("div", [_matrix(f"T_{c.body}_{name}", c.T_body_sensor(name)) for name in shown], "matrices")
+    names = c.mounted if c.body == c.reference else c.on_body
+    return element("div", [_matrix(f"T_{c.body}_{name}", c.T_body_sensor(name)) for name in names], "matrices")
 
 
 def _matrix(name: str, T: np.ndarray) -> Html:
@@ -113,8 +115,8 @@ def _matrix(name: str, T: np.ndarray) -> Html:
 
 def relative(c: Calibration) -> Html:
     """Table and matrices of the relative poses of all pairs in `relative_poses`; empty if there are none."""
-    found = relative_poses(c)
-    if not found:
+    pairs = relative_poses(c)
+    if not pairs:
         return Html("")
     title = element("h3", "One sensor seen from another")
     words = element(
@@ -125,11 +127,11 @@ def relative(c: Calibration) -> Html:
     )
     headers = ("", "distance [mm]", "x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
     body = []
-    for r in found:
+    for r in pairs:
         values = [1e3 * r.distance, *(1e3 * r.T[:3, 3]), *rpy_deg(r.T[:3, :3])]
         std = [1e3 * r.distance_std, *(1e3 * r.std[3:]), *np.rad2deg(r.std[:3])]
-        body.append((r.name, *(f"{x:.3f} ± {shown(s)}" for x, s in zip(values, std, strict=True))))
-    matrices = element("div", [_matrix(r.name, r.T) for r in found], "matrices")
+        body.append((r.name, *(f"{x:.3f} ± {format_number(s)}" for x, s in zip(values, std, strict=True))))
+    matrices = element("div", [_matrix(r.name, r.T) for r in pairs], "matrices")
     return Html(title + words + table(headers, body, headers[1:]) + matrices)
 
 
@@ -144,21 +146,21 @@ def facts(c: Calibration) -> Html:
     """Tables of settings, versions, wall times, sensor rates and input files."""
     names = ("setting", "value")
     parts: list[object] = []
-    for title, found in (
+    for title, values in (
         ("Settings", c.settings),
         ("Versions", c.versions),
         ("Wall time [s]", {k: f"{v:.2f}" for k, v in c.timings.items()}),
         ("Rates [Hz]", {k: f"{v:.4g}" for k, v in c.rates.items()}),
     ):
-        parts.append(element("section", [element("h3", title), table(names, found.items())]))
+        parts.append(element("section", [element("h3", title), table(names, values.items())]))
     files = table(("file", "sha256"), [(name, element("code", digest)) for name, digest in c.inputs.items()])
     return Html(element("div", parts, "grid") + element("h3", "Input files") + files)
 
 
 def size_words(c: Calibration) -> str:
     """One line on the amount of data used: recordings, duration, measurements of each kind, keyframes."""
-    whole = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
+    duration = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
     several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
-    span = sum(r.end - r.start for r in c.recordings) if several else whole
+    span = sum(r.end - r.start for r in c.recordings) if several else duration
     parts = [f"{several}{span:.1f} s"]
     return ", ".join([*parts, *call_all_kinds("show", "amounts", c), f"{len(c.trajectory.seconds)} keyframes"])

@@ -52,9 +52,9 @@ def rig_text(c: Calibration, treatment: Treatment) -> tuple[str, tuple[str, ...]
     settings = {name: value for name, value in plain.pop("settings").items() if value != defaults[name]}
     plain |= {"settings": settings} if settings else {}
     words = {"fixed": "are fixed", "prior": "have priors of its standard deviations", "guess": "are guesses"}
-    said = [f"Rig file by icalib, from a result: its values {words[treatment]}.", *sentences]
+    comments = [f"Rig file by icalib, from a result: its values {words[treatment]}.", *sentences]
     body = yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
-    return "".join(f"# {sentence}\n" for sentence in said) + body, sentences
+    return "".join(f"# {sentence}\n" for sentence in comments) + body, sentences
 
 
 def _is_derived(sensor: Any, g: ParameterGroup) -> bool:

@@ -29,19 +29,19 @@ def in_body_frame(c: Calibration) -> Calibration:
     """
     if c.body == c.reference:
         return c
-    groups, J, names = list[ParameterGroup](), [np.zeros((0, len(c.covariance)))], list[str]()
+    groups, row_blocks, names = list[ParameterGroup](), [np.zeros((0, len(c.covariance)))], list[str]()
     for group, rows in _reframed(c):
         columns = tuple(range(len(names), len(names) + len(rows))) if rows.any() else None
         groups.append(replace(group, columns=columns))
         if columns is not None:
-            J.append(rows)
+            row_blocks.append(rows)
             names += [f"{group.sensor}.{group.name}.{label}" for label in group.labels]
-    whole = np.vstack(J)
-    null = _null_space(c, whole, groups)
+    J = np.vstack(row_blocks)
+    null = _null_space(c, J, groups)
     return replace(
         c,
         groups=tuple(_with_null_space(c, g, null) for g in groups),
-        covariance=whole @ c.covariance @ whole.T,
+        covariance=J @ c.covariance @ J.T,
         covariance_names=tuple(names),
         null_space=null,
     )
@@ -71,10 +71,10 @@ def _pose(c: Calibration, sensor: str) -> Iterator[tuple[ParameterGroup, np.ndar
         verdict: tuple[Verdict, ...] = tuple("fixed" if s == 0.0 else by_size(s) for s in sizes)
         factor = np.divide(std, formal, out=np.ones(3), where=formal > 0.0)
         mode = "free" if rows.any() else "fixed"
-        own = ParameterGroup(
+        group = ParameterGroup(
             sensor, spec.name, spec.labels, spec.unit, value, formal, std, verdict, mode, factor=factor
         )
-        yield own, rows
+        yield group, rows
 
 
 def _rows(c: Calibration, group: ParameterGroup | None) -> np.ndarray:
@@ -106,11 +106,11 @@ def _null_space(c: Calibration, J: np.ndarray, groups: Sequence[ParameterGroup])
 def _pose_tolerances(c: Calibration, groups: Sequence[ParameterGroup], size: int) -> np.ndarray:
     """(size,) tolerances of the parameters in `groups`: of rotations [rad] and translations [m]. All other entries are
     1, as J leaves these parameters unchanged."""
-    found = np.ones(size)
+    tolerances = np.ones(size)
     for spec in _POSE:
         columns = [k for g in groups if g.name == spec.name for k in g.columns or ()]
-        found[columns] = _allowed(c, spec.tolerance)
-    return found
+        tolerances[columns] = _allowed(c, spec.tolerance)
+    return tolerances
 
 
 def _allowed(c: Calibration, setting: object) -> float:

@@ -166,8 +166,8 @@ class Calibration:
     @property
     def imu_residuals(self) -> ImuResiduals:
         """Residuals of the IMU. Raises ValueError without an IMU."""
-        (found,) = self.residuals_of(ImuResiduals.kind)
-        return found
+        (residuals,) = self.residuals_of(ImuResiduals.kind)
+        return residuals
 
     @property
     def lidar_residuals(self) -> tuple[Any, ...]:
@@ -213,8 +213,8 @@ class Calibration:
 
     def group(self, sensor: str, name: str) -> ParameterGroup:
         """The group `name` of `sensor`. Raises KeyError, which lists the existing groups."""
-        if (found := self.group_or_none(sensor, name)) is not None:
-            return found
+        if (group := self.group_or_none(sensor, name)) is not None:
+            return group
         raise KeyError(f"no {name} of {sensor}; there are {', '.join(f'{g.sensor}.{g.name}' for g in self.groups)}")
 
     def group_or_none(self, sensor: str, name: str) -> ParameterGroup | None:

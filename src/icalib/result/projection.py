@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from icalib.result.calibration import Calibration
 
 COLUMNS = 36  # cells of the grid across the width of the image
-FEWEST_SEEN = 12  # cells with observations; with fewer, the pose change is fitted over the whole image
+FEWEST_OBSERVED = 12  # cells with observations; with fewer, the pose change is fitted over the whole image
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ProjectionMap:
 
     u (n,), v (m,): centres of the grid cells [px]. sigma (m, n): standard deviations [px], NaN if the model has no ray.
     seen (m, n) bool: cells with corners or tracked points. The pose change is fitted over the seen cells, or over all
-    cells if fewer than `FEWEST_SEEN` are seen.
+    cells if fewer than `FEWEST_OBSERVED` are.
     """
 
     camera: str
@@ -49,8 +49,8 @@ class ProjectionMap:
     @property
     def median_seen(self) -> float:
         """Median sigma over the seen cells [px]; over the whole image if no cell is seen."""
-        own = self.sigma[self.seen & np.isfinite(self.sigma)]
-        return float(np.median(own)) if len(own) else float(np.nanmedian(self.sigma))
+        sigmas = self.sigma[self.seen & np.isfinite(self.sigma)]
+        return float(np.median(sigmas)) if len(sigmas) else float(np.nanmedian(self.sigma))
 
     @property
     def worst(self) -> tuple[float, float, float]:
@@ -70,13 +70,13 @@ def projection_uncertainty(c: Calibration, camera: str, range_m: float = np.inf)
     n, m = COLUMNS, max(1, round(COLUMNS * height / width))
     u, v = (np.arange(n) + 0.5) * width / n - 0.5, (np.arange(m) + 0.5) * height / m - 0.5
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    seen = np.zeros((m, n), dtype=bool)
+    observed = np.zeros((m, n), dtype=bool)
     for r in (r for r in c.image_residuals if r.sensor == camera):
         cell = ((r.uv[r.used] + 0.5) * [n / width, m / height]).astype(int)
-        seen[np.clip(cell[:, 1], 0, m - 1), np.clip(cell[:, 0], 0, n - 1)] = True
+        observed[np.clip(cell[:, 1], 0, m - 1), np.clip(cell[:, 0], 0, n - 1)] = True
     params = np.concatenate([g.value for g in lens])
-    sigma = projection_std(model, params, joint_covariance(c, lens), uv, seen.ravel(), range_m)
-    return ProjectionMap(camera, range_m, u, v, sigma.reshape(m, n), seen) if np.isfinite(sigma).any() else None
+    sigma = projection_std(model, params, joint_covariance(c, lens), uv, observed.ravel(), range_m)
+    return ProjectionMap(camera, range_m, u, v, sigma.reshape(m, n), observed) if np.isfinite(sigma).any() else None
 
 
 def projection_std(
@@ -84,48 +84,48 @@ def projection_std(
     params: np.ndarray,
     covariance: np.ndarray,
     uv: np.ndarray,
-    seen: np.ndarray,
+    observed: np.ndarray,
     range_m: float = np.inf,
 ) -> np.ndarray:
     """(N,) standard deviation of the projection in the worst direction [px] at pixels uv (N, 2); NaN without a ray.
 
     params (P,), covariance (P, P): intrinsics and distortion. range_m: distance of the points [m]. The absorbed pose
-    change is fitted over the pixels `seen` (N,) bool, or over all if fewer than `FEWEST_SEEN` are usable.
+    change is fitted over the pixels `observed` (N,) bool, or over all if fewer than `FEWEST_OBSERVED` are usable.
     """
     rays, valid = model.unproject(params, uv)
     points = rays * (range_m if np.isfinite(range_m) else 1.0)
-    _, projected, j_point, j_params = model.project_with_jacobians(params, points)
+    _, projected, J_point, J_lens = model.project_with_jacobians(params, points)
     valid &= projected
-    j_motion = j_point @ _moved_by(points, np.isfinite(range_m))
-    used = valid & seen
-    used = used if np.count_nonzero(used) >= FEWEST_SEEN else valid
-    size = j_motion.shape[2]
-    K = np.linalg.lstsq(j_motion[used].reshape(-1, size), -j_params[used].reshape(-1, len(params)), rcond=None)[0]
-    left = j_params + j_motion @ K
-    worst = np.linalg.eigvalsh(left @ covariance @ left.transpose(0, 2, 1))[:, -1]
+    J_pose = J_point @ _point_by_pose(points, np.isfinite(range_m))
+    used = valid & observed
+    used = used if np.count_nonzero(used) >= FEWEST_OBSERVED else valid
+    size = J_pose.shape[2]
+    K = np.linalg.lstsq(J_pose[used].reshape(-1, size), -J_lens[used].reshape(-1, len(params)), rcond=None)[0]
+    J_absorbed = J_lens + J_pose @ K
+    worst = np.linalg.eigvalsh(J_absorbed @ covariance @ J_absorbed.transpose(0, 2, 1))[:, -1]
     return np.where(valid, np.sqrt(np.maximum(worst, 0.0)), np.nan)
 
 
-def _moved_by(points: np.ndarray, near: bool) -> np.ndarray:
+def _point_by_pose(points: np.ndarray, near: bool) -> np.ndarray:
     """(N, 3, 3) Jacobian d points / d rotation of points (N, 3). If `near`: (N, 3, 6), followed by the Jacobian by a
     translation in units of each point's distance."""
     x, y, z = points.T
     zero = np.zeros_like(x)
-    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    J_rotation = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
     if not near:
-        return turned
-    shifted = np.linalg.norm(points, axis=1)[:, None, None] * np.eye(3)
-    return np.concatenate([turned, shifted], axis=2)
+        return J_rotation
+    J_translation = np.linalg.norm(points, axis=1)[:, None, None] * np.eye(3)
+    return np.concatenate([J_rotation, J_translation], axis=2)
 
 
 def working_distance(c: Calibration, camera: str) -> float | None:
     """Median distance of `camera` from the first point of the target in images that show the target [m]. Without such
     images, the median distance of its tracked points; None without either."""
-    own = [r for r in c.corner_residuals if r.sensor == camera and len(r.uv)]
-    if not own:
+    residuals = [r for r in c.corner_residuals if r.sensor == camera and len(r.uv)]
+    if not residuals:
         return next((r.distance for r in c.track_residuals if r.sensor == camera), None)
     path = c.trajectory
-    seconds = own[0].seconds[np.diff(own[0].start) > 0]
+    seconds = residuals[0].seconds[np.diff(residuals[0].start) > 0]
     node = np.clip(np.searchsorted(path.seconds, seconds), 0, len(path.seconds) - 1)
     # The world's origin is the target's first point.
     centre = path.position[node] + path.rotation[node] @ c.group(camera, "translation").value

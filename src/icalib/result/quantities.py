@@ -38,15 +38,15 @@ class Row:
 def rows(calibration: Calibration) -> list[Row]:
     """Rows of all parameters of all sensors, in the order of the groups, with poses relative to the body. IMU
     intrinsics that stay close to their prior share one row; an ideal IMU has none."""
-    found = []
-    for group in shown_groups(in_body_frame(calibration)):
-        own = _rows_of(group)
+    table_rows = []
+    for group in nontrivial_groups(in_body_frame(calibration)):
+        group_rows = _rows_of(group)
         sharpened = _sharpened(calibration, group)
-        found += [row for row, shown in zip(own, sharpened, strict=True) if shown]
-        if rest := [row for row, shown in zip(own, sharpened, strict=True) if not shown]:
-            verdict = worst(tuple(row.verdict for row in rest))
-            found.append(Row(group.sensor, f"{len(rest)} more intrinsics", "prior", "", "", "", "", verdict))
-    return found
+        table_rows += [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if is_sharper]
+        if merged := [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if not is_sharper]:
+            verdict = worst(tuple(row.verdict for row in merged))
+            table_rows.append(Row(group.sensor, f"{len(merged)} more intrinsics", "prior", "", "", "", "", verdict))
+    return table_rows
 
 
 def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
@@ -59,7 +59,7 @@ def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
     return (group.std < SHARPENED * np.array(prior["sigma"])).tolist()
 
 
-def shown_groups(calibration: Calibration) -> list[ParameterGroup]:
+def nontrivial_groups(calibration: Calibration) -> list[ParameterGroup]:
     """All groups except those fixed at zero, and except the identity rotation of the body or the reference."""
     still = [(name, "rotation") for name in (calibration.body, calibration.reference)]
     return [
@@ -76,7 +76,7 @@ def rpy_deg(R: np.ndarray) -> np.ndarray:
     return np.rad2deg([atan2(R[2, 1], R[2, 2]), pitch, atan2(R[1, 0], R[0, 0])])
 
 
-def shown(value: float, digits: int = 2) -> str:
+def format_number(value: float, digits: int = 2) -> str:
     """`value` with `digits` significant digits, without an exponent if it is in 1e-5 to 1e6; "unknown" for NaN,
     "infinite" for infinity."""
     if not isfinite(value):
@@ -88,7 +88,7 @@ def shown(value: float, digits: int = 2) -> str:
 
 def chi2_words(fit: SensorFit) -> str:
     """Text of chi^2 per post-fit degree of freedom."""
-    return "n/a (no redundancy)" if fit.chi2_per_dof is None else shown(fit.chi2_per_dof, 3)
+    return "n/a (no redundancy)" if fit.chi2_per_dof is None else format_number(fit.chi2_per_dof, 3)
 
 
 def dof_words(fit: SensorFit) -> str:
@@ -101,7 +101,7 @@ def rms_words(fit: SensorFit) -> str:
     if fit.rms is None:
         return ""
     unit, scale = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(fit.unit, (fit.unit, 1.0))
-    return f"{shown(scale * fit.rms, 3)} {unit}".rstrip()
+    return f"{format_number(scale * fit.rms, 3)} {unit}".rstrip()
 
 
 def _rows_of(group: ParameterGroup) -> list[Row]:
@@ -113,8 +113,8 @@ def _rows_of(group: ParameterGroup) -> list[Row]:
             sensor=group.sensor,
             name=names[i],
             value=_value_text(values[i], scale * group.std[i]),
-            std="" if verdict == "fixed" else shown(scale * group.std[i]),
-            formal="" if verdict == "fixed" else shown(scale * group.std_formal[i]),
+            std="" if verdict == "fixed" else format_number(scale * group.std[i]),
+            formal="" if verdict == "fixed" else format_number(scale * group.std_formal[i]),
             factor="" if factors[i] is None else f"{factors[i]:.1f}",
             unit=unit,
             verdict=verdict,

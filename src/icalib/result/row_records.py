@@ -22,7 +22,7 @@ def row_record(
     several columns."""
     names = {r.kind: _labels(r) for r in rows} | dict(labels or {})
     columns = [(label, r.unit) for r in rows for label in names[r.kind]]
-    seconds = timeline.shown(rows[0].seconds, timeline.recording_of(rows[0].seconds))
+    seconds = timeline.on_result_clock(rows[0].seconds, timeline.recording_of(rows[0].seconds))
     residual, whitened = (np.hstack([getattr(r, name) for r in rows]) for name in ("residual", "whitened"))
     return RowResiduals(
         rows[0].sensor,

@@ -93,8 +93,8 @@ def _lists(group: ParameterGroup | Plane) -> dict[str, Any]:
     return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in plain.items()}
 
 
-def _plain_cross_validation(held: CrossValidation) -> dict[str, Any]:
-    return _without_arrays(held) | {"fits": [dataclasses.asdict(f) for f in held.fits]}
+def _plain_cross_validation(cross_validation: CrossValidation) -> dict[str, Any]:
+    return _without_arrays(cross_validation) | {"fits": [dataclasses.asdict(f) for f in cross_validation.fits]}
 
 
 def _without_arrays(record: Any) -> dict[str, Any]:
@@ -180,9 +180,9 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
 def _residuals(plain: dict[str, Any], of: Callable[[type, str], dict[str, Any]]) -> Residuals:
     """The residual record of one sensor and kind. Its class is the one that a sensor kind lists in RECORDS, by default
     `RowResiduals`. `of` returns the arrays of a class under a prefix."""
-    own = {record.kind: record for kind in SENSOR_KINDS for record in getattr(facet(kind, "record"), "RECORDS", ())}
+    classes = {record.kind: record for kind in SENSOR_KINDS for record in getattr(facet(kind, "record"), "RECORDS", ())}
     fields = _tuples(plain)
-    record = own.get(fields["kind"], RowResiduals)
+    record = classes.get(fields["kind"], RowResiduals)
     arrays = of(record, f"residuals/{fields['sensor']}/{fields['kind']}")
     if record is not RowResiduals:
         del fields["kind"]  # a constant of the class, not an argument

@@ -63,8 +63,8 @@ def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], 
     """Keys of the parameters of one sensor in calibration.yaml, by (group, label). A key is the label. It is prefixed
     with the group if the label is empty or not unique, or the group has a singular name (`ONE`)."""
     count = Counter(label for g in groups for label in g.labels)
-    own = {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
-    return own | {(name, label): f"{ONE[name]}_{label}" for name, label in own if name in ONE}
+    keys = {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
+    return keys | {(name, label): f"{ONE[name]}_{label}" for name, label in keys if name in ONE}
 
 
 def pose_key(c: Calibration) -> str:
@@ -107,20 +107,22 @@ def _target(c: Calibration, name: str) -> dict[str, Any]:
 def _entry(c: Calibration, name: str) -> dict[str, Any]:
     """Entry of a sensor or target: time_offset and parameters; std, verdict and empirical_factor have the same keys."""
     groups = tuple(g for g in c.groups if g.sensor == name)
-    own = [g for g in groups if g.name in MOUNTED_NAMES or g.value.ndim == 2]
-    rest = tuple(g for g in groups if g.name not in MOUNTED_NAMES and g.value.ndim == 1)
-    entry: dict[str, Any] = {g.name: _short(g, g.value) for g in own if g.name not in (ROTATION.name, TRANSLATION.name)}
-    entry["parameters"] = _by_key(rest, {g.name: g.value for g in rest})
+    by_name = [g for g in groups if g.name in MOUNTED_NAMES or g.value.ndim == 2]
+    by_label = tuple(g for g in groups if g.name not in MOUNTED_NAMES and g.value.ndim == 1)
+    entry: dict[str, Any] = {
+        g.name: _short(g, g.value) for g in by_name if g.name not in (ROTATION.name, TRANSLATION.name)
+    }
+    entry["parameters"] = _by_key(by_label, {g.name: g.value for g in by_label})
     for key, of in (("std", _std), ("verdict", _verdict), ("empirical_factor", _factor)):
-        given = {g.name: _short(g, value) for g in own if (value := of(g)) is not None}
-        entry[key] = given | {"parameters": _by_key(rest, {g.name: of(g) for g in rest})}
+        named_values = {g.name: _short(g, value) for g in by_name if (value := of(g)) is not None}
+        entry[key] = named_values | {"parameters": _by_key(by_label, {g.name: of(g) for g in by_label})}
     return entry
 
 
 def _by_key(groups: tuple[ParameterGroup, ...], values: dict[str, np.ndarray | None]) -> dict[str, Any]:
     keys = parameter_keys(groups)
-    found = ((g, values[g.name]) for g in groups)
-    return {keys[g.name, n]: x for g, v in found if v is not None for n, x in zip(g.labels, v.tolist(), strict=True)}
+    entries = ((g, values[g.name]) for g in groups)
+    return {keys[g.name, n]: x for g, v in entries if v is not None for n, x in zip(g.labels, v.tolist(), strict=True)}
 
 
 def _short(group: ParameterGroup, value: np.ndarray) -> Any:

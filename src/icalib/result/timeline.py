@@ -15,27 +15,27 @@ PAUSE_S = 1.0
 @dataclass(frozen=True)
 class Timeline:
     """Conversion from the joined clock of the estimator to the clock of the result. parts, spans: the n recordings on
-    the first and on the second. moved (n,): what to add to times of each recording [s]."""
+    the first and on the second. shift (n,): added to the times of each recording [s]."""
 
     parts: tuple[Part, ...]
     spans: tuple[RecordingSpan, ...]
-    moved: np.ndarray
+    shift: np.ndarray
 
     @classmethod
     def of(cls, parts: tuple[Part, ...], image_times: list[np.ndarray], body: str) -> Timeline:
         """Timeline of recordings `parts`. image_times: times of each camera's images on the joined clock [s]. body:
         name of the sensor that defines the joined clock."""
-        spans, moved = [], np.zeros(len(parts))
+        spans, shift = [], np.zeros(len(parts))
         for k, part in enumerate(parts):
             first, last = _extent(part, image_times, body)
-            moved[k] = spans[-1].end + PAUSE_S - first if spans else 0.0
+            shift[k] = spans[-1].end + PAUSE_S - first if spans else 0.0
             origin_ns = part.measurements.origin_ns + round(1e9 * (first - part.begin))
-            spans.append(RecordingSpan(part.name, first + moved[k], last + moved[k], origin_ns))
-        return cls(parts, tuple(spans), moved)
+            spans.append(RecordingSpan(part.name, first + shift[k], last + shift[k], origin_ns))
+        return cls(parts, tuple(spans), shift)
 
-    def shown(self, seconds: np.ndarray, recording: np.ndarray) -> np.ndarray:
+    def on_result_clock(self, seconds: np.ndarray, recording: np.ndarray) -> np.ndarray:
         """(n,) times on the clock of the result, from times (n,) on the joined clock and recording indices (n,) [s]."""
-        return seconds + self.moved[recording]
+        return seconds + self.shift[recording]
 
     def recordings_of(self, stream: str) -> np.ndarray:
         """(N,) index of the recording of each stamp of the stream with the key `stream`."""
@@ -51,14 +51,14 @@ class Timeline:
         """Text for an instant on the joined clock [s]: seconds since the start of its recording, and the recording's
         name if there are several. The body sensor must have been running."""
         k = int(self.recording_of(np.array(second)))
-        own = f"{second - self.parts[k].begin:.3f} s"
-        return own if len(self.parts) == 1 else f"{own} of {self.parts[k].name}"
+        text = f"{second - self.parts[k].begin:.3f} s"
+        return text if len(self.parts) == 1 else f"{text} of {self.parts[k].name}"
 
 
 def _extent(part: Part, image_times: list[np.ndarray], body: str) -> tuple[float, float]:
     """Times of the first and the last measurement of a recording, on the joined clock [s]."""
-    own = [part.rows[c.key] for c in part.measurements.cameras]
-    images = [t[rows] for t, rows in zip(image_times, own, strict=True)]
+    image_rows = [part.rows[c.key] for c in part.measurements.cameras]
+    images = [t[rows] for t, rows in zip(image_times, image_rows, strict=True)]
     if not images or part.measurements.imu is not None:  # else the clock is that of a camera
         images.append(part.begin + part.measurements.streams[body].seconds)
     times = np.concatenate(images)

@@ -52,10 +52,10 @@ def usability(c: Calibration) -> Usability:
     """The verdict on the whole result."""
     if not c.converged or c.wrong:
         return "not usable"
-    found = {v for g in c.groups for v in _counted(c, g)}
-    if "undetermined" in found:
+    verdicts = {v for g in c.groups for v in _counted(c, g)}
+    if "undetermined" in verdicts:
         return "partly usable"
-    return "usable with care" if c.warnings or "weak" in found else "usable"
+    return "usable with care" if c.warnings or "weak" in verdicts else "usable"
 
 
 def reasons(c: Calibration) -> tuple[str, ...]:
@@ -104,8 +104,8 @@ def _lens_projection_px(c: Calibration, camera: str) -> float | None:
     groups = [g for g in c.groups if g.sensor == camera and g.name in LENS]
     if len(groups) < len(LENS) or all(g.columns is None for g in groups):
         return None
-    found = projection_uncertainty(c, camera)
-    return None if found is None else found.median_seen
+    projection = projection_uncertainty(c, camera)
+    return None if projection is None else projection.median_seen
 
 
 def lens_verdict(c: Calibration, camera: str) -> Verdict:
@@ -172,8 +172,8 @@ def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:
             continue
         unit, scale = shown_unit(g.unit)
         for label, verdict, std in zip(g.labels, verdicts, g.std.tolist(), strict=False):
-            own = g.name if label in (g.name, "") else f"{g.name} {label}"
-            yield f"{g.sensor} {own.replace('_', ' ')} (std {scale * std:.2g} {unit})".replace(" )", ")"), verdict
+            name = g.name if label in (g.name, "") else f"{g.name} {label}"
+            yield f"{g.sensor} {name.replace('_', ' ')} (std {scale * std:.2g} {unit})".replace(" )", ")"), verdict
 
 
 def _listed(names: list[str]) -> str:

@@ -244,7 +244,7 @@ def _sensor_fits(judged: Sequence[Fit], found: Estimate) -> list[SensorFit]:
 
 def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:
     """The trajectory at the keyframes, on the clock that the user sees."""
-    seconds = timeline.shown(s.seconds, _node_recordings(inputs, s, timeline))
+    seconds = timeline.on_result_clock(s.seconds, _node_recordings(inputs, s, timeline))
     return Trajectory(seconds, s.rotation, s.position, s.velocity, s.bias[:, :3], s.bias[:, 3:])
 
 

@@ -80,7 +80,7 @@ def _track_residuals(estimate: Estimate, timeline: Timeline) -> Iterator[TrackRe
 def _seconds(estimate: Estimate, timeline: Timeline, index: int) -> np.ndarray:
     """(M,) instants [s] of the images of camera `index`, on the time axis of the result."""
     stream = of_type(estimate.problem.factors, CornerFactor)[index].stream
-    return timeline.shown(instants(stream, estimate.outcome.state.values), timeline.recordings_of(stream.key))
+    return timeline.on_result_clock(instants(stream, estimate.outcome.state.values), timeline.recordings_of(stream.key))
 
 
 def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:

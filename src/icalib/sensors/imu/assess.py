@@ -20,7 +20,7 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[I
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
     chain, state = found.problem.chain, found.outcome.state
-    seconds = timeline.shown(state.seconds, state.recording)[:-1]
+    seconds = timeline.on_result_clock(state.seconds, state.recording)[:-1]
     between = np.array(chain.starts[1:], dtype=np.int64) - 1
     whitened = found.outcome.residuals[chain.key].residual
     yield ImuResiduals(chain.name, np.delete(seconds, between), np.delete(whitened, between, axis=0))

@@ -69,7 +69,7 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[L
             len(whole.stamps_ns),
             len(whole.xyz),
             _used(found, stream.name),
-            timeline.shown(seconds, timeline.recording_of(seconds)),
+            timeline.on_result_clock(seconds, timeline.recording_of(seconds)),
             plane,
             np.linalg.norm(stream.xyz, axis=1),
             _sigma(found.judged.noise[stream.name], cosine),

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.base.own_files import SEAL, sealed
 from icalib.result import Calibration, ParameterGroup
-from icalib.result.quantities import shown_groups
+from icalib.result.quantities import nontrivial_groups
 from icalib.tools.batch import plain_record, record_json
 from icalib.tools.fleet.inputs import InputHashes
 
@@ -54,7 +54,7 @@ class JobRecord:
         """Record of a job with a result, converged or not."""
         stamp = min((r.origin_ns for r in result.recordings), default=0)
         low, high = WALL_CLOCK_NS
-        blocks = tuple(_block(g) for g in shown_groups(result) if g.sensor in result.rig["sensors"])
+        blocks = tuple(_block(g) for g in nontrivial_groups(result) if g.sensor in result.rig["sensors"])
         known = stamp if low <= stamp < high else None
         return cls(
             name, result.failure, seconds, inputs, result.status, known, result.undetermined, result.warnings, blocks
