@@ -40,23 +40,23 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, **fields: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **fields)
-        self._given: list[str] = []
+        self._arguments: list[str] = []
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """As the base class, but stores the arguments for `error`, and refuses unknown ones at once, so that the parser
         of the command reports them."""
         if args is not None:
-            self._given = list(args)
-        found, unknown = super().parse_known_args(args, namespace)
+            self._arguments = list(args)
+        parsed, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
-        return found, unknown
+        return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
         """Prints usage and an error message, and exits with code 2."""
-        if found := _CHOICES.search(message):
-            given, available = found["given"].strip("'"), tuple(re.findall(r"[\w./^-]+", found["choices"]))
-            where = f"{message[: found.start()]}there is no {given!r}{suggestion(given, available)}"
+        if match := _CHOICES.search(message):
+            value, available = match["given"].strip("'"), tuple(re.findall(r"[\w./^-]+", match["choices"]))
+            where = f"{message[: match.start()]}there is no {value!r}{suggestion(value, available)}"
             message = f"{where}; available are {', '.join(available)}."
         elif wrong := self._wrong_option():
             message = f"there is no option {wrong}{suggestion(wrong, self._options())}; --help lists all."
@@ -67,11 +67,11 @@ class CommandParser(argparse.ArgumentParser):
 
     def _wrong_option(self) -> str:
         """The first given option that does not exist; empty if all do. Abbreviations of options are valid."""
-        options = (o.partition("=")[0] for o in self._given if o.startswith("--") and len(o) > 2)
+        options = (o.partition("=")[0] for o in self._arguments if o.startswith("--") and len(o) > 2)
         return next((o for o in options if not any(known.startswith(o) for known in self._options())), "")
 
 
-def whole(text: str) -> int:
+def nonnegative_int(text: str) -> int:
     """`type` of an option with a non-negative integer. Raises ArgumentTypeError."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"must be a whole number, but is {text!r}")
@@ -80,6 +80,6 @@ def whole(text: str) -> int:
 
 def count(text: str) -> int:
     """`type` of an option with an integer of at least 1. Raises ArgumentTypeError."""
-    if whole(text) == 0:
+    if nonnegative_int(text) == 0:
         raise argparse.ArgumentTypeError("must be at least 1, but is 0")
     return int(text)

@@ -9,7 +9,7 @@ import traceback
 import warnings
 from pathlib import Path
 
-from icalib.cli.command_parser import CommandParser, add_command, add_part, count, examples, whole
+from icalib.cli.command_parser import CommandParser, add_command, add_part, count, examples, nonnegative_int
 from icalib.cli.result_commands import add_result_commands
 from icalib.cli.target_command import add_target_command
 from icalib.errors import CalibrationError
@@ -152,7 +152,9 @@ def _add_simulate(commands: argparse._SubParsersAction[CommandParser]) -> None:
     )
     c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
     c.add_argument("--output", "-o", type=Path, required=True, help="path of the recording; must not exist yet")
-    c.add_argument("--seed", type=whole, metavar="N", help="seed of motion and noise; default: that of the scenario")
+    c.add_argument(
+        "--seed", type=nonnegative_int, metavar="N", help="seed of motion and noise; default: that of the scenario"
+    )
     levels = "data (default): tables; sensor: a bag of messages as drivers send them (.bag: ROS 1, else ROS 2)"
     c.add_argument("--level", choices=("data", "sensor"), default="data", help=levels)
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no summary")
@@ -167,7 +169,9 @@ def _add_montecarlo(commands: argparse._SubParsersAction[CommandParser]) -> None
     c.add_argument("--runs", type=count, required=True, metavar="N", help=runs)
     folder = "folder for runs and results; the same command resumes an interrupted study"
     c.add_argument("--output", "-o", type=Path, required=True, help=folder)
-    c.add_argument("--seed", type=whole, metavar="N", help="seed of the first run; default: that of the scenario")
+    c.add_argument(
+        "--seed", type=nonnegative_int, metavar="N", help="seed of the first run; default: that of the scenario"
+    )
     guess = "initial guess: none (default), or drawn about the truth"
     c.add_argument("--guess", choices=("none", "drawn"), default="none", help=guess)
     planes = "planes of the LiDARs: known (default) from the simulation, or found in the clouds"
@@ -312,12 +316,14 @@ def _inspect(options: argparse.Namespace) -> None:
         refuse_foreign([options.json], [p for p in (options.recording, options.target) if p], "choose another place")
     target = read_target(options.target) if options.target else None
     with progress_bar(options.quiet) as progress:
-        found = inspect_recording(options.recording, target, progress, start_s=options.start_s, end_s=options.end_s)
+        inspection = inspect_recording(
+            options.recording, target, progress, start_s=options.start_s, end_s=options.end_s
+        )
     if not options.quiet:
-        print_inspection(found)
+        print_inspection(inspection)
     if options.json:
-        write_sealed(options.json, figures_json(found))
+        write_sealed(options.json, figures_json(inspection))
     if options.rig:
-        write_draft(draft_rig(found), options.rig)
+        write_draft(draft_rig(inspection), options.rig)
         if not options.quiet:
             print(f"Wrote {options.rig}, a draft: check it, and fill in what is missing.")

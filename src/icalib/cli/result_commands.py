@@ -94,8 +94,8 @@ def _export(options: argparse.Namespace) -> None:
     from icalib.result import load_calibration
 
     calibration = load_calibration(options.result)
-    found = export(calibration, options.to, dict(options.frame), options.urdf, dict(options.joint))
-    files, folder = found.files, options.output
+    exported = export(calibration, options.to, dict(options.frame), options.urdf, dict(options.joint))
+    files, folder = exported.files, options.output
     if options.to in ONE_FILE:
         files, folder = {options.output.name: next(iter(files.values()))}, options.output.parent
     # The same URDF as input and output: update in place.
@@ -104,7 +104,7 @@ def _export(options: argparse.Namespace) -> None:
     refuse_foreign((folder / name for name in files if not in_place), inputs, "choose another place")
     write_texts(folder, sealed_texts(files))
     if not options.quiet:
-        for sentence in found.sentences:
+        for sentence in exported.sentences:
             print(f"Note: {sentence}")
         print(f"Wrote {', '.join(str(folder / name) for name in files)}.")
 
@@ -144,12 +144,12 @@ def _check(options: argparse.Namespace) -> int:
     calibration = load_calibration(options.result)
     with progress_bar(options.quiet) as progress:
         part = {"start_s": options.start_s, "end_s": options.end_s}
-        found = check_calibration(calibration, options.recording, progress, sigma=options.sigma, **part)
+        check = check_calibration(calibration, options.recording, progress, sigma=options.sigma, **part)
     if options.json:
-        write_sealed(options.json, check_json(found))
+        write_sealed(options.json, check_json(check))
     if not options.quiet:
-        print("\n".join(lines(found)))
-    return found.exit_code
+        print("\n".join(lines(check)))
+    return check.exit_code
 
 
 def _add_rig(commands: argparse._SubParsersAction[CommandParser]) -> None:
@@ -232,12 +232,12 @@ def _compare(options: argparse.Namespace) -> int:
         inputs = [p for side in (options.a, options.b) for p in (side, *set_of(side))]
         refuse_foreign([options.json], inputs, "choose another place")
     tolerances = ComparisonTolerances(**dict(options.tolerance))
-    found = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
+    comparison = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
     if options.json:
-        write_sealed(options.json, comparison_json(found))
+        write_sealed(options.json, comparison_json(comparison))
     if not options.quiet:
-        print("\n".join(lines(found)))
-    return 0 if found.same else 1
+        print("\n".join(lines(comparison)))
+    return 0 if comparison.same else 1
 
 
 def _add_view(commands: argparse._SubParsersAction[CommandParser]) -> None:

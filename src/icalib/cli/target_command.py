@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from icalib.cli.command_parser import CommandParser, add_command, count, examples, whole
+from icalib.cli.command_parser import CommandParser, add_command, count, examples, nonnegative_int
 
 _MOST_IDS = 10_000  # limit; more than any tag family has
 _EXAMPLES = {
@@ -60,7 +60,7 @@ def _options() -> dict[str, dict[str, Any]]:
         "checkerboard": {"rows": count, "cols": count, "square_size": _metres},
         "circles": {"rows": count, "cols": count, "spacing": _metres, "diameter": _metres},
         "markers": {"family": str, "size": _metres, "ids": _ids},
-        "tag": {"family": str, "id": whole, "size": _metres},
+        "tag": {"family": str, "id": nonnegative_int, "size": _metres},
     }
 
 
@@ -69,7 +69,7 @@ def _add_type(types: argparse._SubParsersAction[CommandParser], name: str, optio
 
     one = types.add_parser(name, help=f"{name}, with the fields of the rig file", epilog=examples(_EXAMPLES[name]))
     for field, kind in options.items():
-        unit = {_metres: "METRES", count: "N", whole: "N", _ids: "0-11 or 0,3,7"}.get(kind, "NAME")
+        unit = {_metres: "METRES", count: "N", nonnegative_int: "N", _ids: "0-11 or 0,3,7"}.get(kind, "NAME")
         one.add_argument(
             f"--{field.replace('_', '-')}",
             type=kind,
@@ -92,7 +92,7 @@ def _ids(text: str) -> tuple[int, ...]:
     ids: list[int] = []
     for part in text.split(","):
         first, _, last = part.partition("-")
-        ids += range(whole(first), whole(last or first) + 1)
+        ids += range(nonnegative_int(first), nonnegative_int(last or first) + 1)
     if not ids or len(ids) > _MOST_IDS:
         raise argparse.ArgumentTypeError(f"must be 1 to {_MOST_IDS} ids, as in 0-11 or 0,3,7, but is {text!r}")
     return tuple(ids)

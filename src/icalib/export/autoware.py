@@ -12,8 +12,8 @@ from icalib.export.common import (
     imu_intrinsics,
     inverse,
     no_place_for,
-    own_parameters,
     rpy,
+    sensor_intrinsics,
     time_offsets,
     yaml_text,
 )
@@ -29,8 +29,8 @@ def autoware(c: Calibration, frames: Mapping[str, str]) -> Export:
     """Poses of all sensors except wheels in the frame of the sensor kit, which is the body frame. frames: frame name by
     sensor, for sensors whose frame has another name."""
     names = [name for name in (c.body, *c.on_body) if name not in c.wheels]
-    away = [*own_parameters(c), *imu_intrinsics(c), *time_offsets(c, c.mounted), *c.wheels[1:]]
-    sentences = no_place_for("Autoware", [*away, *(f"the lens of {camera}" for camera in c.cameras)])
+    omissions = [*sensor_intrinsics(c), *imu_intrinsics(c), *time_offsets(c, c.mounted), *c.wheels[1:]]
+    sentences = no_place_for("Autoware", [*omissions, *(f"the lens of {camera}" for camera in c.cameras)])
     sentences += guessed_poses(c)
     comments = [
         f"For Autoware, by icalib. {KIT} is the frame of {c.body}.",

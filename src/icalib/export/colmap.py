@@ -38,16 +38,16 @@ def colmap(c: Calibration) -> Export:
     need(c.cameras, "camera", "COLMAP")
     lenses = [lens_of(c, name, "COLMAP", tuple(_MODELS)) for name in c.cameras]
     imu = [] if c.imu is None else [c.imu]
-    away = [*imu, *others(c, *c.cameras), *time_offsets(c, c.cameras)]
-    sentences = tuple(lens.sentence for lens in lenses if lens.sentence) + no_place_for("COLMAP", away)
+    omissions = [*imu, *others(c, *c.cameras), *time_offsets(c, c.cameras)]
+    sentences = tuple(lens.sentence for lens in lenses if lens.sentence) + no_place_for("COLMAP", omissions)
     sentences += guesses(c, c.cameras)
     first = inverse(c.T_imu_sensor(c.cameras[0]))
     poses = [inverse(first @ c.T_imu_sensor(name)) for name in c.cameras]  # T_cam_rig
     numbered = ", ".join(f"{i} is {name}" for i, name in enumerate(c.cameras, 1))
-    said = [f"For COLMAP, by icalib. {numbered}. Principal points count from the corner of the top-left pixel."]
+    comments = [f"For COLMAP, by icalib. {numbered}. Principal points count from the corner of the top-left pixel."]
     files = {
         "cameras.txt": _text(
-            [*said, *sentences, "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"],
+            [*comments, *sentences, "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"],
             [[i, _MODELS[x.model][0], *x.resolution, *_params(x)] for i, x in enumerate(lenses, 1)],
         ),
         "rigs.txt": _text(

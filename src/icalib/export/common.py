@@ -40,14 +40,14 @@ class CameraParameters:
     sentence: str
 
 
-def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> CameraParameters:
-    """Lens of camera `name` in a model that `program` supports. If its model is not in `held`, it is fitted by
+def lens_of(c: Calibration, name: str, program: str, supported: Sequence[str]) -> CameraParameters:
+    """Lens of camera `name` in a model that `program` supports. If its model is not in `supported`, it is fitted by
     pinhole-radtan for pinhole models and by pinhole-equidistant for all others."""
     sensor = c.rig["sensors"][name]
     model, (width, height) = sensor["model"], (int(side) for side in sensor["resolution"])
     params = np.concatenate([c.group(name, "intrinsics").value, c.group(name, "distortion").value])
     sentence = ""
-    if model not in held:
+    if model not in supported:
         target = camera_model("pinhole-radtan" if model.startswith("pinhole") else "pinhole-equidistant")
         params, rms, most = fit_model(camera_model(model), params, target, (width, height))
         sentence = (
@@ -76,18 +76,20 @@ def need(names: Sequence[str], kind: str, program: str) -> None:
 
 def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
     """A sentence for each of the sensors `names` that has undetermined parameters."""
-    found = []
+    sentences = []
     for name in names:
-        open_ = [
+        labels = [
             g.name.replace("_", " ") + ("" if len(g.labels) == 1 else f" {label}")
             for g in c.groups
             if g.sensor == name
             for label, verdict in zip(g.labels, g.verdict, strict=True)
             if verdict == "undetermined"
         ]
-        if open_:
-            found.append(f"{name}: {', '.join(open_)} was not determined by the data; the file has its initial guess.")
-    return tuple(found)
+        if labels:
+            sentences.append(
+                f"{name}: {', '.join(labels)} was not determined by the data; the file has its initial guess."
+            )
+    return tuple(sentences)
 
 
 def guessed_poses(c: Calibration) -> tuple[str, ...]:
@@ -95,16 +97,16 @@ def guessed_poses(c: Calibration) -> tuple[str, ...]:
     return guesses(in_body_frame(c), tuple(dict.fromkeys((*c.mounted, *c.on_body))))
 
 
-def others(c: Calibration, *taken: str) -> list[str]:
-    """Names of all mounted sensors except `taken`, those that a format covers."""
-    return [name for name in c.mounted if name not in taken]
+def others(c: Calibration, *covered: str) -> list[str]:
+    """Names of all mounted sensors except `covered`, those that the format represents."""
+    return [name for name in c.mounted if name not in covered]
 
 
-def no_place_for(program: str, things: Sequence[str]) -> tuple[str, ...]:
-    """One sentence that lists `things`, which the format of `program` cannot represent; none if the list is empty."""
-    if not things:
+def no_place_for(program: str, omissions: Sequence[str]) -> tuple[str, ...]:
+    """One sentence that lists `omissions`, which `program` cannot represent; none if the list is empty."""
+    if not omissions:
         return ()
-    return (f"{program} has no place for {', '.join(things)}; see calibration.yaml.",)
+    return (f"{program} has no place for {', '.join(omissions)}; see calibration.yaml.",)
 
 
 def time_offset(c: Calibration, name: str) -> float:
@@ -125,8 +127,8 @@ def restarts(c: Calibration, name: str) -> bool:
 
 def time_offsets(c: Calibration, names: Sequence[str]) -> list[str]:
     """Words for the nonzero time offsets among the sensors `names`."""
-    found = {g.sensor: g.value for g in c.groups if g.name == "time_offset" and g.value.any()}
-    return [_time_offset_words(name, found[name]) for name in names if name in found]
+    offsets = {g.sensor: g.value for g in c.groups if g.name == "time_offset" and g.value.any()}
+    return [_time_offset_words(name, offsets[name]) for name in names if name in offsets]
 
 
 def _time_offset_words(name: str, value: np.ndarray) -> str:
@@ -135,23 +137,23 @@ def _time_offset_words(name: str, value: np.ndarray) -> str:
     return f"the time offset of {name} ({1e3 * value[0]:+.3f} ms)"
 
 
-def own_parameters(c: Calibration) -> list[str]:
+def sensor_intrinsics(c: Calibration) -> list[str]:
     """Words for parameters of mounted sensors other than cameras, beyond pose and time offset, such as "radii and
     baseline of wheel0"."""
-    found = []
+    phrases = []
     for name in others(c, *c.cameras):
         specs = SENSOR_TYPES[c.rig["sensors"][name]["type"]].parameters
-        without = {*MOUNTED_NAMES, *(spec.name for spec in specs if spec.manifold == "nuisance")}
-        own = [g.name for g in c.groups if g.sensor == name and g.name not in without]
-        words = [group.replace("_", " ") for group in own]
-        found += [f"{', '.join(words[:-1])}{' and ' if words[1:] else ''}{words[-1]} of {name}"] if words else []
-    return found
+        excluded = {*MOUNTED_NAMES, *(spec.name for spec in specs if spec.manifold == "nuisance")}
+        groups = [g.name for g in c.groups if g.sensor == name and g.name not in excluded]
+        words = [group.replace("_", " ") for group in groups]
+        phrases += [f"{', '.join(words[:-1])}{' and ' if words[1:] else ''}{words[-1]} of {name}"] if words else []
+    return phrases
 
 
 def imu_intrinsics(c: Calibration) -> list[str]:
     """Words for scale and misalignment of the IMU, if any value is nonzero."""
-    found = any((g.sensor, g.name) == (c.imu, "intrinsics") and g.value.any() for g in c.groups)
-    return [f"scale and misalignment of {c.imu}"] if found else []
+    nonzero = any((g.sensor, g.name) == (c.imu, "intrinsics") and g.value.any() for g in c.groups)
+    return [f"scale and misalignment of {c.imu}"] if nonzero else []
 
 
 def topic(c: Calibration, name: str, default: str) -> str:

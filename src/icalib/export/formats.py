@@ -53,8 +53,8 @@ def export(
 def kalibr(c: Calibration) -> Export:
     """Kalibr's camchain if there are cameras, and imu.yaml if there is an IMU."""
     sentences = no_place_for("Kalibr", others(c, *c.cameras)) + guesses(c, c.cameras)
-    said = "".join(f"# {sentence}\n" for sentence in sentences)
-    files = {camchain_name(c): said + camchain(c)} if c.cameras else {}
+    comments = "".join(f"# {sentence}\n" for sentence in sentences)
+    files = {camchain_name(c): comments + camchain(c)} if c.cameras else {}
     if c.imu is not None:
         files["imu.yaml"] = imu_yaml(c)
     return Export(files, sentences)

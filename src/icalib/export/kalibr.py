@@ -159,8 +159,8 @@ def lower(x: np.ndarray) -> np.ndarray:
 
 def cam_overlaps(c: Calibration) -> np.ndarray:
     """(n, n) bool: whether two cameras observed the same target point in simultaneous images (`SAME_INSTANT_S`)."""
-    seen = {r.sensor: r for r in c.corner_residuals}
-    streams = [seen[name] for name in c.cameras]
+    residuals = {r.sensor: r for r in c.corner_residuals}
+    streams = [residuals[name] for name in c.cameras]
     n = len(streams)
     overlaps = np.zeros((n, n), dtype=bool)
     for i in range(n):
@@ -178,9 +178,9 @@ def _overlap(a: CornerResiduals, b: CornerResiduals) -> bool:
     nearest = np.where(a.seconds - b.seconds[before] < b.seconds[after] - a.seconds, before, after)
     together = np.abs(a.seconds - b.seconds[nearest]) <= SAME_INSTANT_S
     n_points = 1 + max(a.point.max(initial=0), b.point.max(initial=0))
-    seen_a = np.repeat(np.where(together, nearest, -1), np.diff(a.start)) * n_points + a.point
-    seen_b = image_of(b) * n_points + b.point
-    return bool(np.isin(seen_a[seen_a >= 0], seen_b).any())
+    keys_a = np.repeat(np.where(together, nearest, -1), np.diff(a.start)) * n_points + a.point
+    keys_b = image_of(b) * n_points + b.point
+    return bool(np.isin(keys_a[keys_a >= 0], keys_b).any())
 
 
 def _renamed(kind: str, names: tuple[str, ...]) -> list[str]:

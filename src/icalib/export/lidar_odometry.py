@@ -34,8 +34,8 @@ def fast_lio(c: Calibration) -> Export:
     """FAST-LIO: one file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "FAST-LIO")
     need(c.lidars, "LiDAR", "FAST-LIO")
-    away = [*others(c, *c.lidars), *imu_intrinsics(c)]
-    sentences = no_place_for("FAST-LIO", away) + guesses(c, c.lidars)
+    omissions = [*others(c, *c.lidars), *imu_intrinsics(c)]
+    sentences = no_place_for("FAST-LIO", omissions) + guesses(c, c.lidars)
     comments = [
         _MERGE.format("FAST-LIO"),
         "extrinsic_R (row by row) and extrinsic_T [m] place the LiDAR in the imu frame:",
@@ -60,8 +60,8 @@ def fast_livo2(c: Calibration) -> Export:
     camera = c.cameras[0]
     lens = lens_of(c, camera, "FAST-LIVO2", tuple(_LENSES))
     sentences = (lens.sentence,) if lens.sentence else ()
-    away = [*others(c, camera, *c.lidars), *imu_intrinsics(c)]
-    sentences += no_place_for("FAST-LIVO2", away) + guesses(c, [camera, *c.lidars])
+    omissions = [*others(c, camera, *c.lidars), *imu_intrinsics(c)]
+    sentences += no_place_for("FAST-LIVO2", omissions) + guesses(c, [camera, *c.lidars])
     comments = [
         _MERGE.format("FAST-LIVO2"),
         "extrinsic_R (row by row) and extrinsic_T [m] place the LiDAR in the imu frame:",
@@ -83,8 +83,8 @@ def fast_livo2(c: Calibration) -> Export:
             "time_offset": {"imu_time_offset": offset, "img_time_offset": time_offset(c, camera) - offset},
         }
         files[f"{name}.yaml"] = yaml_text([*comments, *sentences], data)
-    said = [_MERGE.format("FAST-LIVO2"), f"The lens of {camera}."]
-    files[f"camera_{camera}.yaml"] = yaml_text([*said, *sentences], _vikit(lens))
+    comments = [_MERGE.format("FAST-LIVO2"), f"The lens of {camera}."]
+    files[f"camera_{camera}.yaml"] = yaml_text([*comments, *sentences], _vikit(lens))
     return Export(files, sentences)
 
 
@@ -92,8 +92,8 @@ def lio_sam(c: Calibration) -> Export:
     """LIO-SAM: one file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "LIO-SAM")
     need(c.lidars, "LiDAR", "LIO-SAM")
-    away = [*others(c, *c.lidars), *imu_intrinsics(c), *time_offsets(c, c.lidars)]
-    sentences = no_place_for("LIO-SAM", away) + guesses(c, c.lidars)
+    omissions = [*others(c, *c.lidars), *imu_intrinsics(c), *time_offsets(c, c.lidars)]
+    sentences = no_place_for("LIO-SAM", omissions) + guesses(c, c.lidars)
     comments = [
         _MERGE.format("LIO-SAM"),
         "extrinsicRot (row by row) and extrinsicTrans [m] place the IMU in the lidar frame:",

@@ -33,22 +33,22 @@ def mins(c: Calibration) -> Export:
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
     pairs = [name for name in c.wheels if (name, "radii") in ((g.sensor, g.name) for g in c.groups)]
     positions = c.of_type("position")
-    taken = [*c.cameras, *c.lidars, *pairs[:1], *positions]
-    sentences += no_place_for("MINS", [*imu_intrinsics(c), *others(c, *taken)]) + guesses(c, taken)
+    covered = [*c.cameras, *c.lidars, *pairs[:1], *positions]
+    sentences += no_place_for("MINS", [*imu_intrinsics(c), *others(c, *covered)]) + guesses(c, covered)
     files = {"config_imu.yaml": _imu(c, imu)}
     if c.cameras:
         cameras = {f"cam{i}": _camera(c, name, lens) for i, (name, lens) in enumerate(lenses.items())}
-        files["config_camera.yaml"] = _file(_said("cam", "camera", c.cameras), cameras, sentences)
+        files["config_camera.yaml"] = _file(_conventions("cam", "camera", c.cameras), cameras, sentences)
     if c.lidars:
         lidars = {
             f"lidar{i}": _placed(c, name, "lidar") | {"topic": topic(c, name, f"/{name}")}
             for i, name in enumerate(c.lidars)
         }
-        files["config_lidar.yaml"] = _file(_said("lidar", "LiDAR", c.lidars), lidars, sentences)
+        files["config_lidar.yaml"] = _file(_conventions("lidar", "LiDAR", c.lidars), lidars, sentences)
     if positions:
         gps = {f"gps{i}": _antenna(c, name) for i, name in enumerate(positions)}
-        said = ["pGinI: the antenna in the IMU's frame [m].", *_said("gps", "GPS", positions)[1:]]
-        files["config_gps.yaml"] = _file(said, gps, sentences)
+        comments = ["pGinI: the antenna in the IMU's frame [m].", *_conventions("gps", "GPS", positions)[1:]]
+        files["config_gps.yaml"] = _file(comments, gps, sentences)
     if pairs:
         files["config_wheel.yaml"] = _wheels(c, pairs[0], sentences)
     return Export(files, sentences)
@@ -89,7 +89,7 @@ def _antenna(c: Calibration, name: str) -> dict[str, Any]:
     return {"timeoffset": time_offset(c, name), "pGinI": arm, "topic": topic(c, name, f"/{name}/fix")}
 
 
-def _said(kind: str, word: str, names: tuple[str, ...]) -> list[str]:
+def _conventions(kind: str, word: str, names: tuple[str, ...]) -> list[str]:
     """Comments on the conventions of pose and time offset, and on which sensor each entry stands for."""
     other = [f"{kind}{i} is {name}." for i, name in enumerate(names) if name != f"{kind}{i}"]
     return [_POSE.format(kind, word), _TIME.format(kind), *other]
@@ -99,8 +99,11 @@ def _wheels(c: Calibration, name: str, sentences: tuple[str, ...]) -> str:
     left, right = c.group(name, "radii").value.tolist()
     data = _placed(c, name, "wheel")
     data |= {"intrinsics": [left, right, float(c.group(name, "baseline").value[0])]}
-    said = [*_said("wheel", "wheel", ()), "intrinsics: radius of the left wheel, of the right one, baseline [m]."]
-    return _file(said, {"wheel": data | {"topic": topic(c, name, f"/{name}")}}, sentences)
+    comments = [
+        *_conventions("wheel", "wheel", ()),
+        "intrinsics: radius of the left wheel, of the right one, baseline [m].",
+    ]
+    return _file(comments, {"wheel": data | {"topic": topic(c, name, f"/{name}")}}, sentences)
 
 
 def _file(comments: list[str], data: dict[str, Any], sentences: tuple[str, ...]) -> str:

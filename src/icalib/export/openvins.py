@@ -80,8 +80,8 @@ def _imu(c: Calibration, imu: str) -> str:
     """File of the IMU. w: rate, f: specific force, both in the imu frame; gyro = Tw R_IMUtoGYRO w + Tg f, accel = Ta
     R_IMUtoACC f."""
     noise, x = c.rig["sensors"][imu]["noise"], np.zeros(24)
-    found = [g.value for g in c.groups if (g.sensor, g.name) == (imu, "intrinsics") and len(g.value) == 24]
-    x = found[0] if found else x
+    intrinsics = [g.value for g in c.groups if (g.sensor, g.name) == (imu, "intrinsics") and len(g.value) == 24]
+    x = intrinsics[0] if intrinsics else x
     data = {
         "T_i_b": np.eye(4).tolist(),
         "accelerometer_noise_density": float(noise["accel"]),

@@ -41,9 +41,9 @@ def orb_slam3(c: Calibration) -> Export:
     lenses = [lens_of(c, name, "ORB-SLAM3", tuple(_TYPES)) for name in c.cameras[:_MOST]]
     names = c.cameras[: len(_alike(lenses))]
     lenses = lenses[: len(names)]
-    away = [*others(c, *names), *imu_intrinsics(c)]
+    omissions = [*others(c, *names), *imu_intrinsics(c)]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence)
-    sentences += no_place_for("ORB-SLAM3", [*away, *time_offsets(c, names)]) + guesses(c, names)
+    sentences += no_place_for("ORB-SLAM3", [*omissions, *time_offsets(c, names)]) + guesses(c, names)
     lines = [
         "%YAML:1.0",
         "# For ORB-SLAM3, by icalib: copy its other settings (ORB extractor, viewer, Stereo.ThDepth) in here.",

@@ -15,8 +15,8 @@ from icalib.export.common import (
     need,
     no_place_for,
     others,
-    own_parameters,
     quaternion,
+    sensor_intrinsics,
     time_offsets,
     yaml_text,
 )
@@ -60,8 +60,8 @@ def generate_launch_description():
 def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
     """The file static_transforms.launch.py. frames: frame name by sensor, for sensors whose frame has another name."""
     offsets, lenses = time_offsets(c, c.mounted), [f"the lens of {name}" for name in c.cameras]
-    away = [*offsets, *lenses, *own_parameters(c), *imu_intrinsics(c)]
-    sentences = no_place_for("tf", away) + guessed_poses(c)
+    omissions = [*offsets, *lenses, *sensor_intrinsics(c), *imu_intrinsics(c)]
+    sentences = no_place_for("tf", omissions) + guessed_poses(c)
     parent = frames.get(c.body, c.body)
     comments = [
         "Static transforms for ROS 2, by icalib.",
@@ -83,8 +83,8 @@ def camera_info(c: Calibration) -> Export:
     need(c.cameras, "camera", "CameraInfo")
     lenses = {name: lens_of(c, name, "CameraInfo", tuple(_DISTORTION)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
-    away = ["poses", *time_offsets(c, c.mounted), *others(c, *c.cameras), *imu_intrinsics(c)]
-    sentences += no_place_for("CameraInfo", away)
+    omissions = ["poses", *time_offsets(c, c.mounted), *others(c, *c.cameras), *imu_intrinsics(c)]
+    sentences += no_place_for("CameraInfo", omissions)
     return Export({f"{name}.yaml": _info(name, lens, sentences) for name, lens in lenses.items()}, sentences)
 
 

@@ -16,8 +16,8 @@ from icalib.export.common import (
     imu_intrinsics,
     inverse,
     no_place_for,
-    own_parameters,
     rpy,
+    sensor_intrinsics,
     time_offsets,
 )
 from icalib.export.urdf_tree import Joint, UrdfTree, read_urdf
@@ -29,7 +29,7 @@ _TOO_DEEP = 1e-12  # m or rad: smaller values are written as 0
 def urdf(c: Calibration, frames: Mapping[str, str]) -> Export:
     """The file sensors.urdf: a link of the body, and one fixed joint to each sensor's link. frames: link name by
     sensor, for sensors whose link has another name."""
-    sentences = _left_out(c)
+    sentences = _omissions(c)
     body = frames.get(c.body, c.body)
     comments = [
         "Sensors by icalib.",
@@ -78,7 +78,7 @@ def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: 
         tree = _set(tree, body, links[name], joints.get(name), c.T_body_sensor(name))
     absent = tuple(f"{path.name} has no link {n}, so {n} was left out." for n in sensors if n not in links)
     text = tree.content.decode("utf-8", "surrogateescape")
-    return Export({path.name: text}, absent + _left_out(c))
+    return Export({path.name: text}, absent + _omissions(c))
 
 
 def _set(tree: UrdfTree, body: str, link: str, named: str | None, T_body_link: np.ndarray) -> UrdfTree:
@@ -135,18 +135,18 @@ def _with_origin(tree: UrdfTree, joint: Joint, xyz: str, turn: str) -> UrdfTree:
 
 def _attribute(tag: bytes, name: str, value: str) -> bytes:
     """The start tag with the attribute `name` set to `value`; all other bytes are unchanged."""
-    found = re.search(rb"""(?<=\s)%s\s*=\s*("[^"]*"|'[^']*')""" % name.encode(), tag)
-    if found is None:
+    match = re.search(rb"""(?<=\s)%s\s*=\s*("[^"]*"|'[^']*')""" % name.encode(), tag)
+    if match is None:
         return re.sub(rb"^<origin", f'<origin {name}="{value}"'.encode(), tag)
-    begin, end = found.span(1)
+    begin, end = match.span(1)
     return tag[: begin + 1] + value.encode() + tag[end - 1 :]
 
 
-def _left_out(c: Calibration) -> tuple[str, ...]:
+def _omissions(c: Calibration) -> tuple[str, ...]:
     """Sentences on calibrated values that URDF cannot represent."""
-    away = time_offsets(c, c.mounted) + [f"the lens of {name}" for name in c.cameras]
-    away += own_parameters(c) + imu_intrinsics(c)
-    return no_place_for("URDF", away) + guessed_poses(c)
+    omissions = time_offsets(c, c.mounted) + [f"the lens of {name}" for name in c.cameras]
+    omissions += sensor_intrinsics(c) + imu_intrinsics(c)
+    return no_place_for("URDF", omissions) + guessed_poses(c)
 
 
 def _text(values: object) -> str:

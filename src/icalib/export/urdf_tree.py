@@ -49,12 +49,12 @@ class UrdfTree:
 
     def above(self, link: str) -> Joint | None:
         """The joint whose child is `link`; None for a root. Raises CalibrationError if there are several."""
-        found = [j for j in self.joints if j.child == link]
-        if len(found) > 1:
+        parents = [j for j in self.joints if j.child == link]
+        if len(parents) > 1:
             raise self.fail(
-                f"{link} is the child of {' and '.join(j.name for j in found)}; a link has one joint above."
+                f"{link} is the child of {' and '.join(j.name for j in parents)}; a link has one joint above."
             )
-        return found[0] if found else None
+        return parents[0] if parents else None
 
     def check_link(self, link: str, sensor: str) -> None:
         """Raise CalibrationError if there is no such link. sensor: its name, for the message."""
@@ -185,6 +185,6 @@ class _Reader:
 
 def tag_end(content: bytes, begin: int) -> int:
     """Byte offset just after the start tag that begins at `begin`. A `>` inside quotes does not end the tag."""
-    found = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""").match(content, begin)
-    assert found is not None, "expat has read a tag here"
-    return found.end()
+    match = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""").match(content, begin)
+    assert match is not None, "expat has read a tag here"
+    return match.end()

@@ -35,8 +35,8 @@ def vins_fusion(c: Calibration) -> Export:
     names = c.cameras[:_MOST]
     lenses = [lens_of(c, name, "VINS-Fusion", _MODELS) for name in names]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence) + _offset(c, names)
-    left = [*others(c, *names), *imu_intrinsics(c)]
-    sentences += no_place_for("VINS-Fusion", left) + guesses(c, names)
+    omissions = [*others(c, *names), *imu_intrinsics(c)]
+    sentences += no_place_for("VINS-Fusion", omissions) + guesses(c, names)
     files = {"vins.yaml": _main(c, imu, names, lenses, sentences)}
     for i, (name, lens) in enumerate(zip(names, lenses, strict=True)):
         files[f"cam{i}.yaml"] = _camera(name, lens)
