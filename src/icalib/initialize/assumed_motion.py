@@ -77,11 +77,7 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
-    """As `guess_with_assumed_motion`, without trying other conventions of the poses.
-
-    Poses of the body are smoothed to a trajectory. The rig gets an assumed IMU in the body, the trajectory is sampled
-    at keyframes, and all other sensors are aligned to it.
-    """
+    """As `guess_with_assumed_motion`, without trying other conventions of the poses."""
     motion = _BodyMotion.by(motion_kinds(rig)[0], rig, recordings)
     for kind in kinds_of(rig):
         if (still := kind.start_at_rest(rig, recordings, motion.body, motion.values)) is not None:
