@@ -25,8 +25,6 @@ NAMING = {
     "motion/clouds.py",
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
-    "tools/inspection/frames.py",
-    "tools/inspection/inspect.py",
 }
 
 

@@ -46,17 +46,17 @@ class LidarInspector(KindInspector):
         except RecordingError as error:
             return LidarFacts(problem=str(error))
 
-    def findings(self, found: Inspection) -> Iterator[Finding]:
+    def findings(self, inspection: Inspection) -> Iterator[Finding]:
         """LiDARs that `calibrate` would refuse: a problem if no other sensor gives the motion, else a warning."""
-        own = found.sources.of(Lidar.sensor_type)
-        others = found.sources.cameras or set(moving(found)) - own.keys()
-        for name in own:
-            if (facts := found.facts.get(name)) is not None and facts.problem:
+        lidars = inspection.sources.of(Lidar.sensor_type)
+        others = inspection.sources.cameras or set(moving(inspection)) - lidars.keys()
+        for name in lidars:
+            if (facts := inspection.facts.get(name)) is not None and facts.problem:
                 yield Finding("warning" if others else "problem", facts.problem)
 
-    def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
+    def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """Lines of the draft rig file that name field and unit of the point times."""
-        facts = found.facts.get(name)
+        facts = inspection.facts.get(name)
         if facts is not None and facts.field is not None:
             yield f"point_time_field: {json.dumps(facts.field)}  # looks like the time of each point"
         if facts is not None and facts.unit is not None:

@@ -7,7 +7,9 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
-from icalib.data.recordings import TopicInfo
+from icalib.data.recordings import BagRecording, Recording, TopicInfo
+from icalib.errors import RecordingError
+from icalib.sensors.pose.read.transforms import TRANSFORMS, read_edges, transform_topics
 from icalib.sensors.pose.spec import PoseSensor
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.facts import FramePair, Inspection
@@ -27,28 +29,45 @@ class PoseInspector(KindInspector):
         "absolute is motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor).",
     )
     moves_alone: ClassVar[bool] = True
+    frame_topics: ClassVar[tuple[str, ...]] = (TRANSFORMS,)
 
-    def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
+    def frames(self, recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:
+        """Pairs of frames of /tf and similar topics. Both results are empty for recordings that are not bags."""
+        if not isinstance(recording, BagRecording):
+            return (), ()
+        topics = recording.topics()
+        pairs, notes = list[FramePair](), list[str]()
+        for name in sorted({t.name.removesuffix("_static") for t in topics if t.kind == TRANSFORMS and t.count}):
+            try:
+                edges = read_edges(recording, transform_topics(topics, name), notes.append)
+            except RecordingError as error:
+                notes.append(str(error))
+                continue
+            for (parent, child), e in sorted(edges.items()):
+                pairs.append(FramePair(name, parent, child, len(e.stamps_ns), e.rate_hz, not e.static and e.changes))
+        return tuple(pairs), tuple(notes)
+
+    def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """The `kind` line of the draft. Without an IMU the first pose sensor gives the trajectory, so it must be
         absolute."""
         drifts = topic.kind == "odometry" or "odom" in topic.name
-        yield f"kind: {'relative' if drifts and found.sources.imus else 'absolute'}"
+        yield f"kind: {'relative' if drifts and inspection.sources.imus else 'absolute'}"
 
-    def more_lines(self, found: Inspection, shown: bool) -> Iterator[str]:
+    def more_lines(self, inspection: Inspection, active: bool) -> Iterator[str]:
         """Draft lines of a pose sensor from transforms, if any transform changes. Its frames are the ends of the chain
         with most changing transforms."""
-        shown = shown and not found.sources.of(PoseSensor.sensor_type)
-        chain = _most_motion(found.frames)
+        active = active and not inspection.sources.of(PoseSensor.sensor_type)
+        chain = _most_motion(inspection.frames)
         if not chain:
             return
         topic, frames = chain[0].topic, [chain[0].parent, chain[-1].child]
         kind = "relative" if "odom" in frames[0] else "absolute"
-        if not shown:
+        if not active:
             yield "# Poses from transforms, as of a robot arm? Then remove the #. Choose any two of the frames"
             yield "# listed, the fixed one (base) and the moving one (docs/rig-file.md#pose-sensor)."
         place = (f"  topic: {json.dumps(topic)}", f"  frames: {json.dumps(frames)}")
         for line in ("tf0:", "  type: pose", *place, f"  kind: {kind}"):
-            yield f"{'' if shown else '# '}{line}"
+            yield f"{'' if active else '# '}{line}"
 
 
 INSPECTOR = PoseInspector()
@@ -62,9 +81,9 @@ def _most_motion(pairs: Sequence[FramePair]) -> list[FramePair]:
     for last in pairs:
         if not last.moves:
             continue
-        chain, seen = [last], {last.child}
-        while (pair := above.get((last.topic, chain[0].parent))) is not None and pair.child not in seen:
-            seen.add(pair.child)
+        chain, visited = [last], {last.child}
+        while (pair := above.get((last.topic, chain[0].parent))) is not None and pair.child not in visited:
+            visited.add(pair.child)
             chain.insert(0, pair)
         first = next(k for k, pair in enumerate(chain) if pair.moves)
         best = max(best, chain[first:], key=lambda c: sum(pair.moves for pair in c))

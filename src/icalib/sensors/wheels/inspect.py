@@ -24,7 +24,7 @@ class WheelInspector(KindInspector):
     )
     rolls: ClassVar[bool] = True
 
-    def lines(self, found: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
+    def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """See `KindInspector`."""
         if topic.kind == "twist" or "twist" in topic.type:
             yield "measures: twist"

@@ -17,56 +17,58 @@ _ANSWERS = {
 _UNSEEN = Text("Yes, as far as can be told without searching images for the target.", style="bold green")
 
 
-def print_inspection(found: Inspection, console: Console | None = None) -> None:
+def print_inspection(inspection: Inspection, console: Console | None = None) -> None:
     """Prints on `console`, by default on standard output."""
     out = console or Console()
-    answer = _UNSEEN if found.verdict == "yes" and found.target is None else _ANSWERS[found.verdict]
+    answer = _UNSEEN if inspection.verdict == "yes" and inspection.target is None else _ANSWERS[inspection.verdict]
     out.print(Text("Can this be calibrated? ", style="bold") + answer)
-    for f in found.findings:
+    for f in inspection.findings:
         out.print(Text(f"  {f.severity}: ", style=STYLES[f.severity]) + Text(f.sentence))
     out.print()
-    out.print(streams_table(found))
-    if found.imus:
-        out.print(imu_table(found))
-    if found.frames:
-        out.print(frames_table(found))
-    if found.views:
-        out.print(target_table(found))
-        for name, view in found.views.items():
+    out.print(streams_table(inspection))
+    if inspection.imus:
+        out.print(imu_table(inspection))
+    if inspection.frames:
+        out.print(frames_table(inspection))
+    if inspection.views:
+        out.print(target_table(inspection))
+        for name, view in inspection.views.items():
             if view.cells:
                 out.print(Text(f"Corners over the image of {name} (. none, 1 to 9 the share of the fullest cell):"))
                 out.print(Text(coverage_map(view.cells)))
-    for note in found.notes + tuple(n for v in found.views.values() for n in v.notes):
+    for note in inspection.notes + tuple(n for v in inspection.views.values() for n in v.notes):
         out.print(Text(f"Note: {note}"))
 
 
-def streams_table(found: Inspection) -> Table:
+def streams_table(inspection: Inspection) -> Table:
     """One row for each topic."""
-    names = {c.images.name: c.name for c in found.sources.cameras if c.images}
-    names |= {c.corners.name: c.name for c in found.sources.cameras if c.corners}
-    names |= {t.name: name for name, t in found.sources.imus.items()}
-    names |= {source.topic.name: name for name, source in found.sources.others.items()}
+    names = {c.images.name: c.name for c in inspection.sources.cameras if c.images}
+    names |= {c.corners.name: c.name for c in inspection.sources.cameras if c.corners}
+    names |= {t.name: name for name, t in inspection.sources.imus.items()}
+    names |= {source.topic.name: name for name, source in inspection.sources.others.items()}
     table = _table(
-        f"Topics of {found.recording}",
+        f"Topics of {inspection.recording}",
         ("topic", "type", "sensor", "count", "rate [Hz]", "jitter [ms]", "gaps (longest)", "from to [s]"),
         right=3,
-        caption=_caption(found),
+        caption=_caption(inspection),
     )
-    origin = _origin(found)
-    for s in found.streams:
-        table.add_row(*map(Text, (s.topic.name, _type(found, s), names.get(s.topic.name, ""), *_timing(s, origin))))
+    origin = _origin(inspection)
+    for s in inspection.streams:
+        table.add_row(
+            *map(Text, (s.topic.name, _type(inspection, s), names.get(s.topic.name, ""), *_timing(s, origin)))
+        )
     return table
 
 
-def imu_table(found: Inspection) -> Table:
+def imu_table(inspection: Inspection) -> Table:
     """One row for each axis of each IMU."""
     table = _table(
         "IMU",
         ("sensor", "axis", "gyro [rad/s]", "RMS", "accel [m/s^2]", "RMS about mean", "saturated"),
         right=2,
-        caption="; ".join(f"{n}: mean |accel| {f.mean_accel:.2f} m/s^2" for n, f in found.imus.items()),
+        caption="; ".join(f"{n}: mean |accel| {f.mean_accel:.2f} m/s^2" for n, f in inspection.imus.items()),
     )
-    for name, f in found.imus.items():
+    for name, f in inspection.imus.items():
         for k, axis in enumerate("xyz"):
             saturated = ", ".join(f"{s.kind} at {s.limit:.4g}" for s in f.saturated if s.axis == axis)
             cells = (
@@ -82,7 +84,7 @@ def imu_table(found: Inspection) -> Table:
     return table
 
 
-def frames_table(found: Inspection) -> Table:
+def frames_table(inspection: Inspection) -> Table:
     """One row for each transform between two frames."""
     table = _table(
         "Frames",
@@ -90,24 +92,24 @@ def frames_table(found: Inspection) -> Table:
         right=2,
         caption="frames of a pose sensor: any two that these connect, parent and child.",
     )
-    for f in found.frames:
+    for f in inspection.frames:
         rate = "" if f.rate_hz is None else f"{f.rate_hz:.1f}"
         cells = (f.topic, f"{f.parent} -> {f.child}", str(f.count), rate, "yes" if f.moves else "no")
         table.add_row(*map(Text, cells))
     return table
 
 
-def target_table(found: Inspection) -> Table:
+def target_table(inspection: Inspection) -> Table:
     """One row for each camera: number of images with the target, coverage of the image, tilts and distances."""
     table = _table(
-        f"Target ({found.target.target.type} of {found.target.file})" if found.target else "",
+        f"Target ({inspection.target.target.type} of {inspection.target.file})" if inspection.target else "",
         ("camera", "images", "with target", "corners", "cells covered", "tilt [deg]", "farthest / nearest"),
         right=1,
         caption=(
             "tilt: 10th to 90th percentile of the images; tilt and distances are rough, for the intrinsics are unknown."
         ),
     )
-    for name, v in found.views.items():
+    for name, v in inspection.views.items():
         share = f" ({v.seen / v.images:.0%})" if v.images else ""
         filled = sum(n > 0 for row in v.cells for n in row) if v.cells else None
         table.add_row(
@@ -145,23 +147,23 @@ def _table(title: str, headers: tuple[str, ...], right: int, caption: str) -> Ta
     return table
 
 
-def _origin(found: Inspection) -> int | None:
+def _origin(inspection: Inspection) -> int | None:
     """The earliest stamp of all cameras and IMUs [ns]; None if there is none."""
-    sensors = {t.name for t in found.sources.imus.values()} | {c.topic.name for c in found.sources.cameras}
-    stamps = [s.timing.first_ns for s in found.streams if s.timing and s.topic.name in sensors]
+    sensors = {t.name for t in inspection.sources.imus.values()} | {c.topic.name for c in inspection.sources.cameras}
+    stamps = [s.timing.first_ns for s in inspection.streams if s.timing and s.topic.name in sensors]
     return min(stamps, default=None)
 
 
-def _caption(found: Inspection) -> str:
-    origin = _origin(found)
+def _caption(inspection: Inspection) -> str:
+    origin = _origin(inspection)
     text = "rate: from the median interval; gaps: intervals longer than 1.5 medians"
     return text if origin is None else f"{text}; from, to: stamps after {origin} ns."
 
 
-def _type(found: Inspection, s: StreamFacts) -> str:
+def _type(inspection: Inspection, s: StreamFacts) -> str:
     """The message type of a topic; for images also resolution and encoding."""
-    name = next((c.name for c in found.sources.cameras if c.images and c.images.name == s.topic.name), "")
-    facts = found.images.get(name)
+    name = next((c.name for c in inspection.sources.cameras if c.images and c.images.name == s.topic.name), "")
+    facts = inspection.images.get(name)
     kind = s.topic.type.removeprefix("sensor_msgs/msg/")
     if facts is None or facts.resolution is None:
         return kind

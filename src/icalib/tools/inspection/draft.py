@@ -41,31 +41,31 @@ target:
 """
 
 
-def draft_rig(found: Inspection) -> str:
+def draft_rig(inspection: Inspection) -> str:
     """The text of a rig file. Raises RecordingError if the sensors do not determine the motion: there is no camera, no
     sensor such as a LiDAR beside an IMU, and no sensor that gives the motion without an IMU beside another one."""
-    broken = {c.name: problem for c in found.sources.cameras if (problem := found.stream(c.topic).problem)}
-    cameras = [c for c in found.sources.cameras if c.name not in broken]
-    moved = moving(found) or found.moving_frames
-    if not (cameras or (found.sources.imus and moved) or moves_without_imu(found)):
+    broken = {c.name: problem for c in inspection.sources.cameras if (problem := inspection.stream(c.topic).problem)}
+    cameras = [c for c in inspection.sources.cameras if c.name not in broken]
+    moved = moving(inspection) or inspection.moving_frames
+    if not (cameras or (inspection.sources.imus and moved) or moves_without_imu(inspection)):
         raise RecordingError(
-            f"{found.recording} holds no camera that can be read, no {nouns()} beside an IMU, and no "
+            f"{inspection.recording} holds no camera that can be read, no {nouns()} beside an IMU, and no "
             f"{nouns(alone=True)} beside other sensors, so there is no rig to draft; record one, too."
         )
     lines = [
-        f"# Draft by icalib inspect from {json.dumps(found.recording)}. Check every line (docs/rig-file.md).",
+        f"# Draft by icalib inspect from {json.dumps(inspection.recording)}. Check every line (docs/rig-file.md).",
         "# Start values ({guess: ...}) have no weight; delete such a line to estimate the value from scratch.",
         "sensors:",
-        *_imu(found),
+        *_imu(inspection),
     ]
     for camera in cameras:
-        lines += _camera(found, camera)
-    lines += _others(found, bool(cameras))
-    left_out = {**broken, **found.sources.left_out}
+        lines += _camera(inspection, camera)
+    lines += _others(inspection, bool(cameras))
+    left_out = {**broken, **inspection.sources.left_out}
     lines += [f"  # Not used: {comment(topic)} ({comment(why)})" for topic, why in left_out.items()]
-    blind = any(c.tracks is None and not (found.without_target and c.images) for c in cameras)
-    aimed = found.target is not None or blind
-    return "\n".join([*lines, _target(found) if cameras and aimed else ""])
+    blind = any(c.tracks is None and not (inspection.without_target and c.images) for c in cameras)
+    aimed = inspection.target is not None or blind
+    return "\n".join([*lines, _target(inspection) if cameras and aimed else ""])
 
 
 def check_draft(path: Path) -> None:
@@ -104,17 +104,17 @@ def _link(part: Path, path: Path, text: str) -> None:
             file.write(text)
 
 
-def _imu(found: Inspection) -> list[str]:
-    if not found.sources.imus:
-        alone = "cameras are calibrated alone, the first one's" if found.sources.cameras else "the first sensor's"
+def _imu(inspection: Inspection) -> list[str]:
+    if not inspection.sources.imus:
+        alone = "cameras are calibrated alone, the first one's" if inspection.sources.cameras else "the first sensor's"
         return [f"  # No IMU: {alone} frame is the body frame."]
-    name = found.imu or next(iter(found.sources.imus))
-    topic = found.sources.imus[name]
-    facts = found.imus.get(name)
-    frame, halves = facts.frame if facts else "", found.sources.halves.get(name)
+    name = inspection.imu or next(iter(inspection.sources.imus))
+    topic = inspection.sources.imus[name]
+    facts = inspection.imus.get(name)
+    frame, halves = facts.frame if facts else "", inspection.sources.halves.get(name)
     place = "    " + place_line(topic.name, topic.type, frame) if halves is None else _places(halves, topic.type, frame)
     lines = [f"  {name}:", "    type: imu", place]
-    kalibr = _kalibr_imu(found, topic.name)
+    kalibr = _kalibr_imu(inspection, topic.name)
     if kalibr is None:
         classes = ", ".join(IMU_CLASSES)
         lines += [
@@ -129,44 +129,44 @@ def _imu(found: Inspection) -> list[str]:
         lines.append(
             f"    noise: {{{values}, source: {json.dumps(kalibr.noise.source)}}}  # from {comment(kalibr.file)}"
         )
-    others = [f"{n} ({t.name})" for n, t in found.sources.imus.items() if n != name]
+    others = [f"{n} ({t.name})" for n, t in inspection.sources.imus.items() if n != name]
     if others:
         lines.append(f"  # Also recorded: {comment(', '.join(others))}; a rig has one IMU, choose the best.")
     return lines
 
 
-def _others(found: Inspection, has_cameras: bool) -> Iterator[str]:
+def _others(inspection: Inspection, has_cameras: bool) -> Iterator[str]:
     """Lines of sensors that are neither IMU nor camera. Topics that need not be sensors on the robot are comments,
     unless no other sensor gives the motion."""
-    kinds, imus = inspectors(), found.sources.imus
-    sure = [n for n in moving(found) if kinds[found.sources.others[n].kind].is_certain]
-    shown = not (has_cameras or (imus and sure))
+    kinds, imus = inspectors(), inspection.sources.imus
+    sure = [n for n in moving(inspection) if kinds[inspection.sources.others[n].kind].is_certain]
+    default_active = not (has_cameras or (imus and sure))
     for kind, inspector in kinds.items():
-        for name, topic in found.sources.of(kind).items():
+        for name, topic in inspection.sources.of(kind).items():
             if inspector.sensor.needs_imu and not imus:
                 continue
-            is_shown = shown or inspector.is_certain
-            yield from (f"  # {line}" for line in inspector.doubt if not is_shown)
-            fields = (f"type: {kind}", place_line(topic.name, topic.type), *inspector.lines(found, name, topic))
+            is_active = default_active or inspector.is_certain
+            yield from (f"  # {line}" for line in inspector.doubt if not is_active)
+            fields = (f"type: {kind}", place_line(topic.name, topic.type), *inspector.lines(inspection, name, topic))
             for line in (f"{name}:", *(f"  {field}" for field in fields)):
-                yield f"  {'' if is_shown else '# '}{line}"
-        yield from (f"  {line}" for line in inspector.more_lines(found, shown))
+                yield f"  {'' if is_active else '# '}{line}"
+        yield from (f"  {line}" for line in inspector.more_lines(inspection, default_active))
 
 
-def _kalibr_imu(found: Inspection, topic: str) -> KalibrImu | None:
+def _kalibr_imu(inspection: Inspection, topic: str) -> KalibrImu | None:
     """Kalibr's entry for the IMU's topic; else its only entry, if that names no topic of this recording."""
-    entries = found.kalibr.imus
-    topics = {s.topic.name.strip("/") for s in found.streams}
+    entries = inspection.kalibr.imus
+    topics = {s.topic.name.strip("/") for s in inspection.streams}
     mine = [k for k in entries if k.topic.strip("/") == topic.strip("/")]
     if not mine and len(entries) == 1 and entries[0].topic.strip("/") not in topics:
         mine = list(entries)
     return mine[0] if mine else None
 
 
-def _camera(found: Inspection, camera: CameraSource) -> list[str]:
-    resolution = resolution_of(found, camera)
-    lens = lens_start(found, camera, resolution)
-    frame = found.images[camera.name].frame if camera.images else ""
+def _camera(inspection: Inspection, camera: CameraSource) -> list[str]:
+    resolution = resolution_of(inspection, camera)
+    lens = lens_start(inspection, camera, resolution)
+    frame = inspection.images[camera.name].frame if camera.images else ""
     lines = [f"  {camera.name}:", "    type: camera"]
     if camera.corners:
         lines.append(f"    {place_line(camera.corners.name, camera.corners.type)}")
@@ -175,7 +175,7 @@ def _camera(found: Inspection, camera: CameraSource) -> list[str]:
         lines.append(f"    {place_line(camera.images.name, kind, frame)}")
     if camera.tracks:
         lines.append(f"    tracks: {name_text(camera.tracks.name)}  # {comment(camera.tracks.type)}")
-    elif found.without_target and camera.images:
+    elif inspection.without_target and camera.images:
         lines.append("    tracks: images  # points of the scene; a few images show no tags and no checkerboard")
     lines.append(f"    model: {lens.model}  # {comment(lens.why)}")
     lines.append(
@@ -198,19 +198,19 @@ def _starts(lens: LensStart) -> Iterable[str]:
 
 def _places(halves: TwoSources, kind: str, frame: str) -> str:
     """The `topic` line of an IMU whose gyroscope and accelerometer have a topic each."""
-    shown = f"{{gyro: {name_text(halves.gyro)}, accel: {name_text(halves.accel)}}}"
-    return f"    topic: {shown}  # {comment(kind)}" + in_frame(frame)
+    topics = f"{{gyro: {name_text(halves.gyro)}, accel: {name_text(halves.accel)}}}"
+    return f"    topic: {topics}  # {comment(kind)}" + in_frame(frame)
 
 
-def _target(found: Inspection) -> str:
-    if found.target is None:
+def _target(inspection: Inspection) -> str:
+    if inspection.target is None:
         return _TEMPLATE
-    target = found.target.target
+    target = inspection.target.target
     if isinstance(target, Scene):
         lines = ["targets:", *(f"  {name}: {_fields(fields)}" for name, fields in target.plain().items())]
     else:
         lines = [f"target: {_fields(target.plain())}"]
-    head = f"# The target is from {comment(found.target.file)}; check its sizes with a ruler."
+    head = f"# The target is from {comment(inspection.target.file)}; check its sizes with a ruler."
     return "\n".join([head, *lines, ""])
 
 

@@ -212,8 +212,8 @@ class Inspection:
     @property
     def verdict(self) -> Literal["yes", "yes, but", "no"]:
         """Whether the recording can be calibrated: "no" with a problem, "yes, but" with a warning."""
-        found = {f.severity for f in self.findings}
-        return "no" if "problem" in found else "yes, but" if "warning" in found else "yes"
+        severities = {f.severity for f in self.findings}
+        return "no" if "problem" in severities else "yes, but" if "warning" in severities else "yes"
 
     @property
     def moving_frames(self) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ DEGREE = np.pi / 180.0
 LIKELIER = 0.7  # rates are in deg/s if the spread of gravity is less than this times that for rad/s,
 EXPLAINED = 0.95  # and less than this times the spread without rotation
 CONTRARY = 1.2  # a spread of more than this times that without rotation shows that the rates contradict gravity
-SHORT_S, LEAST_SEEN = 20.0, 0.3  # shortest recording without a warning; share of images with the target
+SHORT_S, LEAST_SHARE = 20.0, 0.3  # shortest recording without a warning; share of images with the target
 FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 0.5  # with an IMU or wheels: 20 pairs of images at most 2 s apart
 FEWEST_STILLS, FEW_STILLS = 2, 10  # cameras alone: images to estimate a lens at all, and to estimate it well
 FLAT_DEG = 15.0  # a warning is given if the 90th percentile of the tilt is below
@@ -31,33 +31,33 @@ EMPTY_EDGE = 0.5  # an edge of the image counts as empty if a larger share of it
 _ORDER = ("problem", "warning", "hint")
 
 
-def findings(found: Inspection) -> tuple[Finding, ...]:
+def findings(inspection: Inspection) -> tuple[Finding, ...]:
     """All findings: problems, then warnings, then hints."""
     every = [
-        *missing_sensors(found),
-        *unread(found),
-        *(f for inspector in inspectors().values() for f in inspector.findings(found)),
-        *_broken(found),
-        *_few_stills(found),
-        *_imu(found),
-        *_clocks(found),
-        *_streams(found),
-        *_target(found),
+        *missing_sensors(inspection),
+        *unread(inspection),
+        *(f for inspector in inspectors().values() for f in inspector.findings(inspection)),
+        *_broken(inspection),
+        *_few_stills(inspection),
+        *_imu(inspection),
+        *_clocks(inspection),
+        *_streams(inspection),
+        *_target(inspection),
     ]
     return tuple(sorted(every, key=lambda f: _ORDER.index(f.severity)))
 
 
-def _broken(found: Inspection) -> Iterator[Finding]:
+def _broken(inspection: Inspection) -> Iterator[Finding]:
     """Findings on cameras and IMUs that cannot be used: problems if no other camera or IMU remains, else warnings."""
-    reasons = [reason for c in found.sources.cameras if (reason := _unfit(found, c))]
-    alone = len(reasons) == len(found.sources.cameras)
+    reasons = [reason for c in inspection.sources.cameras if (reason := _unfit(inspection, c))]
+    alone = len(reasons) == len(inspection.sources.cameras)
     yield from (Finding("problem" if alone else "warning", reason) for reason in reasons)
-    for name, topic in found.sources.imus.items():
-        stream = found.stream(topic)
+    for name, topic in inspection.sources.imus.items():
+        stream = inspection.stream(topic)
         if stream.problem:
-            alone = found.imu is None or found.imu == name
+            alone = inspection.imu is None or inspection.imu == name
             yield Finding("problem" if alone else "warning", stream.problem)
-    for name, images in found.images.items():
+    for name, images in inspection.images.items():
         if 0 < images.damaged < images.decoded:
             yield Finding(
                 "warning",
@@ -66,37 +66,37 @@ def _broken(found: Inspection) -> Iterator[Finding]:
             )
 
 
-def _unfit(found: Inspection, camera: CameraSource) -> str:
+def _unfit(inspection: Inspection, camera: CameraSource) -> str:
     """Why `calibrate` would refuse the camera; "" if it would not."""
-    stream, view, name = found.stream(camera.topic), found.views.get(camera.name), camera.name
+    stream, view, name = inspection.stream(camera.topic), inspection.views.get(camera.name), camera.name
     timing = stream.timing
     if stream.problem or timing is None:
         return stream.problem
     if view is not None and view.problem:
         return view.problem
-    fewest, advice = _fewest_images(found)
+    fewest, advice = _fewest_images(inspection)
     if timing.count < fewest:
         return f"{name} has {timing.count} images, too few; {advice}."
-    if found.sources.imus and timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
+    if inspection.sources.imus and timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
         return f"{name} takes {timing.rate_hz:.2g} images per second, too few to follow its motion; record 10 to 30."
     if view is not None and view.seen < fewest:
         return f"{name} sees the target in {view.seen} images, too few; keep it in view, and {advice}."
     return ""
 
 
-def _fewest_images(found: Inspection) -> tuple[int, str]:
+def _fewest_images(inspection: Inspection) -> tuple[int, str]:
     """Number of images that `calibrate` requires of a camera, and advice on how to record them."""
-    if found.sources.imus or rolls(found):
+    if inspection.sources.imus or rolls(inspection):
         return FEWEST_IMAGES, "record for 30 to 90 s, with 10 to 30 images per second"
     return FEWEST_STILLS, "take 20 to 60 images of the target from all sides"
 
 
-def _few_stills(found: Inspection) -> Iterator[Finding]:
+def _few_stills(inspection: Inspection) -> Iterator[Finding]:
     """Warnings on cameras alone with enough images for a calibration, but too few for a good one."""
-    if _fewest_images(found)[0] != FEWEST_STILLS:
+    if _fewest_images(inspection)[0] != FEWEST_STILLS:
         return
-    for c in found.sources.cameras:
-        timing, view = found.stream(c.topic).timing, found.views.get(c.name)
+    for c in inspection.sources.cameras:
+        timing, view = inspection.stream(c.topic).timing, inspection.views.get(c.name)
         count = view.seen if view is not None and not view.problem else timing.count if timing else 0
         if FEWEST_STILLS <= count < FEW_STILLS:
             yield Finding(
@@ -105,10 +105,10 @@ def _few_stills(found: Inspection) -> Iterator[Finding]:
             )
 
 
-def _imu(found: Inspection) -> Iterator[Finding]:
-    if found.imu is None or found.imus[found.imu].problem:
+def _imu(inspection: Inspection) -> Iterator[Finding]:
+    if inspection.imu is None or inspection.imus[inspection.imu].problem:
         return
-    facts, name = found.imus[found.imu], found.imu
+    facts, name = inspection.imus[inspection.imu], inspection.imu
     yield from (Finding("warning", _capital(note)) for note in facts.notes)
     fast = max(*map(abs, facts.gyro_min), *map(abs, facts.gyro_max))
     radians, degrees, none = facts.gravity_spread or (0.0, 0.0, 0.0)
@@ -131,27 +131,27 @@ def _imu(found: Inspection) -> Iterator[Finding]:
             f"{name} turns at up to {fast:.1f} rad/s ({fast / DEGREE:.0f} deg/s), which blurs images; turn the "
             "rig more slowly, or check that the driver sends rad/s.",
         )
-    yield from _motion(found, name, facts)
+    yield from _motion(inspection, name, facts)
 
 
-def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
+def _motion(inspection: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
     strongest, second, weakest = facts.principal_rms
     if strongest < STILL_RAD_S:
         yield Finding(
             "problem",
             f"{name} hardly moves ({strongest:.3f} rad/s RMS); record again while turning the rig about all "
-            f"three axes{' in front of the target' if found.sources.cameras else ''}.",
+            f"three axes{' in front of the target' if inspection.sources.cameras else ''}.",
         )
     elif second < SECOND_AXIS * strongest or second < STILL_RAD_S:
         # Rotations of cameras are found from rotations of the rig alone; those of other sensors from its path as well.
-        alone = not moving(found)
+        alone = not moving(inspection)
         rest = other_axes(name, facts.principal[0])
         yield Finding(
             "problem" if alone else "warning",
             f"{name} turns about {axis_words(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; "
             f"{second:.2f} and {weakest:.2f} about the perpendicular axes), so some parameters are "
             "unobservable; "
-            f"{'drive over ramps' if rolls(found) else f'turn the rig about {rest} as well'}.",
+            f"{'drive over ramps' if rolls(inspection) else f'turn the rig about {rest} as well'}.",
         )
     else:
         for rms, direction in zip(facts.principal_rms, facts.principal, strict=True):
@@ -169,23 +169,23 @@ def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
         )
 
 
-def _clocks(found: Inspection) -> Iterator[Finding]:
+def _clocks(inspection: Inspection) -> Iterator[Finding]:
     """Warnings on cameras whose stamps overlap little or not at all with those of the IMU."""
-    imu = _imu_timing(found)
-    if imu is None or found.imu is None:
+    imu = _imu_timing(inspection)
+    if imu is None or inspection.imu is None:
         return
-    for c in found.sources.cameras:
-        stream = found.stream(c.topic)
+    for c in inspection.sources.cameras:
+        stream = inspection.stream(c.topic)
         if stream.timing is None:
             continue
         common = overlap_s(stream.timing, imu)
-        whole = stream.timing.duration_s
+        duration = stream.timing.duration_s
         if common <= 0.0:
-            yield _apart(c, found.imu, found.sources.imus[found.imu], -common)
-        elif common < 0.8 * whole:
+            yield _apart(c, inspection.imu, inspection.sources.imus[inspection.imu], -common)
+        elif common < 0.8 * duration:
             yield Finding(
                 "warning",
-                f"{found.imu} was running during {common:.1f} s of the {whole:.1f} s of {c.name}, and images "
+                f"{inspection.imu} was running during {common:.1f} s of the {duration:.1f} s of {c.name}, and images "
                 "without readings are ignored; start and stop both together.",
             )
 
@@ -213,22 +213,22 @@ def _span(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds < 1e4 else f"{seconds / 86400.0:.1f} days"
 
 
-def _streams(found: Inspection) -> Iterator[Finding]:
-    named = {t.name for t in found.sources.imus.values()}  # notes on IMUs name the jumps already
-    for stream in found.streams:
+def _streams(inspection: Inspection) -> Iterator[Finding]:
+    named = {t.name for t in inspection.sources.imus.values()}  # notes on IMUs name the jumps already
+    for stream in inspection.streams:
         if stream.timing is not None and stream.timing.jumps and stream.topic.name not in named:
             yield Finding(
                 "warning",
                 f"{stream.topic.name}: the clock jumps forward; the longest part between jumps is used, "
                 f"{stream.timing.duration_s:.1f} s, unless --from and --to choose another.",
             )
-    imu = _imu_timing(found)
+    imu = _imu_timing(inspection)
     if imu is not None and imu.rate_hz and imu.duration_s < SHORT_S:
         yield Finding("warning", f"The IMU ran for {imu.duration_s:.1f} s; record for 30 to 90 s.")
     if imu is not None and imu.gaps:
-        yield Finding("warning", f"{found.imu} has {_gaps(imu)}; check the load of the recorder and the bus.")
-    for c in found.sources.cameras:
-        timing = found.stream(c.topic).timing
+        yield Finding("warning", f"{inspection.imu} has {_gaps(imu)}; check the load of the recorder and the bus.")
+    for c in inspection.sources.cameras:
+        timing = inspection.stream(c.topic).timing
         # Images without the target leave gaps in a table of corners, which are no gaps of the camera.
         if timing is not None and timing.gaps and not c.corners:
             yield Finding("hint", f"{c.name} has {_gaps(timing)}.")
@@ -241,38 +241,38 @@ def _gaps(t: Timing) -> str:
     )
 
 
-def _imu_timing(found: Inspection) -> Timing | None:
-    return found.stream(found.sources.imus[found.imu]).timing if found.imu else None
+def _imu_timing(inspection: Inspection) -> Timing | None:
+    return inspection.stream(inspection.sources.imus[inspection.imu]).timing if inspection.imu else None
 
 
-def _target(found: Inspection) -> Iterator[Finding]:
-    if found.target is None:
-        if not any(c.images for c in found.sources.cameras):
+def _target(inspection: Inspection) -> Iterator[Finding]:
+    if inspection.target is None:
+        if not any(c.images for c in inspection.sources.cameras):
             return
-        yield from _unknown_target(found)
+        yield from _unknown_target(inspection)
         return
-    for v in found.views.values():
+    for v in inspection.views.values():
         if not v.problem:
             yield from _view(v)
 
 
-def _unknown_target(found: Inspection) -> Iterator[Finding]:
+def _unknown_target(inspection: Inspection) -> Iterator[Finding]:
     """Hints if no target is known: what the images show, and to give a target."""
-    if found.without_target:
+    if inspection.without_target:
         yield Finding(
             "hint",
             "A few images of each camera show no tags and no checkerboard, so the draft tracks points of the scene "
             "(tracks: images). If there is a target, give it with --target FILE.",
         )
         return
-    for camera, words in found.shown.items():
+    for camera, words in inspection.shown.items():
         if words:
             yield Finding("hint", f"A few images of {camera} show {words}.")
     yield Finding("hint", "No target is known, so the images were not searched for it; give --target FILE.")
 
 
 def _view(v: TargetView) -> Iterator[Finding]:
-    if v.images and v.seen < LEAST_SEEN * v.images:
+    if v.images and v.seen < LEAST_SHARE * v.images:
         yield Finding(
             "warning",
             f"{v.camera} sees the target in {v.seen} of {v.images} images ({v.seen / v.images:.0%}); keep it in view.",

@@ -33,8 +33,8 @@ def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = (
     notes: to be put before those of this function."""
     problem, jumps = "", ClockJumps()
     try:
-        imu, own = checked_imu(jumps.cut(imu, f"{where} ({imu.name})"), where)
-        notes += jumps.notes + own
+        imu, reading_notes = checked_imu(jumps.cut(imu, f"{where} ({imu.name})"), where)
+        notes += jumps.notes + reading_notes
     except RecordingError as error:
         problem = str(error)
     fine = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)

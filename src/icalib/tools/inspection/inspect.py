@@ -25,9 +25,9 @@ from icalib.errors import RecordingError
 from icalib.rig import TwoSources
 from icalib.sensors.camera.read.camera_info import CameraInfo, read_camera_info
 from icalib.sensors.imu.read.halves import pair_of
-from icalib.sensors.pose.read.transforms import TRANSFORMS
 from icalib.tools.inspection.facts import (
     CameraSource,
+    FramePair,
     GivenTarget,
     ImageFacts,
     ImuFacts,
@@ -37,7 +37,6 @@ from icalib.tools.inspection.facts import (
     TargetView,
 )
 from icalib.tools.inspection.findings import findings
-from icalib.tools.inspection.frames import frame_pairs
 from icalib.tools.inspection.imu import imu_facts, read_imu
 from icalib.tools.inspection.kalibr import KalibrFiles, find_kalibr_files
 from icalib.tools.inspection.kinds import inspectors
@@ -76,13 +75,15 @@ def inspect_recording(
     share = READING_SHARE if target else 1.0
     streams, images, imus = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
     infos, imu = _infos(recording, sources), _choose(imus, sources, kalibr)
-    found = Inspection(str(path), sources, streams, images, infos, imus, imu, target, kalibr)
-    found = dataclasses.replace(found, facts=_facts(recording, sources))
-    frames, unread = frame_pairs(recording)
-    views = _views(recording, found, lambda what, done: progress(what, share + (1.0 - share) * done))
-    notes = tuple(dict.fromkeys(recording.notes() + unread)) + kalibr.notes
-    found = dataclasses.replace(found, views=views, frames=frames, notes=notes, shown=_shown(recording, found))
-    return dataclasses.replace(found, findings=findings(found))
+    inspection = Inspection(str(path), sources, streams, images, infos, imus, imu, target, kalibr)
+    inspection = dataclasses.replace(inspection, facts=_facts(recording, sources))
+    frames, frame_notes = _frames(recording)
+    views = _views(recording, inspection, lambda what, done: progress(what, share + (1.0 - share) * done))
+    notes = tuple(dict.fromkeys(recording.notes() + frame_notes)) + kalibr.notes
+    inspection = dataclasses.replace(
+        inspection, views=views, frames=frames, notes=notes, shown=_pattern_words(recording, inspection)
+    )
+    return dataclasses.replace(inspection, findings=findings(inspection))
 
 
 def _beside(kalibr: KalibrFiles) -> GivenTarget | None:
@@ -90,13 +91,13 @@ def _beside(kalibr: KalibrFiles) -> GivenTarget | None:
     return GivenTarget(kalibr.target, kalibr.target_file, {}) if kalibr.target else None
 
 
-def resolution_of(found: Inspection, camera: CameraSource) -> tuple[int, int] | None:
+def resolution_of(inspection: Inspection, camera: CameraSource) -> tuple[int, int] | None:
     """Resolution (width, height) px of the camera's images; without images, that of the rig file with the target or of
     Kalibr's camchain; else None."""
     if camera.images:
-        return found.images[camera.name].resolution
-    given = found.target.resolutions.get(camera.name) if found.target else None
-    return given or next((c.resolution for c in found.kalibr.cameras if c.name == camera.name), None)
+        return inspection.images[camera.name].resolution
+    resolution = inspection.target.resolutions.get(camera.name) if inspection.target else None
+    return resolution or next((c.resolution for c in inspection.kalibr.cameras if c.name == camera.name), None)
 
 
 def _read(
@@ -142,6 +143,16 @@ def _facts(recording: Recording, sources: Sources) -> dict[str, Any]:
     return {name: kinds[s.kind].facts(recording, name, s.topic) for name, s in sources.others.items()}
 
 
+def _frames(recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:
+    """Pairs of frames that kinds of sensors read poses from, and notes, see `KindInspector.frames`."""
+    pairs, notes = list[FramePair](), list[str]()
+    for inspector in inspectors().values():
+        frames, sentences = inspector.frames(recording)
+        pairs += frames
+        notes += sentences
+    return tuple(pairs), tuple(notes)
+
+
 def _read_images(recording: Recording, topic: TopicInfo) -> tuple[StreamFacts, ImageFacts]:
     sample = _Sample(max(topic.count // SAMPLE, 1))
     stamps: list[int] = []
@@ -166,18 +177,18 @@ class _Sample:
     """Decodes every n-th image, and counts those that are damaged."""
 
     def __init__(self, every: int) -> None:
-        self._every, self._seen = every, 0
+        self._every, self._count = every, 0
         self.decoded = self.damaged = 0
         self.encoding = self.error = ""
         self.resolution: tuple[int, int] | None = None
 
     def look(self, payload: Payload) -> None:
-        self._seen += 1
-        if self._seen == 1:
+        self._count += 1
+        if self._count == 1:
             self.encoding = payload.encoding
         if self.resolution is None and payload.width:
             self.resolution = payload.width, payload.height
-        if (self._seen - 1) % self._every:
+        if (self._count - 1) % self._every:
             return
         self.decoded += 1
         try:
@@ -203,7 +214,8 @@ def _read_imu(
 def _read_stamps(recording: Recording, topic: TopicInfo, left_out: bool) -> StreamFacts:
     """Facts on a topic from its stamps. Timing is None for topics that icalib does not read, CameraInfo, transforms and
     images that are left out."""
-    if left_out or not topic.count or topic.kind in ("", "camera info", TRANSFORMS):
+    untimed = ("", "camera info", *(kind for inspector in inspectors().values() for kind in inspector.frame_topics))
+    if left_out or not topic.count or topic.kind in untimed:
         return StreamFacts(topic, None)
     try:
         return StreamFacts(topic, timing_of(recording.stamps(topic.name)))
@@ -225,14 +237,14 @@ def _frame(recording: Recording, topic: TopicInfo) -> str:
 
 def _infos(recording: Recording, sources: Sources) -> dict[str, CameraInfo]:
     """CameraInfo by name of the camera, without those whose messages cannot be read."""
-    found: dict[str, CameraInfo] = {}
+    infos: dict[str, CameraInfo] = {}
     for c in sources.cameras:
         if c.info and isinstance(recording, BagRecording):
             try:
-                found[c.name] = read_camera_info(recording, c.info.name)
+                infos[c.name] = read_camera_info(recording, c.info.name)
             except (RecordingError, ValueError):
                 continue
-    return found
+    return infos
 
 
 def _choose(imus: dict[str, ImuFacts], sources: Sources, kalibr: KalibrFiles) -> str | None:
@@ -243,20 +255,24 @@ def _choose(imus: dict[str, ImuFacts], sources: Sources, kalibr: KalibrFiles) ->
     return order[0] if order else None
 
 
-def _shown(recording: Recording, found: Inspection) -> dict[str, str]:
+def _pattern_words(recording: Recording, inspection: Inspection) -> dict[str, str]:
     """Words on the target in a few images of each camera, see `Inspection.shown`; empty if a target is known."""
-    if found.target is not None:
+    if inspection.target is not None:
         return {}
-    cameras = [c for c in found.sources.cameras if c.images and not (c.corners or found.stream(c.topic).problem)]
+    cameras = [
+        c for c in inspection.sources.cameras if c.images and not (c.corners or inspection.stream(c.topic).problem)
+    ]
     return {c.name: target_in(spread_images(recording, c.images.name)) for c in cameras if c.images}
 
 
-def _views(recording: Recording, found: Inspection, progress: Progress) -> dict[str, TargetView]:
+def _views(recording: Recording, inspection: Inspection, progress: Progress) -> dict[str, TargetView]:
     """Detections of the target by name of the camera, for cameras whose images can be read."""
-    if found.target is None:
+    if inspection.target is None:
         return {}
     views: dict[str, TargetView] = {}
-    cameras = [c for c in found.sources.cameras if c.corners or (c.images and not found.stream(c.topic).problem)]
+    cameras = [
+        c for c in inspection.sources.cameras if c.corners or (c.images and not inspection.stream(c.topic).problem)
+    ]
     for k, camera in enumerate(cameras):
         what = f"finding the target in the images of {camera.name}"
 
@@ -264,5 +280,7 @@ def _views(recording: Recording, found: Inspection, progress: Progress) -> dict[
             progress(what, (k + done) / len(cameras))
 
         show(0.0)
-        views[camera.name] = target_view(recording, camera, found.target.target, resolution_of(found, camera), show)
+        views[camera.name] = target_view(
+            recording, camera, inspection.target.target, resolution_of(inspection, camera), show
+        )
     return views

@@ -30,7 +30,7 @@ MODELS = {
     ("ds", "none"): ("double-sphere", 2),
     ("omni", "radtan"): ("omni-radtan", 1),
 }
-Found = TypeVar("Found")
+Entry = TypeVar("Entry")
 
 
 @dataclass(frozen=True)
@@ -96,10 +96,10 @@ def kalibr_target(data: dict[str, Any], file: str) -> Target:
     """The target of Kalibr's target file. Raises RigError naming file and field."""
     kind = data["target_type"]
     if kind == "aprilgrid":
-        rows, cols = (_whole(data, name, file) for name in ("tagRows", "tagCols"))
+        rows, cols = (_integer(data, name, file) for name in ("tagRows", "tagCols"))
         return AprilGrid(rows, cols, _positive(data, "tagSize", file), _positive(data, "tagSpacing", file))
     if kind == "checkerboard":
-        rows, cols = (_whole(data, name, file) for name in ("targetRows", "targetCols"))
+        rows, cols = (_integer(data, name, file) for name in ("targetRows", "targetCols"))
         size, other = (_positive(data, name, file) for name in ("rowSpacingMeters", "colSpacingMeters"))
         if size != other:
             raise RigError(f"{file}: rowSpacingMeters and colSpacingMeters differ; icalib needs square squares.")
@@ -113,7 +113,7 @@ def kalibr_target(data: dict[str, Any], file: str) -> Target:
 
 def _circles(data: dict[str, Any], file: str) -> str:
     """Message on how to write a circle grid in the rig file, as Kalibr's file lacks the diameter of its circles."""
-    rows, cols = (_whole(data, name, file) for name in ("targetRows", "targetCols"))
+    rows, cols = (_integer(data, name, file) for name in ("targetRows", "targetCols"))
     spacing = _positive(data, "spacingMeters", file)
     asymmetric = ", asymmetric: true" if data.get("asymmetricGrid") else ""
     target = f"{{type: circles, rows: {rows}, cols: {cols}, spacing: {spacing:g}, diameter: ...{asymmetric}}}"
@@ -126,8 +126,8 @@ def _circles(data: dict[str, Any], file: str) -> str:
 def _yaml_files(recording: Path) -> list[Path]:
     above = recording.resolve().parent
     folders = [recording, above] if recording.is_dir() else [above]
-    found = [p for f in folders for p in _entries(f) if p.suffix in (".yaml", ".yml") and p.is_file()]
-    return [p for p in found if p.stat().st_size <= _LARGEST_BYTES]
+    paths = [p for f in folders for p in _entries(f) if p.suffix in (".yaml", ".yml") and p.is_file()]
+    return [p for p in paths if p.stat().st_size <= _LARGEST_BYTES]
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -148,8 +148,8 @@ def yaml_mapping(path: Path) -> dict[str, Any]:
 
 
 def _read(
-    path: Path, data: dict[str, Any], mark: str, make: Callable[[str, str, dict[str, Any]], Found]
-) -> list[Found]:
+    path: Path, data: dict[str, Any], mark: str, make: Callable[[str, str, dict[str, Any]], Entry]
+) -> list[Entry]:
     """Results of make(file, name, mapping) for the mappings with the key `mark`: the whole file, or its entries (cam0,
     imu0)."""
     entries = {"": data} if mark in data else {k: v for k, v in data.items() if isinstance(v, dict) and mark in v}
@@ -200,7 +200,7 @@ def _positive(data: dict[str, Any], name: str, file: str) -> float:
     return value
 
 
-def _whole(data: dict[str, Any], name: str, file: str) -> int:
+def _integer(data: dict[str, Any], name: str, file: str) -> int:
     value = _positive(data, name, file)
     if value != int(value):
         raise RigError(f"{file}: {name} must be a whole number; correct the file.")

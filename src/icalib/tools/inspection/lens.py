@@ -32,16 +32,16 @@ class LensStart:
     notes: tuple[str, ...] = ()
 
 
-def lens_start(found: Inspection, camera: CameraSource, resolution: tuple[int, int] | None) -> LensStart:
+def lens_start(inspection: Inspection, camera: CameraSource, resolution: tuple[int, int] | None) -> LensStart:
     """Model and initial values for the lens of `camera`, whose images have `resolution` (width, height) px."""
     notes: list[str] = []
-    kalibr = _kalibr(found, camera)
+    kalibr = _kalibr(inspection, camera)
     if kalibr is not None and kalibr.resolution != resolution:
         notes.append(f"{Path(kalibr.file).name} is for {_size(kalibr.resolution)} px and is not used")
     elif kalibr is not None:
         source = f"{Path(kalibr.file).name} (Kalibr, {kalibr.name})"
         return LensStart(kalibr.model, f"from {source}", kalibr.intrinsics, kalibr.distortion or None, source)
-    info = found.infos.get(camera.name)
+    info = inspection.infos.get(camera.name)
     if info is None or camera.info is None:
         why = "for lenses of up to about 100 deg; for a fisheye: pinhole-equidistant"
         return LensStart(DEFAULT_MODEL, why, notes=tuple(notes))
@@ -87,16 +87,16 @@ def _distortion(info: CameraInfo, model: str) -> Values | None:
     return tuple(float(x) for x in info.distortion[:size]) if np.isfinite(info.distortion).all() else None
 
 
-def _kalibr(found: Inspection, camera: CameraSource) -> KalibrCamera | None:
+def _kalibr(inspection: Inspection, camera: CameraSource) -> KalibrCamera | None:
     """Kalibr's entry with the camera's topic. If no entry names a topic of this recording, that with the camera's
     name."""
-    topics = {s.topic.name.strip("/") for s in found.streams}
-    named = any(k.topic.strip("/") in topics for k in found.kalibr.cameras)
+    topics = {s.topic.name.strip("/") for s in inspection.streams}
+    named = any(k.topic.strip("/") in topics for k in inspection.kalibr.cameras)
     mine = camera.images.name.strip("/") if camera.images else None
     is_mine: Callable[[KalibrCamera], bool] = (
         (lambda k: k.topic.strip("/") == mine) if named else (lambda k: k.name == camera.name)
     )
-    return next((k for k in found.kalibr.cameras if is_mine(k)), None)
+    return next((k for k in inspection.kalibr.cameras if is_mine(k)), None)
 
 
 def _size(resolution: tuple[int, int]) -> str:

@@ -25,20 +25,20 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
     """The sensors among the topics with messages, each under a unique name derived from its topic."""
     filled = [t for t in topics if t.count]
     depth = [t for t in filled if t.kind == "image" and "depth" in t.name.lower()]
-    seen = {
+    camera_topics = {
         kind: _by_key([t for t in filled if t.kind == kind and t not in depth])
         for kind in ("image", "corners", "tracks", "camera info")
     }
     kinds = inspectors()
     others = {"imu": ("imu",)} | {kind: inspector.topic_kinds for kind, inspector in kinds.items()}
     prefixes = {"imu": "imu"} | {kind: inspector.prefix for kind, inspector in kinds.items()}
-    found = [(t, what) for what, kinds in others.items() for t in filled if t.kind in kinds]
-    keys = sorted({*seen["image"], *seen["corners"], *seen["tracks"]})
-    names = _names([(k, "cam") for k in keys] + [(_key(t), prefixes[what]) for t, what in found])
-    cameras = tuple(_camera(n, k, seen) for n, k in zip(names, keys, strict=False))
+    named_topics = [(t, what) for what, kinds in others.items() for t in filled if t.kind in kinds]
+    keys = sorted({*camera_topics["image"], *camera_topics["corners"], *camera_topics["tracks"]})
+    names = _names([(k, "cam") for k in keys] + [(_key(t), prefixes[what]) for t, what in named_topics])
+    cameras = tuple(_camera(n, k, camera_topics) for n, k in zip(names, keys, strict=False))
     left_out = {t.name: "depth images" for t in depth}
     left_out |= {other: f"the images of {c.name} once more" for c in cameras for other in c.others}
-    named = [(name, *of) for name, of in zip(names[len(keys) :], found, strict=True)]
+    named = [(name, *of) for name, of in zip(names[len(keys) :], named_topics, strict=True)]
     imus = {name: t for name, t, kind in named if kind == "imu"}
     return Sources(cameras, imus, left_out, {n: SensorSource(kind, t) for n, t, kind in named if kind != "imu"})
 
@@ -48,11 +48,11 @@ def _plain_names() -> re.Pattern[str]:
     return re.compile("|".join(f"({names})" for names in (_WHAT, *(k.plain_names for k in inspectors().values()))))
 
 
-def _camera(name: str, key: Key, seen: Mapping[str, Mapping[Key, list[TopicInfo]]]) -> CameraSource:
+def _camera(name: str, key: Key, camera_topics: Mapping[str, Mapping[Key, list[TopicInfo]]]) -> CameraSource:
     """The camera with the key `key`. Among several topics of its images, unrectified ones go first, then those with
     most messages, then short names, which are of uncompressed images."""
-    same = sorted(seen["image"].get(key, []), key=lambda t: ("rect" in t.name, -t.count, len(t.name)))
-    corners, tracks, info = (seen[kind].get(key, [None])[0] for kind in ("corners", "tracks", "camera info"))
+    same = sorted(camera_topics["image"].get(key, []), key=lambda t: ("rect" in t.name, -t.count, len(t.name)))
+    corners, tracks, info = (camera_topics[kind].get(key, [None])[0] for kind in ("corners", "tracks", "camera info"))
     images = same[0] if same else None
     topic = corners or images or tracks
     assert topic is not None  # the key is of one of them
@@ -60,10 +60,10 @@ def _camera(name: str, key: Key, seen: Mapping[str, Mapping[Key, list[TopicInfo]
 
 
 def _by_key(topics: list[TopicInfo]) -> dict[Key, list[TopicInfo]]:
-    found: dict[Key, list[TopicInfo]] = {}
+    groups: dict[Key, list[TopicInfo]] = {}
     for topic in topics:
-        found.setdefault(_key(topic), []).append(topic)
-    return found
+        groups.setdefault(_key(topic), []).append(topic)
+    return groups
 
 
 def _key(topic: TopicInfo) -> Key:

@@ -8,8 +8,8 @@ from icalib.data.topics import type_not_read
 from icalib.tools.inspection.facts import Finding, Inspection
 
 
-def unread(found: Inspection) -> Iterator[Finding]:
+def unread(inspection: Inspection) -> Iterator[Finding]:
     """Warnings on topics with messages that icalib does not read, such as raw LiDAR packets and videos."""
-    for stream in found.streams:
-        if stream.topic.count and (held := type_not_read(stream.topic.type)):
-            yield Finding("warning", f"{stream.topic.name} holds {held[1]}.")
+    for stream in inspection.streams:
+        if stream.topic.count and (content := type_not_read(stream.topic.type)):
+            yield Finding("warning", f"{stream.topic.name} holds {content[1]}.")
