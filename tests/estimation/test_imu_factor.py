@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.motion.integration import Increment, integrate, integration_room, readings_of
+from icalib.motion.integration import Increment, integrate, integration_workspace, readings_of
 from icalib.motion.integration_step import COVARIANCE_SIZE, correction
 from icalib.optim.arrowhead import make_pieces
 from icalib.sensors.imu.residual import ImuFactor
@@ -69,7 +69,11 @@ def test_residuals_are_whitened_with_the_covariance_of_the_increments(factor, se
     for k, first in enumerate(imu.interval(t[:-1])):
         P, J = np.empty((15, 15)), np.empty((9, 6))
         out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), J, P)
-        by, room, bias = correction(factor.intrinsics0), integration_room(COVARIANCE_SIZE), tuple(setup.state.bias[k])
+        by, room, bias = (
+            correction(factor.intrinsics0),
+            integration_workspace(COVARIANCE_SIZE),
+            tuple(setup.state.bias[k]),
+        )
         integrate(t[k], t[k + 1], first, bias, readings_of(imu, False), by, room, out)
         np.testing.assert_allclose(factor.increments.W[k] @ P @ factor.increments.W[k].T, np.eye(15), rtol=0, atol=1e-9)
         assert (np.triu(factor.increments.W[k], 1) == 0).all()

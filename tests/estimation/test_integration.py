@@ -6,7 +6,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from icalib.geometry import so3
-from icalib.motion.integration import Increment, Readings, finish, integrate, integration_room
+from icalib.motion.integration import Increment, Readings, finish, integrate, integration_workspace
 from icalib.motion.integration_step import COVARIANCE_SIZE, RUN_SIZE, correction
 from icalib.motion.propagation import empty_prefix, in_order_of_keyframes, integrate_from_keyframe
 
@@ -40,7 +40,7 @@ def run(r, t0, t1, bias=BIAS, intrinsics=None, first=None, width=6, covariance=F
     first = r.interval(t0) if first is None else first
     x = np.zeros(24) if intrinsics is None else intrinsics
     readings = Readings(r.t, r.gyro, r.accel, r.variance, r.walk, linear)
-    room = integration_room(COVARIANCE_SIZE if covariance else 0)
+    room = integration_workspace(COVARIANCE_SIZE if covariance else 0)
     end = integrate(t0, t1, first, tuple(bias), readings, correction(x), room, Increment(R, v, p, J, P))
     return R, v, p, J, P, end
 

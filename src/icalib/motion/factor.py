@@ -246,14 +246,16 @@ class RowFactor(FactorDefaults):
 
     def rows(self: _HasRows, out: Whitened, state: State) -> list[ResidualRows]:
         """See `Factor`."""
-        raw, seconds, found = self.raw(out), self.times(state) if self.kinds else np.zeros(0), []
+        raw, seconds, residual_rows = self.raw(out), self.times(state) if self.kinds else np.zeros(0), []
         sigma = np.ones_like(out.residual) if raw is None else self.raw_sigma()
         for kind, c in self.kinds.items():
             white = out.residual[:, c]
-            own = white if raw is None else raw[:, c]
+            residual = white if raw is None else raw[:, c]
             unit = self.units.get(kind, "")
-            found.append(ResidualRows(self.name, kind, unit, seconds, own, sigma[:, c], white, out.root[:, c]))
-        return found
+            residual_rows.append(
+                ResidualRows(self.name, kind, unit, seconds, residual, sigma[:, c], white, out.root[:, c])
+            )
+        return residual_rows
 
     def rms(self: _HasRows, out: Whitened, kind: str) -> tuple[float | None, str]:
         """RMS of the residuals of `kind` before whitening, and its unit; None and "" if they are defined only
@@ -261,8 +263,8 @@ class RowFactor(FactorDefaults):
         raw = self.raw(out)
         if raw is None:
             return None, ""
-        own = raw[:, self.kinds[kind]]
-        return float(np.sqrt(np.mean(own**2))) if own.size else 0.0, self.units[kind]
+        residual = raw[:, self.kinds[kind]]
+        return float(np.sqrt(np.mean(residual**2))) if residual.size else 0.0, self.units[kind]
 
     def count(self: _HasRows, out: Whitened, kind: str) -> int:
         """Number of scalar residuals of `kind` in use."""
@@ -300,9 +302,9 @@ def keyed(factors: Iterable[Factor]) -> dict[FactorKey, Factor]:
     return {factor.key: factor for factor in factors}
 
 
-def of_type(things: Mapping[FactorKey, Any], wanted: type[T]) -> tuple[T, ...]:
+def of_type(by_key: Mapping[FactorKey, Any], wanted: type[T]) -> tuple[T, ...]:
     """Factors (or outputs of factors) of the class `wanted`, in order."""
-    return tuple(x for x in things.values() if isinstance(x, wanted))
+    return tuple(x for x in by_key.values() if isinstance(x, wanted))
 
 
 def pairs_of(factors: Mapping[FactorKey, Factor], outputs: Residuals, wanted: type[T]) -> list[tuple[T, Any]]:

@@ -86,7 +86,7 @@ class ImuData:
         """Index (n,) of the reading interval of each time; the first or last one for times outside."""
         return np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
 
-    def turned_by_noise(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    def rotation_sigma(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Standard deviation (n,) [rad, about each axis] of the rotation error from gyroscope noise between `begin` and
         `end` (n,) [s]; negative if `end` is earlier."""
         dt = np.diff(self.seconds)
@@ -116,15 +116,15 @@ def _is_dense(measurements: Measurements) -> bool:
 
 def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> ImuData | None:
     """As `imu_data`, for joined recordings. The noise within gaps follows from the motion of each recording."""
-    found = [(p, imu) for p in parts if (imu := imu_data(rig, p.measurements)) is not None]
-    if len(found) < 2 or joined.imu is None:
-        return found[0][1] if found else None
+    imus = [(p, imu) for p in parts if (imu := imu_data(rig, p.measurements)) is not None]
+    if len(imus) < 2 or joined.imu is None:
+        return imus[0][1] if imus else None
     seconds = joined.imu.seconds
     # The interval between two recordings has a variance, too, but no factor uses it.
-    variance = np.concatenate([np.vstack([imu.variance, imu.variance[-1:]]) for _, imu in found])[:-1]
-    gaps = tuple((a + p.begin, b + p.begin) for p, imu in found for a, b in imu.gaps)
-    last = np.cumsum([len(imu.seconds) for _, imu in found])[:-1] - 1
+    variance = np.concatenate([np.vstack([imu.variance, imu.variance[-1:]]) for _, imu in imus])[:-1]
+    gaps = tuple((a + p.begin, b + p.begin) for p, imu in imus for a, b in imu.gaps)
+    last = np.cumsum([len(imu.seconds) for _, imu in imus])[:-1] - 1
     seams = tuple((float(seconds[i]), float(seconds[i + 1])) for i in last)
     gyro, accel = np.ascontiguousarray(joined.imu.gyro), np.ascontiguousarray(joined.imu.accel)
-    one = found[0][1]
-    return ImuData(joined.imu.name, seconds, gyro, accel, variance, one.walk, gaps, seams, one.forwards)
+    first = imus[0][1]
+    return ImuData(joined.imu.name, seconds, gyro, accel, variance, first.walk, gaps, seams, first.forwards)

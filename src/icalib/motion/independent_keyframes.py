@@ -50,8 +50,8 @@ class IndependentKeyframes(RowFactor):
         """Adds information that keeps the keyframes of `piece` positive definite. Returns 0, its cost."""
         del state, out, curved
         if sums:
-            own = np.concatenate([np.full(POSE_DIM, WEAK_POSE_INFORMATION), np.ones(KEYFRAME_DIM - POSE_DIM)])
-            piece.diagonal[:, range(KEYFRAME_DIM), range(KEYFRAME_DIM)] += own
+            information = np.concatenate([np.full(POSE_DIM, WEAK_POSE_INFORMATION), np.ones(KEYFRAME_DIM - POSE_DIM)])
+            piece.diagonal[:, range(KEYFRAME_DIM), range(KEYFRAME_DIM)] += information
         return 0.0
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:

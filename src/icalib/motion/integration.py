@@ -57,7 +57,7 @@ class Increment(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _corrected(gyro, accel, j, share, bias, by):
+def corrected(gyro, accel, j, share, bias, by):
     """Body rate and specific force (3,), from readings interpolated at `share` of the interval from stamp j to j +
     1."""
     w = (
@@ -86,25 +86,25 @@ def bias_of(bias, k):
 
 
 @njit(cache=True, nogil=True)
-def advance(t1, only_whole, j, now, bias, readings, by, run, width, cov, cov_t):
-    """Advances `run` from `now` in interval j to t1 (s); with `only_whole` through whole intervals up to the one that
-    holds t1, or the last. Returns that interval, its start, and rate and specific force (3,) at t1."""
+def advance(t1, whole_intervals, j, now, bias, readings, by, run, width, cov, cov_t):
+    """Advances `run` from `now` in interval j to t1 (s); with `whole_intervals` through whole intervals up to the one
+    that holds t1, or the last. Returns that interval, its start, and rate and specific force (3,) at t1."""
     t, gyro, accel, linear = readings.t, readings.gyro, readings.accel, readings.linear
     backwards, last, rate, force = t1 < now, len(t) - 2, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     while True:
-        here = (j <= 0 or t[j] <= t1) if backwards else (j >= last or t[j + 1] >= t1)
-        if here and only_whole:
+        is_last = (j <= 0 or t[j] <= t1) if backwards else (j >= last or t[j + 1] >= t1)
+        if is_last and whole_intervals:
             break
-        end = t1 if here else (t[j] if backwards else t[j + 1])
+        end = t1 if is_last else (t[j] if backwards else t[j + 1])
         share = _share(t, j, 0.5 * (now + end)) if linear else 0.5
-        rate, force = _corrected(gyro, accel, j, share, bias, by)
+        rate, force = corrected(gyro, accel, j, share, bias, by)
         if end != now:
             turn, by_turn = step(rate, force, end - now, by, run, width)
             if len(cov) > 0:
                 add_covariance(turn, by_turn, end - now, readings.variance[j], readings.walk, run, cov, cov_t)
-        if here:
+        if is_last:
             if linear:
-                rate, force = _corrected(gyro, accel, j, _share(t, j, t1), bias, by)
+                rate, force = corrected(gyro, accel, j, _share(t, j, t1), bias, by)
             break
         now = end
         j += -1 if backwards else 1
@@ -133,26 +133,28 @@ def finish(run, cov, out):
 
 
 @njit(cache=True, nogil=True)
-def integrate(t0, t1, first, bias, readings, by, room, out):
+def integrate(t0, t1, first, bias, readings, by, workspace, out):
     """Integrates `readings` from t0 to t1 (seconds on the IMU clock; t1 < t0 integrates backwards), starting in
     interval `first`; overwrites `out`, an `Increment`.
 
-    bias: six numbers; by: see `correction`; room: see `integration_room`. Beyond the recording, the first or last
-    interval is extrapolated. Returns the corrected rate (3,) and specific force (3,) at t1.
+    bias: six numbers; by: see `correction`; workspace: see `integration_workspace`. Beyond the recording, the first or
+    last interval is extrapolated. Returns the corrected rate (3,) and specific force (3,) at t1.
     """
-    run, cov, cov_t = room
+    run, cov, cov_t = workspace
     start(run)
     for i in range(len(cov)):
         cov[i] = 0.0
-    only_whole = len(run) == 0  # False; the literal would be a type of its own, for which all is compiled once more
+    whole_intervals = (
+        len(run) == 0
+    )  # False; the literal would be a type of its own, for which all is compiled once more
     width = out.J.shape[1]
-    _, _, rate, force = advance(t1, only_whole, first, t0, bias, readings, by, run, width, cov, cov_t)
+    _, _, rate, force = advance(t1, whole_intervals, first, t0, bias, readings, by, run, width, cov, cov_t)
     finish(run, cov, out)
     return rate, force
 
 
 @njit(cache=True, nogil=True)
-def integration_room(n):
+def integration_workspace(n):
     """Workspace of `integrate`; n: COVARIANCE_SIZE with a covariance, else 0."""
     return np.empty(RUN_SIZE), np.empty(n), np.empty(n)
 

@@ -16,8 +16,8 @@ def place_keyframes(imu: ImuData, image_times: list[np.ndarray], spacing: float,
     IMU gaps up to `max_gap` seconds have keyframes too; longer ones, and intervals between recordings, have none.
     """
     times = np.sort(np.concatenate(image_times))
-    own = distinct(times[usable(imu, times, max_gap)])
-    parts = [_filled(recorded, spacing) for recorded in np.split(own, first_keyframes(imu, own)[1:])]
+    instants = distinct(times[usable(imu, times, max_gap)])
+    parts = [_filled(recorded, spacing) for recorded in np.split(instants, first_keyframes(imu, instants)[1:])]
     keyframes = np.concatenate(parts)
     return keyframes[clear_of(_long_gaps(imu, max_gap), keyframes, keyframes)]
 

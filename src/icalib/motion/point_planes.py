@@ -7,7 +7,7 @@ import numpy as np
 from icalib.base.compiled import njit
 
 MAX_COARSE_POINTS = 3_000_000  # points of a LiDAR that a coarse pass uses, roughly
-MAX_PLANE_POINTS_KEPT_WHOLE = 20_000  # points of a plane: planes with fewer are not thinned
+MAX_UNTHINNED_PLANE_POINTS = 20_000  # points of a plane: planes with fewer are not thinned
 
 
 @njit(cache=True, nogil=True)
@@ -36,7 +36,7 @@ def _some(plane, step, count, out):
     due = 0
     for i in range(len(plane)):
         q = plane[i]
-        out[i] = q if i == due or (q >= 0 and count[q] < MAX_PLANE_POINTS_KEPT_WHOLE) else -1
+        out[i] = q if i == due or (q >= 0 and count[q] < MAX_UNTHINNED_PLANE_POINTS) else -1
         if i == due:
             due += step
 

@@ -17,20 +17,21 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
-from icalib.motion.imu_model import correction_matrices
-from icalib.motion.integration import bias_of, readings_of
+from icalib.motion.integration import bias_of, corrected, readings_of
 from icalib.motion.integration_step import (
     AT_INTRINSICS,
     AT_J,
     AT_P,
     AT_V,
     J_STRIDE,
+    ROW_G,
+    ROW_H,
     RUN_SIZE,
     correction,
     fill_intrinsics,
 )
 from icalib.motion.propagation import (
-    Moving,
+    ImuMotion,
     empty_prefix,
     integrate_from_keyframe,
     keyframes_of,
@@ -88,17 +89,18 @@ def assign_keyframes(scheme: Scheme, keyframes: np.ndarray, times: np.ndarray, f
 
 
 @njit(cache=True, nogil=True)
-def _velocity(i, R, run, force, g, at, moving):
-    """Fills entry i of `moving`: acceleration, and Jacobians of the velocity, at instant i of `at`. run: increments
-    since the keyframe (see `integration_step`); R: rotation of the keyframe; force: specific force at the instant."""
+def _velocity(i, R, run, force, g, at, derivatives):
+    """Fills entry i of `derivatives`: acceleration, and Jacobians of the velocity, at instant i of `at`. run:
+    increments since the keyframe (see `integration_step`); R: rotation of the keyframe; force: specific force at the
+    instant."""
     first = 0 * i  # first row of the Jacobians; not a literal, see `_fill_pose`
-    _fill_start(i, first, R, run, AT_J + 3 * J_STRIDE, moving.J_keyframe, moving.J_imu)
-    _fill_turn(i, first, R, run, AT_V, moving.J_keyframe)
+    _fill_start(i, first, R, run, AT_J + 3 * J_STRIDE, derivatives.J_keyframe, derivatives.J_imu)
+    _fill_turn(i, first, R, run, AT_V, derivatives.J_keyframe)
     for a in range(3):
         row = at.rotation[i, a, 0], at.rotation[i, a, 1], at.rotation[i, a, 2]
-        moving.acceleration[i, a] = row[0] * force[0] + row[1] * force[1] + row[2] * force[2]
-        moving.J_keyframe[i, a, 6 + a] = 1.0
-    moving.acceleration[i, 2] -= g
+        derivatives.acceleration[i, a] = row[0] * force[0] + row[1] * force[1] + row[2] * force[2]
+        derivatives.J_keyframe[i, a, 6 + a] = 1.0
+    derivatives.acceleration[i, 2] -= g
 
 
 @njit(cache=True, nogil=True)
@@ -142,85 +144,96 @@ def _fill_start(i, r, R, x, o, Jn, Jx):
 
 
 @njit(cache=True, nogil=True)
-def _inertial(ways, keyframes, readings, intrinsics, at, Jn, Jx, moving):
-    """The `inertial` scheme for the query `ways`: fills `at`, a `Moving`, and, unless they are empty, Jacobians and
-    `moving`."""
+def _inertial(query, keyframes, readings, intrinsics, at, Jn, Jx, derivatives):
+    """The `inertial` scheme for `query`: fills `at`, a `ImuMotion`, and, unless they are empty, Jacobians and
+    `derivatives`."""
     width = 6 + Jx.shape[2] if len(Jn) else 0
-    by, carried, run = correction(intrinsics), empty_prefix(), np.empty(RUN_SIZE)
-    for i in ways.order:
-        k, t = ways.keyframe[i], ways.times[i]
+    by, prefix, run = correction(intrinsics), empty_prefix(), np.empty(RUN_SIZE)
+    for i in query.order:
+        k, t = query.keyframe[i], query.times[i]
         t0, bias = keyframes.seconds[k], bias_of(keyframes.bias, k)
-        rate, force = integrate_from_keyframe(k, t0, t, ways.first[i], bias, readings, by, carried, run, width)
+        rate, force = integrate_from_keyframe(k, t0, t, query.first[i], bias, readings, by, prefix, run, width)
         place(i, t - t0, k, keyframes, run, rate, at)
         if len(Jn):
             _fill_pose(i, t - t0, rotation_of(keyframes, k), run, Jn, Jx)
-        if len(moving.acceleration):
-            _velocity(i, rotation_of(keyframes, k), run, force, keyframes.gravity, at, moving)
+        if len(derivatives.acceleration):
+            _velocity(i, rotation_of(keyframes, k), run, force, keyframes.gravity, at, derivatives)
 
 
 @njit(cache=True, nogil=True)
-def _kinematic(
-    times, keyframe, first, keyframes, R, p, v, b, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx
-):
-    """The `kinematic` scheme: fills poses, rates, velocities and Jacobians by keyframe (Jn) and IMU intrinsics (Jx)."""
-    F, G, H = correction_matrices(intrinsics)
-    n_x = Jx.shape[2]
-    by, run = correction(intrinsics), np.zeros(RUN_SIZE)
-    w, f = np.empty(3), np.empty(3)
+def _kinematic(times, keyframe, first, keyframes, readings, intrinsics, at, Jn, Jx):
+    """The `kinematic` scheme: fills `at`, an `ImuMotion`, and Jacobians by keyframe (Jn) and IMU intrinsics (Jx). first
+    (n,): interval of the readings that holds the keyframe of each instant."""
+    by, run, turn = correction(intrinsics), np.zeros(RUN_SIZE), np.empty(3)
     for i in range(len(times)):
-        k, j = keyframe[i], first[i]
-        dt = times[i] - keyframes[k]
-        s = (keyframes[k] - t[j]) / (t[j + 1] - t[j])
+        k, j, t = keyframe[i], first[i], readings.t
+        dt = times[i] - keyframes.seconds[k]
+        share = (keyframes.seconds[k] - t[j]) / (t[j + 1] - t[j])
+        w, f = corrected(readings.gyro, readings.accel, j, share, bias_of(keyframes.bias, k), by)
         for a in range(3):
-            w[a] = f[a] = 0.0
-            for c in range(3):
-                raw_w = gyro[j, c] + s * (gyro[j + 1, c] - gyro[j, c]) - b[k, c]
-                raw_f = accel[j, c] + s * (accel[j + 1, c] - accel[j, c]) - b[k, 3 + c]
-                w[a] += G[a, c] * raw_w + H[a, c] * raw_f
-                f[a] += F[a, c] * raw_f
-        turn = w * dt
-        turned, Jr = so3.exp(turn), so3.right_jacobian(turn)
-        if n_x:
-            fill_intrinsics((w[0], w[1], w[2]), (f[0], f[1], f[2]), by, run)
-        for a in range(3):
-            rate[i, a] = w[a]
-            vel[i, a] = v[k, a]
-            out_p[i, a] = p[k, a] + v[k, a] * dt
-            Jn[i, 3 + a, 3 + a] = 1.0
-            Jn[i, 3 + a, 6 + a] = dt
-            for c in range(3):
-                out_R[i, a, c] = R[k, a, 0] * turned[0, c] + R[k, a, 1] * turned[1, c] + R[k, a, 2] * turned[2, c]
-                Jn[i, a, c] = turned[c, a]
-                for d in range(3):
-                    Jn[i, a, 9 + c] -= dt * Jr[a, d] * G[d, c]
-                    Jn[i, a, 12 + c] -= dt * Jr[a, d] * H[d, c]
-            for c in range(n_x):
-                by_w = run[AT_INTRINSICS + c], run[AT_INTRINSICS + J_STRIDE + c], run[AT_INTRINSICS + 2 * J_STRIDE + c]
-                Jx[i, a, c] = dt * (Jr[a, 0] * by_w[0] + Jr[a, 1] * by_w[1] + Jr[a, 2] * by_w[2])
+            turn[a] = w[a] * dt
+        increment, Jr = so3.exp(turn), so3.right_jacobian(turn)
+        if Jx.shape[2]:
+            fill_intrinsics(w, f, by, run)
+        _place_at_constant_velocity(i, dt, k, keyframes, increment, w, at)
+        _fill_kinematic(i, dt, increment, Jr, by, run, Jn, Jx)
 
 
 @njit(cache=True, nogil=True)
-def _between(times, keyframe, keyframes, R, p, out_R, out_p, rate, vel, Jn, Jm):
-    """The `pose` scheme: fills poses, rates, velocities and Jacobians by keyframe (Jn) and the next one (Jm)."""
+def _place_at_constant_velocity(i, dt, k, keyframes, increment, rate, at):
+    """Fills entry i of `at`, an `ImuMotion`, from keyframe k. increment (3, 3): rotation over the elapsed time dt; rate
+    (3,): body rate."""
+    R, p, v = keyframes.rotation, keyframes.position, keyframes.velocity
+    for a in range(3):
+        at.rate[i, a] = rate[a]
+        at.velocity[i, a] = v[k, a]
+        at.position[i, a] = p[k, a] + v[k, a] * dt
+        for c in range(3):
+            at.rotation[i, a, c] = (
+                R[k, a, 0] * increment[0, c] + R[k, a, 1] * increment[1, c] + R[k, a, 2] * increment[2, c]
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _fill_kinematic(i, dt, increment, Jr, by, run, Jn, Jx):
+    """Fills entry i of the Jacobians of the `kinematic` scheme. Jr (3, 3): right Jacobian of the `increment`; by: see
+    `correction`; run: holds the derivatives of the rate by the intrinsics."""
+    for a in range(3):
+        Jn[i, 3 + a, 3 + a] = 1.0
+        Jn[i, 3 + a, 6 + a] = dt
+        for c in range(3):
+            Jn[i, a, c] = increment[c, a]
+            for d in range(3):
+                Jn[i, a, 9 + c] -= dt * Jr[a, d] * by[ROW_G, 3 * d + c]
+                Jn[i, a, 12 + c] -= dt * Jr[a, d] * by[ROW_H, 3 * d + c]
+        for c in range(Jx.shape[2]):
+            by_w = run[AT_INTRINSICS + c], run[AT_INTRINSICS + J_STRIDE + c], run[AT_INTRINSICS + 2 * J_STRIDE + c]
+            Jx[i, a, c] = dt * (Jr[a, 0] * by_w[0] + Jr[a, 1] * by_w[1] + Jr[a, 2] * by_w[2])
+
+
+@njit(cache=True, nogil=True)
+def _between(times, keyframe, keyframes, at, Jn, Jm):
+    """The `pose` scheme: fills `at`, an `ImuMotion`, and Jacobians by keyframe (Jn) and the next one (Jm)."""
+    t, R, p = keyframes.seconds, keyframes.rotation, keyframes.position
     for i in range(len(times)):
         k = keyframe[i]
-        span = keyframes[k + 1] - keyframes[k]
-        s = (times[i] - keyframes[k]) / span
+        span = t[k + 1] - t[k]
+        s = (times[i] - t[k]) / span
         R01 = np.ascontiguousarray(R[k].T) @ R[k + 1]
         phi = so3.log(R01)
-        turned = so3.exp(s * phi)
-        slide = s * (so3.right_jacobian(s * phi) @ so3.right_jacobian_inverse(phi))
-        back = slide @ np.ascontiguousarray(R01.T)
-        out_R[i] = R[k] @ turned
+        increment = so3.exp(s * phi)
+        J_next = s * (so3.right_jacobian(s * phi) @ so3.right_jacobian_inverse(phi))
+        back = J_next @ np.ascontiguousarray(R01.T)
+        at.rotation[i] = R[k] @ increment
         for a in range(3):
-            rate[i, a] = phi[a] / span
-            vel[i, a] = (p[k + 1, a] - p[k, a]) / span
-            out_p[i, a] = p[k, a] + s * (p[k + 1, a] - p[k, a])
+            at.rate[i, a] = phi[a] / span
+            at.velocity[i, a] = (p[k + 1, a] - p[k, a]) / span
+            at.position[i, a] = p[k, a] + s * (p[k + 1, a] - p[k, a])
             Jn[i, 3 + a, 3 + a] = 1.0 - s
             Jm[i, 3 + a, 3 + a] = s
             for c in range(3):
-                Jn[i, a, c] = turned[c, a] - back[a, c]
-                Jm[i, a, c] = slide[a, c]
+                Jn[i, a, c] = increment[c, a] - back[a, c]
+                Jm[i, a, c] = J_next[a, c]
 
 
 def poses_of_keyframes(keyframe: np.ndarray, state: State) -> Poses:
@@ -242,29 +255,27 @@ def poses_at(
     gravity [m/s^2]; imu_free: whether IMU intrinsics are estimated."""
     n = len(times)
     if scheme == "inertial":
-        return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
-    out, J_keyframe, J_imu = (
-        Moving.empty(n),
-        np.zeros((n, 6, KEYFRAME_DIM)),
-        np.zeros((n, 6, N_INTRINSICS if imu_free else 0)),
-    )
+        return _propagated(
+            _empty(n, n, imu_free), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0)
+        )
+    at, keyframes, J_keyframe = ImuMotion.empty(n), keyframes_of(state, gravity), np.zeros((n, 6, KEYFRAME_DIM))
     J_next = np.zeros((n if scheme == "pose" else 0, 6, KEYFRAME_DIM))
+    J_imu = np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
     if scheme == "pose":
-        _between(times, keyframe, state.seconds, state.rotation, state.position, *out, J_keyframe, J_next)
+        _between(times, keyframe, keyframes, at, J_keyframe, J_next)
     else:
-        _kinematic(
-            times, keyframe, imu.interval(state.seconds[keyframe]), state.seconds, state.rotation, state.position,
-            state.velocity, state.bias, imu.seconds, imu.gyro, imu.accel, state.values[imu.name, "intrinsics"],
-            *out, J_keyframe, J_imu,
-        )  # fmt: skip
-    return Poses(*out, J_keyframe, J_next, J_imu)
+        first, intrinsics = imu.interval(state.seconds[keyframe]), state.values[imu.name, "intrinsics"]
+        _kinematic(times, keyframe, first, keyframes, readings_of(imu, True), intrinsics, at, J_keyframe, J_imu)
+    return Poses(*at, J_keyframe, J_next, J_imu)
 
 
 def poses_without_jacobians(
     times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float
 ) -> Poses:
     """The `inertial` poses of `poses_at`, with Jacobians of length 0."""
-    return _carried(_empty(len(times), 0, False), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
+    return _propagated(
+        _empty(len(times), 0, False), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0)
+    )
 
 
 def poses_and_velocity_derivatives(
@@ -272,30 +283,30 @@ def poses_and_velocity_derivatives(
 ) -> tuple[Poses, VelocityDerivatives]:
     """The `inertial` poses of `poses_at`, and derivatives of their velocities."""
     n = len(times)
-    moving = VelocityDerivatives.empty(n, N_INTRINSICS if imu_free else 0)
-    return _carried(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, moving), moving
+    derivatives = VelocityDerivatives.empty(n, N_INTRINSICS if imu_free else 0)
+    return _propagated(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, derivatives), derivatives
 
 
 def _empty(n: int, n_jacobians: int, imu_free: bool) -> Poses:
     """Arrays for n `inertial` poses; n_jacobians: n, or 0 for no Jacobians. imu_free: whether IMU intrinsics are
     estimated."""
     J_imu = np.zeros((n_jacobians, 6, N_INTRINSICS if imu_free else 0))
-    return Poses(*Moving.empty(n), np.zeros((n_jacobians, 6, KEYFRAME_DIM)), np.zeros((0, 6, KEYFRAME_DIM)), J_imu)
+    return Poses(*ImuMotion.empty(n), np.zeros((n_jacobians, 6, KEYFRAME_DIM)), np.zeros((0, 6, KEYFRAME_DIM)), J_imu)
 
 
-def _carried(
+def _propagated(
     out: Poses,
     times: np.ndarray,
     keyframe: np.ndarray,
     state: State,
     imu: ImuData,
     gravity: float,
-    moving: VelocityDerivatives,
+    derivatives: VelocityDerivatives,
 ) -> Poses:
-    """Fills `out` with the `inertial` poses, and `moving` with derivatives of the velocity unless it is empty; returns
-    `out`."""
-    ways, keyframes = propagation_query(state, times, keyframe, imu), keyframes_of(state, gravity)
-    at = Moving(out.rotation, out.position, out.rate, out.velocity)
+    """Fills `out` with the `inertial` poses, and `derivatives` with derivatives of the velocity unless it is empty;
+    returns `out`."""
+    query, keyframes = propagation_query(state, times, keyframe, imu), keyframes_of(state, gravity)
+    at = ImuMotion(out.rotation, out.position, out.rate, out.velocity)
     intrinsics = state.values[imu.name, "intrinsics"]
-    _inertial(ways, keyframes, readings_of(imu, True), intrinsics, at, out.J_keyframe, out.J_imu, moving)
+    _inertial(query, keyframes, readings_of(imu, True), intrinsics, at, out.J_keyframe, out.J_imu, derivatives)
     return out

@@ -39,7 +39,7 @@ class PropagationQuery(NamedTuple):
     order: np.ndarray
 
 
-class Moving(NamedTuple):
+class ImuMotion(NamedTuple):
     """Pose and velocity of the IMU at n instants: R_world_imu (n, 3, 3), p_world_imu (n, 3) [m], rate (n, 3) [rad/s,
     IMU frame], velocity (n, 3) [m/s, world]."""
 
@@ -49,47 +49,47 @@ class Moving(NamedTuple):
     velocity: np.ndarray
 
     @classmethod
-    def empty(cls, n: int) -> Moving:
+    def empty(cls, n: int) -> ImuMotion:
         """Uninitialised arrays for n instants."""
         return cls(np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)))
 
 
 @njit(cache=True, nogil=True)
-def integrate_from_keyframe(keyframe, t0, t1, first, bias, readings, by, carried, run, width):
+def integrate_from_keyframe(keyframe, t0, t1, first, bias, readings, by, prefix, run, width):
     """As `integrate`, without covariance and into `run` (RUN_SIZE,).
 
-    `carried` (RUN_SIZE + 3,) is the integral over whole intervals from the same keyframe in the same direction. Its
-    last three elements are an identifier of both, the interval, and the instant reached. It is extended to t1, so that
-    many instants in the order of `in_order_of_keyframes` cost little more than the last one.
+    `prefix` (RUN_SIZE + 3,) is the integral over whole intervals from the same keyframe in the same direction. Its last
+    three elements are an identifier of both, the interval, and the instant reached. It is extended to t1, so that many
+    instants in the order of `in_order_of_keyframes` cost little more than the last one.
     """
     backwards = t1 < t0
-    way = 2 * keyframe + backwards
-    if carried[RUN_SIZE] != way or (t1 >= carried[RUN_SIZE + 2] if backwards else t1 <= carried[RUN_SIZE + 2]):
-        start(carried)
-        carried[RUN_SIZE], carried[RUN_SIZE + 1], carried[RUN_SIZE + 2] = way, first, t0
+    identifier = 2 * keyframe + backwards
+    if prefix[RUN_SIZE] != identifier or (t1 >= prefix[RUN_SIZE + 2] if backwards else t1 <= prefix[RUN_SIZE + 2]):
+        start(prefix)
+        prefix[RUN_SIZE], prefix[RUN_SIZE + 1], prefix[RUN_SIZE + 2] = identifier, first, t0
     none, j, now, rate, force = (
-        carried[:0],
-        int(carried[RUN_SIZE + 1]),
-        carried[RUN_SIZE + 2],
+        prefix[:0],
+        int(prefix[RUN_SIZE + 1]),
+        prefix[RUN_SIZE + 2],
         (0.0, 0.0, 0.0),
         (0.0, 0.0, 0.0),
     )
     for part in range(2):  # whole intervals, and then the rest
-        x = run if part else carried
+        x = run if part else prefix
         j, now, rate, force = advance(t1, part == 0, j, now, bias, readings, by, x, width, none, none)
         if part == 0:
-            carried[RUN_SIZE + 1], carried[RUN_SIZE + 2] = j, now
+            prefix[RUN_SIZE + 1], prefix[RUN_SIZE + 2] = j, now
             for i in range(RUN_SIZE if width else AT_STEP):
-                run[i] = carried[i]
+                run[i] = prefix[i]
     return rate, force
 
 
 @njit(cache=True, nogil=True)
 def empty_prefix():
-    """Initial `carried` of `integrate_from_keyframe`: the identifier -1, of no keyframe, so that it starts anew."""
-    carried = np.zeros(RUN_SIZE + 3)
-    carried[RUN_SIZE] = -1.0
-    return carried
+    """Initial `prefix` of `integrate_from_keyframe`: the identifier -1, of no keyframe, so that it starts anew."""
+    prefix = np.zeros(RUN_SIZE + 3)
+    prefix[RUN_SIZE] = -1.0
+    return prefix
 
 
 @njit(cache=True, nogil=True)
@@ -100,8 +100,8 @@ def rotation_of(keyframes, k):
 
 
 @njit(cache=True, nogil=True)
-def place(i, seconds, k, keyframes, way, rate, out):
-    """Fills entry i of `out`, a `Moving`, from keyframe k and the increments `way` (see `integration_step`). seconds:
+def place(i, seconds, k, keyframes, increments, rate, out):
+    """Fills entry i of `out`, a `ImuMotion`, from keyframe k and the `increments` (see `integration_step`). seconds:
     elapsed time; rate (3,): body rate at the instant."""
     R, g = keyframes.rotation, keyframes.gravity
     for a in range(3):
@@ -109,9 +109,11 @@ def place(i, seconds, k, keyframes, way, rate, out):
         position = keyframes.position[k, a] + keyframes.velocity[k, a] * seconds
         velocity = keyframes.velocity[k, a]
         for c in range(3):
-            out.rotation[i, a, c] = R[k, a, 0] * way[c] + R[k, a, 1] * way[3 + c] + R[k, a, 2] * way[6 + c]
-            position += R[k, a, c] * way[12 + c]
-            velocity += R[k, a, c] * way[9 + c]
+            out.rotation[i, a, c] = (
+                R[k, a, 0] * increments[c] + R[k, a, 1] * increments[3 + c] + R[k, a, 2] * increments[6 + c]
+            )
+            position += R[k, a, c] * increments[12 + c]
+            velocity += R[k, a, c] * increments[9 + c]
         out.position[i, a], out.velocity[i, a] = position, velocity
     out.position[i, 2] -= 0.5 * g * seconds * seconds
     out.velocity[i, 2] -= g * seconds

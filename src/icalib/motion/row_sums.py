@@ -34,10 +34,10 @@ class RobustNoise(NamedTuple):
     loss_scale: float
 
 
-def in_chunks(own: slice) -> Iterator[slice]:
-    """Slices of at most ROWS_PER_CHUNK rows that make up `own`."""
-    for start in range(own.start, own.stop, ROWS_PER_CHUNK):
-        yield slice(start, min(start + ROWS_PER_CHUNK, own.stop))
+def in_chunks(rows: slice) -> Iterator[slice]:
+    """Slices of at most ROWS_PER_CHUNK rows that make up `rows`."""
+    for start in range(rows.start, rows.stop, ROWS_PER_CHUNK):
+        yield slice(start, min(start + ROWS_PER_CHUNK, rows.stop))
 
 
 def rows_by_recording(
@@ -56,12 +56,12 @@ def rows_by_recording(
 
 
 def add_rows(
-    rows: Rows, own: slice, keyframe: np.ndarray, columns: np.ndarray, noise: RobustNoise, into: Into
+    rows: Rows, chunk: slice, keyframe: np.ndarray, columns: np.ndarray, noise: RobustNoise, into: Into
 ) -> float:
-    """Adds the rows `own` of a factor, each to the interval that begins at its `keyframe` (n,), and fills `into.out`.
+    """Adds the rows `chunk` of a factor, each to the interval that begins at its `keyframe` (n,), and fills `into.out`.
     Returns half the robust chi^2. columns (c,): calibration columns of rows.J, -1 where fixed."""
     loss = Loss(LOSSES[noise.loss], noise.loss_scale, into.curved)
     return accumulate_rows(
-        rows, keyframe, noise.whitening, loss, columns, into.piece.sums(into.sums), into.out.residual[own],
-        into.out.root[own],
+        rows, keyframe, noise.whitening, loss, columns, into.piece.sums(into.sums), into.out.residual[chunk],
+        into.out.root[chunk],
     )  # fmt: skip

@@ -32,7 +32,7 @@ N_POSE_PARAMETERS = 7  # extrinsics and time offset; the IMU intrinsics follow
 IDENTITY_6 = np.eye(6)  # Jacobian of a pose by itself
 
 
-class _Moving(Protocol):
+class _SensorFactor(Protocol):
     """Requirements of `Kinematics.of`: a factor of measurements by a sensor on the moving body."""
 
     @property
@@ -60,15 +60,15 @@ class Kinematics:
     scheme: Scheme = "inertial"
 
     @classmethod
-    def of(cls, factor: _Moving) -> Kinematics:
+    def of(cls, factor: _SensorFactor) -> Kinematics:
         """Kinematics of the sensor of a factor, in the `inertial` scheme."""
         return cls(factor.name, factor.layout, factor.imu, factor.gravity)
 
     def columns(self, clock: int = 0) -> np.ndarray:
         """Calibration columns (7 + 24 or 0,) of the sensor's pose, -1 where fixed; `clock`: number of its time
         offset."""
-        own = pose_columns(self.layout, self.sensor, clock)
-        return np.concatenate([own, self.layout.columns(self._imu, "intrinsics")]) if self._imu else own
+        columns = pose_columns(self.layout, self.sensor, clock)
+        return np.concatenate([columns, self.layout.columns(self._imu, "intrinsics")]) if self._imu else columns
 
     @property
     def _imu(self) -> str:
@@ -121,10 +121,10 @@ class SensorPose(NamedTuple):
         """(n, 3) p_world_sensor [m]."""
         return self.p_world_sensor
 
-    def part(self, own: slice | np.ndarray) -> SensorPose:
-        """The poses with the indices `own`."""
+    def part(self, indices: slice | np.ndarray) -> SensorPose:
+        """The poses with the indices `indices`."""
         R_is, p_is, *each = self
-        return SensorPose(R_is, p_is, *(x[own] if len(x) else x for x in each))
+        return SensorPose(R_is, p_is, *(x[indices] if len(x) else x for x in each))
 
     @property
     def n_calib(self) -> int:
@@ -132,17 +132,19 @@ class SensorPose(NamedTuple):
         return N_POSE_PARAMETERS + self.J_imu.shape[2]
 
 
-def rows_at(residual: np.ndarray, J_pose: Sequence[np.ndarray], ends: Sequence[SensorPose], J_own: np.ndarray) -> Rows:
+def rows_at(
+    residual: np.ndarray, J_pose: Sequence[np.ndarray], ends: Sequence[SensorPose], J_further: np.ndarray
+) -> Rows:
     """Rows of n residuals (n, m), from their Jacobians J_pose (n, m, 6) by sensor poses.
 
     For one pose each: by its keyframe and the next one. For two: the earlier by its keyframe, the later by the next
-    one. J_own (n, m, c): by further calibration parameters, whose columns follow those of the pose.
+    one. J_further (n, m, c): by further calibration parameters, whose columns follow those of the pose.
     """
     n, m, n_pose = *residual.shape, ends[0].n_calib
-    if not len(J_own):
+    if not len(J_further):
         return Rows(residual, np.zeros((0, m, KEYFRAME_PAIR_DIM + n_pose)))
-    J = np.zeros((n, m, KEYFRAME_PAIR_DIM + n_pose + J_own.shape[2]))
-    J[:, :, KEYFRAME_PAIR_DIM + n_pose :] = J_own
+    J = np.zeros((n, m, KEYFRAME_PAIR_DIM + n_pose + J_further.shape[2]))
+    J[:, :, KEYFRAME_PAIR_DIM + n_pose :] = J_further
     for k, (by_pose, at) in enumerate(zip(J_pose, ends, strict=True)):
         _chain_rows(by_pose, at, KEYFRAME_DIM * k, J)
     return Rows(residual, J)
@@ -173,7 +175,7 @@ def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
         at.J_next,
         at.J_imu,
     )
-    n_imu, has_next, own, mounted, x = UInt(J_imu.shape[2]), len(J_next) > 0, UInt(first), UInt(calib), UInt(i)
+    n_imu, has_next, at_keyframe, mounted, x = UInt(J_imu.shape[2]), len(J_next) > 0, UInt(first), UInt(calib), UInt(i)
     imu, offset = mounted + UInt(N_POSE_PARAMETERS), mounted + UInt(OFFSET_COLUMN)
     for r in range(UInt(T.shape[0])):
         for k in range(UInt(6)):
@@ -181,10 +183,10 @@ def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
             if f == 0.0:
                 continue
             for j in range(UInt(KEYFRAME_DIM)):
-                T[r, own + j] += f * J_keyframe[x, k, j]
+                T[r, at_keyframe + j] += f * J_keyframe[x, k, j]
             if has_next:
                 for j in range(UInt(KEYFRAME_DIM)):
-                    T[r, own + UInt(KEYFRAME_DIM) + j] += f * J_next[x, k, j]
+                    T[r, at_keyframe + UInt(KEYFRAME_DIM) + j] += f * J_next[x, k, j]
             for j in range(n_imu):
                 T[r, imu + j] += f * J_imu[x, k, j]
         for k in range(UInt(3)):

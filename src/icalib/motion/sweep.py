@@ -33,9 +33,9 @@ class EstimatedMotion:
         times = instants(stream, self.state.values)
         keyframe = assign_keyframes("inertial", self.state.seconds, times, self.imu.forwards)
         near = np.abs(times - self.state.seconds[keyframe]) <= within_s
-        own = np.flatnonzero(near & usable(self.imu, times, self.max_gap_s))
-        own = own[np.argsort(keyframe[own], kind="stable")]
-        return own, keyframe[own]
+        indices = np.flatnonzero(near & usable(self.imu, times, self.max_gap_s))
+        indices = indices[np.argsort(keyframe[indices], kind="stable")]
+        return indices, keyframe[indices]
 
 
 class Sweep(NamedTuple):
@@ -55,19 +55,19 @@ def _to_lidar(R_il, p_il, R, p, rate, velocity):
     for i in range(len(R)):
         w0, w1, w2 = rate[i, 0], rate[i, 1], rate[i, 2]
         lever = (w1 * p_il[2] - w2 * p_il[1], w2 * p_il[0] - w0 * p_il[2], w0 * p_il[1] - w1 * p_il[0])
-        moving = np.empty(3)
+        velocity_i = np.empty(3)
         for a in range(3):
-            moving[a] = lever[a]
+            velocity_i[a] = lever[a]
             for c in range(3):
-                moving[a] += R[i, c, a] * velocity[i, c]
+                velocity_i[a] += R[i, c, a] * velocity[i, c]
                 p[i, a] += R[i, a, c] * p_il[c]
         for a in range(3):
             rate[i, a] = R_il[0, a] * w0 + R_il[1, a] * w1 + R_il[2, a] * w2
-            velocity[i, a] = R_il[0, a] * moving[0] + R_il[1, a] * moving[1] + R_il[2, a] * moving[2]
-        turned = mul3(R[i], R_il)
+            velocity[i, a] = R_il[0, a] * velocity_i[0] + R_il[1, a] * velocity_i[1] + R_il[2, a] * velocity_i[2]
+        rotation = mul3(R[i], R_il)
         for a in range(3):
             for c in range(3):
-                R[i, a, c] = turned[a, c]
+                R[i, a, c] = rotation[a, c]
 
 
 def sweep(drive: EstimatedMotion, name: str, times: np.ndarray, near: np.ndarray | None = None) -> Sweep:
@@ -77,6 +77,6 @@ def sweep(drive: EstimatedMotion, name: str, times: np.ndarray, near: np.ndarray
     keyframe = assign_keyframes("inertial", state.seconds, times if near is None else near)
     imu_at = poses_without_jacobians(times, keyframe, state, imu, drive.gravity)
     R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
-    found = Sweep(imu_at.rotation, imu_at.position, imu_at.rate, imu_at.velocity)
-    _to_lidar(np.ascontiguousarray(R_il), p_il, *found)
-    return found
+    poses = Sweep(imu_at.rotation, imu_at.position, imu_at.rate, imu_at.velocity)
+    _to_lidar(np.ascontiguousarray(R_il), p_il, *poses)
+    return poses

@@ -19,12 +19,12 @@ RECORDING_MARGIN_S = 5.0  # a measurement may precede its stamp by as much; reco
 def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
     """Times (n,) on the clock of the body. seconds (n,): times since the first stamp of the stream, by default those of
     its stamps."""
-    own, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
+    t, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
     if len(offset) == 1:
-        return own + offset[0]
+        return t + offset[0]
     joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in stream.joins_ns]) - RECORDING_MARGIN_S
     assert len(joins) == len(offset) - 1
-    return own + offset[np.searchsorted(joins, own, side="right")]
+    return t + offset[np.searchsorted(joins, t, side="right")]
 
 
 def clock_numbers(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
@@ -54,6 +54,6 @@ def pose_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
     """Calibration columns (7,) of a sensor's rotation (-1 if it has none), translation, and time offset number `clock`
     or the only one."""
     offset = layout.columns(name, "time_offset")
-    own = offset[clock if len(offset) > 1 else 0]
+    offset_column = offset[clock if len(offset) > 1 else 0]
     rotation = layout.columns(name, "rotation") if layout.has(name, "rotation") else np.full(3, -1)
-    return np.concatenate([rotation, layout.columns(name, "translation"), [own]])
+    return np.concatenate([rotation, layout.columns(name, "translation"), [offset_column]])

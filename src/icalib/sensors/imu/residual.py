@@ -17,7 +17,7 @@ from icalib.geometry import so3
 from icalib.geometry.small import inverse_cholesky, mul3, tmul3
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.integration import Increment, bias_of, integrate, integration_room, readings_of
+from icalib.motion.integration import Increment, bias_of, integrate, integration_workspace, readings_of
 from icalib.motion.integration_step import COVARIANCE_SIZE, correction
 from icalib.optim import memory
 from icalib.optim.arrowhead import Piece, in_parallel
@@ -33,7 +33,7 @@ KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": sl
 def _preintegrate(k0, k1, keyframes, first, readings, bias, intrinsics, dR, dv, dp, J, W):
     """Fills the fields of `Increments` of intervals k0 to k1 - 1; keyframes (K,) s; first (K - 1,): the reading at the
     start of each interval."""
-    P, corrected, workspace = np.empty((N_ROWS, N_ROWS)), correction(intrinsics), integration_room(COVARIANCE_SIZE)
+    P, corrected, workspace = np.empty((N_ROWS, N_ROWS)), correction(intrinsics), integration_workspace(COVARIANCE_SIZE)
     for k in range(k0, k1):
         out = Increment(dR[k], dv[k], dp[k], J[k], P)
         integrate(keyframes[k], keyframes[k + 1], first[k], bias_of(bias, k), readings, corrected, workspace, out)

@@ -74,7 +74,7 @@ class LidarFactor(RowFactor):
         moments = take_moments(AssociatedPoints(stream, plane, values), motion, noise, bin_s)
         times = instants(stream, motion.state.values, moments.seconds)
         keyframe = assign_keyframes(scheme, motion.state.seconds, times)
-        noise_angle = motion.imu.turned_by_noise(motion.state.seconds[keyframe], times)
+        noise_angle = motion.imu.rotation_sigma(motion.state.seconds[keyframe], times)
         if scheme != "inertial":
             noise_angle[:] = 0.0
         J_rows = np.zeros((len(moments.plane), 3, N_WHITENED), np.float32)
