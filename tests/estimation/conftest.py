@@ -391,7 +391,7 @@ def make_dense(pieces: tuple[Piece, ...], n_keyframes: int) -> tuple[np.ndarray,
 def schur_of_features(piece: Piece, n_keyframes: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """What eliminating each feature of a piece takes from the dense normal matrix and its gradient."""
     sums, o = not_none(piece.features).sums, KEYFRAME_DIM * n_keyframes
-    for f in range(len(sums.own)):
+    for f in range(len(sums.diagonal)):
         K = np.zeros((3, o + sums.side.shape[2]))
         K[:, o:] = sums.side[f]
         for e in np.flatnonzero(sums.track == f):
@@ -400,7 +400,7 @@ def schur_of_features(piece: Piece, n_keyframes: int) -> Iterator[tuple[np.ndarr
             K[:, a : a + KEYFRAME_DIM] += sums.block[e] @ sums.pose[i]
             if len(sums.next_pose):
                 K[:, a + KEYFRAME_DIM : a + 2 * KEYFRAME_DIM] += sums.block[e] @ sums.next_pose[i]
-        M = K[:, :-1].T @ np.linalg.solve(sums.own[f], K)
+        M = K[:, :-1].T @ np.linalg.solve(sums.diagonal[f], K)
         yield M[:, :-1], M[:, -1]
 
 

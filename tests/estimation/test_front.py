@@ -55,7 +55,7 @@ def add(piece, sums, rows):
             piece.diagonal[k + 1] += A[:, KEYFRAME_DIM:].T @ A[:, KEYFRAME_DIM:]
             piece.side[k + 1] += A[:, KEYFRAME_DIM:].T @ Cr
         if f is not None:
-            sums.own[f] += F.T @ F
+            sums.diagonal[f] += F.T @ F
             sums.side[f] += F.T @ Cr
             sums.block[index[f, i]] += F.T @ G
     piece.calib[-1, -1] = 0.0
@@ -149,7 +149,7 @@ def test_the_size_of_groups_is_chosen_by_cost():
     )
     short = plan(sums, n, True, False, ends)
     assert np.diff(short.keyframes.start).tolist() == [24] * 8
-    assert short.alive.max() == 0 and len(short.local.values) == len(sums.own)
+    assert short.alive.max() == 0 and len(short.local.values) == len(sums.diagonal)
     lasting = FeatureSums.zeros(200, np.tile(np.arange(200), 2), np.repeat([0, n - 1], 200), np.arange(n), 40)
     assert np.diff(plan(lasting, n, True, False).keyframes.start).max() < 24
 
@@ -160,6 +160,6 @@ def test_a_feature_that_nothing_determines_is_an_error():
         features = pieces[1].features
         assert features is not None
         sums = features.sums
-        sums.own[f], sums.side[f], sums.block[sums.track == f] = 0.0, 0.0, 0.0
+        sums.diagonal[f], sums.side[f], sums.block[sums.track == f] = 0.0, 0.0, 0.0
         with pytest.raises(NotDefiniteError):
             solve(pieces, 8, np.ones(2))

@@ -44,11 +44,10 @@ class Accelerator:
         best = now - share @ (np.array(self.moves) + changes)
         return best[: chain.size].reshape(chain.shape), best[chain.size :]
 
-    def note(self, plain: tuple[np.ndarray, np.ndarray], taken: tuple[np.ndarray, np.ndarray], decrease: float) -> None:
-        """Records the `plain` step, its predicted `decrease`, and the step `taken`: the plain or the accelerated
-        one."""
+    def note(self, plain: tuple[np.ndarray, np.ndarray], step: tuple[np.ndarray, np.ndarray], decrease: float) -> None:
+        """Records the `plain` step, its predicted `decrease`, and the step `step`: the plain or the accelerated one."""
         self.steps.append(np.concatenate([x.ravel() for x in plain]))
-        self.moves.append(np.concatenate([x.ravel() for x in taken]))
+        self.moves.append(np.concatenate([x.ravel() for x in step]))
         self.steps, self.moves, self.decrease = (
             self.steps[-MAX_EARLIER_STEPS:],
             self.moves[-MAX_EARLIER_STEPS:],
@@ -64,6 +63,6 @@ class Accelerator:
         """Scale (15 K + B,) of each component of a step, which makes the fit independent of units: the root mean square
         over all keyframes times sqrt(K) for the chain, the magnitude for calibration parameters."""
         by_kind = np.sqrt((chain**2).mean(axis=0)) * np.sqrt(len(chain))
-        own = np.abs(calib)
-        both = [np.tile(np.where(by_kind > 0.0, by_kind, 1.0), len(chain)), np.where(own > 0.0, own, 1.0)]
-        return np.concatenate(both)
+        magnitude = np.abs(calib)
+        scales = [np.tile(np.where(by_kind > 0.0, by_kind, 1.0), len(chain)), np.where(magnitude > 0.0, magnitude, 1.0)]
+        return np.concatenate(scales)

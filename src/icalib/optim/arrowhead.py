@@ -109,8 +109,8 @@ class Piece:
         features = self.features
         if features is not None:
             features = PieceFeatures.of(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
-        own = self.diagonal[:-1], self.upper[:-1], self.side[:-1]
-        return Piece(self.first, self.last - 1, *own, self.calib, features)
+        sums = self.diagonal[:-1], self.upper[:-1], self.side[:-1]
+        return Piece(self.first, self.last - 1, *sums, self.calib, features)
 
     def sums(self, wanted: bool) -> Sums:
         """The arrays for kernels; empty unless `wanted`."""
@@ -145,13 +145,13 @@ class Draw:
 class Factors:
     """Cholesky factors of the block elimination, for back substitution and sampling.
 
-    pieces: overwritten by their factors; done: per piece, see `_reduce`. shared (15, 15), shared_side (15, B + 1):
-    factors of the shared keyframe, empty without one. information (B, B): of the calibration parameters, chain
+    pieces: overwritten by their factors; eliminations: per piece, see `_reduce`. shared (15, 15), shared_side (15, B +
+    1): factors of the shared keyframe, empty without one. information (B, B): of the calibration parameters, chain
     marginalised. tolerance, fixed_directions: see `calib_step`.
     """
 
     pieces: tuple[Piece, ...]
-    done: list[Eliminated | bool]
+    eliminations: list[Eliminated | bool]
     n_keyframes: int
     shared: np.ndarray
     shared_side: np.ndarray
@@ -170,13 +170,13 @@ class Factors:
         if len(self.shared):
             chain[self.pieces[0].last] = np.linalg.solve(np.tril(self.shared).T, white[-1] - self.shared_side @ calib)
         keep = len(self.shared) > 0
-        own = list(zip(self.pieces, self.done, white, strict=False))
-        in_parallel(lambda p: _back(p[0], p[1], p[2], keep, calib, chain), own)
+        tasks = list(zip(self.pieces, self.eliminations, white, strict=False))
+        in_parallel(lambda p: _back(p[0], p[1], p[2], keep, calib, chain), tasks)
         return chain
 
     def rows(self) -> list[int]:
         """Number of unknowns of each piece, then of the shared keyframe."""
-        return [*(_unknowns(p, d) for p, d in zip(self.pieces, self.done, strict=True)), len(self.shared)]
+        return [*(_unknowns(p, d) for p, d in zip(self.pieces, self.eliminations, strict=True)), len(self.shared)]
 
     def draws(self, rng: np.random.Generator, free: int, still: int) -> tuple[Draw, ...]:
         """Draws from the posterior, before the pieces are filled anew. In the first `free` ones the calibration
@@ -253,34 +253,34 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
     """
     forwards = piece.first == 0 or not keep
     if piece.features is None:
-        done = eliminate_chain(piece.diagonal, piece.upper, piece.side, forwards, keep)
-        if done:
+        elimination = eliminate_chain(piece.diagonal, piece.upper, piece.side, forwards, keep)
+        if elimination:
             piece.calib -= _eliminated_part(piece, keep)
-        return done
-    done = eliminate(piece.features, piece.diagonal, piece.upper, piece.side, forwards, keep)
-    if done is None:
+        return elimination
+    elimination = eliminate(piece.features, piece.diagonal, piece.upper, piece.side, forwards, keep)
+    if elimination is None:
         return False
-    left = np.triu(done.left) + np.triu(done.left, 1).T
+    remaining = np.triu(elimination.remaining) + np.triu(elimination.remaining, 1).T
     kept = KEYFRAME_DIM if keep else 0
-    piece.calib += left[kept:, kept:]
+    piece.calib += remaining[kept:, kept:]
     if keep:
         end = -1 if forwards else 0
-        piece.diagonal[end] += left[:KEYFRAME_DIM, :KEYFRAME_DIM]
-        piece.side[end] += left[:KEYFRAME_DIM, KEYFRAME_DIM:]
-    return done
+        piece.diagonal[end] += remaining[:KEYFRAME_DIM, :KEYFRAME_DIM]
+        piece.side[end] += remaining[:KEYFRAME_DIM, KEYFRAME_DIM:]
+    return elimination
 
 
 def _reduce_all(piece: Piece) -> Eliminated | bool:
     """Eliminates all keyframes of a piece in place; see `_reduce` for the result. Raises NotDefiniteError."""
-    done = _reduce(piece, False)
-    if not done:
+    elimination = _reduce(piece, False)
+    if not elimination:
         raise NotDefiniteError(NOT_DEFINITE)
-    return done
+    return elimination
 
 
-def _unknowns(piece: Piece, done: Eliminated | bool) -> int:
+def _unknowns(piece: Piece, elimination: Eliminated | bool) -> int:
     """Number of eliminated unknowns of a piece; without features, a kept end keyframe counts too."""
-    return done.rows if isinstance(done, Eliminated) else len(piece.diagonal) * KEYFRAME_DIM
+    return elimination.rows if isinstance(elimination, Eliminated) else len(piece.diagonal) * KEYFRAME_DIM
 
 
 def marginalise(piece: Piece) -> np.ndarray:
@@ -293,9 +293,16 @@ def marginalise(piece: Piece) -> np.ndarray:
 def chain_step_given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
     """Optimal steps (n, 15, m) of the keyframes of `piece` for given steps (B, m) of the calibration parameters;
     overwrites the piece. Raises NotDefiniteError."""
-    done, m = _reduce_all(piece), calib.shape[1]
+    elimination, m = _reduce_all(piece), calib.shape[1]
     chain = np.zeros((piece.last + 1, KEYFRAME_DIM, m))
-    _back(piece, done, np.zeros((_unknowns(piece, done), m)), False, np.vstack([calib, np.ones((1, m))]), chain)
+    _back(
+        piece,
+        elimination,
+        np.zeros((_unknowns(piece, elimination), m)),
+        False,
+        np.vstack([calib, np.ones((1, m))]),
+        chain,
+    )
     return chain[piece.first :]
 
 
@@ -303,15 +310,15 @@ def marginalise_in_segments(piece: Callable[[int, int], Piece], n_keyframes: int
     """As `marginalise`, for a chain of `n_keyframes` that is built and eliminated a segment at a time, to bound memory.
     `piece` makes the piece between two keyframes."""
     ends = [*range(0, n_keyframes - 1, SEGMENT_KEYFRAMES), n_keyframes - 1]
-    spans, rest = list(pairwise(ends)), None
+    spans, last_keyframe = list(pairwise(ends)), None
     for k in range(0, len(spans), N_THREADS):
-        for own in in_parallel(lambda span: piece(*span), spans[k : k + N_THREADS]):
-            if rest is not None:
-                own.diagonal[0] += rest.diagonal[0]
-                own.side[0] += rest.side[0]
-                own.calib += rest.calib
-            rest = _onto_last(own)
-    return marginalise(piece(0, 0) if rest is None else rest)
+        for segment in in_parallel(lambda span: piece(*span), spans[k : k + N_THREADS]):
+            if last_keyframe is not None:
+                segment.diagonal[0] += last_keyframe.diagonal[0]
+                segment.side[0] += last_keyframe.side[0]
+                segment.calib += last_keyframe.calib
+            last_keyframe = _onto_last(segment)
+    return marginalise(piece(0, 0) if last_keyframe is None else last_keyframe)
 
 
 def _onto_last(piece: Piece) -> Piece:
@@ -327,21 +334,21 @@ def _onto_last(piece: Piece) -> Piece:
 
 
 def _back(
-    piece: Piece, done: Eliminated | bool, white: np.ndarray, keep: bool, calib: np.ndarray, chain: np.ndarray
+    piece: Piece, elimination: Eliminated | bool, white: np.ndarray, keep: bool, calib: np.ndarray, chain: np.ndarray
 ) -> None:
     """Back substitution of one piece: fills its part of `chain` (K, 15, m), from `calib` and the kept keyframe; see
     `Factors.back`."""
-    own = chain[piece.first : piece.last + 1]
-    if isinstance(done, Eliminated):
-        done.substitute(calib, white, own)
+    steps = chain[piece.first : piece.last + 1]
+    if isinstance(elimination, Eliminated):
+        elimination.substitute(calib, white, steps)
         return
     for k in range(calib.shape[1]):
-        one, known = np.ascontiguousarray(own[:, :, k]), np.ascontiguousarray(calib[:, k])
+        step, calib_k = np.ascontiguousarray(steps[:, :, k]), np.ascontiguousarray(calib[:, k])
         noise, forwards = np.ascontiguousarray(white[:, k]).reshape(-1, KEYFRAME_DIM), piece.first == 0 or not keep
-        substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, known, noise, one)
+        substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, calib_k, noise, step)
         # The shared keyframe is an input; each piece writes only its own keyframes.
         inner = slice(None) if not keep else slice(None, -1) if piece.first == 0 else slice(1, None)
-        own[inner, :, k] = one[inner]
+        steps[inner, :, k] = step[inner]
 
 
 def solve(
@@ -362,10 +369,10 @@ def solve(
     if damping:
         for piece in pieces:
             damp(piece.diagonal, damping)
-    done = in_parallel(lambda p: _reduce(p, keep), pieces)
-    if not all(done):
+    eliminations = in_parallel(lambda p: _reduce(p, keep), pieces)
+    if not all(eliminations):
         raise NotDefiniteError(NOT_DEFINITE)
-    rest = sum((p.calib for p in pieces), extra)
+    reduced = sum((p.calib for p in pieces), extra)
     shared, shared_side = np.zeros((0, 0)), np.zeros((0, n_calib + 1))
     if keep:
         shared = pieces[0].diagonal[-1] + pieces[1].diagonal[0]
@@ -373,7 +380,7 @@ def solve(
         if not cholesky(shared):
             raise NotDefiniteError(NOT_DEFINITE)
         forward_solve(shared, shared_side)
-        rest -= shared_side.T @ shared_side
-    information = rest[:n_calib, :n_calib]
-    factors = Factors(pieces, done, n_keyframes, shared, shared_side, information, tolerance, fixed_directions)
-    return Solution.of(factors, rest[:, n_calib])
+        reduced -= shared_side.T @ shared_side
+    information = reduced[:n_calib, :n_calib]
+    factors = Factors(pieces, eliminations, n_keyframes, shared, shared_side, information, tolerance, fixed_directions)
+    return Solution.of(factors, reduced[:, n_calib])

@@ -47,8 +47,8 @@ def least_information(information: np.ndarray, tolerance: np.ndarray) -> float:
 
 def essential_information(information: np.ndarray, tolerance: np.ndarray, layout: Layout) -> float:
     """`least_information` without the rows and columns of nuisance parameters, which their priors bound."""
-    own = layout.essential
-    return least_information(information[np.ix_(own, own)], tolerance[own])
+    essential = layout.essential
+    return least_information(information[np.ix_(essential, essential)], tolerance[essential])
 
 
 def complement(fixed_directions: np.ndarray, n: int) -> np.ndarray:

@@ -19,13 +19,13 @@ from icalib.optim.state import KEYFRAME_DIM
 
 @dataclass(frozen=True)
 class PieceFeatures:
-    """Features of a `Piece`: their sums, the elimination plan, and the workspace `room` of the factors. Each
+    """Features of a `Piece`: their sums, the elimination plan, and the workspace `workspace` of the factors. Each
     elimination overwrites the last one's factors, because writing to freshly mapped memory would cost more than the
     elimination."""
 
     sums: FeatureSums
     plan: Plan
-    room: np.ndarray
+    workspace: np.ndarray
 
     @classmethod
     def of(cls, sums: FeatureSums, plan: Plan) -> PieceFeatures:
@@ -42,20 +42,20 @@ class PieceFeatures:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Result of the elimination: plan and sizes; turn (n, 15, 15), the orthogonal transform of each keyframe; room, the
-    workspace with the factors of all steps; left (15 or 0 + B + 1, same), upper triangle of the remaining system of the
-    kept keyframe, calibration parameters and gradient."""
+    """Result of the elimination: plan and sizes; turn (n, 15, 15), the orthogonal transform of each keyframe;
+    workspace: holds the factors of all steps; remaining (15 or 0 + B + 1, same), upper triangle: the system of the kept
+    keyframe, calibration parameters and gradient."""
 
     plan: Plan
     sizes: Sizes
     turn: np.ndarray
-    room: np.ndarray
-    left: np.ndarray
+    workspace: np.ndarray
+    remaining: np.ndarray
 
     @property
     def rows(self) -> int:
         """Number of eliminated unknowns, without the features that a single step sees."""
-        return int(self.sizes.rest.sum() + self.sizes.coupled.sum() + self.sizes.dying.sum())
+        return int(self.sizes.uncoupled.sum() + self.sizes.coupled.sum() + self.sizes.dying.sum())
 
     def substitute(self, calib: np.ndarray, white: np.ndarray, chain: np.ndarray) -> None:
         """Back substitution of m right-hand sides: fills chain (n, 15, m), whose kept keyframe is an input.
@@ -63,7 +63,7 @@ class Eliminated:
         calib (B + 1, m): steps of the calibration parameters, and in the last row the factor of the gradient. white
         (rows, m): further right-hand sides after forward substitution.
         """
-        substitute_all(self.plan, self.sizes, self.turn, self.room, calib, white, chain)
+        substitute_all(self.plan, self.sizes, self.turn, self.workspace, calib, white, chain)
 
 
 def _sizes(plan: Plan, n_calib: int) -> Sizes:
@@ -72,10 +72,10 @@ def _sizes(plan: Plan, n_calib: int) -> Sizes:
     coupled = np.add.reduceat(np.append(plan.coupled[plan.keyframes.values], 0), plan.keyframes.start[:-1])
     counts = np.diff(plan.keyframes.start)
     coupled[counts == 0] = 0
-    rest, dying, wide = KEYFRAME_DIM * counts - coupled, 3 * np.diff(plan.dying.start), n_calib + 3 * plan.alive
-    room = (rest + coupled) ** 2 + dying * (dying + coupled) + rest * (KEYFRAME_DIM + n_calib)
-    room += (coupled + dying) * (KEYFRAME_DIM + wide)
-    return Sizes(rest, coupled, dying, wide, np.concatenate([[0], np.cumsum(room)]))
+    uncoupled, dying, wide = KEYFRAME_DIM * counts - coupled, 3 * np.diff(plan.dying.start), n_calib + 3 * plan.alive
+    lengths = (uncoupled + coupled) ** 2 + dying * (dying + coupled) + uncoupled * (KEYFRAME_DIM + n_calib)
+    lengths += (coupled + dying) * (KEYFRAME_DIM + wide)
+    return Sizes(uncoupled, coupled, dying, wide, np.concatenate([[0], np.cumsum(lengths)]))
 
 
 def eliminate(
@@ -86,17 +86,17 @@ def eliminate(
     plan, sums, n_calib = features.plan, features.sums, side.shape[2]
     sizes = _sizes(plan, n_calib)
     widest = int(sizes.wide.max())
-    turn, room = np.empty_like(diagonal), features.room
+    turn, workspace = np.empty_like(diagonal), features.workspace
     chain = FrontChain(diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose))
     rotate_keyframes(plan, sums, turn, chain.pose, chain.next_pose)
     front, carry = np.zeros((widest, widest)), np.zeros((KEYFRAME_DIM, KEYFRAME_DIM + widest))
-    if not eliminate_all(plan, sizes, sums, chain, room, front, carry):
+    if not eliminate_all(plan, sizes, sums, chain, workspace, front, carry):
         return None
     if not keep:
-        return Eliminated(plan, sizes, turn, room, front[:n_calib, :n_calib].copy())
-    left = np.zeros((KEYFRAME_DIM + n_calib, KEYFRAME_DIM + n_calib))
-    left[:KEYFRAME_DIM], left[KEYFRAME_DIM:, KEYFRAME_DIM:] = (
+        return Eliminated(plan, sizes, turn, workspace, front[:n_calib, :n_calib].copy())
+    remaining = np.zeros((KEYFRAME_DIM + n_calib, KEYFRAME_DIM + n_calib))
+    remaining[:KEYFRAME_DIM], remaining[KEYFRAME_DIM:, KEYFRAME_DIM:] = (
         carry[:, : KEYFRAME_DIM + n_calib],
         front[:n_calib, :n_calib],
     )
-    return Eliminated(plan, sizes, turn, room, left)
+    return Eliminated(plan, sizes, turn, workspace, remaining)

@@ -2,8 +2,8 @@
 
 The front is the upper triangle over calibration parameters and the features in its slots. `carry` (15, 15 + .) is the
 remaining system of the next keyframe: with itself, calibration parameters, features. The rows of keyframes are rotated
-so that some of them involve no feature ("rest"), and the others do ("coupled"). Rest rows are eliminated first. A
-keyframe with images of one camera has six coupled dimensions of 15.
+so that some of them involve no feature ("uncoupled"), and the others do ("coupled"). Uncoupled rows are eliminated
+first. A keyframe with images of one camera has six coupled dimensions of 15.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class FrontChain(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Sizes of each step (G,): rest rows, coupled rows, rows of features that leave (dying), columns of the front;
+    """Sizes of each step (G,): uncoupled rows, coupled rows, rows of features that leave (dying), columns of the front;
     start (G + 1,): of its factors in the workspace."""
 
-    rest: np.ndarray
+    uncoupled: np.ndarray
     coupled: np.ndarray
     dying: np.ndarray
     wide: np.ndarray
@@ -43,20 +43,20 @@ class Sizes(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def step_factors(g, sizes, n_b, room):
-    """Views of the factors of step g in the workspace `room`: U (keyframes), Ud (dying features), D (coupled keyframe
-    rows by dying features), Wr (rest rows), Wc (coupled rows, then dying features)."""
-    a, c, d, w = sizes.rest[g], sizes.coupled[g], sizes.dying[g], sizes.wide[g]
+def step_factors(g, sizes, n_b, workspace):
+    """Views of the factors of step g in the workspace `workspace`: U (keyframes), Ud (dying features), D (coupled
+    keyframe rows by dying features), Wr (uncoupled rows), Wc (coupled rows, then dying features)."""
+    a, c, d, w = sizes.uncoupled[g], sizes.coupled[g], sizes.dying[g], sizes.wide[g]
     o, p = sizes.start[g], a + c
-    U = room[o : o + p * p].reshape(p, p)
+    U = workspace[o : o + p * p].reshape(p, p)
     o += p * p
-    Ud = room[o : o + d * d].reshape(d, d)
+    Ud = workspace[o : o + d * d].reshape(d, d)
     o += d * d
-    D = room[o : o + c * d].reshape(c, d)
+    D = workspace[o : o + c * d].reshape(c, d)
     o += c * d
-    Wr = room[o : o + a * (KEYFRAME_DIM + n_b)].reshape(a, KEYFRAME_DIM + n_b)
+    Wr = workspace[o : o + a * (KEYFRAME_DIM + n_b)].reshape(a, KEYFRAME_DIM + n_b)
     o += a * (KEYFRAME_DIM + n_b)
-    return U, Ud, D, Wr, room[o : o + (c + d) * (KEYFRAME_DIM + w)].reshape(c + d, KEYFRAME_DIM + w)
+    return U, Ud, D, Wr, workspace[o : o + (c + d) * (KEYFRAME_DIM + w)].reshape(c + d, KEYFRAME_DIM + w)
 
 
 @njit(cache=True, nogil=True)
@@ -135,16 +135,16 @@ def _join(g, plan, sums, n_b, front, carry, old_wide):
         f, a = plan.born.values[q], n_b + 3 * plan.born_at[q]
         for i in range(3):
             for j in range(i, 3):
-                front[a + i, a + j] += sums.own[f, i, j]
+                front[a + i, a + j] += sums.diagonal[f, i, j]
         for j in range(n_b):
             for i in range(3):
                 front[j, a + i] += sums.side[f, i, j]
 
 
 @njit(cache=True, nogil=True)
-def _places(g, plan, rest, row):
-    """Fills row (K, 15) with the row index of each dimension of the step's keyframes, rest rows first."""
-    r, c = 0, rest
+def _places(g, plan, uncoupled, row):
+    """Fills row (K, 15) with the row index of each dimension of the step's keyframes, uncoupled rows first."""
+    r, c = 0, uncoupled
     for q in range(plan.keyframes.start[g], plan.keyframes.start[g + 1]):
         k = plan.keyframes.values[q]
         for j in range(KEYFRAME_DIM):
@@ -160,15 +160,16 @@ def _places(g, plan, rest, row):
 def _fill_keyframes(g, plan, chain, row, U, Wr, Wc):
     """Adds the sums of the step's keyframes, each rotated by its Q, to U, Wr and Wc.
 
-    U (a + c, a + c), upper triangle: the keyframes with one another. Wr (a, .), Wc (c + d, .): the a rest rows, and the
-    c coupled rows followed by d rows of dying features. Their columns: 15 of the next keyframe, calibration parameters,
-    gradient, and features (Wc only). row (K, 15): see `_places`. q counts the step's keyframes, k those of the piece.
+    U (a + c, a + c), upper triangle: the keyframes with one another. Wr (a, .), Wc (c + d, .): the a uncoupled rows,
+    and the c coupled rows followed by d rows of dying features. Their columns: 15 of the next keyframe, calibration
+    parameters, gradient, and features (Wc only). row (K, 15): see `_places`. q counts the step's keyframes, k those of
+    the piece.
     """
     a, n_b, last = len(Wr), chain.side.shape[2], plan.keyframes.start[g + 1] - 1
     for q in range(plan.keyframes.start[g], last + 1):
         k = plan.keyframes.values[q]
         Q = chain.turn[k]
-        own, side = Q.T @ chain.diagonal[k] @ Q, Q.T @ chain.side[k]
+        rotated, side = Q.T @ chain.diagonal[k] @ Q, Q.T @ chain.side[k]
         after = plan.keyframes.values[q + 1] if q < last else plan.after[g]
         link = np.zeros((KEYFRAME_DIM, KEYFRAME_DIM))
         if after >= 0:
@@ -182,7 +183,7 @@ def _fill_keyframes(g, plan, chain, row, U, Wr, Wc):
                 into[KEYFRAME_DIM + j] += side[i, j]
             for j in range(KEYFRAME_DIM):
                 if row[k, j] >= x:
-                    U[x, row[k, j]] += own[i, j]
+                    U[x, row[k, j]] += rotated[i, j]
                 if q == last:
                     into[j] += link[i, j]
                 else:
@@ -191,14 +192,14 @@ def _fill_keyframes(g, plan, chain, row, U, Wr, Wc):
 
 
 @njit(cache=True, nogil=True)
-def _fill_carry(g, plan, row, carry, U, Wc, rest):
+def _fill_carry(g, plan, row, carry, U, Wc, uncoupled):
     """Adds the remaining system of the step's first keyframe that the step before left."""
     k = plan.keyframes.values[plan.keyframes.start[g]]
     x = row[k, 0]
     for i in range(KEYFRAME_DIM):
         for j in range(i, KEYFRAME_DIM):
             U[x + i, x + j] += carry[i, j]
-        Wc[x - rest + i, KEYFRAME_DIM:] += carry[i, KEYFRAME_DIM : Wc.shape[1]]
+        Wc[x - uncoupled + i, KEYFRAME_DIM:] += carry[i, KEYFRAME_DIM : Wc.shape[1]]
 
 
 @njit(cache=True, nogil=True)
@@ -212,29 +213,29 @@ def _add_pose(T, n, block, rows, column, into):
 
 
 @njit(cache=True, nogil=True)
-def _fill_pairs(g, plan, sums, chain, row, rest, n_b, Wc, carry):
+def _fill_pairs(g, plan, sums, chain, row, uncoupled, n_b, Wc, carry):
     """Adds the terms of features in the front with the step's keyframes, and with the next one (carry)."""
-    here, after = plan.keyframes.start[g + 1] > plan.keyframes.start[g], plan.after[g]
+    has_keyframes, after = plan.keyframes.start[g + 1] > plan.keyframes.start[g], plan.after[g]
     for q in range(plan.pair.start[g], plan.pair.start[g + 1]):
         e, column = plan.pair.values[q], KEYFRAME_DIM + n_b + 3 * plan.pair_at[q]
         i = sums.image[e]
         k = sums.keyframe[i]
-        if k == after or not here:
+        if k == after or not has_keyframes:
             _add_pose(chain.pose[i], KEYFRAME_DIM, sums.block[e], 0, column, carry)
         else:
-            _add_pose(chain.pose[i], plan.coupled[k], sums.block[e], row[k, 0] - rest, column, Wc)
+            _add_pose(chain.pose[i], plan.coupled[k], sums.block[e], row[k, 0] - uncoupled, column, Wc)
         if len(chain.next_pose):
-            if k + 1 == after or not here:
+            if k + 1 == after or not has_keyframes:
                 _add_pose(chain.next_pose[i], KEYFRAME_DIM, sums.block[e], 0, column, carry)
             else:
-                _add_pose(chain.next_pose[i], KEYFRAME_DIM, sums.block[e], row[k + 1, 0] - rest, column, Wc)
+                _add_pose(chain.next_pose[i], KEYFRAME_DIM, sums.block[e], row[k + 1, 0] - uncoupled, column, Wc)
 
 
 @njit(cache=True, nogil=True)
-def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
+def _eliminate_local(g, plan, sums, chain, row, uncoupled, U, Wc, front, coupled):
     """Eliminates features that only this step sees. Returns False if they are not positive definite."""
     n, n_b = plan.local.start[g + 1] - plan.local.start[g], sums.side.shape[2]
-    V, own, used = np.zeros((3 * n, coupled + n_b)), np.empty((3, 3)), 0
+    V, block, used = np.zeros((3 * n, coupled + n_b)), np.empty((3, 3)), 0
     for q in range(n):
         at = plan.local.start[g] + q
         f, rows = plan.local.values[at], V[3 * q : 3 * q + 3]
@@ -242,7 +243,7 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
             e = plan.local_pair[p]
             i = sums.image[e]
             k = sums.keyframe[i]
-            begin = row[k, 0] - rest
+            begin = row[k, 0] - uncoupled
             for a in range(3):
                 for j in range(POSE_DIM):
                     w = sums.block[e, a, j]
@@ -253,17 +254,17 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
                 rows[a, coupled + j] = sums.side[f, a, j]
                 if j < n_b - 1 and rows[a, coupled + j] != 0.0:
                     used = max(used, j + 1)
-        own[:] = sums.own[f]
-        if not factorise(own):
+        block[:] = sums.diagonal[f]
+        if not factorise(block):
             return False
-        solve_transposed(own, rows)
-    subtract_gram(V[:, :coupled], U[rest:, rest:])
+        solve_transposed(block, rows)
+    subtract_gram(V[:, :coupled], U[uncoupled:, uncoupled:])
     # Features depend on the first `used` calibration columns at most, and on the gradient.
-    here, gradient, last = V[:, coupled : coupled + used], V[:, coupled + n_b - 1 :], KEYFRAME_DIM + n_b
-    subtract_product(V[:, :coupled], here, Wc[:coupled, KEYFRAME_DIM : KEYFRAME_DIM + used])
+    coupled_calib, gradient, last = V[:, coupled : coupled + used], V[:, coupled + n_b - 1 :], KEYFRAME_DIM + n_b
+    subtract_product(V[:, :coupled], coupled_calib, Wc[:coupled, KEYFRAME_DIM : KEYFRAME_DIM + used])
     subtract_product(V[:, :coupled], gradient, Wc[:coupled, last - 1 : last])
-    subtract_gram(here, front[:used, :used])
-    subtract_product(here, gradient, front[:used, n_b - 1 : n_b])
+    subtract_gram(coupled_calib, front[:used, :used])
+    subtract_product(coupled_calib, gradient, front[:used, n_b - 1 : n_b])
     subtract_gram(gradient, front[n_b - 1 : n_b, n_b - 1 : n_b])
     return True
 
@@ -319,17 +320,17 @@ def _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
 
 
 @njit(cache=True, nogil=True)
-def eliminate_all(plan, sizes, sums, chain, room, front, carry):
+def eliminate_all(plan, sizes, sums, chain, workspace, front, carry):
     """Eliminates the groups of keyframes of a piece one after the other, with the features that no later group sees.
 
-    Factors remain in `room`, the system of the kept keyframe in `carry`, that of the calibration parameters in `front`.
-    Returns False if the sums are not positive definite.
+    Factors remain in `workspace`, the system of the kept keyframe in `carry`, that of the calibration parameters in
+    `front`. Returns False if the sums are not positive definite.
     """
     n_b, old_wide = chain.side.shape[2], 0
     row = np.zeros((len(chain.diagonal), KEYFRAME_DIM), dtype=np.int64)
     for g in range(len(plan.after)):
-        a, c = sizes.rest[g], sizes.coupled[g]
-        U, Ud, D, Wr, Wc = step_factors(g, sizes, n_b, room)
+        a, c = sizes.uncoupled[g], sizes.coupled[g]
+        U, Ud, D, Wr, Wc = step_factors(g, sizes, n_b, workspace)
         _join(g, plan, sums, n_b, front, carry, old_wide)
         old_wide = sizes.wide[g]
         if a + c:

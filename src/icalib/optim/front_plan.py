@@ -25,7 +25,7 @@ NO_TRACK_ENDS = np.zeros(0, dtype=np.int64)
 
 
 class FeatureSums(NamedTuple):
-    """Terms of features in the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with
+    """Terms of features in the normal equations of a `Piece`: diagonal (T, 3, 3); side (T, 3, B + 1), feature with
     calibration parameters, its gradient in the last column; block (E, 3, 6), feature with the camera's pose, for each
     pair of feature and image.
 
@@ -33,7 +33,7 @@ class FeatureSums(NamedTuple):
     keyframe. track and image (E,) of the pairs, keyframe (I,) of the images, all counted from the first of the piece.
     """
 
-    own: np.ndarray
+    diagonal: np.ndarray
     side: np.ndarray
     block: np.ndarray
     pose: np.ndarray
@@ -67,7 +67,7 @@ class FeatureSums(NamedTuple):
 
     def clear(self) -> None:
         """Sets the terms of features to zero; the Jacobians of poses stay."""
-        for a in (self.own, self.side, self.block):
+        for a in (self.diagonal, self.side, self.block):
             a[:] = 0.0
 
 
@@ -144,7 +144,7 @@ class _Lives:
         step = which[sums.keyframe]
         if len(sums.next_pose):
             step = np.minimum(step, which[sums.keyframe + 1])
-        first, last = np.full(len(sums.own), len(groups)), np.full(len(sums.own), -1)
+        first, last = np.full(len(sums.diagonal), len(groups)), np.full(len(sums.diagonal), -1)
         np.minimum.at(first, sums.track, step[sums.image])
         np.maximum.at(last, sums.track, step[sums.image])
         without_keyframes = len(groups) - 1 if keep else -1
@@ -175,11 +175,11 @@ def plan(
 ) -> Plan:
     """Steps that eliminate `n_keyframes` keyframes and all features; with `keep`, all but the last keyframe in this
     direction. ends: keyframes before which all features end; sizes: group sizes, of which the cheapest is taken."""
-    met = np.zeros(n_keyframes, dtype=np.int64)
-    np.add.at(met, sums.keyframe[np.unique(sums.image)], POSE_DIM)
-    coupled = np.minimum(met, KEYFRAME_DIM) if not len(sums.next_pose) else np.full(n_keyframes, KEYFRAME_DIM)
-    tried = [_Lives.of(sums, n_keyframes, forwards, keep, s, ends) for s in sizes]
-    lives = min(tried, key=lambda x: x.cost(coupled, sums.side.shape[2]))
+    n_dims = np.zeros(n_keyframes, dtype=np.int64)
+    np.add.at(n_dims, sums.keyframe[np.unique(sums.image)], POSE_DIM)
+    coupled = np.minimum(n_dims, KEYFRAME_DIM) if not len(sums.next_pose) else np.full(n_keyframes, KEYFRAME_DIM)
+    candidates = [_Lives.of(sums, n_keyframes, forwards, keep, s, ends) for s in sizes]
+    lives = min(candidates, key=lambda x: x.cost(coupled, sums.side.shape[2]))
     return _steps(sums, lives, coupled, n_keyframes, forwards)
 
 
@@ -189,11 +189,11 @@ def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_keyframes: i
     ends = np.cumsum([len(g) for g in groups])
     order = np.arange(n_keyframes) if forwards else np.arange(n_keyframes)[::-1]
     after = np.append(order, -1)[np.minimum(ends, n_keyframes)]
-    own = coupled.copy()
+    coupled_dims = coupled.copy()
     for group in groups:
-        own[group[:1]] = KEYFRAME_DIM  # the step before coupled all of its dimensions
-    own[after[after >= 0]] = KEYFRAME_DIM
-    tracks, in_front = np.arange(len(sums.own)), ~lives.local
+        coupled_dims[group[:1]] = KEYFRAME_DIM  # the step before coupled all of its dimensions
+    coupled_dims[after[after >= 0]] = KEYFRAME_DIM
+    tracks, in_front = np.arange(len(sums.diagonal)), ~lives.local
     slots = _slots(lives, n)
     step = np.where(in_front[sums.track], lives.step[sums.image], -1)
     pair = Lists.sorted_by(step, np.arange(len(step)), n)
@@ -204,7 +204,7 @@ def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_keyframes: i
     return Plan(
         Lists.of(groups),
         after,
-        own,
+        coupled_dims,
         slots.alive,
         Lists.of(slots.leave),
         Lists.of(slots.enter).values,
@@ -237,16 +237,16 @@ def _slots(lives: _Lives, n_steps: int) -> _Slots:
     """Assignment of slots without holes: features keep their slots; those beyond the new end move into holes."""
     lasting = ~lives.local
     born = Lists.sorted_by(np.where(lasting & (lives.last >= 0), lives.first, -1), np.arange(len(lasting)), n_steps)
-    here, out = np.zeros(0, dtype=np.int64), _Slots(np.zeros(n_steps, dtype=np.int64), [], [], [], [], [], [])
+    features, out = np.zeros(0, dtype=np.int64), _Slots(np.zeros(n_steps, dtype=np.int64), [], [], [], [], [], [])
     for g in range(n_steps):
         new = born.values[born.start[g] : born.start[g + 1]]
-        stays = lives.last[here] >= g
+        stays = lives.last[features] >= g
         n = int(stays.sum()) + len(new)
-        kept = np.flatnonzero(stays)
+        stay_at = np.flatnonzero(stays)
         now = np.full(n, -1)
-        now[kept[kept < n]] = here[kept[kept < n]]
-        leave, holes = kept[kept >= n], np.flatnonzero(now < 0)
-        now[holes] = np.concatenate([here[leave], new])
+        now[stay_at[stay_at < n]] = features[stay_at[stay_at < n]]
+        leave, holes = stay_at[stay_at >= n], np.flatnonzero(now < 0)
+        now[holes] = np.concatenate([features[leave], new])
         out.alive[g] = n
         out.leave.append(leave)
         out.enter.append(holes[: len(leave)])
@@ -254,15 +254,15 @@ def _slots(lives: _Lives, n_steps: int) -> _Slots:
         out.born_at.append(holes[len(leave) :])
         out.dying.append(np.flatnonzero(lives.last[now] == g))
         out.at.append(now)
-        here = now
+        features = now
     return out
 
 
 def _places(slots: _Slots, pair: Lists, track: np.ndarray, n_steps: int) -> np.ndarray:
     """(e,) slot in the front of the feature of each pair."""
-    at, found = np.full(int(track.max(initial=-1)) + 1, -1), np.empty(len(pair.values), dtype=np.int64)
+    at, slot = np.full(int(track.max(initial=-1)) + 1, -1), np.empty(len(pair.values), dtype=np.int64)
     for g in range(n_steps):
         at[slots.at[g]] = np.arange(len(slots.at[g]))
-        own = slice(pair.start[g], pair.start[g + 1])
-        found[own] = at[track[pair.values[own]]]
-    return found
+        rows = slice(pair.start[g], pair.start[g + 1])
+        slot[rows] = at[track[pair.values[rows]]]
+    return slot

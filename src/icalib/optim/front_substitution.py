@@ -18,54 +18,54 @@ def _solve_columns(U, X):
 
 
 @njit(cache=True, nogil=True)
-def substitute_all(plan, sizes, turn, room, calib, white, chain):
+def substitute_all(plan, sizes, turn, workspace, calib, white, chain):
     """Back substitution: fills chain (n, 15, m), whose kept keyframe is an input.
 
     calib (B + 1, m): steps of the calibration parameters; last row: factor of the gradient. white (rows, m): further
-    right-hand sides after forward substitution, by step: rest, coupled, dying.
+    right-hand sides after forward substitution, by step: uncoupled, coupled, dying.
     """
     n_b, m, end = len(calib), calib.shape[1], len(white)
-    known = np.zeros((KEYFRAME_DIM + sizes.wide.max(), m))
-    known[KEYFRAME_DIM : KEYFRAME_DIM + n_b] = calib
+    solved = np.zeros((KEYFRAME_DIM + sizes.wide.max(), m))
+    solved[KEYFRAME_DIM : KEYFRAME_DIM + n_b] = calib
     for g in range(len(plan.after) - 1, -1, -1):
-        a, c = sizes.rest[g], sizes.coupled[g]
-        U, Ud, D, Wr, Wc = step_factors(g, sizes, n_b, room)
+        a, c = sizes.uncoupled[g], sizes.coupled[g]
+        U, Ud, D, Wr, Wc = step_factors(g, sizes, n_b, workspace)
         begin = end - a - len(Wc)
-        known[:KEYFRAME_DIM] = 0.0
+        solved[:KEYFRAME_DIM] = 0.0
         if plan.after[g] >= 0:
-            known[:KEYFRAME_DIM] = chain[plan.after[g]]
-        x = white[begin + a : end] - Wc @ known[: Wc.shape[1]]
+            solved[:KEYFRAME_DIM] = chain[plan.after[g]]
+        x = white[begin + a : end] - Wc @ solved[: Wc.shape[1]]
         _solve_columns(Ud, x[c:])
         z = np.empty((a + c, m))
         z[a:] = x[:c] - D @ x[c:]
         _solve_columns(U[a:, a:], z[a:])
-        z[:a] = white[begin : begin + a] - Wr @ known[: KEYFRAME_DIM + n_b]
+        z[:a] = white[begin : begin + a] - Wr @ solved[: KEYFRAME_DIM + n_b]
         for i in range(a):
             for j in range(a, a + c):
                 for k in range(m):
                     z[i, k] -= U[i, j] * z[j, k]
         _solve_columns(U[:a, :a], z[:a])
-        _take_back(g, plan, n_b, x[c:], known)
+        _take_back(g, plan, n_b, x[c:], solved)
         _turn_back(g, plan, a, turn, z, chain)
         end = begin
 
 
 @njit(cache=True, nogil=True)
-def _take_back(g, plan, n_b, dying, known):
-    """Restores features to their slots before the step, in `known`."""
+def _take_back(g, plan, n_b, dying, solved):
+    """Restores features to their slots before the step, in `solved`."""
     o = KEYFRAME_DIM + n_b
     for q in range(plan.dying.start[g], plan.dying.start[g + 1]):
         at, x = o + 3 * plan.dying.values[q], 3 * (q - plan.dying.start[g])
-        known[at : at + 3] = dying[x : x + 3]
+        solved[at : at + 3] = dying[x : x + 3]
     for q in range(plan.leave.start[g], plan.leave.start[g + 1]):
         a, b = o + 3 * plan.leave.values[q], o + 3 * plan.enter[q]
-        known[a : a + 3] = known[b : b + 3]
+        solved[a : a + 3] = solved[b : b + 3]
 
 
 @njit(cache=True, nogil=True)
-def _turn_back(g, plan, rest, turn, z, chain):
+def _turn_back(g, plan, uncoupled, turn, z, chain):
     """Fills the steps of the keyframes, rotated back to their own dimensions."""
-    r, c, x = 0, rest, np.empty((KEYFRAME_DIM, z.shape[1]))
+    r, c, x = 0, uncoupled, np.empty((KEYFRAME_DIM, z.shape[1]))
     for q in range(plan.keyframes.start[g], plan.keyframes.start[g + 1]):
         k = plan.keyframes.values[q]
         n = plan.coupled[k]

@@ -24,8 +24,8 @@ def grouped_quantiles(x: np.ndarray, group: np.ndarray, count: int, share: float
     """Quantiles (count,) at `share` of x (n,) within each `group` (n,) of 0..count - 1; inf for an empty group."""
     out = np.full(count, np.inf)
     ends = np.cumsum(np.bincount(group, minlength=count))
-    for k, own in enumerate(np.split(x[np.argsort(group, kind="stable")], ends[:-1])):
-        if len(own):
-            at = int(share * (len(own) - 1))
-            out[k] = np.partition(own, at)[at]
+    for k, members in enumerate(np.split(x[np.argsort(group, kind="stable")], ends[:-1])):
+        if len(members):
+            at = int(share * (len(members) - 1))
+            out[k] = np.partition(members, at)[at]
     return out

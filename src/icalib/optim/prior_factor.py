@@ -60,11 +60,11 @@ def without_priors(information: np.ndarray, priors: Sequence[Prior], state: Stat
     return information - sums_of_priors(priors, state, len(information))[2]
 
 
-def variance_of_priors(known: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
-    """Variances (B,) that errors of the prior means contribute to the diagonal of the covariance `known` (B, B): diag(C
-    W C) with C = `known` and the information W of `priors`. Measurement noise contributes the rest."""
-    information = sums_of_priors(priors, state, len(known))[2]
-    return np.einsum("ij,jk,ki->i", known, information, known, optimize=True)
+def variance_of_priors(covariance: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
+    """Variances (B,) that errors of the prior means contribute to the diagonal of the covariance `covariance` (B, B):
+    diag(C W C) with C = `covariance` and the information W of `priors`. Measurement noise contributes the rest."""
+    information = sums_of_priors(priors, state, len(covariance))[2]
+    return np.einsum("ij,jk,ki->i", covariance, information, covariance, optimize=True)
 
 
 def accumulate_bias_prior(

@@ -118,7 +118,7 @@ def _common_error(res, root, f, precision, M, inv, rhs, shared):
 
 
 @njit(cache=True, nogil=True)
-def whole_error(res, f, shared, error):
+def add_common_error(res, f, shared, error):
     """Fills error (n, 2): residuals with the image's common error added."""
     for i in range(len(res)):
         for axis in range(2):

@@ -65,60 +65,68 @@ def add_product(k, n_chain, width, A, B, columns, sums):
     """
     diagonal, upper, side = sums.diagonal, sums.upper, sums.side
     n, end, n_b, block = UInt(n_chain), UInt(len(columns)), UInt(sums.calib.shape[0] - 1), UInt(KEYFRAME_DIM)
-    row, rest = np.empty(KEYFRAME_PAIR_DIM), np.empty(len(columns) + 1)
+    row, calib_row = np.empty(KEYFRAME_PAIR_DIM), np.empty(len(columns) + 1)
     for i in range(n):
         is_next = i >= block
-        keyframe, r, own = (UInt(k + 1), i - block, block) if is_next else (UInt(k), i, UInt(0))
+        keyframe, r, column = (UInt(k + 1), i - block, block) if is_next else (UInt(k), i, UInt(0))
         has_next = n > block and not is_next
         for j in range(block):
             row[j] = diagonal[keyframe, r, j]
             if has_next:
                 row[block + j] = upper[keyframe, r, j]
         for j in range(end):
-            rest[j] = side[keyframe, r, UInt(columns[j])] if columns[j] >= 0 else 0.0
-        rest[end] = side[keyframe, r, n_b]
-        for q in range(UInt(len(A))):
-            f = A[q, i]
-            if f == 0.0:
-                continue
-            for j in range(block):
-                row[j] += f * B[q, own + j]
-            if has_next:
-                for j in range(block):
-                    row[block + j] += f * B[q, block + j]
-            for j in range(end + UInt(1)):
-                rest[j] += f * B[q, n + j]
+            calib_row[j] = side[keyframe, r, UInt(columns[j])] if columns[j] >= 0 else 0.0
+        calib_row[end] = side[keyframe, r, n_b]
+        _add_to_row(i, n, end, column, has_next, A, B, row, calib_row)
         for j in range(block):
             diagonal[keyframe, r, j] = row[j]
             if has_next:
                 upper[keyframe, r, j] = row[block + j]
         for j in range(end):
             if columns[j] >= 0:
-                side[keyframe, r, UInt(columns[j])] = rest[j]
-        side[keyframe, r, n_b] = rest[end]
+                side[keyframe, r, UInt(columns[j])] = calib_row[j]
+        side[keyframe, r, n_b] = calib_row[end]
     for i in range(n, UInt(width)):
         if columns[i - n] >= 0:
-            _add_calib(i, n, UInt(width), A, B, columns, sums.calib, rest)
+            _add_calib(i, n, UInt(width), A, B, columns, sums.calib, calib_row)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_to_row(i, n, end, column, has_next, A, B, row, calib_row):
+    """Adds row i of A^T B to `row` (30,): 15 columns of B from `column` on, and those of the next keyframe if
+    `has_next`; and to `calib_row` (end + 1,): the columns of B from n on."""
+    block = UInt(KEYFRAME_DIM)
+    for q in range(UInt(len(A))):
+        f = A[q, i]
+        if f == 0.0:
+            continue
+        for j in range(block):
+            row[j] += f * B[q, column + j]
+        if has_next:
+            for j in range(block):
+                row[block + j] += f * B[q, block + j]
+        for j in range(end + UInt(1)):
+            calib_row[j] += f * B[q, n + j]
 
 
 @njit(cache=True, nogil=True)
-def _add_calib(i, n, width, A, B, columns, calib, rest):
+def _add_calib(i, n, width, A, B, columns, calib, row):
     """Adds row i of A^T B, of a calibration parameter. Columns that A lacks are also added below the diagonal."""
     a, end, n_b = UInt(columns[i - n]), UInt(len(columns)), UInt(calib.shape[0] - 1)
     for j in range(end):
-        rest[j] = calib[a, UInt(columns[j])] if columns[j] >= 0 else 0.0
-    rest[end] = calib[a, n_b]
+        row[j] = calib[a, UInt(columns[j])] if columns[j] >= 0 else 0.0
+    row[end] = calib[a, n_b]
     for q in range(UInt(len(A))):
         f = A[q, i]
         if f != 0.0:
             for j in range(end + UInt(1)):
-                rest[j] += f * B[q, n + j]
+                row[j] += f * B[q, n + j]
     for j in range(end):
         if columns[j] >= 0:
-            calib[a, UInt(columns[j])] = rest[j]
+            calib[a, UInt(columns[j])] = row[j]
             if n + j >= width:
-                calib[UInt(columns[j]), a] = rest[j]
-    calib[a, n_b] = calib[n_b, a] = rest[end]
+                calib[UInt(columns[j]), a] = row[j]
+    calib[a, n_b] = calib[n_b, a] = row[end]
 
 
 @njit(cache=True, nogil=True)

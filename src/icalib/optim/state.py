@@ -148,12 +148,12 @@ class State:
         R, p, v = np.empty_like(self.rotation), np.empty_like(self.position), np.empty_like(self.velocity)
         for turn, k in zip(turns, self.recordings, strict=True):
             Q = so3.exp(turn)
-            own_rotation = np.ascontiguousarray(chain[k, 0:3] - turn @ self.rotation[k])
-            own_position = chain[k, 3:6] - np.cross(turn, self.position[k])
-            own_velocity = chain[k, 6:9] - np.cross(turn, self.velocity[k])
-            R[k] = Q @ self.rotation[k] @ so3.exp_many(own_rotation)
-            p[k] = (self.position[k] + own_position) @ Q.T
-            v[k] = (self.velocity[k] + own_velocity) @ Q.T
+            d_rotation = np.ascontiguousarray(chain[k, 0:3] - turn @ self.rotation[k])
+            d_position = chain[k, 3:6] - np.cross(turn, self.position[k])
+            d_velocity = chain[k, 6:9] - np.cross(turn, self.velocity[k])
+            R[k] = Q @ self.rotation[k] @ so3.exp_many(d_rotation)
+            p[k] = (self.position[k] + d_position) @ Q.T
+            v[k] = (self.velocity[k] + d_velocity) @ Q.T
         return replace(self, rotation=R, position=p, velocity=v, bias=self.bias + chain[:, 9:15], values=values)
 
     def _turns(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> list[np.ndarray]:
@@ -174,13 +174,13 @@ class State:
         free = [b for b in layout.free if b.kind == "plane"]
         if free:
             x = np.array([self.values[b.key][:3] for b in free])
-            moved = np.array([calib[b.columns[:2]] @ planes.tangents(n) for b, n in zip(free, x, strict=True)])
+            displacement = np.array([calib[b.columns[:2]] @ planes.tangents(n) for b, n in zip(free, x, strict=True)])
         else:
-            x, moved = self.position - self.position.mean(axis=0), chain[:, 3:6] - chain[:, 3:6].mean(axis=0)
+            x, displacement = self.position - self.position.mean(axis=0), chain[:, 3:6] - chain[:, 3:6].mean(axis=0)
         spread = (x.T @ x) / len(x)
         A = np.trace(spread) * np.eye(3) - spread + FIRST_KEYFRAME_WEIGHT * np.eye(3)
-        turned = np.cross(x, moved).mean(axis=0)
-        return np.linalg.solve(A, turned + FIRST_KEYFRAME_WEIGHT * (self.rotation[0] @ chain[0, 0:3]))
+        torque = np.cross(x, displacement).mean(axis=0)
+        return np.linalg.solve(A, torque + FIRST_KEYFRAME_WEIGHT * (self.rotation[0] @ chain[0, 0:3]))
 
     def _moved(self, block: Block, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """Value of `block` moved by `d`, in a world that rotates by `turn` (3,)."""

@@ -12,7 +12,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.sensor_pose import SensorPose, chain_width, fill_chain
-from icalib.optim.robust_weights import correct_curvature, marginalise_shared, robust_weights, weight, whole_error
+from icalib.optim.robust_weights import add_common_error, correct_curvature, marginalise_shared, robust_weights, weight
 from icalib.optim.rows import add_gradients, add_gram
 
 
@@ -295,7 +295,7 @@ def accumulate(i0, i1, corners, noise, direct, poses, projection, sums, kept):
         total += _predict_view(i, corners, noise, direct, projection, residual, root, kept)
         if len(sums.diagonal) == 0:
             continue
-        whole_error(residual, noise.field[n0:n1], kept.shared[i], work.error)
+        add_common_error(residual, noise.field[n0:n1], kept.shared[i], work.error)
         _fill_rows(i, corners, noise, direct, poses, projection, root, work.error, J_rows)
         _gram(J_rows, D + 1, 2 * n, G)
         if len(noise.precision):
@@ -318,7 +318,7 @@ def accumulate_clusters(i0, i1, cluster, n_clusters, column, corners, noise, dir
         n = n1 - n0
         residual, root = work.residual[:n], work.root[:n]
         _recall_view(i, corners, kept, residual, root)
-        whole_error(residual, noise.field[n0:n1], kept.shared[i], work.error)
+        add_common_error(residual, noise.field[n0:n1], kept.shared[i], work.error)
         _fill_rows(i, corners, noise, direct, poses, projection, root, work.error, J_rows)
         for d in range(D):
             for g in range(n_clusters):

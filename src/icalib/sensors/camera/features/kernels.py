@@ -158,7 +158,7 @@ def _add_feature(i, J_rows, pair, t, J_chain, n_chain, columns, features, by_pos
     for a in range(3):
         f0, f1 = J_rows[D - 3 + a, 0], J_rows[D - 3 + a, 1]
         for k in range(3):
-            features.own[t, a, k] += f0 * J_rows[D - 3 + k, 0] + f1 * J_rows[D - 3 + k, 1]
+            features.diagonal[t, a, k] += f0 * J_rows[D - 3 + k, 0] + f1 * J_rows[D - 3 + k, 1]
         side[a, n_b] += f0 * J_rows[D, 0] + f1 * J_rows[D, 1]
         for q in range(n_c, columns.shape[1]):
             side[a, columns[i, q]] += f0 * J_rows[6 + q - n_c, 0] + f1 * J_rows[6 + q - n_c, 1]

@@ -255,7 +255,7 @@ class FeatureFactor(FactorDefaults):
         features = NO_SUMS
         if sums and piece.features is not None:
             features = piece.features.sums
-            features.own[:, range(3), range(3)] += MIN_POINT_INFORMATION
+            features.diagonal[:, range(3), range(3)] += MIN_POINT_INFORMATION
         total, begin = 0.0, 0
         for view in views:
             i, loss = view.index, self._loss(curved)
@@ -272,7 +272,7 @@ class FeatureFactor(FactorDefaults):
             loss, off = self._loss(curved), out.off.of(tracks)
             total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
         if sums and piece.features is not None:
-            piece.calib[-1, -1] += predicted_decrease(features.own, features.side[:, :, -1])
+            piece.calib[-1, -1] += predicted_decrease(features.diagonal, features.side[:, :, -1])
         return total
 
     def accumulate_clusters(

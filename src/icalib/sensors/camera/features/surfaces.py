@@ -247,7 +247,7 @@ def _add_row(t, J_point, J_plane, columns, along, weighted, features, calib):
     for a in range(3):
         features.side[t, a, n_b] += weighted * J_point[a]
         for k in range(3):
-            features.own[t, a, k] += along * J_point[a] * J_point[k]
+            features.diagonal[t, a, k] += along * J_point[a] * J_point[k]
     for r in range(3):
         c = columns[r]
         if c < 0:
@@ -273,5 +273,5 @@ def add_points_on_planes(
     """Writes the plane residuals at the points found by `PointSearch` into `out`, and returns half the robust chi^2.
 
     Adds their normal equations to `features` and to the calibration parameters of `piece`, unless features is empty."""
-    calib = piece.calib if len(features.own) else np.zeros((0, 0))
+    calib = piece.calib if len(features.diagonal) else np.zeros((0, 0))
     return _accumulate(on, planes, loss, points.xyz, points.A, features, calib, out)
