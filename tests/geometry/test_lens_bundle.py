@@ -106,11 +106,11 @@ def test_an_adjustment_goes_on_where_the_last_one_ended(monkeypatch: pytest.Monk
     first, steps = adjust(model, RADTAN + 0.01 * np.abs(RADTAN), seen), []
     step = lens_bundle._step
     monkeypatch.setattr(lens_bundle, "_step", lambda *args: steps.append(None) or step(*args))
-    second = adjust(model, first.params, first.seen)
+    second = adjust(model, first.params, first.points)
     assert len(steps) <= 2
     assert np.abs(second.shape).max() < 1e-5
     np.testing.assert_allclose(second.residual, first.residual, atol=1e-3)
-    there = model.project(first.params, first.seen.points)[0] - seen.uv
+    there = model.project(first.params, first.points.points)[0] - seen.uv
     np.testing.assert_allclose(there, first.residual, atol=1e-9)
 
 

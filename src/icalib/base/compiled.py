@@ -20,12 +20,12 @@ from numba.core import event  # noqa: E402
 def fingerprint(package: Path = Path(__file__).parents[1]) -> str:
     """Hex digest (BLAKE2b, 128 bits) of all source files of `package` that define kernels, or named tuples, which are
     arguments of kernels."""
-    found = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(digest_size=16)
     for file in sorted(package.rglob("*.py")):
         text = file.read_bytes()
         if b"njit" in text or b"NamedTuple" in text:
-            found.update(text)
-    return found.hexdigest()
+            digest.update(text)
+    return digest.hexdigest()
 
 
 def njit(**options: Any) -> Any:

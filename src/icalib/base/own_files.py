@@ -79,12 +79,12 @@ def is_ours(path: Path) -> bool:
 def refuse_foreign(paths: Iterable[Path], inputs: Iterable[Path] = (), advice: str = "choose another folder") -> None:
     """Raises CalibrationError if writing `paths` would overwrite one of `inputs`, or an existing file that `is_ours`
     does not recognize. advice: end of the message."""
-    given = {path.resolve() for path in inputs}
+    input_paths = {path.resolve() for path in inputs}
     for path in paths:
         try:
             if not (path.exists() or path.is_symlink()):
                 continue
-            if path.resolve() in given:
+            if path.resolve() in input_paths:
                 raise CalibrationError(f"{path} is an input of this command and would be overwritten; {advice}.")
             if path.is_dir():
                 raise CalibrationError(f"{path} cannot be written (it is a folder); {advice}.")
@@ -103,12 +103,12 @@ def _has_seal(path: Path, kinds: tuple[re.Pattern[bytes], ...]) -> bool:
         begin = max(0, size - _LONGEST_SEAL)
         file.seek(begin)
         tail = file.read()
-        seal = next((found for kind in kinds if (found := kind.search(tail))), None)
+        seal = next((match for kind in kinds if (match := kind.search(tail))), None)
         if seal is None:
             return False
         file.seek(0)
-        digest, left = hashlib.sha256(), begin + seal.start()
-        while left and (block := file.read(min(left, 1 << 20))):
+        digest, n_bytes = hashlib.sha256(), begin + seal.start()
+        while n_bytes and (block := file.read(min(n_bytes, 1 << 20))):
             digest.update(block)
-            left -= len(block)
+            n_bytes -= len(block)
     return digest.hexdigest() == seal[1].decode()

@@ -66,10 +66,10 @@ def copy_unpacked(packed: BinaryIO, out: BinaryIO, stored: int) -> None:
 
     Raises TooLargeError, and errors of `packed`.
     """
-    left = most_bytes(stored)
+    remaining = most_bytes(stored)
     while block := packed.read(1 << 16):  # small: the last block of a truncated file is lost
-        left -= len(block)
-        if left < 0:
+        remaining -= len(block)
+        if remaining < 0:
             raise TooLargeError
         out.write(block)
 
@@ -100,12 +100,12 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(member) as file:
         version = np.lib.format.read_magic(file)
         shape, _, dtype = readers[version](file) if version in readers else ((-1,), False, np.dtype("O"))
-        left = member.file_size - file.tell()
+        n_bytes = member.file_size - file.tell()
     if dtype.hasobject and version in readers:
         raise ValueError("Object arrays cannot be loaded: they may run programs")
     if dtype.hasobject or any(side < 0 for side in shape):
         raise ValueError(f"{member.filename} is not an array of numbers")
-    if math.prod(shape) * dtype.itemsize != left:
+    if math.prod(shape) * dtype.itemsize != n_bytes:
         raise ValueError(f"{member.filename} does not have the size that its header states")
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)

@@ -13,9 +13,9 @@ import yaml
 from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
 
-MOST_WHOLE = 2**63 - 1  # largest int64, the type of timestamps
+LARGEST_INTEGER = 2**63 - 1  # largest int64, the type of timestamps
 _LARGEST = 1e20  # largest absolute number; small enough that its powers in later computations are finite
-_WHOLE = re.compile(r"[-+]?[0-9]{1,19}")
+_INTEGER = re.compile(r"[-+]?[0-9]{1,19}")
 
 # Former names of fields, for the error that names the new one.
 RENAMED = {
@@ -56,7 +56,7 @@ class YamlValue:
     def is_list(self) -> bool:
         return isinstance(self.node, yaml.SequenceNode)
 
-    def shown(self) -> str:
+    def summary(self) -> str:
         """The value for a message: its text up to 40 characters, "a mapping", "a list" or "empty"."""
         if not isinstance(self.node, yaml.ScalarNode):
             return "a mapping" if self.is_mapping else "a list"
@@ -68,48 +68,49 @@ class YamlValue:
     def entries(self) -> dict[str, YamlValue]:
         """Values of the mapping by key. Raises RigError if it is not a mapping, or has a key twice."""
         if not isinstance(self.node, yaml.MappingNode):
-            self.fail(f"must be a mapping (name: value), but is {self.shown()}.")
-        found: dict[str, YamlValue] = {}
+            self.fail(f"must be a mapping (name: value), but is {self.summary()}.")
+        entries: dict[str, YamlValue] = {}
         for key, node in self.node.value:
             at = YamlValue(key, self.file, self.field)
             if not isinstance(key, yaml.ScalarNode):
                 at.fail("a name must be plain text; remove the brackets or braces.")
             name = str(key.value)
-            if name in found:
-                at.fail(f"{name!r} is given twice, first in line {found[name].node.start_mark.line + 1}; remove one.")
-            found[name] = YamlValue(node, self.file, f"{self.field}.{name}" if self.field else name)
-        return found
+            if name in entries:
+                at.fail(f"{name!r} is given twice, first in line {entries[name].node.start_mark.line + 1}; remove one.")
+            entries[name] = YamlValue(node, self.file, f"{self.field}.{name}" if self.field else name)
+        return entries
 
     def record(self, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, YamlValue]:
         """Values of the mapping by key. Raises RigError for a missing `required` key, and for keys in neither list."""
-        found, valid = self.entries(), required + optional
-        for name, value in found.items():
+        entries, valid = self.entries(), required + optional
+        for name, value in entries.items():
             if name not in valid and RENAMED.get(name) in valid:
                 value.fail(f"this field is now called {RENAMED[name]}; rename it{_new_values(name)}.")
             if name not in valid:
                 value.fail(f"there is no such field{suggestion(name, valid)}; available are {', '.join(valid)}.")
-        missing = [name for name in required if name not in found]
+        missing = [name for name in required if name not in entries]
         if missing:
             self.fail(f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing; add {missing[0]}.")
-        return found
+        return entries
 
     def text(self) -> str:
         if not isinstance(self.node, yaml.ScalarNode) or not str(self.node.value).strip():
-            self.fail(f"must be text, but is {self.shown()}.")
+            self.fail(f"must be text, but is {self.summary()}.")
         return str(self.node.value)
 
-    def choice(self, what: str, available: tuple[str, ...]) -> str:
-        """The text, one of `available`. what: noun for the error message."""
+    def choice(self, noun: str, available: tuple[str, ...]) -> str:
+        """The text, one of `available`. noun: noun for the error message."""
         text = self.text()
         if text not in available:
             self.fail(
-                f"there is no {what} {self.shown()}{suggestion(text, available)}; available are {', '.join(available)}."
+                f"there is no {noun} {self.summary()}{suggestion(text, available)}; "
+                f"available are {', '.join(available)}."
             )
         return text
 
     def boolean(self) -> bool:
         if not isinstance(self.node, yaml.ScalarNode) or self.node.tag != "tag:yaml.org,2002:bool":
-            self.fail(f"must be true or false, but is {self.shown()}.")
+            self.fail(f"must be true or false, but is {self.summary()}.")
         return str(self.node.value).lower() in ("true", "yes", "on")
 
     def number(self) -> float:
@@ -117,13 +118,13 @@ class YamlValue:
         plain = isinstance(self.node, yaml.ScalarNode) and self.node.style is None
         text = str(self.node.value) if plain else ""
         if text.lower().lstrip("+-") in (".nan", ".inf", "nan", "inf", "infinity"):
-            self.fail(f"must be a finite number, but is {self.shown()}.")
+            self.fail(f"must be a finite number, but is {self.summary()}.")
         try:
             value = float(text)
         except ValueError:
-            self.fail(f"must be a number, but is {self.shown()}.")
+            self.fail(f"must be a number, but is {self.summary()}.")
         if not abs(value) < _LARGEST:
-            self.fail(f"is too large a number ({self.shown()}).")
+            self.fail(f"is too large a number ({self.summary()}).")
         return value
 
     def positive(self) -> float:
@@ -142,16 +143,16 @@ class YamlValue:
         """An integer from `least` to 2^63 - 1."""
         self.number()
         text = str(self.node.value)
-        if not _WHOLE.fullmatch(text) or int(text) < least:
-            self.fail(f"must be a whole number of at least {least}, but is {self.shown()}.")
-        if int(text) > MOST_WHOLE:
-            self.fail(f"must be a whole number below 2^63, but is {self.shown()}.")
+        if not _INTEGER.fullmatch(text) or int(text) < least:
+            self.fail(f"must be a whole number of at least {least}, but is {self.summary()}.")
+        if int(text) > LARGEST_INTEGER:
+            self.fail(f"must be a whole number below 2^63, but is {self.summary()}.")
         return int(text)
 
     def items(self) -> list[YamlValue]:
         """Values of the list; the field of each ends in [i], counted from 0."""
         if not isinstance(self.node, yaml.SequenceNode):
-            self.fail(f"must be a list in brackets, but is {self.shown()}.")
+            self.fail(f"must be a list in brackets, but is {self.summary()}.")
         return [YamlValue(node, self.file, f"{self.field}[{i}]") for i, node in enumerate(self.node.value)]
 
     def vector(self, size: int) -> np.ndarray:

@@ -43,8 +43,8 @@ def moved(plane: np.ndarray, d: np.ndarray) -> np.ndarray:
     normal, point = plane[:3], plane[3:]
     angle = sqrt(d[0] * d[0] + d[1] * d[1])
     towards = d[:2] @ tangents(np.ascontiguousarray(normal))
-    turned = cos(angle) * normal + (sin(angle) / angle if angle > 0.0 else 1.0) * towards
-    return plane_of(turned, point + d[2] * normal)
+    tilted = cos(angle) * normal + (sin(angle) / angle if angle > 0.0 else 1.0) * towards
+    return plane_of(tilted, point + d[2] * normal)
 
 
 def moved_and_turned(plane: np.ndarray, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -52,8 +52,8 @@ def moved_and_turned(plane: np.ndarray, d: np.ndarray, turn: np.ndarray) -> np.n
     includes the first-order effect of the rotation, which is subtracted first."""
     normal, point = plane[:3], plane[3:]
     across = tangents(np.ascontiguousarray(normal))
-    own = d - np.append(across @ np.cross(turn, normal), normal @ np.cross(turn, point))
-    Q, at = so3.exp(turn), moved(plane, own)
+    correction = d - np.append(across @ np.cross(turn, normal), normal @ np.cross(turn, point))
+    Q, at = so3.exp(turn), moved(plane, correction)
     return np.concatenate([Q @ at[:3], Q @ at[3:]])
 
 

@@ -47,8 +47,8 @@ def _lacks(rig: Rig) -> Iterator[Lack]:
 
 def _second_imu(rig: Rig) -> Iterator[Lack]:
     """Each IMU after the first: the estimator integrates only one. No other check refuses a second IMU."""
-    first, *others = [s.name for s in rig.sensors.values() if s.is_inertial] or [""]
-    for name in others:
+    first, *surplus = [s.name for s in rig.sensors.values() if s.is_inertial] or [""]
+    for name in surplus:
         yield Lack(("sensors", name), f"is a second IMU beside {first}; keep one of them.")
 
 
@@ -59,17 +59,17 @@ def _unknown_frames(rig: Rig) -> Iterator[Lack]:
         name, where = sensor.shared_frame, ("sensors", sensor.name, "frame")
         if name == TARGET_FRAME and len(rig.target.bodies) > 1:
             yield Lack(where, f"a target of {len(rig.target.bodies)} bodies has no frame of its own; write levelled.")
-        known = [TARGET_FRAME] * rig.has_target + [s.name for s in rig.mounted if s.has_frame]
-        if name and name not in known:
-            valid = ("levelled", "tilted", *known)
+        frames = [TARGET_FRAME] * rig.has_target + [s.name for s in rig.mounted if s.has_frame]
+        if name and name not in frames:
+            valid = ("levelled", "tilted", *frames)
             sentence = f"there is no frame {name}{suggestion(name, valid)}; available are {', '.join(valid)}."
             yield Lack(where, sentence)
 
 
 def _no_motion(rig: Rig) -> str:
     nouns = [kind.noun for kind in SENSOR_TYPES.values() if kind.gives_motion]
-    there = " and ".join(s.name for s in (*rig.mounted, rig.imu) if s is not None)
-    alone = f"{there} do not determine the motion, and " if rig.mounted else ""
+    names = " and ".join(s.name for s in (*rig.mounted, rig.imu) if s is not None)
+    alone = f"{names} do not determine the motion, and " if rig.mounted else ""
     missing = f"no {', no '.join(nouns[:-1])} and no {nouns[-1]}"
     return f"{alone}there is {missing}; add one of them."
 

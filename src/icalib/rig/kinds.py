@@ -7,8 +7,8 @@ from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.sensor import Sensor
 
 SENSOR_TYPES: dict[str, type[Sensor]] = {kind: facet(kind, "spec").SENSOR for kind in SENSOR_KINDS}
-_OWN = (spec for kind in SENSOR_TYPES.values() for spec in kind.parameters)
-ALL_SPECS = tuple(dict.fromkeys((*_OWN, *SCENE)))  # without duplicates
+_SENSOR_SPECS = (spec for kind in SENSOR_TYPES.values() for spec in kind.parameters)
+ALL_SPECS = tuple(dict.fromkeys((*_SENSOR_SPECS, *SCENE)))  # without duplicates
 
 # Parameter groups with a plural name -> name of a single number, such as radii -> radius.
 ONE = {spec.name: spec.one for spec in ALL_SPECS if spec.one}

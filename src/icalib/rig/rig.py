@@ -29,11 +29,11 @@ _SHORT: dict[str, type[Sensor]] = {
 
 def by_name(*sensors: Sensor) -> dict[str, Sensor]:
     """`sensors` by name, for `Rig.sensors`. Raises RigError if two have the same name."""
-    found = {sensor.name: sensor for sensor in sensors}
-    if len(found) < len(sensors):
+    named = {sensor.name: sensor for sensor in sensors}
+    if len(named) < len(sensors):
         twice = next(s.name for k, s in enumerate(sensors) if s.name in {x.name for x in sensors[:k]})
         raise RigError(f"the rig has two sensors called {twice}; rename one of them.")
-    return found
+    return named
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class Rig:
         exist, or the value has another type.
         """
         if not part:
-            return self._with_own(fields)
+            return self._with_fields(fields)
         if part == "settings":
             check_fields(part, self.settings, fields)
             return dataclasses.replace(self, settings=dataclasses.replace(self.settings, **fields))
@@ -158,17 +158,17 @@ class Rig:
         check_fields(part, self.sensors[part], fields)
         return self.with_sensors(dataclasses.replace(self.sensors[part], **fields))
 
-    def _with_own(self, fields: dict[str, Any]) -> Rig:
+    def _with_fields(self, fields: dict[str, Any]) -> Rig:
         """A copy with `fields` of the rig replaced. Names in _SHORT, such as "cameras", replace all sensors of a
         type."""
-        own = {name: value for name, value in fields.items() if name not in _SHORT}
-        check_fields("the rig", self, own)
+        plain = {name: value for name, value in fields.items() if name not in _SHORT}
+        check_fields("the rig", self, plain)
         sensors = list(self.sensors.values())
         for name, value in fields.items():
             if name in _SHORT:
                 sensors = [s for s in sensors if not isinstance(s, _SHORT[name])]
                 sensors += _several(value)
-        return dataclasses.replace(self, **({"sensors": by_name(*sensors)} | own))
+        return dataclasses.replace(self, **({"sensors": by_name(*sensors)} | plain))
 
 
 def _several(value: Sensor | Iterable[Sensor] | None) -> tuple[Sensor, ...]:

@@ -62,7 +62,7 @@ def _mode(value: YamlValue, sigmas: tuple[str, ...]) -> tuple[str, dict[str, Yam
     RigError."""
     if not value.is_mapping:
         if value.is_list or value.text() != "free":
-            value.fail(f"must be free or a mapping, but is {value.shown()}; {_FORMS}.")
+            value.fail(f"must be free or a mapping, but is {value.summary()}; {_FORMS}.")
         return "free", None
     found = value.record((), ("guess", "fixed", "prior", *sigmas))
     modes = [name for name in ("guess", "fixed", "prior") if name in found]
@@ -93,7 +93,7 @@ def _rotation(value: YamlValue) -> np.ndarray:
     if value.is_list:
         return _matrix(value)
     if not value.is_mapping:
-        value.fail(f"must be a rotation, {_ROTATION_FORMS}, but is {value.shown()}.")
+        value.fail(f"must be a rotation, {_ROTATION_FORMS}, but is {value.summary()}.")
     found = value.record((), ("xyzw", "rpy_deg"))
     if len(found) != 1:
         value.fail(f"must be one rotation; write {_ROTATION_FORMS}.")

@@ -50,13 +50,13 @@ class _Trial:
     @property
     def squared_error(self) -> np.ndarray:
         """(M,) px^2: sum of squared residuals over the used corners of each test image."""
-        seen, square = self.tested.seen, (self.tested.residual**2).sum(axis=1)
+        seen, square = self.tested.points, (self.tested.residual**2).sum(axis=1)
         return seen.sum_by_image(np.where(seen.used, square, 0.0))
 
     @property
     def corners(self) -> int:
         """Number of used corners in all test images."""
-        return int(self.tested.seen.used.sum())
+        return int(self.tested.points.used.sum())
 
     @property
     def rms(self) -> float:
@@ -164,7 +164,7 @@ def _again(fit: _Trial, used: np.ndarray) -> _Trial | None:
     """The trial, repeated from its parameters with the corners `used` (N,) bool: those of the fitted, then of the test
     images."""
     n = len(fit.fitted.residual)
-    fitted, tested = replace(fit.fitted.seen, used=used[:n]), replace(fit.tested.seen, used=used[n:])
+    fitted, tested = replace(fit.fitted.points, used=used[:n]), replace(fit.tested.points, used=used[n:])
     return _cross_validated(fit.model, fit.fitted.params, fitted, tested)
 
 

@@ -68,8 +68,8 @@ def fit_rays(
         while True:
             damped = np.vstack([J / scale, np.sqrt(damping) * np.eye(len(params))])
             step = -np.linalg.lstsq(damped, padded, rcond=None)[0] / scale
-            moved, valid = target.project(params + step, rays)
-            if valid.all() and np.sum((moved - uv) ** 2) < residual @ residual:
+            trial, valid = target.project(params + step, rays)
+            if valid.all() and np.sum((trial - uv) ** 2) < residual @ residual:
                 break
             damping *= 10.0
             if damping > _MOST_DAMPING:  # the step is below rounding: converged

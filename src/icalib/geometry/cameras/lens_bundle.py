@@ -64,54 +64,54 @@ class ImagePoints:
 
 class Adjusted(NamedTuple):
     """Result of the adjustment. params (P,): lens; shape (s,): change of the target's shape; residual (N, 2) [px]: of
-    all points, used or not; seen: the points with the adjusted shape and poses."""
+    all points, used or not; points: with the adjusted shape and poses."""
 
     params: np.ndarray
     shape: np.ndarray
     residual: np.ndarray
-    seen: ImagePoints
+    points: ImagePoints
 
 
 def initial_parameters(
-    model: CameraModel, other: CameraModel, params: np.ndarray, seen: ImagePoints
+    model: CameraModel, known_model: CameraModel, params: np.ndarray, points: ImagePoints
 ) -> np.ndarray | None:
-    """Initial parameters (P,) of `model` for a lens that is known in the model `other` as `params`.
+    """Initial parameters (P,) of `model` for a lens that is known in the model `known_model` as `params`.
 
     They minimise the distance between projected and measured points, with the points fixed, from the best of the
     model's `start_distortions`. A start for which at most half of the points are valid is omitted; None if all are. fx
-    and fy start with the scale of `other` at the optical axis.
+    and fy start with the scale of `known_model` at the optical axis.
     """
-    few = np.flatnonzero(seen.used)[:: max(int(seen.used.sum()) // START_CORNERS, 1)]
-    points, uv = seen.points[few], seen.uv[few]
-    found = []
+    few = np.flatnonzero(points.used)[:: max(int(points.used.sum()) // START_CORNERS, 1)]
+    xyz, uv = points.points[few], points.uv[few]
+    fits = []
     for distortion in model.start_distortions:
         start = np.array([*params[:4], *distortion])
-        start[:2] *= other.central_scale(params) / model.central_scale(start)
-        visible = model.project(start, points)[1]
+        start[:2] *= known_model.central_scale(params) / model.central_scale(start)
+        visible = model.project(start, xyz)[1]
         if 2 * visible.sum() > len(uv):
             with suppress(np.linalg.LinAlgError):
-                found.append(fit_rays(model, start, points[visible], uv[visible], START_PX))
-    return min(found, key=lambda p: float((_residual(uv, *model.project(p, points)) ** 2).sum()), default=None)
+                fits.append(fit_rays(model, start, xyz[visible], uv[visible], START_PX))
+    return min(fits, key=lambda p: float((_residual(uv, *model.project(p, xyz)) ** 2).sum()), default=None)
 
 
-def adjust(model: CameraModel, params: np.ndarray, seen: ImagePoints, fixed: np.ndarray | None = None) -> Adjusted:
+def adjust(model: CameraModel, params: np.ndarray, points: ImagePoints, fixed: np.ndarray | None = None) -> Adjusted:
     """Minimise the squared residuals of the used points over lens parameters, shape and poses, from `params` (P,).
 
     With a `fixed` shape (s,) only the poses are fitted, and `params` and `fixed` are returned unchanged. Raises
     numpy.linalg.LinAlgError if the points of an image do not determine its pose.
     """
-    shape, n = np.zeros(seen.basis.shape[2]), len(params)
+    shape, n = np.zeros(points.basis.shape[2]), len(params)
     if fixed is not None:
-        shape, n, seen = fixed, 0, seen.moved(np.zeros((len(seen.start) - 1, 6)), fixed)
-    here, damping = _linearised(model, params, seen, fixed is None), 1e-4
+        shape, n, points = fixed, 0, points.moved(np.zeros((len(points.start) - 1, 6)), fixed)
+    at_params, damping = _linearised(model, params, points, fixed is None), 1e-4
     for _ in range(MOST_ROUNDS):
-        step, motion = _step(*here, seen, damping)
-        trial = params + step[:n] if n else params
-        moved = seen.moved(motion, step[n:] if n else np.zeros(len(shape)))
-        there = _linearised(model, trial, moved, fixed is None)
-        before, after = (float((r[seen.used] ** 2).sum()) for r, _ in (here, there))
+        step, motion = _step(*at_params, points, damping)
+        trial_params = params + step[:n] if n else params
+        trial_points = points.moved(motion, step[n:] if n else np.zeros(len(shape)))
+        at_trial = _linearised(model, trial_params, trial_points, fixed is None)
+        before, after = (float((r[points.used] ** 2).sum()) for r, _ in (at_params, at_trial))
         if after < before:
-            params, seen, here = trial, moved, there
+            params, points, at_params = trial_params, trial_points, at_trial
             shape = shape + step[n:] if n else shape
             damping *= 0.1
             if before - after < SETTLED * before:
@@ -120,21 +120,21 @@ def adjust(model: CameraModel, params: np.ndarray, seen: ImagePoints, fixed: np.
             damping *= 10.0
             if damping > MOST_DAMPING:
                 break
-    return Adjusted(params, shape, here[0], seen)
+    return Adjusted(params, shape, at_params[0], points)
 
 
 def _linearised(
-    model: CameraModel, params: np.ndarray, seen: ImagePoints, with_lens: bool
+    model: CameraModel, params: np.ndarray, points: ImagePoints, with_lens: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (N, 2) [px], predicted - measured, and their Jacobian (N, 2, 6 + P + s).
 
     Columns: rotation and translation of the image's points in the camera frame; then lens parameters and shape, if
     `with_lens`.
     """
-    projected, valid, J_point, J_params = model.project_with_jacobians(params, seen.points)
-    J_shared = (J_params, J_point @ seen.basis) if with_lens else ()
-    J = np.concatenate([cross(seen.points[:, None, :], J_point), J_point, *J_shared], axis=2)
-    return _residual(seen.uv, projected, valid), J
+    projected, valid, J_point, J_params = model.project_with_jacobians(params, points.points)
+    J_shared = (J_params, J_point @ points.basis) if with_lens else ()
+    J = np.concatenate([cross(points.points[:, None, :], J_point), J_point, *J_shared], axis=2)
+    return _residual(points.uv, projected, valid), J
 
 
 def _residual(uv: np.ndarray, projected: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -142,24 +142,24 @@ def _residual(uv: np.ndarray, projected: np.ndarray, valid: np.ndarray) -> np.nd
     return np.where(valid[:, None], projected - uv, np.sqrt(0.5) * UNSEEN_PX)
 
 
-def _step(residual: np.ndarray, J: np.ndarray, seen: ImagePoints, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _step(residual: np.ndarray, J: np.ndarray, points: ImagePoints, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Steps of the shared parameters, lens and shape (n,), and of the poses (M, 6), by the Schur complement.
 
     Both diagonals are damped relative to themselves. J (N, 2, 6 + n): Jacobian from `_linearised`.
     """
     rows = np.concatenate([J, residual[:, :, None]], axis=2)
-    rows[~seen.used] = 0.0
-    images = (rows[a:b].reshape(-1, rows.shape[2]) for a, b in pairwise(seen.start))
-    grams = np.array([own.T @ own for own in images])
-    whole = grams[:, 6:, 6:].sum(axis=0)
+    rows[~points.used] = 0.0
+    images = (rows[a:b].reshape(-1, rows.shape[2]) for a, b in pairwise(points.start))
+    grams = np.array([image_rows.T @ image_rows for image_rows in images])
+    total = grams[:, 6:, 6:].sum(axis=0)
     H, C, g = grams[:, :6, :6], grams[:, :6, 6:-1], grams[:, :6, -1]
     diagonal = np.einsum("mii->mi", H)
     diagonal *= 1.0 + damping
     diagonal += 1e-12 * diagonal.max(axis=1, keepdims=True)
     solved = np.linalg.solve(H, np.concatenate([C, g[:, :, None]], axis=2))
-    S = whole[:-1, :-1] - np.einsum("mki,mkj->ij", C, solved[:, :, :-1])
-    b = whole[:-1, -1] - np.einsum("mki,mk->i", C, solved[:, :, -1])
-    scale = np.sqrt(np.maximum(np.diag(whole)[:-1], 1e-300))
+    S = total[:-1, :-1] - np.einsum("mki,mkj->ij", C, solved[:, :, :-1])
+    b = total[:-1, -1] - np.einsum("mki,mk->i", C, solved[:, :, -1])
+    scale = np.sqrt(np.maximum(np.diag(total)[:-1], 1e-300))
     scaled = S / scale[:, None] / scale + damping * np.eye(len(b))
     step = -np.linalg.lstsq(scaled, b / scale, rcond=1e-13)[0] / scale
     return step, -solved[:, :, -1] - np.einsum("mij,j->mi", solved[:, :, :-1], step)

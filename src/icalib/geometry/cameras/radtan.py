@@ -152,8 +152,8 @@ def undistort(params, coefficients, limit, distorted_a, distorted_b):
     k3 = _third_coefficient(params)
     for _ in range(_MAX_NEWTON_STEPS):
         value_a, value_b, j_aa, j_ab, j_bb = distort(params, k3, a, b)
-        turned_over, step_a, step_b = newton_step(value_a - distorted_a, value_b - distorted_b, j_aa, j_ab, j_bb)
-        if turned_over:
+        is_folded, step_a, step_b = newton_step(value_a - distorted_a, value_b - distorted_b, j_aa, j_ab, j_bb)
+        if is_folded:
             return a, b, False
         a, b = a - step_a, b - step_b
         if abs(step_a) + abs(step_b) <= 1e-14 * (1.0 + abs(a) + abs(b)):

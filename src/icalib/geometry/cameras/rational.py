@@ -195,8 +195,8 @@ def _undistort(params, limit, distorted_a, distorted_b):
     a, b = scale * distorted_a, scale * distorted_b
     for _ in range(_MAX_NEWTON_STEPS):
         value_a, value_b, j_aa, j_ab, j_bb, _, _ = _distort(params, a, b)
-        turned_over, step_a, step_b = newton_step(value_a - distorted_a, value_b - distorted_b, j_aa, j_ab, j_bb)
-        if turned_over:
+        is_folded, step_a, step_b = newton_step(value_a - distorted_a, value_b - distorted_b, j_aa, j_ab, j_bb)
+        if is_folded:
             return a, b, False
         a, b = a - step_a, b - step_b
         if abs(step_a) + abs(step_b) <= 1e-14 * (1.0 + abs(a) + abs(b)):

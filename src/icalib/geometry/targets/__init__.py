@@ -36,10 +36,10 @@ TARGETS: dict[str, type[Target]] = {
 def target_from_plain(rig: dict[str, Any]) -> Target | None:
     """The target of a rig as plain data, the inverse of `Target.plain`; None if the rig has no target."""
     if "targets" in rig:
-        return Scene(tuple(rig["targets"]), tuple(_one(fields) for fields in rig["targets"].values()))
-    return _one(rig["target"]) if rig.get("target") else None
+        return Scene(tuple(rig["targets"]), tuple(_target(fields) for fields in rig["targets"].values()))
+    return _target(rig["target"]) if rig.get("target") else None
 
 
-def _one(fields: dict[str, Any]) -> Target:
+def _target(fields: dict[str, Any]) -> Target:
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if k != "type"}
     return TARGETS[fields["type"]](**values)

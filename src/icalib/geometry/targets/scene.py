@@ -33,9 +33,9 @@ class Scene(Target):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "size_sigma", max(t.size_sigma for t in self.targets))
-        for (name, one), (other_name, other) in combinations(zip(self.names, self.targets, strict=True), 2):
-            if common := _in_common(one, other):
-                raise RigError(f"images cannot tell {name} from {other_name}: {common}.")
+        for (name, target), (second_name, second) in combinations(zip(self.names, self.targets, strict=True), 2):
+            if common := _in_common(target, second):
+                raise RigError(f"images cannot tell {name} from {second_name}: {common}.")
 
     def plain(self) -> dict[str, Any]:
         """The content of `targets` in a rig file: fields of each target by name."""
@@ -89,17 +89,18 @@ class Scene(Target):
         index = np.full(len(tag_id), -1)
         owner = np.full(len(tag_id), -1)
         for k, (target, first) in enumerate(zip(self.targets, self.first_points[:-1], strict=True)):
-            own = _rows_of(target, tag_id, corner)
-            if (both := own & (owner >= 0)).any():
-                names = f"{self.names[owner[both][0]]} and {self.names[k]}"
+            is_point = _rows_of(target, tag_id, corner)
+            if (repeated := is_point & (owner >= 0)).any():
+                names = f"{self.names[owner[repeated][0]]} and {self.names[k]}"
                 raise RecordingError(
-                    f"corner {corner[both][0]} of tag {tag_id[both][0]} is on {names}; give them other ids, or images."
+                    f"corner {corner[repeated][0]} of tag {tag_id[repeated][0]} is on {names}; give them other ids, "
+                    "or images."
                 )
-            owner[own] = k
-            index[own] = first + target.point_index(tag_id[own], corner[own])
-        if (lost := owner < 0).any():
+            owner[is_point] = k
+            index[is_point] = first + target.point_index(tag_id[is_point], corner[is_point])
+        if (unknown := owner < 0).any():
             raise RecordingError(
-                f"corner {corner[lost][0]} of tag {tag_id[lost][0]} is on none of {', '.join(self.names)}; "
+                f"corner {corner[unknown][0]} of tag {tag_id[unknown][0]} is on none of {', '.join(self.names)}; "
                 "check the targets in the rig file."
             )
         return index
@@ -109,19 +110,19 @@ class Scene(Target):
         tag_id, corner = np.empty_like(index), np.empty_like(index)
         owner = np.searchsorted(self.first_points, index, side="right") - 1
         for k, target in enumerate(self.targets):
-            own = owner == k
-            tag_id[own], corner[own] = target.point_identity(index[own] - self.first_points[k])
+            rows = owner == k
+            tag_id[rows], corner[rows] = target.point_identity(index[rows] - self.first_points[k])
         return tag_id, corner
 
 
-def _in_common(one: Target, other: Target) -> str:
+def _in_common(first: Target, second: Target) -> str:
     """Why images cannot distinguish the two targets, and advice; empty if they can."""
-    if one.tags and other.tags and (ids := one.tags.shared_with(other.tags)):
+    if first.tags and second.tags and (ids := first.tags.shared_with(second.tags)):
         advice = "give them other ids or families (first_id and family of an aprilgrid), or leave one out"
-        return f"both have tag {ids[0]} of {one.tags.family}; {advice}"
-    if isinstance(one, Circles) and isinstance(other, Circles):
+        return f"both have tag {ids[0]} of {first.tags.family}; {advice}"
+    if isinstance(first, Circles) and isinstance(second, Circles):
         return "both are grids of circles; leave one out, or take a board with tags"
-    boards = [{t.rows, t.cols} for t in (one, other) if isinstance(t, Checkerboard)]
+    boards = [{t.rows, t.cols} for t in (first, second) if isinstance(t, Checkerboard)]
     if len(boards) == 2 and boards[0] == boards[1]:
         return "both are checkerboards with as many corners; take another size, or boards with tags"
     return ""
@@ -129,6 +130,6 @@ def _in_common(one: Target, other: Target) -> str:
 
 def _rows_of(target: Target, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
     """(N,) bool: whether each tag id and corner number is a point of `target`."""
-    known = np.stack(target.point_identity(np.arange(len(target.points))), axis=1)
-    base = 1 + int(max(known.max(), tag_id.max(initial=0), corner.max(initial=0)))
-    return np.isin(tag_id * base + corner, known[:, 0] * base + known[:, 1]) & (tag_id >= 0) & (corner >= 0)
+    identities = np.stack(target.point_identity(np.arange(len(target.points))), axis=1)
+    base = 1 + int(max(identities.max(), tag_id.max(initial=0), corner.max(initial=0)))
+    return np.isin(tag_id * base + corner, identities[:, 0] * base + identities[:, 1]) & (tag_id >= 0) & (corner >= 0)

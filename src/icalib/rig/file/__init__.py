@@ -31,13 +31,13 @@ def rig_from_dict(plain: dict[str, Any], source: str) -> Rig:
 
 
 def _rig(root: YamlValue) -> Rig:
-    found = root.record(("sensors",), ("target", "targets", "gravity", "settings", "body"))
+    fields = root.record(("sensors",), ("target", "targets", "gravity", "settings", "body"))
     rig = Rig(
-        by_name(*(_sensor(name, value) for name, value in found["sensors"].entries().items())),
-        target_or_targets(root) if "target" in found or "targets" in found else NoTarget(),
-        gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
-        settings=_settings(found["settings"]) if "settings" in found else Settings(),
-        body=found["body"].text() if "body" in found else "",
+        by_name(*(_sensor(name, value) for name, value in fields["sensors"].entries().items())),
+        target_or_targets(root) if "target" in fields or "targets" in fields else NoTarget(),
+        gravity=fields["gravity"].positive() if "gravity" in fields else Rig.gravity,
+        settings=_settings(fields["settings"]) if "settings" in fields else Settings(),
+        body=fields["body"].text() if "body" in fields else "",
     )
     if (lack := lack_of(rig)) is not None:
         _place(root, lack).fail(lack.sentence)
@@ -69,8 +69,8 @@ def load_target(path: str | Path) -> Target:
     Raises RigError with file, line and field, what is wrong and what to do.
     """
     root = read_yaml(Path(path))
-    has_its_own_field = {"target", "targets"} & set(root.entries())
-    return target_or_targets(root) if has_its_own_field else target_of(root)
+    has_target_field = {"target", "targets"} & set(root.entries())
+    return target_or_targets(root) if has_target_field else target_of(root)
 
 
 def rig_to_dict(rig: Rig) -> dict[str, Any]:
@@ -93,8 +93,8 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
 
 def _settings(value: YamlValue) -> Settings:
     kinds = get_type_hints(Settings)
-    found = value.record((), tuple(kinds))
-    return Settings(**{name: _setting(name, given, kinds[name]) for name, given in found.items()})
+    fields = value.record((), tuple(kinds))
+    return Settings(**{name: _setting(name, entry, kinds[name]) for name, entry in fields.items()})
 
 
 _MAY_BE_ZERO = ("outlier_std", "outlier_min_px", "points_on_planes_m")

@@ -29,33 +29,33 @@ def target_or_targets(root: YamlValue) -> Target:
 
     Raises RigError with file, line and field, what is wrong and what to do.
     """
-    found = root.entries()
-    if "target" not in found and "targets" not in found:
+    fields = root.entries()
+    if "target" not in fields and "targets" not in fields:
         root.fail("target is missing; add target, or targets for several by name.")
-    if "targets" not in found:
-        return target_of(found["target"])
-    if "target" in found:
-        found["targets"].fail("conflicts with target; put all targets under targets.")
-    named = found["targets"].entries()
+    if "targets" not in fields:
+        return target_of(fields["target"])
+    if "target" in fields:
+        fields["targets"].fail("conflicts with target; put all targets under targets.")
+    named = fields["targets"].entries()
     for name, value in named.items():
         if not NAME.fullmatch(name):
             value.fail(f"a target's name is {NAME_WORDS}, as in wall; rename it.")
     if not named:
-        found["targets"].fail("there is no target; add one, as in wall: {type: markers, ...}.")
+        fields["targets"].fail("there is no target; add one, as in wall: {type: markers, ...}.")
     targets = tuple(target_of(value) for value in named.values())
-    return targets[0] if len(targets) == 1 else _made(found["targets"], lambda: Scene(tuple(named), targets))
+    return targets[0] if len(targets) == 1 else _checked_target(fields["targets"], lambda: Scene(tuple(named), targets))
 
 
 def target_of(value: YamlValue) -> Target:
     """One target from the mapping of its fields. Raises RigError as `target_or_targets`."""
-    given = value.entries()
-    if "type" not in given:
+    entries = value.entries()
+    if "type" not in entries:
         value.fail(f"type is missing; add type: {', type: '.join(_FIELDS)}.")
-    kind = given["type"].choice("target type", tuple(_FIELDS))
+    kind = entries["type"].choice("target type", tuple(_FIELDS))
     required, optional = _FIELDS[kind]
-    found = value.record(("type", *required), (*optional, "size_sigma"))
-    target = _of_kind(kind, value, found)
-    return replace(target, size_sigma=_size_sigma(found["size_sigma"])) if "size_sigma" in found else target
+    fields = value.record(("type", *required), (*optional, "size_sigma"))
+    target = _of_kind(kind, value, fields)
+    return replace(target, size_sigma=_size_sigma(fields["size_sigma"])) if "size_sigma" in fields else target
 
 
 def _size_sigma(value: YamlValue) -> float:
@@ -66,41 +66,43 @@ def _size_sigma(value: YamlValue) -> float:
     return sigma
 
 
-def _of_kind(kind: str, value: YamlValue, found: dict[str, YamlValue]) -> Target:
+def _of_kind(kind: str, value: YamlValue, fields: dict[str, YamlValue]) -> Target:
     if kind == "aprilgrid":
-        return _aprilgrid(value, found)
+        return _aprilgrid(value, fields)
     if kind == "markers":
-        return _markers(value, found)
+        return _markers(value, fields)
     if kind == "circles":
-        counts, spacing = _counts(value, found, "rows", "cols", "circles"), _edge(found["spacing"], "spacing")
-        diameter = _edge(found["diameter"], "circle")
-        return _made(value, lambda: Circles(*counts, spacing, diameter, _yes(found, "asymmetric")))
-    size = _edge(found["square_size"], "square")
+        counts, spacing = _counts(value, fields, "rows", "cols", "circles"), _edge(fields["spacing"], "spacing")
+        diameter = _edge(fields["diameter"], "circle")
+        return _checked_target(value, lambda: Circles(*counts, spacing, diameter, _yes(fields, "asymmetric")))
+    size = _edge(fields["square_size"], "square")
     if kind == "checkerboard":
-        rows, cols = _counts(value, found, "rows", "cols", "corners")
-        return _made(value, lambda: Checkerboard(rows, cols, size, _yes(found, "inverted"), _yes(found, "upright")))
-    squares = _counts(value, found, "squares_x", "squares_y", "squares")
-    marker, dictionary = _edge(found["marker_size"], "tag"), _family(found["dictionary"])
-    how = _yes(found, "legacy"), _yes(found, "inverted")
-    return _made(value, lambda: Charuco(*squares, size, marker, dictionary, *how))
+        rows, cols = _counts(value, fields, "rows", "cols", "corners")
+        return _checked_target(
+            value, lambda: Checkerboard(rows, cols, size, _yes(fields, "inverted"), _yes(fields, "upright"))
+        )
+    squares = _counts(value, fields, "squares_x", "squares_y", "squares")
+    marker, dictionary = _edge(fields["marker_size"], "tag"), _family(fields["dictionary"])
+    how = _yes(fields, "legacy"), _yes(fields, "inverted")
+    return _checked_target(value, lambda: Charuco(*squares, size, marker, dictionary, *how))
 
 
-def _aprilgrid(value: YamlValue, found: dict[str, YamlValue]) -> Target:
-    size = _edge(found["tag_size"], "tag")
-    rows, cols = _counts(value, found, "rows", "cols", "tags")
-    squares = found["squares"].boolean() if "squares" in found else True
-    spacing, border = found["tag_spacing"].positive(), _border(found, AprilGrid.border_bits)
-    first = found["first_id"].whole(0) if "first_id" in found else AprilGrid.first_id
-    family = _family(found["family"]) if "family" in found else AprilGrid.family
-    return _made(value, lambda: AprilGrid(rows, cols, size, spacing, border, squares, first, family))
+def _aprilgrid(value: YamlValue, fields: dict[str, YamlValue]) -> Target:
+    size = _edge(fields["tag_size"], "tag")
+    rows, cols = _counts(value, fields, "rows", "cols", "tags")
+    squares = fields["squares"].boolean() if "squares" in fields else True
+    spacing, border = fields["tag_spacing"].positive(), _border(fields, AprilGrid.border_bits)
+    first = fields["first_id"].whole(0) if "first_id" in fields else AprilGrid.first_id
+    family = _family(fields["family"]) if "family" in fields else AprilGrid.family
+    return _checked_target(value, lambda: AprilGrid(rows, cols, size, spacing, border, squares, first, family))
 
 
-def _markers(value: YamlValue, found: dict[str, YamlValue]) -> Target:
-    family, size = _family(found["family"]), _edge(found["size"], "tag")
-    ids = tuple(entry.whole(0) for entry in found["ids"].items()) if "ids" in found else ()
-    if "ids" in found and not ids:
-        found["ids"].fail("the list of ids is empty; list them, or remove ids to use all tags that are seen.")
-    return _made(value, lambda: Markers(family, size, ids, _border(found, Markers.border_bits)))
+def _markers(value: YamlValue, fields: dict[str, YamlValue]) -> Target:
+    family, size = _family(fields["family"]), _edge(fields["size"], "tag")
+    ids = tuple(entry.whole(0) for entry in fields["ids"].items()) if "ids" in fields else ()
+    if "ids" in fields and not ids:
+        fields["ids"].fail("the list of ids is empty; list them, or remove ids to use all tags that are seen.")
+    return _checked_target(value, lambda: Markers(family, size, ids, _border(fields, Markers.border_bits)))
 
 
 def _family(value: YamlValue) -> str:
@@ -110,28 +112,28 @@ def _family(value: YamlValue) -> str:
         value.fail(str(error))
 
 
-def _yes(found: dict[str, YamlValue], name: str) -> bool:
-    return found[name].boolean() if name in found else False
+def _yes(fields: dict[str, YamlValue], name: str) -> bool:
+    return fields[name].boolean() if name in fields else False
 
 
-def _border(found: dict[str, YamlValue], default: int) -> int:
-    return int(found["border_bits"].choice("width of border", ("1", "2"))) if "border_bits" in found else default
+def _border(fields: dict[str, YamlValue], default: int) -> int:
+    return int(fields["border_bits"].choice("width of border", ("1", "2"))) if "border_bits" in fields else default
 
 
-def _edge(value: YamlValue, what: str) -> float:
+def _edge(value: YamlValue, noun: str) -> float:
     if (size := value.positive()) > _LARGEST_TAG_M:
-        value.fail(f"is in metres, and {size:g} m is too large for a {what}; write 0.088 for 88 mm.")
+        value.fail(f"is in metres, and {size:g} m is too large for a {noun}; write 0.088 for 88 mm.")
     return size
 
 
-def _counts(value: YamlValue, found: dict[str, YamlValue], first: str, second: str, what: str) -> tuple[int, int]:
-    a, b = found[first].whole(1), found[second].whole(1)
+def _counts(value: YamlValue, fields: dict[str, YamlValue], first: str, second: str, noun: str) -> tuple[int, int]:
+    a, b = fields[first].whole(1), fields[second].whole(1)
     if a * b > _MOST_TAGS:
-        value.fail(f"{a} x {b} {what} exceed the limit of {_MOST_TAGS}; correct {first} and {second}.")
+        value.fail(f"{a} x {b} {noun} exceed the limit of {_MOST_TAGS}; correct {first} and {second}.")
     return a, b
 
 
-def _made(value: YamlValue, make: Callable[[], Target]) -> Target:
+def _checked_target(value: YamlValue, make: Callable[[], Target]) -> Target:
     try:
         return make()
     except RigError as error:

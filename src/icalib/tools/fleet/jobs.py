@@ -69,7 +69,7 @@ def _name(value: YamlValue) -> str:
     if not _NAME.fullmatch(text):
         value.fail(
             "must be a valid folder name (letters, digits, _, - and dots, 100 at most), but is "
-            f"{value.shown()}; rename it."
+            f"{value.summary()}; rename it."
         )
     return text
 
@@ -78,7 +78,7 @@ def _time(value: YamlValue) -> datetime:
     try:
         found = datetime.fromisoformat(value.text())
     except ValueError:
-        value.fail(f"must be a date or time as in 2026-11-02 or 2026-11-02T13:05:00+01:00, but is {value.shown()}.")
+        value.fail(f"must be a date or time as in 2026-11-02 or 2026-11-02T13:05:00+01:00, but is {value.summary()}.")
     return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import numpy as np
 
 from icalib.base.file_names import NAME, NAME_WORDS
-from icalib.base.yaml_nodes import MOST_WHOLE, YamlValue, read_yaml
+from icalib.base.yaml_nodes import LARGEST_INTEGER, YamlValue, read_yaml
 from icalib.errors import RigError
 from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
@@ -42,7 +42,7 @@ def load_scenario(path: str | Path) -> Scenario:
     )
     start_ns = found["start_ns"].whole(0) if "start_ns" in found else _START_NS
     duration_s = found["duration"].positive()
-    if start_ns + _MARGIN_S * 1e9 + duration_s * 1e9 > MOST_WHOLE:
+    if start_ns + _MARGIN_S * 1e9 + duration_s * 1e9 > LARGEST_INTEGER:
         found["start_ns" if "start_ns" in found else "duration"].fail("the last stamp would exceed 2^63 ns; lower it.")
     sensors = _sensors(found["sensors"], start_ns)
     room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
