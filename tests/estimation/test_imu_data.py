@@ -29,14 +29,14 @@ def imu():
 def test_noise_walks_with_the_root_of_time(imu):
     begin, end = np.array([0.1, 0.1, 0.1]), np.array([0.1, 0.14, 0.0975])
     expected = DENSITY * np.array([0.0, np.sqrt(0.04), -np.sqrt(0.0025)])
-    np.testing.assert_allclose(imu.turned_by_noise(begin, end), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(imu.rotation_sigma(begin, end), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_drawn_noise_turns_as_far(imu):
     """The mean reading of an interval errs by its density over the root of its length."""
     rng, dt = np.random.default_rng(0), 5e-3
     turns = (DENSITY / np.sqrt(dt) * rng.standard_normal((20000, 8))).sum(axis=1) * dt
-    assert turns.std() == pytest.approx(imu.turned_by_noise(np.array([0.2]), np.array([0.24]))[0], rel=0.02)
+    assert turns.std() == pytest.approx(imu.rotation_sigma(np.array([0.2]), np.array([0.24]))[0], rel=0.02)
 
 
 def test_in_a_gap_it_is_the_unseen_motion_that_turns():
@@ -45,6 +45,6 @@ def test_in_a_gap_it_is_the_unseen_motion_that_turns():
     moving = replace(moving, gyro=np.random.default_rng(1).normal(size=moving.gyro.shape))
     imu = ImuData.build(moving, NOISE)
     assert np.diff(imu.seconds).max() > MIN_GAP_PERIODS * 5e-3
-    across, beside = imu.turned_by_noise(np.array([0.39, 0.29]), np.array([0.45, 0.35]))
+    across, beside = imu.rotation_sigma(np.array([0.39, 0.29]), np.array([0.45, 0.35]))
     assert beside == pytest.approx(DENSITY * np.sqrt(0.06), rel=1e-9)
     assert across > 30.0 * beside
