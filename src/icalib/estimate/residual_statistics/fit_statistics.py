@@ -58,11 +58,11 @@ def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[FitKey, float
 def split_covariance(outcome: Outcome, parts: Segments) -> np.ndarray:
     """(B, B) covariance of the calibration parameters from the scatter of segments.
 
-    The gradient b_g of segment g at the joint optimum, its chain marginalised, would be zero but for noise. With the
-    joint information S, the scatter gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block jackknife to
-    first order.
+    The gradient b_g of segment g at the joint optimum, the joint trajectory marginalised, would be zero but for noise.
+    With the joint information S, the scatter gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block
+    jackknife to first order.
     """
-    b, n = parts.sums[:, :-1, -1], parts.count
+    b, n = parts.gradients, parts.count
     return n / (n - 1.0) * spread_covariance(parts.problem, outcome, b - b.mean(axis=0))
 
 
@@ -70,12 +70,14 @@ def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
     """(B,) expected variances of `split_covariance` for white noise.
 
     At the joint optimum the gradient of segment g has the covariance S_g - S_g S^-1 S_g, because a segment with much
-    information pulls the optimum towards itself (leverage; Bell and McCaffrey 2002). For equal segments these are the
-    formal variances.
+    information pulls the optimum towards itself (leverage; Bell and McCaffrey 2002). S_g is the information of the
+    segment alone, and an equal share of what only the joint trajectory adds. For equal segments these are the formal
+    variances.
     """
     t, n = parts.problem.tolerance, parts.count
     inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.fixed_directions)
-    known = parts.sums[:, :-1, :-1] * t[:, None] * t
+    alone = parts.sums[:, :-1, :-1]
+    known = (alone + (parts.information - alone.sum(axis=0)) / n) * t[:, None] * t
     left = (known - known @ inverse @ known).sum(axis=0)
     return t**2 * n / (n - 1.0) * np.diag(inverse @ left @ inverse)
 

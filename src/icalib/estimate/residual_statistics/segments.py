@@ -3,7 +3,9 @@ eliminated."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,18 +26,43 @@ MIN_SEGMENTS_AT_REST = 4  # of poses at rest: the scatter of fewer is not inform
 LOOSE_FRAME_INFORMATION = 1e-3
 
 
+class PieceGradient(NamedTuple):
+    """Gradient of half the chi^2 of a segment. chain (n, 15): of its keyframes from `first` on; calib (B,): of the
+    calibration parameters."""
+
+    first: int
+    chain: np.ndarray
+    calib: np.ndarray
+
+    def add(self, piece: Piece, column: int) -> None:
+        """Adds the gradient to `column` of `piece`. A keyframe that two pieces share counts in the earlier one, the
+        calibration parameters in the piece of the segment's first keyframe."""
+        first = piece.first + (piece.first > 0)
+        start, end = max(first, self.first), min(piece.last + 1, self.first + len(self.chain))
+        if start < end:
+            piece.side[start - piece.first : end - piece.first, :, column] += self.chain[
+                start - self.first : end - self.first
+            ]
+        if first <= self.first <= piece.last:
+            piece.calib[: len(self.calib), column] += self.calib
+
+
 @dataclass(frozen=True)
 class Segments:
     """Segments of `problem` at `state`; feature tracks are cut at their ends. ends (G + 1,): keyframes that bound the
     segments.
 
-    sums (G, B + 1, B + 1): information of each segment on the calibration parameters, its gradient in the last column.
+    sums (G, B + 1, B + 1): information of each segment alone on the calibration parameters, its gradient in the last
+    column. The trajectory of each segment is eliminated on its own. gradients (G, B), information (B, B): gradient of
+    each segment and information of all, the joint trajectory eliminated. Priors have no part in any of them.
     """
 
     problem: Problem
     state: State
     ends: np.ndarray
     sums: np.ndarray
+    gradients: np.ndarray
+    information: np.ndarray
 
     @classmethod
     def of(cls, problem: Problem, outcome: Outcome, count: int) -> Segments | None:
@@ -47,13 +74,15 @@ class Segments:
         ends = segment_ends(problem.chain.starts, problem.n_keyframes, count)
         if len(ends) < 3 or np.diff(ends).min() < fewest:
             return None
-        parts = cls(problem.cut(outcome.state, ends[:-1]), outcome.state, ends, np.zeros(0))
+        parts = cls(problem.cut(outcome.state, ends[:-1]), outcome.state, ends, *[np.zeros(0)] * 3)
         scratch = parts.problem.reusable_output(outcome.residuals)
         try:
-            sums = in_parallel(lambda g: marginalise(parts.piece(g, scratch)), range(len(ends) - 1))
+            gradients, sums = zip(*in_parallel(lambda g: parts.alone(g, scratch), range(len(ends) - 1)), strict=True)
+            joint = parts.together(gradients, scratch)
         except EstimationError:
             return None
-        return cls(parts.problem, parts.state, ends, np.array(sums))
+        B = problem.layout.size
+        return replace(parts, sums=np.array(sums), gradients=joint[:B, B:-1].T, information=joint[:B, :B])
 
     @property
     def count(self) -> int:
@@ -71,6 +100,36 @@ class Segments:
             hold_frame(state, piece, first, problem.levelled, LOOSE_FRAME_INFORMATION if shared else FRAME_INFORMATION)
         # Nothing links the first keyframe of a recording to the one before, and its images belong to the next segment.
         return piece.without_last() if last in problem.chain.starts else piece
+
+    def alone(self, g: int, scratch: Residuals) -> tuple[PieceGradient, np.ndarray]:
+        """Gradient of segment `g`, and its sums (B + 1, B + 1) with its keyframes eliminated."""
+        piece = self.piece(g, scratch)
+        gradient = PieceGradient(piece.first, piece.side[:, :, -1].copy(), piece.calib[:-1, -1].copy())
+        return gradient, marginalise(piece)
+
+    def together(self, gradients: Sequence[PieceGradient], scratch: Residuals) -> np.ndarray:
+        """System (B + G + 1, B + G + 1) of the calibration parameters, the joint trajectory eliminated. Column B + g is
+        the gradient of segment g.
+
+        Gradients of eliminated points of the scene are zero, because each point is optimal for the current state.
+        """
+        problem, state, B = self.problem, self.state, self.problem.layout.size
+
+        def piece_between(first: int, last: int) -> Piece:
+            piece = Piece.zeros(first, last, B + len(gradients))
+            narrow = problem.attach(problem.narrow(piece, B))
+            problem.add_measurements(state, narrow, scratch)
+            problem.add_bias_prior(state, narrow)
+            problem.hold_frames(state, narrow)
+            piece.side[:, :, :B] = narrow.side[:, :, :B]
+            piece.calib[:B, :B] = narrow.calib[:B, :B]
+            for column, gradient in enumerate(gradients, B):
+                gradient.add(piece, column)
+            if narrow.features is None:
+                return piece
+            return replace(piece, features=narrow.features.widened(B + len(gradients)))
+
+        return problem.marginal(piece_between)
 
     def cost(self, g: int, state: State, out: Residuals) -> float:
         """Half the robust chi^2 of segment `g` at `state`; fills `out` with its residuals."""

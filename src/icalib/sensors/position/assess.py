@@ -22,7 +22,7 @@ from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.position.walk_factor import SLOW_OFFSET
 
 # Correlation of successive residuals above which a warning is given: its value, and its value in standard errors. White
-# noise leaves 0 or less. At 0.1 the standard deviations of a lever arm were 1.4 times too small.
+# noise leaves 0 or less. At 0.1 the formal standard deviations of a lever arm were 1.4 times too small.
 MIN_CORRELATION, MIN_CORRELATION_SIGMAS = 0.1, 3.0
 # Differences between time scales [s]: GPS time is ahead of UTC by 18 s since 2017, and behind TAI by 19 s. Source: IERS
 # Bulletin C.
@@ -94,7 +94,7 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
         advice = f"set position_random_walk: {np.hypot(known, density):.2g} in the rig file" if density else ""
         yield (
             f"the residuals of {factor.name} are correlated ({correlation:.2f} from fix to fix), as by multipath or by "
-            "a receiver that filters. Its standard deviations may be too small by a factor of two; "
+            "a receiver that filters. Its standard deviations may be 1.3 times too small; "
             f"{advice or 'leave out worse fixes with least_status'}."
         )
 
