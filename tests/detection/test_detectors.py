@@ -18,7 +18,7 @@ from icalib.detection import (
     corner_stream,
 )
 from icalib.detection.boards.detectors import detector_of
-from icalib.detection.primitives.corners import judged
+from icalib.detection.primitives.corners import with_verdicts
 from icalib.detection.primitives.families import tag_family
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import Charuco
@@ -219,7 +219,7 @@ def test_verdicts_follow_the_rule():
     sine = np.array([1.0, 1.0, 1.0, 0.25, 1.0, 1.0, 0.25])
     quality = np.stack([unit_sigma, np.ones(7), sine, room_px, np.ones(7)])
     consistent = np.array([True, True, True, True, False, True, False])
-    found = judged(np.arange(7)[::-1], np.zeros((7, 2)), quality, consistent)
+    found = with_verdicts(np.arange(7)[::-1], np.zeros((7, 2)), quality, consistent)
     assert found.point.tolist() == [0, 2, 3, 4, 5, 6]
     assert [VERDICTS[v] for v in found.verdict] == [
         "inconsistent",

@@ -16,8 +16,8 @@ from icalib.detection.primitives.decoding import (
     mapped,
     popcount,
     read_cells,
-    seen_cells,
     unit_homography,
+    visible_cells,
 )
 from icalib.detection.primitives.edge_model import fit_corners, fit_step, solve_small
 from icalib.detection.primitives.growth import fit_homography
@@ -71,7 +71,7 @@ def test_read_cells_packs_row_by_row_and_counts_a_white_border():
     grey[1, 1] = 100.0
     assert read_cells(grey, 1, 50.0) == (0b0110, 1)
     grey[2, 2] = np.nan
-    assert seen_cells(grey, 1) == 0b0111
+    assert visible_cells(grey, 1) == 0b0111
 
 
 @pytest.mark.parametrize("side", [20.0, 30.0, 50.0])

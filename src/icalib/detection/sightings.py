@@ -12,7 +12,7 @@ from icalib.geometry.targets import Markers, Scene, Target
 
 LEAST_IMAGES = 3  # least number of images with a tag whose id is not listed; fewer may be false detections
 LEAST_IMAGE_SHARE = 0.01  # the same, as a share of all images
-_SHOWN = 10  # ids in a sentence, at most
+_MOST_IDS = 10  # ids in a sentence, at most
 Part = tuple[str, Target, int]  # name, target, number of its first point
 
 
@@ -23,7 +23,7 @@ def parts_of(target: Target) -> list[Part]:
     return list(zip(target.names, target.targets, target.first_points[:-1].tolist(), strict=True))
 
 
-def seen_in(images: list[ImageCorners], part: Part) -> int:
+def n_images_with(images: list[ImageCorners], part: Part) -> int:
     """Number of images with kept corners of the part."""
     _, target, first = part
     return sum(bool((i.kept & (i.point >= first) & (i.point < first + len(target.points))).any()) for i in images)
@@ -49,7 +49,7 @@ def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[
         if not len(rare):
             continue
         images = [_without(i, first, rare) for i in images]
-        ids = ", ".join(str(k) for k in part.known[rare[:_SHOWN]]) + (", ..." if len(rare) > _SHOWN else "")
+        ids = ", ".join(str(k) for k in part.known[rare[:_MOST_IDS]]) + (", ..." if len(rare) > _MOST_IDS else "")
         notes.append(
             f"{len(rare)} tags of {part.family} (ids {ids}) are in fewer than {least} of {len(images)} images "
             f"and were ignored; list the ids{' of ' + name if name else ''} in the rig file if they exist."
@@ -70,8 +70,8 @@ def sightings(target: Target, images: list[ImageCorners]) -> tuple[str, ...]:
     dropped = {name: sum(i.counts()[name] for i in images) for k, name in enumerate(VERDICTS) if k != KEPT}
     reasons = ", ".join(f"{n} {name}" for name, n in dropped.items() if n)
     tail = f"; corners rejected: {reasons}" if reasons else ""
-    counts = {part[0] or "the target": seen_in(images, part) for part in parts_of(target)}
-    seen = ", ".join(f"{name} is in {n}" for name, n in counts.items())
+    counts = {part[0] or "the target": n_images_with(images, part) for part in parts_of(target)}
+    words = ", ".join(f"{name} is in {n}" for name, n in counts.items())
     missing = " and ".join(name for name, n in counts.items() if not n)
-    notes = (f"{seen} of {len(images)} images, {kept} corners{tail}.",)
+    notes = (f"{words} of {len(images)} images, {kept} corners{tail}.",)
     return (*notes, f"{missing} is never seen; check its type, family, ids and sizes.") if missing else notes

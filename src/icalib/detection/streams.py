@@ -61,19 +61,19 @@ def find_corners(
         return recording_names(with_resolution(recording.payloads(topic), camera, where), files)
 
     key = stream_key(read(), repr(target)) if keep else ""
-    found = load_corners(key) if keep else None
-    if found is None:
+    detections = load_corners(key) if keep else None
+    if detections is None:
         count, payloads = image_count(recording, topic), read()
-        found = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
-        if wrong := _other_layout(recording, topic, target, found[1]):
+        detections = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
+        if wrong := _other_layout(recording, topic, target, detections[1]):
             raise RecordingError(f"{where}: {wrong}")
         if keep:
-            keep_corners(key, *found)
-    stamps_ns, images = found
+            keep_corners(key, *detections)
+    stamps_ns, images = detections
     images, rare = without_rare_tags(target, number_continuously(target, images))
     if not any(i.kept.any() for i in images):
         what = f"{where}: {_called(target)} in none of {len(images)} images of {camera.name}; "
-        raise RecordingError(what + _seen_instead(recording, topic, target))
+        raise RecordingError(what + _visible_instead(recording, topic, target))
     if wrong := _other_border(recording, topic, target, images):
         raise RecordingError(f"{where}: hardly any detections of {wrong}")
     corners = replace(corner_stream(camera.name, stamps_ns, images), files=files)
@@ -87,7 +87,7 @@ def _called(target: Target) -> str:
     return f"{' and '.join(target.names)} are" if isinstance(target, Scene) else "the target is"
 
 
-def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
+def _visible_instead(recording: Recording, topic: str, target: Target) -> str:
     """A sentence on the tags or the board that the images show instead of the target, with advice."""
     for _, part, _ in parts_of(target):
         if isinstance(part, Checkerboard) and (sentence := other_size(spread_images(recording, topic), part)):
@@ -103,7 +103,7 @@ def _other_border(recording: Recording, topic: str, target: Target, images: list
     """A sentence if a part of the target is poorly seen, but the images show its tags with a border of the other width;
     else ""."""
     for name, part, first in parts_of(target):
-        if not part.tags or isinstance(part, Charuco) or not _poorly_seen(part, first, images):
+        if not part.tags or isinstance(part, Charuco) or not _is_sparse(part, first, images):
             continue
         others = [other.tags for _, other, _ in parts_of(target) if other.tags]
         if sentence := with_other_border(spread_images(recording, topic), part.tags, others):
@@ -119,7 +119,7 @@ def _other_layout(recording: Recording, topic: str, target: Target, images: list
     """
     for name, part, first in parts_of(target):
         wrong = ""
-        if isinstance(part, Charuco) or (isinstance(part, AprilGrid) and _poorly_seen(part, first, images)):
+        if isinstance(part, Charuco) or (isinstance(part, AprilGrid) and _is_sparse(part, first, images)):
             wrong = other_columns(spread_images(recording, topic), part)
         if isinstance(part, Charuco):
             wrong = wrong or with_other_layout(spread_images(recording, topic), part)
@@ -128,14 +128,14 @@ def _other_layout(recording: Recording, topic: str, target: Target, images: list
     return ""
 
 
-def _poorly_seen(part: Target, first: int, images: list[ImageCorners]) -> bool:
+def _is_sparse(part: Target, first: int, images: list[ImageCorners]) -> bool:
     """Whether the images show, on average, less than POOR_SHARE of the part's points (free tags: POOR_CORNERS corners).
 
     first: number of the part's first point in the target.
     """
     usual = POOR_CORNERS if isinstance(part, Markers) else POOR_SHARE * len(part.points)
-    own = [i.kept & (i.point >= first) & (i.point < first + len(part.points)) for i in images]
-    return sum(int(o.sum()) for o in own) < usual * len(images)
+    masks = [i.kept & (i.point >= first) & (i.point < first + len(part.points)) for i in images]
+    return sum(int(o.sum()) for o in masks) < usual * len(images)
 
 
 def _search(
@@ -146,8 +146,8 @@ def _search(
     images: list[ImageCorners] = []
     damaged = ""
     batches = batches_of(payloads, IN_TURN, BYTES_IN_TURN)
-    for own, found, error in on_all_cores(batches, partial(_in_turn, detector=detector)):
-        for stamp, one in zip(own, found, strict=True):
+    for batch_stamps, batch_corners, error in on_all_cores(batches, partial(_in_turn, detector=detector)):
+        for stamp, one in zip(batch_stamps, batch_corners, strict=True):
             stamps.append(stamp)
             images.append(one)
             if len(images) % PACKED == 0:
@@ -163,7 +163,7 @@ def _in_turn(payloads: list[Payload], detector: Detector) -> tuple[list[int], li
     """Stamps and corners of the images of a batch that can be decoded, and the reason why the last other one cannot, or
     ""."""
     stamps: list[int] = []
-    found: list[ImageCorners] = []
+    corners: list[ImageCorners] = []
     damaged = ""
     for p in payloads:
         try:
@@ -172,5 +172,5 @@ def _in_turn(payloads: list[Payload], detector: Detector) -> tuple[list[int], li
             damaged = str(error)
             continue
         stamps.append(p.stamp_ns)
-        found.append(detector.detect(image, found[-MOTION_IMAGES:]))
-    return stamps, found, damaged
+        corners.append(detector.detect(image, corners[-MOTION_IMAGES:]))
+    return stamps, corners, damaged

@@ -27,13 +27,13 @@ def number_continuously(target: Target, images: Sequence[ImageCorners]) -> list[
         if part.symmetric:
             previous_uv = None
             for k, image in enumerate(images):
-                own = (image.point >= first) & (image.point < first + len(part.points))
-                if own.any():
-                    turn = _nearest_turn(part.turns, previous_uv, image.point[own] - first, image.uv[own])
+                rows = (image.point >= first) & (image.point < first + len(part.points))
+                if rows.any():
+                    turn = _nearest_turn(part.turns, previous_uv, image.point[rows] - first, image.uv[rows])
                     point = image.point.copy()
-                    point[own] = first + turn[point[own] - first]
+                    point[rows] = first + turn[point[rows] - first]
                     images[k] = image.renumbered(point)
-                    completed = _completed(part.points[:, :2], point[own] - first, image.uv[own])
+                    completed = _completed(part.points[:, :2], point[rows] - first, image.uv[rows])
                     previous_uv = previous_uv if completed is None else completed
     return images
 

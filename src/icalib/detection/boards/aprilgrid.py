@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.detection.boards.markers import APRILTAG_CORNER
 from icalib.detection.primitives.consistency import consistent_corners, largest_group
-from icalib.detection.primitives.corners import CROWDED, ImageCorners, judged, no_corners
+from icalib.detection.primitives.corners import CROWDED, ImageCorners, no_corners, with_verdicts
 from icalib.detection.primitives.families import Family, tag_family
 from icalib.detection.primitives.growth import confirm, grow
 from icalib.detection.primitives.prediction import PredictedCorners
@@ -91,10 +91,10 @@ class AprilGridDetector:
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, near predicted corners; None if some that should be in the image are not found."""
         n = self.rows * self.cols
-        uv, seen = np.zeros((4 * n, 2)), np.zeros(4 * n, dtype=bool)
-        uv[expected.point], seen[expected.point] = expected.uv, True
+        uv, predicted = np.zeros((4 * n, 2)), np.zeros(4 * n, dtype=bool)
+        uv[expected.point], predicted[expected.point] = expected.uv, True
         of_tag = 4 * np.arange(n)[:, None] + APRILTAG_CORNER
-        known, quads = seen[of_tag].all(axis=1), uv[of_tag]
+        known, quads = predicted[of_tag].all(axis=1), uv[of_tag]
         known = largest_group(
             confirm(view.image, known, quads, *self._cells, self._clear, self.squares), quads, self.tag_corners
         )
@@ -102,8 +102,8 @@ class AprilGridDetector:
             return None
         # Tags at the image border may be missing, so the margin is the side of a tag.
         side = float(np.linalg.norm(quads[known, 1] - quads[known, 0], axis=1).max())
-        found = self._corners(view.image, known, quads)
-        return found if expected.all_found(view.image, found, side) else None
+        corners = self._corners(view.image, known, quads)
+        return corners if expected.all_detected(view.image, corners, side) else None
 
     @cached_property
     def _cells(self) -> tuple[np.ndarray, int, int]:
@@ -131,9 +131,9 @@ class AprilGridDetector:
             uv, quality = refined_corners(image, quads[tags], self._clear)
         uv, quality = uv.reshape(-1, 2), quality.reshape(len(quality), -1)
         point = (4 * tags[:, None] + APRILTAG_CORNER).ravel()
-        board, found = self.tag_corners[tags].reshape(-1, 2), np.isfinite(quality[0])
-        consistent = consistent_corners(uv, board, found, quality[4], image.shape)
-        return judged(point, uv, quality, consistent, np.inf if self.squares else CROWDED)
+        board, valid = self.tag_corners[tags].reshape(-1, 2), np.isfinite(quality[0])
+        consistent = consistent_corners(uv, board, valid, quality[4], image.shape)
+        return with_verdicts(point, uv, quality, consistent, np.inf if self.squares else CROWDED)
 
 
 def grid_tags(rows: int, cols: int, tag_spacing: float) -> np.ndarray:

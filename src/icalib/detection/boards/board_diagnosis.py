@@ -41,12 +41,13 @@ def other_size(images: Iterable[np.ndarray], board: Checkerboard) -> str:
     stated = (min(board.rows, board.cols), max(board.rows, board.cols))
     by_squares = (stated[0] - 1, stated[1] - 1)  # the true size if squares were counted
     sizes = ({by_squares} | {size for image in grey for size in _largest(image)}) - {stated}
-    seen = {size: _count(grey, size) for size in sorted(sizes) if size[0] >= _LEAST_SIDE}
-    if max(seen.values(), default=0) < min(_LEAST_IMAGES, len(grey)):
+    counts = {size: _count(grey, size) for size in sorted(sizes) if size[0] >= _LEAST_SIDE}
+    if max(counts.values(), default=0) < min(_LEAST_IMAGES, len(grey)):
         return ""
-    rows, cols = max(seen, key=lambda size: (seen[size], size == by_squares, size))
+    rows, cols = max(counts, key=lambda size: (counts[size], size == by_squares, size))
     turned = (cols, rows) if board.rows > board.cols else (rows, cols)
-    what = f"a checkerboard of {turned[0]} x {turned[1]} inner corners is in {seen[rows, cols]} of {len(grey)} of them"
+    count = counts[rows, cols]
+    what = f"a checkerboard of {turned[0]} x {turned[1]} inner corners is in {count} of {len(grey)} of them"
     why = "rows and cols count INNER corners, not squares; " if (rows, cols) == by_squares else ""
     return f"{what}; {why}write rows: {turned[0]}, cols: {turned[1]}."
 
@@ -55,10 +56,10 @@ def checkerboard_in(images: Sequence[np.ndarray]) -> str:
     """Text with the size of the largest checkerboard that at least two of the images (h, w) uint8 show; "" if there is
     none."""
     sizes = [size for image in images for size in _largest(image)]
-    seen = {size: sizes.count(size) for size in set(sizes)}
-    if max(seen.values(), default=0) < _LEAST_IMAGES:
+    counts = {size: sizes.count(size) for size in set(sizes)}
+    if max(counts.values(), default=0) < _LEAST_IMAGES:
         return ""
-    rows, cols = max(seen, key=lambda size: (seen[size], size))
+    rows, cols = max(counts, key=lambda size: (counts[size], size))
     return f"a checkerboard of {rows} x {cols} inner corners"
 
 
@@ -68,8 +69,8 @@ def _largest(image: np.ndarray) -> list[tuple[int, int]]:
     cv2 = load_cv2()
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     cv2.setRNGSeed(0)  # the search is random
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST_SIDE, _LEAST_SIDE), flags)
-    return [(min(meta.shape), max(meta.shape))] if found else []
+    success, _, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST_SIDE, _LEAST_SIDE), flags)
+    return [(min(meta.shape), max(meta.shape))] if success else []
 
 
 def _count(images: list[np.ndarray], size: tuple[int, int]) -> int:
@@ -88,12 +89,12 @@ def other_columns(images: Iterable[np.ndarray], board: AprilGrid | Charuco) -> s
     across, down = ("cols", "rows") if isinstance(board, AprilGrid) else ("squares_x", "squares_y")
     stated, other = getattr(board, across), getattr(board, down)
     tags = _number_of_tags(board)
-    seen = _enough(_tags_of(ImageWithQuads(image), board, tags) for image in islice(images, _SEARCHED_IMAGES))
-    misfit = {stated: _misfit_of_columns(seen, board, stated, tags)}
-    if not seen or misfit[stated] <= _MOST_RIGHT:
+    detections = _enough(_tags_of(ImageWithQuads(image), board, tags) for image in islice(images, _SEARCHED_IMAGES))
+    misfit = {stated: _misfit_of_columns(detections, board, stated, tags)}
+    if not detections or misfit[stated] <= _MOST_RIGHT:
         return ""
     for n in range(1, tags + 1):  # more columns than tags give the same single row
-        misfit[n] = _misfit_of_columns(seen, board, n, tags)
+        misfit[n] = _misfit_of_columns(detections, board, n, tags)
     least = min(misfit.values())
     if least > _MOST_BEST or misfit[stated] <= least / _MOST_RATIO:
         return ""
@@ -128,16 +129,16 @@ def _tags_of(view: ImageWithQuads, board: AprilGrid | Charuco, tags: int) -> tup
     """Tags of the board that the image shows exactly once: ids (m,) counted from the first one, below `tags`, and
     corners (m, 4, 2) px."""
     if isinstance(board, AprilGrid):
-        found = find_tags(view, tag_family(board.family), board.border_bits, view.windows[0], board.squares)
-        place = found.ids - board.first_id
+        detections = find_tags(view, tag_family(board.family), board.border_bits, view.windows[0], board.squares)
+        place = detections.ids - board.first_id
     else:
         view = ImageWithQuads(255 - view.image) if board.inverted else view
-        found = all_tags(view, tag_family(board.dictionary), 1)
-        place = found.ids
+        detections = all_tags(view, tag_family(board.dictionary), 1)
+        place = detections.ids
     _, index, count = np.unique(place, return_index=True, return_counts=True)
     rows = index[count == 1]
     rows = rows[(place[rows] >= 0) & (place[rows] < tags)]
-    return place[rows], found.quads[rows]
+    return place[rows], detections.quads[rows]
 
 
 def _enough(images: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -146,10 +147,10 @@ def _enough(images: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.nd
 
 
 def _misfit_of_columns(
-    seen: list[tuple[np.ndarray, np.ndarray]], board: AprilGrid | Charuco, n: int, tags: int
+    detections: list[tuple[np.ndarray, np.ndarray]], board: AprilGrid | Charuco, n: int, tags: int
 ) -> float:
     """Misfit of the layout with n columns: median of `homography_misfit` over the images, the smaller one if there are
     two such layouts; inf without images."""
-    layouts = _with_columns(board, n, tags) if seen else []
-    medians = [np.median([homography_misfit(corners[place], quads) for place, quads in seen]) for corners in layouts]
+    layouts = _with_columns(board, n, tags) if detections else []
+    medians = [np.median([homography_misfit(corners[p], quads) for p, quads in detections]) for corners in layouts]
     return float(min(medians, default=np.inf))

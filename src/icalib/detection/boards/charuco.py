@@ -12,7 +12,7 @@ from icalib.detection.primitives.consistency import largest_group
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.detection.primitives.decoding import mapped
 from icalib.detection.primitives.families import Family, tag_family
-from icalib.detection.primitives.growth import fit_homography, homography_misfit, markers_there
+from icalib.detection.primitives.growth import decoded_markers, fit_homography, homography_misfit
 from icalib.detection.primitives.prediction import PredictedCorners, predict_nodes
 from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.squares import square_corners
@@ -75,7 +75,7 @@ class CharucoDetector:
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
         """As `detect`, for an image whose quads may be known already."""
-        known, quads = self._seen(view)
+        known, quads = self._unique_markers(view)
         known = largest_group(known, quads, self.tag_corners / self.marker_ratio)
         if known.sum() < _LEAST_MARKERS:
             return no_corners()
@@ -86,14 +86,14 @@ class CharucoDetector:
         """As `find`, near predicted corners. None if some that should be in the image are not found, or less than half
         of the markers are."""
         nodes = self._nodes(expected)
-        found = square_corners(view.image, nodes, self._dark, 0.5 * (1.0 - self.marker_ratio))
-        if not len(found.point) or not expected.all_found(view.image, found):
+        corners = square_corners(view.image, nodes, self._dark, 0.5 * (1.0 - self.marker_ratio))
+        if not len(corners.point) or not expected.all_detected(view.image, corners):
             return None
-        quads = _in_squares(self._nodes(PredictedCorners(found.point, found.uv)), self.tag_corners)
+        quads = _in_squares(self._nodes(PredictedCorners(corners.point, corners.uv)), self.tag_corners)
         inside = ((quads > 0.0) & (quads < np.array(view.image.shape[::-1]) - 1.0)).all(axis=(1, 2))
         patterns = np.ascontiguousarray(self._family.codes[: len(quads), 0])
-        there = int(markers_there(view.image, quads[inside], patterns[inside], self._family.bits, 1).sum())
-        return found if there >= max(_LEAST_MARKERS, 0.5 * inside.sum()) else None
+        n_decoded = int(decoded_markers(view.image, quads[inside], patterns[inside], self._family.bits, 1).sum())
+        return corners if n_decoded >= max(_LEAST_MARKERS, 0.5 * inside.sum()) else None
 
     def _nodes(self, corners: PredictedCorners) -> np.ndarray:
         """(rows + 1, cols + 1, 2) px: all corners of the squares, predicted from the inner ones in `corners`."""
@@ -102,12 +102,12 @@ class CharucoDetector:
 
     def misfit(self, view: ImageWithQuads) -> float:
         """Misfit of the markers to the board, see `homography_misfit`; NaN if too few are seen."""
-        known, quads = self._seen(view)
+        known, quads = self._unique_markers(view)
         if known.sum() < _LEAST_TO_TELL:
             return float("nan")
         return homography_misfit(self.tag_corners[known], quads[known])
 
-    def _seen(self, view: ImageWithQuads) -> tuple[np.ndarray, np.ndarray]:
+    def _unique_markers(self, view: ImageWithQuads) -> tuple[np.ndarray, np.ndarray]:
         """Which markers (n,) are seen exactly once, and their corners (n, 4, 2) px."""
         n = len(self.tag_corners)
         known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))

@@ -17,9 +17,10 @@ from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
 
 _REDUCED_PX = 1000  # larger images are first searched at a fraction of their size; only the time depends on it
-_LEAST_SEEN_SHARE = 0.5  # share of the corners without the outermost that must form a grid before the thorough search
+# Share of the corners without the outermost that must form a grid; with fewer, there is no thorough search.
+_LEAST_CROSSING_SHARE = 0.5
 _LEAST_SQUARE_PX = 4  # corners that are closer together merge in the detectors' filters
-_LEAST_FOUND = 0.5  # share of all corners, and of those of each side, that must be found
+_LEAST_CORNER_SHARE = 0.5  # share of all corners, and of those of each side, that must be found
 
 
 @dataclass(frozen=True)
@@ -51,24 +52,25 @@ class CheckerboardDetector:
     def find(self, view: ImageWithQuads) -> ImageCorners:
         """As `detect`, for an image whose quads may be known already."""
         for grid in self._proposed(view.image):
-            found = self._corners(view.image, grid)
-            if self._is_whole(found):
-                return found
+            corners = self._corners(view.image, grid)
+            if self._is_complete(corners):
+                return corners
         return no_corners()
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, near predicted corners; None if some that should be in the image are not found. A board that moved
         by two squares looks the same except at its border."""
         at = np.stack(np.divmod(expected.point, self.cols), axis=1)
-        found = self._corners(view.image, predict_nodes(at, expected.uv, self.rows, self.cols))
-        return found if self._is_whole(found) and expected.all_found(view.image, found) else None
+        corners = self._corners(view.image, predict_nodes(at, expected.uv, self.rows, self.cols))
+        return corners if self._is_complete(corners) and expected.all_detected(view.image, corners) else None
 
-    def _is_whole(self, found: ImageCorners) -> bool:
+    def _is_complete(self, corners: ImageCorners) -> bool:
         """Whether enough corners of the board, and of each of its four sides, are found and consistent."""
-        there = np.zeros(self.rows * self.cols, dtype=bool)
-        there[found.point[found.verdict != INCONSISTENT]] = True
-        there = there.reshape(self.rows, self.cols)
-        return min(part.mean() for part in (there, there[0], there[-1], there[:, 0], there[:, -1])) >= _LEAST_FOUND
+        consistent = np.zeros(self.rows * self.cols, dtype=bool)
+        consistent[corners.point[corners.verdict != INCONSISTENT]] = True
+        board = consistent.reshape(self.rows, self.cols)
+        parts = board, board[0], board[-1], board[:, 0], board[:, -1]
+        return min(part.mean() for part in parts) >= _LEAST_CORNER_SHARE
 
     def _corners(self, image: np.ndarray, grid: np.ndarray) -> ImageCorners:
         """The corners of the board at the grid (rows, cols, 2) px; none if the grid is part of a larger board."""
@@ -89,13 +91,13 @@ class CheckerboardDetector:
             return
         reduced, factor = _reduced(image)
         yield from self._quick(reduced, factor)
-        if not shows_grid(image, _LEAST_SEEN_SHARE * (self.rows - 2) * (self.cols - 2)):
+        if not shows_grid(image, _LEAST_CROSSING_SHARE * (self.rows - 2) * (self.cols - 2)):
             return
         cv2 = load_cv2()
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
         cv2.setRNGSeed(0)  # the search is random: its result must not depend on earlier images
-        found, corners = cv2.findChessboardCornersSB(image, (self.cols, self.rows), flags=flags)
-        if found:
+        success, corners = cv2.findChessboardCornersSB(image, (self.cols, self.rows), flags=flags)
+        if success:
             yield self._grid(corners)
         if factor > 1:
             yield from self._quick(image, 1)
@@ -107,8 +109,8 @@ class CheckerboardDetector:
         cv2 = load_cv2()
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         cv2.setRNGSeed(0)
-        found, corners = cv2.findChessboardCorners(image, (self.cols, self.rows), flags=flags)
-        if found:
+        success, corners = cv2.findChessboardCorners(image, (self.cols, self.rows), flags=flags)
+        if success:
             yield factor * (self._grid(corners) + 0.5) - 0.5
 
     def _fits(self, shape: tuple[int, ...]) -> bool:
@@ -141,8 +143,8 @@ def _reduced(image: np.ndarray) -> tuple[np.ndarray, int]:
         return image, 1
     cv2 = load_cv2()
     height, width = (max(1, side // factor) for side in image.shape)
-    whole = image[: height * factor, : width * factor]
-    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), factor
+    cropped = image[: height * factor, : width * factor]
+    return cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA), factor
 
 
 def _turn(grid: np.ndarray) -> float:

@@ -78,30 +78,30 @@ def dark_ellipses(image: np.ndarray, window: int, step: float) -> Ellipses:
     return _on_white(image, Ellipses(np.array(centre).reshape(-1, 2), np.array(unit).reshape(-1, 2, 2)), step)
 
 
-def _on_white(image: np.ndarray, found: Ellipses, step: float) -> Ellipses:
+def _on_white(image: np.ndarray, ellipses: Ellipses, step: float) -> Ellipses:
     """The ellipses that are darker than their surroundings in all directions, sampled at most half-way to the next
     circle."""
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
-    to_edge = np.linalg.inv(found.unit) @ np.stack([np.cos(angle), np.sin(angle)])  # (m, 2, directions)
+    to_edge = np.linalg.inv(ellipses.unit) @ np.stack([np.cos(angle), np.sin(angle)])  # (m, 2, directions)
     outside = to_edge * np.minimum(1.0 + _OUTSIDE_PX / np.linalg.norm(to_edge, axis=1, keepdims=True), 0.5 * step)
-    around = nearest_greys(image, found.centre[:, None] + outside.swapaxes(1, 2))
-    keep = (around - nearest_greys(image, found.centre)[:, None] >= LEAST_CONTRAST).all(axis=1)
-    return Ellipses(found.centre[keep], found.unit[keep])
+    around = nearest_greys(image, ellipses.centre[:, None] + outside.swapaxes(1, 2))
+    keep = (around - nearest_greys(image, ellipses.centre)[:, None] >= LEAST_CONTRAST).all(axis=1)
+    return Ellipses(ellipses.centre[keep], ellipses.unit[keep])
 
 
-def find_grids(target: Circles, found: Ellipses) -> list[np.ndarray]:
+def find_grids(target: Circles, ellipses: Ellipses) -> list[np.ndarray]:
     """Centres (n, 2) px of the target's circles, in one array for each symmetric rotation of the target that fits.
 
     Empty if the ellipses do not contain the whole grid, or if the grid is a part of a larger one.
     """
     step = step_of(target)
     wanted = _nodes_of(target)
-    tried = np.zeros(len(found.centre), dtype=bool)
-    for seed in range(len(found.centre)):
+    tried = np.zeros(len(ellipses.centre), dtype=bool)
+    for seed in range(len(ellipses.centre)):
         if not tried[seed]:
-            known = _grown(found, seed, step)
+            known = _grown(ellipses, seed, step)
             tried[list(known.values())] = True
-            grids = [found.centre[rows] for turn in range(4) if len(rows := _matched(known, _turned(wanted, turn)))]
+            grids = [ellipses.centre[rows] for turn in range(4) if len(rows := _matched(known, _turned(wanted, turn)))]
             if grids:
                 return grids
     return []
@@ -143,29 +143,29 @@ def _matched(known: dict[Node, int], wanted: np.ndarray) -> list[int]:
     return matches[0] if len(matches) == 1 else []
 
 
-def _grown(found: Ellipses, seed: int, step: float) -> dict[Node, int]:
+def _grown(ellipses: Ellipses, seed: int, step: float) -> dict[Node, int]:
     """Rows of the ellipses by their grid index, from `seed` outwards; only the seed if it has no two neighbours."""
     known: dict[Node, int] = {(0, 0): seed}
-    neighbours = _two_neighbours(found, seed, step)
+    neighbours = _two_neighbours(ellipses, seed, step)
     if neighbours is None:
         return known
     known[1, 0], known[0, 1] = neighbours
-    free = np.ones(len(found.centre), dtype=bool)
+    free = np.ones(len(ellipses.centre), dtype=bool)
     free[list(known.values())] = False
     changed = True
     while changed and free.any():
         changed = False
         for node, beside in _frontier(known).items():
-            row = _nearest_ellipse(found.centre, free, known, node, beside)
+            row = _nearest_ellipse(ellipses.centre, free, known, node, beside)
             if row >= 0:
                 known[node], free[row], changed = row, False, True
     return known
 
 
-def _two_neighbours(found: Ellipses, seed: int, step: float) -> tuple[int, int] | None:
+def _two_neighbours(ellipses: Ellipses, seed: int, step: float) -> tuple[int, int] | None:
     """Rows of the ellipse nearest to the seed, in the coordinates of the seed, and of the one a quarter turn from it.
     None if their distances do not fit a grid."""
-    v = (found.centre - found.centre[seed]) @ found.unit[seed].T
+    v = (ellipses.centre - ellipses.centre[seed]) @ ellipses.unit[seed].T
     distance = np.linalg.norm(v, axis=1)
     distance[seed] = np.inf
     first = int(np.argmin(distance))

@@ -11,13 +11,14 @@ import numpy as np
 
 from icalib.detection.boards.circle_grid import dark_ellipses, find_grids, step_of
 from icalib.detection.primitives.consistency import consistent_corners
-from icalib.detection.primitives.corners import ImageCorners, judged, no_corners
+from icalib.detection.primitives.corners import ImageCorners, no_corners, with_verdicts
 from icalib.detection.primitives.ellipse_model import fit_ellipses
 from icalib.detection.primitives.prediction import PredictedCorners
 from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.geometry.targets import Circles
 
-_LEAST_FOUND = 0.5  # share of the circles that need an ellipse at a consistent position; otherwise there is no grid
+# Share of the circles that need an ellipse at a consistent position; with fewer, there is no grid.
+_LEAST_CIRCLE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -39,29 +40,29 @@ class CirclesDetector:
             grids = find_grids(self.target, dark_ellipses(view.image, window, step_of(self.target)))
             if grids:
                 # The image does not distinguish the rotations: the one whose rows run most to the right is taken.
-                found = self._centres(view.image, max(grids, key=self._to_the_right))
-                if len(found.point):
-                    return found
+                centres = self._centres(view.image, max(grids, key=self._to_the_right))
+                if len(centres.point):
+                    return centres
         return no_corners()
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, near predicted centres of all circles; None if one is not predicted or not found."""
         if len(expected.point) < len(self.target.points):
             return None
-        found = self._centres(view.image, expected.uv)
-        return found if expected.all_found(view.image, found) else None
+        centres = self._centres(view.image, expected.uv)
+        return centres if expected.all_detected(view.image, centres) else None
 
     def _centres(self, image: np.ndarray, uv: np.ndarray) -> ImageCorners:
-        """Centres of the ellipses near uv (n, 2) px; none if fewer than _LEAST_FOUND of them are found and
+        """Centres of the ellipses near uv (n, 2) px; none if fewer than _LEAST_CIRCLE_SHARE are found and
         consistent."""
         axes = _projected_radii(self.target.points[:, :2], self.target.diameter, uv)
         fine, quality = fit_ellipses(image, uv, axes)
-        found = np.isfinite(quality[0])
+        valid = np.isfinite(quality[0])
         board = self.target.points[:, :2] / self.target.spacing
-        consistent = consistent_corners(fine, board, found, quality[4], image.shape)
-        if (found & consistent).mean() < _LEAST_FOUND:
+        consistent = consistent_corners(fine, board, valid, quality[4], image.shape)
+        if (valid & consistent).mean() < _LEAST_CIRCLE_SHARE:
             return no_corners()
-        return judged(np.arange(len(fine)), fine, quality, consistent)
+        return with_verdicts(np.arange(len(fine)), fine, quality, consistent)
 
     def _to_the_right(self, uv: np.ndarray) -> float:
         """Cosine between the target's x in the image and u, by an affine fit to the centres uv (n, 2) px."""

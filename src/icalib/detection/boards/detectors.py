@@ -65,9 +65,9 @@ class _Detector:
         view = ImageWithQuads(image)
         expected = predict_corners(before) if isinstance(self.finder, _Follower) else None
         if expected is not None and isinstance(self.finder, _Follower):
-            found = self.finder.find_near(view, expected)
-            if found is not None:
-                return found
+            corners = self.finder.find_near(view, expected)
+            if corners is not None:
+                return corners
         return self.finder.find(view)
 
 
@@ -115,11 +115,11 @@ class _SceneDetector:
     tagged: tuple[bool, ...]  # whether tags identify the member
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        found = [member.find(view) for member in self.members]
-        of_tags = np.concatenate([np.zeros((0, 2))] + [f.uv for f, t in zip(found, self.tagged, strict=True) if t])
-        found = [f if t or _apart(f.uv, of_tags) else no_corners() for f, t in zip(found, self.tagged, strict=True)]
-        fields = {f.name: np.concatenate([getattr(one, f.name) for one in found]) for f in dataclasses.fields(found[0])}
-        point = np.concatenate([one.point + first for one, first in zip(found, self.first, strict=True)])
+        detections = list(zip([member.find(view) for member in self.members], self.tagged, strict=True))
+        of_tags = np.concatenate([np.zeros((0, 2))] + [corners.uv for corners, tagged in detections if tagged])
+        kept = [corners if tagged or _apart(corners.uv, of_tags) else no_corners() for corners, tagged in detections]
+        fields = {f.name: np.concatenate([getattr(c, f.name) for c in kept]) for f in dataclasses.fields(ImageCorners)}
+        point = np.concatenate([corners.point + first for corners, first in zip(kept, self.first, strict=True)])
         return ImageCorners(**fields | {"point": point})
 
 
@@ -144,12 +144,12 @@ class _Renumbered:
     number: np.ndarray
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        found = self.detector.find(view)
-        return found.renumbered(self.number[found.point])
+        corners = self.detector.find(view)
+        return corners.renumbered(self.number[corners.point])
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
-        found = self.detector.find_near(view, PredictedCorners(np.argsort(self.number)[expected.point], expected.uv))
-        return None if found is None else found.renumbered(self.number[found.point])
+        corners = self.detector.find_near(view, PredictedCorners(np.argsort(self.number)[expected.point], expected.uv))
+        return None if corners is None else corners.renumbered(self.number[corners.point])
 
 
 def _apart(uv: np.ndarray, others: np.ndarray) -> bool:

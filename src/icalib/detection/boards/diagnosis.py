@@ -51,8 +51,8 @@ def what_is_seen(
     for an image that is not grey.
     """
     candidates = _candidates([ImageWithQuads(image).image for image in islice(images, _DIAGNOSED_IMAGES)])
-    own_name = _largest(family)
-    candidates.sort(key=lambda seen: (len(seen.ids), seen.family == own_name), reverse=True)
+    stated_family = _largest(family)
+    candidates.sort(key=lambda tags: (len(tags.ids), tags.family == stated_family), reverse=True)
     if not candidates:
         return (
             "the images show no tags of any known family; check that the target is in view, sharp, well lit, "
@@ -63,8 +63,8 @@ def what_is_seen(
 
 def tags_in(images: Sequence[np.ndarray]) -> str:
     """Text on the tags of any known family that the images (h, w) uint8 show; "" if there are none."""
-    seen = max(_candidates([ImageWithQuads(i).image for i in images]), key=lambda one: len(one.ids), default=None)
-    return "" if seen is None else _words(seen)
+    tags = max(_candidates([ImageWithQuads(i).image for i in images]), key=lambda one: len(one.ids), default=None)
+    return "" if tags is None else _words(tags)
 
 
 def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterable[TagSet]) -> str:
@@ -75,15 +75,15 @@ def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterab
     """
     swapped = TagSet(tags.family, 3 - tags.border_bits, tags.ids)
     ids = sorted(set(tags.ids) - {i for other in others for i in swapped.shared_with(other)})
-    found: dict[int, list[np.ndarray]] = {1: [], 2: []}
+    ids_by_border: dict[int, list[np.ndarray]] = {1: [], 2: []}
     for image in islice(images, _DIAGNOSED_IMAGES):
         view = ImageWithQuads(image)
         quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
-        for border, seen in found.items():
+        for border, decoded_ids in ids_by_border.items():
             read = tags_at(view.image, quads, tag_family(tags.family), border).ids
-            seen.append(read[np.isin(read, ids)])
-    own, swap = (np.concatenate([np.zeros(0, np.int64), *found[t.border_bits]]) for t in (tags, swapped))
-    if len(swap) < _MANY_MORE * max(len(own), 1):
+            decoded_ids.append(read[np.isin(read, ids)])
+    stated, swap = (np.concatenate([np.zeros(0, np.int64), *ids_by_border[t.border_bits]]) for t in (tags, swapped))
+    if len(swap) < _MANY_MORE * max(len(stated), 1):
         return ""
     return _sentence(_VisibleTags(tags.family, swapped.border_bits, "", swap), tags.family, tags.border_bits, tags.ids)
 
@@ -110,42 +110,43 @@ def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
 
 def _candidates(images: list[np.ndarray]) -> list[_VisibleTags]:
     """The tags of each family and border that are found in larger numbers than by chance."""
-    found: dict[tuple[str, int, _How], list[np.ndarray]] = {}
+    ids_by_kind: dict[tuple[str, int, _How], list[np.ndarray]] = {}
     tried = [name for name in _TRIED if is_available(name)]
     for image, how in product(images, _HOWS):
         view = ImageWithQuads({"": image, "mirrored": image[:, ::-1], "inverted": 255 - image}[how])
         quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for name, border in product(tried, _BORDERS):
-            found.setdefault((name, border, how), []).append(tags_at(view.image, quads, tag_family(name), border).ids)
-    seen = [_VisibleTags(*key, np.concatenate(ids)) for key, ids in found.items()]
+            ids = tags_at(view.image, quads, tag_family(name), border).ids
+            ids_by_kind.setdefault((name, border, how), []).append(ids)
+    tags = [_VisibleTags(*key, np.concatenate(ids)) for key, ids in ids_by_kind.items()]
     least = {name: _LEAST_TAGS.get(tag_family(name).bits, _LEAST_TAGS_USUALLY) for name in tried}
-    return [one for one in seen if len(one.ids) >= least[one.family]]
+    return [one for one in tags if len(one.ids) >= least[one.family]]
 
 
-def _sentence(seen: _VisibleTags, family: str, border_bits: int, ids: Sequence[int], field: str = "family") -> str:
-    """A sentence on the tags `seen`, and the field of the rig file to correct."""
-    what = _words(seen)
-    if seen.how == "inverted":
+def _sentence(tags: _VisibleTags, family: str, border_bits: int, ids: Sequence[int], field: str = "family") -> str:
+    """A sentence on the visible tags, and the field of the rig file to correct."""
+    what = _words(tags)
+    if tags.how == "inverted":
         return f"the images show {what}, white on black; set inverted: true of a ChArUco board."
-    if seen.how:
+    if tags.how:
         return f"the images are mirrored, they show {what} after flipping; switch off mirroring in the camera's driver."
-    if seen.family != _largest(family):
+    if tags.family != _largest(family):
         return (
-            f"the images show {what}, none of {family}; correct the target's {field}: write {field}: {_smallest(seen)}."
+            f"the images show {what}, none of {family}; correct the target's {field}: write {field}: {_smallest(tags)}."
         )
-    if seen.border_bits != border_bits:
-        return f"the images show {what} with border_bits {seen.border_bits}, not {border_bits}; correct border_bits."
-    if not np.isin(seen.ids, ids).any():
+    if tags.border_bits != border_bits:
+        return f"the images show {what} with border_bits {tags.border_bits}, not {border_bits}; correct border_bits."
+    if not np.isin(tags.ids, ids).any():
         return (
-            f"the images show {what}, none of those of the target; set first_id: {seen.ids.min()} of an aprilgrid, or "
+            f"the images show {what}, none of those of the target; set first_id: {tags.ids.min()} of an aprilgrid, or "
             "correct the target's ids, rows and cols."
         )
     return f"the images show {what}; check that rows, cols and spacing are those of the target."
 
 
-def _words(seen: _VisibleTags) -> str:
+def _words(tags: _VisibleTags) -> str:
     """Text with the number, family and ids of the tags."""
-    return f"{len(seen.ids)} tags of {_smallest(seen)} (ids {seen.ids.min()} to {seen.ids.max()})"
+    return f"{len(tags.ids)} tags of {_smallest(tags)} (ids {tags.ids.min()} to {tags.ids.max()})"
 
 
 def _largest(family: str) -> str:
@@ -153,8 +154,8 @@ def _largest(family: str) -> str:
     return next((name for name in _TRIED if name.split("_")[0] == family.split("_")[0] and "x" in family), family)
 
 
-def _smallest(seen: _VisibleTags) -> str:
-    """The smallest of OpenCV's families that has all ids seen."""
-    start = seen.family.split("_")[0]
-    fitting = (f"{start}_{size}" for size in _SIZES if size > seen.ids.max() and f"{start}_{size}" in FAMILIES)
-    return next(fitting, seen.family) if "x" in start else seen.family
+def _smallest(tags: _VisibleTags) -> str:
+    """The smallest of OpenCV's families that has the ids of all these tags."""
+    start = tags.family.split("_")[0]
+    fitting = (f"{start}_{size}" for size in _SIZES if size > tags.ids.max() and f"{start}_{size}" in FAMILIES)
+    return next(fitting, tags.family) if "x" in start else tags.family

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.detection.primitives.corners import CROWDED, ImageCorners, judged, no_corners
+from icalib.detection.primitives.corners import CROWDED, ImageCorners, no_corners, with_verdicts
 from icalib.detection.primitives.families import Family, tag_family
 from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.refinement import refined_corners
@@ -72,4 +72,4 @@ class MarkerDetector:
         place = np.array([self.ids.index(int(tag)) for tag in tags.ids[rows]])
         point = (4 * place[:, None] + order).ravel()
         consistent = np.ones(len(point), dtype=bool)
-        return judged(point, uv.reshape(-1, 2), quality.reshape(len(quality), -1), consistent, CROWDED)
+        return with_verdicts(point, uv.reshape(-1, 2), quality.reshape(len(quality), -1), consistent, CROWDED)

@@ -14,7 +14,7 @@ EXCLUSIVE_GATES = 1.6  # gates: least distance between a point and any other pla
 REGION_REACH = 2.5  # standard deviations: largest distance between a voxel's centre and the plane of its region
 
 
-OUTSIDE, NEAR, OWN = 0, 1, 2  # use of a cell by its plane
+OUTSIDE, NEAR, INSIDE = 0, 1, 2  # use of a cell by its plane
 
 
 class Voxels(NamedTuple):
@@ -35,7 +35,7 @@ class OccupancyGrid(NamedTuple):
     axes[q] (2, 3). The grid starts at low[q] (2,) m from the point and has size[q] (2,) cells.
 
     Entries of `use` from first[q] on: OUTSIDE the plane; NEAR, where the plane may be, so that no other plane gets the
-    points; OWN, cells whose points belong to the plane.
+    points; INSIDE, cells whose points belong to the plane.
     """
 
     planes: np.ndarray
@@ -48,13 +48,13 @@ class OccupancyGrid(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def sum_voxels(points, seen_from, variance, which, moments, towards, total):
+def sum_voxels(points, origins, variance, which, moments, towards, total):
     """Adds the moments of points (N, 3) to moments (V, 10), unit vectors to the sensor to towards (V, 3), and variances
-    to total (V,). which (N,): voxel of each point."""
+    to total (V,). origins (N, 3): position of the sensor at each point; which (N,): voxel of each point."""
     for n in range(len(points)):
         v = which[n]
         x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
-        a, b, c = seen_from[n, 0] - x, seen_from[n, 1] - y, seen_from[n, 2] - z
+        a, b, c = origins[n, 0] - x, origins[n, 1] - y, origins[n, 2] - z
         f = 1.0 / np.sqrt(a * a + b * b + c * c)
         towards[v, 0] += f * a
         towards[v, 1] += f * b
@@ -139,7 +139,7 @@ def _reach(q, x, y, z, cells):
 
 
 @njit(cache=True, nogil=True)
-def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cell, distance):
+def associate(points, origins, variance, cells, gate, least_cosine, plane, cell, distance):
     """Associates each point with the plane within `gate` standard deviations that faces the sensor. The plane is -1 if
     there is none, or if a second plane is near, even one that the beam grazes (the floor at the foot of a far wall).
     Fills `plane`, `cell` and `distance` of each point.
@@ -157,10 +157,10 @@ def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cel
         equation[3, q] = p[0] * p[3] + p[1] * p[4] + p[2] * p[5]
     for n in range(len(points)):
         x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
-        a, b, c = seen_from[n, 0] - x, seen_from[n, 1] - y, seen_from[n, 2] - z
+        a, b, c = origins[n, 0] - x, origins[n, 1] - y, origins[n, 2] - z
         far = np.sqrt(a * a + b * b + c * c)
         reach, least = gate * np.sqrt(variance[n]), least_cosine * far
-        found, q_own, k_own, s_own = 0, -1, -1, 0.0
+        n_hits, q_hit, k_hit, s_hit = 0, -1, -1, 0.0
         for q in range(count):
             r[q] = equation[0, q] * x + equation[1, q] * y + equation[2, q] * z - equation[3, q]
         for q in range(count):
@@ -172,20 +172,20 @@ def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cel
             s = -r[q] / facing
             k = _reach(q, x + s * a, y + s * b, z + s * c, cells)
             if k >= 0:
-                found += 1
-                q_own, k_own, s_own = q, k, s
+                n_hits += 1
+                q_hit, k_hit, s_hit = q, k, s
         plane[n] = -1
-        if found == 1 and cells.use[k_own] == OWN:
-            foot = x + s_own * a, y + s_own * b, z + s_own * c
-            near, longest = EXCLUSIVE_GATES * reach, EXCLUSIVE_GATES * reach + abs(s_own) * far
+        if n_hits == 1 and cells.use[k_hit] == INSIDE:
+            foot = x + s_hit * a, y + s_hit * b, z + s_hit * c
+            near, longest = EXCLUSIVE_GATES * reach, EXCLUSIVE_GATES * reach + abs(s_hit) * far
             for q in range(count):
-                if abs(r[q]) > longest or q == q_own:
+                if abs(r[q]) > longest or q == q_hit:
                     continue
                 facing = equation[0, q] * a + equation[1, q] * b + equation[2, q] * c
-                if facing > 0.0 and abs(r[q] + s_own * facing) <= near and _reach(q, *foot, cells) >= 0:
+                if facing > 0.0 and abs(r[q] + s_hit * facing) <= near and _reach(q, *foot, cells) >= 0:
                     break
             else:
-                plane[n], cell[n], distance[n] = q_own, k_own, r[q_own]
+                plane[n], cell[n], distance[n] = q_hit, k_hit, r[q_hit]
 
 
 @njit(cache=True, nogil=True)

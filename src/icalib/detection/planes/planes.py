@@ -3,7 +3,7 @@
 Flat voxels grow into regions, regions of one plane are joined, and regions that bend are dropped. Points are then
 associated with a plane by their distance to it, within square cells on the plane; voxels would cut a noisy wall into
 layers. Points near two planes, in grazing beams, or in cells that are not flat belong to no plane. Both sides of a wall
-are separate planes: a plane is seen only from the side that its normal points to.
+are separate planes: a plane is visible only from the side that its normal points to.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.detection.planes.plane_kernels import (
+    INSIDE,
     LARGEST_TURN,
     MOMENTS,
     NEAR,
     OUTSIDE,
-    OWN,
     OccupancyGrid,
     Voxels,
     associate,
@@ -60,14 +60,14 @@ class PlaneSearch:
     gate: float = 3.0
     least_cosine: float = 0.1
 
-    def variance(self, points: np.ndarray, seen_from: np.ndarray) -> np.ndarray:
-        """(N,) m^2: variance of points (N, 3) seen from sensor positions (N, 3), by noise and registration error."""
-        range2 = ((points - seen_from) ** 2).sum(axis=1)
+    def variance(self, points: np.ndarray, origins: np.ndarray) -> np.ndarray:
+        """(N,) m^2: variance of points (N, 3), by noise and registration error. origins (N, 3): sensor positions."""
+        range2 = ((points - origins) ** 2).sum(axis=1)
         return self.noise_m**2 + self.position_m**2 + self.angle_rad**2 * range2
 
 
 @dataclass(frozen=True)
-class FoundPlanes:
+class ExtractedPlanes:
     """cells: the cells of all surfaces. The first `count` surfaces are planes; the other ones bend or are small, and
     only keep their points from being associated with neighbouring planes."""
 
@@ -83,24 +83,24 @@ class FoundPlanes:
     def areas_m2(self) -> np.ndarray:
         """(P,) total area of the cells of each plane."""
         edges = np.append(self.cells.first, len(self.cells.use))
-        before = np.append(0, np.cumsum(self.cells.use == OWN))
+        before = np.append(0, np.cumsum(self.cells.use == INSIDE))
         return np.diff(before[edges])[: self.count] * self.cells.edge_m**2
 
-    def of_points(self, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
-        """(N,) int32: plane of each of points (N, 3), seen from sensor positions (N, 3), in the world frame; -1 for
+    def of_points(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch) -> np.ndarray:
+        """(N,) int32: plane of each of points (N, 3) with sensor positions `origins` (N, 3), in the world frame; -1 for
         none."""
-        return _associate(self.cells, points, seen_from, search.variance(points, seen_from), search)[0]
+        return _associate(self.cells, points, origins, search.variance(points, origins), search)[0]
 
 
-def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch = PlaneSearch()) -> FoundPlanes:
-    """Planes of points (N, 3) seen from sensor positions (N, 3), both in the world frame [m]; the plane with most cells
-    first."""
+def find_planes(points: np.ndarray, origins: np.ndarray, search: PlaneSearch = PlaneSearch()) -> ExtractedPlanes:
+    """Planes of points (N, 3) with sensor positions `origins` (N, 3), both in the world frame [m]; the plane with most
+    cells first."""
     step = max(1, len(points) // MOST_POINTS)
-    points, seen_from = points[::step], seen_from[::step]
+    points, origins = points[::step], origins[::step]
     if not len(points):
-        return FoundPlanes(_packed([], search.voxel_m), 0)
-    variance = search.variance(points, seen_from)
-    voxels = _voxels(points, seen_from, variance, search)
+        return ExtractedPlanes(_packed([], search.voxel_m), 0)
+    variance = search.variance(points, origins)
+    voxels = _voxels(points, origins, variance, search)
     region = np.full(len(voxels.centre), -1, dtype=np.int64)
     count = grow(voxels, np.argsort(voxels.sigma, kind="stable"), region)
     members = [
@@ -109,12 +109,12 @@ def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch =
     # regions of three or more voxels become patches: a plane with a grid of cells that its points occupy
     patches = _patches(_join(voxels, members), voxels, search)
     for k in range(FIT_ROUNDS):
-        patches = _refined(patches, points, seen_from, variance, search, k == FIT_ROUNDS - 1)
+        patches = _refined(patches, points, origins, variance, search, k == FIT_ROUNDS - 1)
     # bent, uneven and small surfaces have lost the cells that belong to them, and do not count as planes
-    return FoundPlanes(_packed(patches, search.voxel_m), sum(p.own > 0 for p in patches))
+    return ExtractedPlanes(_packed(patches, search.voxel_m), sum(p.n_inside > 0 for p in patches))
 
 
-def _voxels(points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch) -> Voxels:
+def _voxels(points: np.ndarray, origins: np.ndarray, variance: np.ndarray, search: PlaneSearch) -> Voxels:
     """Moments and local planes of all voxels that contain points. variance (N,) m^2: of the points."""
     ijk = np.floor(points / search.voxel_m).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
@@ -123,7 +123,7 @@ def _voxels(points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, sea
     keys, which = np.unique(ijk @ strides, return_inverse=True)
     n = len(keys)
     moments, towards, total = np.zeros((n, MOMENTS)), np.zeros((n, 3)), np.zeros(n)
-    sum_voxels(points, seen_from, variance, which, moments, towards, total)
+    sum_voxels(points, origins, variance, which, moments, towards, total)
     count = moments[:, 0]
     S = moments[:, [2, 4, 7, 4, 5, 8, 7, 8, 9]].reshape(n, 3, 3) / count[:, None, None]
     centre = moments[:, [1, 3, 6]] / count[:, None]
@@ -207,11 +207,11 @@ class _Patch:
     use: np.ndarray
 
     @property
-    def own(self) -> int:
+    def n_inside(self) -> int:
         """Number of cells that belong to the plane."""
-        return int((self.use == OWN).sum())
+        return int((self.use == INSIDE).sum())
 
-    def unowned(self) -> _Patch:
+    def as_exclusion_zone(self) -> _Patch:
         """The patch without cells of its plane: it gets no points, but keeps other planes from getting them."""
         return replace(self, use=np.minimum(self.use, NEAR))
 
@@ -227,18 +227,18 @@ def _patches(regions: list[_Region], voxels: Voxels, search: PlaneSearch) -> lis
         use = np.full(ij.max(axis=0) + 2, OUTSIDE, dtype=np.uint8)
         for i in (-1, 0, 1):
             for j in (-1, 0, 1):
-                use[ij[:, 0] + i, ij[:, 1] + j] = OWN
+                use[ij[:, 0] + i, ij[:, 1] + j] = INSIDE
         patch = _Patch(plane_of(region.normal, region.centre), across, low, use)
         if region.bends(voxels) or region.continues(voxels, bent):
             bent[region.members] = True
-            patch = patch.unowned()
+            patch = patch.as_exclusion_zone()
         patches.append(patch)
     return patches
 
 
 def _packed(patches: list[_Patch], edge_m: float) -> OccupancyGrid:
     """The patches as arrays for the kernels, those with most cells first."""
-    patches = sorted(patches, key=lambda p: -p.own)
+    patches = sorted(patches, key=lambda p: -p.n_inside)
     first = np.cumsum([0, *(p.use.size for p in patches)])[:-1].astype(np.int64)
     return OccupancyGrid(
         np.array([p.plane for p in patches]).reshape(-1, 6),
@@ -252,22 +252,22 @@ def _packed(patches: list[_Patch], edge_m: float) -> OccupancyGrid:
 
 
 def _associate(
-    cells: OccupancyGrid, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
+    cells: OccupancyGrid, points: np.ndarray, origins: np.ndarray, variance: np.ndarray, search: PlaneSearch
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plane (N,), cell (N,) and distance (N,) m of each point, see `associate`."""
     n = len(points)
     plane, cell, distance = np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n)
-    associate(points, seen_from, variance, cells, search.gate, search.least_cosine, plane, cell, distance)
+    associate(points, origins, variance, cells, search.gate, search.least_cosine, plane, cell, distance)
     return plane, cell, distance
 
 
 def _associate_at_once(
-    cells: OccupancyGrid, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
+    cells: OccupancyGrid, points: np.ndarray, origins: np.ndarray, variance: np.ndarray, search: PlaneSearch
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `_associate`, on two threads."""
     halves = (slice(0, len(points) // 2), slice(len(points) // 2, None))
     with ThreadPoolExecutor(len(halves)) as pool:
-        parts = pool.map(lambda h: _associate(cells, points[h], seen_from[h], variance[h], search), halves)
+        parts = pool.map(lambda h: _associate(cells, points[h], origins[h], variance[h], search), halves)
         plane, cell, distance = (np.concatenate(column) for column in zip(*parts, strict=True))
     return plane, cell, distance
 
@@ -275,34 +275,34 @@ def _associate_at_once(
 def _refined(
     patches: list[_Patch],
     points: np.ndarray,
-    seen_from: np.ndarray,
+    origins: np.ndarray,
     variance: np.ndarray,
     search: PlaneSearch,
     last: bool,
 ) -> list[_Patch]:
     """Planes fitted again to their associated points, without cells that are empty or not flat. Planes that are too
     small lose their cells; in the `last` round, if the cloud is well registered, uneven ones do, too."""
-    patches = sorted(patches, key=lambda p: -p.own)
+    patches = sorted(patches, key=lambda p: -p.n_inside)
     cells = _packed(patches, search.voxel_m)
-    plane, cell, distance = _associate_at_once(cells, points, seen_from, variance, search)
+    plane, cell, distance = _associate_at_once(cells, points, origins, variance, search)
     stats, moments = np.zeros((len(cells.use), 3)), np.zeros((len(patches), MOMENTS))
     sum_cells(points, variance, plane, cell, distance, stats, moments)
     good = (stats[:, 0] >= FEWEST_IN_VOXEL) & (stats[:, 2] < MIXED_CELL_RMS**2 * stats[:, 0])
     use = np.where(good, cells.use, np.minimum(cells.use, NEAR))
     mine = [slice(a, a + p.use.size) for a, p in zip(cells.first, patches, strict=True)]
     in_place = last and search.position_m <= FINE_M
-    uneven = _uneven([stats[k][use[k] == OWN] for k in mine]) if in_place else np.zeros(len(mine), dtype=bool)
+    uneven = _uneven([stats[k][use[k] == INSIDE] for k in mine]) if in_place else np.zeros(len(mine), dtype=bool)
     refined = []
     for patch, cut, strays, sums in zip(patches, mine, uneven, moments, strict=True):
-        own = use[cut].reshape(patch.use.shape)
-        if strays or (own == OWN).sum() * search.voxel_m**2 < search.smallest_m2:
-            refined.append(patch.unowned())
+        use_of_patch = use[cut].reshape(patch.use.shape)
+        if strays or (use_of_patch == INSIDE).sum() * search.voxel_m**2 < search.smallest_m2:
+            refined.append(patch.as_exclusion_zone())
             continue
         normal, old, centre = patch.plane[:3].copy(), patch.plane[3:], np.empty(3)
         fit(sums, normal, centre)
         # The point moves only along the normal, so that the cells stay in place.
         at = old + normal * (normal @ (centre - old))
-        refined.append(replace(patch, plane=np.append(normal, at), use=own))
+        refined.append(replace(patch, plane=np.append(normal, at), use=use_of_patch))
     return refined
 
 

@@ -55,7 +55,7 @@ def largest_group(known: np.ndarray, quads: np.ndarray, board: np.ndarray) -> np
 def _links(quads, board):
     """(m, m) bool: which tags predict each other's centre. quads (m, 4, 2) px, board (m, 4, 2) in tag sizes."""
     m = len(quads)
-    seen_from = np.zeros((m, m), dtype=np.bool_)
+    predicts = np.zeros((m, m), dtype=np.bool_)
     for i in range(m):
         H = unit_homography(quads[i])
         ax, ay = board[i, 1, 0] - board[i, 0, 0], board[i, 1, 1] - board[i, 0, 1]
@@ -67,44 +67,44 @@ def _links(quads, board):
             side = hypot(quads[j, 1, 0] - quads[j, 0, 0], quads[j, 1, 1] - quads[j, 0, 1])
             side = max(side, hypot(quads[j, 3, 0] - quads[j, 0, 0], quads[j, 3, 1] - quads[j, 0, 1]))
             off = hypot(quads[j, :, 0].mean() - u, quads[j, :, 1].mean() - v)
-            seen_from[i, j] = off < _LINK_OFF * side * max(hypot(s - 0.5, t - 0.5), 1.0)
-    return seen_from & seen_from.T
+            predicts[i, j] = off < _LINK_OFF * side * max(hypot(s - 0.5, t - 0.5), 1.0)
+    return predicts & predicts.T
 
 
 def consistent_corners(
-    uv: np.ndarray, board: np.ndarray, found: np.ndarray, side: np.ndarray, shape: tuple[int, ...]
+    uv: np.ndarray, board: np.ndarray, valid: np.ndarray, side: np.ndarray, shape: tuple[int, ...]
 ) -> np.ndarray:
     """(N,) bool: whether each corner lies where a homography of its 12 nearest neighbours predicts it. True for those
-    not found.
+    that are not valid.
 
     The bound is 6 times the median distance, at least 0.3 px + 0.01 sides and at most 1 px + 0.05 sides. The worst
     corner is left out first, and the others are tested again. If some corners fail, a lens with distortion is tried,
     and used if the median distance is smaller. The bound is then at least a fifth of the median distance without
     distortion.
 
-    uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px; shape (h, w) of the image, whose centre is taken for the
-    principal point.
+    uv (N, 2) px, board (N, 2), valid (N,) bool: corners that were measured; side (N,) px; shape (h, w) of the image,
+    whose centre is taken for the principal point.
     """
     middle, width = 0.5 * np.array(shape[1::-1]), float(shape[1])
-    straight = _agreeing(_rays(uv - middle, _STRAIGHT_FOCAL * width, False), board, found, side)
+    straight = _agreeing(_rays(uv - middle, _STRAIGHT_FOCAL * width, False), board, valid, side)
     if straight.all():
         return straight
-    bent = _bent_rays(uv - middle, width, board, found)
-    usual = [_usual(rays, board, found) for rays in (_rays(uv - middle, _STRAIGHT_FOCAL * width, False), bent)]
-    return _agreeing(bent, board, found, side, _UNSURE * usual[0]) if usual[1] < usual[0] else straight
+    bent = _bent_rays(uv - middle, width, board, valid)
+    usual = [_usual(rays, board, valid) for rays in (_rays(uv - middle, _STRAIGHT_FOCAL * width, False), bent)]
+    return _agreeing(bent, board, valid, side, _UNSURE * usual[0]) if usual[1] < usual[0] else straight
 
 
 Rays = tuple[np.ndarray, np.ndarray]  # (N, 3) unit rays, (N,) px per radian
 
 
-def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, found: np.ndarray) -> Rays:
+def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, valid: np.ndarray) -> Rays:
     """Rays through the lens with distortion at which the corners agree best with their predictions by neighbours. Two
     lens models and any focal length are tried. uv (N, 2) px from the image centre."""
     best: tuple[float, Rays] | None = None
     for equidistant in (False, True):
 
         def usual(log_focal: float, equidistant: bool = equidistant) -> float:
-            return _usual(_rays(uv, width * exp(log_focal), equidistant), board, found)
+            return _usual(_rays(uv, width * exp(log_focal), equidistant), board, valid)
 
         done: Any = minimize_scalar(usual, bounds=np.log(_BENT), method="bounded", options={"xatol": _SAME_LOG})
         if best is None or done.fun < best[0]:
@@ -113,16 +113,16 @@ def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, found: np.ndarra
     return best[1]
 
 
-def _usual(rays: Rays, board: np.ndarray, found: np.ndarray) -> float:
-    """Median distance [px] of found corners from their predictions; 1e9 if there are too few."""
-    off = distance_from_neighbours(*rays, board, found, _PLACING_CORNERS)
-    placed = found & np.isfinite(off)
+def _usual(rays: Rays, board: np.ndarray, valid: np.ndarray) -> float:
+    """Median distance [px] of valid corners from their predictions; 1e9 if there are too few."""
+    off = distance_from_neighbours(*rays, board, valid, _PLACING_CORNERS)
+    placed = valid & np.isfinite(off)
     return float(np.median(off[placed])) if placed.any() else _FAR_PX
 
 
-def _agreeing(rays: Rays, board: np.ndarray, found: np.ndarray, side: np.ndarray, unsure: float = 0.0) -> np.ndarray:
+def _agreeing(rays: Rays, board: np.ndarray, valid: np.ndarray, side: np.ndarray, unsure: float = 0.0) -> np.ndarray:
     """As `consistent_corners`, for one lens. unsure [px]: least bound, for the remaining error of the lens model."""
-    used, most = found.copy(), _MOST_CORNER_OFF[0] + _MOST_CORNER_OFF[1] * side
+    used, most = valid.copy(), _MOST_CORNER_OFF[0] + _MOST_CORNER_OFF[1] * side
     while True:
         off = distance_from_neighbours(*rays, board, used, _PLACING_CORNERS)
         placed = used & np.isfinite(off)
@@ -130,7 +130,7 @@ def _agreeing(rays: Rays, board: np.ndarray, found: np.ndarray, side: np.ndarray
         bound = np.minimum(most, np.maximum(_OFF[0] + _OFF[1] * side, max(_OFF[2] * usual, unsure)))
         excess = np.where(placed, off / bound, 0.0)
         if not len(excess) or excess.max() <= 1.0:
-            return used | ~found
+            return used | ~valid
         used[np.argmax(excess)] = False
 
 

@@ -75,7 +75,7 @@ def no_corners() -> ImageCorners:
     )
 
 
-def judged(
+def with_verdicts(
     point: np.ndarray,
     uv: np.ndarray,
     quality: np.ndarray,

@@ -137,8 +137,8 @@ def _crossings(image, at, ea, eb):
     count = 0
     for i in range(len(at)):
         most = _MOST_MOVE * min(hypot(ea[i, 0], ea[i, 1]), hypot(eb[i, 0], eb[i, 1])) + 1.0
-        found, u, v = find_saddle(image, at[i, 0], at[i, 1], ea[i], eb[i], _CLEAR, USUAL_BLUR_PX, most)
-        if found:
+        has_saddle, u, v = find_saddle(image, at[i, 0], at[i, 1], ea[i], eb[i], _CLEAR, USUAL_BLUR_PX, most)
+        if has_saddle:
             contrast = crossing_contrast(image, u, v, ea[i], eb[i], _CLEAR, USUAL_BLUR_PX)
             if max(contrast, crossing_contrast(image, u, v, -ea[i], eb[i], _CLEAR, USUAL_BLUR_PX)) >= LEAST_CONTRAST:
                 count += 1

@@ -175,11 +175,11 @@ def read_cells(grey, border, threshold):
 
 
 @njit(cache=True, nogil=True)
-def seen_cells(grey, border):
+def visible_cells(grey, border):
     """uint64 with a one for each data cell inside the image, in the order of `read_cells`."""
     n = len(grey) - 2
-    seen = np.uint64(0)
+    mask = np.uint64(0)
     for row in range(border + 1, n + 1 - border):
         for col in range(border + 1, n + 1 - border):
-            seen = (seen << _ONE) | (np.uint64(0) if np.isnan(grey[row, col]) else _ONE)
-    return seen
+            mask = (mask << _ONE) | (np.uint64(0) if np.isnan(grey[row, col]) else _ONE)
+    return mask

@@ -103,7 +103,7 @@ def _fitted_step(image, u0, v0, u1, v1, end, half):
     p = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     length = hypot(u1 - u0, v1 - v0)
     size = 6 if length >= _CURVED_FROM_PX else 5
-    way, off, grey = _strip(image, u0, v0, u1, v1, 0.5 * length - min(end, _MOST_END * length), half)
+    t, off, grey = _strip(image, u0, v0, u1, v1, 0.5 * length - min(end, _MOST_END * length), half)
     dark, bright = off < -0.5 * half, off > 0.5 * half
     rows = np.empty((7, len(grey)))
     if len(grey) < 2 * size or not dark.any() or not bright.any():
@@ -111,7 +111,7 @@ def _fitted_step(image, u0, v0, u1, v1, end, half):
     p[3], p[4] = grey[dark].mean(), grey[bright].mean()
     A = np.zeros((size, size))
     for _ in range(_ITERATIONS):
-        _fill_rows(rows, p, way, off, grey)
+        _fill_rows(rows, p, t, off, grey)
         step = solve_small(A, normal_equations(A, rows, rows[6]))
         largest = max(abs(step[0]), abs(step[1]))
         scale = min(1.0, 1.0 / max(largest, 1e-12))
@@ -157,27 +157,27 @@ def _strip(image, u0, v0, u1, v1, reach, half):
         return np.empty(0), np.empty(0), np.empty(0)
     x0, x1, y0, y1 = int(np.ceil(cu - ru)), int(cu + ru), int(np.ceil(cv - rv)), int(cv + rv)
     m = (x1 - x0 + 1) * (y1 - y0 + 1)
-    way, off, grey, n = np.empty(m), np.empty(m), np.empty(m), 0
+    t, off, grey, n = np.empty(m), np.empty(m), np.empty(m), 0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
-            t, d = (x - cu) * tu + (y - cv) * tv, (x - cu) * tv - (y - cv) * tu
-            if abs(t) <= reach and abs(d) <= half:
-                way[n], off[n], grey[n] = t / (0.5 * length), d, image[y, x]
+            along, d = (x - cu) * tu + (y - cv) * tv, (x - cu) * tv - (y - cv) * tu
+            if abs(along) <= reach and abs(d) <= half:
+                t[n], off[n], grey[n] = along / (0.5 * length), d, image[y, x]
                 n += 1
-    return way[:n], off[:n], grey[:n]
+    return t[:n], off[:n], grey[:n]
 
 
 @njit(cache=True, nogil=True)
-def _fill_rows(rows, p, way, off, grey):
+def _fill_rows(rows, p, t, off, grey):
     """Fills rows (7, n): derivatives of the grey level by the six parameters p, and the residual."""
     contrast, blur = p[4] - p[3], p[2]
     for i in range(len(grey)):
-        z = (off[i] - p[0] - way[i] * (p[1] + way[i] * p[5])) / blur
+        z = (off[i] - p[0] - t[i] * (p[1] + t[i] * p[5])) / blur
         value, by_z = error_function(z / sqrt(2.0))
         share = 0.5 * (1.0 + value)
         slope = contrast * by_z / (2.0 * sqrt(2.0) * blur)
-        rows[0, i], rows[1, i], rows[2, i] = -slope, -slope * way[i], -slope * z
-        rows[3, i], rows[4, i], rows[5, i] = 1.0 - share, share, -slope * way[i] * way[i]
+        rows[0, i], rows[1, i], rows[2, i] = -slope, -slope * t[i], -slope * z
+        rows[3, i], rows[4, i], rows[5, i] = 1.0 - share, share, -slope * t[i] * t[i]
         rows[6, i] = grey[i] - p[3] - contrast * share
 
 
@@ -212,11 +212,11 @@ def _tangent(quad, k, place, u, v):
     length = hypot(quad[m, 0] - quad[k, 0], quad[m, 1] - quad[k, 1])
     tu, tv = (quad[m, 0] - quad[k, 0]) / length, (quad[m, 1] - quad[k, 1]) / length
     cu, cv = 0.5 * (quad[k, 0] + quad[m, 0]), 0.5 * (quad[k, 1] + quad[m, 1])
-    way = ((u - cu) * tu + (v - cv) * tv) / (0.5 * length)
-    slope = (place[1] + 2.0 * way * place[2]) / (0.5 * length)
+    t = ((u - cu) * tu + (v - cv) * tv) / (0.5 * length)
+    slope = (place[1] + 2.0 * t * place[2]) / (0.5 * length)
     a, b = tv - slope * tu, -tu - slope * tv
-    offset = place[0] + way * (place[1] + way * place[2])
-    along = 0.5 * length * way
+    offset = place[0] + t * (place[1] + t * place[2])
+    along = 0.5 * length * t
     return a, b, a * (cu + along * tu + offset * tv) + b * (cv + along * tv - offset * tu)
 
 
@@ -271,7 +271,7 @@ def fit_corners(image, quad, end, half):
             corners[k, 0], corners[k, 1] = (c0 * b1 - c1 * b0) / det, (a0 * c1 - a1 * c0) / det
         if abs(det) > _LEAST_SINE:
             sigma[k] = sqrt(0.5 * (ends[before, 1, 0] + ends[k, 0, 0])) / abs(det)
-            own, other = (-b0 / det, a0 / det), (b1 / det, -a1 / det)
-            edges[k, 0] = _edge_row(quad, k, 0, place[k], side_blur[k], ends[k, 0, 1], own)
-            edges[k, 1] = _edge_row(quad, before, 1, place[before], side_blur[before], ends[before, 1, 1], other)
+            by_side, by_before = (-b0 / det, a0 / det), (b1 / det, -a1 / det)
+            edges[k, 0] = _edge_row(quad, k, 0, place[k], side_blur[k], ends[k, 0, 1], by_side)
+            edges[k, 1] = _edge_row(quad, before, 1, place[before], side_blur[before], ends[before, 1, 1], by_before)
     return corners, sigma, blur, edges

@@ -11,8 +11,8 @@ from icalib.detection.primitives.decoding import (
     mapped,
     popcount,
     read_cells,
-    seen_cells,
     unit_homography,
+    visible_cells,
 )
 from icalib.detection.primitives.edge_model import LEAST_RISE, USUAL_BLUR_PX, solve_small
 from icalib.detection.primitives.edges import fit_quad
@@ -20,7 +20,7 @@ from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 
 _NEIGHBOURS = 3  # tags that predict another, none farther than two rows or columns
-_LEAST_SEEN_CELLS = 12  # visible data cells of a tag that the image border cuts, at least
+_LEAST_VISIBLE_CELLS = 12  # visible data cells of a tag that the image border cuts, at least
 _WRONG_CELLS = 0.15  # share of visible cells that may be wrong; it is large because the pattern is known
 _MOST_PREDICTION_ERROR = 0.12  # of a side: largest distance of a corner from its prediction
 LEAST_SIDE_PX = 6.0  # shortest side of a quad that is searched
@@ -114,19 +114,19 @@ def _fitted(image, quad, clear, crossing):
     of the others."""
     side = shortest_side(quad)
     if crossing:
-        most, corners, n_found = _MOST_PREDICTION_ERROR * side + 1.0, quad.copy(), 0
-        there, moved = np.zeros(4, dtype=np.bool_), np.zeros(2)
+        most, corners, n_corners = _MOST_PREDICTION_ERROR * side + 1.0, quad.copy(), 0
+        has_corner, moved = np.zeros(4, dtype=np.bool_), np.zeros(2)
         for k in range(4):
             ea, eb = side_vectors(quad, k)
-            found, u, v = find_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, USUAL_BLUR_PX, most)
-            if found and crossing_contrast(image, u, v, ea, eb, clear, USUAL_BLUR_PX) >= LEAST_CONTRAST:
-                corners[k, 0], corners[k, 1], there[k] = u, v, True
+            has_saddle, u, v = find_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, USUAL_BLUR_PX, most)
+            if has_saddle and crossing_contrast(image, u, v, ea, eb, clear, USUAL_BLUR_PX) >= LEAST_CONTRAST:
+                corners[k, 0], corners[k, 1], has_corner[k] = u, v, True
                 moved += corners[k] - quad[k]
-                n_found += 1
+                n_corners += 1
         for k in range(4):
-            if n_found > 0 and not there[k]:
-                corners[k] += moved / n_found
-        return n_found, corners
+            if n_corners > 0 and not has_corner[k]:
+                corners[k] += moved / n_corners
+        return n_corners, corners
     fits, corners = fit_quad(image, quad, min(max(1.5, 0.1 * side), 6.0), LEAST_RISE)
     return 4 if fits else 0, corners
 
@@ -140,9 +140,10 @@ def _is_tag(image, quad, pattern, bits, border):
     if white - black < LEAST_CONTRAST:
         return False
     code, wrong = read_cells(grey, border, 0.5 * (black + white))
-    seen = seen_cells(grey, border)
-    n_seen = popcount(seen)
-    return n_seen >= _LEAST_SEEN_CELLS and wrong + popcount((code ^ pattern) & seen) <= _WRONG_CELLS * n_seen
+    visible = visible_cells(grey, border)
+    n_visible = popcount(visible)
+    wrong += popcount((code ^ pattern) & visible)
+    return n_visible >= _LEAST_VISIBLE_CELLS and wrong <= _WRONG_CELLS * n_visible
 
 
 @njit(cache=True, nogil=True)
@@ -152,22 +153,22 @@ def confirm(image, known, quads, patterns, bits, border, clear, crossing):
 
     Quads of confirmed tags are moved to the measured corners. The other arguments are those of `grow`.
     """
-    there = np.zeros(len(known), dtype=np.bool_)
+    confirmed = np.zeros(len(known), dtype=np.bool_)
     for tag in range(len(known)):
         if known[tag] and shortest_side(quads[tag]) >= LEAST_SIDE_PX:
-            found, quad = _fitted(image, quads[tag], clear, crossing)
-            if found >= 2 and _is_tag(image, quad, patterns[tag], bits, border):
-                quads[tag], there[tag] = quad, True
-    return there
+            n_corners, quad = _fitted(image, quads[tag], clear, crossing)
+            if n_corners >= 2 and _is_tag(image, quad, patterns[tag], bits, border):
+                quads[tag], confirmed[tag] = quad, True
+    return confirmed
 
 
 @njit(cache=True, nogil=True)
-def markers_there(image, quads, patterns, bits, border):
+def decoded_markers(image, quads, patterns, bits, border):
     """(n,) bool: whether the image shows pattern i (n,) uint64 inside quad i (n, 4, 2) px."""
-    there = np.zeros(len(quads), dtype=np.bool_)
+    decoded = np.zeros(len(quads), dtype=np.bool_)
     for i in range(len(quads)):
-        there[i] = _is_tag(image, quads[i], patterns[i], bits, border)
-    return there
+        decoded[i] = _is_tag(image, quads[i], patterns[i], bits, border)
+    return decoded
 
 
 @njit(cache=True, nogil=True)
@@ -191,6 +192,6 @@ def grow(image, known, quads, board, cols, patterns, bits, border, clear, crossi
             tried[tag] = neighbours
             if not np.abs(quad).max() < 1e5 or shortest_side(quad) < LEAST_SIDE_PX:
                 continue
-            found, quad = _fitted(image, quad, clear, crossing)
-            if found >= 2 and _is_tag(image, quad, patterns[tag], bits, border):
+            n_corners, quad = _fitted(image, quad, clear, crossing)
+            if n_corners >= 2 and _is_tag(image, quad, patterns[tag], bits, border):
                 known[tag], quads[tag], changed = True, quad, True

@@ -28,11 +28,11 @@ class PredictedCorners(NamedTuple):
     point: np.ndarray
     uv: np.ndarray
 
-    def all_found(self, image: np.ndarray, found: ImageCorners, margin_px: float = _MARGIN_PX) -> bool:
-        """Whether `found` has every predicted corner that is more than `margin_px` inside the image (h, w)."""
+    def all_detected(self, image: np.ndarray, corners: ImageCorners, margin_px: float = _MARGIN_PX) -> bool:
+        """Whether `corners` has every predicted corner that is more than `margin_px` inside the image (h, w)."""
         high = np.array(image.shape[::-1]) - 1.0 - margin_px
         inside = ((self.uv >= margin_px) & (self.uv <= high)).all(axis=1)
-        return bool(np.isin(self.point[inside], found.point).all())
+        return bool(np.isin(self.point[inside], corners.point).all())
 
 
 def predict_corners(before: Sequence[ImageCorners]) -> PredictedCorners | None:

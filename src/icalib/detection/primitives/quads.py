@@ -57,13 +57,13 @@ def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
     contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     if hierarchy is None:
         return np.zeros((0, 4, 2))
-    found = []
+    quads = []
     for contour, parent in zip(contours, hierarchy[0, :, 3], strict=True):
         if parent < 0 and len(contour) >= 4:
             quad = _quad(cv2, contour)
             if quad is not None:
-                found.append(_grown(quad) if separate else quad)
-    return np.array(found).reshape(-1, 4, 2)
+                quads.append(_grown(quad) if separate else quad)
+    return np.array(quads).reshape(-1, 4, 2)
 
 
 def _quad(cv2, contour: np.ndarray) -> np.ndarray | None:

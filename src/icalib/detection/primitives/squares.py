@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.detection.primitives.consistency import consistent_corners
-from icalib.detection.primitives.corners import ImageCorners, judged, no_corners
+from icalib.detection.primitives.corners import ImageCorners, no_corners, with_verdicts
 from icalib.detection.primitives.edge_model import USUAL_BLUR_PX
 from icalib.detection.primitives.growth import LEAST_SIDE_PX, side_vectors
 from icalib.detection.primitives.prediction import predict_nodes
@@ -36,19 +36,19 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
     at = np.stack([[row, col], [row, col + 1], [row + 1, col + 1], [row + 1, col]], axis=0).transpose(2, 0, 1)
     inner = ((at >= 1) & (at < [rows, cols])).all(axis=2)
     clear = min(inset, _CLEAR)
-    quads, found = _roughly(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
-    if found.sum() >= _LEAST_CORNERS and clear * _usual_side(quads) >= _LEAST_CLEAR_PX:
+    quads, valid = _moved_to_saddles(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
+    if valid.sum() >= _LEAST_CORNERS and clear * _usual_side(quads) >= _LEAST_CLEAR_PX:
         # Search again from the corners found, so that the result does not depend on `expected`.
-        expected = predict_nodes(at[found], quads[found], rows + 1, cols + 1)
-        quads, found = _roughly(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
+        expected = predict_nodes(at[valid], quads[valid], rows + 1, cols + 1)
+        quads, valid = _moved_to_saddles(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
     usable = np.array([shortest_side(quad) >= LEAST_SIDE_PX for quad in quads], dtype=bool)
-    at, quads, found = at[usable], quads[usable], found[usable]
+    at, quads, valid = at[usable], quads[usable], valid[usable]
     fine, measures = refined_crossings(image, quads, np.array([_CLEAR, np.inf, inset]))
-    for i, k in zip(*np.nonzero(found & np.isfinite(measures[0])), strict=True):
+    for i, k in zip(*np.nonzero(valid & np.isfinite(measures[0])), strict=True):
         where = tuple(at[i, k])
         if not measures[0, i, k] >= sigma[where]:
             uv[where], sigma[where], quality[where] = fine[i, k], measures[0, i, k], measures[:, i, k]
-    return _judged(uv, quality, cols, image.shape)
+    return _with_verdicts(uv, quality, cols, image.shape)
 
 
 def _usual_side(quads: np.ndarray) -> float:
@@ -56,25 +56,25 @@ def _usual_side(quads: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2)))
 
 
-def _judged(uv: np.ndarray, quality: dict, cols: int, shape: tuple[int, ...]) -> ImageCorners:
+def _with_verdicts(uv: np.ndarray, quality: dict, cols: int, shape: tuple[int, ...]) -> ImageCorners:
     """Corners with verdicts. quality: measures of `refined_crossings` by (row, col) of the corner; shape: of the
     image."""
     if not quality:
         return no_corners()
     where = np.array(sorted(quality), dtype=np.int64).reshape(-1, 2)
     measures = np.array([quality[tuple(w)] for w in where]).reshape(len(where), -1).T
-    found = uv[where[:, 0], where[:, 1]]
+    corners = uv[where[:, 0], where[:, 1]]
     board = where[:, ::-1].astype(np.float64)
-    consistent = consistent_corners(found, board, np.ones(len(where), dtype=bool), measures[4], shape)
+    consistent = consistent_corners(corners, board, np.ones(len(where), dtype=bool), measures[4], shape)
     point = (where[:, 0] - 1) * (cols - 1) + where[:, 1] - 1
-    return judged(point, found, measures, consistent)
+    return with_verdicts(point, corners, measures, consistent)
 
 
 @njit(cache=True, nogil=True)
-def _roughly(image, quads, inner, clear):
-    """(quads (n, 4, 2), found (n, 4)): dark squares, with those corners that are `inner` moved to saddles, and whether
+def _moved_to_saddles(image, quads, inner, clear):
+    """(quads (n, 4, 2), valid (n, 4)): dark squares, with those corners that are `inner` moved to saddles, and whether
     each was found."""
-    out, found = quads.copy(), np.zeros(inner.shape, dtype=np.bool_)
+    out, valid = quads.copy(), np.zeros(inner.shape, dtype=np.bool_)
     for i in range(len(quads)):
         for k in range(4):
             if not inner[i, k] or shortest_side(quads[i]) < LEAST_SIDE_PX:
@@ -82,7 +82,7 @@ def _roughly(image, quads, inner, clear):
             ea, eb = side_vectors(quads[i], k)
             most = _MOST_SQUARE_MOVE * min(hypot(ea[0], ea[1]), hypot(eb[0], eb[1])) + 1.0
             u, v = quads[i, k]
-            is_there, u, v = find_saddle(image, u, v, ea, eb, clear, USUAL_BLUR_PX, most)
-            if is_there and crossing_contrast(image, u, v, ea, eb, clear, USUAL_BLUR_PX) >= LEAST_CONTRAST:
-                out[i, k, 0], out[i, k, 1], found[i, k] = u, v, True
-    return out, found
+            has_saddle, u, v = find_saddle(image, u, v, ea, eb, clear, USUAL_BLUR_PX, most)
+            if has_saddle and crossing_contrast(image, u, v, ea, eb, clear, USUAL_BLUR_PX) >= LEAST_CONTRAST:
+                out[i, k, 0], out[i, k, 1], valid[i, k] = u, v, True
+    return out, valid

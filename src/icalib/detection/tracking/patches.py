@@ -74,8 +74,8 @@ def _spread(slope: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     by_x, by_y = slope[..., 0], slope[..., 1]
     rows = np.stack([by_x * x, by_x * y, by_y * x, by_y * y, by_x, by_y], axis=-1)
     square = np.stack([x * x, y * y])
-    seen = np.einsum("nija,nijk,qij->nkqa", rows, slope, square, optimize=True)
-    shift = np.einsum("nka,nkqa->nkq", inverse[:, 4:], seen)
+    products = np.einsum("nija,nijk,qij->nkqa", rows, slope, square, optimize=True)
+    shift = np.einsum("nka,nkqa->nkq", inverse[:, 4:], products)
     return np.clip(shift.mean(axis=(1, 2)), 0.0, None)
 
 
@@ -124,17 +124,17 @@ def align(image, templates, uv, A, ncc):
     The point x of a template is at uv + A x in the image. Fills ncc (n,): correlation of both, or -1 if the patch
     leaves the image, has too little contrast, or the iteration does not converge.
     """
-    seen, row, b, step = np.empty((SIDE, SIDE)), np.empty(6), np.empty(6), np.empty(6)
+    patch, row, b, step = np.empty((SIDE, SIDE)), np.empty(6), np.empty(6), np.empty(6)
     for n in range(len(uv)):
         ncc[n] = -1.0
         for _ in range(MOST_ALIGNMENT_STEPS):
-            correlation = _sample(image, uv[n], A[n], templates.grey[n], seen)
+            correlation = _sample(image, uv[n], A[n], templates.grey[n], patch)
             if correlation < 0.0:
                 break
             b[:] = 0.0
             for i in range(SIDE):
                 for j in range(SIDE):
-                    error = seen[i, j] - templates.grey[n, i, j]
+                    error = patch[i, j] - templates.grey[n, i, j]
                     _affine_row(templates.slope[n, i, j], i - RADIUS, j - RADIUS, row)
                     for a in range(6):
                         b[a] += row[a] * error
@@ -151,8 +151,8 @@ def align(image, templates, uv, A, ncc):
 
 
 @njit(cache=True, nogil=True)
-def _sample(image, uv, A, template, seen):
-    """Fills `seen` (SIDE, SIDE) with the grey levels of the mapped patch, normalised to fit the template best. Returns
+def _sample(image, uv, A, template, patch):
+    """Fills `patch` (SIDE, SIDE) with the grey levels of the mapped patch, normalised to fit the template best. Returns
     the correlation with the template, -1 if the patch leaves the image or has too little contrast."""
     h, w = image.shape
     reach_x = RADIUS * (abs(A[0, 0]) + abs(A[0, 1]))
@@ -171,7 +171,7 @@ def _sample(image, uv, A, template, seen):
             above = image[r, c] + p * (image[r, c + 1] - image[r, c])
             below = image[r + 1, c] + p * (image[r + 1, c + 1] - image[r + 1, c])
             value = above + q * (below - above)
-            seen[i, j] = value
+            patch[i, j] = value
             total += value
             square += value * value
             product += value * template[i, j]
@@ -183,7 +183,7 @@ def _sample(image, uv, A, template, seen):
     scale = SIDE**2 / product
     for i in range(SIDE):
         for j in range(SIDE):
-            seen[i, j] = (seen[i, j] - mean) * scale
+            patch[i, j] = (patch[i, j] - mean) * scale
     return product / SIDE**2 / np.sqrt(variance)
 
 

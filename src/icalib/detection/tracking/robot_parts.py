@@ -44,5 +44,5 @@ def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.
 def _ends(feature: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """(n,) the first and the last row of each feature in the sorted feature (N,); row 0 for a feature without rows."""
     begin, end = np.searchsorted(feature, np.arange(n)), np.searchsorted(feature, np.arange(n), side="right")
-    seen = end > begin
-    return np.where(seen, begin, 0), np.where(seen, end - 1, 0)
+    has_rows = end > begin
+    return np.where(has_rows, begin, 0), np.where(has_rows, end - 1, 0)

@@ -51,11 +51,11 @@ def matched(recording: Recording, cameras: Sequence[Camera], streams: Sequence[T
 
     Only pairs of cameras of equal resolution are tried. Pairs that share hardly any features stay unchanged.
     """
-    found = list(streams)
+    extended = list(streams)
     for i, j in combinations(range(len(cameras)), 2):
         if cameras[i].resolution == cameras[j].resolution:
-            found[j] = _with_features_of(recording, (cameras[i], cameras[j]), (streams[i], streams[j]), found[j])
-    return tuple(found)
+            extended[j] = _with_features_of(recording, (cameras[i], cameras[j]), (streams[i], streams[j]), extended[j])
+    return tuple(extended)
 
 
 def _with_features_of(
@@ -126,19 +126,19 @@ def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matc
     even, smooth = zip(prepared(first), prepared(second), strict=True)
     before = stream.uv[rows].astype(np.float32)
     size = (WINDOW_PX, WINDOW_PX)
-    after, there, _ = cv2.calcOpticalFlowPyrLK(
+    after, status, _ = cv2.calcOpticalFlowPyrLK(
         even[0], even[1], before, None, winSize=size, maxLevel=STEREO_PYRAMID_LEVEL
     )
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(
+    back, back_status, _ = cv2.calcOpticalFlowPyrLK(
         even[1], even[0], after, None, winSize=size, maxLevel=STEREO_PYRAMID_LEVEL
     )
-    good = (there.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
-    whole = np.rint(stream.uv[rows])
-    templates, textured = cut_templates(smooth[0], whole)
+    good = (status.ravel() > 0) & (back_status.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
+    pixels = np.rint(stream.uv[rows])
+    templates, textured = cut_templates(smooth[0], pixels)
     A, ncc = np.tile(np.eye(2), (len(rows), 1, 1)), np.full(len(rows), -1.0)
-    uv = after.astype(np.float64) + whole - stream.uv[rows]
+    uv = after.astype(np.float64) + pixels - stream.uv[rows]
     align(smooth[1], templates, uv, A, ncc)
-    uv = uv + np.einsum("nij,nj->ni", A, stream.uv[rows] - whole)
+    uv = uv + np.einsum("nij,nj->ni", A, stream.uv[rows] - pixels)
     good &= textured & (ncc > MIN_NCC) & (np.linalg.norm(uv - after, axis=1) < ALIGNED_PX)
     return _Matches(rows[good], np.full(int(good.sum()), j), uv[good], len(rows))
 

@@ -43,7 +43,7 @@ _COUNTS = ("moving", "in_place")
 
 
 @dataclass(frozen=True)
-class _Found:
+class _TrackArrays:
     """Tracks of some images, in the form of `TrackStream`: stamps_ns (M,), start (M + 1,), feature, views, spread (N,)
     and uv (N, 2).
 
@@ -68,12 +68,12 @@ def find_all_tracks(
 ) -> list[tuple[TrackStream, tuple[str, ...]]]:
     """Feature tracks of each of the cameras, and sentences on rejected points. A feature number is the same point in
     all cameras; pairs of cameras with a common field of view share features. Raises RecordingError as `find_tracks`."""
-    found = []
+    by_camera = []
     for k, camera in enumerate(cameras):
-        found.append(find_tracks(recording, camera, keep, lambda done, k=k: progress((k + done) / len(cameras))))
-    first = np.cumsum([0, *(int(stream.feature.max(initial=-1)) + 1 for stream, _ in found)])
-    apart = [replace(stream, feature=stream.feature + n) for n, (stream, _) in zip(first, found, strict=False)]
-    return list(zip(matched(recording, cameras, apart), (notes for _, notes in found), strict=True))
+        by_camera.append(find_tracks(recording, camera, keep, lambda done, k=k: progress((k + done) / len(cameras))))
+    first = np.cumsum([0, *(int(stream.feature.max(initial=-1)) + 1 for stream, _ in by_camera)])
+    apart = [replace(stream, feature=stream.feature + n) for n, (stream, _) in zip(first, by_camera, strict=False)]
+    return list(zip(matched(recording, cameras, apart), (notes for _, notes in by_camera), strict=True))
 
 
 def find_tracks(
@@ -95,21 +95,21 @@ def find_tracks(
     if kept is not None:
         stamps_ns, start, feature, uv, views, spread, damaged_ns = (kept[name] for name in _COLUMNS)
         moving, in_place = (int(kept[name]) for name in _COUNTS)
-        found = _Found(stamps_ns, start, feature, uv, views, spread, moving, in_place, damaged_ns)
+        tracks = _TrackArrays(stamps_ns, start, feature, uv, views, spread, moving, in_place, damaged_ns)
     else:
         count, payloads = image_count(recording, topic), read()
-        found = _track(payloads, lambda n: progress(n / max(count, n)))
-        if not len(found.stamps_ns):
-            raise RecordingError(found.error or f"{where}: there are no images; check that the camera was running.")
+        tracks = _track(payloads, lambda n: progress(n / max(count, n)))
+        if not len(tracks.stamps_ns):
+            raise RecordingError(tracks.error or f"{where}: there are no images; check that the camera was running.")
         if keep:
-            keep_arrays(key, {name: np.asarray(getattr(found, name)) for name in (*_COLUMNS, *_COUNTS)})
-    stream = _stream(camera.name, found, where)
-    return stream, tuple(f"{where}: {note}" for note in _notes(found, files))
+            keep_arrays(key, {name: np.asarray(getattr(tracks, name)) for name in (*_COLUMNS, *_COUNTS)})
+    stream = _stream(camera.name, tracks, where)
+    return stream, tuple(f"{where}: {note}" for note in _notes(tracks, files))
 
 
-def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
+def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _TrackArrays:
     """Tracks of all images, in segments. done: called with the number of images so far."""
-    parts: list[_Found] = []
+    parts: list[_TrackArrays] = []
     first = next(payloads, None)
     if first is None:
         return _joined(parts)
@@ -124,16 +124,16 @@ def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
     return _joined(parts)
 
 
-def _as_they_are_read(payloads: Iterator[Payload]) -> Iterator[_Found]:
+def _as_they_are_read(payloads: Iterator[Payload]) -> Iterator[_TrackArrays]:
     """Tracks of segments whose images are too large to wait in memory, on one core."""
     for first in payloads:
         yield _track_segment(chain([first], islice(payloads, SEGMENT_IMAGES - 1)))
 
 
-def _track_segment(payloads: Iterable[Payload]) -> _Found:
+def _track_segment(payloads: Iterable[Payload]) -> _TrackArrays:
     """Tracks of one segment, without features that move, stay in place, or are in fewer than FEWEST_VIEWS images."""
     tracker, error, size = Tracker(), "", (1, 1)
-    stamps, seen, damaged = [], [], []
+    stamps, observations, damaged = [], [], []
     for p in payloads:
         try:
             image = decode(p)
@@ -146,25 +146,27 @@ def _track_segment(payloads: Iterable[Payload]) -> _Found:
             tracker.pass_over(image)
             continue
         stamps.append(p.stamp_ns)
-        seen.append(tracker.add(image))
-    whole = _observed(stamps, seen, damaged, error)
-    good = np.bincount(whole.feature) >= FEWEST_VIEWS
-    in_place = good & stay_in_place(whole.start, whole.feature, whole.uv)
-    moving = good & ~in_place & moving_features(whole.start, whole.feature, whole.uv, size)
-    kept = _some(whole, (good & ~in_place & ~moving)[whole.feature])
+        observations.append(tracker.add(image))
+    tracks = _track_arrays(stamps, observations, damaged, error)
+    good = np.bincount(tracks.feature) >= FEWEST_VIEWS
+    in_place = good & stay_in_place(tracks.start, tracks.feature, tracks.uv)
+    moving = good & ~in_place & moving_features(tracks.start, tracks.feature, tracks.uv, size)
+    kept = _selected(tracks, (good & ~in_place & ~moving)[tracks.feature])
     return replace(kept, moving=int(moving.sum()), in_place=int(in_place.sum()))
 
 
-def _observed(stamps_ns: list[int], found: list[Observations], damaged_ns: list[int], error: str) -> _Found:
+def _track_arrays(
+    stamps_ns: list[int], observations: list[Observations], damaged_ns: list[int], error: str
+) -> _TrackArrays:
     """All observations of images at stamps_ns; damaged_ns and error as in `_Found`."""
-    count = [len(s.feature) for s in found]
-    return _Found(
+    count = [len(s.feature) for s in observations]
+    return _TrackArrays(
         np.array(stamps_ns, np.int64),
         np.cumsum([0, *count]).astype(np.int64),
-        np.concatenate([np.zeros(0, np.int64), *(s.feature for s in found)]),
-        np.concatenate([np.zeros((0, 2)), *(s.uv for s in found)]),
-        np.concatenate([np.zeros(0, np.int64), *(s.views for s in found)]),
-        np.concatenate([np.zeros(0), *(s.spread for s in found)]),
+        np.concatenate([np.zeros(0, np.int64), *(s.feature for s in observations)]),
+        np.concatenate([np.zeros((0, 2)), *(s.uv for s in observations)]),
+        np.concatenate([np.zeros(0, np.int64), *(s.views for s in observations)]),
+        np.concatenate([np.zeros(0), *(s.spread for s in observations)]),
         0,
         0,
         np.array(damaged_ns, np.int64),
@@ -172,19 +174,19 @@ def _observed(stamps_ns: list[int], found: list[Observations], damaged_ns: list[
     )
 
 
-def _some(found: _Found, kept: np.ndarray) -> _Found:
+def _selected(tracks: _TrackArrays, kept: np.ndarray) -> _TrackArrays:
     """The observations selected by the mask kept (N,)."""
-    start = np.concatenate([[0], np.cumsum(kept)])[found.start].astype(np.int64)
-    columns = {name: getattr(found, name)[kept] for name in ("feature", "uv", "views", "spread")}
-    return replace(found, start=start, **columns)
+    start = np.concatenate([[0], np.cumsum(kept)])[tracks.start].astype(np.int64)
+    columns = {name: getattr(tracks, name)[kept] for name in ("feature", "uv", "views", "spread")}
+    return replace(tracks, start=start, **columns)
 
 
-def _joined(parts: Sequence[_Found]) -> _Found:
+def _joined(parts: Sequence[_TrackArrays]) -> _TrackArrays:
     """Tracks of the `parts` in sequence, with features renumbered to be unique."""
     none = np.zeros(0, np.int64)
     first = np.cumsum([0, *(int(p.feature.max(initial=-1)) + 1 for p in parts)])
     begin = np.cumsum([0, *(len(p.feature) for p in parts)])
-    return _Found(
+    return _TrackArrays(
         np.concatenate([none, *(p.stamps_ns for p in parts)]),
         np.concatenate([none, *(b + p.start[:-1] for b, p in zip(begin, parts, strict=False)), begin[-1:]]),
         np.concatenate([none, *(f + p.feature for f, p in zip(first, parts, strict=False))]),
@@ -198,10 +200,10 @@ def _joined(parts: Sequence[_Found]) -> _Found:
     )
 
 
-def _stream(name: str, found: _Found, where: str) -> TrackStream:
+def _stream(name: str, tracks: _TrackArrays, where: str) -> TrackStream:
     """The tracks as a stream, without images that have no observation. Raises RecordingError if less than half of the
     images have FEWEST_IN_IMAGE tracked points."""
-    count = np.diff(found.start)
+    count = np.diff(tracks.start)
     enough = int((count >= FEWEST_IN_IMAGE).sum())
     if 2 * enough < len(count):
         raise RecordingError(
@@ -211,18 +213,18 @@ def _stream(name: str, found: _Found, where: str) -> TrackStream:
     kept = count > 0
     start = np.concatenate([[0], np.cumsum(count[kept])]).astype(np.int64)
     return TrackStream(
-        name, found.stamps_ns[kept], start, found.feature, found.uv, views=found.views, spread=found.spread
+        name, tracks.stamps_ns[kept], start, tracks.feature, tracks.uv, views=tracks.views, spread=tracks.spread
     )
 
 
-def _notes(found: _Found, files: dict[int, str]) -> Iterator[str]:
+def _notes(tracks: _TrackArrays, files: dict[int, str]) -> Iterator[str]:
     """Sentences on damaged images, and on points that were rejected because they move or stay in place."""
-    yield from words_on_damaged(found.damaged_ns.tolist(), files)
-    tracks = len(np.unique(found.feature)) + found.moving + found.in_place
-    if found.moving > NOTED * tracks:
-        yield f"{found.moving} of {tracks} points do not fit a single motion of the camera and were rejected."
-    if found.in_place > NOTED * tracks:
+    yield from words_on_damaged(tracks.damaged_ns.tolist(), files)
+    count = len(np.unique(tracks.feature)) + tracks.moving + tracks.in_place
+    if tracks.moving > NOTED * count:
+        yield f"{tracks.moving} of {count} points do not fit a single motion of the camera and were rejected."
+    if tracks.in_place > NOTED * count:
         yield (
-            f"{found.in_place} of {tracks} points keep their place in the image while the camera turns, as if "
+            f"{tracks.in_place} of {count} points keep their place in the image while the camera turns, as if "
             "on the robot or on a dirty lens; they were rejected."
         )

@@ -118,7 +118,7 @@ class Tracker:
         cv2, alive = self._cv2, self._alive
         before = alive.uv.astype(np.float32)
         size, end = (WINDOW_PX, WINDOW_PX), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, *LK_ENDS)
-        after, found, _ = cv2.calcOpticalFlowPyrLK(
+        after, status, _ = cv2.calcOpticalFlowPyrLK(
             self._before,
             even,
             before,
@@ -128,7 +128,7 @@ class Tracker:
             criteria=end,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(
+        back, back_status, _ = cv2.calcOpticalFlowPyrLK(
             even,
             self._before,
             after,
@@ -138,7 +138,7 @@ class Tracker:
             criteria=end,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
-        good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
+        good = (status.ravel() > 0) & (back_status.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
         uv, A, ncc = after.astype(np.float64), alive.A.copy(), np.full(len(before), -1.0)
         align(smooth, alive.first, uv, A, ncc)
         good &= (ncc > MIN_NCC) & (np.linalg.norm(uv - after, axis=1) < ALIGNED_PX)
@@ -181,8 +181,8 @@ class Tracker:
         best = cells.argmax(axis=1)
         strong = cells[np.arange(len(cells)), best] > LEAST_QUALITY
         (row, col), (y, x) = np.nonzero(free), np.divmod(best, side)
-        found = 2 * np.column_stack([col * side + x, row * side + y])[strong]
-        return np.array([self._strongest_near(even, x, y) for x, y in found.tolist()]).reshape(-1, 2)
+        pixels = 2 * np.column_stack([col * side + x, row * side + y])[strong]
+        return np.array([self._strongest_near(even, x, y) for x, y in pixels.tolist()]).reshape(-1, 2)
 
     def _strongest_near(self, even: np.ndarray, x: int, y: int) -> tuple[int, int]:
         """The strongest corner within REFINED_WITHIN_PX of a pixel, which must be at least RADIUS inside the image."""

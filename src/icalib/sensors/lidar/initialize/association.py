@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.data.measurements import LidarStream
-from icalib.detection.planes.planes import MOST_POINTS, FoundPlanes, PlaneSearch, find_planes
+from icalib.detection.planes.planes import MOST_POINTS, ExtractedPlanes, PlaneSearch, find_planes
 from icalib.errors import EstimationError
 from icalib.motion.clouds import Clouds
 from icalib.motion.sweep import EstimatedMotion
@@ -78,8 +78,10 @@ def odd_step(points: int) -> int:
     return -(-points // MOST_POINTS) | 1
 
 
-def _plane_of_points(found: FoundPlanes, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
-    """(N,) int32 plane of each point, -1: none; see `FoundPlanes.of_points`. Uses two threads."""
+def _plane_of_points(
+    found: ExtractedPlanes, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch
+) -> np.ndarray:
+    """(N,) int32 plane of each point, -1: none; see `ExtractedPlanes.of_points`. Uses two threads."""
     parts = [slice(a, a + POINTS_PER_PART) for a in range(0, len(points), POINTS_PER_PART)]
     own = in_parallel(lambda part: found.of_points(points[part], seen_from[part], search), parts)
     return np.concatenate([np.zeros(0, np.int32), *own])
