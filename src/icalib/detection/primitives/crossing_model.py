@@ -37,15 +37,10 @@ def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
     sigma [px] is the standard deviation per axis for image noise of one grey level; contrast is in grey levels between
     dark and light; edges as in `CornerStream`.
     """
-    edges, blur = np.zeros((2, EDGE)), max(blur_a, blur_b)
-    most = max(_MOST_WINDOW[0], _MOST_WINDOW[1] * blur)
-    sa, sb, sine = window_frame(ea, eb, surroundings[0], blur, LEAST_WINDOW_PX, most)
-    room = room_for(image, u, v, ea, eb, sa, sb)
-    narrow = min(sa * hypot(ea[0], ea[1]), sb * hypot(eb[0], eb[1])) * sine
-    if sine < LEAST_SINE or room * narrow < 0.99 * LEAST_WINDOW_PX:
+    edges = np.zeros((2, EDGE))
+    sa, sb, margin = _half_widths(image, u, v, ea, eb, surroundings[0], max(blur_a, blur_b))
+    if sa == 0.0:
         return u, v, np.nan, 0.0, edges
-    sa, sb = room * sa, room * sb
-    margin = MARGIN_BLURS * blur / (sine * hypot(ea[0], ea[1])), MARGIN_BLURS * blur / (sine * hypot(eb[0], eb[1]))
     xs, ys, grey = _window(image, u, v, ea, eb, sa, sb, surroundings, margin)
     if len(grey) < 2 * _SIZE:
         return u, v, np.nan, 0.0, edges
@@ -65,6 +60,22 @@ def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
             _fill_edges(edges, ea, sa, eb, sb, _gain(A, rows))
             return p[0], p[1], _sigma(A), 2.0 * p[5], edges
     return u, v, np.nan, 0.0, edges
+
+
+@njit(cache=True, nogil=True)
+def _half_widths(image, u, v, ea, eb, clear, blur):
+    """(sa, sb, margin (2,)), in units of the sides ea, eb: half widths of the window about (u, v), and its distance
+    from features in the fields. The half widths are zero if the window would be too narrow.
+
+    clear: distance of the nearest other feature across either edge, in units of the sides; blur [px]."""
+    most = max(_MOST_WINDOW[0], _MOST_WINDOW[1] * blur)
+    sa, sb, sine = window_frame(ea, eb, clear, blur, LEAST_WINDOW_PX, most)
+    room = room_for(image, u, v, ea, eb, sa, sb)
+    narrow = min(sa * hypot(ea[0], ea[1]), sb * hypot(eb[0], eb[1])) * sine
+    if sine < LEAST_SINE or room * narrow < 0.99 * LEAST_WINDOW_PX:
+        return 0.0, 0.0, (0.0, 0.0)
+    margin = MARGIN_BLURS * blur / (sine * hypot(ea[0], ea[1])), MARGIN_BLURS * blur / (sine * hypot(eb[0], eb[1]))
+    return room * sa, room * sb, margin
 
 
 @njit(cache=True, nogil=True)

@@ -76,7 +76,6 @@ def _fit(image, u0, v0, axes):
     W = np.array([[axes[1, 1], -axes[1, 0]], [-axes[0, 1], axes[0, 0]]]) / det
     p = np.array([u0, v0, _FIRST_BLUR, 0.0, 0.0])  # centre, blur, grey inside, grey outside; W holds the shape
     A = np.zeros((_SIZE, _SIZE))
-    done = False
     for iteration in range(_MOST_ELLIPSE_STEPS):
         large, small = _half_axes(W)
         if small < 0.5 * LEAST_HALF_AXIS_PX or hypot(p[0] - u0, p[1] - v0) > _MOST_CENTRE_MOVE * small + 1.0:
@@ -87,31 +86,43 @@ def _fit(image, u0, v0, axes):
         b, n = _accumulate(A, image, p, W, half, iteration == 0)
         if n < 2 * _SIZE or not p[4] - p[3] >= LEAST_CONTRAST:
             return u0, v0, np.nan, p[2], large, small
-        step = solve_small(A, b)
-        moved = max(hypot(step[0], step[1]), large * max(abs(step[2]), abs(step[3]), abs(step[4])))
-        scale = min(1.0, _MOST_STEP_PX / max(moved, 1e-12))
-        p[0] += scale * step[0]
-        p[1] += scale * step[1]
-        S = scale * np.array([[step[2], step[4]], [step[4], step[3]]])
-        changed = np.empty((2, 2))
-        for i in range(2):
-            for j in range(2):
-                changed[i, j] = W[i, j] + S[i, 0] * W[0, j] + S[i, 1] * W[1, j]
-        W = changed
-        p[2] = min(max(p[2] + scale * min(max(step[5], -0.5 * p[2]), p[2]), BLUR_RANGE_PX[0]), BLUR_RANGE_PX[1])
-        # Grey levels enter linearly: their step needs no limit.
-        p[3] += step[6]
-        p[4] += step[7]
-        if moved < _CONVERGED_PX:
-            done = True
-            break
+        if _move(p, W, solve_small(A, b), large) < _CONVERGED_PX:
+            large, small = _half_axes(W)
+            return p[0], p[1], _sigma(A), p[2], large, small
     large, small = _half_axes(W)
+    return p[0], p[1], np.nan, p[2], large, small
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _move(p, W, step, large):
+    """Adds a step (8,), shortened to _MOST_STEP_PX, to the parameters p (5,) and the shape W (2, 2). Returns the shift
+    of the edge [px] by the whole step. large [px]: larger half axis."""
+    moved = max(hypot(step[0], step[1]), large * max(abs(step[2]), abs(step[3]), abs(step[4])))
+    scale = min(1.0, _MOST_STEP_PX / max(moved, 1e-12))
+    p[0] += scale * step[0]
+    p[1] += scale * step[1]
+    S = scale * np.array([[step[2], step[4]], [step[4], step[3]]])
+    before = W.copy()
+    for i in range(2):
+        for j in range(2):
+            W[i, j] = before[i, j] + S[i, 0] * before[0, j] + S[i, 1] * before[1, j]
+    p[2] = min(max(p[2] + scale * min(max(step[5], -0.5 * p[2]), p[2]), BLUR_RANGE_PX[0]), BLUR_RANGE_PX[1])
+    # Grey levels enter linearly: their step needs no limit.
+    p[3] += step[6]
+    p[4] += step[7]
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def _sigma(A):
+    """Standard deviation of the centre [px], the mean of both axes, from the normal matrix A (8, 8); NaN if it is not
+    positive definite."""
     variance = 0.0
     for k in range(2):
         unit = np.zeros(_SIZE)
         unit[k] = 1.0
         variance += 0.5 * solve_small(A, unit)[k]
-    return p[0], p[1], sqrt(variance) if done and variance > 0.0 else np.nan, p[2], large, small
+    return sqrt(variance) if variance > 0.0 else np.nan
 
 
 @njit(cache=True, nogil=True)
@@ -127,7 +138,8 @@ def _inside(image, p, reach):
 
 @njit(cache=True, nogil=True)
 def _accumulate(A, image, p, W, half, set_levels):
-    """Fills A (8, 8) with J^T J of the pixels within `half` px of the edge; returns J^T error (8,) and their number.
+    """Fills the lower triangle of A (8, 8) with J^T J of the pixels within `half` px of the edge. Returns J^T error
+    (8,) and the number of pixels.
 
     With `set_levels` the grey levels p[3], p[4] are first set to the means inside and outside.
     """
@@ -158,8 +170,6 @@ def _accumulate(A, image, p, W, half, set_levels):
                 for j in range(i + 1):
                     A[i, j] += J[i] * J[j]
     for i in range(_SIZE):
-        for j in range(i):
-            A[j, i] = A[i, j]
         A[i, i] *= 1.0 + 1e-9  # keeps A positive definite to rounding
     return b, n
 
