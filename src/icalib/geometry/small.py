@@ -33,6 +33,32 @@ def tmul3(a, b):
 
 
 @njit(cache=True, nogil=True)
+def mulv3(a, x):
+    """(3,) product a x of a matrix (3, 3) and a vector (3,)."""
+    out = np.empty(3)
+    for i in range(3):
+        out[i] = a[i, 0] * x[0] + a[i, 1] * x[1] + a[i, 2] * x[2]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def tmulv3(a, x):
+    """(3,) product a^T x of a matrix (3, 3) and a vector (3,)."""
+    out = np.empty(3)
+    for i in range(3):
+        out[i] = a[0, i] * x[0] + a[1, i] * x[1] + a[2, i] * x[2]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def cross3(a, b):
+    """(3,) cross product a x b."""
+    out = np.empty(3)
+    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return out
+
+
+@njit(cache=True, nogil=True)
 def cholesky(A):
     """Overwrite the lower triangle of A (n, n) with its Cholesky factor. False if A is not positive definite."""
     n = A.shape[0]

@@ -52,7 +52,12 @@ def window_rates(
     a = np.arange(len(seconds))
     b = np.searchsorted(seconds, seconds + window - 1e-9)
     a, b = a[b < len(seconds)], b[b < len(seconds)]
-    near = seconds[b] - seconds[a] <= max(longest_step, MAX_WINDOW_STRETCH * window)
-    a, b = a[near], b[near]
+    a, b = pairs_within(seconds, a, b, max(longest_step, MAX_WINDOW_STRETCH * window))
     turn = so3.log_many(np.ascontiguousarray(rotation[a].transpose(0, 2, 1) @ rotation[b]))
     return a, b, turn / (seconds[b] - seconds[a])[:, None]
+
+
+def pairs_within(seconds: np.ndarray, i: np.ndarray, j: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs of instants i, j (n,), indices of increasing `seconds` (N,), that are at most `longest` s apart."""
+    near = seconds[j] - seconds[i] <= longest
+    return i[near], j[near]

@@ -14,6 +14,7 @@ from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
 from icalib.initialize.steps.rate_correlation import SensorRates, max_rate_step
+from icalib.initialize.steps.rate_windows import pairs_within
 
 MAX_POSE_CORNERS = 48  # corners of an image that are used, at most; bounds the time
 MIN_POSE_CORNERS = 6  # corners of a board that give a pose; fewer may be nearly collinear
@@ -260,10 +261,8 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> SensorRates:
             f"{stream.name}: the pose of the target was found in only {len(index)} of {len(t)} images; check "
             "the target, the camera model and the intrinsics in the rig file."
         )
-    a, b = index[:-1], index[1:]
     longest = max_rate_step(stream.name, t[index], "images of the target")
-    near = t[b] - t[a] <= longest
-    a, b = a[near], b[near]
+    a, b = pairs_within(t, index[:-1], index[1:], longest)
     if len(a) < MIN_IMAGE_PAIRS:
         raise EstimationError(
             f"{stream.name}: only {len(a)} pairs of consecutive images, at most {longest:.3g} s apart, show "

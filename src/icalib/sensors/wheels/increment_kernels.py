@@ -18,7 +18,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry import so3
-from icalib.geometry.small import tmul3
+from icalib.geometry.small import cross3, mulv3, tmul3, tmulv3
 from icalib.motion.sensor_pose import N_POSE_PARAMETERS, OFFSET_COLUMN
 from icalib.optim.rows import KEYFRAME_PAIR_DIM
 from icalib.optim.state import KEYFRAME_DIM
@@ -47,19 +47,6 @@ class MotionSamples(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _cross(a, b):
-    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
-
-
-@njit(cache=True, nogil=True)
-def _add(R, x, scale, sign, out):
-    """out (3,) += scale R x, or scale R^T x if sign is negative."""
-    for i in range(3):
-        for j in range(3):
-            out[i] += scale * (R[i, j] if sign > 0 else R[j, i]) * x[j]
-
-
-@njit(cache=True, nogil=True)
 def _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians):
     """Theta (3,) between samples a and b. Adds its derivatives by the two keyframes to rows 3: of J_first and J_second
     (6, 15), and those by time offset and IMU intrinsics to rows 3: of J_calib."""
@@ -83,16 +70,15 @@ def _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians)
 @njit(cache=True, nogil=True)
 def _add_displacement(j, weight, samples, velocities, D, J_keyframe, J_calib, with_jacobians):
     """Adds weight * R^T v of sample j to D (3,), and its derivatives to rows :3 of J_keyframe (6, 15) and J_calib."""
-    R, u = samples.rotation[j], np.zeros(3)
-    _add(R, samples.velocity[j], 1.0, -1, u)
+    R = samples.rotation[j]
+    u = tmulv3(R, samples.velocity[j])
     for i in range(3):
         D[i] += weight * u[i]
     if not with_jacobians:
         return
     # u = R^T v: du/dt = u x rate + R^T acceleration.
-    turning = _cross(u, samples.rate[j])
-    acceleration = np.zeros(3)
-    _add(R, velocities.acceleration[j], 1.0, -1, acceleration)
+    turning = cross3(u, samples.rate[j])
+    acceleration = tmulv3(R, velocities.acceleration[j])
     J_u_rotation = so3.hat(u)
     for i in range(3):
         J_calib[i, 0] += weight * (turning[i] + acceleration[i])
@@ -111,7 +97,7 @@ def _add_displacement(j, weight, samples, velocities, D, J_keyframe, J_calib, wi
 def _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows):
     """Fills the derivatives of row q of interval i by keyframes, R_imu_wheel, time offset and IMU intrinsics."""
     # R <- R Exp(d) rotates X and T by -d: dX = X x d, dT = T x d.
-    x, t = _cross(gX, X), _cross(gT, T)
+    x, t = cross3(gX, X), cross3(gT, T)
     for c in range(3):
         rows.J[i, q, KEYFRAME_PAIR_DIM + c] = x[c] + t[c]
     for k in range(3):
@@ -126,13 +112,11 @@ def _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows):
 
 
 @njit(cache=True, nogil=True)
-def _to_imu_axes(wheels, gX, gT, aY, aT):
-    """Fills the coefficients a_Y, a_T (3,) of a row in IMU axes from g_X, g_T (3,) in wheel axes: a_Y = R g_X, and
+def _to_imu_axes(wheels, gX, gT):
+    """Coefficients a_Y, a_T (3,) of a row in IMU axes, from g_X, g_T (3,) in wheel axes: a_Y = R g_X, and
     a_T = R g_T + p x a_Y, as Y = D + Theta x p."""
-    aY[:], aT[:] = 0.0, 0.0
-    _add(wheels.R, gX, 1.0, 1, aY)
-    _add(wheels.R, gT, 1.0, 1, aT)
-    aT += _cross(wheels.p, aY)
+    aY = mulv3(wheels.R, gX)
+    return aY, mulv3(wheels.R, gT) + cross3(wheels.p, aY)
 
 
 @njit(cache=True, nogil=True)
@@ -157,17 +141,15 @@ def increment_rows(start, weights, samples, velocities, wheels, coefficients, me
     with_jacobians = len(rows.J) > 0
     n_calib = 1 + samples.J_imu.shape[2]
     J_first, J_second, J_calib = np.empty((6, KEYFRAME_DIM)), np.empty((6, KEYFRAME_DIM)), np.empty((6, n_calib))
-    D, X, T, aY, aT = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    D = np.empty(3)
     for i in range(len(start) - 1):
         a, b, g = start[i], start[i + 1] - 1, min(i, len(coefficients.g_X) - 1)
-        J_first[:], J_second[:], J_calib[:], D[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        J_first[:], J_second[:], J_calib[:], D[:] = 0.0, 0.0, 0.0, 0.0
         for j in range(a + 1, b):
-            J_own = J_first if samples.keyframe[j] == samples.keyframe[a] else J_second
-            _add_displacement(j, weights[j], samples, velocities, D, J_own, J_calib, with_jacobians)
+            J_keyframe = J_first if samples.keyframe[j] == samples.keyframe[a] else J_second
+            _add_displacement(j, weights[j], samples, velocities, D, J_keyframe, J_calib, with_jacobians)
         theta = _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians)
-        Y = D + _cross(theta, wheels.p)
-        _add(wheels.R, Y, 1.0, -1, X)  # -1: R transposed
-        _add(wheels.R, theta, 1.0, -1, T)
+        X, T = tmulv3(wheels.R, D + cross3(theta, wheels.p)), tmulv3(wheels.R, theta)
         for q in range(4):
             gX, gT = coefficients.g_X[g, q], coefficients.g_T[g, q]
             s = 0.0
@@ -176,9 +158,9 @@ def increment_rows(start, weights, samples, velocities, wheels, coefficients, me
             rows.residual[i, q] = s - measured[i, q]
             if not with_jacobians:
                 continue
-            _to_imu_axes(wheels, gX, gT, aY, aT)
+            aY, aT = _to_imu_axes(wheels, gX, gT)
             _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows)
-            J_lever_arm = _cross(aY, theta)
+            J_lever_arm = cross3(aY, theta)
             for k in range(3):
                 rows.J[i, q, KEYFRAME_PAIR_DIM + 3 + k] = J_lever_arm[k]
             _fill_drive(i, q, coefficients.J_g_X[g, q], coefficients.J_g_T[g, q], X, T, rows)

@@ -20,6 +20,7 @@ from icalib.errors import EstimationError
 from icalib.initialize.steps.contradicted_guesses import MotionContradictedError
 from icalib.initialize.steps.cross_correlation import best_shift
 from icalib.initialize.steps.rate_correlation import MAX_RATE_STEP_S, correlation_in_words, max_rate_step
+from icalib.initialize.steps.rate_windows import pairs_within
 from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.pose_rows import Extrinsics
 from icalib.motion.stamp_intervals import MAX_INTERVAL_S
@@ -106,10 +107,8 @@ def wheel_rates(name: str, seconds: np.ndarray, integrals: np.ndarray, kind: Whe
     a = np.arange(len(seconds))
     b = np.searchsorted(seconds, seconds + RATE_WINDOW_S - 1e-9)
     good = (b < len(seconds)) & (b > a)
-    a, b = a[good], b[good]
     longest = max_rate_step(name, seconds, "readings", MAX_INTERVAL_S)
-    near = seconds[b] - seconds[a] <= longest
-    a, b = a[near], b[near]
+    a, b = pairs_within(seconds, a[good], b[good], longest)
     if len(a) < MIN_WINDOWS:
         raise EstimationError(
             f"{name}: only {len(a)} pairs of its {len(seconds)} readings are at most {longest:.3g} s apart, "
