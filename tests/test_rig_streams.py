@@ -20,6 +20,8 @@ from icalib.data.same_rig import streams_of_rig
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels, by_name
+from icalib.sensors.position.spec import PositionSensor
+from icalib.sensors.position.stream import PositionStream
 
 STAMPS, NONE = np.arange(3), np.zeros(4, np.int64)
 IMU = ImuStream("imu0", STAMPS, np.zeros((3, 3)), np.zeros((3, 3)))
@@ -85,14 +87,19 @@ def test_a_sensor_has_one_stream_of_a_kind_but_a_camera_corners_and_tracks():
 
 
 @pytest.mark.parametrize("far", [[465_875.0, 5_248_232.0, 413.0], [-7e6, 0.0, 0.0], [0.0, 50.0, 0.0]])
-def test_far_positions_are_counted_from_among_them(far):
-    """No digit is lost: what is taken off added again is what was written."""
+def test_positions_far_from_their_origin_get_a_near_one_with_all_sensors_of_the_frame(far):
+    """No digit is lost: the new origin and a new position add up to the old one exactly."""
     position = far + np.random.default_rng(0).normal(size=(9, 3))
-    stream = PoseStream("mocap", np.arange(9), np.zeros((9, 3, 3)), position)
-    counted, notes = stream.near_origin()
+    poses = PoseStream("mocap", np.arange(9), np.zeros((9, 3, 3)), position)
+    marker, other = (PositionStream(name, np.arange(9), position, np.zeros((0, 3, 3))) for name in ("marker", "gnss"))
+    sensors = PoseSensor("mocap", ""), PositionSensor("marker", "", frame="mocap"), PositionSensor("gnss", "")
+    m = streams_of_rig(Rig(by_name(*sensors)), Measurements.of_streams(poses, marker, other))
+    assert m.streams["gnss"] is other
     if np.linalg.norm(far) < 100.0:
-        assert counted is stream and notes == ()
+        assert m.streams["mocap"] is poses and m.streams["marker"] is marker and m.notes == ()
         return
     origin = np.round(np.median(position, axis=0))
-    np.testing.assert_array_equal(counted.position + origin, position)
-    assert np.abs(counted.position).max() < 5.0 and f"({origin[0]:.0f}, {origin[1]:.0f}, {origin[2]:.0f}) m" in notes[0]
+    for stream, note in zip(m.of(PoseStream) + m.of(PositionStream)[:1], m.notes, strict=True):
+        np.testing.assert_array_equal(stream.position + origin, position)
+        assert np.abs(stream.position).max() < 5.0
+        assert f"{stream.name}: " in note and f"({origin[0]:.0f}, {origin[1]:.0f}, {origin[2]:.0f}) m" in note

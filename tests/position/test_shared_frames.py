@@ -9,8 +9,10 @@ import pytest
 from scipy.stats import chi2
 from tests.position.test_position_runs import antenna, errors, pose
 
+from icalib.data.measurements import PoseStream
 from icalib.pipeline import calibrate_measurements
 from icalib.sensors.pose.simulate import SimPoses
+from icalib.sensors.position.stream import PositionStream
 from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate
 from icalib.tools.simulation.scenario.scenario import SimCamera
 
@@ -62,6 +64,15 @@ def test_exact_without_noise(frame):
     result, sim = calibrated(MADE[frame](**SILENT))
     error, _ = errors(result, sim)
     assert np.abs(error).max() < 1e-9
+
+
+def test_a_shared_frame_may_have_its_origin_far_away():
+    """As in UTM coordinates: poses and fixes get the same new origin."""
+    sim = simulate(with_mocap(**SILENT), 1)
+    far = [s.relative_to(np.array([-465_875.0, -5_248_232.0, 0.0])) for s in sim.measurements.of(PoseStream)]
+    far += [s.relative_to(np.array([-465_875.0, -5_248_232.0, 0.0])) for s in sim.measurements.of(PositionStream)]
+    result = calibrate_measurements(rig_for(sim.scenario), sim.measurements.with_streams(*far))
+    assert np.abs(errors(result, sim)[0]).max() < 1e-7
 
 
 def test_a_known_frame_tells_more_than_one_that_is_estimated():

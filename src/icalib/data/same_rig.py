@@ -29,6 +29,22 @@ def streams_of_rig(rig: Rig, measurements: Measurements) -> Measurements:
         raise RecordingError(
             f"{where} has no data of {' and '.join(missing)}; add the measurements, or remove it from the rig."
         )
-    shifted = [s.near_origin() for name in rig.sensors for s in m.streams.values() if s.name == name]
-    notes = sum((words for _, words in shifted), m.notes)
-    return replace(m, streams={s.key: s for s, _ in shifted}, notes=notes)
+    ordered = {s.key: s for name in rig.sensors for s in m.streams.values() if s.name == name}
+    return _near_origin(rig, replace(m, streams=ordered))
+
+
+def _near_origin(rig: Rig, measurements: Measurements) -> Measurements:
+    """The measurements with positions near the origin of their frame. Sensors that share a frame are shifted
+    together."""
+    owner = {name: sensor.shared_frame or name for name, sensor in rig.sensors.items()}
+    far = ((s.name, s.better_origin()) for s in measurements.streams.values())
+    origins = {name: origin for name, origin in far if origin is not None}
+    streams, notes = {}, measurements.notes
+    for key, stream in measurements.streams.items():
+        origin = origins.get(owner[stream.name])
+        streams[key] = stream if origin is None else stream.relative_to(origin)
+        if streams[key] is not stream:
+            x, y, z = origins[owner[stream.name]]
+            where = f"({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away"
+            notes += (f"{stream.name}: positions are relative to {where}.",)
+    return replace(measurements, streams=streams, notes=notes)

@@ -114,10 +114,16 @@ class Stream:
         found = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {k: v for k, v in found.items() if isinstance(v, np.ndarray) and k not in ("stamps_ns", "start")}
 
-    def near_origin(self) -> tuple[Self, tuple[str, ...]]:
-        """The stream with positions relative to a near origin if the origin of their frame is far (`far_origin`), and
-        notes on it. Here the stream itself: subclasses with positions override it."""
-        return self, ()
+    def better_origin(self) -> np.ndarray | None:
+        """A new origin (3,) [m] for the frame of the positions, near them, if its own is far (`far_origin`), else None.
+        Here None: overridden by streams whose frame is that of other sensors, too."""
+        return None
+
+    def relative_to(self, origin: np.ndarray) -> Self:
+        """The stream with positions relative to `origin` (3,) [m] of its frame. Streams without positions are
+        unchanged."""
+        del origin
+        return self
 
     @classmethod
     def disjoint(cls, recordings: Sequence[Sequence[Self]]) -> Sequence[Sequence[Self]]:

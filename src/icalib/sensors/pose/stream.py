@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,13 +29,10 @@ class PoseStream(Stream):
         shape = self.position.shape
         check(shape == (n, 3), f"{self.name}: position must have shape ({n}, 3), not {shape}.")
 
-    def near_origin(self) -> tuple[Self, tuple[str, ...]]:
-        """The stream with positions relative to a point near them, and a note, if they are far from the frame's origin;
-        else the unchanged stream."""
-        origin = far_origin(self.position)
-        if origin is None:
-            return self, ()
-        x, y, z = origin
-        where = f"({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away"
-        note = f"{self.name}: positions are relative to {where}."
-        return replace(self, position=self.position - origin), (note,)
+    def better_origin(self) -> np.ndarray | None:
+        """See `Stream`."""
+        return far_origin(self.position)
+
+    def relative_to(self, origin: np.ndarray) -> PoseStream:
+        """See `Stream`."""
+        return replace(self, position=self.position - origin)

@@ -34,6 +34,10 @@ class PositionStream(Stream):
         covariance = self.covariance[kept] if len(self.covariance) else self.covariance
         return replace(self, stamps_ns=self.stamps_ns[kept], position=self.position[kept], covariance=covariance)
 
+    def relative_to(self, origin: np.ndarray) -> PositionStream:
+        """See `Stream`."""
+        return replace(self, position=self.position - origin)
+
     @property
     def root(self) -> np.ndarray:
         """(N, 3, 3) W [1/m] with W^T W the inverse of the stated covariance; the identity if none is stated."""
