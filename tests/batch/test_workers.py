@@ -8,7 +8,7 @@ import pytest
 
 from icalib.base.extras import load_distributed
 from icalib.errors import CalibrationError
-from icalib.tools.batch import Crew, Lost, run_all, write_whole
+from icalib.tools.batch import Crew, FailedTask, run_all, write_atomically
 from icalib.tools.batch.workers import _answer
 
 
@@ -18,8 +18,8 @@ def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():
     found = dict(run_all(eval, [killer, "7", "int('x')", "8"], Crew(workers=1)))
     assert (found.pop("7"), found.pop("8")) == (7, 8)
     assert found == {
-        killer: Lost("its worker died 4 times at this task; give it more memory."),
-        "int('x')": Lost(
+        killer: FailedTask("its worker died 4 times at this task; give it more memory."),
+        "int('x')": FailedTask(
             "its worker failed to run it (ValueError: invalid literal for int() with base 10: 'x'); "
             "install the same icalib everywhere."
         ),
@@ -42,11 +42,11 @@ def test_an_answer_that_never_comes_is_a_scheduler_that_went_away(error: BaseExc
 
 
 def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path):
-    write_whole(tmp_path / "a", b"old")
-    write_whole(tmp_path / "a", b"new")
+    write_atomically(tmp_path / "a", b"old")
+    write_atomically(tmp_path / "a", b"new")
     assert (tmp_path / "a").read_bytes() == b"new"
     (tmp_path / "b").mkdir()
     for place in (tmp_path / "b", tmp_path / "a" / "c", tmp_path / "absent" / "c"):
         with pytest.raises(CalibrationError, match=r"cannot be written .*; choose another folder\."):
-            write_whole(place, b"new")
+            write_atomically(place, b"new")
     assert sorted(f.name for f in tmp_path.iterdir()) == ["a", "b"]

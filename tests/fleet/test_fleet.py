@@ -185,10 +185,10 @@ def test_interrupted_it_says_what_is_there(fleet_folder: Path, workshop, capsys)
 def test_a_job_that_killed_its_workers_is_reported_and_tried_again_the_next_time(
     fleet_folder: Path, workshop, monkeypatch
 ):
-    from icalib.tools.batch import Lost
+    from icalib.tools.batch import FailedTask
 
     def lose(work, tasks, crew):
-        yield from ((task, Lost("its worker died again and again; give it more memory.")) for task in tasks)
+        yield from ((task, FailedTask("its worker died again and again; give it more memory.")) for task in tasks)
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "run_all", lose)

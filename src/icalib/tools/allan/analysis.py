@@ -100,22 +100,22 @@ def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoi
     return ImuNoiseStudy(imu.name, where, still.seconds, still.period, gyro, accel, warnings, notes)
 
 
-def _imu_topic(where: str, recording: Recording, given: str | None) -> TopicInfo:
-    """The topic or table `given`, else the only one with readings of an IMU. If gyroscope and accelerometer have a
+def _imu_topic(where: str, recording: Recording, name: str | None) -> TopicInfo:
+    """The topic or table `name`, else the only one with readings of an IMU. If gyroscope and accelerometer have a
     topic each, one of the two. Raises RecordingError with a list of the topics."""
     topics = recording.topics()
-    if given is not None:
-        topic = find_topic(where, topics, given)
+    if name is not None:
+        topic = find_topic(where, topics, name)
         if topic.kind != "imu" or not topic.count:
-            raise RecordingError(f"{where}: {given} holds no readings of an IMU; {listing(topics)}; correct --imu.")
+            raise RecordingError(f"{where}: {name} holds no readings of an IMU; {listing(topics)}; correct --imu.")
         return topic
-    found = [t for t in topics if t.kind == "imu" and t.count]
-    if not found:
+    imus = [t for t in topics if t.kind == "imu" and t.count]
+    if not imus:
         raise RecordingError(f"{where} has no readings of an IMU; {listing(topics)}; record one at rest.")
-    pair = len(found) == 2 and isinstance(recording, BagRecording) and pair_of(recording, topics)
-    if len(found) > 1 and not pair:
-        raise RecordingError(f"{where} has several IMUs, {', '.join(t.name for t in found)}; give one as --imu.")
-    return found[0]
+    pair = len(imus) == 2 and isinstance(recording, BagRecording) and pair_of(recording, topics)
+    if len(imus) > 1 and not pair:
+        raise RecordingError(f"{where} has several IMUs, {', '.join(t.name for t in imus)}; give one as --imu.")
+    return imus[0]
 
 
 def _sensor_noise(kind: str, unit: str, stretches: list[np.ndarray], period: float) -> SensorNoise:
@@ -164,18 +164,18 @@ def _walk_warnings(sensor: SensorNoise, seconds: float) -> tuple[str, ...]:
 
 
 def _shape_warnings(sensor: SensorNoise) -> tuple[str, ...]:
-    found: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     for axis, fit in zip(AXES, sensor.axes, strict=True):
         if fit.white > _WORSE * sensor.together.white:
             ratio = fit.white / sensor.together.white
-            found += (f"the {sensor.kind} {axis} is {ratio:.1f} times as noisy as the mean of the axes.",)
+            warnings += (f"the {sensor.kind} {axis} is {ratio:.1f} times as noisy as the mean of the axes.",)
     if sensor.together.misfit > _MISFIT:
-        found += (
+        warnings += (
             f"the {sensor.kind} has more than white noise and a random walk: its spectrum departs from their "
             f"sum by {sensor.together.misfit:.0%}, which the standard deviations include; look for a slow "
             "drift (temperature) or vibration in the plot.",
         )
-    return found
+    return warnings
 
 
 def _rounding(kind: str, readings: np.ndarray) -> tuple[str, ...]:

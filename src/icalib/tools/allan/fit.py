@@ -59,8 +59,8 @@ class AllanFit:
 def bands_of_all(stretches: Sequence[np.ndarray], period: float) -> Bands:
     """Bands of several stretches of readings, each (n,), one every `period` seconds. The bands of all stretches are
     concatenated, as their likelihoods multiply. No difference spans two stretches."""
-    found = [bands_of(part, period) for part in stretches]
-    return Bands(*(np.concatenate([getattr(b, f.name) for b in found]) for f in fields(Bands)))
+    bands = [bands_of(part, period) for part in stretches]
+    return Bands(*(np.concatenate([getattr(b, f.name) for b in bands]) for f in fields(Bands)))
 
 
 def bands_of(readings: np.ndarray, period: float) -> Bands:
@@ -93,10 +93,10 @@ def fit_noise(bands: Bands, period: float) -> AllanFit:
     misfit, weight = 0.0, 0.5 * bands.count
     ratio, a = _most_likely(bands, weight)
     for _ in range(20):
-        found = _misfit(bands, a * (bands.slope + ratio))
-        if abs(found - misfit) <= 0.01 * misfit:
+        new_misfit = _misfit(bands, a * (bands.slope + ratio))
+        if abs(new_misfit - misfit) <= 0.01 * misfit:
             break
-        misfit, weight = found, 1.0 / (2.0 / bands.count + found**2)
+        misfit, weight = new_misfit, 1.0 / (2.0 / bands.count + new_misfit**2)
         ratio, a = _most_likely(bands, weight)
     floor = _cost(bands, weight, ratio)
     upper = _upper_ratio(bands, weight, ratio, floor)

@@ -59,6 +59,6 @@ def deviation_figure(sensor: SensorNoise, period: float) -> Figure:
 
 def _table(study: ImuNoiseStudy) -> Html:
     head = element("thead", element("tr", [element("th", header) for header in _HEADERS]))
-    found = [cells for sensor in study.sensors for cells in rows(sensor)]
-    body = element("tbody", [element("tr", [element("td", cell) for cell in cells]) for cells in found])
+    cells_of_rows = [cells for sensor in study.sensors for cells in rows(sensor)]
+    body = element("tbody", [element("tr", [element("td", cell) for cell in cells]) for cells in cells_of_rows])
     return element("div", element("table", [head, body]), "scroll")

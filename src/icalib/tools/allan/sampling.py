@@ -77,9 +77,9 @@ def _what_is_used(total_s: float, stretches: list[tuple[float, float]]) -> str:
         long, begin = stretches[0]
         return f"only the longest stretch at rest of {total_s:.0f} s is used, {long:.0f} s from {begin:.0f} s on."
     listed = ", ".join(f"{long:.0f} s from {begin:.0f} s on" for long, begin in stretches)
-    whole = sum(long for long, _ in stretches)
+    used_s = sum(long for long, _ in stretches)
     return (
-        f"only the {len(stretches)} longest stretches at rest of {total_s:.0f} s are used, {whole:.0f} s in "
+        f"only the {len(stretches)} longest stretches at rest of {total_s:.0f} s are used, {used_s:.0f} s in "
         f"total: {listed}."
     )
 
@@ -87,7 +87,7 @@ def _what_is_used(total_s: float, stretches: list[tuple[float, float]]) -> str:
 def _without_glitches(readings: np.ndarray, name: str) -> tuple[np.ndarray, tuple[str, ...]]:
     """`readings` (n, 6) in which glitches, single readings far off both neighbours, are replaced by the mean of these;
     and a warning with their number."""
-    found = np.zeros(readings.shape, bool)
+    is_glitch = np.zeros(readings.shape, bool)
     step = _rounding_step([readings])
     for k, values in enumerate(readings.T if len(readings) >= 2 * _NEAR else ()):
         off = np.abs(values[1:-1] - 0.5 * (values[:-2] + values[2:]))
@@ -97,13 +97,13 @@ def _without_glitches(readings: np.ndarray, name: str) -> tuple[np.ndarray, tupl
         for j in (-3, -2, 2, 3):
             np.maximum(near, padded[_NEAR + j : len(padded) - _NEAR + j], out=near)
         step_size = np.abs(values[2:] - values[:-2])  # large if the IMU is tilted, small about a glitch
-        found[1:-1, k] = off > np.maximum(_GLITCH * usual, _ALONE * np.maximum(near, step_size))
-    if not found.any():
+        is_glitch[1:-1, k] = off > np.maximum(_GLITCH * usual, _ALONE * np.maximum(near, step_size))
+    if not is_glitch.any():
         return readings, ()
-    at, axis = np.nonzero(found)
+    at, axis = np.nonzero(is_glitch)
     repaired = readings.copy()
     repaired[at, axis] = 0.5 * (readings[at - 1, axis] + readings[at + 1, axis])
-    return repaired, (f"{int(found.any(axis=1).sum())} readings of {name} are outliers and were removed.",)
+    return repaired, (f"{int(is_glitch.any(axis=1).sum())} readings of {name} are outliers and were removed.",)
 
 
 def _even(
@@ -125,8 +125,8 @@ def _even(
     if not missing.any():
         return np.split(readings, cuts), begins, period, ()
     parts = np.split(readings, cuts)
-    own = np.split(missing, np.cumsum([len(part) - 1 for part in parts])[:-1])
-    filled = [_filled(part, lost) for part, lost in zip(parts, own, strict=True)]
+    missing_by_part = np.split(missing, np.cumsum([len(part) - 1 for part in parts])[:-1])
+    filled = [_filled(part, count) for part, count in zip(parts, missing_by_part, strict=True)]
     sentence = (
         f"{name} has {int(gap.sum())} gaps, the longest of {joined.max():.3g} s; {int(missing.sum())} of "
         f"{sum(map(len, filled))} readings were interpolated linearly."
@@ -154,13 +154,13 @@ def _disturbed(parts: list[np.ndarray], window: int) -> list[np.ndarray]:
     quietest, loudest = limits
     jump = np.maximum(_JUMP, _SURE * quietest / np.sqrt(window))
     middle = np.nanmedian(np.where(np.concatenate(noises) <= loudest, np.concatenate(means), np.nan), axis=0)[:3]
-    found = []
+    disturbed = []
     for mean, noise in zip(means, noises, strict=True):
         loud = np.pad(np.any(noise > loudest, axis=1), 1)
         loud = loud[:-2] | loud[1:-1] | loud[2:]  # the windows before and after, too
         moved = (np.abs(np.diff(mean, axis=0, prepend=mean[:1])) > jump).any(axis=1)
-        found.append(loud | moved | (np.abs(mean[:, :3] - middle) > _OFF_RAD_S).any(axis=1))
-    return found
+        disturbed.append(loud | moved | (np.abs(mean[:, :3] - middle) > _OFF_RAD_S).any(axis=1))
+    return disturbed
 
 
 def _limits(windows: list[np.ndarray], noises: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:

@@ -80,11 +80,11 @@ def noise_table(study: ImuNoiseStudy) -> Table:
 
 def rows(sensor: SensorNoise) -> list[tuple[str, str, str, str]]:
     """Rows of one sensor: units, each axis, all together. Cells: name, noise density, bias walk, bias instability."""
-    found = [(sensor.kind, *units(sensor), sensor.unit)]
+    table_rows = [(sensor.kind, *units(sensor), sensor.unit)]
     for k, (name, fit) in enumerate([*zip(AXES, sensor.axes, strict=True), ("together", sensor.together)]):
         walk = with_std(fit.walk, fit.walk_std) if fit.resolved else _short(f"below {fit.walk_upper:.1e}")
-        found.append((f"  {name}", with_std(fit.white, fit.white_std), walk, _instability(sensor, k)))
-    return found
+        table_rows.append((f"  {name}", with_std(fit.white, fit.white_std), walk, _instability(sensor, k)))
+    return table_rows
 
 
 def with_std(value: float, std: float) -> str:

@@ -1,15 +1,15 @@
 """Many independent tasks on local processes or a Dask cluster; finished tasks are stored, so that a rerun resumes."""
 
-from icalib.tools.batch.alone import alone
-from icalib.tools.batch.files import replacing, write_whole
+from icalib.tools.batch.files import replacing, write_atomically
+from icalib.tools.batch.lock import exclusive_lock
 from icalib.tools.batch.program import program
 from icalib.tools.batch.records import check_worker, plain_record, record_json, sentence_on
-from icalib.tools.batch.workers import Crew, Lost, run_all
+from icalib.tools.batch.workers import Crew, FailedTask, run_all
 
 __all__ = [
     "Crew",
-    "Lost",
-    "alone",
+    "FailedTask",
+    "exclusive_lock",
     "check_worker",
     "plain_record",
     "program",
@@ -17,5 +17,5 @@ __all__ = [
     "replacing",
     "run_all",
     "sentence_on",
-    "write_whole",
+    "write_atomically",
 ]

@@ -11,7 +11,7 @@ from icalib.base.staging import staged
 from icalib.errors import CalibrationError
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_atomically(path: Path, content: bytes) -> None:
     """Writes the file atomically: readers see the old content or the new one. Raises CalibrationError if it fails."""
     with replacing(path) as part, part.open("wb") as file:
         file.write(content)

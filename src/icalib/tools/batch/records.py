@@ -26,17 +26,17 @@ def plain_record(text: bytes, form: int) -> dict[str, Any]:
     return plain
 
 
-def sentence_on(caught: Exception) -> str:
+def sentence_on(error: Exception) -> str:
     """The message for the record of a failed task, which does not stop the others. An unexpected exception is reported
     as a fault of icalib."""
-    if isinstance(caught, CalibrationError):
-        return str(caught)
-    return f"the program failed ({type(caught).__name__}: {caught}), which is a fault of icalib; please report it."
+    if isinstance(error, CalibrationError):
+        return str(error)
+    return f"the program failed ({type(error).__name__}: {error}), which is a fault of icalib; please report it."
 
 
-def check_worker(by: str, here: str) -> None:
-    """Raises CalibrationError if the worker's program digest `by` differs from the digest `here` on this machine."""
-    if by != here:
+def check_worker(worker_program: str, local_program: str) -> None:
+    """Raises CalibrationError if the digest of the worker's program differs from that on this machine."""
+    if worker_program != local_program:
         raise CalibrationError(
             "a worker of the cluster runs another version of icalib than this machine; install the same "
             "version everywhere."

@@ -38,7 +38,7 @@ class Crew:
 
 
 @dataclass(frozen=True)
-class Lost:
+class FailedTask:
     """Result of a task that could not be run, because its worker died repeatedly or failed; sentence: the message."""
 
     sentence: str
@@ -51,7 +51,7 @@ def cores() -> int:
 
 def run_all(
     work: Callable[[Task], Answer], tasks: Iterable[Task], crew: Crew
-) -> Generator[tuple[Task, Answer | Lost], None, None]:
+) -> Generator[tuple[Task, Answer | FailedTask], None, None]:
     """Runs `work` on each task, and yields pairs of task and result as they finish, in any order. `work` must be a
     function of a module, so that it can be pickled, and must not raise.
 
@@ -89,7 +89,7 @@ def _client(distributed: Any, crew: Crew, stack: ExitStack) -> Any:
 
 
 def _answer(distributed: Any, future: Any) -> Any:
-    """The result of a finished task, or `Lost`. Raises CalibrationError if the connection to the scheduler is lost."""
+    """Result of a finished task, or `FailedTask`. Raises CalibrationError if the connection to Dask is lost."""
     try:
         error = future.exception()
         if error is None:
@@ -100,5 +100,7 @@ def _answer(distributed: Any, future: Any) -> Any:
         ) from None
     if isinstance(error, distributed.KilledWorker):
         times = error.allowed_failures + 1
-        return Lost(f"its worker died {times} times at this task; give it more memory.")
-    return Lost(f"its worker failed to run it ({type(error).__name__}: {error}); install the same icalib everywhere.")
+        return FailedTask(f"its worker died {times} times at this task; give it more memory.")
+    return FailedTask(
+        f"its worker failed to run it ({type(error).__name__}: {error}); install the same icalib everywhere."
+    )

@@ -155,21 +155,21 @@ def _fits_of_fixed(
 
 def _undetermined(c: Calibration) -> list[str]:
     """Names of groups that are undetermined; a lens is classified by the uncertainty of its projection."""
-    found = []
+    names = []
     for g in c.groups:
         if g.columns is None or g.name in AUXILIARY or g.sensor not in c.rig["sensors"] or g.mode == "prior":
             continue
         lens = g.name in LENS and g.sensor in c.cameras
         if (lens_verdict(c, g.sensor) == "undetermined") if lens else ("undetermined" in g.verdict):
-            found.append(_block(c, g))
-    return list(dict.fromkeys(found))
+            names.append(_block(c, g))
+    return list(dict.fromkeys(names))
 
 
 def _fixed(c: Calibration) -> list[str]:
     """Names of groups that the rig file fixes, without the pose of the reference sensor, which is the identity."""
-    own = [g for g in c.groups if g.columns is None and g.sensor in c.rig["sensors"] and g.name not in AUXILIARY]
+    groups = [g for g in c.groups if g.columns is None and g.sensor in c.rig["sensors"] and g.name not in AUXILIARY]
     fixed = [
-        _block(c, g) for g in own if g.mode == "fixed" and not (g.sensor == c.reference and g.name in MOUNTED_NAMES)
+        _block(c, g) for g in groups if g.mode == "fixed" and not (g.sensor == c.reference and g.name in MOUNTED_NAMES)
     ]
     return list(dict.fromkeys(fixed))
 
@@ -180,7 +180,7 @@ def _block(c: Calibration, g: ParameterGroup) -> str:
 
 
 def _drifts(old: Calibration, new: Calibration) -> list[GroupDifference]:
-    found = []
+    drifts = []
     before = {(g.sensor, g.name): g for g in old.groups if g.columns is not None}
     for g in new.groups:
         o = before.get((g.sensor, g.name))
@@ -188,9 +188,9 @@ def _drifts(old: Calibration, new: Calibration) -> list[GroupDifference]:
             continue
         change, total = so3.value_change(o.value, g.value), joint_covariance(old, [o]) + joint_covariance(new, [g])
         std = np.sqrt(np.diag(total))
-        found.append(
+        drifts.append(
             GroupDifference(
                 g.sensor, g.name, g.labels, g.unit, tuple(change.tolist()), tuple(std.tolist()), sigmas(change, total)
             )
         )
-    return found
+    return drifts

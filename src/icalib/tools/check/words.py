@@ -18,18 +18,20 @@ _EXTRINSICS = ("rotation", "translation")
 
 def lines(check: Check) -> list[str]:
     """Lines to print: residuals, changes, notes on the new result, and the verdict as the last line."""
-    found = []
+    text_lines = []
     if check.fits[1]:
-        found.append("Residuals on the new recording with the calibration fixed (in the calibration, calibrated anew):")
-        found += [f"  {line}" for line in _fits(check.fits)]
+        text_lines.append(
+            "Residuals on the new recording with the calibration fixed (in the calibration, calibrated anew):"
+        )
+        text_lines += [f"  {line}" for line in _fit_lines(check.fits)]
     elif check.new is not None:
-        found.append("Residuals: the new recording has no solution with the calibration fixed.")
+        text_lines.append("Residuals: the new recording has no solution with the calibration fixed.")
     if check.comparison is not None:
-        found.append("Changes from the calibration (A) to the new recording (B):")
+        text_lines.append("Changes from the calibration (A) to the new recording (B):")
         for d in sorted(check.tested, key=lambda d: d not in check.changed):
-            found.append(f"  {'CHANGED' if d in check.changed else 'same   '}  {sentence(d, check.comparison)}")
+            text_lines.append(f"  {'CHANGED' if d in check.changed else 'same   '}  {sentence(d, check.comparison)}")
     notes = () if check.new is None else check.new.reasons
-    return [*found, *(f"Note on the new recording: {n}" for n in notes if n != check.reason), verdict(check)]
+    return [*text_lines, *(f"Note on the new recording: {n}" for n in notes if n != check.reason), verdict(check)]
 
 
 def verdict(check: Check) -> str:
@@ -53,7 +55,7 @@ def named(check: Check) -> list[str]:
     poses = [d for d in check.changed if d.what in _EXTRINSICS]
     words = []
     if poses:
-        moved = _moved(check.tested, poses)
+        moved = _moved_sensor(check.tested, poses)
         if moved:
             words.append(f"the pose of {moved} ({_most([d for d in poses if moved in (d.sensor, d.frame)])})")
         else:
@@ -85,13 +87,13 @@ def check_json(check: Check) -> str:
     return printable(json_text(plain))
 
 
-def _moved(differences: Sequence[Difference], changed: Sequence[Difference]) -> str:
+def _moved_sensor(differences: Sequence[Difference], changed: Sequence[Difference]) -> str:
     """The sensor that is part of every changed pose and of no unchanged one; "" unless there is exactly one."""
     pairs = {(d.sensor, d.frame) for d in differences if d.what in _EXTRINSICS}
     off = {(d.sensor, d.frame) for d in changed}
     named = {name for pair in off for name in pair}
-    found = [n for n in sorted(named) if all((n in pair) == (pair in off) for pair in pairs)]
-    return found[0] if len(found) == 1 else ""
+    candidates = [n for n in sorted(named) if all((n in pair) == (pair in off) for pair in pairs)]
+    return candidates[0] if len(candidates) == 1 else ""
 
 
 def _most(changed: Sequence[Difference]) -> str:
@@ -99,17 +101,17 @@ def _most(changed: Sequence[Difference]) -> str:
     return f"{max(known):.1f} sigma" if known else "beyond the tolerance"
 
 
-def _fits(fits: tuple[tuple[SensorFit, ...], ...]) -> list[str]:
+def _fit_lines(fits: tuple[tuple[SensorFit, ...], ...]) -> list[str]:
     by_kind = [{(f.sensor, f.kind): f for f in one} for one in fits]
-    found = []
+    fit_lines = []
     for key, fixed in by_kind[1].items():
         others = [one[key] for one in (by_kind[0], by_kind[2]) if key in one]
         words = f"{fixed.sensor} {fixed.kind}: chi^2 per degree of freedom {chi2_words(fixed)}"
         words += f" ({', '.join(chi2_words(f) for f in others)})"
         if fixed.rms is not None:
             words += f", RMS {rms_words(fixed)} ({', '.join(rms_words(f) for f in others)})"
-        found.append(words)
-    return found
+        fit_lines.append(words)
+    return fit_lines
 
 
 def _plain_fit(f: SensorFit) -> dict[str, Any]:

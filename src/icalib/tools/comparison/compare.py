@@ -133,13 +133,13 @@ def compare_sides(a: Side, b: Side, tolerances: ComparisonTolerances | None = No
     pair = _Pair(a, b, tolerances or ComparisonTolerances(), limit)
     shared = [name for name in a.poses if name in b.poses]
     reference = a.body if a.body == b.body else next(iter(shared), a.body)
-    found = tuple(_poses(pair, reference, shared)) + tuple(_quantities(pair)) + tuple(_lenses(pair))
-    if not found:
+    differences = tuple(_poses(pair, reference, shared)) + tuple(_quantities(pair)) + tuple(_lenses(pair))
+    if not differences:
         raise CalibrationError(
             f"{a.path} ({_names(a)}) and {b.path} ({_names(b)}) have nothing in common to compare; the names "
             "of sensors must match, or give --frame SENSOR=NAME."
         )
-    return Comparison(a, b, reference, found, _notes(a, b, shared))
+    return Comparison(a, b, reference, differences, _notes(a, b, shared))
 
 
 def _names(side: Side) -> str:
@@ -235,6 +235,6 @@ def distance_px(a: LensSide, b: LensSide) -> tuple[float, float]:
     u, v = np.meshgrid(np.linspace(0, width - 1, _GRID[0]), np.linspace(0, height - 1, _GRID[1]))
     uv = np.stack([u.ravel(), v.ravel()], axis=1)
     rays, ok = camera_model(a.model).unproject(a.params, uv)
-    there, seen = camera_model(b.model).project(b.params, rays[ok])
-    off = np.linalg.norm(there - uv[ok], axis=1)[seen]
+    projections, valid = camera_model(b.model).project(b.params, rays[ok])
+    off = np.linalg.norm(projections - uv[ok], axis=1)[valid]
     return float(np.sqrt((off**2).mean())), float(off.max())

@@ -36,34 +36,34 @@ def side_of_kalibr(root: YamlValue) -> Side:
     parts = {"imu0": root} if _KALIBR_NOISE["gyro"] in entries else {n: v for n, v in entries.items() if v.is_mapping}
     cameras = {n: v.entries() for n, v in parts.items() if "camera_model" in v.entries()}
     imus = {n: v.entries() for n, v in parts.items() if _KALIBR_NOISE["gyro"] in v.entries()}
-    has_imu = bool(imus) or any({"T_cam_imu", "T_imu_cam"} & set(found) for found in cameras.values())
+    has_imu = bool(imus) or any({"T_cam_imu", "T_imu_cam"} & set(fields) for fields in cameras.values())
     body = next(iter(imus), "imu") if has_imu else next(iter(cameras))
     poses = {body: np.eye(4)}
-    for i, (name, found) in enumerate(cameras.items()):
-        poses[name] = _camera_pose(root, name, found, poses, list(cameras)[i - 1] if i else None)
+    for i, (name, fields) in enumerate(cameras.items()):
+        poses[name] = _camera_pose(root, name, fields, poses, list(cameras)[i - 1] if i else None)
     quantities: dict[tuple[str, str], Quantity] = {}
-    for name, found in cameras.items():
-        if "timeshift_cam_imu" in found:
-            shift = np.array([found["timeshift_cam_imu"].number()])
+    for name, fields in cameras.items():
+        if "timeshift_cam_imu" in fields:
+            shift = np.array([fields["timeshift_cam_imu"].number()])
             quantities[name, "time_offset"] = quantity(TIME_OFFSET, shift, unknown(1))
-    for name, found in list(imus.items())[:1]:
-        parts[name].record(tuple(_KALIBR_NOISE.values()), tuple(k for k in found if k not in _KALIBR_NOISE.values()))
-        quantities |= noise_quantities(name, {key: found[_KALIBR_NOISE[key]].positive() for key in DENSITIES})
-    lenses = {n: lens for n, found in cameras.items() if (lens := _lens(found)) is not None}
+    for name, fields in list(imus.items())[:1]:
+        parts[name].record(tuple(_KALIBR_NOISE.values()), tuple(k for k in fields if k not in _KALIBR_NOISE.values()))
+        quantities |= noise_quantities(name, {key: fields[_KALIBR_NOISE[key]].positive() for key in DENSITIES})
+    lenses = {n: lens for n, fields in cameras.items() if (lens := _lens(fields)) is not None}
     return Side(root.file, "Kalibr file", body, has_imu, poses, quantities=quantities, lenses=lenses)
 
 
 def _camera_pose(
-    root: YamlValue, name: str, found: dict[str, YamlValue], poses: dict[str, np.ndarray], before: str | None
+    root: YamlValue, name: str, fields: dict[str, YamlValue], poses: dict[str, np.ndarray], before: str | None
 ) -> np.ndarray:
     """(4, 4) T_body_cam: from T_cam_imu, or its inverse T_imu_cam (OpenVINS), or along the chain of cameras; else
     NaN. before: name of the previous camera of the chain."""
-    if "T_cam_imu" in found:
-        return np.linalg.inv(_transform(found["T_cam_imu"]))
-    if "T_imu_cam" in found:
-        return _transform(found["T_imu_cam"])
-    if before is not None and "T_cn_cnm1" in found:
-        return poses[before] @ np.linalg.inv(_transform(found["T_cn_cnm1"]))
+    if "T_cam_imu" in fields:
+        return np.linalg.inv(_transform(fields["T_cam_imu"]))
+    if "T_imu_cam" in fields:
+        return _transform(fields["T_imu_cam"])
+    if before is not None and "T_cn_cnm1" in fields:
+        return poses[before] @ np.linalg.inv(_transform(fields["T_cn_cnm1"]))
     return poses.get(name, np.full((4, 4), np.nan))
 
 
@@ -82,17 +82,17 @@ def _transform(value: YamlValue) -> np.ndarray:
     return T
 
 
-def _lens(found: dict[str, YamlValue]) -> LensSide | None:
-    distortion = found["distortion_model"].text() if "distortion_model" in found else "none"
-    kind = (found["camera_model"].text(), distortion)
-    if kind not in MODELS or not {"intrinsics", "resolution"} <= set(found):
+def _lens(fields: dict[str, YamlValue]) -> LensSide | None:
+    distortion = fields["distortion_model"].text() if "distortion_model" in fields else "none"
+    kind = (fields["camera_model"].text(), distortion)
+    if kind not in MODELS or not {"intrinsics", "resolution"} <= set(fields):
         return None
     model, before = MODELS[kind]
-    values = found["intrinsics"].vector(before + 4)
-    if distortion != "none" and "distortion_coeffs" not in found:
-        found["distortion_model"].fail("needs distortion_coeffs beside it; add them.")
-    more = found["distortion_coeffs"].vector(4) if distortion != "none" else []
-    width, height = (side.whole(1) for side in found["resolution"].items()[:2])
+    values = fields["intrinsics"].vector(before + 4)
+    if distortion != "none" and "distortion_coeffs" not in fields:
+        fields["distortion_model"].fail("needs distortion_coeffs beside it; add them.")
+    more = fields["distortion_coeffs"].vector(4) if distortion != "none" else []
+    width, height = (side.whole(1) for side in fields["resolution"].items()[:2])
     params = np.concatenate([values[before:], values[:before], more])
     return LensSide(model, (width, height), params, unknown(len(params)))
 

@@ -49,8 +49,8 @@ def side_of_result(c: Calibration, path: str) -> Side:
                 quantities[g.sensor, g.name] = quantity(spec, g.value, joint_covariance(c, [g]), g in bad)
     if c.imu is not None:
         quantities |= noise_quantities(c.imu, c.rig["sensors"][c.imu]["noise"])
-        own = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics") and g.columns is not None]
-        for g in own:
+        intrinsics = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics") and g.columns is not None]
+        for g in intrinsics:
             quantities[c.imu, g.name] = Quantity(
                 g.name, g.labels, g.value, joint_covariance(c, [g]), g in bad, g.unit, False
             )

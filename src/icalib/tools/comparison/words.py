@@ -17,22 +17,22 @@ _TITLES = {True: "same", False: "DIFFERS"}
 def lines(comparison: Comparison) -> list[str]:
     """Lines to print: the two sides, a line for each block (differing ones first), notes, and the verdict."""
     c = comparison
-    found = [f"A: {c.a.path} ({c.a.kind})", f"B: {c.b.path} ({c.b.kind}); from A to B:"]
+    text_lines = [f"A: {c.a.path} ({c.a.kind})", f"B: {c.b.path} ({c.b.kind}); from A to B:"]
     width = max(map(len, _TITLES.values()))
     for d in sorted(c.differences, key=lambda d: not d.differs):
-        found.append(f"  {_TITLES[not d.differs]:<{width}}  {sentence(d, c)}")
-    found += [f"Note: {note}" for note in c.notes]
+        text_lines.append(f"  {_TITLES[not d.differs]:<{width}}  {sentence(d, c)}")
+    text_lines += [f"Note: {note}" for note in c.notes]
     count = sum(d.differs for d in c.differences)
-    return [*found, "The same." if c.same else f"{count} of {len(c.differences)} differ."]
+    return [*text_lines, "The same." if c.same else f"{count} of {len(c.differences)} differ."]
 
 
 def sentence(d: Difference, c: Comparison) -> str:
     """A sentence on one difference, such as "cam1 turned by 0.12 deg about its x axis, 4.0 sigma"."""
-    seen = "" if d.frame in (c.reference, d.sensor) else f" relative to {d.frame}"
+    relative = "" if d.frame in (c.reference, d.sensor) else f" relative to {d.frame}"
     match d.what:
         case "rotation":
             turn = _axis(d, "about its {} axis", "about its axis {}")
-            words = f"{d.sensor} turned by {turn}{seen}"
+            words = f"{d.sensor} turned by {turn}{relative}"
         case "translation":
             along = f"along {{}} of {d.frame}"
             words = f"{d.sensor} moved by {_axis(d, along, along)}"

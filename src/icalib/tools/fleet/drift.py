@@ -46,8 +46,8 @@ class Drift:
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors that changed. If only poses between two sensors changed, the sensor of the pair that is
         not the reference frame."""
-        own = [c for c in self.changes if c.at_its_sensor] or self.changes
-        return tuple(dict.fromkeys(c.difference.sensor for c in own))
+        changes = [c for c in self.changes if c.at_its_sensor] or self.changes
+        return tuple(dict.fromkeys(c.difference.sensor for c in changes))
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,10 @@ def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration]
         if last is not None:
             steps.append(_step(last, side, limit))
         first, last = first or side, side
-    seen = {_block(c) for s in steps for c in s.changes}
+    step_blocks = {_block(c) for s in steps for c in s.changes}
     if first is not None and last is not None and len(steps) > 1:
         slow = _step(first, last, limit)
-        steps.append(_Comparison(tuple(c for c in slow.changes if _block(c) not in seen), slow.judged))
+        steps.append(_Comparison(tuple(c for c in slow.changes if _block(c) not in step_blocks), slow.judged))
     changes = [c for s in steps for c in s.changes]
     return Drift(
         robot,
@@ -88,26 +88,26 @@ def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration]
     )
 
 
-def by_chance(judged: int, limit: float) -> float:
-    """Expected number of `judged` comparisons beyond `limit` sigmas by chance."""
-    return judged * erfc(limit / sqrt(2.0))
+def by_chance(n_tested: int, limit: float) -> float:
+    """Expected number of `n_tested` comparisons beyond `limit` sigmas by chance."""
+    return n_tested * erfc(limit / sqrt(2.0))
 
 
 def _step(a: Side, b: Side, limit: float) -> _Comparison:
     try:
-        found = compare_sides(a, b, limit=limit)
+        comparison = compare_sides(a, b, limit=limit)
     except CalibrationError as error:
         return _Comparison(notes=(str(error),))
-    changes = tuple(_change(d, found) for d in found.differences if d.differs)
-    return _Comparison(changes, sum(_judged(d) for d in found.differences), found.notes)
+    changes = tuple(_change(d, comparison) for d in comparison.differences if d.differs)
+    return _Comparison(changes, sum(_is_testable(d) for d in comparison.differences), comparison.notes)
 
 
 def _change(d: Difference, c: Comparison) -> GroupChange:
-    own = d.frame in (c.reference, d.sensor, c.a.body)
-    return GroupChange(c.a.path, c.b.path, d, sentence(d, c), own, _judged(d))
+    at_its_sensor = d.frame in (c.reference, d.sensor, c.a.body)
+    return GroupChange(c.a.path, c.b.path, d, sentence(d, c), at_its_sensor, _is_testable(d))
 
 
-def _judged(d: Difference) -> bool:
+def _is_testable(d: Difference) -> bool:
     return d.sigmas is not None and d.given_by == "both" and not d.open
 
 

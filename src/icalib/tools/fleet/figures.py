@@ -27,9 +27,9 @@ def over_time(results: list[JobResult], sensor: str) -> Figure:
 
     Undetermined entries, which are fixed to the guess, have hollow markers and no error bars.
     """
-    found = [b for r in results for b in r.record.blocks if b.sensor == sensor and _estimated(b)]
-    firsts = {b.name: b for b in reversed(found)}
-    names = list(dict.fromkeys(b.name for b in found))
+    blocks = [b for r in results for b in r.record.blocks if b.sensor == sensor and _estimated(b)]
+    firsts = {b.name: b for b in reversed(blocks)}
+    names = list(dict.fromkeys(b.name for b in blocks))
     places, dated = _places(results)
     traces = [t for k, name in enumerate(names) for t in _traces(results, places, firsts[name], k)]
     titles = [f"{n.replace('_', ' ')}{_unit_words(firsts[n])}" for n in names]

@@ -29,8 +29,8 @@ class InputHashes:
 
     def changed(self, now: InputHashes) -> str:
         """Words on the inputs that differ from `now`; "" if none does."""
-        found = [words for name, words in _CHANGED.items() if getattr(self, name) != getattr(now, name)]
-        return ", ".join(found)
+        changes = [words for name, words in _CHANGED.items() if getattr(self, name) != getattr(now, name)]
+        return ", ".join(changes)
 
 
 _CHANGED = {"rig": "the rig file changed", "recordings": "the recording changed", "program": "icalib changed"}
@@ -45,15 +45,15 @@ def _content(path: Path) -> str:
 
 def _sizes(path: Path) -> str:
     digest = hashlib.sha256(os.fsencode(path.name))
-    found = 0
+    n_files = 0
     for file in sorted(_files(path)):
         try:
-            about = file.stat()
+            status = file.stat()
         except OSError:  # a dangling link, or just deleted: the reader of the recording reports what is missing
             continue
-        digest.update(os.fsencode(f"{os.path.relpath(file, path)}\0{about.st_size}\0{about.st_mtime_ns}\0"))
-        found += 1
-    return digest.hexdigest() if found else "absent"
+        digest.update(os.fsencode(f"{os.path.relpath(file, path)}\0{status.st_size}\0{status.st_mtime_ns}\0"))
+        n_files += 1
+    return digest.hexdigest() if n_files else "absent"
 
 
 def _files(path: Path) -> Iterator[Path]:

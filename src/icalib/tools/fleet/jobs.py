@@ -31,30 +31,34 @@ def load_jobs(path: str | Path) -> tuple[Job, ...]:
     Raises RigError, one sentence naming file, line, field, what is wrong and what to do.
     """
     root = read_yaml(Path(path), "file of jobs")
-    found = root.record(("jobs",), ("defaults",))
-    defaults = found["defaults"].record((), ("robot", "rig")) if "defaults" in found else {}
+    fields = root.record(("jobs",), ("defaults",))
+    defaults = fields["defaults"].record((), ("robot", "rig")) if "defaults" in fields else {}
     folder = Path(path).absolute().parent
-    values = found["jobs"].items()
+    values = fields["jobs"].items()
     if not values:
-        found["jobs"].fail("has no job; add one with robot, rig and recording.")
+        fields["jobs"].fail("has no job; add one with robot, rig and recording.")
     jobs = tuple(_job(value, defaults, folder) for value in values)
     _refuse_twins(jobs, values)
     return jobs
 
 
 def _job(value: YamlValue, defaults: dict[str, YamlValue], folder: Path) -> Job:
-    own = value.record(("recording",), ("name", "robot", "rig", "time"))
-    found = defaults | own
+    job_fields = value.record(("recording",), ("name", "robot", "rig", "time"))
+    fields = defaults | job_fields
     for field in ("robot", "rig"):
-        if field not in found:
+        if field not in fields:
             value.fail(f"{field} is missing; add {field}, here or for all jobs in defaults.")
-    rig = folder / found["rig"].text()
+    rig = folder / fields["rig"].text()
     if not rig.is_file():
-        found["rig"].fail(f"{rig} does not exist; correct the path of the rig file.")
-    robot = found["robot"].text()
-    recordings = tuple(folder / text for text in _texts(found["recording"]))
-    name = _name(own["name"]) if "name" in own else _UNFIT.sub("_", f"{robot}-{recordings[0].name}").lstrip(".-")[:100]
-    return Job(name or "_", robot, rig, recordings, _time(own["time"]) if "time" in own else None)
+        fields["rig"].fail(f"{rig} does not exist; correct the path of the rig file.")
+    robot = fields["robot"].text()
+    recordings = tuple(folder / text for text in _texts(fields["recording"]))
+    name = (
+        _name(job_fields["name"])
+        if "name" in job_fields
+        else _UNFIT.sub("_", f"{robot}-{recordings[0].name}").lstrip(".-")[:100]
+    )
+    return Job(name or "_", robot, rig, recordings, _time(job_fields["time"]) if "time" in job_fields else None)
 
 
 def _texts(value: YamlValue) -> list[str]:
@@ -76,16 +80,16 @@ def _name(value: YamlValue) -> str:
 
 def _time(value: YamlValue) -> datetime:
     try:
-        found = datetime.fromisoformat(value.text())
+        time = datetime.fromisoformat(value.text())
     except ValueError:
         value.fail(f"must be a date or time as in 2026-11-02 or 2026-11-02T13:05:00+01:00, but is {value.summary()}.")
-    return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
 
 
 def _refuse_twins(jobs: tuple[Job, ...], values: list[YamlValue]) -> None:
     """Raises RigError if two jobs have the same name, upper and lower case being equal as in some file systems."""
-    seen: dict[str, int] = {}
+    first_index: dict[str, int] = {}
     for k, job in enumerate(jobs):
-        first = seen.setdefault(job.name.casefold(), k)
+        first = first_index.setdefault(job.name.casefold(), k)
         if first != k:
             values[k].fail(f"this job and {values[first].field} are both called {job.name}; give each its own name.")

@@ -40,8 +40,8 @@ def fleet_html(fleet: Fleet, title: str) -> str:
     return document(f"Fleet of {title}", body, figures)
 
 
-def _titled(title: str, found: list[str], css: str) -> Html:
-    return Html(element("h3", title) + sentences(found, css, "")) if found else Html("")
+def _titled(title: str, lines: list[str], css: str) -> Html:
+    return Html(element("h3", title) + sentences(lines, css, "")) if lines else Html("")
 
 
 def _aside(count: int) -> Html:

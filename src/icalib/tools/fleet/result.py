@@ -68,11 +68,11 @@ class Fleet:
 def by_robot(results: tuple[JobResult, ...]) -> dict[str, list[JobResult]]:
     """Results of each robot, without failed jobs. They are sorted by time, or in the order of the file if one has no
     time."""
-    found: dict[str, list[JobResult]] = {r.job.robot: [] for r in results}
+    groups: dict[str, list[JobResult]] = {r.job.robot: [] for r in results}
     for r in results:
         if not r.failed:
-            found[r.job.robot].append(r)
-    return {robot: in_time(own) for robot, own in found.items()}
+            groups[r.job.robot].append(r)
+    return {robot: in_time(group) for robot, group in groups.items()}
 
 
 def in_time(results: list[JobResult]) -> list[JobResult]:

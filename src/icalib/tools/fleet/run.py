@@ -11,7 +11,7 @@ from icalib.base.own_files import refuse_foreign, sealed
 from icalib.base.result_files import refuse_foreign_set
 from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
-from icalib.tools.batch import Crew, Lost, alone, run_all, write_whole
+from icalib.tools.batch import Crew, FailedTask, exclusive_lock, run_all, write_atomically
 from icalib.tools.fleet.drift import drift_of
 from icalib.tools.fleet.inputs import InputHashes
 from icalib.tools.fleet.jobs import Job, load_jobs
@@ -46,11 +46,11 @@ def run_fleet(
     if not (isfinite(limit) and limit > 0.0):
         raise CalibrationError(f"the limit must be above 0 sigma, not {limit:g}; the usual limit is 3.")
     jobs, store = load_jobs(path), JobStore(Path(output))
-    with alone(store.folder):
+    with exclusive_lock(store.folder):
         refuse_foreign(store.folder / name for name in (TABLE, PAGE))
         fleet = _fleet(jobs, store, crew or Crew(), limit, progress, say)
         write_table(store.folder / TABLE, fleet.results)
-        write_whole(store.folder / PAGE, sealed(printable(fleet_html(fleet, Path(path).name)).encode()))
+        write_atomically(store.folder / PAGE, sealed(printable(fleet_html(fleet, Path(path).name)).encode()))
     return fleet
 
 
@@ -68,29 +68,31 @@ def _fleet(
     records = done | _do(tasks, store, crew, len(jobs), progress)
     results = tuple(JobResult(job, records[job.name]) for job in jobs)
     robots = by_robot(results)
-    drifts = tuple(drift_of(robot, [r.job.name for r in own], store.load, limit) for robot, own in robots.items())
+    drifts = tuple(drift_of(robot, [r.job.name for r in group], store.load, limit) for robot, group in robots.items())
     return Fleet(results, drifts, limit, again)
 
 
 def _do(tasks: list[JobTask], store: JobStore, crew: Crew, total: int, progress: Progress) -> dict[str, JobRecord]:
     """Runs the tasks, and returns their records by name. Records of jobs whose worker died are not stored, so that the
     next run tries them again. total: number of all jobs, for the progress."""
-    found: dict[str, JobRecord] = {}
+    records: dict[str, JobRecord] = {}
     before = total - len(tasks)
     if not tasks:
-        return found
+        return records
     progress(f"{before} of {total} jobs", 0.0)
     try:
         with closing(run_all(run, tasks, crew)) as outcomes:
             for task, outcome in outcomes:
                 name = task.job.name
-                if isinstance(outcome, Lost):
-                    found[name] = JobRecord(name, outcome.sentence, 0.0, None)
+                if isinstance(outcome, FailedTask):
+                    records[name] = JobRecord(name, outcome.sentence, 0.0, None)
                 else:
                     store.add(outcome)
-                    found[name] = outcome.record
-                progress(f"{before + len(found)} of {total} jobs", len(found) / len(tasks))
+                    records[name] = outcome.record
+                progress(f"{before + len(records)} of {total} jobs", len(records) / len(tasks))
     except KeyboardInterrupt:
-        kept = before + sum(r.inputs is not None for r in found.values())
-        raise KeyboardInterrupt(f"{kept} of {total} jobs are in {store.folder}; the same command resumes.") from None
-    return found
+        n_stored = before + sum(r.inputs is not None for r in records.values())
+        raise KeyboardInterrupt(
+            f"{n_stored} of {total} jobs are in {store.folder}; the same command resumes."
+        ) from None
+    return records

@@ -26,10 +26,10 @@ def changed_words(fleet: Fleet) -> str:
 
 def chance_words(fleet: Fleet) -> str:
     """A sentence that compares the number of changes with that expected by chance."""
-    judged = sum(d.judged for d in fleet.drifts)
+    n_tested = sum(d.judged for d in fleet.drifts)
     changes = sum(len(d.changes) for d in fleet.drifts)
     return (
-        f"{changes} of {judged} comparisons exceed {fleet.limit:g} sigma; about {digits(fleet.by_chance)} are "
+        f"{changes} of {n_tested} comparisons exceed {fleet.limit:g} sigma; about {digits(fleet.by_chance)} are "
         "expected by chance."
     )
 
@@ -82,8 +82,8 @@ def robot_rows(fleet: Fleet) -> list[tuple[str, int, int, str, str]]:
     """A row for each robot, with the cells of `ROBOT_HEADERS`."""
     rows = []
     for drift in fleet.drifts:
-        own = [r for r in fleet.results if r.job.robot == drift.robot]
-        rows.append((drift.robot, len(own), sum(r.failed for r in own), span_words(own), drift_cell(drift)))
+        results = [r for r in fleet.results if r.job.robot == drift.robot]
+        rows.append((drift.robot, len(results), sum(r.failed for r in results), span_words(results), drift_cell(drift)))
     return rows
 
 

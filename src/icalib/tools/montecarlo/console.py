@@ -29,16 +29,16 @@ IN_TWO_LINES = ("mean sigma", "sampled / predicted")  # headers that may wrap
 
 def print_study(study: Study, folder: Path) -> None:
     """Prints the table of blocks, failed runs, and the paths of the files on standard output."""
-    console, found = Console(), study.consistency
-    console.print(table(found))
-    for line in (answer(found), largest_words(found), *_failures(found), *_undetermined(found)):
+    console, consistency = Console(), study.consistency
+    console.print(table(consistency))
+    for line in (answer(consistency), largest_words(consistency), *_failures(consistency), *_undetermined(consistency)):
         console.print(line, markup=False)
     seconds = [r.seconds for r in study.records]
     console.print(f"A run took {np.median(seconds):.1f} s (median).", markup=False)
     console.print(f"Wrote {folder / 'consistency.json'}, consistency.html.", markup=False)
 
 
-def table(found: Consistency) -> Table:
+def table(consistency: Consistency) -> Table:
     """One row for each block, and one for all together; a NEES outside its bounds is red. The table fits into 80
     columns of text."""
     out = Table(
@@ -48,23 +48,23 @@ def table(found: Consistency) -> Table:
     for header in HEADERS:
         justify = "right" if header in NUMBERS else "left"
         out.add_column(header, justify=justify, no_wrap=header not in IN_TWO_LINES, overflow="fold")
-    for block in found.blocks:
+    for block in consistency.blocks:
         cells = [Text(cell) for cell in block_row(block)]
         if block.nees is not None:
             cells[3].stylize("green" if block.nees.consistent else "bold red")
         out.add_row(*cells)
-    if found.whole is not None:
+    if consistency.whole is not None:
         out.add_section()
-        out.add_row("all together", "", "", *nees_cells(found.whole))
+        out.add_row("all together", "", "", *nees_cells(consistency.whole))
     return out
 
 
-def _failures(found: Consistency) -> list[str]:
-    lines = [failures_words(found)]
-    lines += [f"  seed {f.seed}: {f.sentence}" for f in found.failures[:MOST_FAILURES]]
-    more = len(found.failures) - MOST_FAILURES
+def _failures(consistency: Consistency) -> list[str]:
+    lines = [failures_words(consistency)]
+    lines += [f"  seed {f.seed}: {f.sentence}" for f in consistency.failures[:MOST_FAILURES]]
+    more = len(consistency.failures) - MOST_FAILURES
     return lines + ([f"  and {more} more, in consistency.json"] if more > 0 else [])
 
 
-def _undetermined(found: Consistency) -> list[str]:
-    return [f"Undetermined in {line}" for line in undetermined_words(found)]
+def _undetermined(consistency: Consistency) -> list[str]:
+    return [f"Undetermined in {line}" for line in undetermined_words(consistency)]

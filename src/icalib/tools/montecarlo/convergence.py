@@ -60,9 +60,9 @@ def _row(runs: Sequence[RunRecord], block: GroupErrors) -> PanelRow:
     panels = []
     for k, label in enumerate(block.labels):
         curves = tuple(_curve(r, int(r.columns(block.key)[k]), scale) for r in runs if len(r.columns(block.key)))
-        own = [b.verdict[k] for r in runs for b in r.blocks if b.key == block.key]
-        times = own.count("undetermined")
-        words = f" (undetermined in {times} of {len(own)})" if times else ""
+        verdicts = [b.verdict[k] for r in runs for b in r.blocks if b.key == block.key]
+        times = verdicts.count("undetermined")
+        words = f" (undetermined in {times} of {len(verdicts)})" if times else ""
         name = block.name if label == block.name else f"{block.name} {label}"
         panels.append(Panel(f"{block.sensor} {name}{words}".replace("_", " "), unit, curves))
     return PanelRow(block.key, tuple(panels))
@@ -92,11 +92,11 @@ def plotly_figure(row: PanelRow) -> Figure:
         layout[f"yaxis{number}"] = axis(_words(panel), type="log", anchor=f"x{number}")
         axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
         for k, curve in enumerate(panel.curves):
-            own = axes | {"legendgroup": str(curve.seed), "showlegend": i == 0}
+            style = axes | {"legendgroup": str(curve.seed), "showlegend": i == 0}
             x, color = np.arange(len(curve.error)), COLORS[k % len(COLORS)]
             dashed = {"line": {"color": color, "width": 1, "dash": "dash"}, "showlegend": False}
-            traces.append(line(x, _positive(curve.error), f"seed {curve.seed}", color, **own))
-            traces.append(line(x, _positive(curve.bound), f"3 sigma, seed {curve.seed}", color, **(own | dashed)))
+            traces.append(line(x, _positive(curve.error), f"seed {curve.seed}", color, **style))
+            traces.append(line(x, _positive(curve.bound), f"3 sigma, seed {curve.seed}", color, **(style | dashed)))
     return figure(traces, height=300, **layout)
 
 

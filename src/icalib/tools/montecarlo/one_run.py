@@ -42,10 +42,10 @@ def run(task: RunTask) -> RunRecord:
         if task.guess == "drawn" or not rig.has_target:
             only = None if task.guess == "drawn" else ("intrinsics",)
             rig = with_drawn_guess(rig, task.scenario, task.seed, only=only)
-        seen = simulation.measurements
+        measurements = simulation.measurements
         if task.planes == "found":
-            seen = seen.unassociated()
-        result = calibrate_measurements(rig, seen, on_visit=visits.append)
+            measurements = measurements.unassociated()
+        result = calibrate_measurements(rig, measurements, on_visit=visits.append)
     except Exception as caught:
         return RunRecord(task.seed, sentence_on(caught), time.perf_counter() - started, program())
     return compare(task.seed, result, simulation.truth, visits, time.perf_counter() - started)

@@ -31,30 +31,30 @@ from icalib.tools.montecarlo.words import (
 MEAN = ("sensor", "kind", "mean over runs")
 
 
-def study_html(found: Consistency, identity: Identity, records: Sequence[RunRecord]) -> str:
+def study_html(consistency: Consistency, identity: Identity, records: Sequence[RunRecord]) -> str:
     """The page as one HTML document."""
     sections = [
         element("h2", "Blocks"),
-        blocks_table(found),
+        blocks_table(consistency),
         element(
             "p",
             "Sampled / predicted: square roots of the smallest and the largest eigenvalue of the sampled "
             "covariance relative to the predicted one; by chance: the range of these in 95 of 100 studies of a "
             "consistent covariance.",
         ),
-        element("p", largest_words(found)),
+        element("p", largest_words(consistency)),
         element("h2", "Mean NEES"),
         plot_place("nees"),
-        *_undetermined(found),
+        *_undetermined(consistency),
         element("h2", "Failed runs"),
-        element("p", failures_words(found)),
-        failures(found),
+        element("p", failures_words(consistency)),
+        failures(consistency),
         element("h2", "Residuals"),
-        _residuals(found),
+        _residuals(consistency),
         element("h2", "Made from"),
         table(("what", "value"), _facts(identity, records)),
     ]
-    return page(f"Consistency, {identity.scenario}", answer(found), sections, {"nees": nees_figure(found)})
+    return page(f"Consistency, {identity.scenario}", answer(consistency), sections, {"nees": nees_figure(consistency)})
 
 
 def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, Figure]) -> str:
@@ -65,25 +65,27 @@ def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, 
     return document(title, body, figures)
 
 
-def failures(found: Consistency) -> Html:
+def failures(consistency: Consistency) -> Html:
     """List of the failed runs, each with its message."""
-    return sentences([f"seed {f.seed}: {f.sentence}" for f in found.failures], "bad", "")
+    return sentences([f"seed {f.seed}: {f.sentence}" for f in consistency.failures], "bad", "")
 
 
-def blocks_table(found: Consistency) -> Html:
+def blocks_table(consistency: Consistency) -> Html:
     headers = (*HEADERS, "by chance", "verdicts")
-    body: list[tuple[str, ...]] = [(*block_row(b), chance_words(b.spread), verdict_words(b)) for b in found.blocks]
-    if found.whole is not None:
-        body.append(("all together", "", "", *nees_cells(found.whole), *[""] * (len(headers) - 5)))
+    body: list[tuple[str, ...]] = [
+        (*block_row(b), chance_words(b.spread), verdict_words(b)) for b in consistency.blocks
+    ]
+    if consistency.whole is not None:
+        body.append(("all together", "", "", *nees_cells(consistency.whole), *[""] * (len(headers) - 5)))
     return table(headers, body, NUMBERS)
 
 
-def nees_figure(found: Consistency) -> Figure:
+def nees_figure(consistency: Consistency) -> Figure:
     """Mean NEES of each block, with the 95 % bounds for a consistent covariance."""
-    known: list[tuple[str, Nees]] = [(b.key, b.nees) for b in found.blocks if b.nees is not None]
-    names = [name for name, _ in known]
-    middle = np.array([0.5 * (n.low + n.high) for _, n in known])
-    half = np.array([0.5 * (n.high - n.low) for _, n in known])
+    blocks: list[tuple[str, Nees]] = [(b.key, b.nees) for b in consistency.blocks if b.nees is not None]
+    names = [name for name, _ in blocks]
+    middle = np.array([0.5 * (n.low + n.high) for _, n in blocks])
+    half = np.array([0.5 * (n.high - n.low) for _, n in blocks])
     bounds = {
         "type": "scatter",
         "mode": "markers",
@@ -97,23 +99,23 @@ def nees_figure(found: Consistency) -> Figure:
         "type": "scatter",
         "mode": "markers",
         "x": names,
-        "y": numbers(np.array([n.mean for _, n in known])),
+        "y": numbers(np.array([n.mean for _, n in blocks])),
         "name": "mean NEES",
         "marker": {"color": COLORS[0], "size": 8},
     }
     return figure([bounds, means], xaxis=axis("", automargin=True), yaxis=axis("NEES per degree of freedom"))
 
 
-def _undetermined(found: Consistency) -> list[Html]:
+def _undetermined(consistency: Consistency) -> list[Html]:
     """Section on what was undetermined in at least one run; empty if nothing was."""
-    if not found.undetermined:
+    if not consistency.undetermined:
         return []
-    return [element("h2", "Undetermined"), sentences(undetermined_words(found), "care", "None.")]
+    return [element("h2", "Undetermined"), sentences(undetermined_words(consistency), "care", "None.")]
 
 
-def _residuals(found: Consistency) -> Html:
-    sizes = [element("h3", "chi2 per post-fit degree of freedom"), table(MEAN, map(mean_cells, found.sizes))]
-    lags = [element("h3", "Correlation with the next one in time"), table(MEAN, map(mean_cells, found.lag1))]
+def _residuals(consistency: Consistency) -> Html:
+    sizes = [element("h3", "chi2 per post-fit degree of freedom"), table(MEAN, map(mean_cells, consistency.sizes))]
+    lags = [element("h3", "Correlation with the next one in time"), table(MEAN, map(mean_cells, consistency.lag1))]
     return element("div", [element("section", sizes), element("section", lags)], "grid")
 
 

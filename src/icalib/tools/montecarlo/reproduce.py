@@ -10,7 +10,7 @@ from icalib.base.own_files import refuse_foreign, sealed
 from icalib.report.page import plot_place
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
-from icalib.tools.batch import write_whole
+from icalib.tools.batch import write_atomically
 from icalib.tools.montecarlo.convergence import plotly_figure, png, rows
 from icalib.tools.montecarlo.page import blocks_table, failures, page
 from icalib.tools.montecarlo.study import Study, StudyPlan, run_study, scenario_digest
@@ -49,18 +49,22 @@ def write_figures(output: Path, studies: dict[str, Study]) -> None:
     sections: list[Html] = []
     figures: dict[str, Figure] = {}
     for motion, study in studies.items():
-        found = study.consistency
-        sections += [element("h2", MOTIONS[motion]), element("p", answer(found)), blocks_table(found)]
-        sections += [element("p", largest_words(found)), element("p", failures_words(found)), failures(found)]
+        consistency = study.consistency
+        sections += [element("h2", MOTIONS[motion]), element("p", answer(consistency)), blocks_table(consistency)]
+        sections += [
+            element("p", largest_words(consistency)),
+            element("p", failures_words(consistency)),
+            failures(consistency),
+        ]
         drawn = rows(study.records)
         for row in drawn:
             name = f"{motion}-{row.key}"
             figures[name] = plotly_figure(row)
             sections.append(plot_place(name))
         if drawn:
-            write_whole(output / _picture(motion), sealed(png(drawn, MOTIONS[motion])))
+            write_atomically(output / _picture(motion), sealed(png(drawn, MOTIONS[motion])))
     words = "Error (lines) and 3 sigma (dashed) at the iterations of the solver, from guesses drawn about the truth."
-    write_whole(output / PAGE, sealed(page("Monte-Carlo runs of the paper", words, sections, figures).encode()))
+    write_atomically(output / PAGE, sealed(page("Monte-Carlo runs of the paper", words, sections, figures).encode()))
 
 
 def _picture(motion: str) -> str:

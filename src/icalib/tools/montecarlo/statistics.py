@@ -94,7 +94,7 @@ def spread(samples: list[Sample]) -> Spread | None:
     if len(samples) <= n or any(len(s.error) != n for s in samples):
         return None
     predicted = np.mean([s.covariance for s in samples], axis=0)
-    found = _roots(np.array([s.error for s in samples]), predicted)
+    roots = _roots(np.array([s.error for s in samples]), predicted)
     rng = np.random.default_rng(0)
     factors = np.array([_factor(s.covariance) for s in samples])
     drawn = [
@@ -102,7 +102,7 @@ def spread(samples: list[Sample]) -> Spread | None:
         for _ in range(DRAWS)
     ]
     low, high = np.quantile(drawn, [0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY], axis=0)
-    return Spread(float(found[0]), (float(low[0]), float(high[0])), float(found[-1]), (float(low[-1]), float(high[-1])))
+    return Spread(float(roots[0]), (float(low[0]), float(high[0])), float(roots[-1]), (float(low[-1]), float(high[-1])))
 
 
 def _roots(errors: np.ndarray, predicted: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from icalib.errors import CalibrationError
 from icalib.result.provenance import versions
-from icalib.tools.batch import check_worker, program, write_whole
+from icalib.tools.batch import check_worker, program, write_atomically
 from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind
 from icalib.tools.montecarlo.record import RunRecord, from_json, to_json
 
@@ -53,7 +53,7 @@ class RunStore:
             if (folder / STUDY).exists():
                 self._check()
             else:
-                write_whole(folder / STUDY, json.dumps(asdict(identity), indent=1).encode())
+                write_atomically(folder / STUDY, json.dumps(asdict(identity), indent=1).encode())
         except OSError as error:
             raise CalibrationError(
                 f"{folder} cannot be written ({error.strerror or error}); choose another folder."
@@ -65,7 +65,7 @@ class RunStore:
     def add(self, record: RunRecord) -> None:
         """Stores a record. Raises CalibrationError if the worker ran another icalib, or the file cannot be written."""
         check_worker(record.program, self.identity.program)
-        write_whole(self._file(record.seed), to_json(record))
+        write_atomically(self._file(record.seed), to_json(record))
 
     def read(self, seed: int) -> RunRecord:
         """The stored record of a seed. Raises CalibrationError if its file is damaged or missing."""
@@ -81,8 +81,8 @@ class RunStore:
     def _check(self) -> None:
         path = self.folder / STUDY
         try:
-            found = json.loads(path.read_bytes())
-            changed = [words for name, words in _CHANGED.items() if found[name] != getattr(self.identity, name)]
+            identity = json.loads(path.read_bytes())
+            changed = [words for name, words in _CHANGED.items() if identity[name] != getattr(self.identity, name)]
         except (ValueError, KeyError, TypeError) as error:
             raise CalibrationError(f"{path} is damaged; choose another folder.") from error
         if changed:

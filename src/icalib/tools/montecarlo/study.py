@@ -11,7 +11,7 @@ from pathlib import Path
 from icalib.base.own_files import refuse_foreign, sealed
 from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
-from icalib.tools.batch import Crew, alone, write_whole
+from icalib.tools.batch import Crew, exclusive_lock, write_atomically
 from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind, RunTask
 from icalib.tools.montecarlo.page import study_html
 from icalib.tools.montecarlo.record import RunRecord
@@ -71,14 +71,14 @@ def run_study(
     store = RunStore(output, Identity.of(name, digest, plan.guess, plan.planes))
     first = scenario.seed if plan.seed is None else plan.seed
     seeds = range(first, first + plan.runs)
-    with alone(output):
+    with exclusive_lock(output):
         lost = _fill(store, scenario, seeds, plan, progress)
         records = tuple(lost[seed] if seed in lost else store.read(seed) for seed in seeds)
         study = Study(store.identity, records, summarise(records))
         about = asdict(store.identity) | {"first_seed": first}
         page = printable(study_html(study.consistency, study.identity, records)).encode()
         for file, content in zip(FILES, (consistency_json(study.consistency, about), page), strict=True):
-            write_whole(output / file, sealed(content))
+            write_atomically(output / file, sealed(content))
     return study
 
 

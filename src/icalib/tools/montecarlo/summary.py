@@ -96,12 +96,12 @@ def summarise(records: Sequence[RunRecord]) -> Consistency:
     for record in good:
         for block in record.blocks:
             first.setdefault(block.key, block)
-    whole = _samples(good, tuple(first))
+    all_samples = _samples(good, tuple(first))
     errors = [error for r in good for error in _errors(r)]
     return Consistency(
         len(ordered),
         tuple(Failure(r.seed, r.failure) for r in ordered if r.failure),
-        nees(whole) if whole else None,
+        nees(all_samples) if all_samples else None,
         largest(errors) if errors else None,
         tuple(_block(good, block) for block in first.values()),
         _means([(s.sensor, s.kind, s.chi2, s.dof) for r in good for s in r.sizes if s.dof > 0.0]),
@@ -110,9 +110,9 @@ def summarise(records: Sequence[RunRecord]) -> Consistency:
     )
 
 
-def consistency_json(found: Consistency, study: Mapping[str, object]) -> bytes:
+def consistency_json(consistency: Consistency, study: Mapping[str, object]) -> bytes:
     """Content of consistency.json; study: inputs of the runs, see `Identity`."""
-    return json.dumps({"format": "icalib consistency", "study": dict(study)} | asdict(found), indent=1).encode()
+    return json.dumps({"format": "icalib consistency", "study": dict(study)} | asdict(consistency), indent=1).encode()
 
 
 def counting(record: RunRecord, key: str) -> np.ndarray:
@@ -134,12 +134,12 @@ def _errors(record: RunRecord) -> list[tuple[float, str, int]]:
 
 def _samples(records: Sequence[RunRecord], keys: tuple[str, ...]) -> list[Sample]:
     """Sample of the blocks `keys` together for each run, without undetermined entries and runs without entries."""
-    found = []
+    samples = []
     for r in records:
         k = np.concatenate([np.arange(0), *(counting(r, key) for key in keys)])
         if len(k):
-            found.append(Sample(r.seed, r.error[k], r.covariance[np.ix_(k, k)]))
-    return found
+            samples.append(Sample(r.seed, r.error[k], r.covariance[np.ix_(k, k)]))
+    return samples
 
 
 def _block(records: Sequence[RunRecord], block: GroupErrors) -> BlockSummary:
@@ -161,9 +161,9 @@ def _block(records: Sequence[RunRecord], block: GroupErrors) -> BlockSummary:
 
 
 def _entry(records: Sequence[RunRecord], block: GroupErrors, index: int) -> Entry:
-    own = [(r, r.columns(block.key)[index]) for r in records if len(r.columns(block.key))]
-    verdicts = Counter(next(b for b in r.blocks if b.key == block.key).verdict[index] for r, _ in own)
-    counted = [(r.error[k], r.covariance[k, k]) for r, k in own if k in counting(r, block.key)]
+    columns = [(r, r.columns(block.key)[index]) for r in records if len(r.columns(block.key))]
+    verdicts = Counter(next(b for b in r.blocks if b.key == block.key).verdict[index] for r, _ in columns)
+    counted = [(r.error[k], r.covariance[k, k]) for r, k in columns if k in counting(r, block.key)]
     errors, variances = np.array(counted).reshape(-1, 2).T
     return Entry(
         block.labels[index], len(counted), _root_mean(errors**2), _root_mean(variances), dict(verdicts.most_common())
@@ -177,11 +177,11 @@ def _root_mean(squares: np.ndarray) -> float | None:
 def _means(figures: list[tuple[str, str, float, float]]) -> tuple[Mean, ...]:
     """Weighted means by sensor and kind, in order of first appearance: sum of the amounts over sum of the weights, from
     tuples (sensor, kind, amount, weight) of all runs."""
-    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    pairs_by_key: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for sensor, kind, *pair in figures:
-        found.setdefault((sensor, kind), []).append((pair[0], pair[1]))
+        pairs_by_key.setdefault((sensor, kind), []).append((pair[0], pair[1]))
     out = []
-    for (sensor, kind), pairs in found.items():
+    for (sensor, kind), pairs in pairs_by_key.items():
         amounts, weights = np.array(pairs).T
         mean, n = amounts.sum() / weights.sum(), len(pairs)
         error = np.std(amounts - mean * weights, ddof=1) / (weights.mean() * np.sqrt(n)) if n > 1 else 0.0

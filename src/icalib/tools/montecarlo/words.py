@@ -26,20 +26,20 @@ def block_row(block: BlockSummary) -> tuple[str, ...]:
     )
 
 
-def nees_cells(found: Nees | None) -> tuple[str, str]:
+def nees_cells(nees: Nees | None) -> tuple[str, str]:
     """Mean NEES per degree of freedom, and its bounds."""
-    return ("", "") if found is None else (f"{found.mean:.3f}", f"{found.low:.2f}-{found.high:.2f}")
+    return ("", "") if nees is None else (f"{nees.mean:.3f}", f"{nees.low:.2f}-{nees.high:.2f}")
 
 
-def spread_words(found: Spread | None) -> str:
-    return "" if found is None else f"{found.least:.2f}-{found.largest:.2f}"
+def spread_words(spread: Spread | None) -> str:
+    return "" if spread is None else f"{spread.least:.2f}-{spread.largest:.2f}"
 
 
-def chance_words(found: Spread | None) -> str:
+def chance_words(spread: Spread | None) -> str:
     """Bounds of the spread for a consistent covariance, smallest then largest; "" without a spread."""
-    if found is None:
+    if spread is None:
         return ""
-    (a, b), (c, d) = found.least_bounds, found.largest_bounds
+    (a, b), (c, d) = spread.least_bounds, spread.largest_bounds
     return f"{a:.2f}-{b:.2f}, {c:.2f}-{d:.2f}"
 
 
@@ -56,9 +56,9 @@ def mean_cells(mean: Mean) -> tuple[str, str, str]:
     return mean.sensor, mean.kind, f"{mean.mean:.3f} +- {mean.standard_error:.3f}"
 
 
-def answer(found: Consistency) -> str:
+def answer(consistency: Consistency) -> str:
     """The result of the study in one sentence: how many blocks have a NEES within its bounds."""
-    counted = [b for b in found.blocks if b.nees is not None]
+    counted = [b for b in consistency.blocks if b.nees is not None]
     if not counted:
         return "No run reached a result."
     out = [b.key for b in counted if b.nees is not None and not b.nees.consistent]
@@ -68,9 +68,9 @@ def answer(found: Consistency) -> str:
     return f"{inside}; {by_chance:.1f} are expected outside by chance{named}."
 
 
-def largest_words(found: Consistency) -> str:
+def largest_words(consistency: Consistency) -> str:
     """A sentence on the largest single error, and its probability by chance."""
-    one = found.largest
+    one = consistency.largest
     if one is None:
         return "No number was determined in any run."
     share = "less than 1" if one.chance < 0.01 else f"at most {100 * one.chance:.0f}"
@@ -80,13 +80,15 @@ def largest_words(found: Consistency) -> str:
     )
 
 
-def failures_words(found: Consistency) -> str:
-    if not found.failures:
-        return f"All {found.runs} runs reached a result."
-    return f"{len(found.failures)} of {found.runs} runs failed, and are excluded from the rest of this page."
+def failures_words(consistency: Consistency) -> str:
+    if not consistency.failures:
+        return f"All {consistency.runs} runs reached a result."
+    return (
+        f"{len(consistency.failures)} of {consistency.runs} runs failed, and are excluded from the rest of this page."
+    )
 
 
-def undetermined_words(found: Consistency) -> list[str]:
+def undetermined_words(consistency: Consistency) -> list[str]:
     """A line for each undetermined combination, with the number of runs in which it was undetermined."""
-    reached = found.runs - len(found.failures)
-    return [f"{n} of {reached} runs: {what}" for what, n in found.undetermined.items()]
+    reached = consistency.runs - len(consistency.failures)
+    return [f"{n} of {reached} runs: {what}" for what, n in consistency.undetermined.items()]

@@ -59,10 +59,10 @@ class CubicPath:
         far = self.rate[k + 1]
         far = far + 0.5 * np.cross(turn, far) + np.cross(turn, np.cross(turn, far)) / 12.0
         phi = hermite(s, turn, h[:, None] * self.rate[k], h[:, None] * far)
-        moved = self.position[k + 1] - self.position[k]
-        way = hermite(s, moved, h[:, None] * self.slope[k], h[:, None] * self.slope[k + 1])
+        chord = self.position[k + 1] - self.position[k]
+        displacement = hermite(s, chord, h[:, None] * self.slope[k], h[:, None] * self.slope[k + 1])
         R = self.rotation[k] @ so3.exp_many(np.ascontiguousarray(phi))
-        return R, self.position[k] + way, inside | at_keyframe
+        return R, self.position[k] + displacement, inside | at_keyframe
 
 
 def _slopes(between: np.ndarray, step: np.ndarray, usable: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ _HEIGHTS = (2.0, 98.0)  # percentiles of the height between which colours change
 Progress = Callable[[str, float], None]
 
 
-class ShownScans(Protocol):
+class ScanPoints(Protocol):
     """The part of a stream of scans that is shown: see `LidarStream`."""
 
     @property
@@ -155,7 +155,7 @@ class Recorded:
         """Sends images of the camera `name` one by one; images that are left out are not decoded."""
         seconds = self._clock(name).seconds(self.recording.stamps(topic))
         count = len(self._during(name, np.sort(seconds)))
-        clock, damaged, shown = self._clock(name), 0, 0
+        clock, damaged, n_sent = self._clock(name), 0, 0
         within = (p for p in self.recording.payloads(topic) if clock.within(_instant(clock, p.stamp_ns))[0])
         for payload in islice(within, 0, None, _stride(count, MOST_IMAGES)):
             try:
@@ -164,12 +164,12 @@ class Recorded:
                 damaged += 1
                 continue
             s.at(f"{place(self.calibration, name)}/image", float(_instant(clock, payload.stamp_ns)[0]), image)
-            shown += 1
+            n_sent += 1
         notes = [f"{name}: {damaged} damaged images are not shown."] if damaged else []
         return notes + _thinned(name, count, MOST_IMAGES, "images")
 
     def _scans(self, s: RerunStream, sensor: Sensor) -> list[str]:
-        stream: ShownScans = call_kind(sensor.sensor_type, "read", "scans", self.recording, sensor)
+        stream: ScanPoints = call_kind(sensor.sensor_type, "read", "scans", self.recording, sensor)
         seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
         inside = self._during(sensor.name, seconds)
         heights, path = None, CubicPath.of(self.calibration)
@@ -187,16 +187,16 @@ class Recorded:
             *_thinned(sensor.name, most, MOST_POINTS, "points of a scan"),
         ]
 
-    def points_in_world(self, path: CubicPath, name: str, stream: ShownScans, scan: int, second: float) -> np.ndarray:
+    def points_in_world(self, path: CubicPath, name: str, stream: ScanPoints, scan: int, second: float) -> np.ndarray:
         """(n, 3) float32 points of scan number `scan` in the world [m], each by the pose of the body at its instant
         (motion compensation). second: time of the scan in the result.
 
         At most MOST_POINTS points are used, evenly spaced; points at instants without a known pose are left out."""
         begin, end = (int(x) for x in stream.start[scan : scan + 2])
-        own = slice(begin, end, _stride(end - begin, MOST_POINTS))
+        rows = slice(begin, end, _stride(end - begin, MOST_POINTS))
         T = self.calibration.T_imu_sensor(name)
-        R, p, known = path.at(second + stream.offset_s[own].astype(np.float64))
-        on_body = stream.xyz[own].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        R, p, known = path.at(second + stream.offset_s[rows].astype(np.float64))
+        on_body = stream.xyz[rows].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         world = np.einsum("nij,nj->ni", R, on_body) + p
         return world[known].astype(np.float32)
 

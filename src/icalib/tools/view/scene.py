@@ -112,9 +112,9 @@ def log_planes(s: RerunStream, c: Calibration) -> None:
         of, size = c.recording_of(cloud.seconds), cloud.size
         top = _WORST_OF_SCALE * float(np.sqrt(np.mean(size**2))) if len(size) else 1.0
         for k, span in enumerate(spans(c)):
-            own = of == k
-            colors, radius = by_value(size[own], 0.0, top), s.rr.Radius.ui_points(POINT)
-            points = s.rr.Points3D(cloud.points[own], colors=colors, radii=radius)
+            rows = of == k
+            colors, radius = by_value(size[rows], 0.0, top), s.rr.Radius.ui_points(POINT)
+            points = s.rr.Points3D(cloud.points[rows], colors=colors, radii=radius)
             s.at(f"world/planes/{cloud.sensor}", span.start, points)
 
 

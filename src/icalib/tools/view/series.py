@@ -26,7 +26,7 @@ def log_residuals(s: RerunStream, c: Calibration) -> None:
             entity = f"residuals/{r.sensor}/{name}" if name else f"residuals/{r.sensor}"
             log_lines(s, entity, curve.seconds, curve.values, curve.labels)
     for r in c.image_residuals:
-        _log_seen(s, c, r)
+        _log_observations(s, c, r)
 
 
 def log_states(s: RerunStream, c: Calibration) -> None:
@@ -47,7 +47,7 @@ def log_lines(s: RerunStream, entity: str, seconds: np.ndarray, values: np.ndarr
     s.over(entity, seconds, s.rr.Scalars.columns(scalars=values.reshape(-1)).partition([m] * n))
 
 
-def _log_seen(s: RerunStream, c: Calibration, r: ImageResiduals) -> None:
+def _log_observations(s: RerunStream, c: Calibration, r: ImageResiduals) -> None:
     """Sends measured corners or tracked points in the camera's image; rejected ones are red, those of unused tracks
     grey."""
     rr, entity = s.rr, f"{place(c, r.sensor)}/image/{r.kind}"

@@ -46,9 +46,9 @@ def _recorded(c: Calibration, folder: Path, recording: Path) -> Recorded:
     opened_recording = open_recording(recording)
     rig = rig_from_dict(c.rig, str(folder / "result.json"))
     opened_recording.use_layouts(tuple(rig.sensors.values()))
-    found = Recorded(c, rig, opened_recording, span_of(c, recording), recording)
-    found.check()
-    return found
+    recorded = Recorded(c, rig, opened_recording, span_of(c, recording), recording)
+    recorded.check()
+    return recorded
 
 
 def _log_result(stream: RerunStream, c: Calibration) -> None:

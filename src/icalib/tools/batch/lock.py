@@ -13,7 +13,7 @@ LOCK = ".lock"
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def exclusive_lock(folder: Path) -> Iterator[None]:
     """Context with an exclusive lock on `folder`. The lock ends with the process, however that ends.
 
     Raises CalibrationError if another process has the lock, or the folder cannot be written. A file system without

@@ -11,10 +11,10 @@ import pytest
 
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.tools.batch import alone
+from icalib.tools.batch import exclusive_lock
 
-HOLD = "import sys, time; from pathlib import Path; from icalib.tools.batch import alone\n" + (
-    "with alone(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
+HOLD = "import sys, time; from pathlib import Path; from icalib.tools.batch import exclusive_lock\n" + (
+    "with exclusive_lock(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
 )
 
 
@@ -28,7 +28,7 @@ def held(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_folder_that_another_process_is_at_work_in_is_refused(tmp_path: Path, held):
-    with pytest.raises(CalibrationError, match=f"another icalib uses {tmp_path}; wait"), alone(tmp_path):
+    with pytest.raises(CalibrationError, match=f"another icalib uses {tmp_path}; wait"), exclusive_lock(tmp_path):
         pass
 
 
@@ -36,20 +36,23 @@ def test_the_lock_ends_with_its_process_however_it_ends(tmp_path: Path, held):
     held.kill()
     held.wait()
     for _ in range(2):
-        with alone(tmp_path):
+        with exclusive_lock(tmp_path):
             pass
 
 
 def test_the_lock_ends_with_the_work_though_that_fails(tmp_path: Path):
-    with pytest.raises(ZeroDivisionError), alone(tmp_path):
+    with pytest.raises(ZeroDivisionError), exclusive_lock(tmp_path):
         raise ZeroDivisionError
-    with alone(tmp_path):
+    with exclusive_lock(tmp_path):
         pass
 
 
 def test_a_folder_that_cannot_be_written_is_a_sentence(tmp_path: Path):
     (tmp_path / "file").touch()
-    with pytest.raises(CalibrationError, match=r"file cannot be written .*; choose another"), alone(tmp_path / "file"):
+    with (
+        pytest.raises(CalibrationError, match=r"file cannot be written .*; choose another"),
+        exclusive_lock(tmp_path / "file"),
+    ):
         pass
 
 
