@@ -22,7 +22,6 @@ NAMING = {
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
     "initialize/cameras_on_odometry.py",
-    "motion/clouds.py",
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
 }

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.motion.clouds import Clouds
+from icalib.motion.plane_association import PlaneAssociation
 from icalib.optim.arrowhead import make_pieces
 from icalib.sensors.camera.features.surfaces import CELL_M, MAX_PLANE_DISTANCE_M, PATCH_M, Surfaces, most_alike
 from icalib.sensors.lidar.binning import points_on_planes
@@ -124,8 +124,8 @@ def test_points_of_one_patch_together_weigh_as_one(surfaces, seen):
 
 
 def test_planes_know_their_recording():
-    assert Clouds(("plane 0", "plane 12"), ()).recording.tolist() == [0, 0]
-    assert Clouds(("plane 1.3", "plane 2.0", "plane 12.4"), ()).recording.tolist() == [0, 1, 11]
+    assert PlaneAssociation(("plane 0", "plane 12"), ()).recording.tolist() == [0, 0]
+    assert PlaneAssociation(("plane 1.3", "plane 2.0", "plane 12.4"), ()).recording.tolist() == [0, 1, 11]
 
 
 def test_a_plane_pulls_its_points_towards_it(setup_of, features_on_planes):

@@ -50,13 +50,13 @@ def solved(r, state, found):
     """The state of a solve with the planes and association `found`."""
     entries = [("imu0", "intrinsics", "vector", 24, False)]
     entries += [(s.name, name, kind, size, True) for s in r.streams for name, kind, size in FREE]
-    layout = make_layout(entries + found.clouds.entries)
+    layout = make_layout(entries + found.association.entries)
     kept = {k: v for k, v in state.values.items() if k[1] != "plane"}
     state = replace(state, values=kept | found.values)
     motion = EstimatedMotion(state, r.imu, 9.81, 0.5)
     lidars = tuple(
-        LidarFactor.build(s, plane, found.clouds.keys, motion, NOISE, layout)
-        for s, plane in zip(r.streams, found.clouds.plane, strict=True)
+        LidarFactor.build(s, plane, found.association.keys, motion, NOISE, layout)
+        for s, plane in zip(r.streams, found.association.plane, strict=True)
     )
     imu = ImuFactor.build(r.imu, state, 9.81, np.zeros(0, dtype=np.int64))
     sensors = ImuSensor("imu0", "", class_noise("consumer")), *(Lidar(s.name, "") for s in r.streams)
@@ -88,8 +88,8 @@ def errors(r, state, k=0):
 def faces_of(found, streams):
     """(P, F) points of each plane found by the face of the room that they lie on; the last: the hills."""
     most = max(int(s.plane.max()) for s in streams) + 1
-    table = np.zeros((len(found.clouds.names), most + 1), dtype=int)
-    for plane, stream in zip(found.clouds.plane, streams, strict=True):
+    table = np.zeros((len(found.association.names), most + 1), dtype=int)
+    for plane, stream in zip(found.association.plane, streams, strict=True):
         used = plane >= 0
         np.add.at(table, (plane[used], np.where(stream.plane >= 0, stream.plane, most)[used]), 1)
     return table
@@ -117,14 +117,16 @@ def test_hardly_a_point_is_on_a_wrong_plane(two_lidars):
     assert len(set(own)) == len(own)
     assert table.max(axis=1).sum() > 0.995 * table.sum()
     assert table.sum() > 0.75 * sum(len(s.xyz) for s in r.streams)
-    np.testing.assert_array_equal(found[-1].clouds.points, table.sum(axis=1))
+    np.testing.assert_array_equal(found[-1].association.points, table.sum(axis=1))
 
 
 def test_a_plane_keeps_its_name(two_lidars):
     r, _, found = two_lidars
     for before, after in zip(found[:-1], found[1:], strict=True):
-        assert len(set(after.clouds.names)) == len(after.clouds.names)
-        faces = [dict(zip(a.clouds.names, faces_of(a, r.streams).argmax(axis=1), strict=True)) for a in (before, after)]
+        assert len(set(after.association.names)) == len(after.association.names)
+        faces = [
+            dict(zip(a.association.names, faces_of(a, r.streams).argmax(axis=1), strict=True)) for a in (before, after)
+        ]
         shared = set(faces[0]) & set(faces[1])
         assert len(shared) >= 0.9 * len(faces[0])
         assert all(faces[0][name] == faces[1][name] for name in shared)
@@ -133,7 +135,9 @@ def test_a_plane_keeps_its_name(two_lidars):
 
 def test_two_lidars_share_their_planes(two_lidars):
     r, _, found = two_lidars
-    seen = [np.bincount(p[p >= 0], minlength=len(found[-1].clouds.names)) > 100 for p in found[-1].clouds.plane]
+    seen = [
+        np.bincount(p[p >= 0], minlength=len(found[-1].association.names)) > 100 for p in found[-1].association.plane
+    ]
     assert (seen[0] & seen[1]).sum() > 0.5 * len(seen[0])
 
 
@@ -157,8 +161,8 @@ def test_one_wall_is_one_plane(free_robot):
     alone = replace(stream, start=start, offset_s=stream.offset_s[wall], xyz=stream.xyz[wall], plane=stream.plane[wall])
     state = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], 0.05))
     found = associate([alone], EstimatedMotion(state, free_robot.imu, 9.81, 0.5), round_search(3, NOISE.sigma))
-    assert found.clouds.names == ("plane 0",)
-    assert found.clouds.points[0] > 0.8 * len(alone.xyz)
+    assert found.association.names == ("plane 0",)
+    assert found.association.points[0] > 0.8 * len(alone.xyz)
 
 
 @pytest.mark.statistical

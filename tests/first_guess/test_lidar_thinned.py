@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import LidarStream, Measurements
-from icalib.motion.clouds import Clouds
+from icalib.motion.plane_association import PlaneAssociation
 from icalib.pipeline import calibrate_measurements
 from icalib.sensors.lidar.initialize import association, association_rounds
-from icalib.sensors.lidar.initialize.association import Association, odd_step
+from icalib.sensors.lidar.initialize.association import AssociatedPlanes, odd_step
 from icalib.sensors.lidar.initialize.association_rounds import _first_points, _unthinned
 from icalib.tools.simulation import rig_for
 
@@ -38,10 +38,10 @@ def test_what_was_found_of_some_points_is_put_where_they_were(step):
     assert firsts.tolist() == [[0], [10]]
     for own, streams, first in zip((number[:10], number[10:]), recordings, firsts, strict=True):
         looked_at = own[own % step == 0]
-        found = Association(Clouds(("plane 0",), (looked_at,)), np.zeros((1, 6)))
+        found = AssociatedPlanes(PlaneAssociation(("plane 0",), (looked_at,)), np.zeros((1, 6)))
         placed = _unthinned(found, streams, first, step)
         assert placed is not None
-        (plane,) = placed.clouds.plane
+        (plane,) = placed.association.plane
         np.testing.assert_array_equal(plane, np.where(own % step == 0, own, -1))
     assert _unthinned(None, recordings[0], firsts[0], step) is None
 

@@ -14,9 +14,9 @@ from icalib.data.joining import Part
 from icalib.data.measurements import Measurements
 from icalib.model.bodies import Bodies
 from icalib.model.statistics import PassEnd, ResidualStatistics
-from icalib.motion.clouds import Clouds
 from icalib.motion.factor import Factor, FactorKey
 from icalib.motion.imu_data import ImuData
+from icalib.motion.plane_association import PlaneAssociation
 from icalib.motion.sweep import EstimatedMotion
 from icalib.motion.time_offsets import instants
 from icalib.optim.state import Entry, Key, Layout, State
@@ -38,7 +38,7 @@ class Pass:
     """
 
     rig: Rig
-    clouds: Clouds
+    association: PlaneAssociation
     layout: Layout
     state: State
     motion: EstimatedMotion | None
@@ -82,9 +82,9 @@ class SensorModel(Generic[S, N]):
 
     # Parameters
 
-    def takes_part(self, sensor: S, clouds: Clouds) -> bool:
-        """Whether the sensor has parameters and factors. clouds: LiDAR points on planes."""
-        del sensor, clouds
+    def takes_part(self, sensor: S, association: PlaneAssociation) -> bool:
+        """Whether the sensor has parameters and factors. association: LiDAR points on planes."""
+        del sensor, association
         return True
 
     def is_estimated(self, sensor: S, spec: ParameterSpec, rig: Rig) -> bool:
@@ -189,8 +189,8 @@ class SensorModel(Generic[S, N]):
         yield from ()
 
     def points_on_planes(self, sensor: S, stream: Any, at: Pass) -> tuple[np.ndarray, np.ndarray] | None:
-        """Some points (n, 3) of the sensor in the world [m], and the index (n,) of the plane in `at.clouds` that each
-        lies on.
+        """Some points (n, 3) of the sensor in the world [m], and the index (n,) of the plane in `at.association` that
+        each lies on.
 
         None for sensors without points.
         """

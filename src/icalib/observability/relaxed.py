@@ -15,7 +15,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.groups import groups_of, with_groups
-from icalib.estimate.problem.inputs import Inputs, with_clouds
+from icalib.estimate.problem.inputs import Inputs, with_association
 from icalib.estimate.problem.outcome import Outcome, outcome_of
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
@@ -124,7 +124,7 @@ def freed_inputs(inputs: Inputs, keys: Collection[Key] | None = None) -> Inputs:
         wanted = p.mode == "fixed" if keys is None else (sensor.name, name) in keys
         return Parameter("free", p.value) if wanted and p.value is not None else p
 
-    return with_clouds(replace(inputs, rig=with_groups(inputs.rig, freed)), inputs.clouds)
+    return with_association(replace(inputs, rig=with_groups(inputs.rig, freed)), inputs.association)
 
 
 def _is_stated(parameter: Parameter) -> bool:

@@ -188,7 +188,7 @@ def pass_at(inputs: Inputs, state: State, coarse: bool = False) -> Pass:
         begins = [part.begin - RECORDING_MARGIN_S for part in inputs.parts[1:]]
         motion, starts = None, (0, *(int(k) for k in np.searchsorted(state.seconds, begins)))
     return Pass(
-        inputs.rig, inputs.clouds, inputs.layout, state, motion, starts, inputs.measurements, inputs.motions,
+        inputs.rig, inputs.association, inputs.layout, state, motion, starts, inputs.measurements, inputs.motions,
         inputs.bodies, coarse,
     )  # fmt: skip
 

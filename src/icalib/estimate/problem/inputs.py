@@ -15,8 +15,8 @@ from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets.base import BOARD
 from icalib.model.bodies import Bodies
 from icalib.model.sensor_model import clocks_of, model_of
-from icalib.motion.clouds import NO_CLOUDS, Clouds
 from icalib.motion.imu_data import ImuData, joined_imu_data
+from icalib.motion.plane_association import NO_ASSOCIATION, PlaneAssociation
 from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, make_layout
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
 from icalib.rig.scene import TILT
@@ -28,8 +28,8 @@ from icalib.sensors.camera.image_times import on_common_images
 class Inputs:
     """Inputs of an estimate that stay the same in all passes.
 
-    bodies: bodies of the target in use. parts: the recordings that were joined to `measurements`. clouds: points on
-    planes; sensors that measure planes are used only with them. guess: initial state, before points were associated
+    bodies: bodies of the target in use. parts: the recordings that were joined to `measurements`. association: points
+    on planes; sensors that measure planes are used only with them. guess: initial state, before points were associated
     with planes. asked: the rig as the user gave it, if `rig` has more.
     """
 
@@ -39,19 +39,19 @@ class Inputs:
     imu: ImuData | None
     layout: Layout
     parts: tuple[Part, ...]
-    clouds: Clouds = NO_CLOUDS
+    association: PlaneAssociation = NO_ASSOCIATION
     guess: State | None = None
     asked: Rig | None = None
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:
         """Mounted sensors that have parameters and factors."""
-        return _taking_part(self.rig, self.clouds)
+        return _taking_part(self.rig, self.association)
 
     @cached_property
     def owners(self) -> dict[str, Sensor]:
         """All sensors that have parameters and factors, by name, the IMU first."""
-        return {s.name: s for s in self.rig.sensors.values() if model_of(s).takes_part(s, self.clouds)}
+        return {s.name: s for s in self.rig.sensors.values() if model_of(s).takes_part(s, self.association)}
 
     @cached_property
     def specs(self) -> dict[Key, ParameterSpec]:
@@ -104,16 +104,18 @@ def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | Non
     return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, parts)
 
 
-def with_clouds(inputs: Inputs, clouds: Clouds) -> Inputs:
+def with_association(inputs: Inputs, association: PlaneAssociation) -> Inputs:
     """The same inputs with points on planes, and planes in the layout."""
-    layout = layout_for(inputs.rig, inputs.bodies, len(inputs.parts), clouds)
-    return replace(inputs, layout=layout, clouds=clouds)
+    layout = layout_for(inputs.rig, inputs.bodies, len(inputs.parts), association)
+    return replace(inputs, layout=layout, association=association)
 
 
-def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds = NO_CLOUDS) -> Layout:
+def layout_for(
+    rig: Rig, bodies: Bodies, n_recordings: int = 1, association: PlaneAssociation = NO_ASSOCIATION
+) -> Layout:
     """Layout of the calibration parameters: IMU intrinsics, target, each sensor's parameters, frames in the scene,
     poses of bodies, planes."""
-    imu, sensors = rig.imu, _taking_part(rig, clouds)
+    imu, sensors = rig.imu, _taking_part(rig, association)
     entries: list[Entry] = []
     if imu is not None:
         entries += model_of(imu).entries(imu, rig, n_recordings)
@@ -126,12 +128,12 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
         entries += model_of(sensor).entries(sensor, rig, n_recordings)
     for sensor in sensors:
         entries += model_of(sensor).scene_entries(sensor, rig, n_recordings)
-    return make_layout(entries + bodies.pose_entries() + clouds.entries)
+    return make_layout(entries + bodies.pose_entries() + association.entries)
 
 
-def _taking_part(rig: Rig, clouds: Clouds) -> tuple[Sensor, ...]:
+def _taking_part(rig: Rig, association: PlaneAssociation) -> tuple[Sensor, ...]:
     """Mounted sensors that have parameters and factors."""
-    return tuple(s for s in rig.mounted if model_of(s).takes_part(s, clouds))
+    return tuple(s for s in rig.mounted if model_of(s).takes_part(s, association))
 
 
 def origin_difference(measurements: Measurements, stream: Stream) -> float:

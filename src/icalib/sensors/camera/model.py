@@ -198,13 +198,13 @@ def of_tracks(factors: Mapping[FactorKey, Factor]) -> tuple[FeatureFactor, ...]:
 
 def _surfaces(at: Pass) -> Surfaces | None:
     """LiDAR planes that tracked points may lie on; None without planes, or if `points_on_planes_m` is 0."""
-    clouds, noise, streams = at.clouds, at.rig.settings.points_on_planes_m, at.measurements.streams
-    if not clouds.count or noise == 0.0:
+    association, noise, streams = at.association, at.rig.settings.points_on_planes_m, at.measurements.streams
+    if not association.count or noise == 0.0:
         return None
-    planes = np.array([at.state.values[key] for key in clouds.keys])
+    planes = np.array([at.state.values[key] for key in association.keys])
     clouds_of_sensors = (model_of(s).points_on_planes(s, streams[s.name], at) for s in at.rig.mounted)
     points_on_planes = (points for points in clouds_of_sensors if points is not None)
-    return Surfaces.of_clouds(clouds.keys, clouds.recording, planes, points_on_planes, noise, at.coarse)
+    return Surfaces.of_clouds(association.keys, association.recording, planes, points_on_planes, noise, at.coarse)
 
 
 def _late_images(pairs: Sequence[tuple[CornerFactor, CornerOutput]], end: PassEnd) -> list[np.ndarray]:

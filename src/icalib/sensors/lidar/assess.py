@@ -39,19 +39,20 @@ HALF_STEP_S = np.float32(2e-3)  # half the step of the central difference of res
 
 def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
     """The estimated planes, with their numbers of points."""
-    clouds = inputs.clouds
-    found = (state.values[key] for key in clouds.keys)
-    for name, v, n in zip(clouds.names, found, clouds.points if clouds.count else (), strict=True):
+    association = inputs.association
+    values = (state.values[key] for key in association.keys)
+    points = association.points if association.count else ()
+    for name, v, n in zip(association.names, values, points, strict=True):
         yield Plane(name, v[:3].copy(), v[3:].copy(), int(n))
 
 
 def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[LidarResiduals]:
     """Residuals of each LiDAR at the estimate and at the initial guess, evenly thinned; none without planes."""
-    if not inputs.clouds.count:
+    if not inputs.association.count:
         return
     state = found.outcome.state
     now, guess = motion_of(inputs, state), motion_of(inputs, inputs.guess or state)
-    values = np.array([state.values[key] for key in inputs.clouds.keys])
+    values = np.array([state.values[key] for key in inputs.association.keys])
     thinned = [_thinned(inputs, k, state) for k in range(len(inputs.rig.lidars))]
     before = [in_world(guess, stream) for stream, _ in thinned]
     first_planes = _fitted_planes(
@@ -83,7 +84,7 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[L
 def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.ndarray]:
     """Points of a LiDAR on planes while the IMU was running, evenly thinned, and the plane (N,) of each."""
     assert inputs.imu is not None
-    stream, plane = inputs.measurements.lidars[index], inputs.clouds.plane[index]
+    stream, plane = inputs.measurements.lidars[index], inputs.association.plane[index]
     own = np.flatnonzero(plane >= 0)
     own = own[:: max(1, -(-len(own) * len(inputs.rig.lidars) // MAX_KEPT_POINTS))]
     one = _some_points(stream, own)
@@ -140,7 +141,7 @@ def _used(found: Estimate, name: str) -> int:
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
     """Notes on the number of points used and their noise."""
-    if not inputs.clouds.count:
+    if not inputs.association.count:
         return
     ranging = [found.judged.noise[s.name] for s in inputs.rig.lidars]
     for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, ranging, strict=True):
@@ -150,13 +151,13 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
             size = f"{1e3 * noise.sigma:.1f} mm from their planes, as residuals show it"
         yield (
             f"{_used(found, lidar.name)} of the {len(stream.xyz)} points of {lidar.name} lie on "
-            f"{inputs.clouds.count} planes; noise {size}."
+            f"{inputs.association.count} planes; noise {size}."
         )
 
 
 def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """Warnings: degenerate scene, wrong point times, few points on planes, stamps at the wrong end of a scan."""
-    if not inputs.clouds.count:
+    if not inputs.association.count:
         return
     yield from _degeneracy_warnings(inputs, found)
     for index, (lidar, stream) in enumerate(zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True)):
@@ -191,7 +192,7 @@ def _time_stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, f
     a scan is removed, as a time offset absorbs it.
     """
     state = found.outcome.state
-    motion, values = motion_of(inputs, state), np.array([state.values[key] for key in inputs.clouds.keys])
+    motion, values = motion_of(inputs, state), np.array([state.values[key] for key in inputs.association.keys])
     stream, plane = _thinned(inputs, index, state)
     if len(plane) < MIN_FITTED_POINTS:
         return 0.0, np.inf
@@ -210,8 +211,8 @@ def _degeneracy_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """A warning if LiDARs alone give the motion, and their planes face fewer than three directions."""
     if any(s.gives_motion for s in inputs.rig.mounted if not isinstance(s, Lidar)):
         return
-    normals = np.array([found.outcome.state.values[key][:3] for key in inputs.clouds.keys])
-    if count_directions(normal_shares(normals, inputs.clouds.points)) < 3:
+    normals = np.array([found.outcome.state.values[key][:3] for key in inputs.association.keys])
+    if count_directions(normal_shares(normals, inputs.association.points)) < 3:
         names = " and ".join(x.name for x in inputs.rig.lidars)
         yield (
             f"the planes that {names} saw face two directions only, as in a corridor: only the IMU constrains the "

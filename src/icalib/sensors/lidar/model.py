@@ -9,7 +9,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.model.statistics import ResidualStatistics
-from icalib.motion.clouds import Clouds
+from icalib.motion.plane_association import PlaneAssociation
 from icalib.motion.point_planes import thinned
 from icalib.rig import Lidar, Settings
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
@@ -27,10 +27,10 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
 
     keyframes = "scans"
 
-    def takes_part(self, sensor: Lidar, clouds: Clouds) -> bool:
+    def takes_part(self, sensor: Lidar, association: PlaneAssociation) -> bool:
         """See `SensorModel`."""
         del sensor
-        return clouds.count > 0
+        return association.count > 0
 
     def first_noise(self, sensor: Lidar, settings: Settings) -> LidarNoise:
         """See `SensorModel`."""
@@ -57,7 +57,7 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         plane = _plane(sensor, at)
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)
         scheme = at.rig.settings.scheme
-        yield LidarFactor.build(stream, used, at.clouds.keys, at.motion, noise, at.layout, scheme, bin_s)
+        yield LidarFactor.build(stream, used, at.association.keys, at.motion, noise, at.layout, scheme, bin_s)
 
     def points_on_planes(self, sensor: Lidar, stream: LidarStream, at: Pass) -> tuple[np.ndarray, np.ndarray]:
         """See `binning.points_on_planes`."""
@@ -67,7 +67,7 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
 
 def _plane(sensor: Lidar, at: Pass) -> np.ndarray:
     """(N,) index of the plane that each point lies on, -1: none."""
-    return at.clouds.plane[[x.name for x in at.rig.lidars].index(sensor.name)]
+    return at.association.plane[[x.name for x in at.rig.lidars].index(sensor.name)]
 
 
 MODEL = LidarModel()

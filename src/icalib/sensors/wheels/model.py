@@ -34,8 +34,8 @@ class WheelModel(SensorModel[Wheels, WheelNoise]):
         yield wheel_factor(sensor, stream, noise, at.motion, at.layout)
         if sensor.ground is not None:
             floor: tuple[Key | None, ...] = (None,) * len(at.state.recordings)
-            if sensor.ground.plane == "floor" and at.clouds.count:
-                floor = floors(at.state, at.clouds.keys, at.clouds.points, at.clouds.recording)
+            if sensor.ground.plane == "floor" and at.association.count:
+                floor = floors(at.state, at.association.keys, at.association.points, at.association.recording)
             yield GroundFactor.build(sensor.name, sensor.ground, floor, at.state, at.motion.imu, at.layout)
 
 

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 
 from icalib.data.measurements import Measurements
-from icalib.estimate.problem.inputs import Inputs, with_clouds
+from icalib.estimate.problem.inputs import Inputs, with_association
 from icalib.initialize.steps.initializer import BY_SCANS, Initializer, InputsWithMotion, Values
 from icalib.initialize.steps.rig_file_values import stated_values
 from icalib.optim.state import State
@@ -40,7 +40,8 @@ class LidarInitializer(Initializer[Lidar]):
             inputs.measurements.with_streams(*source_inputs.measurements.lidars), notes=source_inputs.measurements.notes
         )
         return replace(
-            with_clouds(replace(inputs, measurements=measured), source_inputs.clouds), guess=source_inputs.guess
+            with_association(replace(inputs, measurements=measured), source_inputs.association),
+            guess=source_inputs.guess,
         )
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Lidar]) -> Values:

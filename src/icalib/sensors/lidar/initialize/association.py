@@ -1,4 +1,4 @@
-"""Association of points with planes that several LiDARs share, repeated in each round of association and solve.
+"""AssociatedPlanes of points with planes that several LiDARs share, repeated in each round of association and solve.
 
 Each round transforms all points to the world by the current state, finds planes there, and associates points with them.
 The tolerance allows for errors of that state. A plane keeps its name from round to round if it keeps its points.
@@ -14,7 +14,8 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.detection.planes.planes import MOST_POINTS, ExtractedPlanes, PlaneSearch, find_planes
 from icalib.errors import EstimationError
-from icalib.motion.clouds import Clouds
+from icalib.motion.plane_association import PlaneAssociation
+from icalib.motion.point_planes import count_points
 from icalib.motion.sweep import EstimatedMotion
 from icalib.optim.arrowhead import in_parallel
 from icalib.optim.state import Key
@@ -24,21 +25,22 @@ POINTS_PER_PART = 200_000  # points of a thread at a time; bounds the memory
 ASSOCIATION_ROUNDS = 4
 # Assumed error of the state in each round: position [m], and rotation about the sensor [rad].
 STATE_ERRORS = (0.03, 0.01, 0.003, 0.001)
+MIN_PLANE_POINTS = 100  # points of a plane: with fewer, its normal is too uncertain to be of use
 MIN_KEPT_POINTS = 0.5  # share of the associated points of a plane from the old plane whose name it keeps
 
 
 @dataclass(frozen=True)
-class Association:
+class AssociatedPlanes:
     """Points associated with planes. planes (P, 6): normal, and a point [m], in the world frame; ordered as the names
-    in `clouds`."""
+    in `association`."""
 
-    clouds: Clouds
+    association: PlaneAssociation
     planes: np.ndarray
 
     @property
     def values(self) -> dict[Key, np.ndarray]:
         """The planes as values of a state."""
-        return {key: plane.copy() for key, plane in zip(self.clouds.keys, self.planes, strict=True)}
+        return {key: plane.copy() for key, plane in zip(self.association.keys, self.planes, strict=True)}
 
 
 def round_search(k: int, noise_m: float) -> PlaneSearch:
@@ -48,8 +50,8 @@ def round_search(k: int, noise_m: float) -> PlaneSearch:
 
 
 def associate(
-    streams: Sequence[LidarStream], motion: EstimatedMotion, search: PlaneSearch, before: Association | None = None
-) -> Association:
+    streams: Sequence[LidarStream], motion: EstimatedMotion, search: PlaneSearch, before: AssociatedPlanes | None = None
+) -> AssociatedPlanes:
     """Planes and their points at the state of `motion`. A plane gets the name of the plane in `before` with which it
     shares most points. Raises EstimationError if there is no plane."""
     moved = [in_world(motion, s) for s in streams]
@@ -61,8 +63,18 @@ def associate(
             "or check the point times."
         )
     plane = tuple(_plane_of_points(found, points, seen_from, search) for points, seen_from in moved)
-    clouds = Clouds(_plane_names(found.count, plane, before and before.clouds), plane)
-    return Association(clouds, found.planes.copy())
+    association = PlaneAssociation(_plane_names(found.count, plane, before and before.association), plane)
+    return AssociatedPlanes(association, found.planes.copy())
+
+
+def association_of_streams(streams: Sequence[LidarStream]) -> PlaneAssociation:
+    """The association that the streams contain, without planes of fewer than MIN_PLANE_POINTS points."""
+    n_planes = max((int(s.plane.max(initial=-1)) for s in streams), default=-1) + 1
+    count = sum((count_points(s.plane, n_planes) for s in streams), np.zeros(n_planes, dtype=np.int64))
+    used = np.flatnonzero(count >= MIN_PLANE_POINTS)
+    index = np.full(n_planes + 1, -1, dtype=np.int32)
+    index[used] = np.arange(len(used))
+    return PlaneAssociation(tuple(f"plane {k}" for k in used), tuple(index[s.plane] for s in streams))
 
 
 def _thinned(clouds: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +99,7 @@ def _plane_of_points(
     return np.concatenate([np.zeros(0, np.int32), *own])
 
 
-def _plane_names(count: int, plane: tuple[np.ndarray, ...], before: Clouds | None) -> tuple[str, ...]:
+def _plane_names(count: int, plane: tuple[np.ndarray, ...], before: PlaneAssociation | None) -> tuple[str, ...]:
     """A name for each of `count` planes: that of the plane in `before` with which it shares most points, else a new
     one. plane: for each LiDAR, the plane (N,) of its points."""
     if before is None:

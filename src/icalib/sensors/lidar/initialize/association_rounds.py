@@ -16,7 +16,7 @@ from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, motion_of, start_values
-from icalib.estimate.problem.inputs import Inputs, with_clouds
+from icalib.estimate.problem.inputs import Inputs, with_association
 from icalib.geometry.planes import plane_of
 from icalib.initialize.steps.contradicted_guesses import merged_values
 from icalib.initialize.steps.rig_file_values import known_extrinsics, known_names, stated_values
@@ -30,8 +30,8 @@ from icalib.initialize.steps.single_recording import (
     state_of_recording,
     states_from_best,
 )
-from icalib.motion.clouds import Clouds, joined_clouds, known_planes
 from icalib.motion.known_motion import are_near_keyframes
+from icalib.motion.plane_association import PlaneAssociation, joined_associations
 from icalib.motion.point_planes import are_somewhere, thinned
 from icalib.motion.sweep import EstimatedMotion, sweep
 from icalib.motion.time_offsets import instants
@@ -39,8 +39,9 @@ from icalib.optim.state import Key, State
 from icalib.sensors.lidar.binning import COARSE_BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.initialize.association import (
     ASSOCIATION_ROUNDS,
-    Association,
+    AssociatedPlanes,
     associate,
+    association_of_streams,
     odd_step,
     round_search,
 )
@@ -99,8 +100,10 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     inputs = with_known_motion(inputs, state)
     recordings = points_by_recording(inputs)
     if any((s.plane >= 0).any() for streams in recordings for s in streams):
-        clouds = joined_clouds([known_planes(streams) for streams in recordings])
-        return with_clouds(inputs, clouds), replace(state, values=state.values | fitted_planes(inputs, state, clouds))
+        association = joined_associations([association_of_streams(streams) for streams in recordings])
+        return with_association(inputs, association), replace(
+            state, values=state.values | fitted_planes(inputs, state, association)
+        )
     with explaining_degeneracy(inputs.measurements.lidars):
         return _after_rounds(inputs, state, recordings)
 
@@ -109,24 +112,26 @@ def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[Lidar
     """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points."""
     step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars))
     fewer = _thinned_inputs(inputs, step)
-    found: Sequence[Association | None] = [None] * len(recordings)
+    found: Sequence[AssociatedPlanes | None] = [None] * len(recordings)
     shares = []
     for k in range(ASSOCIATION_ROUNDS - 1):
         fewer, state, found = _associated(fewer, state, k, found)
-        shares.append(_share_on_planes(fewer.clouds))
+        shares.append(_share_on_planes(fewer.association))
         state = first_pass(fewer, state)
     before = [
         _unthinned(a, streams, first, step)
         for a, streams, first in zip(found, recordings, _first_points(recordings), strict=True)
     ]
     inputs, state, _ = _associated(inputs, state, ASSOCIATION_ROUNDS - 1, before)
-    check_shares([*shares, _share_on_planes(inputs.clouds)], " and ".join(s.name for s in inputs.measurements.lidars))
+    check_shares(
+        [*shares, _share_on_planes(inputs.association)], " and ".join(s.name for s in inputs.measurements.lidars)
+    )
     return inputs, state
 
 
 def _associated(
-    inputs: Inputs, state: State, k: int, before: Sequence[Association | None]
-) -> tuple[Inputs, State, list[Association]]:
+    inputs: Inputs, state: State, k: int, before: Sequence[AssociatedPlanes | None]
+) -> tuple[Inputs, State, list[AssociatedPlanes]]:
     """Association of round k at `state`, without a solve. Returns inputs, state with planes, and the association of
     each recording. before: associations of the previous round, None in the first."""
     noise = max(x.range_noise_m or FIRST_RANGE_SIGMA_M for x in inputs.rig.lidars)
@@ -134,10 +139,10 @@ def _associated(
     for r, streams in enumerate(points_by_recording(inputs)):
         with naming_recording(inputs, r):
             found.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r]))
-    clouds = joined_clouds([a.clouds for a in found])
+    association = joined_associations([a.association for a in found])
     planes = np.concatenate([a.planes for a in found])
-    values = _without_planes(state) | dict(zip(clouds.keys, planes, strict=True))
-    return with_clouds(inputs, clouds), replace(state, values=values), found
+    values = _without_planes(state) | dict(zip(association.keys, planes, strict=True))
+    return with_association(inputs, association), replace(state, values=values), found
 
 
 def _thinned_inputs(inputs: Inputs, step: int) -> Inputs:
@@ -154,21 +159,21 @@ def _first_points(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
 
 
 def _unthinned(
-    found: Association | None, streams: tuple[LidarStream, ...], first: np.ndarray, step: int
-) -> Association | None:
+    found: AssociatedPlanes | None, streams: tuple[LidarStream, ...], first: np.ndarray, step: int
+) -> AssociatedPlanes | None:
     """The association `found` of points thinned by `step`, expanded to all points of a recording; points that were left
     out get no plane. first (L,): see `_first_points`."""
     if found is None:
         return None
     planes = tuple(np.full(len(s.xyz), -1, np.int32) for s in streams)
-    for plane, own, n in zip(planes, found.clouds.plane, first, strict=True):
+    for plane, own, n in zip(planes, found.association.plane, first, strict=True):
         plane[-n % step :: step] = own
-    return replace(found, clouds=replace(found.clouds, plane=planes))
+    return replace(found, association=replace(found.association, plane=planes))
 
 
-def _share_on_planes(clouds: Clouds) -> float:
+def _share_on_planes(association: PlaneAssociation) -> float:
     """Share of the points that lie on planes."""
-    return float(clouds.points.sum() / max(sum(len(p) for p in clouds.plane), 1))
+    return float(association.points.sum() / max(sum(len(p) for p in association.plane), 1))
 
 
 def check_shares(shares: Sequence[float], names: str) -> None:
@@ -253,17 +258,17 @@ def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: KnownExtri
         return lidar_on_motion(own.imu, stream, motion, held).offset
 
 
-def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.ndarray]:
+def fitted_planes(inputs: Inputs, state: State, association: PlaneAssociation) -> dict[Key, np.ndarray]:
     """Planes fitted to points with known planes at `state` (total least squares), as values of a state. Very large
     clouds are thinned."""
-    motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
-    for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
+    motion, sums = motion_of(inputs, state), np.zeros((association.count, 4, 4))
+    for stream, plane in zip(inputs.measurements.lidars, association.plane, strict=True):
         if (plane >= 0).any():
-            some = AssociatedPoints(stream, thinned(plane), np.zeros((clouds.count, 6)))
+            some = AssociatedPoints(stream, thinned(plane), np.zeros((association.count, 6)))
             moments = take_moments(some, motion, LidarNoise(1.0), COARSE_BIN_S)
             _add_in_world(moments, motion, stream, sums)
     out = {}
-    for key, M in zip(clouds.keys, sums, strict=True):
+    for key, M in zip(association.keys, sums, strict=True):
         centre = M[1:, 0] / M[0, 0]
         spread = M[1:, 1:] / M[0, 0] - np.outer(centre, centre)
         out[key] = plane_of(np.linalg.eigh(spread)[1][:, 0], centre)

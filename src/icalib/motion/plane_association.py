@@ -7,16 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.data.measurements import LidarStream
 from icalib.motion.point_planes import count_points
 from icalib.optim.state import Entry, Key
 from icalib.rig.scene import PLANE
 
-MIN_PLANE_POINTS = 100  # points of a plane: with fewer, its normal is too uncertain to be of use
-
 
 @dataclass(frozen=True)
-class Clouds:
+class PlaneAssociation:
     """Index of the plane of each LiDAR point. names (P,): of the planes, different from all sensor names. plane: for
     each LiDAR (N,) int32, plane of each point, -1 for none."""
 
@@ -35,7 +32,7 @@ class Clouds:
 
     @property
     def recording(self) -> np.ndarray:
-        """(P,) number of the recording of each plane, see `joined_clouds`."""
+        """(P,) number of the recording of each plane, see `joined_associations`."""
         numbers = (name.removeprefix("plane ").split(".") for name in self.names)
         return np.array([int(n[0]) - 1 if len(n) > 1 else 0 for n in numbers], dtype=np.int64)
 
@@ -50,29 +47,19 @@ class Clouds:
         return sum((count_points(p, self.count) for p in self.plane), np.zeros(self.count, dtype=np.int64))
 
 
-NO_CLOUDS = Clouds((), ())
+NO_ASSOCIATION = PlaneAssociation((), ())
 
 
-def joined_clouds(each: Sequence[Clouds]) -> Clouds:
+def joined_associations(each: Sequence[PlaneAssociation]) -> PlaneAssociation:
     """Associations of consecutive recordings as one. Each recording has its own world and planes: "plane 2.0" is the
     first plane of the second recording."""
     if len(each) == 1:
         return each[0]
-    names = tuple(f"plane {r}.{own.removeprefix('plane ')}" for r, c in enumerate(each, 1) for own in c.names)
+    names = tuple(f"plane {r}.{name.removeprefix('plane ')}" for r, c in enumerate(each, 1) for name in c.names)
     first = np.cumsum([0, *(c.count for c in each)])
-    pairs = zip(*(c.plane for c in each), strict=True)
+    by_lidar = zip(*(c.plane for c in each), strict=True)
     plane = (
-        np.concatenate([np.where(p >= 0, p + n, -1) for p, n in zip(own, first, strict=False)]).astype(np.int32)
-        for own in pairs
+        np.concatenate([np.where(p >= 0, p + n, -1) for p, n in zip(parts, first, strict=False)]).astype(np.int32)
+        for parts in by_lidar
     )
-    return Clouds(names, tuple(plane))
-
-
-def known_planes(streams: Sequence[LidarStream]) -> Clouds:
-    """The association that the streams contain, without planes of fewer than MIN_PLANE_POINTS points."""
-    most = max((int(s.plane.max(initial=-1)) for s in streams), default=-1) + 1
-    count = sum((count_points(s.plane, most) for s in streams), np.zeros(most, dtype=np.int64))
-    used = np.flatnonzero(count >= MIN_PLANE_POINTS)
-    own = np.full(most + 1, -1, dtype=np.int32)
-    own[used] = np.arange(len(used))
-    return Clouds(tuple(f"plane {k}" for k in used), tuple(own[s.plane] for s in streams))
+    return PlaneAssociation(names, tuple(plane))
