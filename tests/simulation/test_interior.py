@@ -26,7 +26,7 @@ from icalib.tools.simulation.images.raster import pixel_kernel, shrink
 from icalib.tools.simulation.scenario.image_faults import faults_of
 from icalib.tools.simulation.scenario.projection import project
 from icalib.tools.simulation.scenario.room import distances
-from icalib.tools.simulation.scenario.texture import atlas_of, leaves
+from icalib.tools.simulation.scenario.texture import atlas_of, dead_leaves
 
 from .conftest import DISTORTED
 
@@ -135,7 +135,9 @@ def test_what_is_nearer_hides_what_is_behind_it_in_every_cell(hills):
 def test_surfaces_do_not_alias():
     """As by 64 rays a pixel on the finest texture: no shift of the pattern, and little difference."""
     room = Room(SIZE, BLOCKS)
-    canvases = [leaves((n * 0.001, m * 0.001), 0.001, Texture(share=1.0), k) for k, (n, m) in enumerate(sides(room))]
+    canvases = [
+        dead_leaves((n * 0.001, m * 0.001), 0.001, Texture(share=1.0), k) for k, (n, m) in enumerate(sides(room))
+    ]
     camera = replace(DISTORTED[0], resolution=(96, 72), intrinsics=(48.0, 48.0, 47.5, 35.5))
     T = looking(np.array([-1.8, -1.2, 0.8]), np.array([1.9, 1.0, 0.9]), 0.2)
     grey = RoomRenderer(camera, WHITE).grey(Interior(room, atlas=atlas_of(canvases)).view(), T, 1.0, None)
@@ -174,10 +176,10 @@ def test_an_exposure_takes_each_cell_at_its_own_instant():
 
 def test_textures_repeat_with_their_seed_and_have_plain_regions():
     size = (3.2, 3.2)
-    one, same, other = (leaves(size, 0.01, Texture(seed), 3) for seed in (1, 1, 2))
+    one, same, other = (dead_leaves(size, 0.01, Texture(seed), 3) for seed in (1, 1, 2))
     assert one.shape == (320, 320) and np.array_equal(one, same) and not np.array_equal(one, other)
-    assert np.ptp(leaves(size, 0.01, Texture(share=0.0), 0)) == 0.0
-    crowded = leaves((16.0, 16.0), 0.01, Texture(contrast=0.5), 0)
+    assert np.ptp(dead_leaves(size, 0.01, Texture(share=0.0), 0)) == 0.0
+    crowded = dead_leaves((16.0, 16.0), 0.01, Texture(contrast=0.5), 0)
     assert 0.1 < (crowded == crowded[0, 0]).mean() < 0.9 and crowded.min() >= 0.25 and crowded.max() <= 0.75
 
 

@@ -16,7 +16,7 @@ from icalib.tools.simulation.images.rendering import Imaging
 from icalib.tools.simulation.output.bag_writer import IMAGE, IMU, IMU_TOPIC, BagWriter
 from icalib.tools.simulation.scenario.sensor import BagTopic
 from icalib.tools.simulation.sensors.simulate import Simulation
-from icalib.tools.simulation.tables import whole, write_truth
+from icalib.tools.simulation.tables import atomic_output, write_truth
 
 Event = tuple[int, str, Callable[[BagWriter], Any]]  # instant on the IMU's clock [ns], topic, maker of the message
 _EXPOSURE_S = 0.004
@@ -39,7 +39,7 @@ def write_sensors(
     topics, streams, notes = _streams(simulation, seed)
     last_ns = simulation.truth.imu_clock_origin_ns + int(simulation.truth.seconds[-1] * 1e9)
     span_ns = max(last_ns - simulation.truth.imu_clock_origin_ns, 1)
-    with whole(path) as place:
+    with atomic_output(path) as place:
         with BagWriter("ros1" if ros1 else "mcap", place, topics) as bag:
             for at_ns, topic, make in heapq.merge(*streams, key=lambda event: event[0]):
                 bag.write(topic, make(bag), at_ns)

@@ -32,7 +32,7 @@ def check_absent(path: Path) -> None:
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def atomic_output(path: Path) -> Iterator[Path]:
     """Context with a temporary path beside `path`. It is renamed to `path` at the end, and removed if anything fails.
 
     Raises RecordingError if `path` exists or cannot be written.
@@ -58,7 +58,7 @@ def write_tables(
     """
     measured = simulation.measurements
     assert measured.imu is not None  # of every scenario
-    with whole(path) as folder:
+    with atomic_output(path) as folder:
         steps: list[Callable[[], None]] = [partial(_write_imu, below(folder, measured.imu.name), measured.imu)]
         steps += [partial(_write_corners, below(folder, c.name), c, simulation.scenario) for c in measured.cameras]
         steps += [partial(_write_tracks, below(folder, t.name), t) for t in measured.tracks]

@@ -75,8 +75,8 @@ class Film:
         due: list[_Frame] = []
         for i, camera in enumerate(self.scenario.cameras):
             stamps, seconds = image_stamps(self.scenario, camera, np.random.default_rng([self.seed, 2 + i]))
-            shown = _shown(seconds, self.scenario.image_faults.frozen)
-            times = zip(seconds.tolist(), stamps.tolist(), shown.tolist(), strict=True)
+            image = _image_numbers(seconds, self.scenario.image_faults.frozen)
+            times = zip(seconds.tolist(), stamps.tolist(), image.tolist(), strict=True)
             due += [_Frame(s, i, stamp, int(k), float(seconds[k])) for s, stamp, k in times]
         return sorted(due)
 
@@ -86,22 +86,22 @@ class Film:
     def _shot(self, take: _Taker, frame: _Frame) -> Shot:
         camera = self.scenario.cameras[frame.camera]
         count = take.instants if self.exposure_s > 0.0 else 1
-        poses = exposure_poses(camera, self.truth.trajectory, frame.taken_s, self.exposure_s, count)
-        picture = take.picture(frame, poses, np.random.default_rng([self.seed, 2 + frame.camera, 1 + frame.shown]))
+        poses = exposure_poses(camera, self.truth.trajectory, frame.image_s, self.exposure_s, count)
+        picture = take.picture(frame, poses, np.random.default_rng([self.seed, 2 + frame.camera, 1 + frame.image]))
         uv = np.concatenate([np.empty((0, 2)), *(sheet.uv for sheet in picture.sheets)])
-        seen = np.concatenate([np.empty(0, dtype=bool), *(sheet.seen for sheet in picture.sheets)])
-        return Shot(camera.name, frame.stamp_ns, frame.seconds, picture.pixels, SheetTruth(uv, seen))
+        in_view = np.concatenate([np.empty(0, dtype=bool), *(sheet.seen for sheet in picture.sheets)])
+        return Shot(camera.name, frame.stamp_ns, frame.seconds, picture.pixels, SheetTruth(uv, in_view))
 
 
 class _Frame(NamedTuple):
-    """One image. seconds: instant on the IMU's clock; camera: its number; stamp_ns: on its clock; shown, taken_s:
-    number and instant of the image that is shown, an earlier one while the camera is frozen."""
+    """One image. seconds: instant on the IMU's clock; camera: its number; stamp_ns: on its clock; image, image_s:
+    number and instant of the image that is rendered, an earlier one while the camera is frozen."""
 
     seconds: float
     camera: int
     stamp_ns: int
-    shown: int
-    taken_s: float
+    image: int
+    image_s: float
 
 
 class _Taker(Protocol):
@@ -147,12 +147,12 @@ class _Room:
 
     def picture(self, frame: _Frame, poses: np.ndarray, rng: np.random.Generator) -> Picture:
         scenario, trajectory = self._film.scenario, self._film.truth.trajectory
-        people = walking(self._people, scenario.cameras[0], trajectory, frame.taken_s)
-        gain = scenario.image_faults.gain_at(frame.taken_s)
+        people = walking(self._people, scenario.cameras[0], trajectory, frame.image_s)
+        gain = scenario.image_faults.gain_at(frame.image_s)
         return Picture(self._renderers[frame.camera].grey(self._interior.view(people), poses, gain, rng), ())
 
 
-def _shown(seconds: np.ndarray, frozen: tuple[tuple[float, float], ...]) -> np.ndarray:
+def _image_numbers(seconds: np.ndarray, frozen: tuple[tuple[float, float], ...]) -> np.ndarray:
     """(M,) number of the image that each image shows: its own, or the last one before an interval in which the camera
     is frozen. seconds (M,): instants of the images."""
     fresh = ~inside(frozen, seconds)

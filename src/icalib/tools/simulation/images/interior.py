@@ -17,7 +17,7 @@ from icalib.tools.simulation.images.roomlight import CELLS, TILE, PixelRays, Ton
 from icalib.tools.simulation.scenario.image_faults import CameraFaults
 from icalib.tools.simulation.scenario.room import Obstacle, Room
 from icalib.tools.simulation.scenario.scenario import SimCamera
-from icalib.tools.simulation.scenario.texture import Atlas, Texture, atlas_of, leaves, texel_size
+from icalib.tools.simulation.scenario.texture import Atlas, Texture, atlas_of, dead_leaves, texel_size
 
 INSTANTS = CELLS * CELLS  # number of poses over an exposure
 _PERSON_SURFACES = 10_000  # first texture number of people, so that they do not change the textures of the room
@@ -65,7 +65,7 @@ class Interior:
             sizes.append(self.room.size[:2])
             looks.append((texture, _PERSON_SURFACES - 1))
         texel_m = texel_size(sum(a * b for a, b in sizes))
-        return atlas_of([leaves(s, texel_m, *look) for s, look in zip(sizes, looks, strict=True)])
+        return atlas_of([dead_leaves(s, texel_m, *look) for s, look in zip(sizes, looks, strict=True)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -170,8 +170,8 @@ class Renderer:
     def _instant(self, sheets: Sequence[Sheet], T_world_cam: np.ndarray) -> np.ndarray:
         """Greys of the cells (shape `Optics.fine_shape`) at one pose, before blur."""
         fine = np.full(self._optics.fine_shape, self.imaging.background, dtype=np.float32)
-        seen_from = [(sheet, np.linalg.inv(sheet.T_world_target) @ T_world_cam) for sheet in sheets]
-        for sheet, T_sheet_cam in sorted(seen_from, key=lambda s: -_distance(*s)):
+        views = [(sheet, np.linalg.inv(sheet.T_world_target) @ T_world_cam) for sheet in sheets]
+        for sheet, T_sheet_cam in sorted(views, key=lambda s: -_distance(*s)):
             pattern, R, C = sheet.pattern, T_sheet_cam[:3, :3], T_sheet_cam[:3, 3]
             front = C[2] > 0.0  # the back of the paper is white
             grey_of = np.where(pattern.white | (not front), self.imaging.white, self.imaging.black)
@@ -189,8 +189,8 @@ class Renderer:
         points = (world - poses[:, None, :3, 3]) @ poses[:, :3, :3]
         uv = project(self.camera, points)
         front = (poses[:, :3, 3] - p_world_target) @ R_world_target[:, 2] > 0.0
-        seen = visible(self.camera, points, uv) & front[:, None]
-        return SheetTruth(uv.mean(axis=0), np.all(seen, axis=0, keepdims=True)[0])
+        in_view = visible(self.camera, points, uv) & front[:, None]
+        return SheetTruth(uv.mean(axis=0), np.all(in_view, axis=0, keepdims=True)[0])
 
 
 def _distance(sheet: Sheet, T_sheet_cam: np.ndarray) -> float:

@@ -27,13 +27,13 @@ def read_effects(value: YamlValue, sensors: Sequence[SimSensor]) -> dict[str, An
     """The fields of `Scenario` that effects change, by name. value: the section; sensors: those of the scenario file.
     Raises RigError naming file, line and field."""
     scales = {effect: (kind, field) for kind in simulated_kinds().values() for effect, field in kind.effects.items()}
-    found, changed = value.record((), ("imu", "target_size", *scales)), {}
-    if "imu" in found:
-        changed["imu_intrinsics"] = _intrinsics(found["imu"])
-    if "target_size" in found:
-        changed["target_size"] = _ratio(found["target_size"])
-    for effect in scales.keys() & found.keys():
-        sensors = _scaled(found[effect], sensors, *scales[effect])
+    fields, changed = value.record((), ("imu", "target_size", *scales)), {}
+    if "imu" in fields:
+        changed["imu_intrinsics"] = _intrinsics(fields["imu"])
+    if "target_size" in fields:
+        changed["target_size"] = _ratio(fields["target_size"])
+    for effect in scales.keys() & fields.keys():
+        sensors = _scaled(fields[effect], sensors, *scales[effect])
         changed["sensors"] = sensors
     return changed
 
@@ -49,10 +49,10 @@ def _intrinsics(value: YamlValue) -> np.ndarray:
     """(24,) IMU intrinsics, in the order of `Scenario.imu_intrinsics`."""
     intrinsics = np.zeros(24)
     for name, numbers in value.record((), tuple(_IMU)).items():
-        own = numbers.vector(len(_IMU[name]))
-        if np.abs(own).max() > _LARGEST:
+        values = numbers.vector(len(_IMU[name]))
+        if np.abs(values).max() > _LARGEST:
             numbers.fail(f"must be between {-_LARGEST} and {_LARGEST}: 0.01 is 1 %, or 10 mrad.")
-        intrinsics[list(_IMU[name])] = own
+        intrinsics[list(_IMU[name])] = values
     return intrinsics
 
 

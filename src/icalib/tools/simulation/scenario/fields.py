@@ -18,15 +18,15 @@ def mounted_fields(
     """The section of a sensor on the robot. required, options: fields of its kind, beside those that all sensors have.
     Returns all fields, and the values of the common ones by their names in `SimSensor`. start_ns: origin of all clocks
     [ns]. Raises RigError naming file, line and field."""
-    found = value.record(("type", *CLOCK, *required), (*CLOCK_OPTIONS, *options))
+    fields = value.record(("type", *CLOCK, *required), (*CLOCK_OPTIONS, *options))
     common = {
-        "T_imu_sensor": pose(found["T_imu_sensor"]),
-        "time_offset_s": found["time_offset"].number() if "time_offset" in found else 0.0,
-        "rate_hz": found["rate"].positive(),
-        "phase_s": at_least(found["phase"], 0.0) if "phase" in found else 0.0,
+        "T_imu_sensor": pose(fields["T_imu_sensor"]),
+        "time_offset_s": fields["time_offset"].number() if "time_offset" in fields else 0.0,
+        "rate_hz": fields["rate"].positive(),
+        "phase_s": at_least(fields["phase"], 0.0) if "phase" in fields else 0.0,
         "clock_origin_ns": start_ns,
     }
-    return found, common
+    return fields, common
 
 
 def at_least(value: YamlValue, least: float) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.tools.simulation.scenario.texture import Texture, leaves
+from icalib.tools.simulation.scenario.texture import Texture, dead_leaves
 
 _PART_TEXEL_M = 0.002  # width of a pixel on the part of the robot, as from 0.9 m at a focal length of 460 px
 _DIRT_SIZE = (0.02, 0.06)  # range of the standard deviation of a spot, relative to the image's width
@@ -39,30 +39,30 @@ class ImageFaults:
 @dataclass(frozen=True, eq=False)
 class CameraFaults:
     """Constant disturbances in the view of one camera. share (H, W): fraction of the light that passes the dirt; part
-    (H, W): fraction of each pixel that the robot covers; own (H, W): texture of the robot there, 0 to 1. None stands
-    for no disturbance."""
+    (H, W): fraction of each pixel that the robot covers; texture (H, W): of the robot there, 0 to 1. None stands for no
+    disturbance."""
 
     share: np.ndarray | None = None
     part: np.ndarray | None = None
-    own: np.ndarray | None = None
+    texture: np.ndarray | None = None
 
     def applied(self, grey: np.ndarray, black: float, white: float) -> np.ndarray:
         """grey (H, W) with the part of the robot and the dirt; black, white: greys of texture 0 and 1."""
-        if self.part is not None and self.own is not None:
-            grey = grey + self.part * (black + (white - black) * self.own - grey)
+        if self.part is not None and self.texture is not None:
+            grey = grey + self.part * (black + (white - black) * self.texture - grey)
         return grey if self.share is None else grey * self.share
 
 
 def faults_of(faults: ImageFaults, resolution: tuple[int, int], camera: int) -> CameraFaults:
     """The constant disturbances of camera number `camera`; resolution: (width, height) px."""
     width, height = resolution
-    share = part = own = None
+    share = part = texture = None
     u, v = np.meshgrid(np.arange(width) / width, np.arange(height) / height)
     if faults.robot_part > 0.0:
         edge = 1.0 - faults.robot_part * (1.0 + 0.2 * np.sin(9.0 * u + camera))
         part = np.clip((v - edge) * height + 0.5, 0.0, 1.0)
         size = (width * _PART_TEXEL_M, height * _PART_TEXEL_M)
-        own = leaves(size, _PART_TEXEL_M, Texture(camera, 1.0), _PART_STREAM)[:height, :width]
+        texture = dead_leaves(size, _PART_TEXEL_M, Texture(camera, 1.0), _PART_STREAM)[:height, :width]
     if faults.dirt:
         rng = np.random.default_rng([camera, _DIRT_STREAM])
         share = np.ones((height, width))
@@ -71,4 +71,4 @@ def faults_of(faults: ImageFaults, resolution: tuple[int, int], camera: int) -> 
             size = rng.uniform(*_DIRT_SIZE)
             square = (u - x) ** 2 + ((v - y) * height / width) ** 2
             share *= 1.0 - rng.uniform(*_DIRT_DARK) * np.exp(-0.5 * square / size**2)
-    return CameraFaults(share, part, own)
+    return CameraFaults(share, part, texture)

@@ -36,10 +36,10 @@ def image_velocity(camera: SimCamera, points: np.ndarray, directions: np.ndarray
 def visible(camera: SimCamera, points: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """(...,) bool: whether points (..., 3) are in the valid range of the model, and their projections uv (..., 2) are
     inside the image."""
-    seen = in_range(camera, np.hypot(points[..., 0], points[..., 1]), points[..., 2])
+    valid = in_range(camera, np.hypot(points[..., 0], points[..., 1]), points[..., 2])
     width, height = camera.resolution
     u, v = uv[..., 0], uv[..., 1]
-    return seen & (u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)
+    return valid & (u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)
 
 
 def in_range(camera: SimCamera, radius: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -141,8 +141,8 @@ class Room:
 
     def faces_of(self, blocks: Sequence[Obstacle]) -> np.ndarray:
         """(n, 4, 3) faces of blocks in the room, in the form of `faces`."""
-        found = [face for b in blocks for face in (_ramp if b.ramp else _box)(b, self.base)]
-        return np.array(found).reshape(-1, 4, 3)
+        faces = [face for b in blocks for face in (_ramp if b.ramp else _box)(b, self.base)]
+        return np.array(faces).reshape(-1, 4, 3)
 
     def points(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Random points (count, 3) m, uniform over the area of all surfaces, and normals (count, 3) of the surfaces.
@@ -156,11 +156,11 @@ class Room:
         on_ground = face == len(area)
         face[on_ground] = 0
         st = np.where((triangle[face] & (st.sum(axis=1) > 1.0))[:, None], 1.0 - st, st)
-        found = self.faces[face, 0] + st[:, :1] * u[face] + st[:, 1:] * v[face]
+        points = self.faces[face, 0] + st[:, :1] * u[face] + st[:, 1:] * v[face]
         if self.hills:
             xy = (rng.random((count, 2)) - 0.5) * self.size[:2]
-            found[on_ground] = np.column_stack([xy, self.hills.height(xy)])[on_ground]
-        return found, np.where(on_ground[:, None], [0.0, 0.0, 1.0], _normals(self.faces)[face])
+            points[on_ground] = np.column_stack([xy, self.hills.height(xy)])[on_ground]
+        return points, np.where(on_ground[:, None], [0.0, 0.0, 1.0], _normals(self.faces)[face])
 
 
 def _normals(faces: np.ndarray) -> np.ndarray:
@@ -192,12 +192,12 @@ def _box(block: Obstacle, base: float) -> list[Face]:
 
 def _ramp(block: Obstacle, base: float) -> list[Face]:
     low, ex, ey, ez = _placed(block, base)
-    whole, half = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    quad, triangle = np.zeros(3), np.array([1.0, 0.0, 0.0])
     return [
-        (low, ex + ez, ey, whole),
-        (low + ex, ey, ez, whole),
-        (low + ex, ez, -ex, half),
-        (low + ex + ey, -ex, ez, half),
+        (low, ex + ez, ey, quad),
+        (low + ex, ey, ez, quad),
+        (low + ex, ez, -ex, triangle),
+        (low + ex + ey, -ex, ez, triangle),
     ]
 
 
@@ -260,9 +260,9 @@ def ground(surfaces, px, py, pz, dx, dy, dz, limit):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def distances(surfaces, origins, directions, found):
-    """Fills found (N,) with the distance from origins (N, 3) to the first surface along directions (N, 3), in units of
-    each direction; inf or NaN if there is none."""
+def distances(surfaces, origins, directions, distance):
+    """Fills distance (N,): from origins (N, 3) to the first surface along directions (N, 3), in units of each
+    direction; inf or NaN if there is none."""
     for i in range(len(origins)):
         p, d = origins[i], directions[i]
-        found[i], _ = nearest(surfaces, p[0], p[1], p[2], d[0], d[1], d[2])
+        distance[i], _ = nearest(surfaces, p[0], p[1], p[2], d[0], d[1], d[2])

@@ -37,19 +37,21 @@ Made = TypeVar("Made")
 def load_scenario(path: str | Path) -> Scenario:
     """Reads a scenario file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
     root = read_yaml(Path(path), "scenario file")
-    found = root.record(
+    fields = root.record(
         ("duration", "sensors", "room", "motion"), ("effects", "features", "target", "images", "seed", "start_ns")
     )
-    start_ns = found["start_ns"].whole(0) if "start_ns" in found else _START_NS
-    duration_s = found["duration"].positive()
+    start_ns = fields["start_ns"].whole(0) if "start_ns" in fields else _START_NS
+    duration_s = fields["duration"].positive()
     if start_ns + _MARGIN_S * 1e9 + duration_s * 1e9 > LARGEST_INTEGER:
-        found["start_ns" if "start_ns" in found else "duration"].fail("the last stamp would exceed 2^63 ns; lower it.")
-    sensors = _sensors(found["sensors"], start_ns)
-    room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
-    features = _features(found["features"]) if "features" in found else None
-    effects: dict[str, Any] = read_effects(found["effects"], sensors["sensors"]) if "effects" in found else {}
-    board: dict[str, Any] = _board(found["target"]) if "target" in found else {"board": False}
-    scenario = _made(
+        fields["start_ns" if "start_ns" in fields else "duration"].fail(
+            "the last stamp would exceed 2^63 ns; lower it."
+        )
+    sensors = _sensors(fields["sensors"], start_ns)
+    room, motion = _room(fields["room"]), _motion(fields["motion"], Path(path).parent)
+    features = _features(fields["features"]) if "features" in fields else None
+    effects: dict[str, Any] = read_effects(fields["effects"], sensors["sensors"]) if "effects" in fields else {}
+    board: dict[str, Any] = _board(fields["target"]) if "target" in fields else {"board": False}
+    scenario = _construct(
         root,
         Scenario,
         duration_s=duration_s,
@@ -57,19 +59,19 @@ def load_scenario(path: str | Path) -> Scenario:
         imu_clock_origin_ns=start_ns,
         room=room,
         features=features,
-        seed=found["seed"].whole(0) if "seed" in found else 0,
-        image_faults=_image_faults(found["images"]) if "images" in found else ImageFaults(),
+        seed=fields["seed"].whole(0) if "seed" in fields else 0,
+        image_faults=_image_faults(fields["images"]) if "images" in fields else ImageFaults(),
         **(sensors | effects),
         **board,
     )
     try:
         refuse_large(scenario)
     except RigError as error:
-        found["duration"].fail(str(error))
+        fields["duration"].fail(str(error))
     return scenario
 
 
-def _made(value: YamlValue, kind: Callable[..., Made], /, **fields: Any) -> Made:
+def _construct(value: YamlValue, kind: Callable[..., Made], /, **fields: Any) -> Made:
     """kind(**fields); a RigError is raised again with file, line and field of `value`."""
     try:
         return kind(**fields)
@@ -106,91 +108,91 @@ def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
 def _imu(name: str, value: YamlValue) -> dict[str, Any]:
     if name != "imu0":
         value.fail("the IMU must be called imu0; rename it.")
-    found = value.record(("type", "rate", "noise"), ("gyro_bias", "accel_bias"))
-    densities = found["noise"].record(_DENSITIES)
+    fields = value.record(("type", "rate", "noise"), ("gyro_bias", "accel_bias"))
+    densities = fields["noise"].record(_DENSITIES)
     noise = ImuNoise(**{name: densities[name].positive() for name in _DENSITIES}, source="scenario")
-    biases = {key: tuple(found[key].vector(3).tolist()) for key in ("gyro_bias", "accel_bias") if key in found}
-    return {"imu_rate_hz": found["rate"].positive(), "imu_noise": noise} | biases
+    biases = {key: tuple(fields[key].vector(3).tolist()) for key in ("gyro_bias", "accel_bias") if key in fields}
+    return {"imu_rate_hz": fields["rate"].positive(), "imu_noise": noise} | biases
 
 
 def _camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
     required = ("model", "resolution", "intrinsics", "distortion", "noise_px")
-    found, common = mounted_fields(value, start_ns, required, ("dropouts",))
-    model = found["model"].choice("camera model", MODELS)
-    sides = found["resolution"].items()
+    fields, common = mounted_fields(value, start_ns, required, ("dropouts",))
+    model = fields["model"].choice("camera model", MODELS)
+    sides = fields["resolution"].items()
     if len(sides) != 2:
-        found["resolution"].fail(f"must be [width, height] in pixels, but has {len(sides)} entries.")
+        fields["resolution"].fail(f"must be [width, height] in pixels, but has {len(sides)} entries.")
     return SimCamera(
         name,
         model,
         (sides[0].whole(1), sides[1].whole(1)),
-        tuple(found["intrinsics"].vector(4).tolist()),
-        tuple(found["distortion"].vector(PARAMETER_COUNTS[model]).tolist()),
-        corner_noise_px=at_least(found["noise_px"], 0.0),
-        dropouts=intervals(found["dropouts"]) if "dropouts" in found else (),
+        tuple(fields["intrinsics"].vector(4).tolist()),
+        tuple(fields["distortion"].vector(PARAMETER_COUNTS[model]).tolist()),
+        corner_noise_px=at_least(fields["noise_px"], 0.0),
+        dropouts=intervals(fields["dropouts"]) if "dropouts" in fields else (),
         **common,
     )
 
 
 def _room(value: YamlValue) -> Room:
-    found = value.record(("size",), ("blocks", "slope_deg", "texture"))
-    blocks = tuple(_block(block) for block in found["blocks"].items()) if "blocks" in found else ()
+    fields = value.record(("size",), ("blocks", "slope_deg", "texture"))
+    blocks = tuple(_block(block) for block in fields["blocks"].items()) if "blocks" in fields else ()
     hills = None
-    if "slope_deg" in found:
-        slope = found["slope_deg"].positive()
+    if "slope_deg" in fields:
+        slope = fields["slope_deg"].positive()
         if slope > _STEEPEST_DEG:
-            found["slope_deg"].fail(f"must be at most {_STEEPEST_DEG:g} degrees, but is {slope:g}.")
+            fields["slope_deg"].fail(f"must be at most {_STEEPEST_DEG:g} degrees, but is {slope:g}.")
         hills = hills_of_slope(slope)
-    texture = _texture(found["texture"]) if "texture" in found else Texture()
-    return _made(value, Room, size=triple(found["size"]), blocks=blocks, hills=hills, texture=texture)
+    texture = _texture(fields["texture"]) if "texture" in fields else Texture()
+    return _construct(value, Room, size=triple(fields["size"]), blocks=blocks, hills=hills, texture=texture)
 
 
 def _texture(value: YamlValue) -> Texture:
-    found = value.record((), ("seed", "share", "contrast"))
-    chosen: dict[str, Any] = {key: share(found[key]) for key in ("share", "contrast") if key in found}
-    if "seed" in found:
-        chosen["seed"] = found["seed"].whole(0)
+    fields = value.record((), ("seed", "share", "contrast"))
+    chosen: dict[str, Any] = {key: share(fields[key]) for key in ("share", "contrast") if key in fields}
+    if "seed" in fields:
+        chosen["seed"] = fields["seed"].whole(0)
     return Texture(**chosen)
 
 
 def _image_faults(value: YamlValue) -> ImageFaults:
-    found = value.record((), ("people", "gain_steps", "frozen", "robot_part", "dirt"))
-    chosen: dict[str, Any] = {key: found[key].whole(0) for key in ("people", "dirt") if key in found}
-    if "gain_steps" in found:
-        steps = [step.vector(2).tolist() for step in found["gain_steps"].items()]
+    fields = value.record((), ("people", "gain_steps", "frozen", "robot_part", "dirt"))
+    chosen: dict[str, Any] = {key: fields[key].whole(0) for key in ("people", "dirt") if key in fields}
+    if "gain_steps" in fields:
+        steps = [step.vector(2).tolist() for step in fields["gain_steps"].items()]
         if any(gain <= 0.0 for _, gain in steps):
-            found["gain_steps"].fail("each entry is [instant, gain], with a gain above 0; correct it.")
+            fields["gain_steps"].fail("each entry is [instant, gain], with a gain above 0; correct it.")
         chosen["gain_steps"] = tuple(map(tuple, steps))
-    if "frozen" in found:
-        chosen["frozen"] = intervals(found["frozen"])
-    if "robot_part" in found:
-        chosen["robot_part"] = share(found["robot_part"])
+    if "frozen" in fields:
+        chosen["frozen"] = intervals(fields["frozen"])
+    if "robot_part" in fields:
+        chosen["robot_part"] = share(fields["robot_part"])
     return ImageFaults(**chosen)
 
 
 def _block(value: YamlValue) -> Obstacle:
-    found = value.record(("center", "size"), ("yaw_deg", "ramp"))
-    x, y = found["center"].vector(2).tolist()
-    yaw = np.deg2rad(found["yaw_deg"].number()) if "yaw_deg" in found else 0.0
-    return Obstacle((x, y), triple(found["size"]), float(yaw), found["ramp"].boolean() if "ramp" in found else False)
+    fields = value.record(("center", "size"), ("yaw_deg", "ramp"))
+    x, y = fields["center"].vector(2).tolist()
+    yaw = np.deg2rad(fields["yaw_deg"].number()) if "yaw_deg" in fields else 0.0
+    return Obstacle((x, y), triple(fields["size"]), float(yaw), fields["ramp"].boolean() if "ramp" in fields else False)
 
 
 def _motion(value: YamlValue, folder: Path) -> Drive:
-    found = value.record(("kind",), ("exact", "axis_imu", "path", "sideslip_deg", "seed"))
-    chosen: dict[str, Any] = {"kind": found["kind"].choice("motion", get_args(DriveKind))}
-    if "exact" in found:
-        chosen["exact"] = found["exact"].boolean()
-    if "axis_imu" in found:
-        chosen["axis_imu"] = tuple(found["axis_imu"].vector(3).tolist())
+    fields = value.record(("kind",), ("exact", "axis_imu", "path", "sideslip_deg", "seed"))
+    chosen: dict[str, Any] = {"kind": fields["kind"].choice("motion", get_args(DriveKind))}
+    if "exact" in fields:
+        chosen["exact"] = fields["exact"].boolean()
+    if "axis_imu" in fields:
+        chosen["axis_imu"] = tuple(fields["axis_imu"].vector(3).tolist())
         if not any(chosen["axis_imu"]):
-            found["axis_imu"].fail("must not be zero; give the direction of the axis.")
-    if "path" in found:
-        chosen["path"] = folder / found["path"].text()
-    if "sideslip_deg" in found:
-        chosen["sideslip_deg"] = at_least(found["sideslip_deg"], 0.0)
-    if "seed" in found:
-        chosen["seed"] = found["seed"].whole(0)
-    return _made(value, Drive, **chosen)
+            fields["axis_imu"].fail("must not be zero; give the direction of the axis.")
+    if "path" in fields:
+        chosen["path"] = folder / fields["path"].text()
+    if "sideslip_deg" in fields:
+        chosen["sideslip_deg"] = at_least(fields["sideslip_deg"], 0.0)
+    if "seed" in fields:
+        chosen["seed"] = fields["seed"].whole(0)
+    return _construct(value, Drive, **chosen)
 
 
 def _board(value: YamlValue) -> dict[str, Any]:
@@ -199,13 +201,13 @@ def _board(value: YamlValue) -> dict[str, Any]:
     if "type" not in fields:
         value.fail(f"type is missing; add type: {', type: '.join(TARGETS)}.")
     kind = TARGETS[fields["type"].choice("target type", tuple(TARGETS))]
-    asked = [f for f in dataclasses.fields(kind) if f.init and f.name != "size_sigma"]
-    required = tuple(f.name for f in asked if f.default is dataclasses.MISSING)
-    optional = tuple(f.name for f in asked if f.name not in required)
-    found = value.record(("type", "T_world_board", *required), optional)
+    parameters = [f for f in dataclasses.fields(kind) if f.init and f.name != "size_sigma"]
+    required = tuple(f.name for f in parameters if f.default is dataclasses.MISSING)
+    optional = tuple(f.name for f in parameters if f.name not in required)
+    values = value.record(("type", "T_world_board", *required), optional)
     types = get_type_hints(kind)
-    chosen = {f.name: _of_type(found[f.name], types[f.name]) for f in asked if f.name in found}
-    return {"target": _made(value, kind, **chosen), "T_world_board": pose(found["T_world_board"])}
+    chosen = {f.name: _of_type(values[f.name], types[f.name]) for f in parameters if f.name in values}
+    return {"target": _construct(value, kind, **chosen), "T_world_board": pose(values["T_world_board"])}
 
 
 def _of_type(value: YamlValue, kind: type) -> Any:
@@ -217,13 +219,13 @@ def _of_type(value: YamlValue, kind: type) -> Any:
 
 
 def _features(value: YamlValue) -> Features:
-    found = value.record((), ("count", "persistent", "longest_track", "per_image", "range", "seed", "relief"))
+    fields = value.record((), ("count", "persistent", "longest_track", "per_image", "range", "seed", "relief"))
     least = {"count": 1, "persistent": 0, "per_image": 1, "seed": 0}
-    chosen: dict[str, Any] = {key: found[key].whole(n) for key, n in least.items() if key in found}
+    chosen: dict[str, Any] = {key: fields[key].whole(n) for key, n in least.items() if key in fields}
     named = {"longest_track": "longest_track_s", "range": "range_m"}
-    chosen |= {field: found[key].positive() for key, field in named.items() if key in found}
-    if "relief" in found:
-        chosen["relief_m"] = at_least(found["relief"], 0.0)
+    chosen |= {field: fields[key].positive() for key, field in named.items() if key in fields}
+    if "relief" in fields:
+        chosen["relief_m"] = at_least(fields["relief"], 0.0)
     features = Features(**chosen)
     if features.persistent > features.count:
         value.fail(f"{features.persistent} persistent points are more than all {features.count}; lower persistent.")

@@ -50,9 +50,9 @@ def texel_size(area_m2: float) -> float:
     return max(_TEXEL_M, float(np.sqrt(area_m2 / _MOST_TEXELS)))
 
 
-def leaves(size: tuple[float, float], texel_m: float, texture: Texture, number: int) -> np.ndarray:
-    """Texture (height, width) float32, 0 to 1, of a surface of `size` (width, height) m. number: of the surface, for
-    its random numbers."""
+def dead_leaves(size: tuple[float, float], texel_m: float, texture: Texture, number: int) -> np.ndarray:
+    """Texture (height, width) float32, 0 to 1, by the dead leaves model, of a surface of `size` (width, height) m.
+    number: of the surface, for its random numbers."""
     rng = np.random.default_rng([texture.seed, number])
     shape = tuple(max(int(np.ceil(side / texel_m)), 1) for side in size)
     canvas = np.full(shape[::-1], 0.5 + texture.contrast * rng.uniform(-0.25, 0.25), dtype=np.float32)

@@ -36,10 +36,10 @@ def board_surface(target: Target, bow: tuple[float, float, float], points: np.nd
     z = a x^2 + b x y + c y^2. bow: (a, b, c) [m], see `Scenario`."""
     bent = points.copy()
     for body in np.flatnonzero(target.bends):
-        own = target.body == body
-        low, high = target.points[own, :2].min(axis=0), target.points[own, :2].max(axis=0)
-        x, y = ((points[own, :2] - 0.5 * (low + high)) / (0.5 * (high - low))).T
-        bent[own, 2] += bow[0] * x**2 + bow[1] * x * y + bow[2] * y**2
+        of_body = target.body == body
+        low, high = target.points[of_body, :2].min(axis=0), target.points[of_body, :2].max(axis=0)
+        x, y = ((points[of_body, :2] - 0.5 * (low + high)) / (0.5 * (high - low))).T
+        bent[of_body, 2] += bow[0] * x**2 + bow[1] * x * y + bow[2] * y**2
     return bent
 
 
@@ -63,22 +63,22 @@ def see_corners(
     surface = board_surface(scenario.target, scenario.bow, scenario.target.points)
     points = _in_camera(scenario, camera, trajectory, seconds, surface)
     uv = project(camera, points)
-    seen = visible(camera, points, uv) & _from_the_front(scenario, camera, trajectory, seconds)
-    seen &= _whole_tags(scenario.target, seen)
-    kept = seen.sum(axis=1) >= _MIN_CORNERS
-    stamps, seconds, points, uv, seen = stamps[kept], seconds[kept], points[kept], uv[kept], seen[kept]
+    in_view = visible(camera, points, uv) & _from_the_front(scenario, camera, trajectory, seconds)
+    in_view &= _complete_tags(scenario.target, in_view)
+    enough = in_view.sum(axis=1) >= _MIN_CORNERS
+    stamps, seconds, points, uv, in_view = stamps[enough], seconds[enough], points[enough], uv[enough], in_view[enough]
 
     uv = uv + camera.bloom_px * _towards_tag_center(scenario, camera, trajectory, seconds, points)
     uv = uv + _to_ellipse_centres(scenario, camera, trajectory, seconds, uv)
-    sigma = _corner_sigma(scenario, camera, trajectory, seconds, seen)
-    image, point = np.nonzero(seen)
-    true = uv[seen]
+    sigma = _corner_sigma(scenario, camera, trajectory, seconds, in_view)
+    image, point = np.nonzero(in_view)
+    true = uv[in_view]
     sigma = sigma[image]
     shift = scenario.shift_px * float(scenario.corner_noise_enabled) * rng.standard_normal((len(stamps), 2))
     measured = true + sigma[:, None] * rng.standard_normal(true.shape) + shift[image]
     outlier = rng.random(len(true)) < scenario.outlier_fraction
     measured[outlier] += rng.uniform(-scenario.outlier_px, scenario.outlier_px, (int(outlier.sum()), 2))
-    start = np.concatenate([[0], np.cumsum(seen.sum(axis=1))]).astype(np.int64)
+    start = np.concatenate([[0], np.cumsum(in_view.sum(axis=1))]).astype(np.int64)
     stream = CornerStream(camera.name, stamps, start, point.astype(np.int64), measured)
     return stream, CornerTruth(seconds, true, sigma, outlier)
 
@@ -106,13 +106,13 @@ def _from_the_front(
     return (np.sum((lens[:, None] - origin) * normal, axis=-1) > 0.0)[:, scenario.target.body]
 
 
-def _whole_tags(target: Target, seen: np.ndarray) -> np.ndarray:
+def _complete_tags(target: Target, in_view: np.ndarray) -> np.ndarray:
     """(M, n) bool: False for points of a free tag that is not seen completely, as it then cannot be identified."""
-    whole = np.ones_like(seen)
+    complete = np.ones_like(in_view)
     for body in np.flatnonzero(~target.bends):
-        own = target.body == body
-        whole[:, own] = seen[:, own].all(axis=1, keepdims=True)
-    return whole
+        of_body = target.body == body
+        complete[:, of_body] = in_view[:, of_body].all(axis=1, keepdims=True)
+    return complete
 
 
 def _towards_tag_center(
@@ -155,9 +155,9 @@ def _to_ellipse_centres(
 
 
 def _corner_sigma(
-    scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, seen: np.ndarray
+    scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, in_view: np.ndarray
 ) -> np.ndarray:
-    """(M,) standard deviation of the corner noise in each image [px]; seen (M, N) bool: visible corners."""
+    """(M,) standard deviation of the corner noise in each image [px]; in_view (M, N) bool: visible corners."""
     if not scenario.corner_noise_enabled:
         return np.zeros(len(seconds))
     surface = board_surface(scenario.target, scenario.bow, scenario.target.points)
@@ -165,6 +165,6 @@ def _corner_sigma(
         project(camera, _in_camera(scenario, camera, trajectory, seconds + dt, surface))
         for dt in (-_DIFFERENCE_S, _DIFFERENCE_S)
     )
-    velocity = np.where(seen[..., None], (after - before) / (2.0 * _DIFFERENCE_S), 0.0)
-    mean_square_speed = np.sum(velocity**2, axis=(1, 2)) / seen.sum(axis=1)
+    velocity = np.where(in_view[..., None], (after - before) / (2.0 * _DIFFERENCE_S), 0.0)
+    mean_square_speed = np.sum(velocity**2, axis=(1, 2)) / in_view.sum(axis=1)
     return np.sqrt(camera.corner_noise_px**2 + scenario.blur_s**2 * mean_square_speed)

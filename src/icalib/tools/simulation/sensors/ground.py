@@ -117,13 +117,13 @@ def _curves(room: Room, rng: np.random.Generator) -> Path:
     return at
 
 
-def _line(rng: np.random.Generator, way: Callable[[Jet], Jet]) -> Path:
-    """Motion without rotation along a line through the middle of the room; way: position on the line [m]."""
+def _line(rng: np.random.Generator, position: Callable[[Jet], Jet]) -> Path:
+    """Motion without rotation along a line through the middle of the room; position: coordinate on the line [m]."""
     heading = rng.uniform(-0.3, 0.3)
     c, s = float(np.cos(heading)), float(np.sin(heading))
 
     def at(time: Jet) -> tuple[Jet, Jet, Jet, Jet]:
-        along = way(time)
+        along = position(time)
         return c * along, s * along, along.constant(c), along.constant(s)
 
     return at

@@ -153,11 +153,11 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nanoseconds(text: str) -> int:
-    whole, _, fraction = text.partition(".")
+    integer, _, fraction = text.partition(".")
     if "e" in text.lower():
         return round(float(text) * 1e9)
-    sign = -1 if whole.startswith("-") else 1
-    return int(whole) * 1_000_000_000 + sign * int((fraction + "0" * 9)[:9])
+    sign = -1 if integer.startswith("-") else 1
+    return int(integer) * 1_000_000_000 + sign * int((fraction + "0" * 9)[:9])
 
 
 def _lines(path: Path) -> list[str]:

@@ -145,11 +145,11 @@ def _corners(
 ) -> tuple[tuple[CornerStream, ...], dict[str, CornerTruth]]:
     if not scenario.board:
         return (), {}
-    seen = [
+    corners = [
         see_corners(scenario, camera, trajectory, np.random.default_rng([seed, _CAMERA_STREAM + i]))
         for i, camera in enumerate(scenario.cameras)
     ]
-    return tuple(stream for stream, _ in seen), {stream.name: truth for stream, truth in seen}
+    return tuple(stream for stream, _ in corners), {stream.name: truth for stream, truth in corners}
 
 
 def _tracks(scenario: Scenario, trajectory: TrueTrajectory, seed: int) -> SimulatedTracks:

@@ -50,17 +50,17 @@ def follow(
     for camera, (stamps, _) in zip(scenario.cameras, images, strict=True):
         check_enough(camera.name, stamps)
     due = sorted((s, i, k) for i, (_, seconds) in enumerate(images) for k, s in enumerate(seconds.tolist()))
-    taken: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in scenario.cameras]
+    tracked: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in scenario.cameras]
     poses = [trajectory.pose_at(seconds)[:2] for _, seconds in images]
     for seconds, i, k in due:
         camera, (rotation, position) = scenario.cameras[i], poses[i]
-        seen, uv = _view(camera, room, features, points, surface, rotation[k], position[k])
-        chosen, number = front_end.choose(i, seconds, seen)
-        taken[i].append((number, uv[chosen]))
+        visible_points, uv = _view(camera, room, features, points, surface, (rotation[k], position[k]))
+        chosen, number = front_end.choose(i, seconds, visible_points)
+        tracked[i].append((number, uv[chosen]))
     noise = float(scenario.robot_noise_enabled)
     streams, truths = zip(
         *(
-            _stream(c, images[i], taken[i], noise, np.random.default_rng([seed, 2 + i, 0, 2]))
+            _stream(c, images[i], tracked[i], noise, np.random.default_rng([seed, 2 + i, 0, 2]))
             for i, c in enumerate(scenario.cameras)
         ),
         strict=True,
@@ -74,11 +74,12 @@ def _view(
     features: Features,
     points: np.ndarray,
     surface: np.ndarray,
-    rotation: np.ndarray,
-    position: np.ndarray,
+    pose: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the visible points, and image points (N, 2) [px] of all points. A point is visible if it is in range,
-    in the image and not occluded. surface (N, 3): points without relief, for which occlusion is tested."""
+    in the image and not occluded. surface (N, 3): points without relief, for which occlusion is tested. pose:
+    R_world_imu, p_world_imu [m]."""
+    rotation, position = pose
     eye = position + rotation @ camera.T_imu_sensor[:3, 3]
     rays = points - eye
     local = rays @ (rotation @ camera.T_imu_sensor[:3, :3])
@@ -86,12 +87,12 @@ def _view(
     near = (far > _NEAREST_M) & (far < features.range_m) & (local[:, 2] > 0.0)
     uv = np.full((len(points), 2), np.nan)
     uv[near] = project(camera, local[near])
-    seen = np.flatnonzero(near)
-    seen = seen[visible(camera, local[seen], uv[seen])]
-    met, rays = np.empty(len(seen)), surface[seen] - eye
+    visible_points = np.flatnonzero(near)
+    visible_points = visible_points[visible(camera, local[visible_points], uv[visible_points])]
+    hit, rays = np.empty(len(visible_points)), surface[visible_points] - eye
     far = np.linalg.norm(rays, axis=1)
-    distances(room.surfaces, np.broadcast_to(eye, (len(seen), 3)), rays, met)
-    return seen[met * far > far - 1e-4], uv
+    distances(room.surfaces, np.broadcast_to(eye, (len(visible_points), 3)), rays, hit)
+    return visible_points[hit * far > far - 1e-4], uv
 
 
 class _FrontEnd:
@@ -107,15 +108,15 @@ class _FrontEnd:
         self._points = list(range(features.persistent))
         self._tracked: dict[int, np.ndarray] = {}
 
-    def choose(self, camera: int, seconds: float, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points among the visible ones `seen` that the camera tracks at an instant, and their feature numbers.
+    def choose(self, camera: int, seconds: float, visible_points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points among `visible_points` that the camera tracks at an instant, and their feature numbers.
 
         Points that the camera tracked in its last image go first, then those that another camera tracks, then others.
         """
-        alive = self._alive(seconds, seen)
-        before = np.isin(seen, self._tracked.get(camera, np.empty(0, dtype=np.int64)))
-        order = np.lexsort((self._rng.random(len(seen)), ~alive, ~before))[: self._features.per_image]
-        chosen = np.sort(seen[order])
+        alive = self._alive(seconds, visible_points)
+        before = np.isin(visible_points, self._tracked.get(camera, np.empty(0, dtype=np.int64)))
+        order = np.lexsort((self._rng.random(len(visible_points)), ~alive, ~before))[: self._features.per_image]
+        chosen = np.sort(visible_points[order])
         new = chosen[~self._alive(seconds, chosen)]
         self._number[new] = len(self._points) + np.arange(len(new))
         self._points += new.tolist()
@@ -126,9 +127,9 @@ class _FrontEnd:
 
     def _alive(self, seconds: float, points: np.ndarray) -> np.ndarray:
         """(n,) bool: whether the feature numbers of `points` (n,) are still valid."""
-        held = seconds - self._last[points] <= self._lost_after
+        recent = seconds - self._last[points] <= self._lost_after
         young = seconds - self._born[points] <= self._features.longest_track_s
-        return (points < self._features.persistent) | (held & young)
+        return (points < self._features.persistent) | (recent & young)
 
     def point_of(self) -> np.ndarray:
         """(F,) number of the point of each feature."""
@@ -138,12 +139,12 @@ class _FrontEnd:
 def _stream(
     camera: SimCamera,
     images: tuple[np.ndarray, np.ndarray],
-    taken: list[tuple[np.ndarray, np.ndarray]],
+    tracked: list[tuple[np.ndarray, np.ndarray]],
     noise: float,
     rng: np.random.Generator,
 ) -> tuple[TrackStream, TrackTruth]:
-    number = np.concatenate([n for n, _ in taken])
-    true = np.concatenate([uv for _, uv in taken])
-    start = np.concatenate([[0], np.cumsum([len(n) for n, _ in taken])]).astype(np.int64)
+    number = np.concatenate([n for n, _ in tracked])
+    true = np.concatenate([uv for _, uv in tracked])
+    start = np.concatenate([[0], np.cumsum([len(n) for n, _ in tracked])]).astype(np.int64)
     measured = true + noise * camera.corner_noise_px * rng.standard_normal(true.shape)
     return TrackStream(camera.name, images[0], start, number, measured), TrackTruth(images[1], true)
