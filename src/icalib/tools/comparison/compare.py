@@ -79,6 +79,15 @@ class Comparison:
 
 
 @dataclass(frozen=True)
+class _Change:
+    """Change of one block from side A to side B, in SI units. covariances: of both sides, NaN if unknown."""
+
+    labels: tuple[str, ...]
+    vector: np.ndarray
+    covariances: tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
 class _Pair:
     """Two sides, with the tolerances and the limit in standard deviations above which they differ."""
 
@@ -90,16 +99,14 @@ class _Pair:
     def difference(
         self,
         names: tuple[str, str, str],
-        unit: str,
-        scale: float,
-        labels: tuple[str, ...],
-        vector: np.ndarray,
-        covariances: tuple[np.ndarray, np.ndarray],
+        change: _Change,
+        display: tuple[str, float],
         open_: tuple[str, ...],
         lens: tuple[float, float] | None = None,
     ) -> Difference:
-        """The difference of one block. names: sensor, frame, what; vector: in SI units; scale: factor from SI to
-        `unit`; covariances: of both sides, NaN if unknown; lens: RMS and largest distance of image points [px]."""
+        """The difference of one block. names: sensor, frame, what; display: unit, and factor from SI to it; open_:
+        sides on which the block is undetermined; lens: RMS and largest distance of image points [px]."""
+        vector, covariances, (unit, scale) = change.vector, change.covariances, display
         known = [bool(np.isfinite(c).all() and c.any()) for c in covariances]
         total = sum((np.zeros_like(c) if not np.isfinite(c).all() else c for c in covariances), np.zeros((1, 1)))
         count = sigmas(vector, total) if any(known) else None
@@ -109,7 +116,7 @@ class _Pair:
         return Difference(
             *names,
             unit=unit,
-            labels=labels,
+            labels=change.labels,
             vector=tuple((scale * vector).tolist()),
             size=size,
             std=std,
@@ -178,13 +185,11 @@ def _pose(pair: _Pair, frame: str, sensor: str) -> Iterator[Difference]:
     open_ = {name: _open(pair, frame, sensor, name) for name in ("rotation", "translation")}
     if np.isfinite([Ta[:3, :3], Tb[:3, :3]]).all():
         turn = so3.log(np.ascontiguousarray(Ta[:3, :3].T @ Tb[:3, :3]))
-        covariances = Ca[:3, :3], Cb[:3, :3]
-        names = (sensor, frame, "rotation")
-        yield pair.difference(names, "deg", 180.0 / np.pi, ("x", "y", "z"), turn, covariances, open_["rotation"])
+        change = _Change(("x", "y", "z"), turn, (Ca[:3, :3], Cb[:3, :3]))
+        yield pair.difference((sensor, frame, "rotation"), change, ("deg", 180.0 / np.pi), open_["rotation"])
     if np.isfinite([Ta[:3, 3], Tb[:3, 3]]).all():
-        covariances = Ca[3:, 3:], Cb[3:, 3:]
-        names, move = (sensor, frame, "translation"), Tb[:3, 3] - Ta[:3, 3]
-        yield pair.difference(names, "mm", 1e3, ("x", "y", "z"), move, covariances, open_["translation"])
+        change = _Change(("x", "y", "z"), Tb[:3, 3] - Ta[:3, 3], (Ca[3:, 3:], Cb[3:, 3:]))
+        yield pair.difference((sensor, frame, "translation"), change, ("mm", 1e3), open_["translation"])
 
 
 def _open(pair: _Pair, frame: str, sensor: str, name: str) -> tuple[str, ...]:
@@ -198,14 +203,14 @@ def _quantities(pair: _Pair) -> Iterator[Difference]:
         qb = pair.b.quantities.get((sensor, key))
         if qb is None or (key == TIME_OFFSET.name and not clocks):
             continue
-        change, (Ca, Cb) = qb.value - qa.value, (qa.covariance, qb.covariance)
+        vector, (Ca, Cb) = qb.value - qa.value, (qa.covariance, qb.covariance)
         # Quantities without a unit, such as the intrinsics of an IMU, are ratios already.
-        unit, scale = shown_unit(qa.unit) if qa.unit and not qa.is_relative else ("percent", 1e2)
+        display = shown_unit(qa.unit) if qa.unit and not qa.is_relative else ("percent", 1e2)
         if qa.is_relative:
             relative = np.outer(1.0 / qa.value, 1.0 / qa.value)
-            change, Ca, Cb = change / qa.value, Ca * relative, Cb * relative
-        names = (sensor, pair.a.body, qa.what)
-        yield pair.difference(names, unit, scale, qa.labels, change, (Ca, Cb), _open_of(qa, qb))
+            vector, Ca, Cb = vector / qa.value, Ca * relative, Cb * relative
+        change = _Change(qa.labels, vector, (Ca, Cb))
+        yield pair.difference((sensor, pair.a.body, qa.what), change, display, _open_of(qa, qb))
 
 
 def _lenses(pair: _Pair) -> Iterator[Difference]:
@@ -213,15 +218,12 @@ def _lenses(pair: _Pair) -> Iterator[Difference]:
         lb = pair.b.lenses.get(sensor)
         if lb is None:
             continue
-        away = distance_px(la, lb)
         same = la.model == lb.model
         labels = camera_model(la.model).parameter_names if same else ()
-        change = lb.params - la.params if same else np.zeros(0)
-        nothing = np.full((0, 0), np.nan)
-        covariances = (la.covariance, lb.covariance) if same else (nothing, nothing)
-        yield pair.difference(
-            (sensor, sensor, "lens"), "px", 1.0, labels, change, covariances, _open_of(la, lb), lens=away
-        )
+        vector = lb.params - la.params if same else np.zeros(0)
+        unknown = np.full((0, 0), np.nan)
+        change = _Change(labels, vector, (la.covariance, lb.covariance) if same else (unknown, unknown))
+        yield pair.difference((sensor, sensor, "lens"), change, ("px", 1.0), _open_of(la, lb), distance_px(la, lb))
 
 
 def _open_of(a: Quantity | LensSide, b: Quantity | LensSide) -> tuple[str, ...]:
