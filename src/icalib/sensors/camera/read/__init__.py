@@ -15,7 +15,7 @@ from icalib.data.topics import MessageType, UnreadType
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.sensors.camera.read.checks import checked_corners
-from icalib.sensors.camera.read.corners import CORNER_TABLE, group_corners
+from icalib.sensors.camera.read.corners import CORNER_TABLE, CornerRows, group_corners
 from icalib.sensors.camera.read.tracks import read_track_stamps, read_tracks
 from icalib.sensors.camera.spec import Camera
 from icalib.sensors.camera.stream import CornerStream, TrackStream
@@ -90,7 +90,8 @@ def corners(recording: Recording, camera: Camera, target: Target) -> CornerStrea
     path = recording.table(camera, camera.path)
     table = read_table(path, CORNER_TABLE, layout, recording.note)
     stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))
-    return recording.inside(group_corners(camera.name, str(path), stamps, tag, corner, table.decimals, target), path)
+    rows = CornerRows(stamps, tag, corner, table.decimals)
+    return recording.inside(group_corners(camera.name, str(path), rows, target), path)
 
 
 def tracks(recording: Recording, camera: Camera) -> TrackStream:

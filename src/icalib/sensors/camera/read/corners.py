@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from icalib.data.measurements import CornerStream
@@ -24,28 +26,30 @@ CORNER_TABLE = TableKind(
 )
 
 
-def group_corners(
-    name: str,
-    source: str,
-    stamps_ns: np.ndarray,
-    tag: np.ndarray,
-    corner: np.ndarray,
-    uv: np.ndarray,
-    target: Target,
-) -> CornerStream:
-    """The corner stream of one camera, from rows stamps_ns, tag, corner (N,) int64 and uv (N, 2) px.
+class CornerRows(NamedTuple):
+    """Rows of a corner table: stamps_ns, tag, corner (N,) int64, and uv (N, 2) px."""
+
+    stamps_ns: np.ndarray
+    tag: np.ndarray
+    corner: np.ndarray
+    uv: np.ndarray
+
+
+def group_corners(name: str, source: str, rows: CornerRows, target: Target) -> CornerStream:
+    """The corner stream of one camera from the rows of its table.
 
     Raises RecordingError naming `source` and the instant: images out of order, a corner that the target does not have,
     or one that appears twice in an image.
     """
-    start = image_starts(source, stamps_ns)
-    point = _point_index(source, stamps_ns, tag, corner, target)
-    _refuse_repeated(source, stamps_ns, tag, corner, point, start, len(target.points))
-    return CornerStream(name, stamps_ns[start[:-1]], start, point, np.ascontiguousarray(uv))
+    start = image_starts(source, rows.stamps_ns)
+    point = _point_index(source, rows, target)
+    _refuse_repeated(source, rows, start, point)
+    return CornerStream(name, rows.stamps_ns[start[:-1]], start, point, np.ascontiguousarray(rows.uv))
 
 
-def _point_index(source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np.ndarray, target: Target) -> np.ndarray:
+def _point_index(source: str, rows: CornerRows, target: Target) -> np.ndarray:
     """(N,) index of the target point of each row. Raises RecordingError naming the first unknown corner."""
+    tag, corner = rows.tag, rows.corner
     try:
         return target.point_index(tag, corner)
     except RecordingError:
@@ -53,7 +57,7 @@ def _point_index(source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np
     try:
         return target.point_index(tag[row : row + 1], corner[row : row + 1])
     except RecordingError as error:
-        raise RecordingError(f"{source}: in the image at {stamps_ns[row]} ns, {error}") from None
+        raise RecordingError(f"{source}: in the image at {rows.stamps_ns[row]} ns, {error}") from None
 
 
 def _first_unknown(tag: np.ndarray, corner: np.ndarray, target: Target) -> int:
@@ -69,23 +73,17 @@ def _first_unknown(tag: np.ndarray, corner: np.ndarray, target: Target) -> int:
     return refused - 1
 
 
-def _refuse_repeated(
-    source: str,
-    stamps_ns: np.ndarray,
-    tag: np.ndarray,
-    corner: np.ndarray,
-    point: np.ndarray,
-    start: np.ndarray,
-    n_points: int,
-) -> None:
-    """Raises RecordingError naming the instant if a corner appears twice in an image."""
+def _refuse_repeated(source: str, rows: CornerRows, start: np.ndarray, point: np.ndarray) -> None:
+    """Raises RecordingError naming the instant if a corner appears twice in an image.
+
+    start (M + 1,): first row of each image; point (N,): index of the target point of each row."""
     image = np.repeat(np.arange(len(start) - 1), np.diff(start))
-    key = image * n_points + point
+    key = image * (1 + point.max(initial=0)) + point
     order = np.argsort(key, kind="stable")
     repeated = order[1:][np.diff(key[order]) == 0]
     if len(repeated):
         row = int(repeated.min())
         raise RecordingError(
-            f"{source}: the image at {stamps_ns[row]} ns has corner {corner[row]} of tag {tag[row]} twice; "
-            "remove one, or give images taken at the same instant different cameras."
+            f"{source}: the image at {rows.stamps_ns[row]} ns has corner {rows.corner[row]} of tag {rows.tag[row]} "
+            "twice; remove one, or give images taken at the same instant different cameras."
         )
