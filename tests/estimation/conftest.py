@@ -240,7 +240,8 @@ def make_features(
     keep = [rng.random(len(s.uv)) < 0.9 for s in streams]
     cuts = tuple(p.first for p in make_pieces(len(setup.state.seconds), 0)[1:])
     noise = (TrackNoise(0.8), TrackNoise(1.1, 0.3))
-    return FeatureFactor.build(cameras, streams, noise, tuple(keep), loss, setup.state, cuts)
+    factor = FeatureFactor(cameras, streams, noise, tuple(keep), *loss, setup.layout)
+    return factor.cut(setup.state, cuts)
 
 
 def make_features_on_planes(setup: Setup, *arguments, **options) -> tuple[Setup, FeatureFactor]:

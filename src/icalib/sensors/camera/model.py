@@ -182,12 +182,14 @@ def feature_factor(cameras: tuple[CornerFactor, ...], selected: Sequence[TrackSe
     )
     observed = observed_at_keyframes(cameras, at.measurements.tracks, state, settings.max_gap_s)
     keep = tuple(selection.keep & s for selection, s in zip(selected, observed, strict=True))
-    loss, noise = (settings.loss, settings.loss_scale), tuple(selection.noise for selection in selected)
+    noise, outliers = tuple(s.noise for s in selected), tuple(s.outliers for s in selected)
     cuts = chain_cuts(len(state.seconds))
     if at.coarse:
         cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / COARSE_TRACK_S)))))
-    factor = FeatureFactor.build(cameras, streams, noise, keep, loss, state, cuts, state.starts[1:], _surfaces(at))
-    factor = replace(factor, outliers=tuple(selection.outliers for selection in selected))
+    factor = FeatureFactor(
+        cameras, streams, noise, keep, settings.loss, settings.loss_scale, cameras[0].layout, state.starts[1:],
+        _surfaces(at), outliers,
+    ).cut(state, cuts)  # fmt: skip
     return factor.coarse(state) if at.coarse else factor
 
 
@@ -222,7 +224,7 @@ def _next_tracks(cameras: Sequence[Camera], noise: Mapping[str, CameraNoise], en
     next_noise = {c.name: noise[c.name] for c in cameras}
     for factor, out in pairs_of(end.factors, end.residuals, FeatureFactor):
         now = [selection for c in cameras if (selection := noise[c.name].tracks) is not None]
-        tracks = next_selections(cameras, factor, out, now, end.state, end.rig.settings, end.is_first)
+        tracks = next_selections(cameras, factor, out, now, end)
         for camera, selection in zip(cameras, tracks, strict=True):
             next_noise[camera.name] = replace(next_noise[camera.name], tracks=selection)
     return next_noise

@@ -41,6 +41,7 @@ from icalib.sensors.camera.features.statistics import (
 )
 from icalib.sensors.camera.features.surfaces import (
     NO_PLANES,
+    NO_SUMS,
     OnPlanes,
     PlaneDistances,
     Surfaces,
@@ -63,7 +64,7 @@ class FeatureFactor(FactorDefaults):
     cameras: corner factors, which have the camera poses and models. For each camera: streams, with the same images as
     its corners; noise; keep (N,) bool: observations in use; outliers (N,) bool, an empty tuple if not yet tested. loss,
     loss_scale: robust loss and its threshold in sigma. seams: first keyframe of each recording but the first;
-    surfaces: planes that points may lie on; on: the plane of each track."""
+    surfaces: planes that points may lie on. `cut` gives the tracks, and `on`, the plane of each track."""
 
     cameras: tuple[CornerFactor, ...]
     streams: tuple[TrackStream, ...]
@@ -71,31 +72,12 @@ class FeatureFactor(FactorDefaults):
     keep: tuple[np.ndarray, ...]
     loss: str
     loss_scale: float
-    tracks: Tracks
     layout: Layout
     seams: tuple[int, ...] = ()
     surfaces: Surfaces | None = None
-    on: OnPlanes = NO_PLANES
     outliers: tuple[np.ndarray, ...] = ()
-
-    @classmethod
-    def build(
-        cls,
-        cameras: tuple[CornerFactor, ...],
-        streams: tuple[TrackStream, ...],
-        noise: tuple[TrackNoise, ...],
-        keep: tuple[np.ndarray, ...],
-        loss: tuple[str, float],
-        state: State,
-        cuts: tuple[int, ...],
-        seams: tuple[int, ...] = (),
-        surfaces: Surfaces | None = None,
-    ) -> FeatureFactor:
-        """The factor, with tracks and initial points triangulated by the poses of `state`.
-
-        cuts: keyframes at which tracks end; loss: name of the robust loss, and its threshold in sigma."""
-        factor = cls(cameras, streams, noise, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
-        return factor.cut(state, cuts)
+    tracks: Tracks = NO_TRACKS
+    on: OnPlanes = NO_PLANES
 
     ties_distant_keyframes: ClassVar[bool] = True
 
@@ -269,8 +251,8 @@ class FeatureFactor(FactorDefaults):
                 )  # fmt: skip
             begin += len(view.observed.keyframe)
         if planes is not None:
-            loss, off = self._loss(curved), out.off.of(tracks)
-            total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
+            summed, loss = piece if sums else None, self._loss(curved)
+            total += add_points_on_planes(self.on.of(tracks), planes, loss, points, summed, out.off.of(tracks))
         if sums and piece.features is not None:
             piece.calib[-1, -1] += predicted_decrease(features.diagonal, features.side[:, :, -1])
         return total
@@ -387,7 +369,3 @@ class FeatureFactor(FactorDefaults):
             i = image[tracks][rows] - view.first
             out[rows] = np.einsum("nij,nj->ni", view.poses.R_sensor_world[i], points[rows] - view.poses.position[i])
         return out
-
-
-NO_NUMBERS = np.zeros(0, dtype=np.int64)
-NO_SUMS = FeatureSums.zeros(0, NO_NUMBERS, NO_NUMBERS, NO_NUMBERS, 0)

@@ -59,6 +59,8 @@ class OnPlanes(NamedTuple):
 
 
 NO_PLANES = OnPlanes.none(0)
+NO_NUMBERS = np.zeros(0, dtype=np.int64)
+NO_SUMS = FeatureSums.zeros(0, NO_NUMBERS, NO_NUMBERS, NO_NUMBERS, 0)  # of passes without normal equations
 
 
 class PlaneDistances(NamedTuple):
@@ -262,16 +264,13 @@ def _add_row(t, J_point, J_plane, columns, along, weighted, features, calib):
 
 
 def add_points_on_planes(
-    on: OnPlanes,
-    planes: Planes,
-    loss: Loss,
-    points: PointSearch,
-    features: FeatureSums,
-    piece: Piece,
-    out: PlaneDistances,
+    on: OnPlanes, planes: Planes, loss: Loss, points: PointSearch, piece: Piece | None, out: PlaneDistances
 ) -> float:
-    """Writes the plane residuals at the points found by `PointSearch` into `out`, and returns half the robust chi^2.
+    """Writes the plane residuals at the points of `PointSearch` into `out`, and returns half the robust chi^2.
 
-    Adds their normal equations to `features` and to the calibration parameters of `piece`, unless features is empty."""
-    calib = piece.calib if len(features.diagonal) else np.zeros((0, 0))
+    Adds their normal equations to the tracks and calibration parameters of `piece`; not if it is None or has no
+    tracks."""
+    features, calib = NO_SUMS, np.zeros((0, 0))
+    if piece is not None and piece.features is not None and len(piece.features.sums.diagonal):
+        features, calib = piece.features.sums, piece.calib
     return _accumulate(on, planes, loss, points.xyz, points.A, features, calib, out)

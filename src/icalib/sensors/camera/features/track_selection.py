@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.data.measurements import TrackStream
+from icalib.model.statistics import PassEnd
 from icalib.motion.factor import output_at
 from icalib.motion.time_offsets import instants
 from icalib.optim.arrowhead import chain_cuts
@@ -46,18 +47,12 @@ class TrackSelection:
 
 
 def next_selections(
-    cameras: Sequence[Camera],
-    factor: FeatureFactor,
-    out: FeatureOutput,
-    now: Sequence[TrackSelection],
-    state: State,
-    settings: Settings,
-    is_first: bool,
+    cameras: Sequence[Camera], factor: FeatureFactor, out: FeatureOutput, now: Sequence[TrackSelection], end: PassEnd
 ) -> list[TrackSelection]:
     """For each camera the selection of the next pass: noise by the residuals `out`, unless stated, and inliers.
 
-    state: poses and lens at the end of this pass; now: selections of this pass; is_first: whether this was the first
-    pass, which has a laxer test."""
+    now: selections of this pass, which ends with `end`. The first pass has a laxer test."""
+    settings, state = end.rig.settings, end.state
     noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(cameras))
     if settings.outlier_std <= 0.0:
         return [replace(selection, noise=n) for selection, n in zip(now, noise, strict=True)]
@@ -65,7 +60,7 @@ def next_selections(
     # and its first lens may have turned inliers into outliers.
     observed = observed_at_keyframes(factor.cameras, factor.streams, state, settings.max_gap_s)
     anew = replace(factor, noise=noise, keep=observed).cut(state, chain_cuts(factor.n_keyframes))
-    left, share = output_at(anew, state), INLIER_SHARE_FIRST if is_first else INLIER_SHARE
+    left, share = output_at(anew, state), INLIER_SHARE_FIRST if end.is_first else INLIER_SHARE
     # Observations of tracks that are left out are not in use: their residuals are unknown.
     return [TrackSelection(n, *_tested(anew, left, i, settings, share)) for i, n in enumerate(noise)]
 

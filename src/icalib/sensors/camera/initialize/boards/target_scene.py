@@ -116,6 +116,18 @@ def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarra
     return TargetPoses(rotation, position, rms < MAX_POSE_RMS_PX, rms)
 
 
+@njit(cache=True, nogil=True)
+def _compose(R_ab, p_ab, R_bc, p_bc, R_ac, p_ac):
+    """Writes the pose T_a_c = T_a_b T_b_c into R_ac (3, 3) and p_ac (3,) m."""
+    for a in range(3):
+        p_ac[a] = p_ab[a]
+        for b in range(3):
+            p_ac[a] += R_ab[a, b] * p_bc[b]
+            R_ac[a, b] = 0.0
+            for c in range(3):
+                R_ac[a, b] += R_ab[a, c] * R_bc[c, b]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_poses(
     start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms
@@ -134,14 +146,7 @@ def _best_poses(
             for side in range(R_bc.shape[1]):
                 if count < 4 or not ok[v, side]:
                     continue
-                k = body[v]
-                for a in range(3):
-                    p_sc[a] = p_sb[k, a]
-                    for b in range(3):
-                        p_sc[a] += R_sb[k, a, b] * p_bc[v, side, b]
-                        R_sc[a, b] = 0.0
-                        for c in range(3):
-                            R_sc[a, b] += R_sb[k, a, c] * R_bc[v, side, c, b]
+                _compose(R_sb[body[v]], p_sb[body[v]], R_bc[v, side], p_bc[v, side], R_sc, p_sc)
                 camera_in_target(R_sc, p_sc, trial_R, trial_t)
                 error = refine_pose(points[:count], observed[:count], trial_R.copy(), trial_t.copy(), 1)
                 if error < best:
