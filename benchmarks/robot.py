@@ -72,7 +72,7 @@ def _parts(inputs: Inputs, found: Estimate) -> None:
     """Accumulation of points to moments, and one linearisation by sensor."""
     problem, state = found.problem, found.outcome.state
     motion, planes = motion_of(inputs, state), np.array([state.values[k] for k in inputs.association.keys])
-    noises = [found.judged.noise[s.name] for s in inputs.measurements.lidars]
+    noises = [found.measurement_model.noise[s.name] for s in inputs.measurements.lidars]
     for stream, plane, noise in zip(inputs.measurements.lidars, inputs.association.plane, noises, strict=True):
         cloud = AssociatedPoints(stream, plane, planes)
         spent = min(_spent(lambda c=cloud, n=noise: take_moments(c, motion, n))[1] for _ in range(REPEATS))

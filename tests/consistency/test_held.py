@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from icalib.estimate.estimate import Callbacks
 from icalib.estimate.problem.outcome import Step
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability import determination
@@ -20,7 +21,7 @@ def test_of_an_estimate_that_failed_no_answers_are_looked_for(robot, monkeypatch
         return replace(found, outcome=replace(found.outcome, converged=False, stopped_early=False))
 
     monkeypatch.setattr(determination, "estimate", failing)
-    monkeypatch.setattr(determination, "owed_to_guess", None)
+    monkeypatch.setattr(determination, "prior_sensitivity", None)
     scenario = robot("planar", 4.0, "lw")
     rig = with_drawn_guess(rig_for(scenario), scenario, 0)
     found = determine(*guess_of_rig(rig, [simulate(scenario, 0).measurements])[:2])
@@ -39,9 +40,11 @@ def test_held_directions_are_moved_in_the_estimate_without_them(robot):
     found = determine(
         inputs,
         state,
-        lambda stage, step: steps.append((fixed_directions[-1], stage, step)),
-        lambda stage, problem, visit: fixed_directions.append(problem.fixed_directions.size),
         guess,
+        Callbacks(
+            lambda stage, step: steps.append((fixed_directions[-1], stage, step)),
+            lambda stage, problem, visit: fixed_directions.append(problem.fixed_directions.size),
+        ),
     )
     assert found.fixed_directions.shape[1] > 0
     again = next(k for k, (n, _, _) in enumerate(steps) if n > 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.estimate.estimate import estimate
+from icalib.estimate.estimate import Callbacks, EstimateOptions, estimate
 from icalib.geometry import so3
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.motion.factor import of_type
@@ -45,7 +45,8 @@ def passes(inputs, found, turned_deg: float):
         if not any(features is p for p in begun):
             begun.append(features)
 
-    again = estimate(inputs, replace(end, values=end.values | {key: turned}), on_visit=note, judged=found.judged)
+    options = EstimateOptions(measurement_model=found.measurement_model)
+    again = estimate(inputs, replace(end, values=end.values | {key: turned}), options, Callbacks(on_visit=note))
     return again, begun
 
 

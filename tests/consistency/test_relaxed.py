@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icalib.initialize.rig_guess import guess_of_rig
-from icalib.observability.determination import determine, judge
+from icalib.observability.determination import classify_directions, determine
 from icalib.observability.relaxed import freed_inputs, relaxed
 from icalib.optim.arrowhead import solve
 from icalib.rig import Parameter
@@ -36,7 +36,7 @@ def test_some_groups_alone_are_free_as_in_a_problem_of_their_own(estimated):
     outcome, gradient = stated.without(keys)
     columns = np.setdiff1d(np.arange(stated.layout.size), stated.fixed_columns(keys))
     freed = freed_inputs(inputs, keys)
-    problem = found.judged.problem(freed, stated.state)
+    problem = found.measurement_model.problem(freed, stated.state)
     pieces = problem.pieces()
     problem.linearise(stated.state, pieces, problem.residuals(), curved=True)
     own = solve(pieces, problem.n_keyframes, problem.tolerance)
@@ -46,7 +46,9 @@ def test_some_groups_alone_are_free_as_in_a_problem_of_their_own(estimated):
     np.testing.assert_allclose(one, other, atol=1e-8 * np.abs(other).max())
     np.testing.assert_allclose(t * gradient[columns], t * own.gradient[:-1], atol=1e-6 * np.sqrt(np.diag(other)).max())
     # What noise adds is found by other draws.
-    seen = judge(stated.inputs, outcome, columns=columns)
-    alone = judge(freed, replace(outcome, problem=problem, information=own.information, draws=None, room=None))
+    seen = classify_directions(stated.inputs, outcome, columns=columns)
+    alone = classify_directions(
+        freed, replace(outcome, problem=problem, information=own.information, draws=None, workspace=None)
+    )
     assert seen.undetermined.shape[1] == alone.undetermined.shape[1] == 0
     np.testing.assert_allclose(seen.data, alone.data, atol=0.02 * np.abs(alone.data).max())

@@ -27,8 +27,8 @@ def first_judged(monkeypatch):
     end: where it is left half-way, a tenth more noise is found than there is."""
     seen = []
 
-    def to_its_end(*args, maybe_rank_deficient, guess, **kwargs):
-        return estimate(*args, **kwargs)
+    def to_its_end(inputs, state, options, callbacks):
+        return estimate(inputs, state, callbacks=callbacks)
 
     def spy(problem, outcome, *_):
         seen.append((problem, outcome))

@@ -14,6 +14,7 @@ from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.problem.assembly import assemble, keyframe_times, keyframes_for, resample
 from icalib.estimate.problem.inputs import inputs_for, origin_difference
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.geometry.targets import NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
@@ -61,7 +62,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
     last = None
     for _ in range(3):
         problem = assemble(inputs, state, noise, coarse=True)
-        outcome = minimise(problem, state, tolerance=1e-10)
+        outcome = minimise(problem, state, SolverOptions(1e-10))
         assert outcome.converged, outcome.status
         last = problem, state, outcome
         state = outcome.state
@@ -79,8 +80,8 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
 
 def _is_the_same_in_its_own_room(problem, state, outcome):
     """Solved once more in the pieces that the last solve left behind, to the last bit."""
-    again = minimise(problem, state, tolerance=1e-10, room=outcome.room)
-    assert again.room is outcome.room is not None
+    again = minimise(problem, state, SolverOptions(1e-10), outcome.workspace)
+    assert again.workspace is outcome.workspace is not None
     np.testing.assert_array_equal(again.information, outcome.information)
     np.testing.assert_array_equal(again.state.position, outcome.state.position)
 

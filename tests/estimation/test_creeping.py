@@ -7,8 +7,9 @@ from typing import Any, cast
 
 import pytest
 
+from icalib.estimate.problem.damping import CAREFUL_DAMPING, Damping
+from icalib.estimate.problem.descent import Descent
 from icalib.estimate.problem.outcome import Step
-from icalib.estimate.problem.solver import CAREFUL_DAMPING, _DampingControl, _Descent
 
 
 @pytest.mark.parametrize(
@@ -19,23 +20,23 @@ def test_steps_that_fail_do_not_creep(promised: tuple[float, ...], accepted: tup
     """After a step that failed the next one, damped, promises nearly as much: nothing that noise leads."""
     steps = [Step(1e3, p, 0.0, a) for p, a in zip(promised, accepted, strict=True)]
     descent, solution = (cast(Any, SimpleNamespace(**f)) for f in ({"steps": steps}, {"decrease": 5.0}))
-    assert _Descent.creeps(descent, solution) == creeps
+    assert Descent.converges_slowly(descent, solution) == creeps
 
 
 def test_damping_stays_near_what_the_last_failure_asked_for():
     """It grows by 2, 4, 8 and shrinks by a third at most, until one good step follows another."""
-    care = _DampingControl(CAREFUL_DAMPING)
+    damping = Damping(CAREFUL_DAMPING)
     grown = []
     for _ in range(5):
-        care.more()
-        grown.append(care.damping / CAREFUL_DAMPING.first)
+        damping.after_failure()
+        grown.append(damping.value / CAREFUL_DAMPING.least_after_failure)
     assert grown == pytest.approx([1.0, 4.0, 32.0, 512.0, 16384.0])
-    care.less(near=False, gain=1.0)
-    assert care.damping == pytest.approx(grown[-1] * CAREFUL_DAMPING.first / 3.0)
-    before = care.damping
-    care.less(near=False, gain=1.0)
-    assert care.damping == pytest.approx(CAREFUL_DAMPING.less * before)
-    care.less(near=False, gain=0.1)
-    assert care.damping == pytest.approx(CAREFUL_DAMPING.less * before)
-    care.less(near=True, gain=0.5)
-    assert care.curved and care.damping == pytest.approx(CAREFUL_DAMPING.less * before)
+    damping.after_success(curved=False, gain=1.0)
+    assert damping.value == pytest.approx(grown[-1] * CAREFUL_DAMPING.least_after_failure / 3.0)
+    before = damping.value
+    damping.after_success(curved=False, gain=1.0)
+    assert damping.value == pytest.approx(CAREFUL_DAMPING.min_factor * before)
+    damping.after_success(curved=False, gain=0.1)
+    assert damping.value == pytest.approx(CAREFUL_DAMPING.min_factor * before)
+    damping.after_success(curved=True, gain=0.5)
+    assert damping.curved and damping.value == pytest.approx(CAREFUL_DAMPING.min_factor * before)

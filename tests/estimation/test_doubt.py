@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from icalib.estimate.residual_statistics.jacobian_noise import Spurious
-from icalib.observability.determination import _are_alike, _shown, scatter
+from icalib.observability.determination import _are_alike, _principal_directions, scatter
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
 TOLERANCE = np.array([1e-3, 0.1, 2.0, 0.5])
@@ -22,10 +22,10 @@ def test_only_what_may_be_noise_by_chance_is_in_doubt():
     """Beside noise of 6 there are 3 that it hardly reaches, 2 that it may, 7 that it may but that are most of it, and
     next to nothing."""
     asked = DIRECTIONS @ np.diag([9.0, 8.0, 13.0, 6.001]) @ DIRECTIONS.T
-    seen = _shown(asked, TOLERANCE, np.ones(4, dtype=bool), spurious(0.1, 2.0, 2.0, 0.1))
+    seen = _principal_directions(asked, TOLERANCE, np.ones(4, dtype=bool), spurious(0.1, 2.0, 2.0, 0.1))
     along = (DIRECTIONS.T @ seen.vectors) ** 2
-    np.testing.assert_allclose(along @ seen.in_doubt, [0.0, 1.0, 0.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(along @ seen.nothing, [0.0, 0.0, 0.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(along @ seen.maybe_noise, [0.0, 1.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(along @ seen.unobservable, [0.0, 0.0, 0.0, 1.0], atol=1e-9)
 
 
 def test_whether_all_else_is_determined_is_asked_with_nuisance_parameters_known():
@@ -34,8 +34,8 @@ def test_whether_all_else_is_determined_is_asked_with_nuisance_parameters_known(
     asked = np.zeros((3, 3))
     asked[np.ix_([0, 2], [0, 2])] = 4.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
     nothing = Spurious(np.zeros((1, 3, 3)))
-    seen = _shown(asked, TOLERANCE[:3], np.array([True, True, False]), nothing)
-    np.testing.assert_allclose(seen.vectors[:, seen.nothing].T ** 2, [[0.0, 1.0, 0.0]], atol=1e-12)
+    seen = _principal_directions(asked, TOLERANCE[:3], np.array([True, True, False]), nothing)
+    np.testing.assert_allclose(seen.vectors[:, seen.unobservable].T ** 2, [[0.0, 1.0, 0.0]], atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [3, 7])

@@ -12,6 +12,7 @@ from tests.typed import not_none
 
 from icalib.estimate.problem.outcome import Draws, Outcome, posterior
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.estimate.residual_statistics.fit_statistics import fits
 from icalib.estimate.residual_statistics.jacobian_noise import spurious_information
 from icalib.motion.factor import of_type
@@ -176,7 +177,7 @@ def test_degrees_of_freedom_of_points_on_planes(scanned, dense):
 
 def test_an_early_outcome_has_no_draws_and_they_are_made_where_they_are_asked_for(followed, setup):
     start = setup.perturbed(np.random.default_rng(5), 1.0)
-    early, late = minimise(followed, start, tolerance=0.5), minimise(followed, start)
+    early, late = minimise(followed, start, SolverOptions(0.5)), minimise(followed, start)
     assert early.draws is None and early.information.size == 0
     there = posterior(followed, late.state)
     for a, b in zip(

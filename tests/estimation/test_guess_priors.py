@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from icalib.estimate import estimate as estimates
-from icalib.estimate.estimate import Estimate, MeasurementModel, estimate
-from icalib.estimate.problem import solver
+from icalib.estimate.estimate import Estimate, EstimateOptions, MeasurementModel, estimate
+from icalib.estimate.problem import descent
 from icalib.estimate.problem.assembly import given_priors
+from icalib.estimate.problem.descent import Descent
 from icalib.estimate.problem.guess_priors import guess_priors, guess_sigma
 from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.solver import _Descent
+from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.estimate.problem.tolerances import UNGUESSED_TRANSLATION_SIGMA_M
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.optim.arrowhead import solve
@@ -88,7 +89,7 @@ def same_information(found: Estimate) -> None:
 def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them(begun, monkeypatch, doubtful: bool):
     """Guesses are taken to be good to a hundredth, so that they would be missed. To the last digit: by steps until
     nothing is left."""
-    monkeypatch.setattr(solver, "SMALL_DECREASE", 0.0)
+    monkeypatch.setattr(descent, "SMALL_DECREASE", 0.0)
     monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-2))
     inputs, state = begun
     asked: list[int] = []
@@ -97,7 +98,7 @@ def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them
         asked.append(len(problem.priors))
         return doubtful
 
-    found = estimate(inputs, state, maybe_rank_deficient=seems_open, guess=state)
+    found = estimate(inputs, state, EstimateOptions(maybe_rank_deficient=seems_open, guess=state))
     given = {p.block.key for p in given_priors(inputs)}
     guessed = {p.block.key for p in guess_priors(inputs, state)}
     left = {p.block.key for p in found.problem.priors}
@@ -116,9 +117,10 @@ def test_priors_that_are_let_go_leave_the_step_of_the_problem_without_them(begun
     more = guess_priors(inputs, replace(state, values=state.values | TURNED))
     led = replace(problem, priors=(*problem.priors, *more))
     assert led.without(more).priors == problem.priors
-    at = _Descent.begin(led, state, 1e-3, 0.0, lambda _: None)
-    freed = at.let_go(more, at.solution())
-    alone = _Descent.begin(problem, state, 1e-3, 0.0, lambda _: None)
+    options = SolverOptions(1e-3, 0.0)
+    at = Descent.begin(led, state, options)
+    freed = at.drop_priors(more, at.solution())
+    alone = Descent.begin(problem, state, options)
     expected = alone.solution()
     assert at.cost == pytest.approx(alone.cost, rel=1e-12)
     assert freed.decrease == pytest.approx(expected.decrease, rel=1e-9)
@@ -135,9 +137,9 @@ def test_the_last_step_is_taken_with_the_sums_at_hand(begun, monkeypatch):
     information is that of the end."""
     monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-2))
     inputs, state = begun
-    short = estimate(inputs, state, guess=state)
-    monkeypatch.setattr(solver, "SMALL_DECREASE", 0.0)
-    long = estimate(inputs, state, guess=state)
+    short = estimate(inputs, state, EstimateOptions(guess=state))
+    monkeypatch.setattr(descent, "SMALL_DECREASE", 0.0)
+    long = estimate(inputs, state, EstimateOptions(guess=state))
     assert len(short.steps) < len(long.steps)
     assert short.outcome.converged and short.outcome.cost == pytest.approx(long.outcome.cost, abs=1e-4)
     sigma = np.sqrt(np.diag(np.linalg.inv(long.outcome.information)))
@@ -155,10 +157,10 @@ def test_while_something_is_held_they_count_and_the_estimate_is_half_way(begun, 
     inputs, state = begun
     fixed_directions = np.zeros((inputs.layout.size, 1))
     fixed_directions[inputs.layout.columns(inputs.rig.cameras[1].name, "translation")[0]] = 1.0
-    free = estimate(inputs, state, fixed_directions=fixed_directions)
+    free = estimate(inputs, state, EstimateOptions(fixed_directions))
     key = inputs.rig.cameras[1].name, "time_offset"
     elsewhere = replace(state, values=state.values | {key: free.outcome.state.values[key] + 5e-3})
-    led = estimate(inputs, state, fixed_directions=fixed_directions, guess=elsewhere)
+    led = estimate(inputs, state, EstimateOptions(fixed_directions, guess=elsewhere))
     assert led.outcome.stopped_early
     assert not free.outcome.stopped_early
     assert len(led.problem.priors) == len(free.problem.priors) == len(given_priors(inputs))

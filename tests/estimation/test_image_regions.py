@@ -15,6 +15,7 @@ from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.estimate.residual_statistics.image_regions import _cluster_gradients, _count, cluster_covariances
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.rig_guess import guess_of_rig
@@ -48,7 +49,7 @@ def solved() -> tuple[Problem, Outcome]:
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
     inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 1).measurements])
     problem = assemble(inputs, state, MODEL.first_noises(rig.cameras, rig, inputs.measurements))
-    return problem, minimise(problem, state, tolerance=1e-6)
+    return problem, minimise(problem, state, SolverOptions(1e-6))
 
 
 def gradient(problem: Problem, outcome: Outcome) -> np.ndarray:

@@ -9,6 +9,7 @@ from tests.typed import not_none
 from icalib.errors import EstimationError
 from icalib.estimate.problem import solver
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.solver_options import CONVERGED_DECREASE, SolverOptions
 from icalib.geometry import so3
 from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import N_THREADS, solve
@@ -96,13 +97,13 @@ def noisy_problem(setup_of, problem_of):
 def test_costs_of_accepted_steps_fall(noisy_problem):
     problem, start = noisy_problem
     steps = []
-    outcome = minimise(problem, start, steps.append)
+    outcome = minimise(problem, start, SolverOptions(on_step=steps.append))
     assert outcome.converged and tuple(steps) == outcome.steps
     costs = [s.cost for s in steps if s.accepted] + [outcome.cost]
     assert all(b < a for a, b in zip(costs[:-2], costs[1:-1], strict=True))
     assert costs[-1] <= costs[-2] * (1.0 + 1e-9)
     assert outcome.status.startswith(f"converged in {len(steps)} iterations of the last pass")
-    assert steps[-1].damping == 0.0 and steps[-1].predicted_decrease < solver.CONVERGED_DECREASE
+    assert steps[-1].damping == 0.0 and steps[-1].predicted_decrease < CONVERGED_DECREASE
 
 
 def test_information_is_that_of_the_end_and_without_damping(noisy_problem):

@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 from tests.typed import StandIn
 
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.optim.anderson import Accelerator
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.calib_block import NO_DIRECTIONS
@@ -119,7 +120,7 @@ def at(y: float) -> State:
 
 def test_it_ends_where_it_is_and_calls_that_converged():
     for tolerance in (0.5, 5e-4):
-        outcome = minimise(Valley(), at(0.0), tolerance=tolerance)
+        outcome = minimise(Valley(), at(0.0), SolverOptions(tolerance))
         assert outcome.converged, outcome.status
         assert outcome.state.values[KEY][0] == 0.0
         assert not outcome.steps[-1].accepted
@@ -139,7 +140,7 @@ def test_an_early_pass_ends_with_a_step_that_gains_what_was_foretold():
     """Where nothing bends, the sums that it began with are enough; where something does, they are made anew."""
     straight, bent = Slope(0.0), Slope(0.2)
     for slope, most in ((straight, 1), (bent, 3)):
-        outcome = minimise(slope, at(0.0), tolerance=0.5)
+        outcome = minimise(slope, at(0.0), SolverOptions(0.5))
         assert slope.rows(outcome.state.values[KEY][0])[0][0] ** 2 < 2.0 * 0.5
         assert slope.asked <= most
     assert bent.asked > 1
@@ -153,7 +154,7 @@ def test_the_last_pass_makes_its_sums_anew_after_a_step_that_gained_what_was_for
 
 
 def test_an_early_pass_finds_the_damping_it_needs_in_few_tries_and_lets_go_of_it_in_few():
-    outcome = minimise(Turn(), at(2.0), tolerance=0.5)
+    outcome = minimise(Turn(), at(2.0), SolverOptions(0.5))
     assert abs(outcome.state.values[KEY][0]) < 1e-2
     tries = next(k for k, s in enumerate(outcome.steps) if s.accepted)
     assert 1 <= tries <= 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome, Step, Visit, relative_decrease
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.estimate.residual_statistics.fit_statistics import chi2_by_kind, fits
 from icalib.model.sensor_model import by_kind
 from icalib.model.statistics import PassEnd
@@ -26,15 +27,13 @@ from icalib.optim.state import State
 FIRST_PASS_PRIOR_WIDTH = 3.0  # width of the priors of `first_pass`, over the prior uncertainty of the guess
 # An early pass stops if the predicted decrease of half the chi^2 is below the first, or below the second times it.
 EARLY_DECREASE, EARLY_DECREASE_SHARE = 0.5, 1e-6
+EARLY_PASS = SolverOptions(tolerance=EARLY_DECREASE, tolerance_share=EARLY_DECREASE_SHARE)
 FIRST_DECREASE_SHARE = 1e-3  # EARLY_DECREASE_SHARE of the first pass, whose noise and inliers are less accurate
 MAX_FINAL_REPEATS = 4  # repetitions of the final pass with weights frozen anew
 # chi^2 at the start of a pass over chi^2 at its end: above this ratio the weights frozen at the start are out of date
 STALE_CHI2_RATIO = 1.1
 # relative cost decrease over that of the pass before: above this ratio passes alternate between two states
 ALTERNATING_RATIO = 0.5
-
-
-OnVisit = Callable[[str, Problem, Visit], None]  # called with the name of the pass, its problem, and the solver's visit
 
 
 @dataclass(frozen=True)
@@ -72,202 +71,238 @@ class MeasurementModel:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Result of the last pass. judged: noise and inliers that the pass used. steps: of all passes, each with the name
-    of its pass."""
+    """Result of the last pass. measurement_model: noise and inliers that the pass used. steps: of all passes, each with
+    the name of its pass."""
 
     outcome: Outcome
-    judged: MeasurementModel
-    steps: tuple[tuple[str, Step], ...]  # of all passes, with the pass's name
+    measurement_model: MeasurementModel
+    steps: tuple[tuple[str, Step], ...]
 
     @property
     def problem(self) -> Problem:
         return self.outcome.problem
 
 
+OnVisit = Callable[[str, Problem, Visit], None]
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """Functions that observe the solver. on_step: called with the name of the pass and each step. on_visit: called with
+    the name of the pass, its problem, and each state at which a step is computed."""
+
+    on_step: Callable[[str, Step], None] = lambda *_: None
+    on_visit: OnVisit = lambda *_: None
+
+
+@dataclass(frozen=True)
+class EstimateOptions:
+    """Options of `estimate`.
+
+    fixed_directions (B, m): directions of the calibration parameters that are fixed, see `Problem`.
+
+    measurement_model: known noise and inliers. With them only the final pass runs.
+
+    guess: mean of priors that keep unobservable directions from drifting. They apply until the null space is known, and
+    while directions are fixed. A pass that ends with these priors counts as stopped early.
+
+    maybe_rank_deficient: gets a problem and the information (B, B) of the calibration parameters. If it returns True,
+    the pass stops early, because it would converge slowly along an unobservable direction.
+    """
+
+    fixed_directions: np.ndarray = field(default_factory=lambda: NO_DIRECTIONS)
+    measurement_model: MeasurementModel | None = None
+    guess: State | None = None
+    maybe_rank_deficient: Callable[[Problem, np.ndarray], bool] = lambda *_: False
+
+
+NO_CALLBACKS, DEFAULT_OPTIONS = Callbacks(), EstimateOptions()
+
+
 def estimate(
     inputs: Inputs,
     state: State,
-    on_step: Callable[[str, Step], None] = lambda *_: None,
-    fixed_directions: np.ndarray = NO_DIRECTIONS,
-    on_visit: OnVisit = lambda *_: None,
-    judged: MeasurementModel | None = None,
-    maybe_rank_deficient: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
-    guess: State | None = None,
+    options: EstimateOptions = DEFAULT_OPTIONS,
+    callbacks: Callbacks = NO_CALLBACKS,
 ) -> Estimate:
-    """Runs all passes from an initial `state`, and returns the last one. With known noise and inliers `judged`, runs
-    the final pass alone.
-
-    fixed_directions (B, m): directions of the calibration parameters that are fixed, see `Problem`. on_step, on_visit:
-    called with each step and each `Visit` of the solver. maybe_rank_deficient: gets a problem and the information (B,
-    B) of the calibration parameters. If it returns True, the pass stops early, because it would converge slowly along
-    an unobservable direction. guess: mean of priors that keep unobservable directions from drifting. They apply until
-    the null space is known, and while directions are fixed. A pass that ends with these priors counts as stopped early,
-    too.
-
-    Raises EstimationError if the data do not suffice for an estimate.
-    """
-    *early, final = pass_names(inputs)
-    about = () if guess is None else guess_priors(inputs, guess)
-    passes = _Passes(
-        inputs,
-        fixed_directions,
-        on_step,
-        on_visit,
-        maybe_rank_deficient,
-        state,
-        judged or MeasurementModel.first(inputs),
-        about,
-    )
-    if judged is None:
-        for name in early:
-            passes.early(name)
-            memory.trim_heap()  # before the next one takes as much memory
-    else:
+    """Runs all passes from an initial `state`, and returns the last one. Raises EstimationError if the data do not
+    suffice for an estimate."""
+    passes = _Passes.begin(inputs, state, options, callbacks)
+    *early_names, final_name = pass_names(inputs)
+    if options.measurement_model is not None:
         passes.begin_at(state)
-    way = np.inf
-    for left in reversed(range(1 + MAX_FINAL_REPEATS)):
-        way_before = way if left else 0.0  # 0: the last repetition runs to convergence, see `_is_far`
-        outcome, way = passes.final(final, way_before)
-        if not left or not _again(inputs, outcome, passes.judged, way, way_before):
-            return Estimate(_without_priors(outcome, passes.about), passes.judged, tuple(passes.history))
-        passes.begin_at(outcome.state)
-        del outcome
-        memory.trim_heap()
-    raise AssertionError("the loop ends where nothing is left")
+        return passes.run_final(final_name)
+    for name in early_names:
+        passes.run_early(name)
+        memory.trim_heap()  # before the next one takes as much memory
+    return passes.run_final(final_name)
 
 
 @dataclass
 class _Passes:
-    """Passes of one estimate. state: start of the next pass. judged: its noise and inliers. about: priors about the
-    initial guess, in use until every direction is observable and none is fixed."""
+    """Passes of one estimate. state: start of the next pass. measurement_model: its noise and inliers. guess_priors:
+    priors about the initial guess, in use until every direction is observable and none is fixed. history: steps of all
+    passes."""
 
     inputs: Inputs
-    fixed_directions: np.ndarray
-    on_step: Callable[[str, Step], None]
-    on_visit: OnVisit
-    maybe_rank_deficient: Callable[[Problem, np.ndarray], bool]
+    options: EstimateOptions
+    callbacks: Callbacks
     state: State
-    judged: MeasurementModel
-    about: tuple[Prior, ...]
+    measurement_model: MeasurementModel
+    guess_priors: tuple[Prior, ...]
     history: list[tuple[str, Step]] = field(default_factory=list)
+
+    @classmethod
+    def begin(cls, inputs: Inputs, state: State, options: EstimateOptions, callbacks: Callbacks) -> _Passes:
+        """Passes before the first one, which starts at `state`."""
+        priors = () if options.guess is None else guess_priors(inputs, options.guess)
+        measurement_model = options.measurement_model or MeasurementModel.first(inputs)
+        return cls(inputs, options, callbacks, state, measurement_model, priors)
 
     def begin_at(self, state: State) -> None:
         """Lets the next pass start at `state`, resampled at the keyframe times that its time offsets imply."""
-        self.state = _on_own_keyframes(self.inputs, state)
+        self.state = _resampled(self.inputs, state)
 
-    def early(self, name: str) -> None:
+    def run_early(self, name: str) -> None:
         """Runs a pass with a wide tolerance, and updates noise and inliers from its residuals."""
         first = name == "first"
-        problem, told = self._next(name)
-        share = FIRST_DECREASE_SHARE if first else EARLY_DECREASE_SHARE
-
-        def leaves(_: float, information: np.ndarray) -> bool:
-            return self.maybe_rank_deficient(problem, information)
-
-        outcome = minimise(problem, self.state, told.step, EARLY_DECREASE, told.visit, share, leaves=leaves)
-        self._let_go(self.maybe_rank_deficient(problem, told.information))
-        self.judged = self.judged.next(self.inputs, outcome, first)
+        problem, recorder = self._next(name)
+        options = SolverOptions(
+            tolerance=EARLY_DECREASE,
+            tolerance_share=FIRST_DECREASE_SHARE if first else EARLY_DECREASE_SHARE,
+            stops_early=lambda _, information: self.options.maybe_rank_deficient(problem, information),
+            on_step=recorder.step,
+            on_visit=recorder.visit,
+        )
+        outcome = minimise(problem, self.state, options)
+        self._drop_guess_priors(self.options.maybe_rank_deficient(problem, recorder.information))
+        self.measurement_model = self.measurement_model.next(self.inputs, outcome, first)
         self.begin_at(outcome.state)
 
-    def final(self, name: str, way_before: float) -> tuple[Outcome, float]:
+    def run_final(self, name: str) -> Estimate:
+        """Runs the final pass, and repeats it while its frozen quantities are out of date."""
+        decrease = np.inf
+        for n_left in reversed(range(1 + MAX_FINAL_REPEATS)):
+            decrease_before = decrease if n_left else 0.0  # 0: the last one runs to convergence, see `_is_stale`
+            outcome, decrease = self._final(name, decrease_before)
+            if not n_left or not self._must_repeat(outcome, decrease, decrease_before):
+                return Estimate(
+                    _without_priors(outcome, self.guess_priors), self.measurement_model, tuple(self.history)
+                )
+            self.begin_at(outcome.state)
+            del outcome
+            memory.trim_heap()
+        raise AssertionError("the last repetition returns")
+
+    def _final(self, name: str, decrease_before: float) -> tuple[Outcome, float]:
         """Solves the final pass. Returns the outcome and its relative cost decrease; `inf` if it stopped early because
         the problem is rank deficient.
 
-        way_before: relative cost decrease of the previous final pass. The pass also stops early if its frozen weights
-        are out of date, or while priors about the guess apply. Once every direction is observable, it drops these
-        priors and continues.
+        decrease_before: relative cost decrease of the previous final pass. The pass also stops early if its frozen
+        weights are out of date, or while priors about the guess apply. Once every direction is observable, it drops
+        these priors and continues.
         """
-        problem, told = self._next(name)
+        problem, recorder = self._next(name)
+        maybe_rank_deficient = partial(self.options.maybe_rank_deficient, problem)
 
-        def leaves(way: float, information: np.ndarray) -> bool:
-            return bool(self.about) or self.maybe_rank_deficient(problem, information) or _is_far(way, way_before)
+        def stops_early(decrease: float, information: np.ndarray) -> bool:
+            return bool(self.guess_priors) or maybe_rank_deficient(information) or _is_stale(decrease, decrease_before)
 
-        def priors_to_drop(way: float, information: np.ndarray) -> tuple[Prior, ...]:
-            return () if _is_far(way, way_before) else self._let_go(self.maybe_rank_deficient(problem, information))
+        def priors_to_drop(decrease: float, information: np.ndarray) -> tuple[Prior, ...]:
+            if _is_stale(decrease, decrease_before):
+                return ()
+            return self._drop_guess_priors(maybe_rank_deficient(information))
 
-        outcome = minimise(
-            problem, self.state, told.step, on_visit=told.visit, leaves=leaves, priors_to_drop=priors_to_drop
-        )
-        is_open = self.maybe_rank_deficient(problem, told.information)
-        way, gone = relative_decrease(outcome.steps, outcome.cost), self._let_go(is_open)
-        if gone and not _is_far(way, way_before):
-            without, room = outcome.problem.without(gone), outcome.room
-            rest = minimise(without, outcome.state, told.step, on_visit=told.visit, room=room)
-            outcome = replace(rest, steps=(*outcome.steps, *rest.steps))
-            way = relative_decrease(outcome.steps, outcome.cost)
-        return outcome, np.inf if is_open and outcome.stopped_early else way
+        to_convergence = SolverOptions(on_step=recorder.step, on_visit=recorder.visit)
+        options = replace(to_convergence, stops_early=stops_early, priors_to_drop=priors_to_drop)
+        outcome = minimise(problem, self.state, options)
+        is_deficient = maybe_rank_deficient(recorder.information)
+        decrease, dropped = relative_decrease(outcome.steps, outcome.cost), self._drop_guess_priors(is_deficient)
+        if dropped and not _is_stale(decrease, decrease_before):
+            outcome = _continued(outcome, dropped, to_convergence)
+            decrease = relative_decrease(outcome.steps, outcome.cost)
+        return outcome, np.inf if is_deficient and outcome.stopped_early else decrease
 
-    def _next(self, name: str) -> tuple[Problem, _Told]:
+    def _next(self, name: str) -> tuple[Problem, _PassRecorder]:
         """Problem of the next pass with the priors about the guess, and the recorder of its steps."""
-        problem = _with_priors(self.judged.problem(self.inputs, self.state, self.fixed_directions), self.about)
-        return problem, _Told(name, problem, self.on_step, self.on_visit, self.history)
+        problem = self.measurement_model.problem(self.inputs, self.state, self.options.fixed_directions)
+        problem = _with_priors(problem, self.guess_priors)
+        return problem, _PassRecorder(name, problem, self.callbacks, self.history)
 
-    def _let_go(self, is_open: bool) -> tuple[Prior, ...]:
-        """Drops the priors about the guess, unless directions are unobservable (`is_open`) or fixed. Returns the
+    def _drop_guess_priors(self, is_deficient: bool) -> tuple[Prior, ...]:
+        """Drops the priors about the guess, unless directions are unobservable (`is_deficient`) or fixed. Returns the
         dropped priors."""
-        if is_open or self.fixed_directions.size:
+        if is_deficient or self.options.fixed_directions.size:
             return ()
-        gone, self.about = self.about, ()
-        return gone
+        dropped, self.guess_priors = self.guess_priors, ()
+        return dropped
+
+    def _must_repeat(self, outcome: Outcome, decrease: float, decrease_before: float) -> bool:
+        """True if the final pass must be repeated: its frozen quantities, such as weights of points on planes, are out
+        of date, or many rejected measurements fit again.
+
+        decrease, decrease_before: relative cost decrease of the last pass and of the pass before. `decrease` is
+        infinite if the pass stopped early because the problem is rank deficient.
+        """
+        inputs, model = self.inputs, self.measurement_model
+        rebuilt = cache(lambda: model.problem(inputs, _resampled(inputs, outcome.state)).factors)
+        used = outcome.problem.factors
+        return _is_stale(decrease, decrease_before) or any(
+            m.uses_more(used, rebuilt) for m, _ in by_kind(inputs.sensors)
+        )
 
 
 @dataclass
-class _Told:
+class _PassRecorder:
     """Recorder of one pass. Appends steps to the `history` of all passes, calls the callbacks, and keeps the latest
     information (B, B) of the calibration parameters."""
 
     name: str
     problem: Problem
-    on_step: Callable[[str, Step], None]
-    on_visit: OnVisit
+    callbacks: Callbacks
     history: list[tuple[str, Step]]
     information: np.ndarray = field(default_factory=lambda: NO_DIRECTIONS)
 
     def step(self, step: Step) -> None:
         self.history.append((self.name, step))
-        self.on_step(self.name, step)
+        self.callbacks.on_step(self.name, step)
 
-    def visit(self, at: Visit) -> None:
-        self.information = at.information
-        self.on_visit(self.name, self.problem, at)
-
-
-def _with_priors(problem: Problem, more: Sequence[Prior]) -> Problem:
-    return replace(problem, priors=(*problem.priors, *more))
+    def visit(self, visit: Visit) -> None:
+        self.information = visit.information
+        self.callbacks.on_visit(self.name, self.problem, visit)
 
 
-def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
-    """The outcome of a problem with the priors `more`, as one of the problem without them. If it had converged it
-    counts as stopped early, because the optimum without priors differs."""
-    if not more:
+def _continued(outcome: Outcome, dropped: Sequence[Prior], options: SolverOptions) -> Outcome:
+    """The pass of `outcome`, continued without the priors `dropped`, with the steps of both parts."""
+    problem, workspace = outcome.problem.without(dropped), outcome.workspace
+    end = minimise(problem, outcome.state, options, workspace)
+    return replace(end, steps=(*outcome.steps, *end.steps))
+
+
+def _with_priors(problem: Problem, priors: Sequence[Prior]) -> Problem:
+    return replace(problem, priors=(*problem.priors, *priors))
+
+
+def _without_priors(outcome: Outcome, priors: Sequence[Prior]) -> Outcome:
+    """The outcome of a problem with `priors`, as one of the problem without them. If it had converged it counts as
+    stopped early, because the optimum without priors differs."""
+    if not priors:
         return outcome
     return replace(
         outcome,
-        problem=outcome.problem.without(more),
-        information=without_priors(outcome.information, more, outcome.state),
+        problem=outcome.problem.without(priors),
+        information=without_priors(outcome.information, priors, outcome.state),
         stopped_early=outcome.stopped_early or outcome.converged,
     )
 
 
-def _again(inputs: Inputs, outcome: Outcome, judged: MeasurementModel, way: float, way_before: float) -> bool:
-    """True if the final pass must be repeated: its frozen quantities, such as weights of points on planes, are out of
-    date, or many rejected measurements fit again.
-
-    way, way_before: relative cost decrease of the last pass and of the pass before. `way` is infinite if the pass
-    stopped early because the problem is rank deficient.
-    """
-    rebuilt = cache(lambda: judged.problem(inputs, _on_own_keyframes(inputs, outcome.state)).factors)
-    used = outcome.problem.factors
-    return _is_far(way, way_before) or any(m.uses_more(used, rebuilt) for m, _ in by_kind(inputs.sensors))
-
-
-def _is_far(way: float, way_before: float) -> bool:
+def _is_stale(decrease: float, decrease_before: float) -> bool:
     """True if the frozen weights of a pass are out of date, and passes converge instead of alternating between two
-    states."""
-    return STALE_CHI2_RATIO - 1.0 < way < ALTERNATING_RATIO * way_before
+    states. decrease, decrease_before: relative cost decrease of the pass, and of the one before."""
+    return STALE_CHI2_RATIO - 1.0 < decrease < ALTERNATING_RATIO * decrease_before
 
 
-def _on_own_keyframes(inputs: Inputs, state: State) -> State:
+def _resampled(inputs: Inputs, state: State) -> State:
     """The same motion, resampled at the keyframe times that its time offsets imply."""
     return resample(state, keyframes_for(inputs, keyframe_times(inputs, state.values)), inputs)
 
@@ -280,11 +315,12 @@ def first_pass(inputs: Inputs, state: State) -> State:
     """
     problem = MeasurementModel.first(inputs).problem(inputs, state)
     problem = _with_priors(problem, guess_priors(inputs, state, FIRST_PASS_PRIOR_WIDTH))
-    return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_DECREASE_SHARE, second_order=False).state
+    return minimise(problem, state, replace(EARLY_PASS, second_order=False)).state
 
 
 def pass_names(inputs: Inputs) -> tuple[str, ...]:
     """Names of the passes in order. Between the first and the final pass there are up to two that estimate noise and
     inliers, as many as the sensors need."""
-    count = max((m.passes(own, inputs.rig, inputs.measurements) for m, own in by_kind(inputs.sensors)), default=0)
+    kinds = by_kind(inputs.sensors)
+    count = max((model.passes(sensors, inputs.rig, inputs.measurements) for model, sensors in kinds), default=0)
     return ("first", *("noise", "noise again")[:count], "final")

@@ -115,12 +115,12 @@ def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcom
     assert inputs.rig.imu is not None
     rig = inputs.rig.with_sensors(replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
     other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
-    state, judged = found.outcome.state, found.judged
+    state, model = found.outcome.state, found.measurement_model
     scaled = {
-        s.name: model_of(s).scaled_noise(judged.noise[s.name], scales[s.name]) for s in rig.mounted if s.name in scales
+        s.name: model_of(s).scaled_noise(model.noise[s.name], scales[s.name]) for s in rig.mounted if s.name in scales
     }
     return minimise(
-        replace(judged, noise={**judged.noise, **scaled}).problem(other, state, found.problem.fixed_directions), state
+        replace(model, noise={**model.noise, **scaled}).problem(other, state, found.problem.fixed_directions), state
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
+from icalib.estimate.estimate import Callbacks
 from icalib.estimate.problem.groups import groups_of, with_groups
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Step, Visit
@@ -129,7 +130,7 @@ def _make_attempt(
     with ExitStack() as explaining:
         for kind in kinds_of(rig):
             explaining.enter_context(kind.explaining(inputs))
-        solution = determine(inputs, state, on_step, partial(on_visit, inputs), guess)
+        solution = determine(inputs, state, guess, Callbacks(on_step, partial(on_visit, inputs)))
     return Attempt(inputs, solution)
 
 

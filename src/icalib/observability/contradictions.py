@@ -16,7 +16,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.residual_statistics.fit_statistics import fits
 from icalib.geometry import so3
-from icalib.observability.determination import Determined, determine, judge, scatter
+from icalib.observability.determination import Determined, classify_directions, determine, scatter
 from icalib.observability.relaxed import Relaxed, freed_inputs, stated_keys
 from icalib.optim.calib_block import restricted_root
 from icalib.optim.state import Block, Key, State
@@ -64,61 +64,61 @@ def contradictions(inputs: Inputs, stated: Relaxed | None, factor: float) -> tup
     formal standard deviations."""
     if stated is None:
         return ()
-    alone = [_shown(inputs, stated.state, stated.layout.block(*k), *stated.step([k]), factor) for k in stated.stated]
-    standing_out = _standing_out(alone)
-    if not standing_out:
+    one_freed = [
+        _difference(inputs, stated.state, stated.layout.block(*k), *stated.step([k]), factor) for k in stated.stated
+    ]
+    significant = _significant(one_freed)
+    if not significant:
         return ()
-    if any(_is_far(c) for c in standing_out):
-        return _standing_out(_estimated(inputs, stated.state, standing_out))
-    return _standing_out(_linear(inputs, stated, standing_out, factor))
+    if any(c.in_prior_sigmas > FAR for c in significant):
+        return _significant(_estimated(inputs, stated.state, significant))
+    return _significant(_linear(inputs, stated, significant, factor))
 
 
-def _standing_out(shown: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
-    return tuple(c for c in shown if c.away.max() > SIGMAS)
-
-
-def _is_far(shown: Contradiction) -> bool:
-    return shown.in_prior_sigmas > FAR
+def _significant(differences: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
+    return tuple(c for c in differences if c.away.max() > SIGMAS)
 
 
 def _linear(
-    inputs: Inputs, stated: Relaxed, standing_out: Sequence[Contradiction], factor: float
+    inputs: Inputs, stated: Relaxed, significant: Sequence[Contradiction], factor: float
 ) -> Sequence[Contradiction]:
-    """Contradictions after one Newton step in which all groups of `standing_out` are free, and unobservable directions
+    """Contradictions after one Newton step in which all groups of `significant` are free, and unobservable directions
     stay fixed."""
-    keys, n = [c.key for c in standing_out], stated.layout.size
+    keys, n = [c.key for c in significant], stated.layout.size
     columns = np.setdiff1d(np.arange(n), stated.fixed_columns(keys))
     outcome, gradient = stated.without(keys)
-    seen = judge(stated.inputs, outcome, columns=columns)
+    directions = classify_directions(stated.inputs, outcome, columns=columns)
+    noise, null_space = directions.noise, directions.undetermined
     t = stated.problem.tolerance[columns]
     information = t[:, None] * outcome.information[np.ix_(columns, columns)] * t
-    root = restricted_root(information, seen.undetermined)
+    root = restricted_root(information, null_space)
     step, sigma = np.zeros(n), np.zeros(n)
     step[columns] = -t * (root @ (root.T @ (t * gradient[columns])))
-    sigma[columns] = t * np.sqrt(np.diag(scatter(information - seen.noise, seen.noise, seen.undetermined)))
-    return [_shown(inputs, stated.state, stated.layout.block(*c.key), step, sigma, factor) for c in standing_out]
+    sigma[columns] = t * np.sqrt(np.diag(scatter(information - noise, noise, null_space)))
+    return [_difference(inputs, stated.state, stated.layout.block(*c.key), step, sigma, factor) for c in significant]
 
 
-def _estimated(inputs: Inputs, state: State, standing_out: Sequence[Contradiction]) -> Sequence[Contradiction]:
-    """Contradictions after a new estimate in which all groups of `standing_out` are free; `standing_out` itself if that
+def _estimated(inputs: Inputs, state: State, significant: Sequence[Contradiction]) -> Sequence[Contradiction]:
+    """Contradictions after a new estimate in which all groups of `significant` are free; `significant` itself if that
     fails."""
-    freed = freed_inputs(inputs, [c.key for c in standing_out])
+    freed = freed_inputs(inputs, [c.key for c in significant])
     try:
-        again = determine(freed, state, guess=state.values)
+        solution = determine(freed, state, guess=state.values)
     except EstimationError:
-        return standing_out
-    return _by(inputs, again, [c.key for c in standing_out]) if again.estimate.outcome.converged else standing_out
+        return significant
+    converged = solution.estimate.outcome.converged
+    return _differences(inputs, solution, [c.key for c in significant]) if converged else significant
 
 
 def contradicted_by(inputs: Inputs, without: Determined) -> tuple[Contradiction, ...]:
     """Values stated in the rig file of `inputs` that contradict the estimate `without`, in which they are free. The
     largest difference comes first."""
     layout = without.estimate.problem.layout
-    found = _standing_out(_by(inputs, without, stated_keys(inputs, layout)))
-    return tuple(sorted(found, key=lambda c: -c.in_prior_sigmas))
+    significant = _significant(_differences(inputs, without, stated_keys(inputs, layout)))
+    return tuple(sorted(significant, key=lambda c: -c.in_prior_sigmas))
 
 
-def _by(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contradiction]:
+def _differences(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contradiction]:
     """Differences between the stated values of the groups `keys` and the estimate `without`, in which these are free.
 
     Standard deviations are multiplied by the root of the largest chi^2 per degree of freedom of any residuals, so that
@@ -128,10 +128,10 @@ def _by(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contra
     ratios = [f.chi2 / f.dof for f in fits(outcome.problem, outcome) if f.dof > np.sqrt(f.count)]
     factor = float(np.sqrt(max([1.0, *ratios])))
     sigma, nothing = np.sqrt(np.diag(without.covariance)), np.zeros(layout.size)
-    return [_shown(inputs, outcome.state, layout.block(*key), nothing, sigma, factor) for key in keys]
+    return [_difference(inputs, outcome.state, layout.block(*key), nothing, sigma, factor) for key in keys]
 
 
-def _shown(
+def _difference(
     inputs: Inputs, state: State, block: Block, step: np.ndarray, sigma: np.ndarray, factor: float
 ) -> Contradiction:
     """The difference between the stated value of `block` and the value at `state` plus `step` (B,). sigma (B,): formal
@@ -139,12 +139,14 @@ def _shown(
     sensor = (inputs.asked or inputs.rig).sensors[block.sensor]
     parameter: Parameter = getattr(sensor, block.name)
     assert parameter.value is not None
-    value, own = state.values[block.key], step[block.columns]
+    value, step = state.values[block.key], step[block.columns]
     if block.kind == "rotation":
-        there = value @ so3.exp(own)
-        off = so3.log(np.ascontiguousarray(parameter.value.T @ there))
+        value = value @ so3.exp(step)
+        difference = so3.log(np.ascontiguousarray(parameter.value.T @ value))
     else:
         shift = origin_difference(inputs.measurements, inputs.stream(block.sensor))
-        there = value + own - (shift if block.name == "time_offset" else 0.0)
-        off = there - parameter.value
-    return Contradiction(block.key, sensor.spec(block.name), parameter, there, off, factor * sigma[block.columns])
+        value = value + step - (shift if block.name == "time_offset" else 0.0)
+        difference = value - parameter.value
+    return Contradiction(
+        block.key, sensor.spec(block.name), parameter, value, difference, factor * sigma[block.columns]
+    )

@@ -13,7 +13,7 @@ its estimate, unless this is farther from the guess than the prior uncertainty o
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -22,17 +22,31 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
 from icalib.errors import EstimationError
-from icalib.estimate.estimate import EARLY_DECREASE, EARLY_DECREASE_SHARE, Estimate, OnVisit, estimate
+from icalib.estimate.estimate import (
+    EARLY_PASS,
+    NO_CALLBACKS,
+    Callbacks,
+    Estimate,
+    EstimateOptions,
+    estimate,
+)
 from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.outcome import Outcome, Step
+from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.estimate.residual_statistics.inflation import MIN_INFLATION, inflation, nuisance_priors, with_priors_weighed
 from icalib.estimate.residual_statistics.jacobian_noise import Spurious, spurious_information
-from icalib.observability.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.observability.prior_sensitivity import (
+    directions_to_reset,
+    linear_prior_sensitivity,
+    prior_sensitivity,
+    project_to_guess,
+    project_to_prior,
+)
 from icalib.optim.calib_block import UNOBSERVABLE_BELOW, essential_information, restricted_root
-from icalib.optim.prior_factor import variance_of_priors, without_priors
+from icalib.optim.prior_factor import Prior, variance_of_priors, without_priors
 from icalib.optim.state import Key, State
 
 # A direction may be unobservable only if less than this share of its information is left without noise in the Jacobian.
@@ -110,129 +124,132 @@ def scatter(known: np.ndarray, noise: np.ndarray, fixed_directions: np.ndarray) 
 def determine(
     inputs: Inputs,
     start: State,
-    on_step: Callable[[str, Step], None] = lambda *_: None,
-    on_visit: OnVisit = lambda *_: None,
     guess: dict[Key, np.ndarray] | None = None,
+    callbacks: Callbacks = NO_CALLBACKS,
 ) -> Determined:
     """Estimates the parameters, and fixes the null space of the data at `guess` (default: the values of `start`).
 
-    The estimate is repeated from `start` until the null space no longer changes. Fixed directions are then weighted
-    with the priors of the rig file (`weigh`), and priors on nuisance parameters by the empirical errors (`balance`). A
+    The estimate is repeated from `start` until the null space no longer changes. Fixed directions are then reset to the
+    mean of the priors of the rig file, and priors on nuisance parameters are weighted by the empirical errors. A
     direction that noise in the Jacobian constrains stays at its estimate if that is near the guess. Raises
     EstimationError if the data allow no estimate.
     """
-    wanted = replace(start, values=start.values | (guess or {}))
-    search = _Search.begin(inputs, start, wanted, on_step, on_visit)
-    search.settle()
-    search.weigh()
-    search.balance()
-    found, seen = search.found, search.seen
+    guess_state = replace(start, values=start.values | (guess or {}))
+    search = _NullSpaceSearch.begin(inputs, start, guess_state, callbacks)
+    search.find_null_space()
+    search.apply_priors()
+    search.weight_nuisance_priors()
+    result, directions = search.estimate, search.directions
     fixed_directions, shifts = np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size))
-    if found.problem.fixed_directions.size:
-        fixed_directions = found.problem.fixed_directions
+    if result.problem.fixed_directions.size:
+        fixed_directions = result.problem.fixed_directions
         # After a failed solve, re-solving for the sensitivity might fail, too.
-        worth = _is_worth_keeping(found.outcome)
-        shifts = (owed_to_guess if worth else in_proportion)(inputs, found.outcome, seen.data)
+        sensitivity = prior_sensitivity if _is_usable(result.outcome) else linear_prior_sensitivity
+        shifts = sensitivity(inputs, result.outcome, directions.data)
     # free the workspace: nothing is solved in it any more
-    found = replace(found, outcome=replace(found.outcome, room=None))
-    return Determined(found, seen.data, seen.noise, fixed_directions, shifts, search.inflation)
+    result = replace(result, outcome=replace(result.outcome, workspace=None))
+    return Determined(result, directions.data, directions.noise, fixed_directions, shifts, search.inflation)
 
 
 @dataclass
-class _Search:
-    """Search for the null space. `found` is the last estimate and `seen` its observability; the first estimate began at
-    `start`."""
+class _NullSpaceSearch:
+    """Search for the null space. start: state at which the first estimate began. guess: state to which unobservable
+    directions are reset. estimate, directions: the last estimate, and the observability of its directions. inflation:
+    see `Determined`."""
 
     inputs: Inputs
     start: State
     guess: State
-    on_step: Callable[[str, Step], None]
-    on_visit: OnVisit
-    found: Estimate
-    seen: Judgement
+    callbacks: Callbacks
+    estimate: Estimate
+    directions: DirectionClasses
     inflation: float = 1.0
 
     @classmethod
-    def begin(
-        cls, inputs: Inputs, start: State, guess: State, on_step: Callable[[str, Step], None], on_visit: OnVisit
-    ) -> _Search:
+    def begin(cls, inputs: Inputs, start: State, guess: State, callbacks: Callbacks) -> _NullSpaceSearch:
         """The first estimate, no direction fixed."""
-        found = estimate(
-            inputs, start, on_step, on_visit=on_visit, maybe_rank_deficient=_maybe_rank_deficient, guess=guess
-        )
-        return cls(inputs, start, guess, on_step, on_visit, found, judge(inputs, found.outcome))
+        options = EstimateOptions(guess=guess, maybe_rank_deficient=_maybe_rank_deficient)
+        first = estimate(inputs, start, options, callbacks)
+        return cls(inputs, start, guess, callbacks, first, classify_directions(inputs, first.outcome))
 
-    def settle(self) -> None:
+    def find_null_space(self) -> None:
         """Estimates again, with the null space fixed, until it no longer changes. The guess acts as a prior until then,
-        but not in the last estimate. LATE rounds and later accept more fixed directions, see `_is_settled`."""
+        but not in the last estimate. LATE rounds and later accept more fixed directions, see `_is_same_null_space`."""
         for k in range(MOST_ROUNDS):
-            found, seen = self.found, self.seen
-            settled = _is_settled(seen.undetermined, found.problem.fixed_directions, k >= LATE)
-            if settled and not found.outcome.stopped_early:
+            last, null_space = self.estimate, self.directions.undetermined
+            unchanged = _is_same_null_space(null_space, last.problem.fixed_directions, k >= LATE)
+            if unchanged and not last.outcome.stopped_early:
                 return
-            fixed_directions = (
-                found.problem.fixed_directions if settled and found.problem.fixed_directions.size else seen.undetermined
-            )
+            keeps_fixed = unchanged and last.problem.fixed_directions.size
+            fixed_directions = last.problem.fixed_directions if keeps_fixed else null_space
             # A failed estimate is no start for the next one.
-            state = found.outcome.state if _is_worth_keeping(found.outcome) else self.start
-            moving = astray(self.inputs, found.problem, state, self.guess, fixed_directions, seen.asked)
-            if moving.size:
-                state = _followed(found, moved_to_guess(found.problem, state, self.guess, moving), fixed_directions)
-            del found
-            self._estimate(state, fixed_directions, led=not settled and k + 1 < MOST_ROUNDS)
+            state = last.outcome.state if _is_usable(last.outcome) else self.start
+            reset = self._directions_to_reset(last.problem, state, fixed_directions)
+            if reset.size:
+                state = project_to_guess(last.problem, state, self.guess, reset)
+                state = _adapted(last, state, fixed_directions)
+            del last
+            self._estimate(state, fixed_directions, with_guess_priors=not unchanged and k + 1 < MOST_ROUNDS)
 
-    def weigh(self) -> None:
+    def apply_priors(self) -> None:
         """Resets the state along the fixed directions to the mean of the priors that the rig file states, and
         re-solves all other parameters. Repeated until the state stays there; does nothing without such priors."""
         for _ in range(MOST_ROUNDS):
-            problem, state = self.found.problem, self.found.outcome.state
-            moving = astray(self.inputs, problem, state, self.guess, problem.fixed_directions, self.seen.asked)
-            begin = moved_to_worth(self.inputs, problem, state, self.guess, moving)
-            if begin is None:
+            problem, state = self.estimate.problem, self.estimate.outcome.state
+            fixed_directions = problem.fixed_directions
+            reset = self._directions_to_reset(problem, state, fixed_directions)
+            state = project_to_prior(self.inputs, problem, state, self.guess, reset)
+            if state is None:
                 return
-            begin, fixed_directions = _followed(self.found, begin, problem.fixed_directions), problem.fixed_directions
+            state = _adapted(self.estimate, state, fixed_directions)
             del problem
-            self._estimate(begin, fixed_directions, led=False)
+            self._estimate(state, fixed_directions, with_guess_priors=False)
 
-    def balance(self) -> None:
+    def weight_nuisance_priors(self) -> None:
         """Re-solves with priors on nuisance parameters weighted by the empirical errors of the measurements
         (`inflation`)."""
-        outcome = self.found.outcome
+        outcome = self.estimate.outcome
         if not outcome.converged or (factor := inflation(self.inputs, outcome)) < MIN_INFLATION:
             return
         problem = with_priors_weighed(outcome.problem, factor)
-        again = minimise(problem, outcome.state, partial(self.on_step, "last"), room=outcome.room)
-        if again.converged:
-            self.found, self.inflation = replace(self.found, outcome=again), factor
-            self.seen = judge(self.inputs, again, self.seen)
+        options = SolverOptions(on_step=partial(self.callbacks.on_step, "last"))
+        outcome = minimise(problem, outcome.state, options, outcome.workspace)
+        if outcome.converged:
+            self.estimate, self.inflation = replace(self.estimate, outcome=outcome), factor
+            self.directions = classify_directions(self.inputs, outcome, self.directions)
 
-    def _estimate(self, begin: State, fixed_directions: np.ndarray, led: bool) -> None:
-        """Estimates again, with the guess as a prior if `led`. Noise and outliers are those of the last estimate,
-        unless it failed."""
-        judged = self.found.judged if _is_worth_keeping(self.found.outcome) else None
-        del self.found  # before the next one takes as much memory
-        guess = self.guess if led else None
-        self.found = estimate(self.inputs, begin, self.on_step, fixed_directions, self.on_visit, judged, guess=guess)
-        self.seen = judge(self.inputs, self.found.outcome, self.seen)
+    def _directions_to_reset(self, problem: Problem, state: State, fixed_directions: np.ndarray) -> np.ndarray:
+        """(B, k) directions in the span of `fixed_directions` (B, m) that are reset to the guess."""
+        return directions_to_reset(
+            self.inputs, problem, state, self.guess, fixed_directions, self.directions.information
+        )
+
+    def _estimate(self, start: State, fixed_directions: np.ndarray, with_guess_priors: bool) -> None:
+        """Estimates again from `start`. Noise and outliers are those of the last estimate, unless it failed."""
+        model = self.estimate.measurement_model if _is_usable(self.estimate.outcome) else None
+        del self.estimate  # before the next one takes as much memory
+        options = EstimateOptions(fixed_directions, model, self.guess if with_guess_priors else None)
+        self.estimate = estimate(self.inputs, start, options, self.callbacks)
+        self.directions = classify_directions(self.inputs, self.estimate.outcome, self.directions)
 
 
-def _followed(found: Estimate, moved: State, fixed_directions: np.ndarray) -> State:
-    """`moved`, re-solved with `fixed_directions` (B, m) fixed, in the problem of `found`.
+def _adapted(last: Estimate, state: State, fixed_directions: np.ndarray) -> State:
+    """`state`, re-solved with `fixed_directions` (B, m) fixed, in the problem of the estimate `last`.
 
-    Frozen quantities of `found`, such as tracks and weights of points on planes, are kept. Computed at `moved`, before
-    the trajectory has adapted, they would fit no state, and the next estimate might diverge. Returns `moved` if the
+    Frozen quantities of `last`, such as tracks and weights of points on planes, are kept. Computed at `state`, before
+    the trajectory has adapted, they would fit no state, and the next estimate might diverge. Returns `state` if the
     solve fails.
     """
-    if not _is_worth_keeping(found.outcome):
-        return moved
-    problem, room = replace(found.problem, fixed_directions=fixed_directions), found.outcome.room
+    if not _is_usable(last.outcome):
+        return state
+    problem = replace(last.problem, fixed_directions=fixed_directions)
     try:
-        return minimise(problem, moved, tolerance=EARLY_DECREASE, share=EARLY_DECREASE_SHARE, room=room).state
+        return minimise(problem, state, EARLY_PASS, last.outcome.workspace).state
     except EstimationError:
-        return moved
+        return state
 
 
-def _is_worth_keeping(outcome: Outcome) -> bool:
+def _is_usable(outcome: Outcome) -> bool:
     """Whether the solver converged or stopped early, so that its state can be used."""
     return outcome.converged or outcome.stopped_early
 
@@ -242,92 +259,97 @@ def _maybe_rank_deficient(problem: Problem, information: np.ndarray) -> bool:
     return essential_information(information, problem.tolerance, problem.layout) < RANK_DEFICIENT_BELOW
 
 
-def _is_settled(undetermined: np.ndarray, fixed_directions: np.ndarray, late: bool) -> bool:
-    """Whether the fixed subspace `fixed_directions` (B, m) equals the null space `undetermined` (B, n), both
+def _is_same_null_space(null_space: np.ndarray, fixed_directions: np.ndarray, late: bool) -> bool:
+    """Whether the fixed subspace `fixed_directions` (B, m) equals the null space `null_space` (B, n), both
     orthonormal. In `late` rounds a superset is accepted, to avoid cycling."""
-    n, m = (d.shape[1] if d.size else 0 for d in (undetermined, fixed_directions))
+    n, m = (d.shape[1] if d.size else 0 for d in (null_space, fixed_directions))
     if n == 0 or n > m:
         return n == m or (n == 0 and late)
-    inside = np.linalg.svd(undetermined.T @ fixed_directions, compute_uv=False).min() > ALIKE
+    inside = np.linalg.svd(null_space.T @ fixed_directions, compute_uv=False).min() > ALIKE
     return bool(inside and (n == m or late))
 
 
-class Judgement(NamedTuple):
-    """Observability of an estimate, in tolerance units.
+class DirectionClasses(NamedTuple):
+    """Observability of the directions of the calibration parameters, in tolerance units.
 
-    data (B, B): information of the data and of priors on nuisance parameters, without `noise`. noise (B, B): the
-    information that noise in the Jacobian adds. asked (B, B): the information without the priors of the rig file, noise
-    included. undetermined (B, m): orthonormal basis of the unobservable directions. spurious: the draws behind `noise`.
+    spurious: the draws behind `noise`. data (B, B): information of the data and of priors on nuisance parameters,
+    without `noise`. noise (B, B): the information that noise in the Jacobian adds. information (B, B): without the
+    priors of the rig file, noise included. undetermined (B, m): orthonormal basis of the unobservable directions.
     """
 
     spurious: Spurious
     data: np.ndarray
     noise: np.ndarray
-    asked: np.ndarray
+    information: np.ndarray
     undetermined: np.ndarray
 
 
-def judge(
-    inputs: Inputs, outcome: Outcome, before: Judgement | None = None, columns: np.ndarray | None = None
-) -> Judgement:
+def classify_directions(
+    inputs: Inputs, outcome: Outcome, last: DirectionClasses | None = None, columns: np.ndarray | None = None
+) -> DirectionClasses:
     """Observability of the calibration parameters `columns` (default: all of them), the other ones fixed.
 
     Parameters with a prior from the model (target shape, edge bloom) are unobservable only in combination with other
     ones. Nuisance parameters never are: they count as known in this test, and the covariance holds the dependence on
-    them. Noise in the Jacobian is not drawn again if the information is about the same as in the judgement `before`.
+    them. Noise in the Jacobian is not drawn again if the information is about the same as in `last`.
     """
-    problem, information, state = outcome.problem, outcome.information, outcome.state
-    columns = np.arange(len(information)) if columns is None else columns
-    among, t = np.ix_(columns, columns), problem.tolerance[columns]
-    # Without the priors of the rig file, as these must not hide what the data leave unobservable.
-    counted = {p.block.key for p in problem.priors}
-    given = [p for p in given_priors(inputs) if p.block.key in counted]
-    asked = t[:, None] * without_priors(information, given, state)[among] * t
+    problem, state = outcome.problem, outcome.state
+    columns = np.arange(len(outcome.information)) if columns is None else columns
+    t = problem.tolerance[columns]
+
+    def without(priors: Sequence[Prior]) -> np.ndarray:
+        """Information of `columns` without `priors`, in parameter units."""
+        return without_priors(outcome.information, priors, state)[np.ix_(columns, columns)]
+
+    # Without the priors of the rig file, because they would hide unobservable directions.
+    used = {p.block.key for p in problem.priors}
+    information = t[:, None] * without([p for p in given_priors(inputs) if p.block.key in used]) * t
     is_essential = np.isin(columns, problem.layout.essential)
-    # Classifies the directions once the noise in the Jacobian is known. Drawing stops when no direction is possibly
-    # rank deficient.
-    shown = partial(_shown, asked, t, is_essential)
-    own = np.ix_(is_essential, is_essential)
-    if before is not None and _are_alike(before.asked[own], asked[own]):
-        spurious = before.spurious
+    principal = partial(_principal_directions, information, t, is_essential)
+    essential = np.ix_(is_essential, is_essential)
+    # More noise is drawn while it decides about a direction.
+    if last is not None and _are_alike(last.information[essential], information[essential]):
+        spurious = last.spurious
     else:
-        spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any(), columns)
-    seen, noise = shown(spurious), spurious.mean
+        spurious = spurious_information(problem, outcome, lambda draws: not principal(draws).maybe_noise.any(), columns)
+    directions, noise = principal(spurious), spurious.mean
     # Also without the priors of the model, except those on nuisance parameters.
-    bounded = [p for p in problem.priors if not p.block.is_nuisance]
-    data = without_priors(information, bounded, state)[among] - noise
-    undetermined = seen.vectors[:, seen.nothing | seen.in_doubt]
-    return Judgement(spurious, t[:, None] * data * t, t[:, None] * noise * t, asked, undetermined)
+    data = without([p for p in problem.priors if not p.block.is_nuisance]) - noise
+    undetermined = directions.vectors[:, directions.unobservable | directions.maybe_noise]
+    return DirectionClasses(spurious, t[:, None] * data * t, t[:, None] * noise * t, information, undetermined)
 
 
 def _are_alike(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two information matrices (B, B), in tolerance units, agree to a relative UNCHANGED in every observable
     direction."""
-    nothing = UNOBSERVABLE_BELOW * np.eye(len(a))
+    floor = UNOBSERVABLE_BELOW * np.eye(len(a))
     try:
-        ratios = eigh(b + nothing, a + nothing, eigvals_only=True)
+        ratios = eigh(b + floor, a + floor, eigvals_only=True)
     except LinAlgError:  # not positive definite: the state is far from the minimum
         return False
     return bool(np.abs(ratios - 1.0).max(initial=0.0) < UNCHANGED)
 
 
-class _ShownDirections(NamedTuple):
-    """Eigenvectors (B, n) of the information without noise, in tolerance units, with two flags each. nothing (n,):
-    unobservable. in_doubt (n,): noise in the Jacobian may account for all of the information."""
+class _PrincipalDirections(NamedTuple):
+    """Eigenvectors (B, n) of the information without noise, in tolerance units, with two flags each. unobservable (n,):
+    there is next to no information. maybe_noise (n,): noise in the Jacobian may account for all of the information."""
 
     vectors: np.ndarray
-    nothing: np.ndarray
-    in_doubt: np.ndarray
+    unobservable: np.ndarray
+    maybe_noise: np.ndarray
 
 
-def _shown(asked: np.ndarray, tolerance: np.ndarray, is_essential: np.ndarray, spurious: Spurious) -> _ShownDirections:
-    """Directions of the essential parameters `is_essential` (B,), classified by the information `asked` (B, B) in
-    tolerance units, which includes the noise `spurious`. tolerance: (B,)."""
-    own = np.flatnonzero(is_essential)
-    known = asked - tolerance[:, None] * spurious.mean * tolerance
-    vectors = np.zeros((len(asked), len(own)))
-    values, vectors[own] = np.linalg.eigh(known[np.ix_(own, own)])
-    all_of_it = np.einsum("ik,ij,jk->k", vectors, asked, vectors)
-    nothing = values < UNOBSERVABLE_BELOW
-    maybe = values < spurious.chance(tolerance[:, None] * vectors)
-    return _ShownDirections(vectors, nothing, ~nothing & maybe & (values < SPURIOUS_SHARE * all_of_it))
+def _principal_directions(
+    information: np.ndarray, tolerance: np.ndarray, is_essential: np.ndarray, spurious: Spurious
+) -> _PrincipalDirections:
+    """Directions of the essential parameters `is_essential` (B,), classified by the `information` (B, B) in tolerance
+    units, which includes the noise `spurious`. tolerance: (B,)."""
+    essential = np.flatnonzero(is_essential)
+    without_noise = information - tolerance[:, None] * spurious.mean * tolerance
+    vectors = np.zeros((len(information), len(essential)))
+    values, vectors[essential] = np.linalg.eigh(without_noise[np.ix_(essential, essential)])
+    with_noise = np.einsum("ik,ij,jk->k", vectors, information, vectors)
+    unobservable = values < UNOBSERVABLE_BELOW
+    by_chance = values < spurious.chance(tolerance[:, None] * vectors)
+    maybe_noise = ~unobservable & by_chance & (values < SPURIOUS_SHARE * with_noise)
+    return _PrincipalDirections(vectors, unobservable, maybe_noise)

@@ -16,7 +16,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.groups import groups_of, with_groups
 from icalib.estimate.problem.inputs import Inputs, with_association
-from icalib.estimate.problem.outcome import Outcome, outcome_of
+from icalib.estimate.problem.outcome import Linearised, Outcome, outcome_of
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import Solution, solve
@@ -70,7 +70,7 @@ class Relaxed:
         Noise in the Jacobian can be estimated from this outcome."""
         pull, known = self._priors_of(freed)
         problem = self.problem.without([p for p in self.problem.priors if p.block.key in freed])
-        found = outcome_of(problem, self.state, 0.0, self.residuals, 0.0, [], self.solution)
+        found = outcome_of(Linearised(problem, self.state, 0.0, self.residuals), 0.0, [], self.solution)
         return replace(found, information=found.information - known), self.solution.gradient[:-1] - pull
 
     def _priors_of(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +88,7 @@ def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
     fixed_directions = _held_in(freed.layout, inputs.layout, found.problem.fixed_directions)
     state = found.outcome.state
     try:
-        problem = found.judged.problem(freed, state, fixed_directions)
+        problem = found.measurement_model.problem(freed, state, fixed_directions)
         pieces, residuals = problem.pieces(), problem.residuals()
         problem.linearise(state, pieces, residuals, curved=True)
         solution = solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=fixed_directions)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class Outcome:
 
     information (B, B): of the calibration parameters at `state`, chain marginalised, undamped. It is empty, and draws
     are None, if another pass follows. stopped_early: stopped before convergence, because more steps seemed useless.
-    room: the pieces of the solve, reusable as workspace; None without features.
+    workspace: the pieces of the solve, which another solve may overwrite; None without features.
     """
 
     problem: Problem
@@ -61,7 +62,7 @@ class Outcome:
     status: str
     draws: Draws | None = None
     stopped_early: bool = False
-    room: tuple[Piece, ...] | None = None
+    workspace: tuple[Piece, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -88,35 +89,43 @@ def relative_decrease(steps: Sequence[Step], cost: float) -> float:
     return steps[0].cost / cost - 1.0 if steps and cost > 0.0 else 0.0
 
 
+class Linearised(NamedTuple):
+    """A problem and its residuals at `state`. cost: half the robust chi^2."""
+
+    problem: Problem
+    state: State
+    cost: float
+    residuals: Residuals
+
+
 def outcome_of(
-    problem: Problem,
-    state: State,
-    cost: float,
-    residuals: Residuals,
-    left: float,
-    steps: list[Step],
-    end: Solution | None = None,
+    end: Linearised, remaining_decrease: float, steps: Sequence[Step], solution: Solution | None = None
 ) -> Outcome:
-    """The outcome at `state`. left: predicted further decrease of half the chi^2. end: the solution at `state`, None if
-    another pass follows."""
-    converged, n = left < STALLED_DECREASE, len(steps)
-    # A decrease d of half the chi^2 is a step of at most sqrt(2 d) standard deviations.
-    share = max(100.0 * np.sqrt(2.0 * max(left, 0.0)), 1.0)
-    status = (
-        f"converged in {n} iteration{'s' * (n != 1)} of the last pass: the next step would move no parameter by more "
-        f"than {share:.0f} % of its standard deviation."
-        if converged
-        else (
-            f"not converged after {n} iterations: the next step would still lower half the chi^2 of {cost:.6g} by "
-            f"{left:.3g}; give a better initial guess, or check the noise in the rig file."
+    """The outcome at `end`. remaining_decrease: predicted further decrease of half the chi^2. solution: undamped, at
+    `end`; None if another pass follows."""
+    converged = remaining_decrease < STALLED_DECREASE
+    status = _status(end.cost, remaining_decrease, len(steps))
+    outcome = Outcome(*end, NO_DIRECTIONS, tuple(steps), converged, status)
+    if solution is None:
+        return outcome
+    pieces = solution.factors.pieces
+    workspace = pieces if any(p.features is not None for p in pieces) else None
+    return replace(outcome, information=solution.information, draws=Draws.of(solution), workspace=workspace)
+
+
+def _status(cost: float, remaining_decrease: float, n_steps: int) -> str:
+    """A sentence about convergence after `n_steps` iterations."""
+    if remaining_decrease < STALLED_DECREASE:
+        # A decrease d of half the chi^2 is a step of at most sqrt(2 d) standard deviations.
+        percent = max(100.0 * np.sqrt(2.0 * max(remaining_decrease, 0.0)), 1.0)
+        return (
+            f"converged in {n_steps} iteration{'s' * (n_steps != 1)} of the last pass: the next step would move no "
+            f"parameter by more than {percent:.0f} % of its standard deviation."
         )
+    return (
+        f"not converged after {n_steps} iterations: the next step would still lower half the chi^2 of {cost:.6g} by "
+        f"{remaining_decrease:.3g}; give a better initial guess, or check the noise in the rig file."
     )
-    begun = Outcome(problem, state, cost, residuals, NO_DIRECTIONS, tuple(steps), converged, status)
-    if end is None:
-        return begun
-    pieces = end.factors.pieces
-    room = pieces if any(p.features is not None for p in pieces) else None
-    return replace(begun, information=end.information, draws=Draws.of(end), room=room)
 
 
 def posterior(problem: Problem, state: State) -> Draws:

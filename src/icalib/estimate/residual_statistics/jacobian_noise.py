@@ -115,7 +115,7 @@ class _Noise:
         `readings`. Terms that are odd in the noise are included."""
         there = self.outcome.state.retract(self.problem.layout, sign * chain, np.zeros(self.problem.layout.size))
         noisy = self.problem if readings is None else _with_noise(self.problem, there, sign * readings)
-        return (_information(noisy, there, self.outcome.room) - self.outcome.information)[self.among]
+        return (_information(noisy, there, self.outcome.workspace) - self.outcome.information)[self.among]
 
     def followed(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """Spurious information (B, B) if the trajectory follows the noise `readings`, in addition to a posterior draw
@@ -126,7 +126,7 @@ class _Noise:
 
     def _step(self, problem: Problem) -> np.ndarray:
         """Solver's step (K, 15) of the chain for `problem`, calibration parameters fixed."""
-        pieces = self.outcome.room or problem.pieces()
+        pieces = self.outcome.workspace or problem.pieces()
         problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
         factors = solve(pieces, problem.n_keyframes, problem.tolerance).factors
         # Zero steps of the calibration parameters, then factor 1 of the gradient, see `Factors.back`.
@@ -142,13 +142,13 @@ def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:
     return float(np.abs(np.linalg.eigvalsh(half.T @ noise @ half)).max(initial=0.0))
 
 
-def _information(problem: Problem, state: State, room: tuple[Piece, ...] | None) -> np.ndarray:
+def _information(problem: Problem, state: State, workspace: tuple[Piece, ...] | None) -> np.ndarray:
     """Information (B, B) on the calibration parameters at `state`, chain marginalised."""
-    if room is None:
+    if workspace is None:
         n = problem.layout.size
         return problem.marginal(partial(problem.sums_of, state))[:n, :n]
-    problem.linearise(state, room, problem.residuals(), curved=True)
-    return solve(room, problem.n_keyframes, problem.tolerance).information
+    problem.linearise(state, workspace, problem.residuals(), curved=True)
+    return solve(workspace, problem.n_keyframes, problem.tolerance).information
 
 
 def _reading_noise(imu: ImuData, rng: np.random.Generator) -> np.ndarray:

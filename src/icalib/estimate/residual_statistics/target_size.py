@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.model.target_factor import TargetFactor
 from icalib.motion.factor import Residuals, of_type
 from icalib.optim.arrowhead import Piece, solve
@@ -36,19 +37,16 @@ class TargetSize:
 def target_size(problem: Problem, state: State) -> TargetSize | None:
     """True over stated size of the target by the accelerometer, with its standard deviation. None without a target or
     an IMU, or if the size is unobservable. state: the solution with the stated size."""
-    seen = any(f.sees_target for f in of_type(problem.factors, TargetFactor))
-    if not seen or not problem.framed or not isinstance(problem.chain, ImuFactor):
+    sees_target = any(f.sees_target for f in of_type(problem.factors, TargetFactor))
+    if not sees_target or not problem.framed or not isinstance(problem.chain, ImuFactor):
         return None
     ratio = std = 1.0
-    room = problem.pieces(), problem.residuals()
+    workspace = problem.pieces(), problem.residuals()
     for _ in range(MAX_SIZE_ROUNDS):
-        costs = [
-            _least_cost(*_grown(problem, state, ratio, ratio + step), *room) for step in (-SIZE_STEP, 0.0, SIZE_STEP)
-        ]
-        slope, curvature = (
-            (costs[2] - costs[0]) / (2.0 * SIZE_STEP),
-            (costs[2] - 2.0 * costs[1] + costs[0]) / SIZE_STEP**2,
-        )
+        sizes = (ratio - SIZE_STEP, ratio, ratio + SIZE_STEP)
+        costs = [_least_cost(*_grown(problem, state, ratio, size), *workspace) for size in sizes]
+        slope = (costs[2] - costs[0]) / (2.0 * SIZE_STEP)
+        curvature = (costs[2] - 2.0 * costs[1] + costs[0]) / SIZE_STEP**2
         if curvature * MAX_SIZE_SIGMA**2 < 1.0:
             return None
         change, std = -slope / curvature, curvature**-0.5
@@ -56,7 +54,7 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
         ratio += change
         if abs(change) < MAX_SIZE_CHANGE:
             break
-        state = minimise(grown, begin, tolerance=INNER_TOLERANCE).state
+        state = minimise(grown, begin, SolverOptions(INNER_TOLERANCE)).state
     return TargetSize(float(ratio), float(std))
 
 

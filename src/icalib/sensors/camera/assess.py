@@ -89,7 +89,7 @@ def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[st
         yield words
     factors = of_type(estimate.problem.factors, CornerFactor)
     yield from _outside_imu_notes(inputs, estimate, factors)
-    noise: list[CameraNoise] = [estimate.judged.noise[c.name] for c in inputs.rig.cameras]
+    noise: list[CameraNoise] = [estimate.measurement_model.noise[c.name] for c in inputs.rig.cameras]
     for camera, factor, camera_noise in zip(inputs.rig.cameras, factors, noise, strict=True):
         yield from _corner_notes(camera, factor, camera_noise.model, camera_noise.late, estimate)
     if words := late_words(factors, [camera_noise.late for camera_noise in noise]):

@@ -73,7 +73,7 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[L
             timeline.on_result_clock(seconds, timeline.recording_of(seconds)),
             plane,
             np.linalg.norm(stream.xyz, axis=1),
-            _sigma(found.judged.noise[stream.name], cosine),
+            _sigma(found.measurement_model.noise[stream.name], cosine),
             world,
             residual,
             first_world,
@@ -143,7 +143,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
     """Notes on the number of points used and their noise."""
     if not inputs.association.count:
         return
-    ranging = [found.judged.noise[s.name] for s in inputs.rig.lidars]
+    ranging = [found.measurement_model.noise[s.name] for s in inputs.rig.lidars]
     for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, ranging, strict=True):
         given = lidar.range_noise_m is not None
         size = f"{1e3 * noise.beam_sigma:.1f} mm along the beam, as the rig file has it"

@@ -25,7 +25,7 @@ UNKNOWN_CAUSE = "they are no white noise, and the cause is unknown: check its cl
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
     """One note for each pose sensor: number of poses (or relative poses) used, and their noise."""
     counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(found)}
-    posing = [found.judged.noise[s.name] for s in inputs.rig.poses]
+    posing = [found.measurement_model.noise[s.name] for s in inputs.rig.poses]
     for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, posing, strict=True):
         what = "poses" if sensor.kind == "absolute" else "steps"
         count = f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses"

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.observability import guess_worth
-from icalib.observability.guess_worth import (
-    TOGETHER,
-    astray,
-    in_proportion,
-    moved_to_guess,
-    moved_to_worth,
-    owed_to_guess,
+from icalib.observability import prior_sensitivity as module
+from icalib.observability.prior_sensitivity import (
+    N_SIGN_DRAWS,
+    directions_to_reset,
+    linear_prior_sensitivity,
+    prior_sensitivity,
+    project_to_guess,
+    project_to_prior,
 )
 from icalib.optim.state import Entry, State, make_layout
 
@@ -46,11 +46,11 @@ def given(monkeypatch):
     )
     priors: list = []
     sigma = np.concatenate([SIGMA[b.name] for b in layout.free])
-    monkeypatch.setattr(guess_worth, "given_priors", lambda _: priors)
-    monkeypatch.setattr(guess_worth, "guess_sigma", lambda *_: sigma.copy())
-    monkeypatch.setattr(guess_worth, "minimise", lambda problem, state, tolerance, room: SimpleNamespace(state=state))
+    monkeypatch.setattr(module, "given_priors", lambda _: priors)
+    monkeypatch.setattr(module, "guess_sigma", lambda *_: sigma.copy())
+    monkeypatch.setattr(module, "minimise", lambda problem, state, *_: SimpleNamespace(state=state))
     inputs = SimpleNamespace(is_sensor=lambda name: name in "ab", layout=layout)
-    outcome = SimpleNamespace(problem=problem, state=state, room=None)
+    outcome = SimpleNamespace(problem=problem, state=state, workspace=None)
     return SimpleNamespace(inputs=inputs, problem=problem, state=state, sigma=sigma, priors=priors, outcome=outcome)
 
 
@@ -60,9 +60,9 @@ def landed(given, rng) -> np.ndarray:
     for errors in given.sigma * rng.standard_normal((DRAWS, 8)):
         guess = given.state.retract(given.problem.layout, np.zeros((2, 15)), errors)
         moved = (
-            moved_to_worth(given.inputs, given.problem, given.state, guess, given.problem.fixed_directions)
+            project_to_prior(given.inputs, given.problem, given.state, guess, given.problem.fixed_directions)
             if given.priors
-            else moved_to_guess(given.problem, given.state, guess, given.problem.fixed_directions)
+            else project_to_guess(given.problem, given.state, guess, given.problem.fixed_directions)
         )
         moved = given.state if moved is None else moved
         out.append(np.concatenate([moved.values[b.key] for b in given.problem.layout.free]))
@@ -79,7 +79,7 @@ def test_only_where_noise_pulls_to_near_the_guess_a_direction_stays(given, pull:
     asked = np.diag(np.full(8, 1e-3)) + pull * np.outer(mixture, mixture)
     to = given.state.retract(given.problem.layout, np.zeros((2, 15)), sigmas * worth * mixture * tolerance)
     turned = fixed_directions @ np.array([[0.6, -0.8], [0.8, 0.6]])
-    found = astray(given.inputs, given.problem, given.state, to, turned, asked)
+    found = directions_to_reset(given.inputs, given.problem, given.state, to, turned, asked)
     expected = fixed_directions if moves else fixed_directions[:, :1]
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-9)
 
@@ -88,8 +88,8 @@ def test_only_where_noise_pulls_to_near_the_guess_a_direction_stays(given, pull:
 def test_the_shifts_have_the_covariance_of_where_guesses_land(given, weighed: bool):
     if weighed:
         given.priors.append(SimpleNamespace(block=given.problem.layout.free[0], sigma=np.array([0.1, 0.2, 0.05])))
-    shifts = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
-    assert 2 < len(shifts) <= 2 + TOGETHER  # two errors, and what both together make beyond their sum
+    shifts = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
+    assert 2 < len(shifts) <= 2 + N_SIGN_DRAWS  # two errors, and what both together make beyond their sum
     np.testing.assert_allclose(shifts[2:], 0.0, atol=1e-12)
     drawn = np.cov(landed(given, np.random.default_rng(0)).T)
     expected, scale = shifts.T @ shifts, given.problem.tolerance
@@ -103,13 +103,13 @@ def test_the_shifts_have_the_covariance_of_where_guesses_land(given, weighed: bo
 
 
 def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
-    def bent(problem, state, tolerance, room):
+    def bent(problem, state, options, workspace):
         values = {k: v.copy() for k, v in state.values.items()}
         values["a", "translation"][1] += 7.0 * values["a", "translation"][0] * values["a", "translation"][2]
         return SimpleNamespace(state=replace(state, values=values))
 
-    monkeypatch.setattr(guess_worth, "minimise", bent)
-    shifts = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
+    monkeypatch.setattr(module, "minimise", bent)
+    shifts = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
     assert np.abs(shifts[:2, 1]).max() < 1e-12  # neither alone moves it
     drawn = landed(given, np.random.default_rng(0))
     product = 7.0 * drawn[:, 0] * drawn[:, 2]
@@ -118,27 +118,27 @@ def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
 
 def test_nothing_is_tried_out_where_the_guess_alone_leaves_all_open(given, monkeypatch):
     given.problem.fixed_directions = np.eye(8)
-    monkeypatch.setattr(guess_worth, "minimise", None)
-    shifts = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
+    monkeypatch.setattr(module, "minimise", None)
+    shifts = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
     np.testing.assert_allclose(np.sqrt((shifts**2).sum(axis=0)), given.sigma)
 
 
 def test_in_proportion_only_what_is_held_moves(given, monkeypatch):
     nothing = np.zeros((8, 8))
-    expected = owed_to_guess(given.inputs, given.outcome, nothing)[:2]
-    monkeypatch.setattr(guess_worth, "minimise", None)
-    np.testing.assert_allclose(in_proportion(given.inputs, given.outcome, nothing), expected, atol=1e-12)
+    expected = prior_sensitivity(given.inputs, given.outcome, nothing)[:2]
+    monkeypatch.setattr(module, "minimise", None)
+    np.testing.assert_allclose(linear_prior_sensitivity(given.inputs, given.outcome, nothing), expected, atol=1e-12)
 
 
 def test_a_way_along_which_nothing_can_be_solved_is_made_shorter(given, monkeypatch):
-    def short_only(problem, state, tolerance, room):
+    def short_only(problem, state, options, workspace):
         if np.abs(state.values["b", "translation"]).max() > 0.02:
             raise EstimationError("too far")
         return SimpleNamespace(state=state)
 
-    expected = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
-    monkeypatch.setattr(guess_worth, "minimise", short_only)
-    found = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
+    expected = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
+    monkeypatch.setattr(module, "minimise", short_only)
+    found = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
@@ -147,7 +147,7 @@ def test_what_nobody_guessed_moves_no_further_than_the_data_leave_open(given):
     data = np.diag(np.full(8, 5e-3))
     data[0, 0] = 0.0
     given.problem.fixed_directions = np.eye(8)[:, [0, 1]]  # of a, which is no sensor now
-    shifts = owed_to_guess(given.inputs, given.outcome, data)
+    shifts = prior_sensitivity(given.inputs, given.outcome, data)
     width = np.sqrt((shifts**2).sum(axis=0)) / given.problem.tolerance
-    assert width[0] == pytest.approx(guess_worth.UNGUESSED_SIGMA / 5e-3)
-    assert width[1] == pytest.approx(min(guess_worth.UNGUESSED_SIGMA / 5e-3, 1.0 / np.sqrt(5e-3)))
+    assert width[0] == pytest.approx(module.UNGUESSED_SIGMA / 5e-3)
+    assert width[1] == pytest.approx(min(module.UNGUESSED_SIGMA / 5e-3, 1.0 / np.sqrt(5e-3)))
