@@ -307,7 +307,7 @@ def classify_directions(
     is_essential = np.isin(columns, problem.layout.essential)
     principal = partial(_principal_directions, information, t, is_essential)
     essential = np.ix_(is_essential, is_essential)
-    # More noise is drawn while it decides about a direction.
+    # Drawing stops when no direction is possibly rank deficient.
     if last is not None and _are_alike(last.information[essential], information[essential]):
         spurious = last.spurious
     else:
