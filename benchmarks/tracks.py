@@ -73,7 +73,7 @@ def _step(found: Estimate) -> None:
     features = [p.features for p in pieces if p.features is not None]
     alive = max(int(f.plan.alive.max(initial=0)) for f in features)
     n = sum(len(f.sums.track) for f in features)
-    print(f"{problem.n_keyframes} keyframes, {sum(len(f.sums.own) for f in features)} tracks")
+    print(f"{problem.n_keyframes} keyframes, {sum(len(f.sums.diagonal) for f in features)} tracks")
     print(f"{alive} alive, {n} observations")
     print(f"linearising               {min(linearising):>8.2f} s, {1e6 * min(linearising) / n:.2f} us an observation")
     print(f"solving                   {min(solving):>8.2f} s, {min(solving) / products:.1f} times its products alone")
