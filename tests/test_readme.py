@@ -93,8 +93,6 @@ def test_no_page_installs_icalib_from_an_index():
 def test_programs_that_pages_name_exist():
     text = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").rglob("*.md"))
     code = "\n".join(re.findall(r"```.*?```|`[^`\n]+`|^    .*", text, re.DOTALL | re.MULTILINE))
-    named = set(
-        re.findall(r"(?:tests|benchmarks|estimation|first_guess|detection|assessment|geometry)/[\w/]*\.py", code)
-    )
+    named = set(re.findall(r"(?:tests|benchmarks|estimation|detection|assessment|geometry)/[\w/]*\.py", code))
     assert len(named) > 50
     assert not [name for name in sorted(named) if not any((ROOT / at / name).exists() for at in ("", "src/icalib"))]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 from tests.consistency.test_assumed_motion import without_imu
-from tests.consistency.test_upwards import level
-from tests.first_guess.test_pose_ways import conjugated, inverted, w_first, y_up
+from tests.consistency.test_level_frame import level
+from tests.initialize.test_pose_conventions import conjugated, inverted, w_first, y_up
 
 from icalib.errors import EstimationError
 from icalib.initialize.assumed_motion import guess_with_assumed_motion
