@@ -67,16 +67,19 @@ def relative_to_first_camera(rig: Rig, sensor: str, values: Values) -> Values:
     return out
 
 
-def with_stated_values(inputs: Inputs, sensor: str, found: Values) -> Values:
-    """`found`, completed by values of the rig file for cameras and `sensor` that do not contradict it. The height of
-    `sensor` is taken from the rig file if stated, because planar motion does not show it."""
-    out, rig = dict(found), inputs.rig
-    for other in (*rig.cameras[1:], rig.sensors[sensor]):
-        names = MOUNTED_NAMES if other.name != sensor else [spec.name for spec in other.specs()]
-        known, estimated = stated_values(inputs, other, names), {k: v for k, v in found.items() if k[0] == other.name}
+def with_stated_values(inputs: Inputs, sensor: str, estimates: Values) -> Values:
+    """`estimates`, completed by values of the rig file for cameras and `sensor` that do not contradict it. The height
+    of `sensor` is taken from the rig file if stated, because planar motion does not show it."""
+    out, rig = dict(estimates), inputs.rig
+    for rig_sensor in (*rig.cameras[1:], rig.sensors[sensor]):
+        names = MOUNTED_NAMES if rig_sensor.name != sensor else [spec.name for spec in rig_sensor.specs()]
+        stated, of_sensor = (
+            stated_values(inputs, rig_sensor, names),
+            {k: v for k, v in estimates.items() if k[0] == rig_sensor.name},
+        )
         arm = sensor, "translation"
-        if arm in known and arm in estimated:
-            up = estimated[sensor, "rotation"][:, 2]
-            estimated[arm] = estimated[arm] + up * (up @ (known[arm] - estimated[arm]))
-        out |= merged_values(other, known, estimated)
+        if arm in stated and arm in of_sensor:
+            up = of_sensor[sensor, "rotation"][:, 2]
+            of_sensor[arm] = of_sensor[arm] + up * (up @ (stated[arm] - of_sensor[arm]))
+        out |= merged_values(rig_sensor, stated, of_sensor)
     return out

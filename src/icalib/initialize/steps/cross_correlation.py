@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+MaskedSignal = tuple[np.ndarray, np.ndarray]  # values, and bool: which of them are known
+
 
 class CorrelationPeak(NamedTuple):
     """Signal b(t) is most like a(t + samples). correlation: Pearson's coefficient at this shift; largest: at
@@ -17,19 +19,20 @@ class CorrelationPeak(NamedTuple):
     largest: float
 
 
-def best_shift(a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float) -> CorrelationPeak:
-    """The shift between a (n,) and b (m,), sampled on one regular grid, at which they are most alike. Only samples
-    where both masks are true count. At least `least` samples must overlap, or half of the known ones if these are
-    fewer."""
-    return best_shifts(a, mask_a, b, mask_b, least, 1, 0)[0]
+def best_shift(a: MaskedSignal, b: MaskedSignal, least: float) -> CorrelationPeak:
+    """The shift between the signals a (n,) and b (m,), sampled on one regular grid, at which they are most alike. Only
+    samples where both masks are true count. At least `least` samples must overlap, or half of the known ones if these
+    are fewer."""
+    return best_shifts(a, b, least, 1, 0)[0]
 
 
 def best_shifts(
-    a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float, most: int, apart: int
+    signal_a: MaskedSignal, signal_b: MaskedSignal, least: float, most: int, apart: int
 ) -> list[CorrelationPeak]:
     """At most `most` peaks, the best first, each more than `apart` samples from the better ones. See `best_shift`.
     Peaks are ranked by Fisher's z (atanh of the correlation) times the root of the overlap, so that a long overlap
     outweighs a short one."""
+    (a, mask_a), (b, mask_b) = signal_a, signal_b
     n = len(a) + len(b) - 1
     size = 1 << (n - 1).bit_length()
 

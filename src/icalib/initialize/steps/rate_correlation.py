@@ -138,7 +138,7 @@ def _peaks_of_means(imu: ImuData, rates: SensorRates, count: int) -> list[Correl
     )
     least, apart = MIN_RATE_OVERLAP_S * CORRELATION_GRID_HZ, round(MIN_PEAK_DISTANCE_S * CORRELATION_GRID_HZ)
     return max(
-        (best_shifts(*a, *sensor_speed, least, MAX_OFFSET_PEAKS, apart) for a in gyro_speeds),
+        (best_shifts(a, sensor_speed, least, MAX_OFFSET_PEAKS, apart) for a in gyro_speeds),
         key=lambda p: _correlation_or_least(p[0]),
     )
 

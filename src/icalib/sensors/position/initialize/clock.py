@@ -33,7 +33,7 @@ def likely_offsets(imu: ImuData, fix: Fix) -> list[CorrelationPeak]:
     if not (varies(fix_signal, fix_known) and varies(imu_signal, imu_known)):
         return []
     least, apart = MIN_JERK_OVERLAP_S * SIGNAL_RATE_HZ, round(PEAK_SPACING_S * SIGNAL_RATE_HZ)
-    return best_shifts(imu_signal, imu_known, fix_signal, fix_known, least, MAX_JERK_PEAKS, apart)
+    return best_shifts((imu_signal, imu_known), (fix_signal, fix_known), least, MAX_JERK_PEAKS, apart)
 
 
 def varies(signal: np.ndarray, known: np.ndarray) -> bool:

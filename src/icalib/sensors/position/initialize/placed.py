@@ -97,7 +97,7 @@ def _candidate_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> 
     if not (varies(*moved) and varies(*seen)):
         return by_acceleration
     overlap, spacing = MIN_SPEED_OVERLAP_S * SIGNAL_RATE_HZ, round(PEAK_SPACING_S * SIGNAL_RATE_HZ)
-    peaks = best_shifts(*moved, *seen, overlap, MAX_SPEED_PEAKS, spacing)
+    peaks = best_shifts(moved, seen, overlap, MAX_SPEED_PEAKS, spacing)
     return [*(peak.samples / SIGNAL_RATE_HZ for peak in peaks), *by_acceleration]
 
 

@@ -349,7 +349,7 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
         count = max(1, round(float(np.median(rates.end - rates.start)) * CORRELATION_HZ))
         turned = np.convolve(turned, np.full(count, 1.0 / count), "same")
     found, opposite = (
-        best_shift(sign * turned, known, turning, covered, MIN_OVERLAP_S * CORRELATION_HZ) for sign in (1.0, -1.0)
+        best_shift((sign * turned, known), (turning, covered), MIN_OVERLAP_S * CORRELATION_HZ) for sign in (1.0, -1.0)
     )
     if opposite.correlation > max(found.correlation, MIN_CORRELATION):
         raise EstimationError(f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}.")
