@@ -68,8 +68,8 @@ def imu_source(where: str, bag: HasImuMessages, topics: Sequence[TopicInfo], sen
 def pair_of(bag: HasImuMessages, topics: Sequence[TopicInfo]) -> TwoSources | None:
     """The two topics of an IMU if exactly one topic has only gyroscope readings and exactly one has only accelerometer
     readings; otherwise None."""
-    found = [t.name for t in topics if t.kind == "imu" and t.count]
-    carried = {name: _carried(bag, name) for name in found} if len(found) > 1 else {}
+    names = [t.name for t in topics if t.kind == "imu" and t.count]
+    carried = {name: _carried(bag, name) for name in names} if len(names) > 1 else {}
     gyros, accels = ([name for name, what in carried.items() if what == half] for half in ("gyro", "accel"))
     return TwoSources(gyros[0], accels[0]) if len(gyros) == len(accels) == 1 else None
 
@@ -99,25 +99,8 @@ def one_stream(imu: ImuStream | ImuHalves, what: str) -> tuple[ImuStream, tuple[
 def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
     """One stream at the gyroscope's stamps within the time common to both, with the accelerometer interpolated
     linearly; and notes. Raises RecordingError as `kept_readings`, and if the two overlap too little."""
-    own = "export the IMU's own stamps"
-    notes: tuple[str, ...] = ()
-    streams = []
-    for kind, stamps_ns, values in (
-        ("gyroscope", halves.gyro_ns, halves.gyro),
-        ("accelerometer", halves.accel_ns, halves.accel),
-    ):
-        if np.isfinite(values).all(axis=1).sum() < 2:
-            raise RecordingError(
-                f"{what}: the {kind} has only {len(stamps_ns)} readings; record it as long as the rest."
-            )
-        finite = np.isfinite(values).all(axis=1)
-        if not finite.all():
-            notes += (f"{what}, {kind}: {int((~finite).sum())} readings are not finite and were left out.",)
-            stamps_ns, values = stamps_ns[finite], values[finite]
-        kept, found = kept_readings(stamps_ns, values, f"{what}, {kind}", RATE_HZ, "reading", own)
-        notes += found
-        streams.append((stamps_ns[kept], values[kept]))
-    (gyro_ns, gyro), (accel_ns, accel) = streams
+    gyro_ns, gyro, gyro_notes = _checked_half(halves.gyro_ns, halves.gyro, "gyroscope", what)
+    accel_ns, accel, accel_notes = _checked_half(halves.accel_ns, halves.accel, "accelerometer", what)
     common = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
     if not common.any() or np.ptp(gyro_ns[common]) < 1e9 * _LEAST_COMMON_S:
         raise RecordingError(
@@ -127,8 +110,25 @@ def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
     gyro_ns, gyro = gyro_ns[common], gyro[common]
     at, known = ((x - accel_ns[0]).astype(np.float64) for x in (gyro_ns, accel_ns))
     accel = np.stack([np.interp(at, known, accel[:, k]) for k in range(3)], axis=1)
-    notes += (
+    note = (
         f"{what}: gyroscope and accelerometer have separate stamps; {len(known)} readings of the accelerometer "
-        f"were interpolated to {len(at)} stamps of the gyroscope.",
+        f"were interpolated to {len(at)} stamps of the gyroscope."
     )
-    return ImuStream(halves.name, gyro_ns, gyro, accel), notes
+    return ImuStream(halves.name, gyro_ns, gyro, accel), (*gyro_notes, *accel_notes, note)
+
+
+def _checked_half(
+    stamps_ns: np.ndarray, values: np.ndarray, kind: str, what: str
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Stamps [ns] and values of the finite readings of gyroscope or accelerometer (`kind`), without repetitions; and
+    notes. Raises RecordingError for fewer than two readings, and as `kept_readings`."""
+    finite = np.isfinite(values).all(axis=1)
+    if finite.sum() < 2:
+        raise RecordingError(f"{what}: the {kind} has only {len(stamps_ns)} readings; record it as long as the rest.")
+    notes: tuple[str, ...] = ()
+    if not finite.all():
+        notes = (f"{what}, {kind}: {int((~finite).sum())} readings are not finite and were left out.",)
+        stamps_ns, values = stamps_ns[finite], values[finite]
+    remedy = "export the IMU's own stamps"
+    kept, more = kept_readings(stamps_ns, values, f"{what}, {kind}", RATE_HZ, "reading", remedy)
+    return stamps_ns[kept], values[kept], notes + more

@@ -66,12 +66,12 @@ TABLES = (
 
 def read(recording: Recording, sensors: Sequence[PoseSensor], reading: Reading) -> list[ReadStream]:
     """The checked streams, with notes. Raises RecordingError as `readings` and `checked_poses` do."""
-    found = []
+    streams = []
     for sensor in sensors:
         where = recording.where(sensor)
         written = reading.cut(readings(recording, sensor), f"{where} ({sensor.name})")
-        found.append(checked_poses(as_frame_sensor(written, sensor), sensor, where))
-    return found
+        streams.append(checked_poses(as_frame_sensor(written, sensor), sensor, where))
+    return streams
 
 
 def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
@@ -92,9 +92,9 @@ def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
         path = recording.table(sensor, sensor.path)
         return recording.inside(read_pose_file(sensor.name, path, sensor.layout, recording.note), path)
     topic = _topic(recording, sensor)
-    found = read_odometry(recording, topic.name).pose if topic.kind == "odometry" else read_poses(recording, topic.name)
-    order = recording.by_stamp(topic.name, found.stamps_ns)
-    return PoseReadings(sensor.name, found.stamps_ns[order], found.rotation[order], found.position[order])
+    poses = read_odometry(recording, topic.name).pose if topic.kind == "odometry" else read_poses(recording, topic.name)
+    order = recording.by_stamp(topic.name, poses.stamps_ns)
+    return PoseReadings(sensor.name, poses.stamps_ns[order], poses.rotation[order], poses.position[order])
 
 
 def where(recording: Recording, sensor: PoseSensor) -> str:

@@ -28,14 +28,14 @@ _MIN_GAP_STEPS = 2.0  # in median time steps; over a longer step the motion may 
 @dataclass(frozen=True)
 class ContinuousPoses:
     """The trajectory among N poses. on (N,) bool: whether a pose is on it; jumps (M,): index of the first pose after
-    each jump; size_m, size_rad: size of the largest jump; lasting_m: length of the sum of jumps that stay in the
+    each jump; size_m, size_rad: size of the largest jump; net_jump_m: length of the sum of jumps that stay in the
     trajectory [m]; longest_s: longest gap that omitted poses leave [s]."""
 
     on: np.ndarray
     jumps: np.ndarray
     size_m: float
     size_rad: float
-    lasting_m: float
+    net_jump_m: float
     longest_s: float
 
 
@@ -51,22 +51,22 @@ def stale_copies(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
     the speed afterwards decides."""
     before = _same_before(np.hstack([position, rotation.reshape(-1, 9)]))
     copy = (before >= 0) & (seconds - seconds[before] <= _MAX_COPY_AGE_S)
-    own = np.flatnonzero(~copy)
-    if len(own) == len(seconds) or len(own) < 3:
+    new = np.flatnonzero(~copy)
+    if len(new) == len(seconds) or len(new) < 3:
         return np.zeros(len(seconds), dtype=bool)
     first = np.arange(len(seconds))
     for i in np.flatnonzero(copy).tolist():
         first[i] = first[before[i]]
-    after = np.searchsorted(own, np.arange(len(seconds)), side="right")
+    after = np.searchsorted(new, np.arange(len(seconds)), side="right")
     # If no new pose follows, the step to the repeated pose decides.
-    ends = after == len(own)
+    ends = after == len(new)
     a = np.where(ends, np.maximum(first - 1, 0), first)
-    b = np.where(ends, first, own[np.minimum(after, len(own) - 1)])
+    b = np.where(ends, first, new[np.minimum(after, len(new) - 1)])
     step = np.maximum(seconds[b] - seconds[a], 1e-9)
     stale = np.zeros(len(seconds), dtype=bool)
-    for way in (np.linalg.norm(position[b] - position[a], axis=1), _angles(rotation, a, b)):
-        usual = float(np.median((way / step)[own[:-1]]))
-        stale |= (usual > 0.0) & (way / step > _MIN_MOVING_SPEED * usual)
+    for change in (np.linalg.norm(position[b] - position[a], axis=1), _angles(rotation, a, b)):
+        usual = float(np.median((change / step)[new[:-1]]))
+        stale |= (usual > 0.0) & (change / step > _MIN_MOVING_SPEED * usual)
     return stale & copy
 
 
@@ -85,40 +85,40 @@ def _same_before(rows: np.ndarray) -> np.ndarray:
 def continuous_poses(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> ContinuousPoses:
     """The trajectory and the jumps among N poses at seconds (N,)."""
     step, n = np.diff(seconds), len(seconds)
-    way, turn = (
-        _Steps.of(np.diff(position, axis=0), step, _MIN_JUMP_M),
-        _Steps.of(_rotation_steps(rotation), step, _MIN_JUMP_RAD),
-    )
-    jump = way.jump | turn.jump
+    shift = _Steps.of(np.diff(position, axis=0), step, _MIN_JUMP_M)
+    turn = _Steps.of(_rotation_steps(rotation), step, _MIN_JUMP_RAD)
+    jump = shift.jump | turn.jump
     if not jump.any():
         return ContinuousPoses(np.ones(n, dtype=bool), np.empty(0, np.int64), 0.0, 0.0, 0.0, 0.0)
 
-    def moved(i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def excess_shift(i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Displacement (n, 3) from poses i to j beyond steady motion, and whether it is a jump."""
-        return way.left(seconds[j] - seconds[i], position[j] - position[i], i, j)
+        return shift.excess(seconds[j] - seconds[i], position[j] - position[i], i, j)
 
     def apart(i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """(n,) whether position or rotation jump between poses i and j."""
         turned = so3.log_many(np.ascontiguousarray(rotation[i].transpose(0, 2, 1) @ rotation[j]))
-        return moved(i, j)[1] | turn.left(seconds[j] - seconds[i], turned, i, j)[1]
+        return excess_shift(i, j)[1] | turn.excess(seconds[j] - seconds[i], turned, i, j)[1]
 
     cuts = np.concatenate([[0], np.flatnonzero(jump) + 1, [n]])
     chain = _longest_chain(cuts, _MIN_KEPT_SHARE * n, apart)
-    on = np.zeros(n, dtype=bool)
-    for k in chain.tolist():
-        on[cuts[k] : cuts[k + 1]] = True
-    left, lasts = moved(cuts[chain[:-1] + 1] - 1, cuts[chain[1:]])
-    own = np.flatnonzero(on)
-    ends = np.concatenate([[0], own, [n - 1]])
-    missing = np.diff(seconds[ends])[np.diff(ends) > 1]
+    on = np.repeat(np.isin(np.arange(len(cuts) - 1), chain), np.diff(cuts))
+    excess, is_jump = excess_shift(cuts[chain[:-1] + 1] - 1, cuts[chain[1:]])
     return ContinuousPoses(
         on,
         np.flatnonzero(jump) + 1,
-        float(way.size[jump].max()),
+        float(shift.size[jump].max()),
         float(turn.size[jump].max()),
-        float(np.linalg.norm(left[lasts].sum(axis=0))),
-        float(missing.max(initial=0.0)),
+        float(np.linalg.norm(excess[is_jump].sum(axis=0))),
+        _longest_gap(seconds, on),
     )
+
+
+def _longest_gap(seconds: np.ndarray, on: np.ndarray) -> float:
+    """Longest time [s] that omitted poses, those that are not `on` (N,) bool, leave without a pose; 0 if none are
+    omitted."""
+    ends = np.concatenate([[0], np.flatnonzero(on), [len(seconds) - 1]])
+    return float(np.diff(seconds[ends])[np.diff(ends) > 1].max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -145,16 +145,16 @@ class _Steps:
         fastest = float(np.linalg.norm(rate[steady], axis=1).max(initial=0.0))
         jump |= gap & (size > limit + 2.0 * fastest * step)
         if len(steady):  # at a jump, the rate is interpolated from the steps before and after
-            rate = np.stack([np.interp(np.arange(len(rate)), steady, own) for own in rate[steady].T], axis=1)
+            rate = np.stack([np.interp(np.arange(len(rate)), steady, r) for r in rate[steady].T], axis=1)
         rate = _medians(np.concatenate([rate[:1], rate]))
         return cls(size, jump, limit, rate, fastest, usual)
 
-    def left(self, dt: np.ndarray, change: np.ndarray, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def excess(self, dt: np.ndarray, change: np.ndarray, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Change (n, 3) between poses i and j, given with its duration dt (n,) [s], minus that of motion at constant
         rate; and whether it is a jump (n,) bool."""
-        left = change - 0.5 * (self.rate[i] + self.rate[j]) * dt[:, None]
+        excess = change - 0.5 * (self.rate[i] + self.rate[j]) * dt[:, None]
         allowed = self.limit + self.fastest * np.maximum(dt - 1.5 * self.usual_s, 0.0)
-        return left, np.linalg.norm(left, axis=1) > allowed
+        return excess, np.linalg.norm(excess, axis=1) > allowed
 
 
 def _longest_chain(cuts: np.ndarray, price: float, apart: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:

@@ -17,7 +17,7 @@ from icalib.sensors.pose.read.pose_tables import POSE_RATE_HZ, PoseReadings
 _MAX_SPEED = 100.0  # m/s; a higher median speed means a wrong unit of length or time
 _MAX_INVALID_SHARE = 0.5  # share of all poses; with more, the writing program is faulty
 # Jumps cancel if the length of their sum is below the larger of these: metres, share of the largest jump.
-_MAX_LASTING_M, _MAX_LASTING_SHARE = 0.05, 0.5
+_MAX_NET_JUMP_M, _MAX_NET_JUMP_SHARE = 0.05, 0.5
 _MIN_TRAVEL_M, _MIN_TRAVEL_RAD = 0.02, 0.02  # a sensor with smaller largest displacement and rotation is at rest
 
 
@@ -33,8 +33,8 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
         raise RecordingError(f"{what}: only {len(read.stamps_ns)} poses; a calibration needs the whole recording.")
     read, broken = _without_invalid(read, what)
     values = np.hstack([read.position, read.rotation.reshape(-1, 9)])
-    own = "write the sensor's own stamps"
-    kept, notes = kept_readings(read.stamps_ns, values, what, POSE_RATE_HZ, "pose", own)
+    remedy = "write the sensor's own stamps"
+    kept, notes = kept_readings(read.stamps_ns, values, what, POSE_RATE_HZ, "pose", remedy)
     read = read.some(kept)
     copied, single, jumped = (), (), ()
     if not stands_still_between(read.seconds, read.rotation, read.position):
@@ -98,7 +98,7 @@ def _on_trajectory(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[P
     first, count = read.stamps_ns[path.jumps[0]], int((~path.on).sum())
     words = f"{what}: {len(path.jumps)} jumps of its poses, the first at {first} ns, by up to {path.size_m:.2g} m"
     words += f" and {path.size_rad:.2g} rad"
-    if sensor.kind == "absolute" and path.lasting_m > max(_MAX_LASTING_M, _MAX_LASTING_SHARE * path.size_m):
+    if sensor.kind == "absolute" and path.net_jump_m > max(_MAX_NET_JUMP_M, _MAX_NET_JUMP_SHARE * path.size_m):
         raise RecordingError(
             f"{words}, and do not return, as if an odometry closed a loop or lost its track. Write kind: "
             f"relative for {sensor.name} in the rig file, or cut the recording with --from and --to."

@@ -41,9 +41,9 @@ def single_outliers(seconds: np.ndarray, rotation: np.ndarray, position: np.ndar
     if not candidate.any() or candidate.sum() > 5.0 * _MAX_OUTLIERS * n:
         return wrong
     at = np.flatnonzero(candidate)
-    asked = np.unique(np.clip(np.concatenate([at - 1, at, at + 1]), 0, n - 1))
-    far[asked], size = _distances(poses, np.flatnonzero(~candidate), asked)
-    limit[asked] *= size[:, None]
+    rows = np.unique(np.clip(np.concatenate([at - 1, at, at + 1]), 0, n - 1))
+    far[rows], size = _distances(poses, np.flatnonzero(~candidate), rows)
+    limit[rows] *= size[:, None]
     beside = np.maximum(far[np.maximum(at - 1, 0)], far[np.minimum(at + 1, n - 1)])
     alone = beside <= np.maximum(_MAX_NEIGHBOUR_DISTANCE * far[at], _MAX_NEIGHBOUR_LIMIT * limit[at])
     wrong[at] = ((far[at] > limit[at]) & alone).any(axis=1)
@@ -51,20 +51,22 @@ def single_outliers(seconds: np.ndarray, rotation: np.ndarray, position: np.ndar
 
 
 def _distances(
-    poses: tuple[np.ndarray, np.ndarray, np.ndarray], knots: np.ndarray, asked: np.ndarray
+    poses: tuple[np.ndarray, np.ndarray, np.ndarray], knots: np.ndarray, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (n, 2) [m, rad] of the poses with indices `asked` (n,) from a cubic through the two nearest of `knots`
+    """Distances (n, 2) [m, rad] of the poses with indices `rows` (n,) from a cubic through the two nearest of `knots`
     (m,) on each side. The distance is 0 if there are fewer knots. The second value (n,) is the ratio of their noise to
     that for evenly spaced poses."""
     t, R, p = poses
-    left, right = np.searchsorted(knots, asked), np.searchsorted(knots, asked, side="right")
-    found = (left >= 2) & (right <= len(knots) - 2)
+    left, right = np.searchsorted(knots, rows), np.searchsorted(knots, rows, side="right")
+    has_knots = (left >= 2) & (right <= len(knots) - 2)
     left, right = np.clip(left, 2, len(knots)), np.clip(right, 0, len(knots) - 2)
     beside = knots[np.stack([left - 2, left - 1, right, right + 1])]
-    found &= t[beside[3]] - t[beside[0]] < _MAX_CUBIC_STEPS * np.median(np.diff(t))
-    weight = np.where(found, lagrange_weights(np.where(found, t[beside] - t[asked], np.arange(1.0, 5.0)[:, None])), 0.0)
-    off = p[asked] - np.einsum("kn,kni->ni", weight, p[beside])
-    turns = [so3.log_many(np.ascontiguousarray(R[asked].transpose(0, 2, 1) @ R[k])) for k in beside]
+    has_knots &= t[beside[3]] - t[beside[0]] < _MAX_CUBIC_STEPS * np.median(np.diff(t))
+    weight = np.where(
+        has_knots, lagrange_weights(np.where(has_knots, t[beside] - t[rows], np.arange(1.0, 5.0)[:, None])), 0.0
+    )
+    off = p[rows] - np.einsum("kn,kni->ni", weight, p[beside])
+    turns = [so3.log_many(np.ascontiguousarray(R[rows].transpose(0, 2, 1) @ R[k])) for k in beside]
     turned = np.einsum("kn,kni->ni", weight, np.stack(turns))
     far = np.stack([np.linalg.norm(off, axis=1), np.linalg.norm(turned, axis=1)], axis=1)
-    return far * found[:, None], np.sqrt((1.0 + (weight**2).sum(axis=0)) / _EVEN_VARIANCE)
+    return far * has_knots[:, None], np.sqrt((1.0 + (weight**2).sum(axis=0)) / _EVEN_VARIANCE)

@@ -73,8 +73,8 @@ class _TransformEdge:
 def transform_topics(topics: Sequence[TopicInfo], given: str = DEFAULT_TOPIC) -> list[TopicInfo]:
     """The topic `given` of transforms and its static counterpart, as far as they have messages."""
     stem = given.strip("/").removesuffix(_STATIC)
-    found = [t for t in topics if t.kind == TRANSFORMS and t.count]
-    return [t for t in found if t.name.strip("/") in (stem, stem + _STATIC)]
+    sent = [t for t in topics if t.kind == TRANSFORMS and t.count]
+    return [t for t in sent if t.name.strip("/") in (stem, stem + _STATIC)]
 
 
 def read_transform_poses(bag: HasTopics, sensor: PoseSensor, note: Note) -> PoseReadings:
@@ -119,7 +119,7 @@ def refuse_without_frames(root: Path, topics: Sequence[TopicInfo], sensor: PoseS
 
 def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dict[Pair, Edge]:
     """All edges of `topics` by parent and child. Transforms that are repeated with the same stamp count once."""
-    found: dict[Pair, Edge] = {}
+    edges: dict[Pair, Edge] = {}
     # Static topics are last, so that their transforms replace moving ones of the same two frames.
     for topic in sorted(topics, key=lambda t: t.name.endswith(_STATIC)):
         static, where = topic.name.endswith(_STATIC), f"{bag.root} {topic.name}"
@@ -131,8 +131,8 @@ def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dic
             )
         for pair, r in received.items():
             rows = np.array(r.values, np.float64).reshape(-1, 7)
-            found[pair] = _edge(pair, np.array(r.stamps_ns, np.int64), rows, static, where, note)
-    return found
+            edges[pair] = _edge(pair, np.array(r.stamps_ns, np.int64), rows, static, where, note)
+    return edges
 
 
 @dataclass
@@ -162,19 +162,19 @@ def _rows(bag: HasMessages, topic: str) -> dict[Pair, _Rows]:
 def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, where: str, note: Note) -> Edge:
     """The edge of rows (N, 7) x, y, z, qx, qy, qz, qw, without invalid and repeated ones. Raises RecordingError if most
     are invalid, or the clock was set back."""
-    shown = f"{pair[0]} -> {pair[1]}"
+    frames = f"{pair[0]} -> {pair[1]}"
     with np.errstate(over="ignore", invalid="ignore"):
         good = np.isfinite(rows).all(axis=1) & (
             np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < MAX_QUATERNION_ERROR
         )
     if 2 * good.sum() < len(good):
         raise RecordingError(
-            f"{where}: the transform {shown} at {stamps_ns[np.argmin(good)]} ns is not finite or has no unit "
+            f"{where}: the transform {frames} at {stamps_ns[np.argmin(good)]} ns is not finite or has no unit "
             "quaternion, as are most others; correct the publisher."
         )
     if not good.all():
         note(
-            f"{where}: {int((~good).sum())} of {len(good)} transforms {shown} are not finite or have no unit "
+            f"{where}: {int((~good).sum())} of {len(good)} transforms {frames} are not finite or have no unit "
             f"quaternion and were removed, the first at {stamps_ns[np.argmin(good)]} ns."
         )
     stamps_ns, rows = stamps_ns[good], rows[good]
@@ -186,8 +186,8 @@ def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, whe
         back_ns = int((np.maximum.accumulate(received) - received).max(initial=0))
         if back_ns > _MAX_BACKWARDS_NS:
             raise RecordingError(
-                f"{where}: the stamps of {shown} go back by {back_ns * 1e-9:.1f} s, so the clock was set back; cut the "
-                "recording there with --from and --to."
+                f"{where}: the stamps of {frames} go back by {back_ns * 1e-9:.1f} s, so the clock was set back; cut "
+                "the recording there with --from and --to."
             )
         stamps_ns, rows = stamps_ns[first], rows[first]
     rotation = unit_rotations(rows[:, 3:], np.ones(len(rows), dtype=bool))
@@ -209,10 +209,10 @@ def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[
     queue = [parent]
     for frame in queue:
         for (a, b), edge in edges.items():
-            for here, there, inverted in ((a, b, False), (b, a, True)):
-                if here == frame and there not in steps_to:
-                    steps_to[there] = [*steps_to[frame], _TransformEdge(edge, inverted)]
-                    queue.append(there)
+            for near, far, inverted in ((a, b, False), (b, a, True)):
+                if near == frame and far not in steps_to:
+                    steps_to[far] = [*steps_to[frame], _TransformEdge(edge, inverted)]
+                    queue.append(far)
     if child not in steps_to:
         raise RecordingError(
             f"{what}: no transforms connect {parent} and {child}; {parent} is connected with "
@@ -226,38 +226,38 @@ def _along(steps: Sequence[_TransformEdge], sensor: PoseSensor, where: str, note
     """Poses composed along a chain, at the common stamps of its changing edges. Raises RecordingError if no transform
     changes."""
     assert sensor.frames is not None
-    what, shown = f"{where} ({sensor.name})", " -> ".join(sensor.frames)
+    what, frames = f"{where} ({sensor.name})", " -> ".join(sensor.frames)
     sent = [s.edge for s in steps if len(s.edge.stamps_ns) > 1]
     moving = [e for e in sent if e.changes] or sent
     if not moving:
         raise RecordingError(
-            f"{what}: nothing moves between the frames {shown}; choose `frames` with a joint or the motion of "
+            f"{what}: nothing moves between the frames {frames}; choose `frames` with a joint or the motion of "
             "a vehicle between them."
         )
-    stamps_ns = _common_stamps(moving, what, shown, note)
+    stamps_ns = _common_stamps(moving, what, frames, note)
     R, p = np.tile(np.eye(3), (len(stamps_ns), 1, 1)), np.zeros((len(stamps_ns), 3))
     for step in steps:
         edge = step.edge
-        own_R, own_p = _at(edge, stamps_ns) if edge in moving else (edge.rotation[:1], edge.position[:1])
+        edge_R, edge_p = _at(edge, stamps_ns) if edge in moving else (edge.rotation[:1], edge.position[:1])
         if step.inverted:
-            own_R = own_R.transpose(0, 2, 1)
-            own_p = -np.einsum("nij,nj->ni", own_R, own_p)
-        R, p = R @ own_R, p + np.einsum("nij,nj->ni", R, np.broadcast_to(own_p, p.shape))
+            edge_R = edge_R.transpose(0, 2, 1)
+            edge_p = -np.einsum("nij,nj->ni", edge_R, edge_p)
+        R, p = R @ edge_R, p + np.einsum("nij,nj->ni", R, np.broadcast_to(edge_p, p.shape))
     return PoseReadings(sensor.name, stamps_ns, np.ascontiguousarray(R), p)
 
 
-def _common_stamps(moving: Sequence[Edge], what: str, shown: str, note: Note) -> np.ndarray:
+def _common_stamps(moving: Sequence[Edge], what: str, frames: str, note: Note) -> np.ndarray:
     """(N,) stamps of the changing edge with most transforms (the last of several) at which all other changing edges are
     known."""
     stamps_ns = max(moving[::-1], key=lambda e: len(e.stamps_ns)).stamps_ns
     known = np.logical_and.reduce([_covered(edge, stamps_ns) for edge in moving])
     if not known.any():
         raise RecordingError(
-            f"{what}: the transforms between {shown} have no time in common; check the clocks of their publishers."
+            f"{what}: the transforms between {frames} have no time in common; check the clocks of their publishers."
         )
     if not known.all():
         note(
-            f"{what}: {int((~known).sum())} of {len(known)} poses {shown} were removed, the first at "
+            f"{what}: {int((~known).sum())} of {len(known)} poses {frames} were removed, the first at "
             f"{stamps_ns[np.argmin(known)]} ns, because another transform between the two frames is missing "
             "there."
         )
@@ -268,18 +268,18 @@ def _covered(edge: Edge, stamps_ns: np.ndarray) -> np.ndarray:
     """(N,) whether an edge is known at stamps (N,): at the stamps of the edge, and between two that are close."""
     after = np.searchsorted(edge.stamps_ns, stamps_ns)
     last = len(edge.stamps_ns) - 1
-    own = edge.stamps_ns[np.minimum(after, last)] == stamps_ns
+    exact = edge.stamps_ns[np.minimum(after, last)] == stamps_ns
     gap = edge.stamps_ns[np.minimum(after, last)] - edge.stamps_ns[np.maximum(after - 1, 0)]
     near = gap <= _MAX_INTERPOLATED_PERIODS * float(np.median(np.diff(edge.stamps_ns)))
-    return own | ((after > 0) & (after <= last) & near)
+    return exact | ((after > 0) & (after <= last) & near)
 
 
 def _at(edge: Edge, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations (N, 3, 3) and positions (N, 3) of an edge at stamps (N,), which must be covered. Interpolation is
     geodesic for rotations and linear for positions."""
     i = np.clip(np.searchsorted(edge.stamps_ns, stamps_ns, side="right") - 1, 0, len(edge.stamps_ns) - 2)
-    whole = (edge.stamps_ns[i + 1] - edge.stamps_ns[i]).astype(np.float64)
-    share = ((stamps_ns - edge.stamps_ns[i]) / whole)[:, None]
+    duration = (edge.stamps_ns[i + 1] - edge.stamps_ns[i]).astype(np.float64)
+    share = ((stamps_ns - edge.stamps_ns[i]) / duration)[:, None]
     R, p = edge.rotation[i], edge.position[i]
     turn = so3.log_many(np.ascontiguousarray(R.transpose(0, 2, 1) @ edge.rotation[i + 1]))
     return R @ so3.exp_many(share * turn), p + share * (edge.position[i + 1] - p)

@@ -45,8 +45,8 @@ class Fix:
     @property
     def triples(self) -> Triples:
         """Triples of fixes about a second apart, without a step of the solution between them."""
-        found = triples_of(self.t)
-        return found.some(self.run[found.i] == self.run[found.k])
+        triples = triples_of(self.t)
+        return triples.some(self.run[triples.i] == self.run[triples.k])
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,14 @@ class WindowUnknowns:
 
 
 @dataclass(frozen=True)
+class WindowPrior:
+    """Gaussian prior of `WindowUnknowns`: mean, and standard deviations sigma (13,) of a step from it."""
+
+    mean: WindowUnknowns
+    sigma: np.ndarray
+
+
+@dataclass(frozen=True)
 class WindowFit:
     """Result of `fit_window`. misfit: RMS of the residuals over the RMS of the second differences of the fixes;
     covariance (13, 13) of the unknowns, scaled by the residuals."""
@@ -109,10 +117,10 @@ def first_attitude(
     plus gravity."""
     t = fix.t + offset
     integrated = IntegratedReadings.of(imu, span_of(t, triples), reference, np.zeros(3), forces_only=True)
-    seen = triples.second(fix.position)
-    seen[:, 2] += gravity * triples.half
+    differences = triples.second(fix.position)
+    differences[:, 2] += gravity * triples.half
     felt = triples.second(integrated.doubles_at(t)[:, :3])
-    return so3.closest_rotation(seen.T @ felt)
+    return so3.closest_rotation(differences.T @ felt)
 
 
 def fit_window(
@@ -120,12 +128,11 @@ def fit_window(
     fix: Fix,
     triples: Triples,
     start: WindowUnknowns,
-    prior: WindowUnknowns,
-    sigma: np.ndarray,
+    prior: WindowPrior,
     gravity: float,
 ) -> WindowFit:
-    """Robust Gauss-Newton on the second differences over `triples` (see module `triples`) from `start`. prior, sigma:
-    means and standard deviations (13,) of a Gaussian prior; gravity [m/s^2]."""
+    """Robust Gauss-Newton on the second differences over `triples` (see module `triples`) from `start`. gravity
+    [m/s^2]."""
     x, row_sigma, information = start, MIN_TRIPLE_SIGMA_M_S, np.eye(13)
     r, kept = np.zeros((0, 3)), np.zeros(0, dtype=bool)
     for _ in range(MAX_WINDOW_ROUNDS):
@@ -134,13 +141,13 @@ def fit_window(
         kept = size <= MAX_TRIPLE_MEDIANS * np.median(size)
         row_sigma = max(MIN_TRIPLE_SIGMA_M_S, float(np.median(size)))
         A, b = J[kept].reshape(-1, 13) / row_sigma, r[kept].ravel() / row_sigma
-        information = A.T @ A + np.diag(sigma**-2)
-        step = np.linalg.solve(information, A.T @ b - x.minus(prior) / sigma**2)
+        information = A.T @ A + np.diag(prior.sigma**-2)
+        step = np.linalg.solve(information, A.T @ b - x.minus(prior.mean) / prior.sigma**2)
         x = x.moved(step)
         if np.abs(step).max() < WINDOW_STEP_TOLERANCE:
             break
-    seen = triples.second(fix.position)[kept]
-    misfit = np.sqrt((r[kept] ** 2).sum() / max(float((seen**2).sum()), 1e-9))
+    differences = triples.second(fix.position)[kept]
+    misfit = np.sqrt((r[kept] ** 2).sum() / max(float((differences**2).sum()), 1e-9))
     return WindowFit(x, float(misfit), np.linalg.inv(information))
 
 

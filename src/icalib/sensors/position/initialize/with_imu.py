@@ -20,6 +20,7 @@ from icalib.sensors.position.initialize.attitude import (
     MIN_WINDOW_TRIPLES,
     Fix,
     WindowFit,
+    WindowPrior,
     WindowUnknowns,
     first_attitude,
     fit_window,
@@ -104,13 +105,13 @@ def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: 
     offsets, rms = _candidate_offsets(imu, fix, known), _moves_evenly(fix, triples)
     if not offsets:
         raise _motionless(name, rms) if rms is not None else _contradicting(imu, name, 1.0, False)
-    found = [one for x in offsets if (one := _fit_at_offset(imu, fix, triples, x, gravity, known)) is not None]
-    if not found:
+    fits = [one for x in offsets if (one := _fit_at_offset(imu, fix, triples, x, gravity, known)) is not None]
+    if not fits:
         raise OtherMotionError(
             f"{name}: too few of its fixes fall within the recording of {imu.name}; check that both come from the same "
             "recording, or the time_offset in the rig file."
         )
-    best, window = min(found, key=lambda one: one[0].misfit)
+    best, window = min(fits, key=lambda one: one[0].misfit)
     if best.misfit > MAX_ACCELERATION_MISFIT and rms is not None:
         raise _motionless(name, rms)
     if best.misfit > SUSPICIOUS_MISFIT:
@@ -124,14 +125,15 @@ def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: 
 
 
 def _contradicting(imu: ImuData, name: str, misfit: float, mirrored: bool) -> EstimationError:
-    told = f"{name}: {imu.name} does not explain {misfit:.0%} of its acceleration at any time offset"
+    sentence = f"{name}: {imu.name} does not explain {misfit:.0%} of its acceleration at any time offset"
     if mirrored:
         return EstimationError(
-            f"{told}, but does where east and north are swapped; correct the order of latitude and longitude, or of x "
-            "and y, by `columns: [...]` in the rig file."
+            f"{sentence}, but does where east and north are swapped; correct the order of latitude and longitude, or "
+            "of x and y, by `columns: [...]` in the rig file."
         )
     return OtherMotionError(
-        f"{told}; check that both are on the same vehicle, and units and axes of {imu.name} (accel_unit, gyro_unit)."
+        f"{sentence}; check that both are on the same vehicle, and units and axes of {imu.name} "
+        "(accel_unit, gyro_unit)."
     )
 
 
@@ -146,8 +148,8 @@ def _candidate_offsets(imu: ImuData, fix: Fix, known: KnownExtrinsics) -> list[f
     """Time offsets to be tried [s]: the known one, or the highest correlations."""
     if known.offset is not None:
         return [known.offset]
-    found = likely_offsets(imu, fix)
-    return [s.samples / SIGNAL_RATE_HZ for s in found if s.correlation > MIN_JERK_CORRELATION][:MAX_OFFSETS_TRIED]
+    shifts = likely_offsets(imu, fix)
+    return [s.samples / SIGNAL_RATE_HZ for s in shifts if s.correlation > MIN_JERK_CORRELATION][:MAX_OFFSETS_TRIED]
 
 
 def _moves_evenly(fix: Fix, triples: Triples) -> float | None:
@@ -179,14 +181,14 @@ def _fit_at_offset(
         within = usable
     R = first_attitude(imu, fix, within, centre + offset, offset, gravity)
     no = np.zeros(3)
-    start = prior = WindowUnknowns(centre + offset, R, no, no, no if arm is None else arm, offset)
+    start = mean = WindowUnknowns(centre + offset, R, no, no, no if arm is None else arm, offset)
     sigma = sigmas()
     if arm is not None:
         sigma[9:12] = KNOWN_ARM_SIGMA_M
     if known.offset is not None:
         sigma[12] = KNOWN_OFFSET_SIGMA_S
     while True:
-        fitted = fit_window(imu, fix, within, start, replace(prior, R_wg=start.R_wg), sigma, gravity)
+        fitted = fit_window(imu, fix, within, start, WindowPrior(replace(mean, R_wg=start.R_wg), sigma), gravity)
         window = centre - half, centre + half
         if half >= MAX_HALF_WINDOW_S or len(within.i) == len(usable.i):
             return fitted, window
@@ -227,5 +229,5 @@ def _next(imu: ImuData, fix: Fix, usable: Triples, last: MotionWindow, length: f
         return MotionWindow(begin, end, start)
     sigma = sigmas(KNOWN_ARM_SIGMA_M, KNOWN_OFFSET_SIGMA_S)
     sigma[:9] = np.repeat([NEXT_ROTATION_SIGMA_RAD, NEXT_GYRO_BIAS_SIGMA_RAD_S, NEXT_ACCEL_BIAS_SIGMA_M_S2], 3)
-    found = fit_window(imu, fix, within, start, start, sigma, gravity)
-    return MotionWindow(begin, end, found.at if found.misfit < 1.0 else start)
+    fit = fit_window(imu, fix, within, start, WindowPrior(start, sigma), gravity)
+    return MotionWindow(begin, end, fit.at if fit.misfit < 1.0 else start)
