@@ -18,7 +18,7 @@ from typing import Any
 
 from icalib.base.text_files import write_texts
 from icalib.result.quantities import format_number
-from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import display_unit
 from icalib.tools.montecarlo.record import from_json
 from icalib.tools.montecarlo.statistics import Nees
 from icalib.tools.montecarlo.summary import consistency_json, summarise
@@ -39,7 +39,7 @@ def block_table(found: dict[str, Any]) -> str:
     for block in found["blocks"]:
         if block["nees"] is None:
             continue
-        unit, scale = shown_unit(block["unit"])
+        unit, scale = display_unit(block["unit"])
         sizes = [f"{format_number(scale * block[name], 3)} {unit}".strip() for name in ("rmse", "mean_sigma")]
         name = f"{block['sensor']} {block['name'].replace('_', ' ')}"
         rows.append(f"| {name} | {' | '.join(sizes)} | {_nees(Nees(**block['nees']))} |")

@@ -141,7 +141,7 @@ def test_a_definition_is_all_that_a_new_parameter_needs():
     layout = make_layout(own_entries(sensor))
     specs = specs_of(layout, [sensor])
     block, spec = layout.block("lidar0", "bend"), specs["lidar0", "bend"]
-    assert (block.kind, block.size, spec.shown_unit[0], spec.labels) == ("vector", 2, "deg", ("left", "up"))
+    assert (block.kind, block.size, spec.display_unit[0], spec.labels) == ("vector", 2, "deg", ("left", "up"))
     np.testing.assert_array_equal(tolerance_of(layout, specs, Settings())[block.columns], 1e-3)
     with pytest.raises(icalib.CalibrationError, match="bend needs 2 numbers"):
         Bent("lidar0", "", bend=Parameter("fixed", np.zeros(3)))

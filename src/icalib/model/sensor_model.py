@@ -122,9 +122,9 @@ class SensorModel(Generic[S, N]):
         """Noise before any residuals are known: stated, or usual values."""
         raise NotImplementedError
 
-    def next_noise(self, sensor: S, noise: N, found: ResidualStatistics) -> N:
-        """Noise estimated from the residuals `found` of a pass with `noise`. Stated parts are unchanged."""
-        del sensor, found
+    def next_noise(self, sensor: S, noise: N, statistics: ResidualStatistics) -> N:
+        """Noise estimated from the residual statistics of a pass with `noise`. Stated parts are unchanged."""
+        del sensor, statistics
         return noise
 
     def noise_passes(self, sensor: S) -> int:

@@ -12,7 +12,7 @@ from icalib.result.body_frame import in_body_frame
 from icalib.result.verdict import worst
 from icalib.rig import LENS
 from icalib.rig.kinds import ONE
-from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import display_unit
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
@@ -105,7 +105,7 @@ def rms_words(fit: SensorFit) -> str:
 
 
 def _rows_of(group: ParameterGroup) -> list[Row]:
-    unit, scale = shown_unit(group.unit)
+    unit, scale = display_unit(group.unit)
     names, values = _names(group), _values(group, scale)
     factors = [None] * len(names) if group.columns is None or group.factor is None else group.factor.tolist()
     return [

@@ -24,7 +24,7 @@ from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
 from icalib.rig import LENS, Settings
 from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
-from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import display_unit
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, Verdict
@@ -170,7 +170,7 @@ def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:
             if verdicts and g.name == LENS[0]:
                 yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0]
             continue
-        unit, scale = shown_unit(g.unit)
+        unit, scale = display_unit(g.unit)
         for label, verdict, std in zip(g.labels, verdicts, g.std.tolist(), strict=False):
             name = g.name if label in (g.name, "") else f"{g.name} {label}"
             yield f"{g.sensor} {name.replace('_', ' ')} (std {scale * std:.2g} {unit})".replace(" )", ")"), verdict

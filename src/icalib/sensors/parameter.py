@@ -129,29 +129,29 @@ def _array(value: Any) -> np.ndarray:
 
 
 def _checked_value(value: Any) -> np.ndarray:
-    found = _array(value)
-    if found.shape != (3, 3) and (found.ndim != 1 or not len(found)):
-        raise RigError(f"a parameter's value is {_ANY_VECTOR}, but it has shape {found.shape}; correct the value.")
-    if not np.isfinite(found).all():
+    array = _array(value)
+    if array.shape != (3, 3) and (array.ndim != 1 or not len(array)):
+        raise RigError(f"a parameter's value is {_ANY_VECTOR}, but it has shape {array.shape}; correct the value.")
+    if not np.isfinite(array).all():
         raise RigError("a parameter's value has entries that are NaN or infinite; leave the value out, or correct it.")
-    if found.ndim == 1:
-        return found
+    if array.ndim == 1:
+        return array
     try:
-        return nearest_rotation(found)
+        return nearest_rotation(array)
     except RigError as error:
         raise RigError(f"a parameter's 3x3 value {error}; correct the matrix.") from None
 
 
 def _checked_sigma(sigma: Any, size: int) -> np.ndarray:
-    found = _array(sigma)
-    if found.shape not in ((1,), (size,)):
-        raise RigError(f"a prior's sigma needs 1 or {size} numbers, but it has shape {found.shape}; correct sigma.")
-    if not (np.isfinite(found) & (found > 0.0)).all():
+    array = _array(sigma)
+    if array.shape not in ((1,), (size,)):
+        raise RigError(f"a prior's sigma needs 1 or {size} numbers, but it has shape {array.shape}; correct sigma.")
+    if not (np.isfinite(array) & (array > 0.0)).all():
         raise RigError(
-            f"a prior's sigma must be above 0 and finite, but one entry is {_worst(found):g}; for an exact value use "
+            f"a prior's sigma must be above 0 and finite, but one entry is {_worst(array):g}; for an exact value use "
             "icalib.fixed, for an unknown one icalib.guess."
         )
-    return np.broadcast_to(found, (size,)).copy() if len(found) != size else found
+    return np.broadcast_to(array, (size,)).copy() if len(array) != size else array
 
 
 def _worst(sigma: np.ndarray) -> float:

@@ -23,26 +23,26 @@ def parameter(value: YamlValue, spec: ParameterSpec) -> Parameter:
 
 def vector_parameter(value: YamlValue, size: int) -> Parameter:
     """Parses a group of `size` numbers. Raises RigError naming line and field."""
-    mode, found = _mode(value, ("sigma",))
-    if found is None:
+    mode, fields = _mode(value, ("sigma",))
+    if fields is None:
         return Parameter("free")
-    mean = found[mode].vector(size)
+    mean = fields[mode].vector(size)
     if mode != "prior":
         return Parameter("free" if mode == "guess" else "fixed", mean)
-    return Parameter("prior", mean, _sigma(found["sigma"], size))
+    return Parameter("prior", mean, _sigma(fields["sigma"], size))
 
 
 def rotation_parameter(value: YamlValue) -> Parameter:
     """Parses a rotation R_imu_sensor with `sigma` in rad or `sigma_deg`. Raises RigError naming line and field."""
-    mode, found = _mode(value, ("sigma", "sigma_deg"))
-    if found is None:
+    mode, fields = _mode(value, ("sigma", "sigma_deg"))
+    if fields is None:
         return Parameter("free")
-    matrix = _rotation(found[mode])
+    matrix = _rotation(fields[mode])
     if mode != "prior":
         return Parameter("free" if mode == "guess" else "fixed", matrix)
-    if "sigma_deg" in found:
-        return Parameter("prior", matrix, np.deg2rad(_sigma(found["sigma_deg"], 3)))
-    return Parameter("prior", matrix, _sigma(found["sigma"], 3))
+    if "sigma_deg" in fields:
+        return Parameter("prior", matrix, np.deg2rad(_sigma(fields["sigma_deg"], 3)))
+    return Parameter("prior", matrix, _sigma(fields["sigma"], 3))
 
 
 def parameter_to_plain(parameter: Parameter) -> Any:
@@ -64,16 +64,16 @@ def _mode(value: YamlValue, sigmas: tuple[str, ...]) -> tuple[str, dict[str, Yam
         if value.is_list or value.text() != "free":
             value.fail(f"must be free or a mapping, but is {value.summary()}; {_FORMS}.")
         return "free", None
-    found = value.record((), ("guess", "fixed", "prior", *sigmas))
-    modes = [name for name in ("guess", "fixed", "prior") if name in found]
+    fields = value.record((), ("guess", "fixed", "prior", *sigmas))
+    modes = [name for name in ("guess", "fixed", "prior") if name in fields]
     if len(modes) != 1:
         value.fail(f"needs exactly one of guess, fixed and prior, but has {' and '.join(modes) or 'none'}; {_FORMS}.")
-    given = [name for name in sigmas if name in found]
+    given = [name for name in sigmas if name in fields]
     if modes[0] == "prior" and len(given) != 1:
         value.fail(f"a prior needs exactly one of {' and '.join(sigmas)}; {_FORMS}.")
     if modes[0] != "prior" and given:
-        found[given[0]].fail(f"belongs to a prior, not to {modes[0]}; {_FORMS}.")
-    return modes[0], found
+        fields[given[0]].fail(f"belongs to a prior, not to {modes[0]}; {_FORMS}.")
+    return modes[0], fields
 
 
 def _sigma(value: YamlValue, size: int) -> np.ndarray:
@@ -94,12 +94,12 @@ def _rotation(value: YamlValue) -> np.ndarray:
         return _matrix(value)
     if not value.is_mapping:
         value.fail(f"must be a rotation, {_ROTATION_FORMS}, but is {value.summary()}.")
-    found = value.record((), ("xyzw", "rpy_deg"))
-    if len(found) != 1:
+    fields = value.record((), ("xyzw", "rpy_deg"))
+    if len(fields) != 1:
         value.fail(f"must be one rotation; write {_ROTATION_FORMS}.")
-    if "xyzw" in found:
-        return _from_quaternion(found["xyzw"])
-    return _from_rpy(*(radians(angle) for angle in found["rpy_deg"].vector(3)))
+    if "xyzw" in fields:
+        return _from_quaternion(fields["xyzw"])
+    return _from_rpy(*(radians(angle) for angle in fields["rpy_deg"].vector(3)))
 
 
 def _matrix(value: YamlValue) -> np.ndarray:

@@ -15,7 +15,7 @@ ToleranceSetting = Literal[
     "rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance"
 ]  # fields of `rig.Settings`
 # SI unit -> unit in reports and messages, and the factor by which SI values are multiplied.
-SHOWN_UNITS = {"rad": ("deg", 180.0 / pi), "m": ("mm", 1e3), "s": ("ms", 1e3)}
+DISPLAY_UNITS = {"rad": ("deg", 180.0 / pi), "m": ("mm", 1e3), "s": ("ms", 1e3)}
 AXES = ("x", "y", "z")
 
 
@@ -61,11 +61,11 @@ class ParameterSpec:
         return owner, self.name, self.manifold, self.size, estimated
 
     @property
-    def shown_unit(self) -> tuple[str, float]:
+    def display_unit(self) -> tuple[str, float]:
         """The unit in reports and messages, and the factor by which SI values are multiplied."""
-        return shown_unit(self.unit)
+        return display_unit(self.unit)
 
 
-def shown_unit(unit: str) -> tuple[str, float]:
+def display_unit(unit: str) -> tuple[str, float]:
     """The unit in reports and messages for values in the SI `unit`, and the factor by which they are multiplied."""
-    return SHOWN_UNITS.get(unit, (unit, 1.0))
+    return DISPLAY_UNITS.get(unit, (unit, 1.0))

@@ -111,8 +111,8 @@ class Stream:
 
     def columns(self) -> dict[str, np.ndarray]:
         """All arrays by name, except stamps_ns and start."""
-        found = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return {k: v for k, v in found.items() if isinstance(v, np.ndarray) and k not in ("stamps_ns", "start")}
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {k: v for k, v in values.items() if isinstance(v, np.ndarray) and k not in ("stamps_ns", "start")}
 
     def better_origin(self) -> np.ndarray | None:
         """A new origin (3,) [m] for the frame of the positions, near them, if its own is far (`far_origin`), else None.
@@ -142,12 +142,12 @@ class Stream:
             raise RecordingError(f"{cls.__name__} {streams[0].name}: another recording has a stream of another class.")
         shifts = [0] * len(streams) if shifts_ns is None else shifts_ns
         stamps = [s.stamps_ns + np.int64(shift) for s, shift in zip(streams, shifts, strict=True)]
-        changed: dict[str, Any] = {"joins_ns": tuple(int(own[0]) for own in stamps[1:])}
+        changed: dict[str, Any] = {"joins_ns": tuple(int(stamps_ns[0]) for stamps_ns in stamps[1:])}
         if hasattr(streams[0], "start"):
             counts = np.concatenate([np.diff(getattr(s, "start")) for s in streams])  # noqa: B009
             changed["start"] = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         for name, first in streams[0].columns().items():
             values = [getattr(s, name) for s in streams]
-            stated = all(len(own) == s.rows for own, s in zip(values, streams, strict=True))
+            stated = all(len(column) == s.rows for column, s in zip(values, streams, strict=True))
             changed[name] = np.concatenate(values) if stated else first[:0]
         return dataclasses.replace(streams[0], stamps_ns=np.concatenate(stamps), **changed)

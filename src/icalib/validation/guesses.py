@@ -14,7 +14,7 @@ from icalib.initialize.steps.contradicted_guesses import is_contradicted
 from icalib.result import ParameterGroup
 from icalib.rig import LENS, Camera
 from icalib.sensors.camera.spec import INTRINSICS
-from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import display_unit
 from icalib.validation.looks_like import looks_like
 from icalib.validation.stated import scaled
 
@@ -58,7 +58,7 @@ def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:
     if group.name == "rotation":
         off = np.rad2deg(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ group.value))))
         return f"{what} is {off:.1f} deg from what the data show, which alone count."
-    unit, scale = shown_unit(group.unit)
+    unit, scale = display_unit(group.unit)
     unit = f" {unit}" if unit else ""
     if group.name == "time_offset":
         off = guess - group.value

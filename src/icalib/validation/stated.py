@@ -26,7 +26,7 @@ def stated_words(inputs: Inputs, c: Contradiction) -> str:
     """A sentence on the contradiction `c`: both values, their standard deviations and distance, and a likely
     mistake."""
     spec = inputs.specs[c.key]
-    labels, (unit, scale) = spec.labels, spec.shown_unit
+    labels, (unit, scale) = spec.labels, spec.display_unit
     stated, unit = c.parameter.sigma, f" {unit}" if unit else ""
     sigma = scale * float(c.sigma[c.worst])
     allowed = "" if stated is None else f" +- {scale * np.broadcast_to(stated, c.off.shape)[c.worst]:.3g}{unit}"

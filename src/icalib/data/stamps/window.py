@@ -77,7 +77,8 @@ def stamps_inside(window: Window, stamps_ns: np.ndarray, what: str, spans: Seque
 
 
 def start_of(span: Span, spans: Sequence[Span]) -> int:
-    """Start of the recording [ns] on the clock of a stream with the span `span`.
+    """Start of the recording [ns] on the clock of a stream. span: its first and last stamp [ns]; spans: those of all
+    streams.
 
     It is the first stamp of all streams whose spans overlap that span, directly or through other streams. A stream with
     a clock jump (longer than a day), or with another clock, starts at its first stamp.

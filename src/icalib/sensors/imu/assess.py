@@ -14,19 +14,19 @@ from icalib.rig import ImuSensor
 from icalib.sensors.imu.spec import INTRINSICS_LABELS, class_of_sigma
 
 
-def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[ImuResiduals]:
+def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[ImuResiduals]:
     """The residuals of all intervals between keyframes; intervals between two recordings have no data and are
     omitted."""
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
-    chain, state = found.problem.chain, found.outcome.state
+    chain, state = estimate.problem.chain, estimate.outcome.state
     seconds = timeline.on_result_clock(state.seconds, state.recording)[:-1]
     between = np.array(chain.starts[1:], dtype=np.int64) - 1
-    whitened = found.outcome.residuals[chain.key].residual
+    whitened = estimate.outcome.residuals[chain.key].residual
     yield ImuResiduals(chain.name, np.delete(seconds, between), np.delete(whitened, between, axis=0))
 
 
-def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """Notes on noise, the prior of the intrinsics and gaps; without an IMU, on the assumed smooth motion."""
     imu = inputs.imu
     if imu is None:

@@ -219,8 +219,8 @@ class ImuFactor(RowFactor):
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """Adds the broad prior on the biases of the first keyframe of each recording in `piece`. Its mean is the biases
         at the start of the pass. Returns half its chi^2."""
-        own = [k for k in self.starts if piece.first <= k < piece.last]
-        return sum(accumulate_bias_prior(state, piece, sums, self.increments.bias0[k], k) for k in own)
+        keyframes = [k for k in self.starts if piece.first <= k < piece.last]
+        return sum(accumulate_bias_prior(state, piece, sums, self.increments.bias0[k], k) for k in keyframes)
 
     @classmethod
     def build(cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray) -> ImuFactor:

@@ -116,16 +116,16 @@ def class_imperfections(name: str) -> Imperfections:
 def class_of_noise(noise: ImuNoise) -> str:
     """The class of an IMU by its noise: the class whose default it is; otherwise tactical if the noise is as small,
     else consumer."""
-    own = next((name for name in IMU_CLASSES if class_noise(name).source == noise.source), None)
-    if own is not None:
-        return own
+    imu_class = next((name for name in IMU_CLASSES if class_noise(name).source == noise.source), None)
+    if imu_class is not None:
+        return imu_class
     is_tactical = bool((noise.densities <= _LARGEST_TACTICAL_RATIO * np.array(_FIGURES["tactical"])).all())
     return "tactical" if is_tactical else DEFAULT_CLASS
 
 
 def class_of_sigma(sigma: np.ndarray) -> str | None:
     """The class whose imperfections have standard deviations `sigma` (24,), or None."""
-    return next((name for name, own in _IMPERFECTIONS.items() if np.array_equal(own.sigma, sigma)), None)
+    return next((name for name, prior in _IMPERFECTIONS.items() if np.array_equal(prior.sigma, sigma)), None)
 
 
 @dataclass(frozen=True)
@@ -184,21 +184,21 @@ class ImuSensor(Sensor):
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> ImuSensor:
         names = [spec.name for spec in cls.stated()]
-        found = value.record(("type",), ("path", "topic", "noise", *names, *_FIELDS, *TABLE))
+        fields = value.record(("type",), ("path", "topic", "noise", *names, *_FIELDS, *TABLE))
         units: dict[str, Any] = {
-            field: found[field].choice("such unit as", get_args(kind))
+            field: fields[field].choice("such unit as", get_args(kind))
             for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
-            if field in found
+            if field in fields
         }
-        groups: dict[str, Any] = {name: _intrinsics(found[name]) for name in names if name in found}
+        groups: dict[str, Any] = {name: _intrinsics(fields[name]) for name in names if name in fields}
         return cls(
             name=name,
-            path=_source(found["path"]) if "path" in found else f"{name}/data.csv",
-            noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
-            topic=_source(found["topic"]) if "topic" in found else None,
-            accel_axes=axes_or_none(found, "accel_axes"),
-            gyro_axes=axes_or_none(found, "gyro_axes"),
-            layout=table_layout(found),
+            path=_source(fields["path"]) if "path" in fields else f"{name}/data.csv",
+            noise=_noise(fields["noise"]) if "noise" in fields else class_noise(DEFAULT_CLASS),
+            topic=_source(fields["topic"]) if "topic" in fields else None,
+            accel_axes=axes_or_none(fields, "accel_axes"),
+            gyro_axes=axes_or_none(fields, "gyro_axes"),
+            layout=table_layout(fields),
             **units,
             **groups,
         )
@@ -221,17 +221,17 @@ class ImuSensor(Sensor):
 def _noise(value: YamlValue) -> ImuNoise:
     if not value.is_mapping:
         return class_noise(value.choice("IMU class", IMU_CLASSES))
-    found = value.record(_DENSITIES, ("source",))
-    densities = {name: found[name].positive() for name in _DENSITIES}
-    return ImuNoise(**densities, source=found["source"].text() if "source" in found else ImuNoise.source)
+    fields = value.record(_DENSITIES, ("source",))
+    densities = {name: fields[name].positive() for name in _DENSITIES}
+    return ImuNoise(**densities, source=fields["source"].text() if "source" in fields else ImuNoise.source)
 
 
 def _source(value: YamlValue) -> str | TwoSources:
     """One name, or one each for gyroscope and accelerometer."""
     if not value.is_mapping:
         return value.text()
-    found = value.record(("gyro", "accel"))
-    return TwoSources(found["gyro"].text(), found["accel"].text())
+    fields = value.record(("gyro", "accel"))
+    return TwoSources(fields["gyro"].text(), fields["accel"].text())
 
 
 def _plain_source(source: str | TwoSources) -> str | dict[str, str]:

@@ -46,11 +46,11 @@ def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
         yield Plane(name, v[:3].copy(), v[3:].copy(), int(n))
 
 
-def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[LidarResiduals]:
+def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[LidarResiduals]:
     """Residuals of each LiDAR at the estimate and at the initial guess, evenly thinned; none without planes."""
     if not inputs.association.count:
         return
-    state = found.outcome.state
+    state = estimate.outcome.state
     now, guess = motion_of(inputs, state), motion_of(inputs, inputs.guess or state)
     values = np.array([state.values[key] for key in inputs.association.keys])
     thinned = [_thinned(inputs, k, state) for k in range(len(inputs.rig.lidars))]
@@ -58,22 +58,22 @@ def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[L
     first_planes = _fitted_planes(
         [(points, plane) for (points, _), (_, plane) in zip(before, thinned, strict=True)], values
     )
-    for whole, (stream, plane), (first_world, seen_from) in zip(
+    for recorded, (stream, plane), (first_world, first_origin) in zip(
         inputs.measurements.lidars, thinned, before, strict=True
     ):
         seconds = _seconds_of(stream, state)
         world, at = in_world(now, stream)
         residual, cosine = _on_planes(world, at, values[plane])
-        first_residual, _ = _on_planes(first_world, seen_from, first_planes[plane])
+        first_residual, _ = _on_planes(first_world, first_origin, first_planes[plane])
         yield LidarResiduals(
             stream.name,
-            len(whole.stamps_ns),
-            len(whole.xyz),
-            _used(found, stream.name),
+            len(recorded.stamps_ns),
+            len(recorded.xyz),
+            _used(estimate, stream.name),
             timeline.on_result_clock(seconds, timeline.recording_of(seconds)),
             plane,
             np.linalg.norm(stream.xyz, axis=1),
-            _sigma(found.measurement_model.noise[stream.name], cosine),
+            _sigma(estimate.measurement_model.noise[stream.name], cosine),
             world,
             residual,
             first_world,
@@ -85,11 +85,11 @@ def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.
     """Points of a LiDAR on planes while the IMU was running, evenly thinned, and the plane (N,) of each."""
     assert inputs.imu is not None
     stream, plane = inputs.measurements.lidars[index], inputs.association.plane[index]
-    own = np.flatnonzero(plane >= 0)
-    own = own[:: max(1, -(-len(own) * len(inputs.rig.lidars) // MAX_KEPT_POINTS))]
-    one = _some_points(stream, own)
+    points = np.flatnonzero(plane >= 0)
+    points = points[:: max(1, -(-len(points) * len(inputs.rig.lidars) // MAX_KEPT_POINTS))]
+    one = _some_points(stream, points)
     running = usable(inputs.imu, _seconds_of(one, state), inputs.rig.settings.max_gap_s)
-    return _some_points(one, np.flatnonzero(running)), plane[own[running]]
+    return _some_points(one, np.flatnonzero(running)), plane[points[running]]
 
 
 def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:
@@ -99,18 +99,18 @@ def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarr
     """
     out = values.copy()
     for k in range(len(values)):
-        own = np.concatenate([points[plane == k] for points, plane in clouds]).astype(np.float64)
-        if len(own) >= MIN_FITTED_POINTS:
-            centre = own.mean(axis=0)
-            normal = np.linalg.eigh(np.cov(own.T))[1][:, 0]
+        on_plane = np.concatenate([points[plane == k] for points, plane in clouds]).astype(np.float64)
+        if len(on_plane) >= MIN_FITTED_POINTS:
+            centre = on_plane.mean(axis=0)
+            normal = np.linalg.eigh(np.cov(on_plane.T))[1][:, 0]
             out[k] = plane_of(np.copysign(1.0, normal @ values[k, :3]) * normal, centre)
     return out
 
 
-def _some_points(stream: LidarStream, own: np.ndarray) -> LidarStream:
-    """The stream with the points numbered `own` (n,), increasing. Scans without such points stay as empty ones."""
-    start = np.searchsorted(own, stream.start)
-    columns = {name: getattr(stream, name)[own] for name in ("offset_s", "xyz", "plane")}
+def _some_points(stream: LidarStream, points: np.ndarray) -> LidarStream:
+    """The stream with the points numbered `points` (n,), increasing. Scans without such points stay as empty ones."""
+    start = np.searchsorted(points, stream.start)
+    columns = {name: getattr(stream, name)[points] for name in ("offset_s", "xyz", "plane")}
     return replace(stream, start=start, **columns)
 
 
@@ -120,10 +120,10 @@ def _seconds_of(stream: LidarStream, state: State) -> np.ndarray:
     return instants(stream, state.values, stamps) + stream.offset_s
 
 
-def _on_planes(points: np.ndarray, seen_from: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _on_planes(points: np.ndarray, origin: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances (N,) [m], float32, of points (N, 3) in the world from their planes (N, 6); and cosines (N,) of
-    the angle between the beam, from seen_from (N, 3), and the normal."""
-    normal, beam = planes[:, :3], points - seen_from
+    the angle between the beam, from origin (N, 3), and the normal."""
+    normal, beam = planes[:, :3], points - origin
     residual = np.einsum("na,na->n", normal, points - planes[:, 3:])
     cosine = np.einsum("na,na->n", normal, beam) / np.linalg.norm(beam, axis=1)
     return residual.astype(np.float32), cosine
@@ -134,49 +134,50 @@ def _sigma(noise: LidarNoise, cosine: np.ndarray) -> np.ndarray:
     return np.sqrt(noise.sigma**2 + (noise.beam_sigma * cosine) ** 2).astype(np.float32)
 
 
-def _used(found: Estimate, name: str) -> int:
+def _used(estimate: Estimate, name: str) -> int:
     """Number of points of LiDAR `name` in the estimate."""
-    return sum(int(f.moments.count.sum()) for f in of_type(found.problem.factors, LidarFactor) if f.name == name)
+    return sum(int(f.moments.count.sum()) for f in of_type(estimate.problem.factors, LidarFactor) if f.name == name)
 
 
-def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """Notes on the number of points used and their noise."""
     if not inputs.association.count:
         return
-    ranging = [found.measurement_model.noise[s.name] for s in inputs.rig.lidars]
+    ranging = [estimate.measurement_model.noise[s.name] for s in inputs.rig.lidars]
     for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, ranging, strict=True):
         given = lidar.range_noise_m is not None
         size = f"{1e3 * noise.beam_sigma:.1f} mm along the beam, as the rig file has it"
         if not given:
             size = f"{1e3 * noise.sigma:.1f} mm from their planes, as residuals show it"
         yield (
-            f"{_used(found, lidar.name)} of the {len(stream.xyz)} points of {lidar.name} lie on "
+            f"{_used(estimate, lidar.name)} of the {len(stream.xyz)} points of {lidar.name} lie on "
             f"{inputs.association.count} planes; noise {size}."
         )
 
 
-def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """Warnings: degenerate scene, wrong point times, few points on planes, stamps at the wrong end of a scan."""
     if not inputs.association.count:
         return
-    yield from _degeneracy_warnings(inputs, found)
+    yield from _degeneracy_warnings(inputs, estimate)
     for index, (lidar, stream) in enumerate(zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True)):
-        stretch, std = _time_stretch(inputs, found, index)
+        stretch, std = _time_stretch(inputs, estimate, index)
         if abs(stretch) > max(MAX_TIME_STRETCH, SIGNIFICANT_STRETCH * std):
             yield (
                 f"the times of points within a scan of {lidar.name} seem too {'short' if stretch > 0.0 else 'long'}, "
                 "or in the wrong order: points lie off their planes in proportion to the motion. Check their unit, "
                 "their origin and the sense of rotation, or set point_time in the rig file."
             )
-        share = _used(found, lidar.name) / max(len(stream.xyz), 1)
+        share = _used(estimate, lidar.name) / max(len(stream.xyz), 1)
         if share < MIN_SHARE_ON_PLANES:
             yield (
                 f"only {share:.1%} of the points of {lidar.name} lie on planes; the scene has few flat surfaces, or "
                 "the times of its points, their order within a scan, or its range_noise in the rig file are wrong."
             )
-        own = found.outcome.state.values[lidar.name, "time_offset"] - origin_difference(inputs.measurements, stream)
+        offsets = estimate.outcome.state.values[lidar.name, "time_offset"]
+        offsets = offsets - origin_difference(inputs.measurements, stream)
         period = float(np.median(np.diff(stream.seconds)))
-        offset = float(own[np.argmin(np.abs(np.abs(own) - period))])
+        offset = float(offsets[np.argmin(np.abs(np.abs(offsets) - period))])
         if abs(abs(offset) - period) < PERIOD_TOLERANCE * period:
             yield (
                 f"the time_offset of {lidar.name}, {offset:+.4f} s, is about the period of its scans: its stamps may "
@@ -185,13 +186,13 @@ def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
             )
 
 
-def _time_stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, float]:
+def _time_stretch(inputs: Inputs, estimate: Estimate, index: int) -> tuple[float, float]:
     """Relative error of point times within a scan, positive if they are too short, and its standard deviation.
 
     A point taken at a wrong instant is off its plane by the time error times its speed along the normal. The mean over
     a scan is removed, as a time offset absorbs it.
     """
-    state = found.outcome.state
+    state = estimate.outcome.state
     motion, values = motion_of(inputs, state), np.array([state.values[key] for key in inputs.association.keys])
     stream, plane = _thinned(inputs, index, state)
     if len(plane) < MIN_FITTED_POINTS:
@@ -207,11 +208,11 @@ def _time_stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, f
     return -float(J_stretch @ residual) / information, float(residual.std()) / np.sqrt(information)
 
 
-def _degeneracy_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+def _degeneracy_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """A warning if LiDARs alone give the motion, and their planes face fewer than three directions."""
     if any(s.gives_motion for s in inputs.rig.mounted if not isinstance(s, Lidar)):
         return
-    normals = np.array([found.outcome.state.values[key][:3] for key in inputs.association.keys])
+    normals = np.array([estimate.outcome.state.values[key][:3] for key in inputs.association.keys])
     if count_directions(normal_shares(normals, inputs.association.points)) < 3:
         names = " and ".join(x.name for x in inputs.rig.lidars)
         yield (

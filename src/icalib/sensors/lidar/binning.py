@@ -172,15 +172,15 @@ def in_world(motion: EstimatedMotion, stream: LidarStream) -> tuple[np.ndarray, 
 
     Within a step the LiDAR moves with its twist. In gaps of the IMU its motion follows the nearest reading.
     """
-    points, seen_from = np.empty((len(stream.xyz), 3), np.float32), np.empty((len(stream.xyz), 3), np.float32)
+    points, origins = np.empty((len(stream.xyz), 3), np.float32), np.empty((len(stream.xyz), 3), np.float32)
 
     def move(group: slice) -> None:
-        scans, seconds, own = _scans_with_steps(stream, stream.plane, BIN_STEP_S, 1, group)
+        scans, seconds, range_of_points = _scans_with_steps(stream, stream.plane, BIN_STEP_S, 1, group)
         lidar = sweep(motion, stream.name, instants(stream, motion.state.values, seconds))
-        move_to_world(scans, lidar, BIN_STEP_S, points[own], seen_from[own])
+        move_to_world(scans, lidar, BIN_STEP_S, points[range_of_points], origins[range_of_points])
 
     in_parallel(move, _scan_groups(stream))
-    return points, seen_from
+    return points, origins
 
 
 def points_on_planes(motion: EstimatedMotion, stream: LidarStream, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

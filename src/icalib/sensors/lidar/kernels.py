@@ -115,8 +115,8 @@ def _add_pose_gram(J_rows, J_distance, incidence, gram):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_plane(k, J_rows, J_pose, columns, own, sums, V):
-    """Adds to the sums of keyframe k all products of an entry with the columns `own` (3,) of its plane.
+def _add_plane(k, J_rows, J_pose, columns, plane_columns, sums, V):
+    """Adds to the sums of keyframe k all products of an entry with the columns `plane_columns` (3,) of its plane.
 
     J_pose (6, w): derivative of the pose of the bin by keyframes and calibration columns (c,); V (3, w): workspace.
     """
@@ -131,40 +131,40 @@ def _add_plane(k, J_rows, J_pose, columns, own, sums, V):
     for h in range(n_chain // KEYFRAME_DIM):
         for r in range(KEYFRAME_DIM):
             for t in range(PLANE_DIM):
-                sums.side[k + h, r, own[t]] += V[t, KEYFRAME_DIM * h + r]
+                sums.side[k + h, r, plane_columns[t]] += V[t, KEYFRAME_DIM * h + r]
     for j in range(len(columns)):
         if columns[j] >= 0:
             for t in range(PLANE_DIM):
-                sums.calib[columns[j], own[t]] += V[t, n_chain + j]
-                sums.calib[own[t], columns[j]] += V[t, n_chain + j]
+                sums.calib[columns[j], plane_columns[t]] += V[t, n_chain + j]
+                sums.calib[plane_columns[t], columns[j]] += V[t, n_chain + j]
     for t in range(PLANE_DIM):
         b = B[POSE_DIM + t]
         for c in range(PLANE_DIM + 1):
-            d, other = B[POSE_DIM + c], n_b if c == PLANE_DIM else own[c]
+            d, other = B[POSE_DIM + c], n_b if c == PLANE_DIM else plane_columns[c]
             s = b[0] * d[0] + b[1] * d[1] + b[2] * d[2] + b[3] * d[3]
-            sums.calib[own[t], other] += s
+            sums.calib[plane_columns[t], other] += s
             if c == PLANE_DIM:
-                sums.calib[n_b, own[t]] += s
+                sums.calib[n_b, plane_columns[t]] += s
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_plane_incidence(J_distance, incidence, own, sums):
-    """Adds the gradient of the incidence term by the plane with columns `own` (3,) to the sums."""
+def _add_plane_incidence(J_distance, incidence, plane_columns, sums):
+    """Adds the gradient of the incidence term by the plane with columns `plane_columns` (3,) to the sums."""
     n_b = sums.calib.shape[0] - 1
     for t in range(PLANE_DIM):
         J = J_distance[POSE_DIM + t]
         s = J[1] * incidence[1] + J[2] * incidence[2] + J[3] * incidence[3]
-        sums.calib[own[t], n_b] += s
-        sums.calib[n_b, own[t]] += s
+        sums.calib[plane_columns[t], n_b] += s
+        sums.calib[n_b, plane_columns[t]] += s
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _eliminate_noise(k, noise, n_chain, columns, plane_columns, sums):
     """Eliminates the unknown rotation of one side of keyframe k. Returns the decrease of the chi^2 by it."""
-    own, V = noise_columns(noise, columns, plane_columns), eliminated_noise(noise)
+    noise_cols, V = noise_columns(noise, columns, plane_columns), eliminated_noise(noise)
     last = V.shape[1] - 1
     if len(sums.diagonal) > 0:
-        add_product(k, n_chain, last, V, -V, own, sums)
+        add_product(k, n_chain, last, V, -V, noise_cols, sums)
     return V[0, last] ** 2 + V[1, last] ** 2 + V[2, last] ** 2
 
 
@@ -257,7 +257,7 @@ def linearise_noise(bins, at, columns, planes):
 def _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise, has_noise):
     """Adds entry e, of a bin of keyframe k, to the sums unless these are empty. Returns its part of the cost."""
     q, wanted = bins.plane[e], len(sums.diagonal) > 0
-    own, A, B = planes.columns[q], work.J_distance, work.J_rows
+    plane_columns, A, B = planes.columns[q], work.J_distance, work.J_rows
     cost = _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows)
     if wanted:
         _fill_jacobian(R_lw, p_wl, q, planes, work.m, A)
@@ -265,9 +265,9 @@ def _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise,
         _add_pose_gram(B, A, bins.incidence[e], work.gram)
     if has_noise:
         add_entry_noise(bins.J_rows_noise[e], bins.J_incidence_noise[e], rows[e], B, work.gram_noise, noise)
-    if wanted and own[0] >= 0:
-        _add_plane(k, B, work.J_pose, columns, own, sums, work.V)
-        _add_plane_incidence(A, bins.incidence[e], own, sums)
+    if wanted and plane_columns[0] >= 0:
+        _add_plane(k, B, work.J_pose, columns, plane_columns, sums, work.V)
+        _add_plane_incidence(A, bins.incidence[e], plane_columns, sums)
         if has_noise:
             add_plane_noise(bins.J_rows_noise[e], B, q, noise)
     return cost

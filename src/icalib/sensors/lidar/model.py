@@ -39,9 +39,9 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
             return LidarNoise(FIRST_RANGE_SIGMA_M, 0.0, loss, scale)
         return LidarNoise(GRAZING_SIGMA_M, sensor.range_noise_m, loss, scale)
 
-    def next_noise(self, sensor: Lidar, noise: LidarNoise, found: ResidualStatistics) -> LidarNoise:
+    def next_noise(self, sensor: Lidar, noise: LidarNoise, statistics: ResidualStatistics) -> LidarNoise:
         """The noise scaled by the RMS of the whitened distances, unless the rig file states it."""
-        points = found.squares.get("points")
+        points = statistics.squares.get("points")
         if sensor.range_noise_m is not None or points is None:
             return noise
         sigma = max(noise.sigma * float(np.sqrt(points.chi2 / points.n)), MIN_RANGE_SIGMA_M)

@@ -176,9 +176,9 @@ def _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums):
         wx, wy, wz = w * x, w * y, w * z
         s0, s1, s2, s3, s4 = s0 + w, s1 + wx, s2 + wx * x, s3 + wy, s4 + wy * x
         s5, s6, s7, s8, s9 = s5 + wy * y, s6 + wz, s7 + wz * x, s8 + wz * y, s9 + wz * z
-    own = (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, g0, g1, g2)
+    added = (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, g0, g1, g2)
     for k in range(N_SUMS):
-        sums[k] += own[k]
+        sums[k] += added[k]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -250,16 +250,16 @@ def bin_scans(scans, motion, poses, per_bin, planes, weights, per_s, entries):
         n_points = max(n_points, scans.start[i + 1] - scans.start[i])
     ends, points = np.empty(n_keys, np.int64), np.empty((4, n_points), np.float32)
     for i in range(len(scans.start) - 1):
-        own = ends[: (scans.step_start[i + 1] - scans.step_start[i]) * len(planes)]
-        _sort_scan(i, scans, per_s, len(planes), own, points)
+        scan_ends = ends[: (scans.step_start[i + 1] - scans.step_start[i]) * len(planes)]
+        _sort_scan(i, scans, per_s, len(planes), scan_ends, points)
         # int: the literal 0 has a type of its own, for which numba would compile everything again
-        total = _bin_scan(i, scans, motion, poses, per_bin, planes, weights, (own, points), entries, int(total))
+        total = _bin_scan(i, scans, motion, poses, per_bin, planes, weights, (scan_ends, points), entries, int(total))
     return total
 
 
 @njit(cache=True, nogil=True)
-def move_to_world(scans, motion, step_s, points, seen_from):
-    """Fills `points` (N, 3), all points in the world [m], and `seen_from` (N, 3), the position of the LiDAR at the
+def move_to_world(scans, motion, step_s, points, origins):
+    """Fills `points` (N, 3), all points in the world [m], and `origins` (N, 3), the position of the LiDAR at the
     instant of each point [m]. motion: `Sweep` at the middles of steps of step_s seconds."""
     for i in range(len(scans.start) - 1):
         for n in range(scans.start[i], scans.start[i + 1]):
@@ -268,10 +268,10 @@ def move_to_world(scans, motion, step_s, points, seen_from):
             b, dt = scans.step_start[i] + k - scans.first_step[i], offset - (k + 0.5) * step_s
             x, v, w = scans.xyz[n], motion.velocity[b], motion.rate[b]
             for a in range(3):
-                points[n, a] = seen_from[n, a] = motion.position[b, a]
+                points[n, a] = origins[n, a] = motion.position[b, a]
             for c in range(3):
                 d, e = (c + 1) % 3, (c + 2) % 3
                 turned = x[c] + dt * (w[d] * x[e] - w[e] * x[d])
                 for a in range(3):
                     points[n, a] += motion.rotation[b, a, c] * (turned + dt * v[c])
-                    seen_from[n, a] += motion.rotation[b, a, c] * dt * v[c]
+                    origins[n, a] += motion.rotation[b, a, c] * dt * v[c]

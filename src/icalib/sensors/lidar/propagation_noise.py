@@ -28,14 +28,15 @@ class NoiseSums(NamedTuple):
 
     information (3, 3): products of x with itself. by_pose (3, w + 1): products of x with the w columns of keyframes and
     calibration parameters that act through the pose, and with the residual. by_plane (P, 3, 3): products of x with the
-    columns of each plane; only the first n_seen (1,) planes in `seen` (P,) are filled.
+    columns of each plane; only those of the first n_planes (1,) numbers in `planes` (P,) are
+    filled.
     """
 
     information: np.ndarray
     by_pose: np.ndarray
     by_plane: np.ndarray
-    seen: np.ndarray
-    n_seen: np.ndarray
+    planes: np.ndarray
+    n_planes: np.ndarray
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -81,11 +82,11 @@ def add_pose_noise(gram, J_pose, noise):
 def add_plane_noise(J_rows_noise, J_rows, q, noise):
     """Adds the products of x with plane q in one bin. J_rows (10, 4): derivatives by the pose, then by the plane."""
     known = False
-    for i in range(noise.n_seen[0]):
-        known = known or noise.seen[i] == q
+    for i in range(noise.n_planes[0]):
+        known = known or noise.planes[i] == q
     if not known:
-        noise.seen[noise.n_seen[0]] = q
-        noise.n_seen[0] += 1
+        noise.planes[noise.n_planes[0]] = q
+        noise.n_planes[0] += 1
     for a in range(3):
         for t in range(PLANE_DIM):
             for c in range(4):
@@ -96,14 +97,14 @@ def add_plane_noise(J_rows_noise, J_rows, q, noise):
 def noise_columns(noise, columns, plane_columns):
     """(m,) calibration columns of the sums: `columns` (c,), which act through the pose, then those of the planes seen,
     from plane_columns (P, 3)."""
-    n_c, n = len(columns), noise.n_seen[0]
-    own = np.empty(n_c + PLANE_DIM * n, np.int64)
+    n_c, n = len(columns), noise.n_planes[0]
+    out = np.empty(n_c + PLANE_DIM * n, np.int64)
     for j in range(n_c):  # in loops: copies of arrays take seconds to compile
-        own[j] = columns[j]
+        out[j] = columns[j]
     for i in range(n):
         for t in range(PLANE_DIM):
-            own[n_c + PLANE_DIM * i + t] = plane_columns[noise.seen[i], t]
-    return own
+            out[n_c + PLANE_DIM * i + t] = plane_columns[noise.planes[i], t]
+    return out
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -113,7 +114,7 @@ def eliminated_noise(noise):
     Columns: keyframes, calibration parameters in the order of `noise_columns` (n planes seen), residual. Resets the
     sums.
     """
-    n, width, L = noise.n_seen[0], noise.by_pose.shape[1] - 1, noise.information
+    n, width, L = noise.n_planes[0], noise.by_pose.shape[1] - 1, noise.information
     last = width + PLANE_DIM * n
     V = np.empty((3, last + 1))
     for a in range(3):
@@ -122,7 +123,7 @@ def eliminated_noise(noise):
         V[a, last] = noise.by_pose[a, width]
         for i in range(n):
             for t in range(PLANE_DIM):
-                V[a, width + PLANE_DIM * i + t] = noise.by_plane[noise.seen[i], a, t]
+                V[a, width + PLANE_DIM * i + t] = noise.by_plane[noise.planes[i], a, t]
         L[a, a] += 1.0
     cholesky(L)
     for a in range(3):
@@ -131,7 +132,7 @@ def eliminated_noise(noise):
                 V[a, j] -= L[a, b] * V[b, j]
             V[a, j] /= L[a, a]
     for i in range(n):
-        noise.by_plane[noise.seen[i]] = 0.0
+        noise.by_plane[noise.planes[i]] = 0.0
     noise.information[:], noise.by_pose[:] = 0.0, 0.0
-    noise.n_seen[0] = 0
+    noise.n_planes[0] = 0
     return V

@@ -154,9 +154,9 @@ class LidarFactor(RowFactor):
     ) -> Iterator[tuple[np.ndarray, int, int]]:
         """Yields bins b0:b1 in chunks: calibration columns (c,) of their poses, first bin, and the bin after the
         last."""
-        for clock, own in slices_by_clock(state, self.name, self.keyframe[b0:b1]):
+        for clock, block in slices_by_clock(state, self.name, self.keyframe[b0:b1]):
             columns = kinematics.columns(clock)
-            first, last = b0 + own.start, b0 + own.stop
+            first, last = b0 + block.start, b0 + block.stop
             # Bins on one side of a keyframe share an unknown rotation, so that they must not be separated.
             sides = np.flatnonzero(np.diff(2 * self.keyframe[first:last] + (self.noise_angle[first:last] >= 0.0))) + 1
             sides = np.append(sides, last - first)

@@ -103,11 +103,11 @@ def _residuals_over(r: LidarResiduals, x: np.ndarray, title: str) -> Figure:
     if not len(x):
         return figure([], 340, xaxis=axis(title), yaxis=axis("residual [mm]"))
     edges = np.linspace(x.min(), np.nextafter(x.max(), np.inf), N_FIGURE_BINS + 1)
-    own = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, N_FIGURE_BINS - 1)
-    count = np.bincount(own, minlength=N_FIGURE_BINS)
+    bin_of = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, N_FIGURE_BINS - 1)
+    count = np.bincount(bin_of, minlength=N_FIGURE_BINS)
     enough = np.where(count >= MIN_BIN_POINTS, count, np.nan)
-    rms = np.sqrt(np.bincount(own, size.astype(np.float64) ** 2, N_FIGURE_BINS) / enough)
-    mean = np.bincount(own, size, N_FIGURE_BINS) / enough
+    rms = np.sqrt(np.bincount(bin_of, size.astype(np.float64) ** 2, N_FIGURE_BINS) / enough)
+    mean = np.bincount(bin_of, size, N_FIGURE_BINS) / enough
     middle = 0.5 * (edges[1:] + edges[:-1])
     top = MAX_RESIDUAL_RMS * float(np.sqrt(np.mean(size.astype(np.float64) ** 2)))
     return figure(
@@ -135,49 +135,50 @@ def plane_maps(c: Calibration) -> dict[str, Figure]:
     top = MAX_COLOR_RMS * 1e3 * float(np.sqrt(np.mean(after[1].astype(np.float64) ** 2))) if len(plane) else 1.0
     names = [span.name for span in c.recordings] or [""]
     of_recording = c.recording_of(seconds)
-    found: list[tuple[list[dict[str, Any]], list[dict[str, Any]]]] = []
+    traces: list[tuple[list[dict[str, Any]], list[dict[str, Any]]]] = []
     for k in range(len(names)):
-        own = of_recording == k
-        walls = _outlines(c.planes, after[0][own], plane[own])
-        found.append(([_cloud(before, own, top)], [_cloud(after, own, top), walls]))
-    first, now = zip(*found, strict=True)
+        in_recording = of_recording == k
+        walls = _outlines(c.planes, after[0][in_recording], plane[in_recording])
+        traces.append(([_cloud(before, in_recording, top)], [_cloud(after, in_recording, top), walls]))
+    first, now = zip(*traces, strict=True)
     return {"map-before": _map(list(first), names), "map-after": _map(list(now), names)}
 
 
-def _cloud(cloud: tuple[np.ndarray, np.ndarray], own: np.ndarray, top: float) -> dict[str, Any]:
-    """Trace of the points `own` (N,) bool of a cloud: points (N, 3) and residuals (N,) [m]; colours end at `top` mm."""
-    points, residual = (x[own] for x in cloud)
+def _cloud(cloud: tuple[np.ndarray, np.ndarray], chosen: np.ndarray, top: float) -> dict[str, Any]:
+    """Trace of the points `chosen` (N,) bool of a cloud: points (N, 3) and residuals (N,) [m]; colours end at `top`
+    mm."""
+    points, residual = (x[chosen] for x in cloud)
     size = np.minimum(np.abs(1e3 * residual.astype(np.float64)), top)
     marker: dict[str, Any] = {"size": 1.6, "color": numbers(np.round(size, 1)), "colorscale": "Viridis"}
     marker |= {"cmin": 0.0, "cmax": top, "colorbar": {"title": {"text": "off its plane [mm]"}, "thickness": 10}}
-    shown = np.round(points.astype(np.float64), 3)
-    return path_3d(shown, "points", "", mode="markers", marker=marker, hoverinfo="skip", showlegend=False)
+    rounded = np.round(points.astype(np.float64), 3)
+    return path_3d(rounded, "points", "", mode="markers", marker=marker, hoverinfo="skip", showlegend=False)
 
 
 def _map(traces: list[list[dict[str, Any]]], names: list[str]) -> Figure:
     """Figure with the traces of all recordings. A menu selects one; the first is selected at the start."""
     scene = {name: {"title": {"text": f"world {name[0]} [m]"}, "nticks": 6} for name in ("xaxis", "yaxis", "zaxis")}
     layout: dict[str, Any] = {"scene": scene | VIEW, "margin": {"l": 0, "r": 0, "t": 10, "b": 0}}
-    of = [k for k, own in enumerate(traces) for _ in own]
-    shown = [trace | {"visible": k == 0} for k, own in enumerate(traces) for trace in own]
+    of = [k for k, of_recording in enumerate(traces) for _ in of_recording]
+    visible = [trace | {"visible": k == 0} for k, of_recording in enumerate(traces) for trace in of_recording]
     if len(names) > 1:
         choices = [
             {"label": name, "method": "restyle", "args": ["visible", [k == number for k in of]]}
             for number, name in enumerate(names)
         ]
         layout |= {"updatemenus": [{"buttons": choices, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "top"}]}
-    return figure(shown, 460, **layout)
+    return figure(visible, 460, **layout)
 
 
 def _outlines(planes: tuple[Plane, ...], points: np.ndarray, plane: np.ndarray) -> dict[str, Any]:
     """Trace of a rectangle around the points (N, 3) of each plane, one side level, separated by NaN."""
     pen = []
     for k, p in enumerate(planes):
-        own = points[plane == k]
-        if not len(own):
+        on_plane = points[plane == k]
+        if not len(on_plane):
             continue
         across = _level_axes(p.normal)
-        flat = (own - p.point) @ across.T
+        flat = (on_plane - p.point) @ across.T
         (u0, v0), (u1, v1) = flat.min(axis=0), flat.max(axis=0)
         corners = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1), (u0, v0)])
         pen += [p.point + corners @ across, np.full((1, 3), np.nan)]

@@ -50,14 +50,14 @@ class SimLidar(SimSensor):
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimLidar:
         options = ("rings", "azimuth_steps", "elevation_deg", "range", "noise")
-        found, common = mounted_fields(value, start_ns, options=options)
-        chosen: dict[str, Any] = {key: found[key].whole(1) for key in ("rings", "azimuth_steps") if key in found}
-        if "elevation_deg" in found:
-            chosen["elevation_deg"] = interval(found["elevation_deg"])
-        if "range" in found:
-            chosen["range_m"] = interval(found["range"])
-        if "noise" in found:
-            chosen["range_noise_m"] = at_least(found["noise"], 0.0)
+        fields, common = mounted_fields(value, start_ns, options=options)
+        chosen: dict[str, Any] = {key: fields[key].whole(1) for key in ("rings", "azimuth_steps") if key in fields}
+        if "elevation_deg" in fields:
+            chosen["elevation_deg"] = interval(fields["elevation_deg"])
+        if "range" in fields:
+            chosen["range_m"] = interval(fields["range"])
+        if "noise" in fields:
+            chosen["range_noise_m"] = at_least(fields["noise"], 0.0)
         return cls(name, **common, **chosen)
 
     def check(self, room: Room | None, drive: Drive | None) -> None:

@@ -48,24 +48,24 @@ class Lidar(MountedSensor):
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Lidar:
-        found = value.record(("type",), (*_FIELDS, *parameter_fields(cls)))
-        low = positive_or(found, "min_range", cls.min_range_m)
-        high = positive_or(found, "max_range", cls.max_range_m)
+        fields = value.record(("type",), (*_FIELDS, *parameter_fields(cls)))
+        low = positive_or(fields, "min_range", cls.min_range_m)
+        high = positive_or(fields, "max_range", cls.max_range_m)
         if low >= high:
-            found["min_range" if "min_range" in found else "max_range"].fail(
+            fields["min_range" if "min_range" in fields else "max_range"].fail(
                 f"the range from {low:g} to {high:g} m is empty; min_range must be below max_range."
             )
         return cls(
             name=name,
-            path=path_or(found, f"{name}/scans.npz"),
-            range_noise_m=found["range_noise"].positive() if "range_noise" in found else None,
+            path=path_or(fields, f"{name}/scans.npz"),
+            range_noise_m=fields["range_noise"].positive() if "range_noise" in fields else None,
             min_range_m=low,
             max_range_m=high,
-            point_time=_point_time(found),
-            point_time_field=found["point_time_field"].text() if "point_time_field" in found else None,
-            point_time_unit=choice_or(found, "point_time_unit", TimeUnit, None),
-            topic=topic_or_none(found),
-            **parameters(found, cls.stated()),
+            point_time=_point_time(fields),
+            point_time_field=fields["point_time_field"].text() if "point_time_field" in fields else None,
+            point_time_unit=choice_or(fields, "point_time_unit", TimeUnit, None),
+            topic=topic_or_none(fields),
+            **parameters(fields, cls.stated()),
         )
 
     def plain(self) -> dict[str, Any]:
@@ -76,12 +76,12 @@ class Lidar(MountedSensor):
         return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
 
 
-def _point_time(found: dict[str, YamlValue]) -> PointTime:
+def _point_time(fields: dict[str, YamlValue]) -> PointTime:
     """The value of point_time. Raises RigError if a field or unit of point times is given although it uses no times."""
-    chosen = choice_or(found, "point_time", PointTime, Lidar.point_time)
+    chosen = choice_or(fields, "point_time", PointTime, Lidar.point_time)
     for name in ("point_time_field", "point_time_unit"):
-        if name in found and chosen in ("azimuth", "snapshot"):
-            found[name].fail(f"point_time: {chosen} uses no point times; remove {name}, or point_time.")
+        if name in fields and chosen in ("azimuth", "snapshot"):
+            fields[name].fail(f"point_time: {chosen} uses no point times; remove {name}, or point_time.")
     return chosen
 
 

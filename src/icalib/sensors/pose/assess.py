@@ -22,19 +22,19 @@ MAX_LAG_ONE_CORRELATION, MAX_LAG_ONE_ANTICORRELATION = 0.5, 0.35
 UNKNOWN_CAUSE = "they are no white noise, and the cause is unknown: check its clock and mount, and record again, slower"
 
 
-def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """One note for each pose sensor: number of poses (or relative poses) used, and their noise."""
-    counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(found)}
-    posing = [found.measurement_model.noise[s.name] for s in inputs.rig.poses]
+    counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(estimate)}
+    posing = [estimate.measurement_model.noise[s.name] for s in inputs.rig.poses]
     for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, posing, strict=True):
         what = "poses" if sensor.kind == "absolute" else "steps"
         count = f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses"
         yield f"{count} of {sensor.name}; {_noise(sensor, noise)}."
 
 
-def _pose_factors(found: Estimate) -> list[tuple[AbsolutePoseFactor | RelativePosesFactor, Whitened]]:
+def _pose_factors(estimate: Estimate) -> list[tuple[AbsolutePoseFactor | RelativePosesFactor, Whitened]]:
     """All factors of pose sensors, with their whitened residuals."""
-    pairs = [(f, found.outcome.residuals[key]) for key, f in found.problem.factors.items()]
+    pairs = [(f, estimate.outcome.residuals[key]) for key, f in estimate.problem.factors.items()]
     return [(f, out) for f, out in pairs if isinstance(f, AbsolutePoseFactor | RelativePosesFactor)]
 
 
@@ -50,13 +50,13 @@ def _source(given: float | None) -> str:
     return "as residuals show it" if given is None else "as the rig file has it"
 
 
-def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """Warnings on residuals that are correlated in time: poses are filtered or drift, or the kind (absolute, relative)
     is wrong."""
     kinds = {s.name: s.kind for s in inputs.rig.poses}
-    for factor, rows in _pose_factors(found):
-        for what, own in (("rotation", rows.residual[:, :3]), ("position", rows.residual[:, 3:])):
-            correlation = lag_one_correlation(own)
+    for factor, rows in _pose_factors(estimate):
+        for what, components in (("rotation", rows.residual[:, :3]), ("position", rows.residual[:, 3:])):
+            correlation = lag_one_correlation(components)
             if kinds[factor.name] == "absolute" and correlation > MAX_LAG_ONE_CORRELATION:
                 yield (
                     f"the {what} residuals of {factor.name} follow one another (correlation {correlation:.2f} from "

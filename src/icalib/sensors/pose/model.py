@@ -52,11 +52,11 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
         position = FIRST_POSITION_NOISE if sensor.position_noise is None else sensor.position_noise
         return PoseNoise(rotation, position, settings.loss, settings.loss_scale)
 
-    def next_noise(self, sensor: PoseSensor, noise: PoseNoise, found: ResidualStatistics) -> PoseNoise:
+    def next_noise(self, sensor: PoseSensor, noise: PoseNoise, statistics: ResidualStatistics) -> PoseNoise:
         """See `SensorModel`."""
         if not self.noise_is_estimated(sensor):
             return noise
-        return estimated_noise(sensor, noise, found.variance_factors())
+        return estimated_noise(sensor, noise, statistics.variance_factors())
 
     def noise_passes(self, sensor: PoseSensor) -> int:
         """See `SensorModel`."""

@@ -164,26 +164,26 @@ class AbsolutePoseFactor(_PoseFactor):
             Into(piece, out, sums, curved),
             rows_by_recording(self.keyframe, self.starts, self.n_keyframes, piece),
         )
-        return sum(self._add_recording(k, own, state, into) for k, own in parts)
+        return sum(self._add_recording(k, block, state, into) for k, block in parts)
 
-    def _add_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
-        """Add the rows of the poses `own` of one recording. Returns their cost."""
+    def _add_recording(self, recording: int, block: slice, state: State, into: Into) -> float:
+        """Add the rows of the poses `block` of one recording. Returns their cost."""
         frame = frame_of(self.name, recording)
-        v, keyframe, kinematics = state.values, self.keyframe[own], Kinematics.of(self)
-        at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
-        found = absolute_residuals(
+        v, keyframe, kinematics = state.values, self.keyframe[block], Kinematics.of(self)
+        at = SensorPose.at(kinematics, self.seconds[block], keyframe, state, into.sums)
+        residuals = absolute_residuals(
             at.rotation,
             at.position,
             Frame(v[frame, FRAME[0]], v[frame, FRAME[1]]),
-            self.rotation[own],
-            v[self.name, "scale"][0] * self.position[own],
+            self.rotation[block],
+            v[self.name, "scale"][0] * self.position[block],
             into.sums,
         )
-        rows = _rows(found, (at,), self, state, own)
+        rows = _rows(residuals, (at,), self, state, block)
         frame_columns = self.layout.columns(frame, *FRAME)
         columns = [kinematics.columns(recording), frame_columns, self.layout.columns(self.name, "scale")]
         interval = rows.on_intervals(keyframe, self.n_keyframes)
-        return add_rows(rows, own, interval, np.concatenate(columns), _noise(self, own), into)
+        return add_rows(rows, block, interval, np.concatenate(columns), _noise(self, block), into)
 
 
 @dataclass(frozen=True)
@@ -209,12 +209,12 @@ class RelativePosesFactor(_PoseFactor):
         `motion`."""
         state, seconds = motion.state, stream.seconds
         times = instants(stream, state.values)
-        found = choose_intervals(motion.imu, state.seconds, state.starts, times)
-        R0, R1 = stream.rotation[found.first], stream.rotation[found.last]
-        displacement = stream.position[found.last] - stream.position[found.first]
+        intervals = choose_intervals(motion.imu, state.seconds, state.starts, times)
+        R0, R1 = stream.rotation[intervals.first], stream.rotation[intervals.last]
+        displacement = stream.position[intervals.last] - stream.position[intervals.first]
         position = np.einsum("nji,nj->ni", R0, displacement)
         rotation = np.ascontiguousarray(R0.transpose(0, 2, 1) @ R1)
-        return cls(stream.name, seconds, found, rotation, position, motion.imu, motion.gravity, noise, layout)
+        return cls(stream.name, seconds, intervals, rotation, position, motion.imu, motion.gravity, noise, layout)
 
     @property
     def instants(self) -> np.ndarray:
@@ -241,42 +241,45 @@ class RelativePosesFactor(_PoseFactor):
                 cost += self._add_interval_rows(clock, some, state, into)
         return cost
 
-    def _add_interval_rows(self, clock: int, own: slice, state: State, into: Into) -> float:
-        """Add the rows of the relative poses `own`, all with time offset number `clock`. Returns their cost."""
-        first, last, keyframe = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.keyframe))
+    def _add_interval_rows(self, clock: int, block: slice, state: State, into: Into) -> float:
+        """Add the rows of the relative poses `block`, all with time offset number `clock`. Returns their cost."""
+        first, last, keyframe = (x[block] for x in (self.intervals.first, self.intervals.last, self.intervals.keyframe))
         kinematics = Kinematics.of(self)
         a = SensorPose.at(kinematics, self.seconds[first], keyframe, state, into.sums)
         b = SensorPose.at(kinematics, self.seconds[last], keyframe + 1, state, into.sums)
-        found = relative_residuals(
+        residuals = relative_residuals(
             (a.rotation, b.rotation),
             (a.position, b.position),
-            self.rotation[own],
-            state.values[self.name, "scale"][0] * self.position[own],
+            self.rotation[block],
+            state.values[self.name, "scale"][0] * self.position[block],
             into.sums,
         )
         columns = np.append(kinematics.columns(clock), self.layout.columns(self.name, "scale"))
-        return add_rows(_rows(found, (a, b), self, state, own), own, keyframe, columns, _noise(self, own), into)
+        rows = _rows(residuals, (a, b), self, state, block)
+        return add_rows(rows, block, keyframe, columns, _noise(self, block), into)
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor
 
 
-def _rows(found: PoseResiduals, ends: tuple[SensorPose, ...], factor: PoseFactor, state: State, own: slice) -> Rows:
-    """Rows of predicted / scale - measured, from residuals `found` of predicted - scale * measured. Their calibration
+def _rows(
+    residuals: PoseResiduals, ends: tuple[SensorPose, ...], factor: PoseFactor, state: State, block: slice
+) -> Rows:
+    """Rows of predicted / scale - measured, from `residuals`, which are predicted - scale * measured. Their calibration
     parameters are those of the poses at both `ends`, then frame and scale."""
-    scale, reported = float(state.values[factor.name, "scale"][0]), factor.position[own]
-    found.residual[:, 3:] /= scale
-    n = len(found.J_frame)
-    J_frame_scale = np.zeros((n, 6, found.J_frame.shape[2] + 1))
-    J_frame_scale[:, :, :-1] = found.J_frame
-    for J in (J_frame_scale, *found.J_pose):
+    scale, reported = float(state.values[factor.name, "scale"][0]), factor.position[block]
+    residuals.residual[:, 3:] /= scale
+    n = len(residuals.J_frame)
+    J_frame_scale = np.zeros((n, 6, residuals.J_frame.shape[2] + 1))
+    J_frame_scale[:, :, :-1] = residuals.J_frame
+    for J in (J_frame_scale, *residuals.J_pose):
         J[:, 3:] /= scale
     if n:
-        J_frame_scale[:, 3:, -1] = -(found.residual[:, 3:] + reported) / scale
-    return rows_at(found.residual, found.J_pose, ends, J_frame_scale)
+        J_frame_scale[:, 3:, -1] = -(residuals.residual[:, 3:] + reported) / scale
+    return rows_at(residuals.residual, residuals.J_pose, ends, J_frame_scale)
 
 
-def _noise(factor: PoseFactor, own: slice) -> RobustNoise:
-    """Noise of the measurements `own`."""
-    whitening = np.eye(6) / factor.sigma[own][:, :, None]
+def _noise(factor: PoseFactor, block: slice) -> RobustNoise:
+    """Noise of the measurements `block`."""
+    whitening = np.eye(6) / factor.sigma[block][:, :, None]
     return RobustNoise(whitening, factor.noise.loss, factor.noise.loss_scale)

@@ -55,12 +55,12 @@ class SimPoses(SimSensor):
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimPoses:
         noises = ("rotation_noise", "position_noise")
-        found, common = mounted_fields(value, start_ns, options=("kind", "T_world_frame", *noises))
-        chosen: dict[str, Any] = {key: at_least(found[key], 0.0) for key in noises if key in found}
-        if "kind" in found:
-            chosen["kind"] = found["kind"].choice("kind", ("absolute", "relative"))
-        if "T_world_frame" in found:
-            chosen["T_world_frame"] = pose(found["T_world_frame"])
+        fields, common = mounted_fields(value, start_ns, options=("kind", "T_world_frame", *noises))
+        chosen: dict[str, Any] = {key: at_least(fields[key], 0.0) for key in noises if key in fields}
+        if "kind" in fields:
+            chosen["kind"] = fields["kind"].choice("kind", ("absolute", "relative"))
+        if "T_world_frame" in fields:
+            chosen["T_world_frame"] = pose(fields["T_world_frame"])
         return cls(name, **common, **chosen)
 
     def values(self) -> dict[str, np.ndarray]:
@@ -75,14 +75,14 @@ class SimPoses(SimSensor):
         R, p, _ = scene.trajectory.pose_at(seconds)
         T = np.tile(np.eye(4), (len(seconds), 1, 1))
         T[:, :3, :3], T[:, :3, 3] = R, p
-        seen = np.linalg.inv(self.T_world_frame) @ T @ self.T_imu_sensor
-        seen[:, :3, 3] /= self.scale
-        truth = PoseTruth(seconds, seen[:, :3, :3].copy(), seen[:, :3, 3].copy())
+        poses = np.linalg.inv(self.T_world_frame) @ T @ self.T_imu_sensor
+        poses[:, :3, 3] /= self.scale
+        truth = PoseTruth(seconds, poses[:, :3, :3].copy(), poses[:, :3, 3].copy())
         if scene.noisy:
             rng = np.random.default_rng(seed)
             is_absolute = self.kind == "absolute"
-            seen = _with_white_noise(self, seen, rng) if is_absolute else _with_drift(self, seen, seconds, rng)
-        return Report(PoseStream(self.name, stamps, seen[:, :3, :3].copy(), seen[:, :3, 3].copy()), truth)
+            poses = _with_white_noise(self, poses, rng) if is_absolute else _with_drift(self, poses, seconds, rng)
+        return Report(PoseStream(self.name, stamps, poses[:, :3, :3].copy(), poses[:, :3, 3].copy()), truth)
 
     def rig_entry(self) -> PoseSensor:
         noise = self.rotation_noise, self.position_noise
@@ -118,21 +118,21 @@ def _message(bag: BagWriter, stamp_ns: int, frame: str, position: np.ndarray, R:
     return bag.make(_POSE_MESSAGE, bag.header(stamp_ns, frame), bag.make("geometry_msgs/msg/Pose", point, turn))
 
 
-def _with_white_noise(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _with_white_noise(sensor: SimPoses, poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Poses (N, 4, 4) with independent noise, for rotations about the axes of the sensor and for positions along the
     axes of the frame."""
-    out = seen.copy()
+    out = poses.copy()
     for T in out:
         T[:3, :3] = T[:3, :3] @ rotation_from_vector(sensor.rotation_noise * rng.standard_normal(3))
         T[:3, 3] += sensor.position_noise * rng.standard_normal(3)
     return out
 
 
-def _with_drift(sensor: SimPoses, seen: np.ndarray, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _with_drift(sensor: SimPoses, poses: np.ndarray, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Poses (N, 4, 4) that drift, as independent noise is added to the steps between successive poses."""
-    out = seen.copy()
-    for k in range(1, len(seen)):
-        step, root = np.linalg.inv(seen[k - 1]) @ seen[k], np.sqrt(seconds[k] - seconds[k - 1])
+    out = poses.copy()
+    for k in range(1, len(poses)):
+        step, root = np.linalg.inv(poses[k - 1]) @ poses[k], np.sqrt(seconds[k] - seconds[k - 1])
         step[:3, :3] = step[:3, :3] @ rotation_from_vector(sensor.rotation_noise * root * rng.standard_normal(3))
         step[:3, 3] += sensor.position_noise * root * rng.standard_normal(3)
         out[k] = out[k - 1] @ step

@@ -66,21 +66,21 @@ class PoseSensor(MountedSensor):
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> PoseSensor:
-        found = value.record(("type",), (*_FIELDS, *_NOISE, *TABLE, *parameter_fields(cls)))
+        fields = value.record(("type",), (*_FIELDS, *_NOISE, *TABLE, *parameter_fields(cls)))
         return cls(
             name=name,
-            path=path_or(found, f"{name}/poses.csv"),
-            kind=choice_or(found, "kind", PoseKind, cls.kind),
-            position_axes=axes_or_none(found, "position_axes"),
-            level=found["level"].boolean() if "level" in found else cls.level,
-            topic=topic_or_none(found),
-            rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
-            position_noise=found["position_noise"].positive() if "position_noise" in found else None,
-            inverted="inverted" in found and found["inverted"].boolean(),
-            layout=table_layout(found),
-            scale_sigma=_scale_sigma(found["scale_sigma"]) if "scale_sigma" in found else cls.scale_sigma,
-            frames=_frames(found["frames"]) if "frames" in found else None,
-            **parameters(found, cls.stated()),
+            path=path_or(fields, f"{name}/poses.csv"),
+            kind=choice_or(fields, "kind", PoseKind, cls.kind),
+            position_axes=axes_or_none(fields, "position_axes"),
+            level=fields["level"].boolean() if "level" in fields else cls.level,
+            topic=topic_or_none(fields),
+            rotation_noise=fields["rotation_noise"].positive() if "rotation_noise" in fields else None,
+            position_noise=fields["position_noise"].positive() if "position_noise" in fields else None,
+            inverted="inverted" in fields and fields["inverted"].boolean(),
+            layout=table_layout(fields),
+            scale_sigma=_scale_sigma(fields["scale_sigma"]) if "scale_sigma" in fields else cls.scale_sigma,
+            frames=_frames(fields["frames"]) if "frames" in fields else None,
+            **parameters(fields, cls.stated()),
         )
 
     def plain(self) -> dict[str, Any]:

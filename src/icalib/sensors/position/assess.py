@@ -32,24 +32,25 @@ SAME_SCALE_S = 0.5  # largest distance of a time offset from one of SCALES: rece
 LABELS = {"horizontal": ("east", "north"), "vertical": ("up",)}
 
 
-def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
+def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
     """Residuals of each position sensor, along the axes of its frame."""
-    for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
-        yield row_record("positions", factor.rows(rows, found.outcome.state), timeline, LABELS)
+    for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PositionFactor):
+        yield row_record("positions", factor.rows(rows, estimate.outcome.state), timeline, LABELS)
 
 
-def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """Sentences on the number of fixes in use, their noise, and time offsets that are differences of time scales."""
     del timeline
-    for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
+    for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PositionFactor):
         sensor, stream = inputs.sensor(factor.name), inputs.stream(factor.name)
         assert isinstance(stream, PositionStream)
         used = f"{int(factor.used.sum())} of {len(stream.stamps_ns)} fixes of {factor.name}"
         wrong = int((~factor.used).sum())
         rejected = f"; {wrong} are outliers of the trajectory, the largest by {_largest(factor, rows):.2g} m"
         yield f"{used}{rejected if wrong else ''}; {_noise(sensor, stream, factor.noise)}."
-        own = found.outcome.state.values[factor.name, "time_offset"] - origin_difference(inputs.measurements, stream)
-        yield from scale_of_time(factor.name, float(own[0]))
+        offset = estimate.outcome.state.values[factor.name, "time_offset"]
+        offset = offset - origin_difference(inputs.measurements, stream)
+        yield from scale_of_time(factor.name, float(offset[0]))
 
 
 def _largest(factor: PositionFactor, rows: Whitened) -> float:
@@ -82,9 +83,9 @@ def scale_of_time(name: str, offset: float) -> Iterator[str]:
             )
 
 
-def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """A sentence for each sensor whose successive residuals are correlated, so that its sigmas are too small."""
-    for factor, rows in pairs_of(found.problem.factors, found.outcome.residuals, PositionFactor):
+    for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PositionFactor):
         whitened = rows.residual[factor.used]
         correlation = lag_one_correlation(whitened)
         if correlation <= max(MIN_CORRELATION, MIN_CORRELATION_SIGMAS / np.sqrt(max(whitened.size, 1))):

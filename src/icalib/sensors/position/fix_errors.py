@@ -30,13 +30,13 @@ def outliers_of(whitened: np.ndarray, raw: np.ndarray, deviations: float) -> np.
     Horizontal and vertical residuals are scaled by the median of each group, so that the size of the noise need not be
     known. deviations: limit in standard deviations of a normal variable. The limit on chi^2 has the same probability.
     """
-    rare, found = 2.0 * ndtr(-deviations), np.zeros(len(whitened), dtype=bool)
+    rare, outliers = 2.0 * ndtr(-deviations), np.zeros(len(whitened), dtype=bool)
     for columns, freedom in ((slice(0, 2), 2), (slice(2, 3), 1)):
         squares = (whitened[:, columns] ** 2).sum(axis=1)
         typical = np.median(squares) / chi2.ppf(0.5, freedom) if len(squares) else 1.0
         far = np.linalg.norm(raw[:, columns], axis=1) > MIN_OUTLIER_M
-        found |= far & (squares > typical * chi2.isf(rare, freedom))
-    return found
+        outliers |= far & (squares > typical * chi2.isf(rare, freedom))
+    return outliers
 
 
 def bursts_of(seconds: np.ndarray, raw: np.ndarray, sigma: np.ndarray) -> np.ndarray:
@@ -55,8 +55,8 @@ def bursts_of(seconds: np.ndarray, raw: np.ndarray, sigma: np.ndarray) -> np.nda
     gap = dt > MAX_GAP_STEPS * np.median(dt)
     is_step = (size > MIN_STEP_M**2) & (size > MIN_STEP_SIGMAS**2 * typical * expected) & ~gap
     offset = np.cumsum(np.vstack([np.zeros(3), np.where(is_step[:, None], moved, 0.0)]), axis=0)
-    for own in np.split(np.arange(len(seconds)), np.flatnonzero(gap) + 1):
-        wrong[own] = np.linalg.norm(offset[own] - np.median(offset[own], axis=0), axis=1) > MIN_STEP_M
+    for fixes in np.split(np.arange(len(seconds)), np.flatnonzero(gap) + 1):
+        wrong[fixes] = np.linalg.norm(offset[fixes] - np.median(offset[fixes], axis=0), axis=1) > MIN_STEP_M
     return wrong
 
 

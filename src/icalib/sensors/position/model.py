@@ -53,11 +53,11 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
         first = 1.0 if size == "messages" or size is None else size
         return PositionNoise(first, first, settings.loss, settings.loss_scale)
 
-    def next_noise(self, sensor: PositionSensor, noise: PositionNoise, found: ResidualStatistics) -> PositionNoise:
+    def next_noise(self, sensor: PositionSensor, noise: PositionNoise, statistics: ResidualStatistics) -> PositionNoise:
         """See `SensorModel`."""
         if not self.noise_is_estimated(sensor):
             return noise
-        factors = found.variance_factors()
+        factors = statistics.variance_factors()
         horizontal, vertical = (
             max(size * float(np.sqrt(factors.get(kind, 1.0))), LEAST_NOISE)
             for kind, size in (("horizontal", noise.horizontal), ("vertical", noise.vertical))

@@ -146,41 +146,41 @@ class PositionFactor(RowFactor):
             Into(piece, out, sums, curved),
             rows_by_recording(self.keyframe, self.starts, self.n_keyframes, piece),
         )
-        return sum(self._of_recording(k, own, state, into) for k, own in parts)
+        return sum(self._of_recording(k, block, state, into) for k, block in parts)
 
-    def _of_recording(self, recording: int, own: slice, state: State, into: Into) -> float:
-        """Adds the fixes `own`, all of one recording, to `into`; returns their cost."""
-        frame, keyframe = PositionFrame.of(self.frame, recording, state.values), self.keyframe[own]
+    def _of_recording(self, recording: int, block: slice, state: State, into: Into) -> float:
+        """Adds the fixes `block`, all of one recording, to `into`; returns their cost."""
+        frame, keyframe = PositionFrame.of(self.frame, recording, state.values), self.keyframe[block]
         kinematics = Kinematics.of(self)
-        at = SensorPose.at(kinematics, self.seconds[own], keyframe, state, into.sums)
-        rows = self._rows(own, frame, at, state, into.sums)
+        at = SensorPose.at(kinematics, self.seconds[block], keyframe, state, into.sums)
+        rows = self._rows(block, frame, at, state, into.sums)
         columns = np.concatenate([kinematics.columns(recording), frame.columns(self.layout)])
-        return self._add(rows, own, rows.on_intervals(keyframe, self.n_keyframes), columns, into)
+        return self._add(rows, block, rows.on_intervals(keyframe, self.n_keyframes), columns, into)
 
-    def _rows(self, own: slice, frame: PositionFrame, at: SensorPose, state: State, jacobians: bool) -> Rows:
-        """Residuals (n, 3) m of the fixes `own`, with derivatives by the keyframes, then the calibration parameters of
-        the sensor's pose, of the frame, and of the knots before and after each fix."""
+    def _rows(self, block: slice, frame: PositionFrame, at: SensorPose, state: State, jacobians: bool) -> Rows:
+        """Residuals (n, 3) m of the fixes `block`, with derivatives by the keyframes, then the calibration parameters
+        of the sensor's pose, of the frame, and of the knots before and after each fix."""
         inside, walk = frame.inward(at.position), self.walk
-        residual = inside - self.position[own]
+        residual = inside - self.position[block]
         if walk is not None:
-            residual += walk.offsets(own, state)
+            residual += walk.offsets(block, state)
         if not jacobians:
             return rows_at(residual, (), (at,), np.zeros((0, 3, 0)))
         J_pose = np.concatenate([np.zeros((len(inside), 3, 3)), frame.rotation.T @ at.rotation], axis=2)
-        J_own = [frame.jacobian(inside)] if walk is None else [frame.jacobian(inside), walk.weights(own)]
-        return rows_at(residual, (J_pose,), (at,), np.concatenate(J_own, axis=2))
+        J_calib = [frame.jacobian(inside)] if walk is None else [frame.jacobian(inside), walk.weights(block)]
+        return rows_at(residual, (J_pose,), (at,), np.concatenate(J_calib, axis=2))
 
-    def _add(self, rows: Rows, own: slice, interval: np.ndarray, columns: np.ndarray, into: Into) -> float:
-        """Adds the rows `own`, outliers with weight 0, to `into`; returns their cost. columns: calibration columns that
-        all rows share; interval: number of the keyframe interval of each row."""
-        W, used, cost = self.whitening[own], self.used[own], 0.0
+    def _add(self, rows: Rows, block: slice, interval: np.ndarray, columns: np.ndarray, into: Into) -> float:
+        """Adds the rows `block`, outliers with weight 0, to `into`; returns their cost. columns: calibration columns
+        that all rows share; interval: number of the keyframe interval of each row."""
+        W, used, cost = self.whitening[block], self.used[block], 0.0
         weighted = np.where(used[:, None, None], W, 0.0)
-        whole = [(slice(0, len(used)), np.zeros(0, dtype=np.int64))]
-        for part, knots in whole if self.walk is None else self.walk.stretches(own):
+        everything = [(slice(0, len(used)), np.zeros(0, dtype=np.int64))]
+        for part, knots in everything if self.walk is None else self.walk.stretches(block):
             some = Rows(rows.residual[part], rows.J[part])
-            where = slice(own.start + part.start, own.start + part.stop)
+            where = slice(block.start + part.start, block.start + part.stop)
             noise = RobustNoise(weighted[part], self.noise.loss, self.noise.loss_scale)
             cost += add_rows(some, where, interval[part], np.concatenate([columns, knots]), noise, into)
-        into.out.residual[own][~used] = np.einsum("nij,nj->ni", W[~used], rows.residual[~used])
-        into.out.root[own][~used] = 0.0
+        into.out.residual[block][~used] = np.einsum("nij,nj->ni", W[~used], rows.residual[~used])
+        into.out.root[block][~used] = 0.0
         return cost

@@ -29,15 +29,15 @@ def sections(c: Calibration) -> Iterator[Section]:
     yield from row_sections(c, "position", "positions", "Residuals of position sensors", _WORDS)
     figures = {f"map-{i}": _map(c, r) for i, r in enumerate(_residuals_of_positions(c))}
     if figures:
-        shown = zip(figures, _residuals_of_positions(c), strict=True)
-        parts = [element("h3", r.sensor) + plot_place(name) for name, r in shown]
+        places = zip(figures, _residuals_of_positions(c), strict=True)
+        parts = [element("h3", r.sensor) + plot_place(name) for name, r in places]
         yield Section("maps", "Map of fixes", _MAP, Html("".join(parts)), figures)
 
 
 def amounts(c: Calibration) -> Iterator[str]:
     """The number of fixes in use."""
-    if own := _residuals_of_positions(c):
-        yield f"{sum(len(r.seconds) for r in own)} fixes"
+    if records := _residuals_of_positions(c):
+        yield f"{sum(len(r.seconds) for r in records)} fixes"
 
 
 def _residuals_of_positions(c: Calibration) -> list[RowResiduals]:

@@ -68,12 +68,12 @@ class SimPositions(SimSensor):
             "position_noise", "vertical_noise", "drift_noise", "drift_time_s", "outliers", "outlier_m", "random_walk",
             "bursts", "burst_s", "burst_m",
         )  # fmt: skip
-        found, common = mounted_fields(value, start_ns, options=("T_world_frame", "shared_frame", *sizes))
-        chosen: dict[str, Any] = {key: at_least(found[key], 0.0) for key in sizes if key in found}
-        if "T_world_frame" in found:
-            chosen["T_world_frame"] = pose(found["T_world_frame"])
-        if "shared_frame" in found:
-            chosen["shared_frame"] = found["shared_frame"].text()
+        fields, common = mounted_fields(value, start_ns, options=("T_world_frame", "shared_frame", *sizes))
+        chosen: dict[str, Any] = {key: at_least(fields[key], 0.0) for key in sizes if key in fields}
+        if "T_world_frame" in fields:
+            chosen["T_world_frame"] = pose(fields["T_world_frame"])
+        if "shared_frame" in fields:
+            chosen["shared_frame"] = fields["shared_frame"].text()
         return cls(name, **common, **chosen)
 
     def plain(self) -> dict[str, Any]:
@@ -83,12 +83,12 @@ class SimPositions(SimSensor):
         """Fixes within the span of the IMU's readings, noisy if the scene is, and their true values."""
         stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
         R, p, _ = scene.trajectory.pose_at(seconds)
-        seen = p + R @ self.T_imu_sensor[:3, 3]
-        seen = (seen - self.T_world_frame[:3, 3]) @ self.T_world_frame[:3, :3]
-        truth = PositionTruth(seconds, seen.copy())
+        positions = p + R @ self.T_imu_sensor[:3, 3]
+        positions = (positions - self.T_world_frame[:3, 3]) @ self.T_world_frame[:3, :3]
+        truth = PositionTruth(seconds, positions.copy())
         if scene.noisy:
-            seen = seen + self._errors(seconds, np.random.default_rng(seed))
-        return Report(PositionStream(self.name, stamps, seen, np.zeros((0, 3, 3))), truth)
+            positions = positions + self._errors(seconds, np.random.default_rng(seed))
+        return Report(PositionStream(self.name, stamps, positions, np.zeros((0, 3, 3))), truth)
 
     def _errors(self, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(N, 3) m: errors of the fixes at `seconds` (N,)."""

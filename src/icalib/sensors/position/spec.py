@@ -87,18 +87,18 @@ class PositionSensor(ClockedSensor):
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> PositionSensor:
-        found = value.record(("type",), (*_FIELDS, *TABLE, *parameter_fields(cls)))
+        fields = value.record(("type",), (*_FIELDS, *TABLE, *parameter_fields(cls)))
         return cls(
             name=name,
-            path=path_or(found, f"{name}/positions.csv"),
-            coordinates=choice_or(found, "coordinates", Coordinates, None),
-            frame=found["frame"].text() if "frame" in found else cls.frame,
-            position_noise=_noise(found["position_noise"]) if "position_noise" in found else None,
-            position_random_walk=found["position_random_walk"].positive() if "position_random_walk" in found else 0.0,
-            least_status=choice_or(found, "least_status", Status, cls.least_status),
-            topic=topic_or_none(found),
-            layout=table_layout(found),
-            **parameters(found, cls.stated()),
+            path=path_or(fields, f"{name}/positions.csv"),
+            coordinates=choice_or(fields, "coordinates", Coordinates, None),
+            frame=fields["frame"].text() if "frame" in fields else cls.frame,
+            position_noise=_noise(fields["position_noise"]) if "position_noise" in fields else None,
+            position_random_walk=fields["position_random_walk"].positive() if "position_random_walk" in fields else 0.0,
+            least_status=choice_or(fields, "least_status", Status, cls.least_status),
+            topic=topic_or_none(fields),
+            layout=table_layout(fields),
+            **parameters(fields, cls.stated()),
         )
 
     def plain(self) -> dict[str, Any]:

@@ -80,9 +80,9 @@ class OffsetWalk:
         n_recordings = len(stream.joins_ns) + 1
         firsts = np.searchsorted(stream.stamps_ns, stream.joins_ns)
         segments: list[_Segment] = []
-        for k, own in enumerate(np.split(stream.seconds, firsts)):
+        for k, seconds in enumerate(np.split(stream.seconds, firsts)):
             keys = knot_keys(stream.name, k, n_recordings)
-            edges = np.linspace(own[0], own[-1], len(keys) + 1)
+            edges = np.linspace(seconds[0], seconds[-1], len(keys) + 1)
             before = [None, *keys[:-1]]
             segments += [_Segment(k, *x) for x in zip(edges[:-1], np.diff(edges), before, keys, strict=True)]
         begins = np.array([s.begin for s in segments])
@@ -110,21 +110,21 @@ class OffsetWalk:
         durations = np.array([s.duration for s in self.segments])[self.segment]
         return self.density**2 * durations * self.share * (1.0 - self.share)
 
-    def offsets(self, own: slice, state: State) -> np.ndarray:
-        """(n, 3) m: offsets of the fixes `own`."""
-        before, after = self.knots(state)[self.segment[own]].transpose(1, 0, 2)
-        share = self.share[own, None]
+    def offsets(self, block: slice, state: State) -> np.ndarray:
+        """(n, 3) m: offsets of the fixes `block`."""
+        before, after = self.knots(state)[self.segment[block]].transpose(1, 0, 2)
+        share = self.share[block, None]
         return (1.0 - share) * before + share * after
 
-    def weights(self, own: slice) -> np.ndarray:
-        """(n, 3, 6) derivatives of the offsets of the fixes `own` by the knots before and after."""
-        share = self.share[own, None, None]
+    def weights(self, block: slice) -> np.ndarray:
+        """(n, 3, 6) derivatives of the offsets of the fixes `block` by the knots before and after."""
+        share = self.share[block, None, None]
         return np.concatenate([(1.0 - share) * np.eye(3), share * np.eye(3)], axis=2)
 
-    def stretches(self, own: slice) -> Iterator[tuple[slice, np.ndarray]]:
-        """For each segment with fixes of `own`: the slice of these fixes, relative to own.start, and the calibration
-        columns (6,) of the segment."""
-        segment = self.segment[own]
+    def stretches(self, block: slice) -> Iterator[tuple[slice, np.ndarray]]:
+        """For each segment with fixes of `block`: the slice of these fixes, relative to block.start, and the
+        calibration columns (6,) of the segment."""
+        segment = self.segment[block]
         edges = [0, *(np.flatnonzero(np.diff(segment)) + 1).tolist(), len(segment)]
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             if a < b:
@@ -202,8 +202,8 @@ class OffsetWalkFactor(RowFactor):
         cost = 0.0
         first, last = (int(j) for j in np.searchsorted(self.interval, [piece.first, piece.last]))
         for j in range(first, last):
-            own = slice(j, j + 1)
-            noise = RobustNoise(whitening[own], "none", 1.0)
-            rows = Rows(increments[own], J)
-            cost += add_rows(rows, own, self.interval[own], self.walk.columns[j], noise, into)
+            row = slice(j, j + 1)
+            noise = RobustNoise(whitening[row], "none", 1.0)
+            rows = Rows(increments[row], J)
+            cost += add_rows(rows, row, self.interval[row], self.walk.columns[j], noise, into)
         return cost

@@ -44,17 +44,17 @@ RATE_UNIT_FACTORS = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
 UNIT_TOLERANCE = 0.1  # relative deviation of a size ratio from the factor of a wrong unit
 
 
-def residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
+def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
     """The residuals of each set of wheels, one row per interval between keyframes; the measured slip is 0."""
-    for key, factor in found.problem.factors.items():
+    for key, factor in estimate.problem.factors.items():
         if isinstance(factor, IncrementFactor | RelativePoseFactor):
-            rows = factor.rows(found.outcome.residuals[key], found.outcome.state)
+            rows = factor.rows(estimate.outcome.residuals[key], estimate.outcome.state)
             yield row_record("increments", rows, timeline, LABELS)
 
 
-def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """A note if only the assumption of an upright camera decides whether wheels are upside down."""
-    for wheels, up in _without_vertical(inputs, found):
+    for wheels, up in _without_vertical(inputs, estimate):
         if not inputs.rig.moves_by_poses and _posture(up) is None:
             yield (
                 f"{wheels}: nothing but {_body(inputs)}, which then stands upright, shows which way is up; if it is "
@@ -62,15 +62,15 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
             )
 
 
-def warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """Warnings if no LiDAR sees the ground of wheels, or if no sensor determines the vertical."""
-    yield from ground_warnings(found)
-    yield from _upwards_warnings(inputs, found)
+    yield from ground_warnings(estimate)
+    yield from _upwards_warnings(inputs, estimate)
 
 
-def ground_warnings(found: Estimate) -> Iterator[str]:
+def ground_warnings(estimate: Estimate) -> Iterator[str]:
     """A warning for each ground factor whose floor no LiDAR sees."""
-    for factor in of_type(found.problem.factors, GroundFactor):
+    for factor in of_type(estimate.problem.factors, GroundFactor):
         if not len(factor.keyframes):
             yield (
                 f"none of the planes that LiDARs see is a floor (nearly level and below the IMU), so the ground of "
@@ -78,10 +78,10 @@ def ground_warnings(found: Estimate) -> Iterator[str]:
             )
 
 
-def _upwards_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+def _upwards_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """A warning with both possible verticals if no sensor determines the sign of the vertical, and the assumption of an
     upright camera does not apply: the motion comes from pose sensors, or the camera is not upright in the result."""
-    for wheels, up in _without_vertical(inputs, found):
+    for wheels, up in _without_vertical(inputs, estimate):
         if inputs.rig.moves_by_poses:
             x, y, z = up
             yield (
@@ -95,11 +95,11 @@ def _upwards_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
             )
 
 
-def _without_vertical(inputs: Inputs, found: Estimate) -> Iterator[tuple[str, np.ndarray]]:
+def _without_vertical(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, np.ndarray]]:
     """Names of wheels for which neither data nor rig file determine the sign of the vertical. With each name: the z
     axis (3,) of the wheel frame in the axes of the body."""
-    values = found.outcome.state.values
-    if not inputs.rig.assumes_motion or level_sensor(inputs, found.outcome.state) is not None:
+    values = estimate.outcome.state.values
+    if not inputs.rig.assumes_motion or level_sensor(inputs, estimate.outcome.state) is not None:
         return
     for wheels in inputs.rig.wheels:
         if wheels.rotation.mode == "free":
@@ -161,11 +161,11 @@ def sizes(wheels: Wheels) -> tuple[str, ...]:
     return (wheels.drive_specs[0].name,)
 
 
-def absurd(wheels: Wheels, found: dict[tuple[str, str], ParameterGroup]) -> Iterator[str]:
+def absurd(wheels: Wheels, groups: dict[tuple[str, str], ParameterGroup]) -> Iterator[str]:
     """A sentence if the ratio of radius to baseline is implausible, as for readings in a wrong unit."""
     if wheels.kind != "pair":
         return
-    radii, baseline = found.get((wheels.name, "radii")), found.get((wheels.name, "baseline"))
+    radii, baseline = groups.get((wheels.name, "radii")), groups.get((wheels.name, "baseline"))
     if radii is None or baseline is None:
         return
     ratio = float(radii.value.mean() / baseline.value[0])
@@ -180,16 +180,16 @@ def absurd(wheels: Wheels, found: dict[tuple[str, str], ParameterGroup]) -> Iter
     )
 
 
-def looks_like(wheels: Wheels, name: str, value: np.ndarray, found: np.ndarray) -> str:
-    """A sentence on the likely mistake in a stated size, with a leading space; empty without one. value, found: the
+def looks_like(wheels: Wheels, name: str, value: np.ndarray, estimated: np.ndarray) -> str:
+    """A sentence on the likely mistake in a stated size, with a leading space; empty without one. value, estimated: the
     stated and the estimated size."""
     if name not in ("radii", "radius"):
         return ""
-    if is_near(found, 0.5 * value, UNIT_TOLERANCE):
+    if is_near(estimated, 0.5 * value, UNIT_TOLERANCE):
         return " It looks like a diameter: write the radius."
     if wheels.measures == "ticks" and wheels.counts_per_turn is not None:
-        return f" With it counts_per_turn would be {wheels.counts_per_turn * float(np.median(value / found)):.0f}."
+        return f" With it counts_per_turn would be {wheels.counts_per_turn * float(np.median(value / estimated)):.0f}."
     for factor, unit in RATE_UNIT_FACTORS.items() if wheels.measures == "rates" else ():
-        if is_near(found, factor * value, UNIT_TOLERANCE):
+        if is_near(estimated, factor * value, UNIT_TOLERANCE):
             return f" Its readings look like {unit}: write rate_unit: {unit}."
     return ""

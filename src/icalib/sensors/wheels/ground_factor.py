@@ -45,13 +45,13 @@ def floors(state: State, keys: tuple[Key, ...], points: np.ndarray, recording: n
 
     keys: the P planes that LiDARs see; points (P,): LiDAR points on each; recording (P,): recording of each plane.
     """
-    found = []
+    keys_of_floors = []
     for r, keyframes in enumerate(state.recordings):
-        own = np.flatnonzero(recording == r)
+        planes = np.flatnonzero(recording == r)
         middle = state.position[keyframes].mean(axis=0)
-        below = [k for k in own if _is_floor(state.values[keys[k]], middle)]
-        found.append(keys[max(below, key=lambda k: points[k])] if below else None)
-    return tuple(found)
+        below = [k for k in planes if _is_floor(state.values[keys[k]], middle)]
+        keys_of_floors.append(keys[max(below, key=lambda k: points[k])] if below else None)
+    return tuple(keys_of_floors)
 
 
 def _is_floor(plane: np.ndarray, above: np.ndarray) -> bool:
@@ -139,12 +139,12 @@ class GroundFactor(RowFactor):
             low, high = np.searchsorted(self.keyframes, [max(begin, piece.first), min(end, piece.last)])
             if low >= high:
                 continue
-            own = slice(int(low), int(high))
-            rows = self._rows(state, self.keyframes[own], None if key is None else state.values[key])
+            block = slice(int(low), int(high))
+            rows = self._rows(state, self.keyframes[block], None if key is None else state.values[key])
             whitening = np.tile(np.diag(1.0 / self.sigma), (high - low, 1, 1))
             by = RobustNoise(whitening, "none", 1.0)
             into = Into(piece, out, sums, curved)
-            cost += add_rows(rows, own, self.keyframes[own], self._columns(key), by, into)
+            cost += add_rows(rows, block, self.keyframes[block], self._columns(key), by, into)
         return cost
 
     def _columns(self, key: Key | None) -> np.ndarray:

@@ -32,9 +32,9 @@ def integrals_of(stream: WheelStream) -> np.ndarray:
     the driven wheel turned [rad], integrals of cos and sin of the steering angle [s], and the integral of
     (rate of the wheel / cos)^2 [rad^2/s]. The variance of the steering row is proportional to the last.
     """
-    whole = integrated(stream.seconds, stream.rate, stream.sampling)
+    integrals = integrated(stream.seconds, stream.rate, stream.sampling)
     if stream.kind != "steered":
-        return whole
+        return integrals
     rate, steer = stream.rate[:, 0], np.clip(stream.rate[:, 1], -MAX_STEERING_RAD, MAX_STEERING_RAD)
     others = np.stack([np.cos(steer), np.sin(steer), (rate / np.cos(steer)) ** 2], axis=1)
-    return np.concatenate([whole[:, :1], integrated(stream.seconds, others, "instantaneous")], axis=1)
+    return np.concatenate([integrals[:, :1], integrated(stream.seconds, others, "instantaneous")], axis=1)

@@ -45,11 +45,12 @@ def wheel_factor(
     """The factor of the readings; the fields `measures` and `factor` of the rig file choose its type."""
     if isinstance(stream, WheelPoses):
         return RelativePoseFactor.of_poses(stream, motion.imu, motion.gravity, noise, layout, motion.state)
-    own = wheels.name, stream.seconds, integrals_of(stream), motion.imu, motion.gravity, noise, layout, motion.state
+    name, seconds, state = wheels.name, stream.seconds, motion.state
+    arguments = name, seconds, integrals_of(stream), motion.imu, motion.gravity, noise, layout, state
     times = instants(stream, motion.state.values)
     if wheels.factor == "relative-poses":
-        return RelativePoseFactor.build(*own, times)
-    return IncrementFactor.build(*own, stream.kind, times)
+        return RelativePoseFactor.build(*arguments, times)
+    return IncrementFactor.build(*arguments, stream.kind, times)
 
 
 MODEL = WheelModel()

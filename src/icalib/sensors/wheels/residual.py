@@ -119,18 +119,19 @@ class IncrementFactor(RowFactor):
         seconds (N,): stamps since the first, on the wheels' clock; integrals (N, m): see `integrals_of`, for a pair the
         angles of both wheels [rad]. times (N,): stamps on the IMU's clock; default: seconds plus the only time offset.
         """
-        found = wheel_intervals(name, seconds, imu, state, times)
-        dt = seconds[found.last] - seconds[found.first]
-        whole = integrals[found.last] - integrals[found.first]
-        sigma = _row_sigma(kind, noise, dt, whole, drive_of(name, state, kind))
+        intervals = wheel_intervals(name, seconds, imu, state, times)
+        dt = seconds[intervals.last] - seconds[intervals.first]
+        increments = integrals[intervals.last] - integrals[intervals.first]
+        sigma = _row_sigma(kind, noise, dt, increments, drive_of(name, state, kind))
         whitening = np.eye(4) / sigma[:, :, None]
         measured = np.zeros((len(dt), 4))
         n_measured = 1 if kind == "steered" else 2
-        measured[:, :n_measured] = whole[:, :n_measured]
-        mean = whole[:, 1:] / dt[:, None]
-        change = state.seconds[found.keyframe + 1] - offset_at(state, name, found.keyframe) if imu.forwards else None
-        instants = quadrature(seconds, found, change)
-        return cls(name, kind, found, measured, mean, whitening, instants, imu, gravity, noise, layout)
+        measured[:, :n_measured] = increments[:, :n_measured]
+        mean = increments[:, 1:] / dt[:, None]
+        k = intervals.keyframe
+        change = state.seconds[k + 1] - offset_at(state, name, k) if imu.forwards else None
+        instants = quadrature(seconds, intervals, change)
+        return cls(name, kind, intervals, measured, mean, whitening, instants, imu, gravity, noise, layout)
 
     def output(self) -> Whitened:
         """See `Factor`."""
@@ -154,23 +155,23 @@ class IncrementFactor(RowFactor):
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
         """
         into = Into(piece, out, sums, curved)
-        return sum(self._added(own, state, into) for own in in_chunks(_in_piece(self.intervals, piece)))
+        return sum(self._added(block, state, into) for block in in_chunks(_in_piece(self.intervals, piece)))
 
-    def _added(self, own: slice, state: State, into: Into) -> float:
-        """Adds the intervals `own`; returns half their robust chi^2."""
-        start = self.instants.start[own.start : own.stop + 1]
+    def _added(self, block: slice, state: State, into: Into) -> float:
+        """Adds the intervals `block`; returns half their robust chi^2."""
+        start = self.instants.start[block.start : block.stop + 1]
         used = slice(int(start[0]), int(start[-1]))
         keyframe = self.instants.keyframe[used]
         times = self.instants.times[used] + offset_at(state, self.name, keyframe)
         poses, velocities = _motion(self, times, keyframe, state, into.sums)
         rows = Rows.empty(len(start) - 1, 4, N_POSE_PARAMETERS + poses.J_imu.shape[2] + N_DRIVE, into.sums)
         wheels = _wheel_parameters(self.name, state, self.kind)
-        c = coefficients(self.kind, wheels.drive, self.mean[own])
+        c = coefficients(self.kind, wheels.drive, self.mean[block])
         increment_rows(
             start - start[0], self.instants.weight[used], _samples(keyframe, poses), velocities, wheels, c,
-            self.measured[own], rows,
+            self.measured[block], rows,
         )  # fmt: skip
-        return _add(self, own, rows, state, into)
+        return _add(self, block, rows, state, into)
 
 
 @dataclass(frozen=True)
@@ -206,15 +207,16 @@ class RelativePoseFactor(RowFactor):
         """The factor of recorded relative poses, which do not depend on radii and baseline. Their noise includes the
         propagated IMU noise between keyframes and stamps."""
         times = instants(stream, state.values)
-        found = pose_intervals(imu, state.seconds, state.starts, times)
-        k, ends = found.first, [(found.keyframe, times[found.first]), (found.keyframe + 1, times[found.last])]
+        intervals = pose_intervals(imu, state.seconds, state.starts, times)
+        k = intervals.first
+        ends = [(intervals.keyframe, times[k]), (intervals.keyframe + 1, times[intervals.last])]
         first, last = (poses_at("inertial", t, keyframe, state, imu, gravity, False) for keyframe, t in ends)
         propagated = np.stack([np.abs(t - state.seconds[keyframe]) for keyframe, t in ends], axis=1)
         wheels = Extrinsics(state.values[stream.name, "rotation"], state.values[stream.name, "translation"])
         covariance = stream.covariance[k] + propagation_noise(first, last, propagated, wheels, imu)
         W = np.linalg.inv(np.linalg.cholesky(covariance))
         poses = RelativePoses(stream.pose[k], np.zeros((len(k), 3, 3)), W, np.zeros(3))
-        return cls(stream.name, stream.seconds, found, poses, imu, gravity, noise, layout)
+        return cls(stream.name, stream.seconds, intervals, poses, imu, gravity, noise, layout)
 
     @property
     def whitening(self) -> np.ndarray:
@@ -235,9 +237,9 @@ class RelativePoseFactor(RowFactor):
         times: np.ndarray | None = None,
     ) -> RelativePoseFactor:
         """See `IncrementFactor.build`. angles (N, 2) rad, integrated with the radii and the baseline of `state`."""
-        found = wheel_intervals(name, seconds, imu, state, times)
-        poses = preintegrated(seconds, angles, found, drive_of(name, state), noise.wheel, noise.lateral_slip)
-        return cls(name, seconds, found, poses, imu, gravity, noise, layout)
+        intervals = wheel_intervals(name, seconds, imu, state, times)
+        poses = preintegrated(seconds, angles, intervals, drive_of(name, state), noise.wheel, noise.lateral_slip)
+        return cls(name, seconds, intervals, poses, imu, gravity, noise, layout)
 
     @property
     def key(self) -> FactorKey:
@@ -267,25 +269,25 @@ class RelativePoseFactor(RowFactor):
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `IncrementFactor.accumulate`."""
         into = Into(piece, out, sums, curved)
-        return sum(self._added(own, state, into) for own in in_chunks(_in_piece(self.intervals, piece)))
+        return sum(self._added(block, state, into) for block in in_chunks(_in_piece(self.intervals, piece)))
 
-    def _added(self, own: slice, state: State, into: Into) -> float:
-        """Adds the intervals `own`; returns half their robust chi^2."""
+    def _added(self, block: slice, state: State, into: Into) -> float:
+        """Adds the intervals `block`; returns half their robust chi^2."""
         i, z, kinematics = self.intervals, self.poses, Kinematics.of(self)
-        first = SensorPose.at(kinematics, self.seconds[i.first[own]], i.keyframe[own], state, into.sums)
-        last = SensorPose.at(kinematics, self.seconds[i.last[own]], i.keyframe[own] + 1, state, into.sums)
-        n, drive = len(z.z[own]), drive_of(self.name, state, self.kind)
-        found = relative_residuals(
+        first = SensorPose.at(kinematics, self.seconds[i.first[block]], i.keyframe[block], state, into.sums)
+        last = SensorPose.at(kinematics, self.seconds[i.last[block]], i.keyframe[block] + 1, state, into.sums)
+        n, drive = len(z.z[block]), drive_of(self.name, state, self.kind)
+        relative = relative_residuals(
             (first.rotation, last.rotation),
             (first.position, last.position),
             np.broadcast_to(np.eye(3), (n, 3, 3)),
             np.zeros((n, 3)),
             into.sums,
         )
-        residual = found.residual[:, YAW_X_Y] - z.z[own] - z.J_drive[own] @ (drive - z.drive0)
-        J_pose = [np.ascontiguousarray(J[:, YAW_X_Y]) for J in found.J_pose]
-        rows = rows_at(residual, J_pose, (first, last), -z.J_drive[own] if into.sums else z.J_drive[:0])
-        return _add(self, own, rows, state, into)
+        residual = relative.residual[:, YAW_X_Y] - z.z[block] - z.J_drive[block] @ (drive - z.drive0)
+        J_pose = [np.ascontiguousarray(J[:, YAW_X_Y]) for J in relative.J_pose]
+        rows = rows_at(residual, J_pose, (first, last), -z.J_drive[block] if into.sums else z.J_drive[:0])
+        return _add(self, block, rows, state, into)
 
 
 def wheel_intervals(
@@ -302,12 +304,14 @@ def wheel_intervals(
 def drive_of(name: str, state: State, kind: WheelKind = "pair") -> np.ndarray:
     """Drive parameters (3,) of the wheels `name` in the order of `rig.DRIVES`, padded with zeros; for a pair left
     radius, right radius, baseline [m]."""
-    found = np.concatenate([state.values[name, group] for group in drive_names(kind)])
-    return np.concatenate([found, np.zeros(N_DRIVE - len(found))])
+    drive = np.concatenate([state.values[name, group] for group in drive_names(kind)])
+    return np.concatenate([drive, np.zeros(N_DRIVE - len(drive))])
 
 
-def _row_sigma(kind: WheelKind, noise: WheelNoise, dt: np.ndarray, whole: np.ndarray, drive: np.ndarray) -> np.ndarray:
-    """Standard deviations (n, 4) of the rows of intervals of length dt (n,) [s]; whole (n, m): integrals over each.
+def _row_sigma(
+    kind: WheelKind, noise: WheelNoise, dt: np.ndarray, integrals: np.ndarray, drive: np.ndarray
+) -> np.ndarray:
+    """Standard deviations (n, 4) of the rows of intervals of length dt (n,) [s]; integrals (n, m): over each.
 
     The steering row has two sources of noise: the lateral slip of the front wheels, and the lateral motion of the front
     axle, whose speed is v / cos(angle), due to an error of the steering angle.
@@ -317,7 +321,7 @@ def _row_sigma(kind: WheelKind, noise: WheelNoise, dt: np.ndarray, whole: np.nda
     )
     sigma = np.array([first, second, noise.lateral_slip, noise.vertical_slip]) * np.sqrt(dt)[:, None]
     if kind == "steered":
-        sigma[:, 1] = np.hypot(sigma[:, 1], noise.steering * drive[0] * np.sqrt(whole[:, 3]))
+        sigma[:, 1] = np.hypot(sigma[:, 1], noise.steering * drive[0] * np.sqrt(integrals[:, 3]))
     return sigma
 
 
@@ -359,16 +363,16 @@ def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
     return slice(int(i0), int(i1))
 
 
-def _add(factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, state: State, into: Into) -> float:
-    """Adds the rows of the intervals `own` to the normal equations; returns half their robust chi^2. The calibration
+def _add(factor: IncrementFactor | RelativePoseFactor, block: slice, rows: Rows, state: State, into: Into) -> float:
+    """Adds the rows of the intervals `block` to the normal equations; returns half their robust chi^2. The calibration
     columns of the rows are those of the pose, then those of the drive parameters."""
-    cost, keyframe, layout = 0.0, factor.intervals.keyframe[own], factor.layout
+    cost, keyframe, layout = 0.0, factor.intervals.keyframe[block], factor.layout
     drive = layout.columns(factor.name, *drive_names(factor.kind))
     drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])
     kinematics = Kinematics.of(factor)
     for clock, part in slices_by_clock(state, factor.name, keyframe):
         columns = np.concatenate([kinematics.columns(clock), drive])
-        mine = slice(own.start + part.start, own.start + part.stop)
-        noise = RobustNoise(factor.whitening[mine], factor.noise.loss, factor.noise.loss_scale)
-        cost += add_rows(Rows(rows.residual[part], rows.J[part]), mine, keyframe[part], columns, noise, into)
+        rows_of_clock = slice(block.start + part.start, block.start + part.stop)
+        noise = RobustNoise(factor.whitening[rows_of_clock], factor.noise.loss, factor.noise.loss_scale)
+        cost += add_rows(Rows(rows.residual[part], rows.J[part]), rows_of_clock, keyframe[part], columns, noise, into)
     return cost

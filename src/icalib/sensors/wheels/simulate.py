@@ -93,15 +93,15 @@ class SimWheels(SimSensor):
 
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimWheels:
-        fields = value.entries()
-        reports = fields["reports"].choice("reports", tuple(_FIELDS)) if "reports" in fields else cls.reports
+        entries = value.entries()
+        reports = entries["reports"].choice("reports", tuple(_FIELDS)) if "reports" in entries else cls.reports
         required, options = _FIELDS[reports]
-        found, common = mounted_fields(value, start_ns, required, (*options, "reports", "sampling"))
+        fields, common = mounted_fields(value, start_ns, required, (*options, "reports", "sampling"))
         chosen: dict[str, Any] = {"reports": reports}
-        for key in found.keys() & {*required, *options}:
-            chosen[key] = _number(key, found[key])
-        if "sampling" in found:
-            chosen["sampling"] = found["sampling"].choice("sampling", ("interval-mean", "instantaneous"))
+        for key in fields.keys() & {*required, *options}:
+            chosen[key] = _number(key, fields[key])
+        if "sampling" in fields:
+            chosen["sampling"] = fields["sampling"].choice("sampling", ("interval-mean", "instantaneous"))
         return cls(name, **common, **chosen)
 
     def check(self, room: Room | None, drive: Drive | None) -> None:
@@ -120,8 +120,8 @@ class SimWheels(SimSensor):
         drawn, off = {}, relative_error * rng.standard_normal(3)
         positive = {spec.name for spec in Wheels.parameters if spec.is_positive}
         for name, value in self.values().items():
-            own, off = off[: value.size], off[value.size :]
-            drawn[name] = value + own * (value if name in positive else 1.0)
+            errors, off = off[: value.size], off[value.size :]
+            drawn[name] = value + errors * (value if name in positive else 1.0)
         return drawn
 
     def plain(self) -> dict[str, Any]:

@@ -200,34 +200,34 @@ class Wheels(MountedSensor):
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Wheels:
-        found = value.record(
+        fields = value.record(
             ("type",),
             (*_WORDS, "ground", *_NOISES, *_SLIP, *TABLE, *parameter_fields(cls)),
         )
-        measures: WheelMeasure = choice_or(found, "measures", WheelMeasure, cls.measures)
-        drive: WheelDrive = choice_or(found, "drive", WheelDrive, cls.drive)
+        measures: WheelMeasure = choice_or(fields, "measures", WheelMeasure, cls.measures)
+        drive: WheelDrive = choice_or(fields, "drive", WheelDrive, cls.drive)
         bare = cls(name, "", drive, measures=measures)
-        _refuse_other_measures(value, found, bare)
-        groups = parameters(found, bare.specs())
-        _refuse_negative_lengths(found, groups, bare)
-        given: dict[str, Any] = {d: positive_or(found, d, getattr(cls, d)) for d in (*_NOISES, *_SLIP)}
+        _refuse_other_measures(value, fields, bare)
+        groups = parameters(fields, bare.specs())
+        _refuse_negative_lengths(fields, groups, bare)
+        given: dict[str, Any] = {d: positive_or(fields, d, getattr(cls, d)) for d in (*_NOISES, *_SLIP)}
         given |= groups
         return cls(
             name=name,
-            path=path_or(found, f"{name}/{measures}.csv"),
+            path=path_or(fields, f"{name}/{measures}.csv"),
             drive=drive,
-            factor=choice_or(found, "factor", WheelFactor, "relative-poses" if measures == "poses" else cls.factor),
+            factor=choice_or(fields, "factor", WheelFactor, "relative-poses" if measures == "poses" else cls.factor),
             measures=measures,
-            sampling=choice_or(found, "sampling", Literal["interval-mean", "instantaneous"], cls.sampling),
-            counts_per_turn=found["counts_per_turn"].positive() if "counts_per_turn" in found else None,
-            counter_size=found["counter_size"].whole(2) if "counter_size" in found else None,
-            angle_range=found["angle_range"].positive() if "angle_range" in found else None,
-            rate_unit=choice_or(found, "rate_unit", RateUnit, cls.rate_unit),
-            signs=_signs(found["signs"], drive) if "signs" in found else None,
-            topic=topic_or_none(found),
-            joints=_joints(found["joints"], drive) if "joints" in found else None,
-            ground=_ground(found["ground"]) if "ground" in found else None,
-            layout=table_layout(found),
+            sampling=choice_or(fields, "sampling", Literal["interval-mean", "instantaneous"], cls.sampling),
+            counts_per_turn=fields["counts_per_turn"].positive() if "counts_per_turn" in fields else None,
+            counter_size=fields["counter_size"].whole(2) if "counter_size" in fields else None,
+            angle_range=fields["angle_range"].positive() if "angle_range" in fields else None,
+            rate_unit=choice_or(fields, "rate_unit", RateUnit, cls.rate_unit),
+            signs=_signs(fields["signs"], drive) if "signs" in fields else None,
+            topic=topic_or_none(fields),
+            joints=_joints(fields["joints"], drive) if "joints" in fields else None,
+            ground=_ground(fields["ground"]) if "ground" in fields else None,
+            layout=table_layout(fields),
             **given,
         )
 
@@ -261,43 +261,43 @@ class Wheels(MountedSensor):
             )
 
 
-def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], bare: Wheels) -> None:
+def _refuse_other_measures(value: YamlValue, fields: dict[str, YamlValue], bare: Wheels) -> None:
     """Raises RigError if a field is not valid for `measures` or `drive`, or is missing."""
     for name, measures in _ONLY_OF.items():
-        if name in found and bare.measures not in measures:
-            found[name].fail(
+        if name in fields and bare.measures not in measures:
+            fields[name].fail(
                 f"belongs to wheels that measure {' or '.join(measures)}, not {bare.measures}; remove it, or correct "
                 "measures."
             )
-    if bare.measures == "ticks" and "counts_per_turn" not in found:
+    if bare.measures == "ticks" and "counts_per_turn" not in fields:
         value.fail(
             "counts_per_turn is missing; add the number of ticks per turn of the wheel, including the gear ratio."
         )
     if bare.drive != "differential" and bare.measures not in _TURNED:
-        found["drive"].fail(f"goes with wheels that measure {' or '.join(_TURNED)}; remove it, or correct measures.")
+        fields["drive"].fail(f"goes with wheels that measure {' or '.join(_TURNED)}; remove it, or correct measures.")
     for name, kinds in _ONLY_OF_KIND.items():
-        if name in found and bare.kind not in kinds:
-            found[name].fail(
+        if name in fields and bare.kind not in kinds:
+            fields[name].fail(
                 f"belongs to wheels with {' or '.join(_CALLED[k] for k in kinds)}; remove it, or correct drive and "
                 "measures."
             )
-    _refuse_factor(found, bare)
+    _refuse_factor(fields, bare)
 
 
-def _refuse_factor(found: dict[str, YamlValue], bare: Wheels) -> None:
-    given = found["factor"].text() if "factor" in found else None
+def _refuse_factor(fields: dict[str, YamlValue], bare: Wheels) -> None:
+    given = fields["factor"].text() if "factor" in fields else None
     if bare.measures == "poses" and given == "increments":
-        found["factor"].fail("relative poses have no increments of wheels; write relative-poses.")
+        fields["factor"].fail("relative poses have no increments of wheels; write relative-poses.")
     if bare.kind != "pair" and given == "relative-poses":
-        found["factor"].fail("relative-poses (the paper's factor) needs a left and a right wheel; write increments.")
+        fields["factor"].fail("relative-poses (the paper's factor) needs a left and a right wheel; write increments.")
 
 
-def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Any], bare: Wheels) -> None:
+def _refuse_negative_lengths(fields: dict[str, YamlValue], groups: dict[str, Any], bare: Wheels) -> None:
     for spec in bare.drive_specs:
         value = groups[spec.name].value if spec.name in groups else None
         if spec.is_positive and value is not None and (value <= 0).any():
             unit = "is in metres and" if spec.unit == "m" else "are factors and"
-            found[spec.name].fail(f"{unit} must be above 0; correct it.")
+            fields[spec.name].fail(f"{unit} must be above 0; correct it.")
 
 
 def _signs(value: YamlValue, drive: WheelDrive) -> tuple[int, ...]:
@@ -317,18 +317,18 @@ def _joints(value: YamlValue, drive: WheelDrive) -> tuple[str, ...]:
 
 
 def _ground(value: YamlValue) -> Ground:
-    found = value.record(("plane",), _GROUND)
-    if "tilt_noise" not in found and "height_sigma" not in found:
+    fields = value.record(("plane",), _GROUND)
+    if "tilt_noise" not in fields and "height_sigma" not in fields:
         value.fail("has no effect; add tilt_noise (rad), or height and height_sigma (m), or both.")
     for name in ("height", "bump_noise"):
-        if name in found and "height_sigma" not in found:
-            found[name].fail("needs height_sigma, the uncertainty of the height (m); add it.")
+        if name in fields and "height_sigma" not in fields:
+            fields[name].fail("needs height_sigma, the uncertainty of the height (m); add it.")
     return Ground(
-        choice_or(found, "plane", GroundPlane, "level"),
-        tilt_noise=found["tilt_noise"].positive() if "tilt_noise" in found else None,
-        height=found["height"].number() if "height" in found else Ground.height,
-        height_sigma=found["height_sigma"].positive() if "height_sigma" in found else None,
-        bump_noise=positive_or(found, "bump_noise", Ground.bump_noise),
+        choice_or(fields, "plane", GroundPlane, "level"),
+        tilt_noise=fields["tilt_noise"].positive() if "tilt_noise" in fields else None,
+        height=fields["height"].number() if "height" in fields else Ground.height,
+        height_sigma=fields["height_sigma"].positive() if "height_sigma" in fields else None,
+        bump_noise=positive_or(fields, "bump_noise", Ground.bump_noise),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
-from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import display_unit
 from icalib.sensors.sensor import TIME_OFFSET
 from icalib.tools.comparison.sides import LensSide, Quantity, Side
 from icalib.tools.comparison.significance import sigmas
@@ -205,7 +205,7 @@ def _quantities(pair: _Pair) -> Iterator[Difference]:
             continue
         vector, (Ca, Cb) = qb.value - qa.value, (qa.covariance, qb.covariance)
         # Quantities without a unit, such as the intrinsics of an IMU, are ratios already.
-        display = shown_unit(qa.unit) if qa.unit and not qa.is_relative else ("percent", 1e2)
+        display = display_unit(qa.unit) if qa.unit and not qa.is_relative else ("percent", 1e2)
         if qa.is_relative:
             relative = np.outer(1.0 / qa.value, 1.0 / qa.value)
             vector, Ca, Cb = vector / qa.value, Ca * relative, Cb * relative

@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.report.plot import AXIS_COLORS, COLORS, Figure, figure, numbers, stacked_axes, y_of
-from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import display_unit
 from icalib.tools.fleet.record import GroupRecord
 from icalib.tools.fleet.result import JobResult
 
@@ -56,7 +56,7 @@ def _traces(results: list[JobResult], places: dict[str, str], first: GroupRecord
             if (b.sensor, b.name, b.labels) == (first.sensor, first.name, first.labels):
                 at.append(r)
                 blocks.append(b)
-    scale = shown_unit(first.unit)[1]
+    scale = display_unit(first.unit)[1]
     values = scale * np.array([so3.value_change(first.value, b.value) for b in blocks])
     colors = AXIS_COLORS if len(first.labels) == len(AXIS_COLORS) else COLORS
     return [
@@ -92,5 +92,5 @@ def _estimated(b: GroupRecord) -> bool:
 
 
 def _unit_words(b: GroupRecord) -> str:
-    unit = shown_unit(b.unit)[0]
+    unit = display_unit(b.unit)[0]
     return f" [{unit}]" if unit else ""

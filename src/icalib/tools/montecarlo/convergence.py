@@ -11,7 +11,7 @@ import numpy as np
 
 from icalib.base.extras import load_matplotlib
 from icalib.report.plot import COLORS, Figure, axis, figure, line
-from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import display_unit
 from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 
 MOST_RUNS = 6
@@ -56,7 +56,7 @@ def rows(records: Sequence[RunRecord]) -> tuple[PanelRow, ...]:
 
 
 def _row(runs: Sequence[RunRecord], block: GroupErrors) -> PanelRow:
-    unit, scale = shown_unit(block.unit)
+    unit, scale = display_unit(block.unit)
     panels = []
     for k, label in enumerate(block.labels):
         curves = tuple(_curve(r, int(r.columns(block.key)[k]), scale) for r in runs if len(r.columns(block.key)))

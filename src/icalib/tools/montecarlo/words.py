@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from icalib.result.quantities import format_number
-from icalib.sensors.parameter_spec import shown_unit
+from icalib.sensors.parameter_spec import display_unit
 from icalib.tools.montecarlo.statistics import PROBABILITY, Nees, Spread
 from icalib.tools.montecarlo.summary import BlockSummary, Consistency, Mean
 
@@ -13,7 +13,7 @@ NUMBERS = HEADERS[1:7] + HEADERS[8:]
 
 def block_row(block: BlockSummary) -> tuple[str, ...]:
     """Cells of one block under `HEADERS`."""
-    unit, scale = shown_unit(block.unit)
+    unit, scale = display_unit(block.unit)
     sizes = ["" if x is None else format_number(scale * x, 3) for x in (block.rmse, block.mean_sigma)]
     return (
         f"{block.sensor} {block.name.replace('_', ' ')}",

@@ -60,9 +60,9 @@ def readings(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
 def _from_messages(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
     def rows(topic: str) -> tuple[np.ndarray, np.ndarray]:
         """Stamps (N,) [ns] and gyroscope and accelerometer readings (N, 6) of a topic, sorted by stamp."""
-        found = [(stamp, values_of(message)) for stamp, message in recording.messages(topic, "imu")]
-        stamps_ns = np.array([stamp for stamp, _ in found], np.int64)
-        values = np.array([row for _, row in found], np.float64).reshape(-1, 6)
+        stamped = [(stamp, values_of(message)) for stamp, message in recording.messages(topic, "imu")]
+        stamps_ns = np.array([stamp for stamp, _ in stamped], np.int64)
+        values = np.array([row for _, row in stamped], np.float64).reshape(-1, 6)
         order = recording.by_stamp(topic, stamps_ns)
         return stamps_ns[order], values[order]
 

@@ -45,8 +45,8 @@ def checked_imu(imu: ImuStream, where: str, sensor: ImuSensor | None = None) -> 
     imu, timed = in_time(imu, what)
     if len(imu.stamps_ns) < 2:
         raise RecordingError(f"{what}: no two readings are finite; check the driver, and record again.")
-    values, own = np.hstack([imu.gyro, imu.accel]), "export the IMU's own stamps"
-    kept, notes = kept_readings(imu.stamps_ns, values, what, RATE_HZ, "reading", own)
+    values, remedy = np.hstack([imu.gyro, imu.accel]), "export the IMU's own stamps"
+    kept, notes = kept_readings(imu.stamps_ns, values, what, RATE_HZ, "reading", remedy)
     if notes:
         imu = ImuStream(imu.name, imu.stamps_ns[kept], imu.gyro[kept], imu.accel[kept])
     _refuse_frozen(imu, what)
@@ -71,11 +71,11 @@ def _saturation_notes(imu: ImuStream, what: str) -> tuple[str, ...]:
 
 def saturations(imu: ImuStream) -> tuple[Saturation, ...]:
     """The longest run of readings at the largest and at the smallest value of each axis, if it looks saturated."""
-    found: list[Saturation] = []
+    runs: list[Saturation] = []
     for kind, values in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
         for axis, name in enumerate("xyz"):
             for limit in (values[:, axis].max(), values[:, axis].min()):
                 at, count = longest_run(values[:, axis] == limit)
                 if abs(limit) >= _NARROWEST_RANGE[kind] and count >= _SATURATED_RUN:
-                    found.append(Saturation(kind, name, float(limit), count, int(imu.stamps_ns[at])))
-    return tuple(found)
+                    runs.append(Saturation(kind, name, float(limit), count, int(imu.stamps_ns[at])))
+    return tuple(runs)

@@ -59,7 +59,7 @@ def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]
     """`imu` without outliers, and notes. A slower sensor whose readings the driver repeats is interpolated instead."""
     notes = _Notes(what, imu.stamps_ns)
     seconds, good = imu.seconds, np.ones(len(imu.stamps_ns), bool)
-    found = []
+    repaired = []
     for kind, values in zip(_SENSORS, (imu.gyro, imu.accel), strict=True):
         if (new := new_values(values)) is not None:
             values = _interpolated(seconds, values, new)
@@ -72,10 +72,10 @@ def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]
         bad[rest[spikes(seconds[rest], values[rest])]] = True
         notes.left_out(bad, f"are outliers of the {kind}, or repeat it exactly before a jump,")
         good &= ~bad
-        found.append(values)
+        repaired.append(values)
     if good.sum() < 2 or not notes.sentences:
         return imu, ()
-    return ImuStream(imu.name, imu.stamps_ns[good], found[0][good], found[1][good]), notes.sentences
+    return ImuStream(imu.name, imu.stamps_ns[good], repaired[0][good], repaired[1][good]), notes.sentences
 
 
 class _Notes:

@@ -64,15 +64,15 @@ def even_stamps(stamps_ns: np.ndarray, values: np.ndarray) -> EvenStamps | None:
         return None
     ns = (stamps_ns - stamps_ns[0]).astype(np.float64)
     limit = _MAX_ROUGHNESS_BURSTS if in_bursts else _MAX_ROUGHNESS_JITTER
-    tried = (_fitted(ns, last, first, in_bursts) for first in _periods(ns[last], last))
-    found = [
+    candidates = (_fitted(ns, last, first, in_bursts) for first in _periods(ns[last], last))
+    fits = [
         fit
-        for fit in tried
+        for fit in candidates
         if fit is not None and (_is_even_but_for_some(ns - fit[0], fit) or _left(fit[0], ns, values) < limit)
     ]
-    if not found:
+    if not fits:
         return None
-    even, period, _ = min(found, key=lambda fit: _wander(ns[last] - fit[0][last]) / fit[1] + _LOSS_PENALTY * fit[2])
+    even, period, _ = min(fits, key=lambda fit: _wander(ns[last] - fit[0][last]) / fit[1] + _LOSS_PENALTY * fit[2])
     if not in_bursts and _wander(ns - even) > _MAX_JITTER_PERIODS * period:
         return None
     burst = round(float(np.median(np.diff(last)))) if in_bursts else 1
@@ -81,8 +81,8 @@ def even_stamps(stamps_ns: np.ndarray, values: np.ndarray) -> EvenStamps | None:
 
 def _evenness(step: np.ndarray, period: float) -> float:
     """Share of steps (N - 1,) that differ from a whole number of periods by more than _UNEVEN_STEP_PERIODS."""
-    whole = np.maximum(np.round(step / period), 1.0)
-    return float((np.abs(step / period - whole) > _UNEVEN_STEP_PERIODS).mean())
+    periods = np.maximum(np.round(step / period), 1.0)
+    return float((np.abs(step / period - periods) > _UNEVEN_STEP_PERIODS).mean())
 
 
 def _periods(end: np.ndarray, last: np.ndarray) -> list[float]:
@@ -122,13 +122,13 @@ def _fitted(ns: np.ndarray, last: np.ndarray, period: float, in_bursts: bool) ->
     if losses > _MAX_LOSS_SHARE * len(ns):
         return None
     number = (np.arange(len(ns)) + np.repeat(lost, np.diff(last, prepend=-1))).astype(np.float64)
-    half, own = len(last) // 2, number[last]
-    period = float(np.median((ns[last][half:] - ns[last][:-half]) / (own[half:] - own[:-half])))
-    blocks = max(round(own[-1] * period / max(1e9 * _BLOCK_S, _BLOCK_BURSTS * own[-1] * period / len(last))), 1)
-    free = _delay_free(ns[last] - period * own, blocks, in_bursts)
+    half, burst = len(last) // 2, number[last]
+    period = float(np.median((ns[last][half:] - ns[last][:-half]) / (burst[half:] - burst[:-half])))
+    blocks = max(round(burst[-1] * period / max(1e9 * _BLOCK_S, _BLOCK_BURSTS * burst[-1] * period / len(last))), 1)
+    free = _delay_free(ns[last] - period * burst, blocks, in_bursts)
     if not in_bursts and np.abs(np.diff(free[1])).max(initial=0.0) > _MAX_CLOCK_STEP_PERIODS * period:
         return None
-    return period * number + np.interp(number, *(own[free[0]], free[1])), period, losses / len(last)
+    return period * number + np.interp(number, *(burst[free[0]], free[1])), period, losses / len(last)
 
 
 def _lost(delay: np.ndarray, period: float) -> np.ndarray:
@@ -156,9 +156,9 @@ def _delay_free(delay: np.ndarray, blocks: int, in_bursts: bool) -> tuple[np.nda
     least of one-sided delays (n,), the median of symmetric ones."""
     low, middle, high = np.quantile(delay, [0.05, 0.5, 0.95])
     one_sided = in_bursts or (high + low - 2.0 * middle) > _MIN_SKEWNESS * max(high - low, 1e-9)
-    own = np.array_split(np.arange(len(delay)), blocks)
-    values = [np.quantile(delay[x], _MIN_DELAY_QUANTILE if one_sided else 0.5) for x in own]
-    return np.array([x[len(x) // 2] for x in own]), np.array(values)
+    bursts = np.array_split(np.arange(len(delay)), blocks)
+    values = [np.quantile(delay[x], _MIN_DELAY_QUANTILE if one_sided else 0.5) for x in bursts]
+    return np.array([x[len(x) // 2] for x in bursts]), np.array(values)
 
 
 def _left(even: np.ndarray, ns: np.ndarray, values: np.ndarray) -> float:

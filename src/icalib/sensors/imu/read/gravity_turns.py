@@ -41,20 +41,20 @@ def _level_force(imu: ImuStream, unit: float, most: int | None = None) -> np.nda
     Windows without readings are left out. None for a recording shorter than one window."""
     t = imu.seconds
     count = int(WINDOW_S * _RATE_HZ)
-    own = np.unique((t[t < WINDOW_S * int(t[-1] / WINDOW_S)] / WINDOW_S).astype(np.int64))
-    if not len(own):
+    windows = np.unique((t[t < WINDOW_S * int(t[-1] / WINDOW_S)] / WINDOW_S).astype(np.int64))
+    if not len(windows):
         return None
-    if most is not None and len(own) > most:
-        own = own[np.linspace(0, len(own) - 1, most).astype(int)]
-    at = ((own * count)[:, None] + np.arange(count)).ravel() / _RATE_HZ
+    if most is not None and len(windows) > most:
+        windows = windows[np.linspace(0, len(windows) - 1, most).astype(int)]
+    at = ((windows * count)[:, None] + np.arange(count)).ravel() / _RATE_HZ
     # The integral of the rates is interpolated, not the rates, so that no rotation between the instants is lost.
     angle = np.zeros((len(t), 3))
     angle[1:] = np.cumsum(0.5 * unit * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(t)[:, None], axis=0)
     turn, force = (
-        np.stack([np.interp(at, t, x[:, k]) for k in range(3)], axis=1).reshape(len(own), count, 3)
+        np.stack([np.interp(at, t, x[:, k]) for k in range(3)], axis=1).reshape(len(windows), count, 3)
         for x in (angle, imu.accel)
     )
-    R = np.tile(np.eye(3), (len(own), 1, 1))
+    R = np.tile(np.eye(3), (len(windows), 1, 1))
     level = np.empty_like(force)
     for k in range(count):
         level[:, k] = np.einsum("nij,nj->ni", R, force[:, k])

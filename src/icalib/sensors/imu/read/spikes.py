@@ -37,9 +37,9 @@ def spikes(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
         good = np.flatnonzero(~bad)
         t, x = seconds[good], values[good]
         for run in _runs(flag[good]):
-            for own in _within(run, len(good)):
-                if _is_wrong(t, x, own):
-                    bad[good[own]] = True
+            for group in _within(run, len(good)):
+                if _is_wrong(t, x, group):
+                    bad[good[group]] = True
                     break
     return bad
 
@@ -117,20 +117,20 @@ def _within(run: tuple[int, int], n: int) -> Iterator[np.ndarray]:
     yield from (np.array([k, k + 1, k + 2]) for k in one[:-2])
 
 
-def _is_wrong(seconds: np.ndarray, values: np.ndarray, own: np.ndarray) -> bool:
-    """True if the readings with indices `own` deviate, do not look like a shock, and their neighbours fit the line
+def _is_wrong(seconds: np.ndarray, values: np.ndarray, group: np.ndarray) -> bool:
+    """True if the readings with indices `group` deviate, do not look like a shock, and their neighbours fit the line
     after their removal."""
-    low, high = max(own[0] - 2 * _HALF_WINDOW, 0), min(own[-1] + 2 * _HALF_WINDOW + 1, len(values))
-    others = np.setdiff1d(np.arange(low, high), own, assume_unique=True)
+    low, high = max(group[0] - 2 * _HALF_WINDOW, 0), min(group[-1] + 2 * _HALF_WINDOW + 1, len(values))
+    others = np.setdiff1d(np.arange(low, high), group, assume_unique=True)
     t, x = seconds[others], values[others]
     off = _off_line(t, x, np.arange(1, len(others) - 1), 1)
     scale = _MAD_TO_SIGMA * np.median(off, axis=0) + 1e-300
-    away = values[own] - np.stack([np.interp(seconds[own], t, x[:, k]) for k in range(3)], axis=1)
+    away = values[group] - np.stack([np.interp(seconds[group], t, x[:, k]) for k in range(3)], axis=1)
     if not (np.abs(away) > _MAX_DEVIATIONS * scale).any(axis=1).all():
         return False
-    edge = own[0] - low
-    if (off[max(edge - 3, 0) : edge + 1 + own[-1] - own[0]] > _MAX_NEIGHBOUR_DEVIATIONS * scale).any():
+    edge = group[0] - low
+    if (off[max(edge - 3, 0) : edge + 1 + group[-1] - group[0]] > _MAX_NEIGHBOUR_DEVIATIONS * scale).any():
         return False
     unit = away / np.linalg.norm(away, axis=1, keepdims=True)
     alike = (unit[1:] * unit[:-1]).sum(axis=1) > _MAX_COSINE
-    return not (alike & (np.diff(own) == 1)).any()
+    return not (alike & (np.diff(group) == 1)).any()

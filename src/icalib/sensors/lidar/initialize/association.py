@@ -55,16 +55,16 @@ def associate(
     """Planes and their points at the state of `motion`. A plane gets the name of the plane in `before` with which it
     shares most points. Raises EstimationError if there is no plane."""
     moved = [in_world(motion, s) for s in streams]
-    found = find_planes(*_thinned(moved), search)
-    if not found.count:
+    planes = find_planes(*_thinned(moved), search)
+    if not planes.count:
         names = " and ".join(s.name for s in streams)
         raise EstimationError(
             f"{names} saw no flat surface of {search.smallest_m2} m^2 or more; record among walls and floors, "
             "or check the point times."
         )
-    plane = tuple(_plane_of_points(found, points, seen_from, search) for points, seen_from in moved)
-    association = PlaneAssociation(_plane_names(found.count, plane, before and before.association), plane)
-    return AssociatedPlanes(association, found.planes.copy())
+    plane = tuple(_plane_of_points(planes, points, origins, search) for points, origins in moved)
+    association = PlaneAssociation(_plane_names(planes.count, plane, before and before.association), plane)
+    return AssociatedPlanes(association, planes.planes.copy())
 
 
 def association_of_streams(streams: Sequence[LidarStream]) -> PlaneAssociation:
@@ -81,8 +81,8 @@ def _thinned(clouds: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, n
     """Points, and the positions from which they were seen, of all clouds together, thinned to at most MOST_POINTS. The
     step is odd, as an even step would select only some lasers of a spinning LiDAR."""
     step = odd_step(sum(len(points) for points, _ in clouds))
-    points, seen_from = zip(*clouds, strict=True)
-    return np.concatenate([p[::step] for p in points]), np.concatenate([s[::step] for s in seen_from])
+    points, origins = zip(*clouds, strict=True)
+    return np.concatenate([p[::step] for p in points]), np.concatenate([s[::step] for s in origins])
 
 
 def odd_step(points: int) -> int:
@@ -91,12 +91,12 @@ def odd_step(points: int) -> int:
 
 
 def _plane_of_points(
-    found: ExtractedPlanes, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch
+    planes: ExtractedPlanes, points: np.ndarray, origins: np.ndarray, search: PlaneSearch
 ) -> np.ndarray:
     """(N,) int32 plane of each point, -1: none; see `ExtractedPlanes.of_points`. Uses two threads."""
     parts = [slice(a, a + POINTS_PER_PART) for a in range(0, len(points), POINTS_PER_PART)]
-    own = in_parallel(lambda part: found.of_points(points[part], seen_from[part], search), parts)
-    return np.concatenate([np.zeros(0, np.int32), *own])
+    numbers = in_parallel(lambda part: planes.of_points(points[part], origins[part], search), parts)
+    return np.concatenate([np.zeros(0, np.int32), *numbers])
 
 
 def _plane_names(count: int, plane: tuple[np.ndarray, ...], before: PlaneAssociation | None) -> tuple[str, ...]:

@@ -61,33 +61,34 @@ def state_from_lidar(inputs: Inputs) -> State:
     Raises EstimationError if a recording does not determine the trajectory.
     """
 
-    def state_of(own: Inputs, held: KnownExtrinsics | None) -> State:
-        with explaining_degeneracy(own.measurements.lidars[:1]):
-            return _single_state(own, held)
+    def state_of(recording: Inputs, extrinsics: KnownExtrinsics | None) -> State:
+        with explaining_degeneracy(recording.measurements.lidars[:1]):
+            return _single_state(recording, extrinsics)
 
     first = inputs.rig.lidars[0]
     return states_from_best(inputs, first, fullest_recording(inputs, first.name), state_of)
 
 
-def _single_state(inputs: Inputs, held: KnownExtrinsics | None = None) -> State:
-    """The initial state of one recording. held: known extrinsics of the LiDAR from another recording."""
+def _single_state(inputs: Inputs, extrinsics: KnownExtrinsics | None = None) -> State:
+    """The initial state of one recording. extrinsics: those known of the LiDAR from another recording."""
     assert inputs.imu is not None
     lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
     try:
         guess, motion = lidar_and_motion(
-            inputs.imu, stream, inputs.rig.gravity, held or known_extrinsics(inputs, lidar)
+            inputs.imu, stream, inputs.rig.gravity, extrinsics or known_extrinsics(inputs, lidar)
         )
     except EstimationError:
         known = known_extrinsics(inputs, lidar, guesses=True)
-        if held is not None or known.rotation is None or known.offset is None:
+        if extrinsics is not None or known.rotation is None or known.offset is None:
             raise
         # The motion is insufficient: the initial guess of the rig file is used as known extrinsics.
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
     # Rotation and offset from angular rates are more accurate than a guess, which would make planes too thick to
     # detect.
     names = ("translation", *known_names(lidar)) if guess.rotation_observable else MOUNTED_NAMES
-    own, known = guess.values(lidar.name), stated_values(inputs, lidar, names)
-    values = start_values(inputs, merged_values(lidar, known, own) if guess.rotation_observable else own | known)
+    estimated, known = guess.values(lidar.name), stated_values(inputs, lidar, names)
+    initial = merged_values(lidar, known, estimated) if guess.rotation_observable else estimated | known
+    values = start_values(inputs, initial)
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
     keyframes = keyframes_for(inputs, keyframe_times(inputs, hosts)[:1])
     rotation, position, velocity = motion.at(keyframes)
@@ -112,15 +113,15 @@ def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[Lidar
     """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points."""
     step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars))
     fewer = _thinned_inputs(inputs, step)
-    found: Sequence[AssociatedPlanes | None] = [None] * len(recordings)
+    associations: Sequence[AssociatedPlanes | None] = [None] * len(recordings)
     shares = []
     for k in range(ASSOCIATION_ROUNDS - 1):
-        fewer, state, found = _associated(fewer, state, k, found)
+        fewer, state, associations = _associated(fewer, state, k, associations)
         shares.append(_share_on_planes(fewer.association))
         state = first_pass(fewer, state)
     before = [
         _unthinned(a, streams, first, step)
-        for a, streams, first in zip(found, recordings, _first_points(recordings), strict=True)
+        for a, streams, first in zip(associations, recordings, _first_points(recordings), strict=True)
     ]
     inputs, state, _ = _associated(inputs, state, ASSOCIATION_ROUNDS - 1, before)
     check_shares(
@@ -135,14 +136,14 @@ def _associated(
     """Association of round k at `state`, without a solve. Returns inputs, state with planes, and the association of
     each recording. before: associations of the previous round, None in the first."""
     noise = max(x.range_noise_m or FIRST_RANGE_SIGMA_M for x in inputs.rig.lidars)
-    found = []
+    associations = []
     for r, streams in enumerate(points_by_recording(inputs)):
         with naming_recording(inputs, r):
-            found.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r]))
-    association = joined_associations([a.association for a in found])
-    planes = np.concatenate([a.planes for a in found])
+            associations.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r]))
+    association = joined_associations([a.association for a in associations])
+    planes = np.concatenate([a.planes for a in associations])
     values = _without_planes(state) | dict(zip(association.keys, planes, strict=True))
-    return with_association(inputs, association), replace(state, values=values), found
+    return with_association(inputs, association), replace(state, values=values), associations
 
 
 def _thinned_inputs(inputs: Inputs, step: int) -> Inputs:
@@ -159,16 +160,16 @@ def _first_points(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
 
 
 def _unthinned(
-    found: AssociatedPlanes | None, streams: tuple[LidarStream, ...], first: np.ndarray, step: int
+    associated: AssociatedPlanes | None, streams: tuple[LidarStream, ...], first: np.ndarray, step: int
 ) -> AssociatedPlanes | None:
-    """The association `found` of points thinned by `step`, expanded to all points of a recording; points that were left
+    """`associated`, of points thinned by `step`, expanded to all points of a recording; points that were left
     out get no plane. first (L,): see `_first_points`."""
-    if found is None:
+    if associated is None:
         return None
     planes = tuple(np.full(len(s.xyz), -1, np.int32) for s in streams)
-    for plane, own, n in zip(planes, found.association.plane, first, strict=True):
-        plane[-n % step :: step] = own
-    return replace(found, association=replace(found.association, plane=planes))
+    for plane, plane_of_thinned, n in zip(planes, associated.association.plane, first, strict=True):
+        plane[-n % step :: step] = plane_of_thinned
+    return replace(associated, association=replace(associated.association, plane=planes))
 
 
 def _share_on_planes(association: PlaneAssociation) -> float:
@@ -233,29 +234,29 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
         known = stated_values(inputs, lidar)
         if len(known) < len(MOUNTED_NAMES):
             k = fullest_recording(inputs, inputs.rig.lidars[i].name)
-            own, motion = single_recording(inputs, k), state_of_recording(inputs, k, state)
-            assert own.imu is not None
-            stream = own.measurements.lidars[i]
+            recording, motion = single_recording(inputs, k), state_of_recording(inputs, k, state)
+            assert recording.imu is not None
+            stream = recording.measurements.lidars[i]
             with naming_recording(inputs, k), explaining_degeneracy([stream]):
-                found = lidar_on_motion(own.imu, stream, motion, known_extrinsics(own, lidar))
-            offsets = np.array([converted_offset(found.offset, lidar.name, own, inputs)])
+                guess = lidar_on_motion(recording.imu, stream, motion, known_extrinsics(recording, lidar))
+            offsets = np.array([converted_offset(guess.offset, lidar.name, recording, inputs)])
             if lidar.clock_restarts:
-                held = KnownExtrinsics(found.rotation, found.position)
-                others = partial(_offset_on_motion, inputs, state, i, held)
-                offsets = offset_of_each_clock(inputs, lidar.name, others, {k: found.offset})
-            known = found.values(lidar.name) | {(lidar.name, "time_offset"): offsets} | known
+                extrinsics = KnownExtrinsics(guess.rotation, guess.position)
+                others = partial(_offset_on_motion, inputs, state, i, extrinsics)
+                offsets = offset_of_each_clock(inputs, lidar.name, others, {k: guess.offset})
+            known = guess.values(lidar.name) | {(lidar.name, "time_offset"): offsets} | known
         out |= known
     return out
 
 
-def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: KnownExtrinsics, recording: int) -> float:
+def _offset_on_motion(inputs: Inputs, state: State, lidar: int, extrinsics: KnownExtrinsics, recording: int) -> float:
     """Time offset [s] of the LiDAR with index `lidar` in one recording, relative to the first stamps of that recording;
-    held: known extrinsics."""
-    own, motion = single_recording(inputs, recording), state_of_recording(inputs, recording, state)
-    assert own.imu is not None
-    stream = own.measurements.lidars[lidar]
+    extrinsics: those known."""
+    single, motion = single_recording(inputs, recording), state_of_recording(inputs, recording, state)
+    assert single.imu is not None
+    stream = single.measurements.lidars[lidar]
     with explaining_degeneracy([stream]):
-        return lidar_on_motion(own.imu, stream, motion, held).offset
+        return lidar_on_motion(single.imu, stream, motion, extrinsics).offset
 
 
 def fitted_planes(inputs: Inputs, state: State, association: PlaneAssociation) -> dict[Key, np.ndarray]:
@@ -293,8 +294,8 @@ def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
     if len(inputs.parts) == 1:
         return [streams]
     scans = [[len(part.measurements.lidars[i].stamps_ns) for part in inputs.parts] for i in range(len(streams))]
-    own = [np.repeat(np.arange(len(n)), n) for n in scans]
+    recording_of_scan = [np.repeat(np.arange(len(n)), n) for n in scans]
     return [
-        tuple(s.some(np.repeat(o == r, np.diff(s.start))) for s, o in zip(streams, own, strict=True))
+        tuple(s.some(np.repeat(o == r, np.diff(s.start))) for s, o in zip(streams, recording_of_scan, strict=True))
         for r in range(len(inputs.parts))
     ]

@@ -42,8 +42,8 @@ def n_directions(stream: LidarStream) -> int:
     """Number of directions, 1 to 3, that flat surfaces face in most scans; 0 if few scans have flat surfaces."""
     filled = np.flatnonzero(np.diff(stream.start) > 0)
     some = filled[np.linspace(0, len(filled) - 1, min(N_SAMPLED_SCANS, len(filled))).astype(np.int64)]
-    found = [shares for i in some if (shares := _scan_shares(stream, int(i))) is not None]
-    return count_directions(np.median(found, axis=0)) if len(found) >= MIN_PLANAR_SCANS else 0
+    shares = [s for i in some if (s := _scan_shares(stream, int(i))) is not None]
+    return count_directions(np.median(shares, axis=0)) if len(shares) >= MIN_PLANAR_SCANS else 0
 
 
 def count_directions(shares: np.ndarray) -> int:
@@ -58,8 +58,8 @@ def _scan_shares(stream: LidarStream, scan: int) -> np.ndarray | None:
     xyz = xyz[np.isfinite(size2) & (size2 > 0.0)]
     xyz = xyz[:: -(-len(xyz) // MAX_SAMPLED_POINTS) | 1]
     voxels = VoxelMap.empty(NORMAL_VOXEL_M, MAX_NORMAL_VOXELS)
-    here = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    insert(voxels, here, xyz, np.zeros(len(xyz)), 0, 1.0)
+    identity = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    insert(voxels, identity, xyz, np.zeros(len(xyz)), 0, 1.0)
     normal, weight = voxels.normal[voxels.flat], voxels.weight[voxels.flat]
     return normal_shares(normal, weight) if len(normal) else None
 

@@ -41,28 +41,32 @@ SAME_ALIGNMENT_RAD, SAME_ALIGNMENT_S = 5e-3, 1e-3
 
 
 def lidar_and_motion(
-    imu: ImuData, stream: LidarStream, gravity: float, held: KnownExtrinsics = NOTHING_KNOWN
+    imu: ImuData, stream: LidarStream, gravity: float, extrinsics: KnownExtrinsics = NOTHING_KNOWN
 ) -> tuple[ExtrinsicsGuess, ImuTrajectory]:
-    """Extrinsics and IMU trajectory from one LiDAR and the IMU. gravity [m/s^2]; held: known extrinsics. Raises
+    """Extrinsics and IMU trajectory from one LiDAR and the IMU. gravity [m/s^2]; extrinsics: those known. Raises
     EstimationError if the recording does not determine them."""
-    aligned, trajectory, rates = _aligned(imu, stream.name, sampled_scans(stream), held)
-    found = fit_imu_trajectory(imu, trajectory, rates, aligned, gravity, held)
-    if found is None:
+    aligned, trajectory, rates = _aligned(imu, stream.name, sampled_scans(stream), extrinsics)
+    fit = fit_imu_trajectory(imu, trajectory, rates, aligned, gravity, extrinsics)
+    if fit is None:
         raise _too_short(stream)
-    _check_axes(stream.name, imu.name, found.unexplained > MIN_MIRRORED_SHARE)
-    _check_gravity(found.gravity, gravity, imu.name, stream.name)
-    return found.guess, found.motion
+    _check_axes(stream.name, imu.name, fit.unexplained > MIN_MIRRORED_SHARE)
+    _check_gravity(fit.gravity, gravity, imu.name, stream.name)
+    return fit.guess, fit.motion
 
 
 def lidar_on_motion(
-    imu: ImuData, stream: LidarStream, known: State, held: KnownExtrinsics = NOTHING_KNOWN
+    imu: ImuData, stream: LidarStream, known: State, extrinsics: KnownExtrinsics = NOTHING_KNOWN
 ) -> ExtrinsicsGuess:
-    """Extrinsics and time offset given the IMU trajectory `known`, with keyframes at most about 50 ms apart. held:
-    known extrinsics. Raises EstimationError if the recording does not determine them."""
+    """Extrinsics and time offset given the IMU trajectory `known`, with keyframes at most about 50 ms apart.
+    extrinsics: those known. Raises EstimationError if the recording does not determine them."""
     scans = sampled_scans(stream)
-    aligned, free, rates = _aligned(imu, stream.name, scans, held)
-    guess = ExtrinsicsGuess(aligned.rotation, np.zeros(3) if held.position is None else held.position, aligned.offset)
-    prior = lever_arm_prior(np.zeros(0), rates.rate, DISPLACEMENT_SIGMA_M, held.rotation is not None, held.position)
+    aligned, free, rates = _aligned(imu, stream.name, scans, extrinsics)
+    guess = ExtrinsicsGuess(
+        aligned.rotation, np.zeros(3) if extrinsics.position is None else extrinsics.position, aligned.offset
+    )
+    prior = lever_arm_prior(
+        np.zeros(0), rates.rate, DISPLACEMENT_SIGMA_M, extrinsics.rotation is not None, extrinsics.position
+    )
     gyro = GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0))
 
     def fitted(trajectory: SensorTrajectory, now: ExtrinsicsGuess) -> ExtrinsicsGuess:
@@ -70,13 +74,13 @@ def lidar_on_motion(
         trajectory = trajectory.only(trajectory.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
         R, p = imu_poses_at(known, gyro, trajectory.seconds + now.offset)
         system = system_from_trajectory(R, p, trajectory.seconds, trajectory.rotation, trajectory.position)
-        found = solve_lever_arm(system, prior, now.rotation, rates.rate)
-        if found is None:
+        solution = solve_lever_arm(system, prior, now.rotation, rates.rate)
+        if solution is None:
             raise _too_short(stream)
-        _check_axes(stream.name, imu.name, is_mirrored(system, *found))
-        return ExtrinsicsGuess(found[0], found[1][3:6], aligned.offset)
+        _check_axes(stream.name, imu.name, is_mirrored(system, *solution))
+        return ExtrinsicsGuess(solution[0], solution[1][3:6], aligned.offset)
 
-    if held.rotation is None and only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is not None:
+    if extrinsics.rotation is None and only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is not None:
         # Rates about one axis do not determine the rotation about it: it comes from the known trajectory first.
         guess = fitted(free, guess)
     for _ in range(LEVER_ARM_ROUNDS):
@@ -100,14 +104,14 @@ def _trajectory_near(
 
 
 def _aligned(
-    imu: ImuData, name: str, scans: list[Scan], held: KnownExtrinsics
+    imu: ImuData, name: str, scans: list[Scan], extrinsics: KnownExtrinsics
 ) -> tuple[RateAlignment, SensorTrajectory, SensorRates]:
     """Alignment with the gyroscope: time offset, rotation and gyroscope bias. Also the LiDAR trajectory with rotations
     from the gyroscope, while the IMU was running; and the angular rates of this trajectory."""
-    first = align_trajectory(imu, name, _rates(name, lidar_trajectory(name, scans, single_map=False)), held)
+    first = align_trajectory(imu, name, _rates(name, lidar_trajectory(name, scans, single_map=False)), extrinsics)
     trajectory = _trajectory_with_gyro(imu, name, scans, first)
     rates = _rates(name, trajectory)
-    aligned = align_trajectory(imu, name, rates, held)
+    aligned = align_trajectory(imu, name, rates, extrinsics)
     if not _is_same(first, aligned):
         trajectory = _trajectory_with_gyro(imu, name, scans, aligned)
     t = trajectory.seconds + aligned.offset

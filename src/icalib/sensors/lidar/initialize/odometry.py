@@ -135,8 +135,8 @@ def _share_on_lines(scan: Scan, edge_m: float) -> float:
 
 def _sampled_scan(stream: LidarStream, i: int) -> Scan:
     """Scan i of the stream, thinned."""
-    own = slice(int(stream.start[i]), int(stream.start[i + 1]))
-    offset, xyz = stream.offset_s[own], stream.xyz[own]
+    rows = slice(int(stream.start[i]), int(stream.start[i + 1]))
+    offset, xyz = stream.offset_s[rows], stream.xyz[rows]
     if not len(offset):
         return Scan(float(stream.seconds[i]), np.empty((0, 3)), np.empty(0))
     middle = 0.5 * (float(offset.min()) + float(offset.max()))
@@ -186,9 +186,9 @@ class _KnownSteps:
         step = None if position_at is None else np.diff(p := position_at(seconds), axis=0, prepend=p[:1])
         return cls(back @ R, None if step is None else np.einsum("nij,nj->ni", back, step))
 
-    def part(self, own: slice) -> _KnownSteps:
-        """The steps of the scans `own`."""
-        return _KnownSteps(*(None if x is None else x[own] for x in (self.rotation, self.translation)))
+    def part(self, scans: slice) -> _KnownSteps:
+        """The steps of a slice of the scans."""
+        return _KnownSteps(*(None if x is None else x[scans] for x in (self.rotation, self.translation)))
 
 
 def _track_in_several_maps(scans: list[Scan], known: _KnownSteps, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
@@ -196,11 +196,11 @@ def _track_in_several_maps(scans: list[Scan], known: _KnownSteps, edge_m: float)
     threads."""
     n, seconds = len(scans), np.array([s.middle for s in scans])
     parts = [slice(0, n)] if n < MIN_SCANS_FOR_TWO_MAPS else [slice(0, n // 2), slice(n // 2, n)]
-    found = _track_parts(scans, known, edge_m, parts, False)
-    ok = np.concatenate([fits for _, fits in found])
-    for own in parts[1:]:
-        ok[own] &= seconds[own] > seconds[own.start - 1] + MAX_SCAN_STEP_S
-    return [pose for poses, _ in found for pose in poses], ok
+    tracks = _track_parts(scans, known, edge_m, parts, False)
+    ok = np.concatenate([fits for _, fits in tracks])
+    for part in parts[1:]:
+        ok[part] &= seconds[part] > seconds[part.start - 1] + MAX_SCAN_STEP_S
+    return [pose for poses, _ in tracks for pose in poses], ok
 
 
 def _track_in_single_map(scans: list[Scan], known: _KnownSteps, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
@@ -222,21 +222,21 @@ def _track_parts(
 ) -> list[tuple[list[ScanPose], np.ndarray]]:
     """Poses, and a mask of valid ones, for each part; one thread per part."""
 
-    def track(own: slice) -> tuple[list[ScanPose], np.ndarray]:
-        return _MapTracker(scans[own], known.part(own), edge_m, single_map).track()
+    def track(part: slice) -> tuple[list[ScanPose], np.ndarray]:
+        return _MapTracker(scans[part], known.part(part), edge_m, single_map).track()
 
     with ThreadPoolExecutor(len(parts)) as pool:
         return list(pool.map(track, parts))
 
 
-def _joined(here: list[ScanPose], there: list[ScanPose], others: list[ScanPose]) -> list[ScanPose]:
-    """Poses `others` in the second map, transformed to the first. here, there: poses of the same scans in the first and
-    in the second map."""
+def _joined(first: list[ScanPose], second: list[ScanPose], others: list[ScanPose]) -> list[ScanPose]:
+    """Poses `others` in the second map, transformed to the first. first, second: poses of the same scans in the first
+    and in the second map."""
     u, _, vt = np.linalg.svd(
-        sum((a.rotation @ b.rotation.T for a, b in zip(here, there, strict=True)), np.zeros((3, 3)))
+        sum((a.rotation @ b.rotation.T for a, b in zip(first, second, strict=True)), np.zeros((3, 3)))
     )
     R = u @ vt  # chordal mean; its determinant is 1, as the rotations are near one another
-    p = np.mean([a.position - R @ b.position for a, b in zip(here, there, strict=True)], axis=0)
+    p = np.mean([a.position - R @ b.position for a, b in zip(first, second, strict=True)], axis=0)
     return [ScanPose(R @ x.rotation, p + R @ x.position, x.rate, R @ x.velocity) for x in others]
 
 

@@ -28,7 +28,7 @@ MAX_GROUPS, MIN_GROUPS = 200, 10
 MIN_OCCUPIED_SHARE = 0.8  # share of the groups with a point in a voxel of the robot
 MIN_STEP_M, MIN_STEP_RAD = 0.2, 0.2  # motion of the LiDAR between groups; at rest all voxels seem occupied
 WORLD_VOXEL_M = 0.2  # edge of the voxels in the world; twice ROBOT_VOXEL_M, as odometry errs by centimetres
-MIN_SEEN_FROM_FAR = 0.5  # share of the world places of a voxel; a larger one means scene, not robot
+MIN_SHARE_FROM_FAR = 0.5  # share of the world places of a voxel; a larger one means scene, not robot
 MAX_FAR_POINTS = 1_000_000  # far points that are compared with these places; bounds the memory
 MIN_SELF_RETURN_SHARE = 1e-3  # of all points; fewer are rejected by the robust loss
 MAX_MEAN_DIRECTION = 0.3  # length of the mean of unit directions; directions with a shorter mean are "on all sides"
@@ -39,10 +39,10 @@ def without_self_returns(recording: Measurements) -> Measurements:
     planes is left as it is."""
     lidars, warnings = [], list(recording.warnings)
     for stream in recording.lidars:
-        own = None if (stream.plane >= 0).any() else self_returns_of(stream)
-        if own is not None:
-            warnings.append(_warning(stream, own))
-            stream = stream.some(~own)
+        self_returns = None if (stream.plane >= 0).any() else self_returns_of(stream)
+        if self_returns is not None:
+            warnings.append(_warning(stream, self_returns))
+            stream = stream.some(~self_returns)
         lidars.append(stream)
     return replace(recording.with_streams(*lidars), warnings=tuple(warnings))
 
@@ -54,9 +54,9 @@ def self_returns_of(stream: LidarStream) -> np.ndarray | None:
     robot = _robot_voxels(middle, near)
     if robot is None:
         return None
-    whole, own = near if middle is stream else _NearPoints.of(stream), np.zeros(len(stream.xyz), dtype=bool)
-    own[whole.point[robot[whole.voxel]]] = True
-    return own if np.count_nonzero(own) >= MIN_SELF_RETURN_SHARE * len(own) else None
+    all_near, self_returns = near if middle is stream else _NearPoints.of(stream), np.zeros(len(stream.xyz), dtype=bool)
+    self_returns[all_near.point[robot[all_near.voxel]]] = True
+    return self_returns if np.count_nonzero(self_returns) >= MIN_SELF_RETURN_SHARE * len(self_returns) else None
 
 
 def _middle_scans(stream: LidarStream) -> LidarStream:
@@ -84,7 +84,7 @@ def _robot_voxels(stream: LidarStream, near: _NearPoints) -> np.ndarray | None:
     if len(groups) < MIN_GROUPS:
         return None
     occupied = near.occupied(groups)
-    return _dilated(occupied & ~_seen_from_far(stream, trajectory, near, groups, occupied))
+    return _dilated(occupied & ~_visible_from_far(stream, trajectory, near, groups, occupied))
 
 
 @dataclass(frozen=True)
@@ -120,10 +120,10 @@ class _NearPoints:
         """(N_ROBOT_VOXELS,) bool: most of `groups` (g,) have a point in the voxel."""
         number = np.full(self.groups + 1, -1)
         number[groups] = np.arange(len(groups))
-        own = number[self.group]
-        seen = np.zeros((N_ROBOT_VOXELS, len(groups)), dtype=bool)
-        seen[self.voxel[own >= 0], own[own >= 0]] = True
-        return seen.sum(axis=1) >= max(MIN_OCCUPIED_SHARE * len(groups), 1.0)
+        column = number[self.group]
+        occupied = np.zeros((N_ROBOT_VOXELS, len(groups)), dtype=bool)
+        occupied[self.voxel[column >= 0], column[column >= 0]] = True
+        return occupied.sum(axis=1) >= max(MIN_OCCUPIED_SHARE * len(groups), 1.0)
 
 
 def _trajectory_without(stream: LidarStream, excluded: np.ndarray) -> SensorTrajectory | None:
@@ -160,17 +160,20 @@ def _moving_groups(trajectory: SensorTrajectory, at: np.ndarray) -> np.ndarray:
     return np.array(chosen, dtype=np.int64)
 
 
-def _seen_from_far(
+def _visible_from_far(
     stream: LidarStream, trajectory: SensorTrajectory, near: _NearPoints, groups: np.ndarray, occupied: np.ndarray
 ) -> np.ndarray:
     """(N_ROBOT_VOXELS,) bool: most places of the world that an occupied voxel passed in `groups` (g,) are also seen by
     the LiDAR from beyond ROBOT_RADIUS_M."""
-    own = np.isin(near.group, groups) & occupied[near.voxel]
+    near_points = np.isin(near.group, groups) & occupied[near.voxel]
     far = np.flatnonzero(np.einsum("na,na->n", stream.xyz, stream.xyz) > np.float32(ROBOT_RADIUS_M) ** 2)
     far = far[:: -(-len(far) // MAX_FAR_POINTS) | 1]
-    seen = np.isin(_world_voxels(stream, trajectory, near.point[own]), _world_voxels(stream, trajectory, far))
-    times, of_them = (np.bincount(near.voxel[own], weights=w, minlength=N_ROBOT_VOXELS) for w in (None, seen))
-    return of_them >= MIN_SEEN_FROM_FAR * np.maximum(times, 1)
+    voxel = near.voxel[near_points]
+    visible = np.isin(
+        _world_voxels(stream, trajectory, near.point[near_points]), _world_voxels(stream, trajectory, far)
+    )
+    n_places, n_visible = (np.bincount(voxel, weights=w, minlength=N_ROBOT_VOXELS) for w in (None, visible))
+    return n_visible >= MIN_SHARE_FROM_FAR * np.maximum(n_places, 1)
 
 
 def _world_voxels(stream: LidarStream, trajectory: SensorTrajectory, point: np.ndarray) -> np.ndarray:
@@ -189,9 +192,9 @@ def _dilated(voxels: np.ndarray) -> np.ndarray:
     return grid.ravel()
 
 
-def _warning(stream: LidarStream, own: np.ndarray) -> str:
-    """The warning on self-returns `own` (N,) bool: their share, distance and direction."""
-    xyz = stream.xyz[own].astype(np.float64)
+def _warning(stream: LidarStream, self_returns: np.ndarray) -> str:
+    """The warning on self-returns `self_returns` (N,) bool: their share, distance and direction."""
+    xyz = stream.xyz[self_returns].astype(np.float64)
     distance = np.linalg.norm(xyz, axis=1)
     low, high = np.percentile(distance, [1.0, 99.0])
     x, y, z = (xyz / distance[:, None]).mean(axis=0)
@@ -200,7 +203,7 @@ def _warning(stream: LidarStream, own: np.ndarray) -> str:
     if np.linalg.norm([x, y, z]) < MAX_MEAN_DIRECTION:
         where = "on all sides"
     return (
-        f"{stream.name} has self-returns: {own.mean():.1%} of its points move with its frame, {low:.2f} to "
+        f"{stream.name} has self-returns: {self_returns.mean():.1%} of its points move with its frame, {low:.2f} to "
         f"{high:.2f} m away, {where}. They were removed; to remove them by distance instead, set min_range of "
         f"{stream.name} to {high + 0.1:.1f} in the rig file, or mask them in its driver."
     )

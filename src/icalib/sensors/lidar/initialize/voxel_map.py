@@ -95,11 +95,11 @@ def _slot(key, i, j, k):
     """Slot of voxel (i, j, k) in the hash table, or the empty slot for it; and its key. Voxels that differ in k only
     are neighbours in the table, as searches visit them together."""
     column = ((i + MAX_VOXEL_INDEX) << 21) + (j + MAX_VOXEL_INDEX)
-    own, mask = (column << 21) + (k + MAX_VOXEL_INDEX), len(key) - 1
+    voxel_key, mask = (column << 21) + (k + MAX_VOXEL_INDEX), len(key) - 1
     s = (((column * 0x9E3779B97F4A7C1) >> 20) + k) & mask
-    while key[s] != own and key[s] != -1:
+    while key[s] != voxel_key and key[s] != -1:
         s = (s + 1) & mask
-    return s, own
+    return s, voxel_key
 
 
 @njit(cache=True, nogil=True)
@@ -127,11 +127,11 @@ def insert(voxels, pose, xyz, tau, scan, decay):
         i, j, k = _index(y[0], voxels), _index(y[1], voxels), _index(y[2], voxels)
         if max(abs(i), abs(j), abs(k)) >= MAX_VOXEL_INDEX - 1:
             continue
-        s, own = _slot(voxels.key, i, j, k)
+        s, voxel_key = _slot(voxels.key, i, j, k)
         if voxels.key[s] == -1:
             if voxels.size[0] == len(voxels.weight):
                 continue
-            voxels.key[s], voxels.row[s] = own, voxels.size[0]
+            voxels.key[s], voxels.row[s] = voxel_key, voxels.size[0]
             v = voxels.size[0]
             voxels.size[0] += 1
             for a, index in enumerate((i, j, k)):
@@ -180,7 +180,7 @@ def _planar_voxel_at(voxels, y, around):
     i0, j0, k0 = _index(y[0], voxels), _index(y[1], voxels), _index(y[2], voxels)
     if max(abs(i0), abs(j0), abs(k0)) >= MAX_VOXEL_INDEX - 2:
         return -1
-    found, least = -1, np.inf
+    nearest, least = -1, np.inf
     for i in range(i0 - around, i0 + around + 1):
         for j in range(j0 - around, j0 + around + 1):
             for k in range(k0 - around, k0 + around + 1):
@@ -192,8 +192,8 @@ def _planar_voxel_at(voxels, y, around):
                 for a in range(3):
                     d += (y[a] - voxels.centre[v, a]) ** 2
                 if d < least:
-                    found, least = v, d
-    return found
+                    nearest, least = v, d
+    return nearest
 
 
 @njit(cache=True, nogil=True, inline="always")

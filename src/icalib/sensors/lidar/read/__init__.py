@@ -45,13 +45,13 @@ TABLES = (TableFile("scans.npz", "scans", "points", _stamps),)
 def read(recording: Recording, sensors: Sequence[Lidar], reading: Reading) -> list[ReadStream]:
     """The checked stream of each LiDAR, with notes for the user. Raises RecordingError as `scans` and
     `checked_lidar`."""
-    found = []
+    streams = []
     for sensor in sensors:
         where = recording.where(sensor)
         # Checked before the cut, which would take a single wrong stamp for a jump of the clock.
         stream, notes = checked_lidar(scans(recording, sensor), where)
-        found.append((reading.cut(stream, f"{where} ({sensor.name})"), notes))
-    return found
+        streams.append((reading.cut(stream, f"{where} ({sensor.name})"), notes))
+    return streams
 
 
 def scans(recording: Recording, sensor: Lidar) -> LidarStream:

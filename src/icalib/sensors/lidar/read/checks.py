@@ -89,8 +89,8 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
         start = np.append(stream.start[:-1][filled], stream.start[-1])
         stream = LidarStream(stream.name, stream.stamps_ns[filled], start, stream.offset_s, stream.xyz, stream.plane)
     for check in (without_repeats, in_order, at_even_steps):
-        stream, found = check(stream, what)
-        notes += found
+        stream, more = check(stream, what)
+        notes += more
     if len(stream.stamps_ns) < 2:
         raise RecordingError(
             f"{what}: all scans are the same; the LiDAR or its driver froze; restart it, and record again."
@@ -98,8 +98,8 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
     sentence = rate_sentence(what, stream.stamps_ns, *_SCAN_RATE_HZ)
     if sentence:
         raise RecordingError(sentence)
-    stream, found = _near_their_stamps(stream, what)
-    return stream, notes + found
+    stream, more = _near_their_stamps(stream, what)
+    return stream, notes + more
 
 
 def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:

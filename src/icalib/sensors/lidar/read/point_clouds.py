@@ -106,18 +106,18 @@ def timing_fields(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tupl
 def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:
     """Clouds up to the one that is number _N_TIMING_CLOUDS with points. Raises RecordingError if fewer than two have
     points."""
-    found: list[PointCloud] = []
+    first: list[PointCloud] = []
     filled = 0
     for cloud in clouds:
-        found.append(cloud)
+        first.append(cloud)
         filled += len(cloud.points) > 0
         if filled == _N_TIMING_CLOUDS:
-            return found
+            return first
     if filled < 2:
         raise RecordingError(
-            f"{what}: {filled} of {len(found)} clouds have points; check the driver, and record again."
+            f"{what}: {filled} of {len(first)} clouds have points; check the driver, and record again."
         )
-    return found
+    return first
 
 
 def _with_usual_fields(clouds: Sequence[PointCloud]) -> tuple[list[PointCloud], frozenset[str]]:

@@ -173,8 +173,8 @@ def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
             )
         return given
     known = [f for f in FIELDS if f in names]
-    if found := [f for f in known if f in differs]:
-        return found[0]
+    if usable := [f for f in known if f in differs]:
+        return usable[0]
     if likely := likely_fields(scans):
         raise RecordingError(
             f"{what}: the points have no field of times that icalib knows ({listed}); {likely[0]} looks like one: set "
@@ -193,12 +193,12 @@ def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
     )
 
 
-def _usual_unit(field: str, whole: bool) -> TimeUnit:
+def _usual_unit(field: str, are_integers: bool) -> TimeUnit:
     """The unit in the name of the field, else ns for whole numbers and s for others."""
     for unit in UNIT_NS:
         if field.endswith(f"_{unit}"):
             return unit
-    return "ns" if whole else "s"
+    return "ns" if are_integers else "s"
 
 
 def _differing(scans: Sequence[np.ndarray]) -> list[str]:

@@ -99,8 +99,8 @@ def _is_off(stream: LidarStream, i: int, late_ns: float) -> bool:
     around = range(i - 1, i + 2)
     ends = [np.percentile(stream.offset_s[stream.start[k] : stream.start[k + 1]], _SCAN_ENDS_PERCENT) for k in around]
     stamps = stream.stamps_ns[i - 1 : i + 2] - stream.stamps_ns[i]
-    before, own, after = (stamp + 1e9 * end for stamp, end in zip(stamps, ends, strict=True))
-    off = own - 0.5 * (before + after)
+    before, scan, after = (stamp + 1e9 * end for stamp, end in zip(stamps, ends, strict=True))
+    off = scan - 0.5 * (before + after)
     return bool((off > late_ns).all() or (off < -late_ns).all())
 
 
@@ -162,7 +162,7 @@ def _longest_increasing(stamps_ns: np.ndarray) -> np.ndarray:
         length = bisect_left(tails, value)
         before[i] = at[length - 1] if length else -1
         tails[length : length + 1], at[length : length + 1] = [value], [i]
-    found = [at[-1]]
-    while before[found[-1]] >= 0:
-        found.append(int(before[found[-1]]))
-    return np.array(found[::-1])
+    chain = [at[-1]]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])

@@ -27,16 +27,16 @@ def read_scans(name: str, path: Path) -> LidarStream:
     if missing:
         raise RecordingError(f"{path} has no array {missing[0]}; it needs {', '.join(_REQUIRED)}.")
     kinds = _REQUIRED | _OPTIONAL
-    found = {n: _of_kind(path, n, array, kinds[n]) for n, array in arrays.items()}
-    if "plane" in found and not _are_planes(arrays["plane"]):
+    checked = {n: _of_kind(path, n, array, kinds[n]) for n, array in arrays.items()}
+    if "plane" in checked and not _are_planes(arrays["plane"]):
         raise RecordingError(
             f"{path}: plane must be -1 or a plane's number, from 0 up and below the number of points; correct "
             "the program that writes it."
         )
-    if "plane" not in found:
-        found["plane"] = np.full(len(found["xyz"]), -1, np.int32)
+    if "plane" not in checked:
+        checked["plane"] = np.full(len(checked["xyz"]), -1, np.int32)
     try:
-        return LidarStream(name, *(found[n] for n in kinds))
+        return LidarStream(name, *(checked[n] for n in kinds))
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
 

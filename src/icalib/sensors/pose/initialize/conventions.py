@@ -104,11 +104,11 @@ def with_checked_convention(
     rotation (3, 3) from the frame of positions to that of rotations, or None. Raises EstimationError as `place` does,
     or if the poses fit far better with another convention.
     """
-    found: T | None = None
+    result: T | None = None
     failed: EstimationError | None = None
     unexplained = 1.0
     try:
-        found, unexplained = place(stream)
+        result, unexplained = place(stream)
     except EstimationError as error:
         failed = error
     if unexplained > MAX_UNEXPLAINED:
@@ -117,10 +117,10 @@ def with_checked_convention(
         for words, convert in CONVENTIONS:
             if _unexplained(place, convert(stream)) < most:
                 raise EstimationError(f"the poses of {stream.name} {words}.") from failed
-    if found is None:
+    if result is None:
         assert failed is not None
         raise failed
-    return found
+    return result
 
 
 def _refuse_two_frames(

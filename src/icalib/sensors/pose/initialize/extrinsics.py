@@ -88,33 +88,33 @@ def _aligned_values(inputs: Inputs, state: State, sensor: PoseSensor, stream: Po
     """Extrinsics and time offsets of a sensor, given the trajectory in `state`. If its clock restarts with each
     recording, the extrinsics come from the recording with most poses."""
     assert inputs.imu is not None
-    held = known_extrinsics(inputs, sensor)
+    extrinsics = known_extrinsics(inputs, sensor)
     if not sensor.clock_restarts:
-        known = {"known": state, "held": held}
+        known = {"known": state, "extrinsics": extrinsics}
         rotation_of = partial(_position_rotation_on_trajectory, inputs.imu, **known)
         place = partial(_fit_to_trajectory, inputs.imu, **known)
         return with_checked_convention(stream, place, rotation_of).values(sensor.name)
     streams = [_imu_and_poses(inputs, k, sensor.name) for k in range(len(inputs.parts))]
     k = fullest_recording(inputs, sensor.name)
-    imu, own = streams[k]
+    imu, poses = streams[k]
     with naming_recording(inputs, k):
-        known = {"known": state_of_recording(inputs, k, state), "held": held}
+        known = {"known": state_of_recording(inputs, k, state), "extrinsics": extrinsics}
         rotation_of = partial(_position_rotation_on_trajectory, imu, **known)
-        found = with_checked_convention(own, partial(_fit_to_trajectory, imu, **known), rotation_of)
+        guess = with_checked_convention(poses, partial(_fit_to_trajectory, imu, **known), rotation_of)
 
     def offset(recording: int) -> float:
-        return _aligned(*streams[recording], KnownExtrinsics(found.rotation))[0].offset
+        return _aligned(*streams[recording], KnownExtrinsics(guess.rotation))[0].offset
 
-    offsets = offset_of_each_clock(inputs, sensor.name, offset, {k: found.offset})
-    return found.values(sensor.name) | {(sensor.name, "time_offset"): offsets}
+    offsets = offset_of_each_clock(inputs, sensor.name, offset, {k: guess.offset})
+    return guess.values(sensor.name) | {(sensor.name, "time_offset"): offsets}
 
 
 def _imu_and_poses(inputs: Inputs, recording: int, sensor: str) -> tuple[ImuData, PoseStream]:
     """Readings of the IMU, and poses of a sensor, in one recording."""
-    own = single_recording(inputs, recording)
-    stream = own.stream(sensor)
-    assert own.imu is not None and isinstance(stream, PoseStream)
-    return own.imu, stream
+    single = single_recording(inputs, recording)
+    stream = single.stream(sensor)
+    assert single.imu is not None and isinstance(stream, PoseStream)
+    return single.imu, stream
 
 
 def state_from_poses(inputs: Inputs) -> State:
@@ -126,20 +126,21 @@ def state_from_poses(inputs: Inputs) -> State:
     return states_from_best(inputs, sensor, fullest_recording(inputs, sensor.name), _single_state)
 
 
-def _single_state(inputs: Inputs, held: KnownExtrinsics | None) -> State:
-    """The initial state of one recording. held: extrinsics of the sensor known from another recording, or None."""
+def _single_state(inputs: Inputs, extrinsics: KnownExtrinsics | None) -> State:
+    """The initial state of one recording. extrinsics: those known of the sensor from another recording,
+    or None."""
     assert inputs.imu is not None
     sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
-    known = held or known_extrinsics(inputs, sensor)
-    found = with_checked_convention(
+    known = extrinsics or known_extrinsics(inputs, sensor)
+    fit = with_checked_convention(
         stream, lambda x: _fit_to_imu(imu, x, gravity, known), lambda x: _position_rotation_by_imu(imu, x, known)
     )
-    own = merged_values(sensor, stated_values(inputs, sensor), found.guess.values(sensor.name))
-    values = start_values(inputs, own)
+    mounted = merged_values(sensor, stated_values(inputs, sensor), fit.guess.values(sensor.name))
+    values = start_values(inputs, mounted)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
     keyframes = keyframes_for(inputs, keyframe_times(inputs, hosts))
-    rotation, position, velocity = found.motion.at(keyframes)
-    return State(keyframes, rotation, position, velocity, np.tile(found.motion.bias, (len(keyframes), 1)), values)
+    rotation, position, velocity = fit.motion.at(keyframes)
+    return State(keyframes, rotation, position, velocity, np.tile(fit.motion.bias, (len(keyframes), 1)), values)
 
 
 def pose_rates(stream: PoseStream) -> SensorRates:
@@ -165,44 +166,46 @@ def _trajectory(stream: PoseStream) -> SensorTrajectory:
     )
 
 
-def _aligned(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> tuple[RateAlignment, SensorRates]:
-    """Alignment of the sensor's angular rates with the gyroscope, and these rates. held: known extrinsics."""
+def _aligned(imu: ImuData, stream: PoseStream, extrinsics: KnownExtrinsics) -> tuple[RateAlignment, SensorRates]:
+    """Alignment of the sensor's angular rates with the gyroscope, and these rates. extrinsics: those known."""
     rates = pose_rates(stream)
-    return align_trajectory(imu, stream.name, rates, held), rates
+    return align_trajectory(imu, stream.name, rates, extrinsics), rates
 
 
-def _fit_to_imu(imu: ImuData, stream: PoseStream, gravity: float, held: KnownExtrinsics) -> tuple[TrajectoryFit, float]:
+def _fit_to_imu(
+    imu: ImuData, stream: PoseStream, gravity: float, extrinsics: KnownExtrinsics
+) -> tuple[TrajectoryFit, float]:
     """Extrinsics and IMU trajectory from poses and IMU, and the share of the motion that they do not explain. Raises
     EstimationError if poses and IMU contradict each other, or poses are too few."""
-    aligned, rates = _aligned(imu, stream, held)
+    aligned, rates = _aligned(imu, stream, extrinsics)
     trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
     trajectory = trajectory.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
     gyro, R_is = GyroRotation.integrate(imu, aligned.gyro_bias), aligned.rotation
     trajectory = replace(
         trajectory, rotation=gyro.smoothed(trajectory.seconds + aligned.offset, trajectory.rotation @ R_is.T) @ R_is
     )
-    found = fit_imu_trajectory(imu, trajectory, rates, aligned, gravity, held)
-    if found is None:
+    fit = fit_imu_trajectory(imu, trajectory, rates, aligned, gravity, extrinsics)
+    if fit is None:
         raise too_few_poses(stream.name)
-    off = abs(found.gravity / gravity - 1.0)
+    off = abs(fit.gravity / gravity - 1.0)
     if off <= MAX_GRAVITY_ERROR:
-        _check_scale(imu, stream.name, trajectory, aligned, found)
+        _check_scale(imu, stream.name, trajectory, aligned, fit)
     if off > TRAJECTORY_GRAVITY_TOLERANCE:
         raise EstimationError(
-            f"{imu.name} and {stream.name} together give a gravity of {found.gravity:.3g} m/s^2 instead of "
+            f"{imu.name} and {stream.name} together give a gravity of {fit.gravity:.3g} m/s^2 instead of "
             f"{gravity:.3g}; check that the accelerometer is in m/s^2, not in g (accel_unit), and the "
             f"positions of {stream.name} in metres."
         )
     step = max(1, round(FIT_STEP_S / float(np.median(np.diff(trajectory.seconds)))))
     apart = fit_imu_trajectory(
-        imu, trajectory.only(np.arange(len(trajectory.seconds)) % step == 0), rates, aligned, gravity, held
+        imu, trajectory.only(np.arange(len(trajectory.seconds)) % step == 0), rates, aligned, gravity, extrinsics
     )
-    return found, 0.0 if apart is None else apart.unexplained
+    return fit, 0.0 if apart is None else apart.unexplained
 
 
-def _position_rotation_by_imu(imu: ImuData, stream: PoseStream, held: KnownExtrinsics) -> np.ndarray | None:
+def _position_rotation_by_imu(imu: ImuData, stream: PoseStream, extrinsics: KnownExtrinsics) -> np.ndarray | None:
     """`rotation_of_positions` with the readings of the IMU as reference."""
-    aligned, _ = _aligned(imu, stream, held)
+    aligned, _ = _aligned(imu, stream, extrinsics)
     trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
     trajectory = trajectory.only((t > imu.seconds[0]) & (t < imu.seconds[-1]))
     carry = partial(
@@ -215,10 +218,10 @@ def _position_rotation_by_imu(imu: ImuData, stream: PoseStream, held: KnownExtri
 
 
 def _position_rotation_on_trajectory(
-    imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics
+    imu: ImuData, stream: PoseStream, known: State, extrinsics: KnownExtrinsics
 ) -> np.ndarray | None:
     """`rotation_of_positions` with the trajectory `known` as reference."""
-    aligned, _ = _aligned(imu, stream, held)
+    aligned, _ = _aligned(imu, stream, extrinsics)
     trajectory, t = _trajectory(stream), stream.seconds + aligned.offset
     trajectory = trajectory.only((t >= known.seconds[0]) & (t <= known.seconds[-1]))
     t = trajectory.seconds + aligned.offset
@@ -231,7 +234,7 @@ def _position_rotation_on_trajectory(
 
 
 def _check_scale(
-    imu: ImuData, name: str, trajectory: SensorTrajectory, aligned: RateAlignment, found: TrajectoryFit
+    imu: ImuData, name: str, trajectory: SensorTrajectory, aligned: RateAlignment, fit: TrajectoryFit
 ) -> None:
     """Raise EstimationError if the accelerometer contradicts the scale of positions. The scale is estimated together
     with the lever arm; see `scale_by_accelerometer`."""
@@ -241,7 +244,7 @@ def _check_scale(
         """Equations of lever arm, gravity and accelerometer bias, as if the sensor had measured `position` (n, 3)."""
         carry = partial(gyro.carry, t, to=imu.seconds)
         return system_from_readings(imu, carry, t, trajectory.rotation, position)(
-            found.guess.rotation, found.guess.position
+            fit.guess.rotation, fit.guess.position
         )
 
     rows, from_imu = rows_at(trajectory.position), -rows_at(np.zeros_like(trajectory.position)).b
@@ -254,10 +257,10 @@ def _check_scale(
 
 
 def _fit_to_trajectory(
-    imu: ImuData, stream: PoseStream, known: State, held: KnownExtrinsics
+    imu: ImuData, stream: PoseStream, known: State, extrinsics: KnownExtrinsics
 ) -> tuple[ExtrinsicsGuess, float]:
     """`extrinsics_on_trajectory` for a stream of poses."""
-    return extrinsics_on_trajectory(imu, stream.name, _trajectory(stream), known, held)
+    return extrinsics_on_trajectory(imu, stream.name, _trajectory(stream), known, extrinsics)
 
 
 def _frames(
@@ -270,18 +273,20 @@ def _frames(
     t = instants(stream, values)
     for k, keyframes in enumerate(known.recordings if sensor.kind == "absolute" else ()):
         part = _keyframes(known, keyframes)
-        own = np.flatnonzero((t >= part.seconds[0]) & (t <= part.seconds[-1]))
-        if not len(own):
+        rows = np.flatnonzero((t >= part.seconds[0]) & (t <= part.seconds[-1]))
+        if not len(rows):
             raise too_few_poses(stream.name)
-        R, p = imu_poses_at(part, GyroRotation.integrate(imu, part.bias[:, :3].mean(axis=0)), t[own])
-        R_wf = so3.closest_rotation((R @ R_is @ stream.rotation[own].transpose(0, 2, 1)).sum(axis=0))
-        origin = np.median(p + R @ p_is - stream.position[own] @ R_wf.T, axis=0)
+        R, p = imu_poses_at(part, GyroRotation.integrate(imu, part.bias[:, :3].mean(axis=0)), t[rows])
+        R_wf = so3.closest_rotation((R @ R_is @ stream.rotation[rows].transpose(0, 2, 1)).sum(axis=0))
+        origin = np.median(p + R @ p_is - stream.position[rows] @ R_wf.T, axis=0)
         frame = frame_of(sensor.name, k)
         out |= {(frame, FRAME[0]): R_wf, (frame, FRAME[1]): origin}
     return out
 
 
-def _keyframes(state: State, own: slice) -> State:
-    """The state with only the keyframes `own`, as one recording."""
-    columns = {name: getattr(state, name)[own] for name in ("seconds", "rotation", "position", "velocity", "bias")}
+def _keyframes(state: State, keyframes: slice) -> State:
+    """The state with only a slice of its keyframes, as one recording."""
+    columns = {
+        name: getattr(state, name)[keyframes] for name in ("seconds", "rotation", "position", "velocity", "bias")
+    }
     return replace(state, **columns, starts=(0,))

@@ -28,7 +28,7 @@ def matched_poses(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, np.nd
     same = apart <= MERGED_WITHIN_S
     if same.sum() >= 0.5 * min(len(body.seconds), len(sensor.seconds)):
         return i[same], k[same]
-    steps = [float(np.median(np.diff(own.seconds))) if len(own.seconds) > 1 else np.inf for own in (body, sensor)]
+    steps = [float(np.median(np.diff(poses.seconds))) if len(poses.seconds) > 1 else np.inf for poses in (body, sensor)]
     if min(steps) > MIN_STOP_INTERVAL_S:
         near = apart < MAX_STOP_SHARE * min(steps)
         return i[near], k[near]
@@ -42,18 +42,18 @@ def _mutually_nearest(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, n
     """Indices (n,) of poses of the body and (n,) of the sensor that are mutually nearest in time."""
     k = np.searchsorted(0.5 * (sensor.seconds[1:] + sensor.seconds[:-1]), body.seconds)
     i = np.searchsorted(0.5 * (body.seconds[1:] + body.seconds[:-1]), sensor.seconds)
-    own = np.flatnonzero(i[k] == np.arange(len(k)))
-    return own, k[own]
+    matched = np.flatnonzero(i[k] == np.arange(len(k)))
+    return matched, k[matched]
 
 
-def _is_at_rest(own: BodyPoses, seconds: np.ndarray) -> np.ndarray:
+def _is_at_rest(poses: BodyPoses, seconds: np.ndarray) -> np.ndarray:
     """(n,) whether a sensor is at rest at `seconds` (n,). Its poses just outside +- MAX_CLOCK_OFFSET_S must be at most
     MAX_REST_GAP_S apart and nearly equal."""
-    last = len(own.seconds) - 1
-    before = np.clip(np.searchsorted(own.seconds, seconds - MAX_CLOCK_OFFSET_S, side="right") - 1, 0, last)
-    after = np.clip(np.searchsorted(own.seconds, seconds + MAX_CLOCK_OFFSET_S), 0, last)
+    last = len(poses.seconds) - 1
+    before = np.clip(np.searchsorted(poses.seconds, seconds - MAX_CLOCK_OFFSET_S, side="right") - 1, 0, last)
+    after = np.clip(np.searchsorted(poses.seconds, seconds + MAX_CLOCK_OFFSET_S), 0, last)
     rng = np.random.default_rng(0)
     a, b = rng.integers(0, last + 1, (2, N_MOTION_SAMPLES))
-    typical = float(np.median(moved(own.rotation, own.position, a, b)))
-    seen = own.seconds[after] - own.seconds[before] <= MAX_REST_GAP_S
-    return seen & (moved(own.rotation, own.position, before, after) < MAX_REST_MOTION * typical)
+    typical = float(np.median(moved(poses.rotation, poses.position, a, b)))
+    covered = poses.seconds[after] - poses.seconds[before] <= MAX_REST_GAP_S
+    return covered & (moved(poses.rotation, poses.position, before, after) < MAX_REST_MOTION * typical)

@@ -48,20 +48,20 @@ ADVICE = (
 )
 
 
-def is_stop_and_go(rig: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses]) -> bool:
+def is_stop_and_go(rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses]) -> bool:
     """Whether the body or a pose sensor stood still at all its poses, and the rig has only cameras and pose sensors.
-    shown: poses of the body in each recording."""
+    body: poses of the body in each recording."""
     others = {s.sensor_type for s in rig.mounted} - {"camera", "pose"}
     if others or (rig.cameras and rig.moves_by_poses):
         return False
-    each = [list(shown), *(list(own) for own in zip(*(m.poses for m in recordings), strict=True))]
-    return any(all(stands_still_between(s.seconds, s.rotation, s.position) for s in own) for own in each)
+    each = [list(body), *(list(poses) for poses in zip(*(m.poses for m in recordings), strict=True))]
+    return any(all(stands_still_between(s.seconds, s.rotation, s.position) for s in poses) for poses in each)
 
 
 def state_from_pairs(
-    rig: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], cameras: dict[Key, np.ndarray]
+    rig: Rig, recordings: Sequence[Measurements], body: Sequence[BodyPoses], cameras: dict[Key, np.ndarray]
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
-    """Inputs, initial state and its values from pairs of poses. shown: poses of the body in each recording; cameras:
+    """Inputs, initial state and its values from pairs of poses. body: poses of the body in each recording; cameras:
     parameters of the cameras. Time offsets are those of the rig file, or 0. Raises EstimationError if pairs are too
     few, or a pose sensor is relative."""
     relative = next((s for s in rig.poses if s.kind == "relative"), None)
@@ -72,18 +72,18 @@ def state_from_pairs(
         )
     is_body = not rig.cameras  # whether the first pose sensor is the body
     still = rig.with_sensors(*(_with_known_clock(s, is_body and k == 0) for k, s in enumerate(rig.poses)))
-    found, at = dict(cameras), list(recordings)
+    values, at = dict(cameras), list(recordings)
     for k in range(int(is_body), len(rig.poses)):
-        at, values = _with_extrinsics(still, k, at, shown)
-        found |= values
+        at, mounted = _with_extrinsics(still, k, at, body)
+        values |= mounted
     inputs = replace(inputs_for(still, at), asked=rig)
     for sensor in still.poses:
-        found |= stated_values(inputs, sensor, MOUNTED_NAMES if sensor.name == rig.reference else ("time_offset",))
+        values |= stated_values(inputs, sensor, MOUNTED_NAMES if sensor.name == rig.reference else ("time_offset",))
     for k in range(len(recordings)):
         frame = frame_of(rig.reference, k)
         world = {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}
-        found |= world if is_body else {(in_recording(BOARD, k), "tilt"): np.eye(3)}
-    state = _state(inputs, shown, found)
+        values |= world if is_body else {(in_recording(BOARD, k), "tilt"): np.eye(3)}
+    state = _state(inputs, body, values)
     return inputs, state, state.values
 
 
@@ -94,12 +94,12 @@ def _with_known_clock(sensor: PoseSensor, is_body: bool) -> PoseSensor:
     return replace(known, rotation=fixed(np.eye(3)), translation=fixed(np.zeros(3))) if is_body else known
 
 
-def _state(inputs: Inputs, shown: Sequence[BodyPoses], found: dict[Key, np.ndarray]) -> State:
+def _state(inputs: Inputs, body: Sequence[BodyPoses], extrinsics: dict[Key, np.ndarray]) -> State:
     """The state at rest: each keyframe has the nearest pose of the body and zero velocity."""
-    values = start_values(inputs, found)
+    values = start_values(inputs, extrinsics)
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
-    t = np.concatenate([own.seconds + part.begin for own, part in zip(shown, inputs.parts, strict=True)])
-    R, p = (np.concatenate([getattr(own, name) for own in shown]) for name in ("rotation", "position"))
+    t = np.concatenate([poses.seconds + part.begin for poses, part in zip(body, inputs.parts, strict=True)])
+    R, p = (np.concatenate([getattr(poses, name) for poses in body]) for name in ("rotation", "position"))
     k, n = np.searchsorted(0.5 * (t[1:] + t[:-1]), keyframes), len(keyframes)
     return State(keyframes, np.ascontiguousarray(R[k]), p[k], np.zeros((n, 3)), np.zeros((n, 6)), values)
 
@@ -115,48 +115,49 @@ class _PairedPoses:
 
 
 def _with_extrinsics(
-    rig: Rig, index: int, recordings: list[Measurements], shown: Sequence[BodyPoses]
+    rig: Rig, index: int, recordings: list[Measurements], body: Sequence[BodyPoses]
 ) -> tuple[list[Measurements], dict[Key, np.ndarray]]:
     """Recordings that keep only paired inlier poses of the sensor number `index`, and values of its extrinsics and
     frames. The extrinsics come from the recording with most pairs."""
     sensor = rig.poses[index]
     paired = []
-    for m, own in zip(recordings, shown, strict=True):
+    for m, poses in zip(recordings, body, strict=True):
         with naming(m.name if len(recordings) > 1 else ""):
-            paired.append(_paired_poses(rig, sensor, m, m.poses[index], own))
+            paired.append(_paired_poses(rig, sensor, m, m.poses[index], poses))
     best = int(np.argmax([len(x.stream.stamps_ns) for x in paired]))
-    found = _hand_eye(rig, sensor, paired[best])
+    solution = _hand_eye(rig, sensor, paired[best])
     values: dict[Key, np.ndarray] = {
-        (sensor.name, "rotation"): found.extrinsics.R,
-        (sensor.name, "translation"): found.extrinsics.p,
+        (sensor.name, "rotation"): solution.extrinsics.R,
+        (sensor.name, "translation"): solution.extrinsics.p,
     }
     out = []
-    for k, (m, own) in enumerate(zip(recordings, paired, strict=True)):
-        here = found if k == best else hand_eye(own.pairs, found.extrinsics, (True, True))
+    for k, (m, pairing) in enumerate(zip(recordings, paired, strict=True)):
+        fitted = solution if k == best else hand_eye(pairing.pairs, solution.extrinsics, (True, True))
         values |= {
-            (frame_of(sensor.name, k), FRAME[0]): here.frame.R,
-            (frame_of(sensor.name, k), FRAME[1]): here.frame.p,
+            (frame_of(sensor.name, k), FRAME[0]): fitted.frame.R,
+            (frame_of(sensor.name, k), FRAME[1]): fitted.frame.p,
         }
-        out.append(_with_inliers(rig, sensor, own, outlier_pairs(here.residual), m))
+        out.append(_with_inliers(rig, sensor, pairing, outlier_pairs(fitted.residual), m))
     return out, values
 
 
-def _with_inliers(rig: Rig, sensor: PoseSensor, own: _PairedPoses, bad: np.ndarray, m: Measurements) -> Measurements:
+def _with_inliers(rig: Rig, sensor: PoseSensor, paired: _PairedPoses, bad: np.ndarray, m: Measurements) -> Measurements:
     """The recording with the paired poses of one sensor, except the outliers `bad` (n,) bool, and with notes."""
     good = np.flatnonzero(~bad)
-    columns = {name: getattr(own.stream, name)[good] for name in ("stamps_ns", "rotation", "position")}
-    return replace(m.with_streams(replace(own.stream, **columns)), notes=(*m.notes, *_notes(rig, sensor, own, bad, m)))
+    columns = {name: getattr(paired.stream, name)[good] for name in ("stamps_ns", "rotation", "position")}
+    notes = (*m.notes, *_notes(rig, sensor, paired, bad, m))
+    return replace(m.with_streams(replace(paired.stream, **columns)), notes=notes)
 
 
-def _notes(rig: Rig, sensor: PoseSensor, own: _PairedPoses, bad: np.ndarray, m: Measurements) -> list[str]:
+def _notes(rig: Rig, sensor: PoseSensor, paired: _PairedPoses, bad: np.ndarray, m: Measurements) -> list[str]:
     """Notes on the number of pairs, and on the rejected poses `bad` (n,) bool."""
-    n = len(own.stream.stamps_ns)
+    n = len(paired.stream.stamps_ns)
     words = [
-        f"{n} poses of {sensor.name} were taken at rest, each together with one of the {own.counts[0]} of "
+        f"{n} poses of {sensor.name} were taken at rest, each together with one of the {paired.counts[0]} of "
         f"{rig.reference}. No motion is assumed in between, and its time_offset is not estimated."
     ]
     if bad.any():
-        seconds = own.stream.stamps_ns[bad][:3] - m.origin_ns
+        seconds = paired.stream.stamps_ns[bad][:3] - m.origin_ns
         at = ", ".join(f"{1e-9 * x:.3f} s" for x in seconds)
         words.append(
             f"{sensor.name}: {int(bad.sum())} of its {n} poses do not fit the others and were rejected, {at} after "
@@ -165,42 +166,42 @@ def _notes(rig: Rig, sensor: PoseSensor, own: _PairedPoses, bad: np.ndarray, m: 
     return words
 
 
-def _paired_poses(rig: Rig, sensor: PoseSensor, m: Measurements, stream: PoseStream, shown: BodyPoses) -> _PairedPoses:
+def _paired_poses(rig: Rig, sensor: PoseSensor, m: Measurements, stream: PoseStream, body: BodyPoses) -> _PairedPoses:
     """Matching poses of body and sensor in one recording. Raises EstimationError if they are too few."""
     assert sensor.time_offset.value is not None
     offset = float(sensor.time_offset.value[0])
     seconds = (stream.stamps_ns - m.origin_ns) * 1e-9 + offset
-    i, k = matched_poses(shown, BodyPoses(seconds, stream.rotation, stream.position))
-    counts = len(shown.seconds), len(stream.stamps_ns)
+    i, k = matched_poses(body, BodyPoses(seconds, stream.rotation, stream.position))
+    counts = len(body.seconds), len(stream.stamps_ns)
     if len(i) < MIN_POSE_PAIRS:
         raise EstimationError(
             f"only {len(i)} of the {counts[1]} poses of {sensor.name} were taken together with one of the "
             f"{counts[0]} of {rig.reference}, and {MIN_POSE_PAIRS} are needed; {ADVICE}."
         )
-    stamps = m.origin_ns + np.round((shown.seconds[i] - offset) * 1e9).astype(np.int64)
+    stamps = m.origin_ns + np.round((body.seconds[i] - offset) * 1e9).astype(np.int64)
     chosen = replace(stream, stamps_ns=stamps, rotation=stream.rotation[k], position=stream.position[k])
-    pairs = PosePairs(shown.rotation[i], shown.position[i], chosen.rotation, chosen.position)
+    pairs = PosePairs(body.rotation[i], body.position[i], chosen.rotation, chosen.position)
     return _PairedPoses(pairs, chosen, counts)
 
 
-def _hand_eye(rig: Rig, sensor: PoseSensor, own: _PairedPoses) -> HandEye:
+def _hand_eye(rig: Rig, sensor: PoseSensor, paired: _PairedPoses) -> HandEye:
     """Hand-eye solution of one recording. Raises EstimationError if motions of body and sensor disagree, or agree only
     with another convention of poses."""
     R, p = sensor.rotation.value, sensor.translation.value
     start = (
         None if R is None and p is None else Extrinsics(np.eye(3) if R is None else R, np.zeros(3) if p is None else p)
     )
-    held = sensor.rotation.mode == "fixed", sensor.translation.mode == "fixed"
+    fixed = sensor.rotation.mode == "fixed", sensor.translation.mode == "fixed"
 
     def place(stream: PoseStream) -> tuple[tuple[HandEye, float], float]:
-        pairs = replace(own.pairs, R_sensor=stream.rotation, p_sensor=stream.position)
-        found = hand_eye(pairs, start, held)
-        unexplained = unexplained_motion(pairs, found)
-        return (found, unexplained), unexplained
+        pairs = replace(paired.pairs, R_sensor=stream.rotation, p_sensor=stream.position)
+        solution = hand_eye(pairs, start, fixed)
+        unexplained = unexplained_motion(pairs, solution)
+        return (solution, unexplained), unexplained
 
-    found, unexplained = with_checked_convention(own.stream, place)
+    solution, unexplained = with_checked_convention(paired.stream, place)
     if unexplained > MAX_UNEXPLAINED_MOTION:
-        turns = relative_motions(own.pairs)
+        turns = relative_motions(paired.pairs)
         by_body, by_sensor = (
             np.rad2deg(np.median(np.linalg.norm(w, axis=1))) for w in (turns.turn_body, turns.turn_sensor)
         )
@@ -211,8 +212,8 @@ def _hand_eye(rig: Rig, sensor: PoseSensor, own: _PairedPoses) -> HandEye:
             )
         raise EstimationError(
             f"{rig.reference} and {sensor.name} do not move alike: {unexplained:.0%} of the motion between "
-            f"{len(own.pairs.p_body)} pairs of poses is unexplained (median rotation {by_body:.1f} and {by_sensor:.1f} "
-            f"deg). Check that each pose of {sensor.name} belongs to the image with its stamp, and that one of "
-            "the two is fixed to the other."
+            f"{len(paired.pairs.p_body)} pairs of poses is unexplained (median rotation {by_body:.1f} and "
+            f"{by_sensor:.1f} deg). Check that each pose of {sensor.name} belongs to the image with its stamp, and "
+            "that one of the two is fixed to the other."
         )
-    return found
+    return solution

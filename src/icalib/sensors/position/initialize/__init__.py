@@ -46,10 +46,10 @@ class PositionInitializer(Initializer[PositionSensor]):
 
     def motion_rank(self, rig: Rig) -> int | None:
         """See `Initializer`. Positions need an IMU for the attitude, and a frame of their own for the world."""
-        return BY_POSITIONS if rig.imu is not None and self._own_frames(rig) else None
+        return BY_POSITIONS if rig.imu is not None and self._with_frame(rig) else None
 
     def sources(self, rig: Rig) -> tuple[str, ...]:
-        return (self._own_frames(rig)[0].name,)
+        return (self._with_frame(rig)[0].name,)
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         del fallback
@@ -77,7 +77,7 @@ class PositionInitializer(Initializer[PositionSensor]):
         return out
 
     @staticmethod
-    def _own_frames(rig: Rig) -> list[PositionSensor]:
+    def _with_frame(rig: Rig) -> list[PositionSensor]:
         """The sensors that share no frame of another sensor or of the target."""
         return [s for s in rig.of(PositionSensor) if s.has_frame]
 
@@ -91,14 +91,14 @@ def _state_of_one(inputs: Inputs, extrinsics: KnownExtrinsics | None) -> State:
     assert inputs.imu is not None
     sensor = inputs.rig.of(PositionSensor)[0]
     known = extrinsics or _known_extrinsics(inputs, sensor)
-    found = motion_from_fixes(inputs.imu, sensor.name, _fix(inputs, sensor), inputs.rig.gravity, known)
-    shown = {
+    motion = motion_from_fixes(inputs.imu, sensor.name, _fix(inputs, sensor), inputs.rig.gravity, known)
+    estimated = {
         (sensor.name, name): value
-        for name, value in zip(GUESSED_GROUPS, (found.best.at.arm, np.array([found.best.at.offset])), strict=True)
+        for name, value in zip(GUESSED_GROUPS, (motion.best.at.arm, np.array([motion.best.at.offset])), strict=True)
     }
-    values = start_values(inputs, merged_values(sensor, stated_values(inputs, sensor, GUESSED_GROUPS), shown))
+    values = start_values(inputs, merged_values(sensor, stated_values(inputs, sensor, GUESSED_GROUPS), estimated))
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
-    rotation, position, velocity, bias = found.at(keyframes)
+    rotation, position, velocity, bias = motion.at(keyframes)
     return State(keyframes, rotation, position, velocity, bias, values)
 
 
@@ -107,24 +107,27 @@ def _on_motion(inputs: Inputs, state: State, sensor: PositionSensor) -> Values:
     the lever arm, and the time offset unless the clock restarts."""
     recordings = [single_recording(inputs, k) for k in range(len(inputs.parts))]
     best = fullest_recording(inputs, sensor.name)
-    found: dict[int, PlacedSensor] = {}
+    placed: dict[int, PlacedSensor] = {}
     for k in sorted(range(len(recordings)), key=lambda k: k != best):
         extrinsics, frame = _known_extrinsics(recordings[k], sensor), None
         if k != best:
-            offset = converted_offset(found[best].offset, sensor.name, recordings[best], recordings[k])
+            offset = converted_offset(placed[best].offset, sensor.name, recordings[best], recordings[k])
             offset = extrinsics.offset if sensor.clock_restarts else offset
-            extrinsics = KnownExtrinsics(position=found[best].arm, offset=offset)
+            extrinsics = KnownExtrinsics(position=placed[best].arm, offset=offset)
         if not sensor.has_frame:
             frame = PositionFrame.of(frame_owner(sensor), k, state.values)
         known = KnownPlace(_is_levelled(inputs, sensor), extrinsics.position, extrinsics.offset, frame)
         with naming_recording(inputs, k):
             motion = motion_of(recordings[k], state_of_recording(inputs, k, state))
-            found[k] = place(motion, sensor.name, _fix(recordings[k], sensor), known)
+            placed[k] = place(motion, sensor.name, _fix(recordings[k], sensor), known)
     clocks = range(len(recordings)) if sensor.clock_restarts else (best,)
-    offsets = [converted_offset(found[k].offset, sensor.name, recordings[k], inputs) for k in clocks]
-    shown = {(sensor.name, GUESSED_GROUPS[0]): found[best].arm, (sensor.name, GUESSED_GROUPS[1]): np.array(offsets)}
-    frames = _frames(inputs, sensor, [(found[k].R_wf, found[k].p_wf) for k in range(len(recordings))])
-    return merged_values(sensor, stated_values(inputs, sensor, GUESSED_GROUPS), shown) | frames
+    offsets = [converted_offset(placed[k].offset, sensor.name, recordings[k], inputs) for k in clocks]
+    estimated = {
+        (sensor.name, GUESSED_GROUPS[0]): placed[best].arm,
+        (sensor.name, GUESSED_GROUPS[1]): np.array(offsets),
+    }
+    frames = _frames(inputs, sensor, [(placed[k].R_wf, placed[k].p_wf) for k in range(len(recordings))])
+    return merged_values(sensor, stated_values(inputs, sensor, GUESSED_GROUPS), estimated) | frames
 
 
 def _known_extrinsics(inputs: Inputs, sensor: PositionSensor) -> KnownExtrinsics:
@@ -146,16 +149,16 @@ def _is_levelled(inputs: Inputs, sensor: PositionSensor) -> bool:
     return (frame_of(sensor.name, 0), FRAME_YAW.name) in {b.key for b in inputs.layout.blocks}
 
 
-def _frames(inputs: Inputs, sensor: PositionSensor, found: Sequence[tuple[np.ndarray, np.ndarray]]) -> Values:
-    """Values of the sensor's frame in each recording, and zeros for the slow offset of the fixes. found: R_world_frame
+def _frames(inputs: Inputs, sensor: PositionSensor, frames: Sequence[tuple[np.ndarray, np.ndarray]]) -> Values:
+    """Values of the sensor's frame in each recording, and zeros for the slow offset of the fixes. frames: R_world_frame
     (3, 3) and p_world_frame (3,) m of each recording. A shared frame has no values here."""
     out: Values = {}
     if sensor.position_random_walk:
-        out |= {key: np.zeros(3) for k in range(len(found)) for key in knot_keys(sensor.name, k, len(found))}
+        out |= {key: np.zeros(3) for k in range(len(frames)) for key in knot_keys(sensor.name, k, len(frames))}
     if not sensor.has_frame:
         return out
     levelled = _is_levelled(inputs, sensor)
-    for k, (R, p) in enumerate(found):
+    for k, (R, p) in enumerate(frames):
         name, value = (
             (FRAME_YAW.name, np.array([np.arctan2(R[1, 0], R[0, 0])])) if levelled else (FRAME_ROTATION.name, R)
         )

@@ -63,15 +63,18 @@ class KnownPlace:
 def place(motion: EstimatedMotion, name: str, fix: Fix, known: KnownPlace) -> PlacedSensor:
     """Lever arm, frame and time offset of the sensor `name` from its fixes in one recording; motion: the trajectory in
     it. Raises EstimationError where the fixes are too few, or contradict the trajectory."""
-    found = [x for offset in _candidate_offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
-    if min((x.misfit for x in found), default=np.inf) > MAX_POSITION_MISFIT and known.offset is None:
-        found += [x for offset in _scanned_offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))]
-    if not found:
+    offsets = _candidate_offsets(motion, fix, known)
+    candidates = [x for offset in offsets if (x := _placed(motion, fix, offset, known))]
+    if min((x.misfit for x in candidates), default=np.inf) > MAX_POSITION_MISFIT and known.offset is None:
+        candidates += [
+            x for offset in _scanned_offsets(motion, fix, known) if (x := _placed(motion, fix, offset, known))
+        ]
+    if not candidates:
         raise OtherMotionError(
             f"{name}: too few of its fixes fall within the motion that the other sensors show; check that the clocks "
             "overlap, or the time_offset in the rig file."
         )
-    best = min(found, key=lambda x: x.misfit)
+    best = min(candidates, key=lambda x: x.misfit)
     if best.misfit > MAX_POSITION_MISFIT:
         hint = "check that both are on the same vehicle"
         if known.frame is not None:
@@ -92,12 +95,12 @@ def _candidate_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> 
         return [known.offset]
     by_acceleration = [shift.samples / SIGNAL_RATE_HZ for shift in likely_offsets(motion.imu, fix)]
     state = motion.state
-    moved = _speeds(state.seconds, state.position, np.zeros(len(state.seconds)))
-    seen = _speeds(fix.t, fix.position, fix.run)
-    if not (varies(*moved) and varies(*seen)):
+    motion_speeds = _speeds(state.seconds, state.position, np.zeros(len(state.seconds)))
+    fix_speeds = _speeds(fix.t, fix.position, fix.run)
+    if not (varies(*motion_speeds) and varies(*fix_speeds)):
         return by_acceleration
     overlap, spacing = MIN_SPEED_OVERLAP_S * SIGNAL_RATE_HZ, round(PEAK_SPACING_S * SIGNAL_RATE_HZ)
-    peaks = best_shifts(moved, seen, overlap, MAX_SPEED_PEAKS, spacing)
+    peaks = best_shifts(motion_speeds, fix_speeds, overlap, MAX_SPEED_PEAKS, spacing)
     return [*(peak.samples / SIGNAL_RATE_HZ for peak in peaks), *by_acceleration]
 
 
@@ -211,8 +214,8 @@ def _linear(at: Poses, p: np.ndarray, known: KnownPlace, offset: float) -> _Unkn
         R = so3.exp(np.array([0.0, 0.0, np.arctan2(x[4], x[3])]))
     else:
         R = so3.closest_rotation(x[3:12].reshape(3, 3))
-    found = x[:3] if arm is None else arm
-    return _Unknowns(found, R, np.median(at.position + at.rotation @ found - p @ R.T, axis=0), offset)
+    lever_arm = x[:3] if arm is None else arm
+    return _Unknowns(lever_arm, R, np.median(at.position + at.rotation @ lever_arm - p @ R.T, axis=0), offset)
 
 
 def _linear_arm(at: Poses, p: np.ndarray, frame: PositionFrame, arm: np.ndarray | None, offset: float) -> _Unknowns:

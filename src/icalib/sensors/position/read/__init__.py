@@ -29,7 +29,8 @@ from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.sensor import TableLayout
 
 NAVSAT, POINT = "navsat", "point"
-OWN, OTHERS = (NAVSAT, POINT), ("pose", "odometry")  # kinds of topics with positions alone, and with poses
+POSITION_KINDS = (NAVSAT, POINT)  # kinds of topics with positions alone
+POSE_KINDS = ("pose", "odometry")  # kinds of topics with poses
 MESSAGES = (
     MessageType("sensor_msgs/msg/NavSatFix", NAVSAT),
     MessageType("geometry_msgs/msg/PointStamped", POINT),
@@ -54,18 +55,18 @@ def read(recording: Recording, sensors: Sequence[PositionSensor], reading: Readi
     right."""
     places = {sensor.name: f"{recording.where(sensor)} ({sensor.name})" for sensor in sensors}
     written = {sensor.name: _readings(recording, sensor, places[sensor.name]) for sensor in sensors}
-    found = []
+    streams = []
     for sensor in sensors:
-        what, (own, notes) = places[sensor.name], written[sensor.name]
+        what, (readings, notes) = places[sensor.name], written[sensor.name]
         if sensor.shared_frame:
             owner = written.get(sensor.shared_frame)
             frame = AS_RECORDED if owner is None else owner[0].frame
-            if own.frame is not frame:
-                own = own.inside(what, frame, sensor.shared_frame)
+            if readings.frame is not frame:
+                readings = readings.inside(what, frame, sensor.shared_frame)
                 notes += (f"{what}: its positions were then converted to the frame of {sensor.shared_frame}.",)
-        stream, more = checked_positions(reading.cut(own, what), what)
-        found.append((stream, notes + more))
-    return found
+        stream, more = checked_positions(reading.cut(readings, what), what)
+        streams.append((stream, notes + more))
+    return streams
 
 
 def where(recording: Recording, sensor: PositionSensor) -> str:
@@ -85,8 +86,8 @@ def _is_solution(path: Path) -> bool:
 
 def _topic(recording: Recording, sensor: PositionSensor) -> TopicInfo:
     """The topic of a sensor. Messages with positions alone go before poses and odometry."""
-    own = any(t.kind in OWN and t.count for t in recording.topics())
-    kinds = OWN if own and sensor.topic is None else (*OWN, *OTHERS)
+    has_positions = any(t.kind in POSITION_KINDS and t.count for t in recording.topics())
+    kinds = POSITION_KINDS if has_positions and sensor.topic is None else (*POSITION_KINDS, *POSE_KINDS)
     return recording.topic(sensor.name, sensor.topic, *kinds)
 
 
@@ -112,8 +113,8 @@ def _of_topic(recording: Recording, sensor: PositionSensor, topic: TopicInfo, wh
         return about_first(what, from_positions(sensor.name, messages))
     written, degrees = from_navsat(sensor.name, messages)
     good = good_fixes(written.status, sensor.least_status, len(degrees))
-    found, notes = from_geodetic(what, written, degrees, good)
-    return found, left_out(what, written.status, good, sensor.least_status) + notes
+    readings, notes = from_geodetic(what, written, degrees, good)
+    return readings, left_out(what, written.status, good, sensor.least_status) + notes
 
 
 def _of_solution(recording: Recording, sensor: PositionSensor, path: Path, what: str) -> Noted:
@@ -123,13 +124,13 @@ def _of_solution(recording: Recording, sensor: PositionSensor, path: Path, what:
     good = good_fixes(written.status, sensor.least_status, len(written.stamps_ns))
     notes = left_out(what, written.status, good, sensor.least_status)
     if file.kind == "geodetic":
-        found, more = from_geodetic(what, written, written.position, good)
-        return found, notes + more
+        readings, more = from_geodetic(what, written, written.position, good)
+        return readings, notes + more
     written = written.some(good)
     if file.kind == "earth" and len(written.stamps_ns):
         written = _levelled(written)
-    found, more = about_first(what, written)
-    return found, notes + more
+    readings, more = about_first(what, written)
+    return readings, notes + more
 
 
 def _levelled(written: PositionReadings) -> PositionReadings:

@@ -41,7 +41,7 @@ def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream
         notes += (f"{what}: {int((~finite).sum())} of {len(finite)} positions are not finite and were removed.",)
         read = read.some(finite)
     remedy = "write the receiver's own stamps"
-    kept, found = kept_readings(read.stamps_ns, read.position, what, FIX_RATES_HZ, "fix", remedy)
+    kept, repeated = kept_readings(read.stamps_ns, read.position, what, FIX_RATES_HZ, "fix", remedy)
     read = read.some(kept)
     if len(read.stamps_ns) < MIN_FIXES:
         raise RecordingError(
@@ -51,7 +51,7 @@ def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream
     _refuse_units(read, what)
     read, frozen = _without_frozen(read, what)
     read, single = _without_singles(read, what)
-    notes += found + frozen + single + _jumps(read, what)
+    notes += repeated + frozen + single + _jumps(read, what)
     return PositionStream(read.name, read.stamps_ns, np.ascontiguousarray(read.position), read.covariance), notes
 
 
@@ -105,8 +105,8 @@ def _leaps(t: np.ndarray, p: np.ndarray, k: int) -> bool:
     """Whether reaching the fix after k, from rest at k, takes more than _MAX_ACCELERATION_M_S2."""
     if k + 1 >= len(t):
         return False
-    step, way = t[k + 1] - t[k], float(np.linalg.norm(p[k + 1] - p[k]))
-    return way > max(_MIN_LEAP_M, 0.5 * _MAX_ACCELERATION_M_S2 * step**2)
+    step, distance = t[k + 1] - t[k], float(np.linalg.norm(p[k + 1] - p[k]))
+    return distance > max(_MIN_LEAP_M, 0.5 * _MAX_ACCELERATION_M_S2 * step**2)
 
 
 def _without_singles(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:

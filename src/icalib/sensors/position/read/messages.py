@@ -15,9 +15,9 @@ _NAVSAT_STATUS = {0: STATUSES.index("single"), 1: STATUSES.index("differential")
 COVARIANCE_UNKNOWN = 0
 
 
-def from_navsat(name: str, found: Iterable[tuple[int, Any]]) -> tuple[PositionReadings, np.ndarray]:
+def from_navsat(name: str, stamped: Iterable[tuple[int, Any]]) -> tuple[PositionReadings, np.ndarray]:
     """Readings of sensor_msgs/NavSatFix, not yet in metres; and latitude, longitude [deg], height [m] (N, 3)."""
-    messages = list(found)
+    messages = list(stamped)
     stamps_ns = np.array([stamp for stamp, _ in messages], np.int64)
     degrees = np.array([(m.latitude, m.longitude, m.altitude) for _, m in messages]).reshape(-1, 3)
     status = np.array([_NAVSAT_STATUS.get(int(m.status.status), -1) for _, m in messages], np.int64)
@@ -29,10 +29,10 @@ def from_navsat(name: str, found: Iterable[tuple[int, Any]]) -> tuple[PositionRe
     return PositionReadings(name, stamps_ns, degrees, _usable(covariance, known, fixed), status), degrees
 
 
-def from_positions(name: str, found: Iterable[tuple[int, Any]]) -> PositionReadings:
+def from_positions(name: str, messages: Iterable[tuple[int, Any]]) -> PositionReadings:
     """Readings of PointStamped, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry."""
     stamps, positions, covariances = [], [], []
-    for stamp, message in found:
+    for stamp, message in messages:
         stamps.append(stamp)
         point, covariance = _point(message)
         positions.append((point.x, point.y, point.z))

@@ -57,5 +57,5 @@ def steps(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     beyond = moved - dt[:, None] * median_filter(moved / dt[:, None], size=(5, 1), mode="nearest")
     typical, size = float(np.median(dt)), np.linalg.norm(beyond, axis=1)
     limit = max(MIN_STEP_M, MIN_STEP_M_S2 * typical**2, MAX_MEDIAN_DISTANCES * float(np.median(size)))
-    found = np.flatnonzero((size > limit) & (dt < MAX_GAP_STEPS * typical))
-    return found + 1, beyond[found]
+    before = np.flatnonzero((size > limit) & (dt < MAX_GAP_STEPS * typical))
+    return before + 1, beyond[before]

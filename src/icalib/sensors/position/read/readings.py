@@ -78,22 +78,22 @@ def from_geodetic(
 
     Raises RecordingError where latitudes, longitudes or heights cannot be right.
     """
-    own = good & np.isfinite(degrees).all(axis=1) & (np.abs(degrees[:, :2]) > 1e-9).any(axis=1)
+    usable = good & np.isfinite(degrees).all(axis=1) & (np.abs(degrees[:, :2]) > 1e-9).any(axis=1)
     _refuse_heights(what, degrees, good)
-    if not own.any():
+    if not usable.any():
         raise RecordingError(f"{what}: no position has latitude, longitude and height; record again with a fix.")
     latitude, longitude, height = degrees.T
-    if (np.abs(latitude[own]) > 90.0).any():
-        swapped = (np.abs(longitude[own]) <= 90.0).all()
+    if (np.abs(latitude[usable]) > 90.0).any():
+        swapped = (np.abs(longitude[usable]) <= 90.0).all()
         cause = "latitude and longitude are swapped" if swapped else "it is not in degrees"
         raise RecordingError(
-            f"{what}: the first latitude is {latitude[own][0]:.6g} degrees, as if {cause}; say which "
+            f"{what}: the first latitude is {latitude[usable][0]:.6g} degrees, as if {cause}; say which "
             "column is which by `columns: [...]` in the rig file."
         )
     xyz = earth_centred(np.deg2rad(latitude), np.deg2rad(longitude), height)
-    first = int(np.argmax(own))
+    first = int(np.argmax(usable))
     position, axes = local_metres(xyz, xyz[first])
-    away = float(np.linalg.norm(position[own], axis=1).max())
+    away = float(np.linalg.norm(position[usable], axis=1).max())
     if away > MAX_DISTANCE_M:
         raise RecordingError(
             f"{what}: its fixes are up to {away / 1e3:.0f} km from the first one; the plane of east and north does not "
@@ -103,7 +103,7 @@ def from_geodetic(
         f"{what}: metres are east, north and up of the first fix, latitude {latitude[first]:.8f}, longitude "
         f"{longitude[first]:.8f}, height {height[first]:.3f} m."
     )
-    return replace(readings, position=position, frame=LocalFrame(xyz[first], axes, True)).some(own), (note,)
+    return replace(readings, position=position, frame=LocalFrame(xyz[first], axes, True)).some(usable), (note,)
 
 
 def _refuse_heights(what: str, degrees: np.ndarray, good: np.ndarray) -> None:

@@ -92,9 +92,9 @@ def _kind(path: Path, header: str, names: list[str]) -> str:
     for kind, first in (("geodetic", "latitude"), ("earth", "x-ecef"), ("local", "e-baseline")):
         if len(names) > 4 and names[1] == first:
             return kind
-    shown = header.strip() or "there is no line that starts with % and names the columns"
+    words = header.strip() or "there is no line that starts with % and names the columns"
     raise RecordingError(
-        f"{path}: the header does not name the columns of an RTKLIB solution ({shown:.80}); write the file with its "
+        f"{path}: the header does not name the columns of an RTKLIB solution ({words:.80}); write the file with its "
         "header, with latitude, longitude and height, or x, y and z."
     )
 
@@ -104,13 +104,13 @@ def _stamp_ns(first: str, second: str) -> int:
     if "/" in first:
         year, month, day = (int(x) for x in first.split("/"))
         hours, minutes, seconds = second.split(":")
-        whole, _, fraction = seconds.partition(".")
+        integer, _, fraction = seconds.partition(".")
         at = datetime(year, month, day, tzinfo=UTC) + timedelta(
-            hours=int(hours), minutes=int(minutes), seconds=int(whole)
+            hours=int(hours), minutes=int(minutes), seconds=int(integer)
         )
     else:
-        whole, _, fraction = second.partition(".")
-        at = _GPS_START + timedelta(weeks=int(first), seconds=int(whole))
+        integer, _, fraction = second.partition(".")
+        at = _GPS_START + timedelta(weeks=int(first), seconds=int(integer))
     return round(at.timestamp()) * _EPOCH_NS + int(f"{fraction:0<9.9}")
 
 
@@ -130,12 +130,12 @@ def _covariance(table: np.ndarray, columns: list[str], kind: str) -> np.ndarray:
     names = _SIGMAS[kind]
     if any(name not in columns or columns.index(name) >= table.shape[1] for name in names[:3]):
         return np.zeros((0, 3, 3))
-    found = [
+    sigmas = [
         table[:, columns.index(n)] if n in columns and columns.index(n) < table.shape[1] else np.zeros(len(table))
         for n in names
     ]
-    a, b, c = (x**2 for x in found[:3])
-    ab, bc, ca = (np.copysign(x**2, x) for x in found[3:])
+    a, b, c = (x**2 for x in sigmas[:3])
+    ab, bc, ca = (np.copysign(x**2, x) for x in sigmas[3:])
     if kind == "geodetic":  # north, east, up
         a, b, ab, bc, ca = b, a, ab, ca, bc
     rows = np.stack([a, ab, ca, ab, b, bc, ca, bc, c], axis=1).reshape(-1, 3, 3)

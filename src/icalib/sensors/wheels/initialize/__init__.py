@@ -38,7 +38,7 @@ class WheelInitializer(Initializer[Wheels]):
         noise = [
             wheel_noise(wheels, [m.wheels[k] for m in recordings], motion.paths) for k, wheels in enumerate(rig.wheels)
         ]
-        return min(motion.spacing_for_increments(turn, way) for way, turn in noise)
+        return min(motion.spacing_for_increments(turn, distance) for distance, turn in noise)
 
 
 INITIALIZER = WheelInitializer()

@@ -129,8 +129,10 @@ def _check_turning(name: str, rate: np.ndarray, kind: WheelKind) -> None:
                 "that it drove."
             )
         return
-    size = np.sqrt((rate**2).mean(axis=0))
-    still = [which for which, own in zip(("left", "right"), size, strict=True) if own <= STANDSTILL_RATIO * size.max()]
+    sizes = np.sqrt((rate**2).mean(axis=0))
+    still = [
+        which for which, rms in zip(("left", "right"), sizes, strict=True) if rms <= STANDSTILL_RATIO * sizes.max()
+    ]
     if still:
         raise EstimationError(
             f"{name}: the {' and the '.join(still)} wheel did not turn according to its readings; check the "
@@ -257,8 +259,8 @@ def _steered(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> t
             f"{name}: its steering angle does not match the yaw rate of the vehicle; check that it is in "
             "radians, and that of the front wheels, not of the steering wheel."
         )
-    found = radius, np.array([base]), np.array([offset])
-    return float(-turned[1] * radius[0]), dict(zip(drive_names("steered"), found, strict=True))
+    values = radius, np.array([base]), np.array([offset])
+    return float(-turned[1] * radius[0]), dict(zip(drive_names("steered"), values, strict=True))
 
 
 def _check_radii(name: str, radii: np.ndarray) -> None:
@@ -348,12 +350,12 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     if rates.longest_step_s > MAX_RATE_STEP_S:  # average the yaw rate over windows as long as those of the wheels
         count = max(1, round(float(np.median(rates.end - rates.start)) * CORRELATION_HZ))
         turned = np.convolve(turned, np.full(count, 1.0 / count), "same")
-    found, opposite = (
+    best, opposite = (
         best_shift((sign * turned, known), (turning, covered), MIN_OVERLAP_S * CORRELATION_HZ) for sign in (1.0, -1.0)
     )
-    if opposite.correlation > max(found.correlation, MIN_CORRELATION):
+    if opposite.correlation > max(best.correlation, MIN_CORRELATION):
         raise EstimationError(f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}.")
-    if not found.correlation > MIN_CORRELATION:
+    if not best.correlation > MIN_CORRELATION:
         if np.std(turned[known]) < MIN_RATE_VARIATION * abs(np.mean(turned[known])):
             raise EstimationError(
                 f"{name}: the yaw rate was nearly constant, so the time offset is unobservable; record again "
@@ -361,7 +363,7 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
             )
         raise EstimationError(
             f"the yaw rate of {name} does not match that of {imu.name} at any time offset "
-            f"({correlation_in_words(found.largest)}); check that both come from the same recording and overlap "
+            f"({correlation_in_words(best.largest)}); check that both come from the same recording and overlap "
             "in time."
         )
-    return found.samples / CORRELATION_HZ
+    return best.samples / CORRELATION_HZ

@@ -66,30 +66,32 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     clock = wheels.name, "time_offset"
     offset = known.get(clock)
     try:
-        found = _from_trajectory(inputs, state, wheels, stream, None if wheels.time_offset.mode == "free" else offset)
-        if not complete and offset is not None and not is_contradicted(TIME_OFFSET, offset, found[clock]):
-            found = _from_trajectory(inputs, state, wheels, stream, offset)
+        estimated = _from_trajectory(
+            inputs, state, wheels, stream, None if wheels.time_offset.mode == "free" else offset
+        )
+        if not complete and offset is not None and not is_contradicted(TIME_OFFSET, offset, estimated[clock]):
+            estimated = _from_trajectory(inputs, state, wheels, stream, offset)
     except EstimationError:
         if complete:
             return known
         if offset is None:
             raise
-        found = _from_trajectory(inputs, state, wheels, stream, offset)
+        estimated = _from_trajectory(inputs, state, wheels, stream, offset)
     translation = wheels.name, "translation"
     stated = known.get(translation)
-    level = found[translation] if stated is None else _at_height_of(inputs, state, stated, found[translation])
-    refuse_far_off(wheels, found | {translation: level})
+    level = estimated[translation] if stated is None else _at_height_of(inputs, state, stated, estimated[translation])
+    refuse_far_off(wheels, estimated | {translation: level})
     if stated is not None and not is_contradicted(TRANSLATION, stated, level):
-        found[translation] = stated
-    return merged_values(wheels, known, found)
+        estimated[translation] = stated
+    return merged_values(wheels, known, estimated)
 
 
-def _at_height_of(inputs: Inputs, state: State, stated: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """The lever arm `found` (3,), moved along the vertical to the height of `stated` (3,), as motion on a floor does
-    not determine the height."""
+def _at_height_of(inputs: Inputs, state: State, stated: np.ndarray, lever_arm: np.ndarray) -> np.ndarray:
+    """`lever_arm` (3,) m, moved along the vertical to the height of `stated` (3,), as motion on a floor
+    does not determine the height."""
     up = possible_verticals(inputs, state).candidates[0]
     up = up / np.linalg.norm(up)
-    return found + up * (up @ (stated - found))
+    return lever_arm + up * (up @ (stated - lever_arm))
 
 
 def _from_trajectory(
@@ -110,10 +112,10 @@ def _from_trajectory(
     up = possible_verticals(inputs, state)
     failed: list[EstimationError] = []
     for candidate in up.candidates:
-        found = _attempt(inputs, state, stream, rates, candidate, offset)
-        if not isinstance(found, EstimationError):
-            return found
-        failed.append(found)
+        values = _attempt(inputs, state, stream, rates, candidate, offset)
+        if not isinstance(values, EstimationError):
+            return values
+        failed.append(values)
     other = _attempt(inputs, state, stream, rates, -up.candidates[0], offset) if up.level_sensor else failed[0]
     if not isinstance(other, EstimationError):
         raise EstimationError(
@@ -149,16 +151,16 @@ def _from_rates(
     start, end = instants(stream, clock, rates.start), instants(stream, clock, rates.end)
     inside, rate, velocity = _means(inputs, state, start, end)
     drive = drive_guess(name, rates.rate[inside], rate, velocity, up, rates.kind)
-    found = mounted(drive.extrinsics.R, drive.extrinsics.p, offset) | drive.values
-    return {(name, group): value for group, value in found.items()}
+    values = mounted(drive.extrinsics.R, drive.extrinsics.p, offset) | drive.values
+    return {(name, group): value for group, value in values.items()}
 
 
 def _offset_alone(inputs: Inputs, name: str, up: np.ndarray, recording: int) -> float:
     """Time offset [s] in one recording, relative to the first stamps of it; up (3,): the vertical in IMU axes."""
-    own = single_recording(inputs, recording)
-    stream = own.stream(name)
-    assert own.imu is not None and isinstance(stream, WheelStream)
-    return wheel_offset(own.imu, up, name, wheel_rates(name, stream.seconds, integrals_of(stream), stream.kind))
+    single = single_recording(inputs, recording)
+    stream = single.stream(name)
+    assert single.imu is not None and isinstance(stream, WheelStream)
+    return wheel_offset(single.imu, up, name, wheel_rates(name, stream.seconds, integrals_of(stream), stream.kind))
 
 
 def _from_relative_poses(
@@ -170,8 +172,8 @@ def _from_relative_poses(
         offset = np.array([poses_offset(inputs.imu, stream)])
     times = stream.seconds + offset[0]  # relative poses come from a single recording
     inside, rate, velocity = _means(inputs, state, times[:-1], times[1:])
-    found = extrinsics_guess(stream, inside, rate, velocity)
-    values = mounted(found.R, found.p, offset)
+    extrinsics = extrinsics_guess(stream, inside, rate, velocity)
+    values = mounted(extrinsics.R, extrinsics.p, offset)
     return {(stream.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 

@@ -39,16 +39,16 @@ def poses_offset(imu: ImuData, stream: WheelPoses) -> float:
     """
     middle, yaw = yaw_rates(stream)
     grid = np.arange(int(imu.seconds[-1] * CORRELATION_HZ) + 1) / CORRELATION_HZ
-    own = np.arange(int(middle[0] * CORRELATION_HZ), int(middle[-1] * CORRELATION_HZ) + 1) / CORRELATION_HZ
+    wheel_grid = np.arange(int(middle[0] * CORRELATION_HZ), int(middle[-1] * CORRELATION_HZ) + 1) / CORRELATION_HZ
     gyro = np.stack([np.interp(grid, imu.seconds, g) for g in imu.gyro.T])
-    turned = np.interp(own, middle, yaw)
+    turned = np.interp(wheel_grid, middle, yaw)
     offset, explained = _best_shift(gyro - gyro.mean(axis=1, keepdims=True), turned - turned.mean())
     if explained < MIN_EXPLAINED:
         raise EstimationError(
             f"the yaw rate of {stream.name} does not match that of {imu.name} at any time offset "
             f"({explained:.0%} of it explained); check that both come from the same recording, and turn more."
         )
-    offset -= own[0]
+    offset -= wheel_grid[0]
     angle = np.zeros_like(imu.gyro)
     np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0, out=angle[1:])
     for _ in range(MAX_REFINEMENTS):
@@ -65,7 +65,7 @@ def poses_offset(imu: ImuData, stream: WheelPoses) -> float:
 
 def _at(t: np.ndarray, imu: ImuData, x: np.ndarray) -> np.ndarray:
     """x (N, 3), given at the stamps of the IMU, interpolated at t (n,) [s]; returns (n, 3)."""
-    return np.stack([np.interp(t, imu.seconds, own) for own in x.T], axis=1)
+    return np.stack([np.interp(t, imu.seconds, column) for column in x.T], axis=1)
 
 
 def extrinsics_guess(stream: WheelPoses, inside: np.ndarray, rate: np.ndarray, velocity: np.ndarray) -> Extrinsics:
@@ -80,7 +80,7 @@ def extrinsics_guess(stream: WheelPoses, inside: np.ndarray, rate: np.ndarray, v
     x, y = c * pose[:, 1] + s * pose[:, 2], c * pose[:, 2] - s * pose[:, 1]  # in axes at half the yaw
     up = _least_squares(np.column_stack([rate, np.ones(len(rate))]), pose[:, 0] / dt)[:3]
     moving = np.column_stack([velocity, rate])
-    ahead, left = (_least_squares(moving, way / dt) for way in (x, y))
+    ahead, left = (_least_squares(moving, displacement / dt) for displacement in (x, y))
     R = so3.closest_rotation(np.stack([ahead[:3], left[:3], up]))
     rows = np.concatenate([-_cross(R[0]), -_cross(R[1])])  # p x r = -r x p
     return Extrinsics(R.T, _least_squares(rows, np.concatenate([ahead[3:], left[3:]])))

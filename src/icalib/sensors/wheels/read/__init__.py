@@ -46,12 +46,12 @@ TABLES = tuple(TableFile(f"{m}.csv", f"table of {m}", "wheels", _stamps) for m i
 def read(recording: Recording, sensors: Sequence[Wheels], reading: Reading) -> list[ReadStream]:
     """The checked stream of each set of wheels, with notes for the user. Raises RecordingError as `readings` and
     `checked_wheels`."""
-    found = []
+    streams = []
     for sensor in sensors:
         where = recording.where(sensor)
         written = reading.cut(readings(recording, sensor), f"{where} ({sensor.name})")
-        found.append(checked_wheels(written, sensor, where))
-    return found
+        streams.append(checked_wheels(written, sensor, where))
+    return streams
 
 
 def readings(recording: Recording, sensor: Wheels) -> WheelReadings | WheelPoses:

@@ -39,8 +39,8 @@ def checked_wheels(
     if len(read.stamps_ns) < 3:
         raise RecordingError(f"{what}: only {len(read.stamps_ns)} readings; a calibration needs the whole recording.")
     read, broken = _finite(read, what)
-    own = "write the encoders' own stamps"
-    kept, notes = kept_readings(read.stamps_ns, read.value, what, RATE_HZ, "reading", own)
+    remedy = "write the encoders' own stamps"
+    kept, notes = kept_readings(read.stamps_ns, read.value, what, RATE_HZ, "reading", remedy)
     if (rate_hz := 1e9 / usual_step(read.stamps_ns)) < _LEAST_HZ:
         raise RecordingError(
             f"{what}: the rate of {rate_hz:.2g} Hz is too low to follow the wheels, at least {_LEAST_HZ:g} Hz "
@@ -96,8 +96,8 @@ def _turning(read: WheelReadings, wheels: Wheels) -> int:
 
 def _even_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
     """Rates or velocities without outliers, and a note."""
-    off, own = apart(read.value, read.seconds)
-    return _some(read, ~np.logical_or.reduce(own, axis=1)), _apart_note(read, off, own, what)
+    off, outlier = apart(read.value, read.seconds)
+    return _some(read, ~np.logical_or.reduce(outlier, axis=1)), _apart_note(read, off, outlier, what)
 
 
 def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
@@ -107,22 +107,22 @@ def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelRe
     counter that was reset, are removed next.
     """
     size, notes = _range(read, wheels, what)
-    off, own = apart(_steps(read, wheels, size), read.seconds[1:])
+    off, outlier = apart(_steps(read, wheels, size), read.seconds[1:])
     dt = np.diff(read.seconds)[:, None]
-    wrong = second_order(off * dt, own)
+    wrong = second_order(off * dt, outlier)
     if wrong.any():
         at = read.stamps_ns[np.argmax(wrong)]
         notes += (f"{what}: {int(wrong.sum())} single readings are outliers and were removed, the first at {at} ns.",)
         read = _some(read, ~wrong)
-        off, own = apart(_steps(read, wheels, size), read.seconds[1:])
-    own = set_back(_steps(read, wheels, size), off, own)
-    if wheels.measures == "ticks" and wheels.counter_size is None and own.any():
-        _refuse_counter(read, wheels, off * np.diff(read.seconds)[:, None] * own, what)
+        off, outlier = apart(_steps(read, wheels, size), read.seconds[1:])
+    outlier = set_back(_steps(read, wheels, size), off, outlier)
+    if wheels.measures == "ticks" and wheels.counter_size is None and outlier.any():
+        _refuse_counter(read, wheels, off * np.diff(read.seconds)[:, None] * outlier, what)
     rate, stamps = _steps(read, wheels, size), read.stamps_ns
     n_turning = _turning(read, wheels)
     turned = WheelReadings(read.name, stamps[1:], np.concatenate([rate, read.value[1:, n_turning:]], axis=1))
-    notes += _apart_note(turned, off, own, what)
-    turned = _some(turned, ~np.logical_or.reduce(own, axis=1))
+    notes += _apart_note(turned, off, outlier, what)
+    turned = _some(turned, ~np.logical_or.reduce(outlier, axis=1))
     first = np.concatenate([turned.value[0, :n_turning], read.value[0, n_turning:]])
     value = np.concatenate([first[None], turned.value])
     return WheelReadings(read.name, np.concatenate([stamps[:1], turned.stamps_ns]), value), notes
@@ -165,14 +165,14 @@ def _refuse_counter(read: WheelReadings, wheels: Wheels, off: np.ndarray, what: 
         )
 
 
-def _apart_note(read: WheelReadings, off: np.ndarray, own: np.ndarray, what: str) -> tuple[str, ...]:
-    """A note on outliers: own (N, m) marks them, off (N, m) are the deviations from their neighbours."""
-    count = int(own.any(axis=1).sum())
+def _apart_note(read: WheelReadings, off: np.ndarray, outlier: np.ndarray, what: str) -> tuple[str, ...]:
+    """A note on outliers: outlier (N, m) marks them, off (N, m) are the deviations from their neighbours."""
+    count = int(outlier.any(axis=1).sum())
     if not count:
         return ()
-    at, most = read.stamps_ns[np.argmax(own.any(axis=1))], np.abs(off[own]).max()
+    at, most = read.stamps_ns[np.argmax(outlier.any(axis=1))], np.abs(off[outlier]).max()
     return (
-        f"{what}: {count} of {len(own)} readings are outliers, off by up to {most:.3g}, and were removed, the "
+        f"{what}: {count} of {len(outlier)} readings are outliers, off by up to {most:.3g}, and were removed, the "
         f"first at {at} ns.",
     )
 
@@ -266,19 +266,19 @@ _UNITS = {"pair": ("rad/s", "rad/s"), "steered": ("rad/s", "rad"), "twist": ("m/
 def _stuck_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
     """Notes on a column that stays constant for longer than _STUCK_S while the other one changes."""
     notes: list[str] = []
-    for own, (name, but, moving) in enumerate(_COLUMNS[stream.kind]):
-        other = 1 - own
-        same = np.concatenate([[False], np.diff(stream.rate[:, own]) == 0])
+    for column, (name, but, moving) in enumerate(_COLUMNS[stream.kind]):
+        other = 1 - column
+        same = np.concatenate([[False], np.diff(stream.rate[:, column]) == 0])
         same &= np.abs(stream.rate[:, other]) > moving
         same &= np.concatenate([[False], np.diff(stream.rate[:, other]) != 0])
         second, count = longest_run(same)  # run of readings equal to the one before
         begin = max(second - 1, 0)
         duration = (stream.stamps_ns[begin + count] - stream.stamps_ns[begin]) * 1e-9
         if duration > _STUCK_S:
-            unit = _UNITS[stream.kind][own]
+            unit = _UNITS[stream.kind][column]
             report = "reports" if "wheel" in name else "stays at"
             notes.append(
-                f"{what}: {name} {report} {stream.rate[begin, own]:.4g} {unit} for {duration:.3g} s from "
+                f"{what}: {name} {report} {stream.rate[begin, column]:.4g} {unit} for {duration:.3g} s from "
                 f"{stream.stamps_ns[begin]} ns on while {but}."
             )
     return tuple(notes)

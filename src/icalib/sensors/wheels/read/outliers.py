@@ -33,12 +33,12 @@ def apart(rate: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray
     limit = np.maximum(limit, [_coarse(r, o) for r, o in zip(rate.T, off.T, strict=True)])
     # Readings at the ends have neighbours on one side only; a higher limit keeps a sudden start.
     ends = np.isin(np.arange(len(rate)), [0, 1, len(rate) - 2, len(rate) - 1])[:, None]
-    own = np.abs(off) > np.where(ends, np.maximum(limit, _fastest(rate)), limit)
+    outlier = np.abs(off) > np.where(ends, np.maximum(limit, _fastest(rate)), limit)
     span = np.diff(seconds, prepend=seconds[0])
-    own &= (span + np.append(span[1:], 0.0) < _MAX_SPAN_S)[:, None]
-    if own.any(axis=1).sum() > _MAX_OUTLIER_SHARE * len(rate):
-        own[:] = False
-    return off, own
+    outlier &= (span + np.append(span[1:], 0.0) < _MAX_SPAN_S)[:, None]
+    if outlier.any(axis=1).sum() > _MAX_OUTLIER_SHARE * len(rate):
+        outlier[:] = False
+    return off, outlier
 
 
 def _coarse(rate: np.ndarray, off: np.ndarray) -> float:
@@ -49,10 +49,10 @@ def _coarse(rate: np.ndarray, off: np.ndarray) -> float:
     return min(_MAX_QUANTA * float(np.percentile(size, 10)), 2.0 * fast) if len(size) else 0.0
 
 
-def set_back(rate: np.ndarray, off: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Mask (N, m) of the outlying steps `own` of angles that no motion explains: the angle was reset. Shorter ones are
-    true motion and are kept. rate, off (N, m): rate of each step, and its deviation from its neighbours."""
-    return own & (np.abs(off) > _fastest(rate))
+def set_back(rate: np.ndarray, off: np.ndarray, outlier: np.ndarray) -> np.ndarray:
+    """Mask (N, m) of the outlying steps `outlier` of angles that no motion explains: the angle was reset. Shorter ones
+    are true motion and are kept. rate, off (N, m): rate of each step, and its deviation from its neighbours."""
+    return outlier & (np.abs(off) > _fastest(rate))
 
 
 def _fastest(rate: np.ndarray) -> np.ndarray:
@@ -60,19 +60,20 @@ def _fastest(rate: np.ndarray) -> np.ndarray:
     return _MAX_RATE_CHANGES * np.percentile(np.abs(rate), _CHANGE_PERCENTILE, axis=0)
 
 
-def second_order(off: np.ndarray, own: np.ndarray) -> np.ndarray:
+def second_order(off: np.ndarray, outlier: np.ndarray) -> np.ndarray:
     """Mask (N + 1,) of angles that are outliers: a jump leads away from the course of the angle and another one back.
 
-    off (N, m): deviations of the N steps between the angles from neighbouring steps; own (N, m): those that are large.
+    off (N, m): deviations of the N steps between the angles from neighbouring steps; outlier (N, m): those that are
+    large.
     """
     wrong = np.zeros(len(off) + 1, dtype=bool)
     for column in range(off.shape[1]):
-        steps = np.flatnonzero(own[:, column])
+        steps = np.flatnonzero(outlier[:, column])
         for i in steps.tolist():
             if wrong[i]:
                 continue
             for j in range(i + 1, min(i + _MAX_STEPS_BACK, len(off))):
-                if own[j, column] and abs(off[i : j + 1, column].sum()) < _MAX_REMAINDER * abs(off[i, column]):
+                if outlier[j, column] and abs(off[i : j + 1, column].sum()) < _MAX_REMAINDER * abs(off[i, column]):
                     wrong[i + 1 : j + 1] = True
                     break
     return wrong

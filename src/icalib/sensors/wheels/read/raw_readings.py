@@ -119,10 +119,10 @@ def _in_the_world(twists: TwistStream) -> bool:
     good = np.isfinite(across) & np.isfinite(rate)
     rate, square = np.where(good, rate, 0.0), np.where(good, across, 0.0) ** 2
     turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
-    whole = np.abs(square).sum()
-    if not whole > 0.0:
+    total = np.abs(square).sum()
+    if not total > 0.0:
         return False
-    as_they_are, back = (abs((square * np.exp(-2j * a)).sum()) / whole for a in (0.0 * turned, turned))
+    as_they_are, back = (abs((square * np.exp(-2j * a)).sum()) / total for a in (0.0 * turned, turned))
     return bool(back > _ALIGNED and as_they_are < _SCATTERED)
 
 
@@ -134,37 +134,37 @@ def read_wheel_joints(wheels: Wheels, joints: JointStream, what: str) -> WheelRe
         raise RecordingError(
             f"{what}: a bag holds no relative planar poses; set another `measures` of {wheels.name} in the rig file."
         )
-    own = _own_joints(wheels, joints.names, what)
-    column = [joints.names.index(name) for name in own]
+    names = _joint_names(wheels, joints.names, what)
+    column = [joints.names.index(name) for name in names]
     value = (joints.velocity if wheels.measures == "rates" else joints.position)[:, column]
     if wheels.drive == "ackermann":
-        half = len(own) // 2
+        half = len(names) // 2
         value[:, half:] = joints.position[:, column[half:]]
     sent = ~np.isnan(value)
     ever = np.any(sent, axis=0).tolist()
-    missing = [name for name, once in zip(own, ever, strict=True) if not once]
+    missing = [name for name, once in zip(names, ever, strict=True) if not once]
     if missing:
-        steering = wheels.drive == "ackermann" and missing[0] in own[len(own) // 2 :]
+        steering = wheels.drive == "ackermann" and missing[0] in names[len(names) // 2 :]
         field, other = ("velocity", "angles") if wheels.measures == "rates" and not steering else ("position", "rates")
         advice = (
             "record the steering angle" if steering else f"set `measures` of {wheels.name} to {other} in the rig file"
         )
         have = "has" if len(missing) == 1 else "have"
         raise RecordingError(f"{what}: {' and '.join(missing)} {have} no {field}; {advice}.")
-    _refuse_zeros(wheels, joints, own, what)
+    _refuse_zeros(wheels, joints, names, what)
     some, all_ = sent.any(axis=1), sent.all(axis=1)
     if (some & ~all_).sum() > _MOST_PARTIAL * some.sum():
         raise RecordingError(
             f"{what}: the message at {joints.stamps_ns[np.argmax(some & ~all_)]} ns has only one of "
-            f"{' and '.join(own)}; let the driver send {'both' if len(own) == 2 else 'all'} together."
+            f"{' and '.join(names)}; let the driver send {'both' if len(names) == 2 else 'all'} together."
         )
     return WheelReadings(wheels.name, joints.stamps_ns[some], value[some])
 
 
-def _refuse_zeros(wheels: Wheels, joints: JointStream, own: tuple[str, ...], what: str) -> None:
-    """Raises RecordingError if the quantity that is used of the joints `own`, velocity or position, is always 0 and the
-    other one is not: a driver fills missing values with 0."""
-    turning = own[: len(own) // 2] if wheels.drive == "ackermann" else own
+def _refuse_zeros(wheels: Wheels, joints: JointStream, names: tuple[str, ...], what: str) -> None:
+    """Raises RecordingError if the quantity that is used of the joints `names`, velocity or position, is always 0 and
+    the other one is not: a driver fills missing values with 0."""
+    turning = names[: len(names) // 2] if wheels.drive == "ackermann" else names
     column = [joints.names.index(name) for name in turning]
     velocity, position = (np.nan_to_num(x[:, column]).any() for x in (joints.velocity, joints.position))
     zero, other, advice = ("velocity", "position", "angles") if position else ("position", "velocity", "rates")
@@ -175,7 +175,7 @@ def _refuse_zeros(wheels: Wheels, joints: JointStream, own: tuple[str, ...], wha
         )
 
 
-def _own_joints(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str, ...]:
+def _joint_names(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str, ...]:
     """Names of the joints of the wheels, in the column order of `WheelReadings`. Raises RecordingError if they are not
     found or ambiguous."""
     if wheels.joints is not None:
@@ -187,11 +187,11 @@ def _own_joints(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str,
             )
         return wheels.joints
     sides = SIDES[wheels.drive]
-    found = [[name for name in names if all(word in name.lower() for word in side.split())] for side in sides]
-    if any(len(own) != 1 for own in found):
+    matches = [[name for name in names if all(word in name.lower() for word in side.split())] for side in sides]
+    if any(len(match) != 1 for match in matches):
         which = "the left and the right wheel" if wheels.drive == "differential" else f"the {', the '.join(sides)}"
         raise RecordingError(
             f"{what}: the names of the joints {', '.join(names)} do not tell which are {which}; set `joints: "
             f"[{', '.join(side.upper() for side in sides)}]` of {wheels.name} in the rig file."
         )
-    return tuple(own[0] for own in found)
+    return tuple(match[0] for match in matches)
