@@ -29,25 +29,25 @@ def main() -> None:
     images = [_grey(path) for path in files]
     detector, size = CheckerboardDetector(options.rows, options.cols), (options.cols, options.rows)
     detector.detect(images[0])  # compiles
-    ways: dict[str, Callable[[np.ndarray], bool]] = {
+    detectors: dict[str, Callable[[np.ndarray], bool]] = {
         "icalib": lambda i: int(detector.detect(i).kept.sum()) >= 0.5 * options.rows * options.cols,
         "SB": lambda i: cv2.findChessboardCornersSB(i, size, flags=PLAIN)[0],
         "SB exhaustive": lambda i: cv2.findChessboardCornersSB(i, size, flags=PLAIN | cv2.CALIB_CB_EXHAUSTIVE)[0],
         "classic": lambda i: cv2.findChessboardCorners(i, size, flags=QUICK)[0],
     }
     print(f"{options.folder.name}: {len(images)} images, {images[0].shape[1]} x {images[0].shape[0]} px")
-    found = {name: _counted(way, images) for name, way in ways.items()}
-    theirs = np.any([hits for name, (hits, _) in found.items() if name != "icalib"], axis=0)
-    for name, (hits, seconds) in found.items():
+    counts = {name: _counted(detect, images) for name, detect in detectors.items()}
+    theirs = np.any([hits for name, (hits, _) in counts.items() if name != "icalib"], axis=0)
+    for name, (hits, seconds) in counts.items():
         print(f"  {name:<14}{sum(hits):>5}{1e3 * seconds / len(images):>9.0f} ms an image")
     print(f"  {'any of OpenCV':<14}{theirs.sum():>5}")
-    print(f"  {'by it alone':<14}{(theirs & ~np.array(found['icalib'][0])).sum():>5}")
+    print(f"  {'by it alone':<14}{(theirs & ~np.array(counts['icalib'][0])).sum():>5}")
 
 
-def _counted(way: Callable[[np.ndarray], bool], images: list[np.ndarray]) -> tuple[list[bool], float]:
+def _counted(detect: Callable[[np.ndarray], bool], images: list[np.ndarray]) -> tuple[list[bool], float]:
     """Whether each image shows the board, and processor seconds."""
     began = time.process_time()
-    hits = [bool(way(image)) for image in images]
+    hits = [bool(detect(image)) for image in images]
     return hits, time.process_time() - began
 
 

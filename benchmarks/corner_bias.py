@@ -53,9 +53,9 @@ def _errors(run: Film):
     model, params = camera_model(camera.model), np.array([*camera.intrinsics, *camera.distortion])
     T_target_world, detector = np.linalg.inv(run.scenario.body_poses[0]), detector_of(target)
     for shot in run.shots(workers=1):
-        found = detector.detect(shot.pixels)
-        kept = found.kept
-        uv, point, edges = found.uv[kept], found.point[kept], found.edges[kept].astype(np.float64)
+        corners = detector.detect(shot.pixels)
+        kept = corners.kept
+        uv, point, edges = corners.uv[kept], corners.point[kept], corners.edges[kept].astype(np.float64)
         T = T_target_world @ exposure_poses(camera, run.truth.trajectory, shot.seconds, 0.0, 1)[0]
         X, plane = (target.points[point] - T[:3, 3]) @ T[:3, :3], np.tile(T[:3, :3].T[:, :2], (len(point), 1, 1))
         bent = uv.copy()

@@ -20,12 +20,12 @@ def main(folder: Path) -> None:
     began = time.process_time()
     images = [_image(one) for one in data]
     read = time.process_time()
-    found = [detector.detect(image) for image in images]
+    corners = [detector.detect(image) for image in images]
     ended = time.process_time()
     print(f"{len(images)} images of {images[0].shape[1]} x {images[0].shape[0]} px")
     print(f"reading   {1e3 * (read - began) / len(images):6.2f} ms")
     print(f"detection {1e3 * (ended - read) / len(images):6.2f} ms")
-    print(f"corners   {sum(int(one.kept.sum()) for one in found)} kept of {sum(len(one.point) for one in found)}")
+    print(f"corners   {sum(int(one.kept.sum()) for one in corners)} kept of {sum(len(one.point) for one in corners)}")
 
 
 def _image(data: np.ndarray) -> np.ndarray:

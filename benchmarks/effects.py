@@ -224,10 +224,10 @@ def main() -> int:
     parser.add_argument("--rig", nargs="+", choices=tuple(KINDS), default=tuple(KINDS))
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--first-seed", type=int, default=0)
-    asked = parser.parse_args()
-    seeds, far, began = range(asked.first_seed, asked.first_seed + asked.seeds), 0, time.process_time()
+    options = parser.parse_args()
+    seeds, far, began = range(options.first_seed, options.first_seed + options.seeds), 0, time.process_time()
     print("| rig | effect | sigma | converged | determined: worst | weak: worst |\n|---|---|---|---|---|---|")
-    for name in asked.rig:
+    for name in options.rig:
         kind = KINDS[name]
         for effect, times in [(NONE, 0.0), *((e, t) for e in kind.effects for t in TIMES)]:
             row = row_of(kind, effect, times, seeds)

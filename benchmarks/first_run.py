@@ -34,10 +34,10 @@ RUN = "import sys; from icalib.cli import main; sys.exit(main())"
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"some of: {', '.join(CASES)} (all)")
-    asked = parser.parse_args().cases or list(CASES)
+    names = parser.parse_args().cases or list(CASES)
     print(f"{'case':<14}{'first cpu s':>12}{'s':>7}{'later cpu s':>12}{'s':>7}{'compilation cpu s':>19}", flush=True)
     worst = 0
-    for name in asked:
+    for name in names:
         with tempfile.TemporaryDirectory() as folder:
             rig, recording = CASES[name](Path(folder))
             first, later = (_calibrated(Path(folder), rig, recording, k) for k in ("first", "later"))

@@ -112,7 +112,7 @@ def main() -> int:
     if options.what == "compare":
         print(f"{'case':<20}{'value / std':>13}{'std':>11}{'relative':>11}{'visits':>12}{'cpu s':>15}{'times':>7}")
     for name in options.only or CASES:
-        new = _in_own_process(name, options.data)
+        new = _in_subprocess(name, options.data)
         file = FOLDER / f"{name}.json"
         if options.what == "store":
             FOLDER.mkdir(exist_ok=True)
@@ -133,7 +133,7 @@ def _line(name: str, old: Record, new: Record, change: Change) -> str:
     return "\n".join([line, *(f"    {words}" for words in change.words)])
 
 
-def _in_own_process(name: str, data: Path) -> Record:
+def _in_subprocess(name: str, data: Path) -> Record:
     command = [sys.executable, __file__, "store", "--child", name, "--data", str(data)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     return Record(**json.loads(done.stdout.splitlines()[-1]))

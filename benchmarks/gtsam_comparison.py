@@ -171,8 +171,8 @@ def optimised(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, cameras: 
     ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, False)
     params.setOrdering(ordering)
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
-    found = optimizer.optimize()
-    return optimizer.iterations(), found, ordering
+    solution = optimizer.optimize()
+    return optimizer.iterations(), solution, ordering
 
 
 def extrinsics_covariance(

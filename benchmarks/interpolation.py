@@ -77,8 +77,8 @@ def draw(rows: list[dict]) -> None:
     for line, (axis, title) in zip(axes, titles.items(), strict=True):
         for panel, (key, label, unit) in zip(line, shown, strict=True):
             for scheme, mark in zip(SCHEMES, "os^", strict=True):
-                own = [r for r in rows if r["axis"] == axis and r["scheme"] == scheme]
-                panel.loglog([r["at"] for r in own], [unit * r[key] for r in own], marker=mark, label=scheme)
+                selected = [r for r in rows if r["axis"] == axis and r["scheme"] == scheme]
+                panel.loglog([r["at"] for r in selected], [unit * r[key] for r in selected], marker=mark, label=scheme)
             panel.set(xlabel=title, ylabel=label)
             panel.grid(alpha=0.3)
             if key.startswith("nees"):

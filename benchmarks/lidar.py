@@ -73,8 +73,8 @@ def _errors(simulation: Simulation, result) -> None:
     T, truth = result.T_imu_sensor(name), simulation.truth.T_imu_sensor[name]
     cosine = 0.5 * (np.trace(truth[:3, :3].T @ T[:3, :3]) - 1.0)
     off_us = 1e6 * (result.group(name, "time_offset").value[0] - simulation.truth.time_offset[name])
-    way_mm = 1e3 * np.linalg.norm(T[:3, 3] - truth[:3, 3])
-    print(f"off by {np.rad2deg(np.arccos(min(cosine, 1.0))):.4f} deg, {way_mm:.2f} mm, {off_us:.1f} us")
+    error_mm = 1e3 * np.linalg.norm(T[:3, 3] - truth[:3, 3])
+    print(f"off by {np.rad2deg(np.arccos(min(cosine, 1.0))):.4f} deg, {error_mm:.2f} mm, {off_us:.1f} us")
 
 
 def _peak_mb() -> float:

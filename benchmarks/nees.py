@@ -149,8 +149,8 @@ def _run(case: Case, seed: int) -> tuple[RunRecord, np.ndarray]:
 def _judged(kind: str, runs: list[tuple[RunRecord, np.ndarray]]) -> Judged:
     by_covariance, by_printed = [], []
     for record, printed in runs:
-        own = [b for b in record.blocks if kind in (TOGETHER, b.sensor.rstrip("0123456789"))]
-        k = np.concatenate([record.columns(b.key) for b in own])
+        blocks = [b for b in record.blocks if kind in (TOGETHER, b.sensor.rstrip("0123456789"))]
+        k = np.concatenate([record.columns(b.key) for b in blocks])
         covariance = record.covariance[np.ix_(k, k)]
         scale = printed[k] / np.sqrt(np.diag(covariance))
         by_covariance.append(Sample(record.seed, record.error[k], covariance))
@@ -164,12 +164,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=1)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     failed = 0
-    for round_ in range(asked.rounds):
+    for round_ in range(options.rounds):
         for name, make in CASES.items():
             case = make()
-            for found in judge(case, asked.first_seed + round_ * case.recordings):
+            for found in judge(case, options.first_seed + round_ * case.recordings):
                 print(f"round {round_}  {name:8s} {found}{'' if found.consistent else '  FAILS'}", flush=True)
                 failed += not found.consistent
     return min(failed, 1)

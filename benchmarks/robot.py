@@ -47,8 +47,8 @@ def main() -> None:
     with threadpool_limits(limits=1, user_api="blas"):
         _run(rig, simulation.measurements)  # compiles
         print(f"load before: {os.getloadavg()[0]:.1f}")
-        inputs, found = _run(rig, simulation.measurements, show=True)
-        _parts(inputs, found.estimate)
+        inputs, solution = _run(rig, simulation.measurements, show=True)
+        _parts(inputs, solution.estimate)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     print(f"load after: {os.getloadavg()[0]:.1f}; peak memory {peak:.0f} MB, the simulation included")
 
@@ -57,22 +57,22 @@ def _run(rig: Rig, measurements: Measurements, show: bool = False) -> tuple[Inpu
     """Measurements to covariance, stage by stage."""
     begun, clock = time.process_time(), time.perf_counter()
     (inputs, state, guess), starting = _spent(lambda: guess_of_rig(rig, [measurements]))
-    found, solving = _spent(lambda: determine(inputs, state, guess=guess))
-    _, judging = _spent(lambda: assess(inputs, found))
+    solution, solving = _spent(lambda: determine(inputs, state, guess=guess))
+    _, judging = _spent(lambda: assess(inputs, solution))
     if show:
         print(f"measurements to covariance{time.process_time() - begun:>8.2f} s of the processor, ", end="")
-        print(f"{time.perf_counter() - clock:.2f} s on the clock, {len(found.estimate.steps)} steps")
+        print(f"{time.perf_counter() - clock:.2f} s on the clock, {len(solution.estimate.steps)} steps")
         print(f"  start                   {starting:>8.2f} s")
         print(f"  solving, determination  {solving:>8.2f} s")
         print(f"  judging                 {judging:>8.2f} s")
-    return inputs, found
+    return inputs, solution
 
 
-def _parts(inputs: Inputs, found: Estimate) -> None:
+def _parts(inputs: Inputs, estimate: Estimate) -> None:
     """Accumulation of points to moments, and one linearisation by sensor."""
-    problem, state = found.problem, found.outcome.state
+    problem, state = estimate.problem, estimate.outcome.state
     motion, planes = motion_of(inputs, state), np.array([state.values[k] for k in inputs.association.keys])
-    noises = [found.measurement_model.noise[s.name] for s in inputs.measurements.lidars]
+    noises = [estimate.measurement_model.noise[s.name] for s in inputs.measurements.lidars]
     for stream, plane, noise in zip(inputs.measurements.lidars, inputs.association.plane, noises, strict=True):
         cloud = AssociatedPoints(stream, plane, planes)
         spent = min(_spent(lambda c=cloud, n=noise: take_moments(c, motion, n))[1] for _ in range(REPEATS))
@@ -80,9 +80,9 @@ def _parts(inputs: Inputs, found: Estimate) -> None:
         print(f"{stream.name}: {1e-6 * len(stream.xyz):.1f} M points to moments {spent:.2f} s, ", end="")
         print(f"{rate:.0f} M points/s and core, {2.0 * rate:.0f} on two")
     pieces, residuals = problem.pieces(), problem.residuals()
-    whole = min(_spent(lambda: problem.linearise(state, pieces, residuals))[1] for _ in range(REPEATS))
+    total = min(_spent(lambda: problem.linearise(state, pieces, residuals))[1] for _ in range(REPEATS))
     print(f"{problem.n_keyframes} keyframes, {problem.layout.size} calibration parameters")
-    print(f"linearising {whole:.3f} s, of which")
+    print(f"linearising {total:.3f} s, of which")
     for factor in problem.factors.values():
         out = factor.output()
         own = min(

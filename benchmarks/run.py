@@ -47,7 +47,7 @@ def main() -> int:
     ]
     _print(figures)
     for group in options.only or GROUPS:
-        found = _in_own_process(group, options.data)
+        found = _in_subprocess(group, options.data)
         _print(found)
         figures += found
     if options.json:
@@ -65,10 +65,10 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _in_own_process(group: str, data: Path) -> list[dict]:
+def _in_subprocess(group: str, data: Path) -> list[dict]:
     if group == "duration":
         repetitions = ("1", "4", "8", "17")  # 72 s each: 1.2, 5, 10 and 20 minutes
-        return [f for n in repetitions for f in _in_own_process(f"duration:{n}", data)]
+        return [f for n in repetitions for f in _in_subprocess(f"duration:{n}", data)]
     command = [sys.executable, __file__, "--child", group, "--data", str(data)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])

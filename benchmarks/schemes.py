@@ -53,15 +53,17 @@ def run(case: Case, seed: int) -> tuple[dict[str, float], float, float]:
     settings = dataclasses.replace(
         rig.settings, keyframes=case.keyframes, scheme=case.scheme, segments=0, keyframe_spacing_s=case.spacing_s
     )
-    found = calibrate_measurements(dataclasses.replace(rig, settings=settings), simulated.measurements)
-    errors = {b: _errors(found, simulated.truth, b) for b in BLOCKS}
+    calibration = calibrate_measurements(dataclasses.replace(rig, settings=settings), simulated.measurements)
+    errors = {b: _errors(calibration, simulated.truth, b) for b in BLOCKS}
     rms = {b: float(np.sqrt(np.mean(e**2))) for b, (e, _) in errors.items()}
     nees = {b: float(e @ np.linalg.solve(P, e)) / len(e) for b, (e, P) in errors.items()}
     return nees, rms["time_offset"], rms["translation"]
 
 
-def _errors(found: Calibration, truth: Truth, block: str) -> tuple[np.ndarray, np.ndarray]:
-    groups = [g for g in found.groups if g.name == block and g.columns is not None and g.sensor in truth.T_imu_sensor]
+def _errors(calibration: Calibration, truth: Truth, block: str) -> tuple[np.ndarray, np.ndarray]:
+    groups = [
+        g for g in calibration.groups if g.name == block and g.columns is not None and g.sensor in truth.T_imu_sensor
+    ]
     errors = []
     for g in groups:
         T = truth.T_imu_sensor[g.sensor]
@@ -70,7 +72,7 @@ def _errors(found: Calibration, truth: Truth, block: str) -> tuple[np.ndarray, n
         else:
             errors.append(g.value - (T[:3, 3] if block == "translation" else truth.time_offset[g.sensor]))
     columns = np.concatenate([np.array(g.columns) for g in groups])
-    return np.concatenate(errors), found.covariance[np.ix_(columns, columns)]
+    return np.concatenate(errors), calibration.covariance[np.ix_(columns, columns)]
 
 
 def main() -> None:

@@ -50,29 +50,29 @@ def main() -> None:
         png, jpeg = (decoding(images, suffix) for suffix in (".png", ".jpg"))
         detector = detector_of(target)
         in_turn(detector, images[:6])  # compiles
-        alone, found = timed(lambda d=detector, i=images: [d.detect(image) for image in i])
+        alone, corners = timed(lambda d=detector, i=images: [d.detect(image) for image in i])
         turns, also = timed(lambda d=detector, i=images: in_turn(d, i))
         rates = f"{1 / png:>8.0f}{1 / jpeg:>8.0f}{count / alone:>8.0f}{count / turns:>8.0f}"
-        print(f"{target.type:<22}{rates}   {differences(found, also)}", flush=True)
+        print(f"{target.type:<22}{rates}   {differences(corners, also)}", flush=True)
 
 
 def in_turn(detector: Detector, images: list[np.ndarray]) -> list[ImageCorners]:
     """As `find_corners` searches a recording."""
-    found: list[ImageCorners] = []
+    corners: list[ImageCorners] = []
     for k, image in enumerate(images):
-        found.append(detector.detect(image, found[k - min(k % IN_TURN, MOTION_IMAGES) :]))
-    return found
+        corners.append(detector.detect(image, corners[k - min(k % IN_TURN, MOTION_IMAGES) :]))
+    return corners
 
 
-def differences(found: list[ImageCorners], also: list[ImageCorners]) -> str:
+def differences(corners: list[ImageCorners], also: list[ImageCorners]) -> str:
     """How many corners are found, and lost, and how far apart [px] those of both are."""
     lost, apart = 0, [np.zeros(0)]
-    for a, b in zip(found, also, strict=True):
+    for a, b in zip(corners, also, strict=True):
         common, i, j = np.intersect1d(a.point[a.kept], b.point[b.kept], return_indices=True)
         lost += int(a.kept.sum()) - len(common)
         apart.append(np.abs(a.uv[a.kept][i] - b.uv[b.kept][j]).ravel())
     off = np.concatenate(apart)
-    return f"{sum(int(f.kept.sum()) for f in found)}, {lost}, {np.sqrt(np.mean(off**2)):.5f} px, {off.max():.4f} px"
+    return f"{sum(int(f.kept.sum()) for f in corners)}, {lost}, {np.sqrt(np.mean(off**2)):.5f} px, {off.max():.4f} px"
 
 
 def rendered(target: Target, count: int) -> list[np.ndarray]:

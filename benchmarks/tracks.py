@@ -61,9 +61,9 @@ def _rig(rig: Rig) -> Rig:
     return rig.with_(target=NoTarget(), cameras=tuple(cameras))
 
 
-def _step(found: Estimate) -> None:
+def _step(result: Estimate) -> None:
     """One step, and its products alone."""
-    problem, state = found.problem, found.outcome.state
+    problem, state = result.problem, result.outcome.state
     pieces, residuals = problem.pieces(), problem.residuals()
     linearising, solving = [], []
     for _ in range(REPEATS):
