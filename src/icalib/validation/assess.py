@@ -15,7 +15,6 @@ from icalib.estimate.problem.problem import Problem
 from icalib.estimate.residual_statistics.fit_statistics import fits, raw_sizes
 from icalib.estimate.residual_statistics.inflation import calibration_columns
 from icalib.estimate.residual_statistics.segments import Segments
-from icalib.model.statistics import Fit
 from icalib.motion.axes import hardly_turned
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined
@@ -55,47 +54,56 @@ LARGE_BLOOM_PX = 0.8  # px; a warning above it: ink and overexposure shift edges
 def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()) -> Calibration:
     """The result of the estimate `determined`. against: values of the rig file that the data contradict so strongly
     that other faults of the estimate may follow from them."""
-    found = determined.estimate
-    outcome, state = found.outcome, found.outcome.state
-    names = _column_names(inputs)
-    seen = _observed(inputs, determined, names)
-    parts = Segments.of(found.problem, outcome, inputs.rig.settings.segments)
-    groups = _groups(inputs, determined, seen, VarianceParts.of(determined, parts))
-    judged = _sensor_fits([f for f in fits(found.problem, outcome) if not _is_assumed(inputs, f.sensor)], found)
-    validation = cross_validation(parts, [s for s in (inputs.rig.reference,) if _is_assumed(inputs, s)])
-    timeline = Timeline.of(inputs.parts, image_times(inputs.measurements, state.values), inputs.rig.reference)
+    estimate, rig = determined.estimate, inputs.rig
+    observability = _observed(inputs, determined, _column_names(inputs))
+    segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
+    groups = _groups(inputs, determined, observability, VarianceParts.of(determined, segments))
+    validation = cross_validation(segments, [s for s in (rig.reference,) if _is_assumed(inputs, s)])
+    timeline = Timeline.of(inputs.parts, image_times(inputs.measurements, estimate.outcome.state.values), rig.reference)
     factors = _factors(inputs, groups)
-    assessed = AssessedEstimate(inputs, found, groups, judged, factors.max(initial=1.0), parts, timeline)
+    sensor_fits = _sensor_fits(inputs, estimate)
+    assessed = AssessedEstimate(inputs, estimate, groups, sensor_fits, factors.max(initial=1.0), segments, timeline)
     causes, size_notes = all_causes(assessed, against)
-    wrong = tuple(c.sentence for c in causes if c.grave)
+    grave = tuple(c.sentence for c in causes if c.grave)
     warnings = (
-        *wrong,
+        *grave,
         *(c.sentence for c in causes if not c.grave),
-        *_warnings(inputs, found, groups),
-        *scatter_warnings(factors, parts is not None, validation),
+        *_warnings(inputs, estimate, groups),
+        *scatter_warnings(factors, segments is not None, validation),
     )
+    return dataclasses.replace(
+        _calibration(assessed, determined, observability),
+        warnings=tuple(dict.fromkeys(warnings)),
+        notes=(*_notes(assessed), *size_notes, *few_parts_notes(inputs, segments)),
+        cross_validation=validation,
+        wrong=grave,
+    )
+
+
+def _calibration(assessed: AssessedEstimate, determined: Determined, observability: Observability) -> Calibration:
+    """The result without warnings, notes and cross-validation."""
+    inputs, timeline, estimate = assessed.inputs, assessed.timeline, determined.estimate
+    outcome = estimate.outcome
     return Calibration(
-        groups=groups,
-        covariance=seen.covariance,
-        covariance_names=names,
+        groups=assessed.groups,
+        covariance=observability.covariance,
+        covariance_names=_column_names(inputs),
         null_space=determined.fixed_directions,
-        undetermined=seen.undetermined,
-        fits=tuple(judged),
-        residuals=by_key(_residuals(inputs, found, timeline)),
-        trajectory=_trajectory(inputs, state, timeline),
-        iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
+        undetermined=observability.undetermined,
+        fits=tuple(assessed.fits),
+        residuals=by_key(_residuals(inputs, estimate, timeline)),
+        trajectory=_trajectory(inputs, outcome.state, timeline),
+        iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in estimate.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=tuple(dict.fromkeys(warnings)),
-        notes=(*_notes(assessed), *size_notes, *few_parts_notes(inputs, parts)),
+        warnings=(),
+        notes=(),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
         versions=versions(),
         recordings=timeline.spans,
-        planes=tuple(call_all_kinds("assess", "planes", inputs, state)),
-        cross_validation=validation,
-        wrong=wrong,
+        planes=tuple(call_all_kinds("assess", "planes", inputs, outcome.state)),
     )
 
 
@@ -169,46 +177,45 @@ def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
 
 
 def _groups(
-    inputs: Inputs, determined: Determined, seen: Observability, variances: VarianceParts
+    inputs: Inputs, determined: Determined, observability: Observability, variances: VarianceParts
 ) -> tuple[ParameterGroup, ...]:
     """The parameter groups of the result, fixed ones included. `variances` gives the empirical factors."""
-    formal, found = np.sqrt(np.diag(seen.covariance)), determined.estimate
+    formal, problem = np.sqrt(np.diag(observability.covariance)), determined.estimate.problem
     overall = variances.pooled(calibration_columns(inputs))
+    state = determined.estimate.outcome.state
     groups = []
     for block in inputs.layout.blocks:
         if block.name in IN_THE_WORLD or _is_assumed(inputs, block.sensor):
             continue
-        spec = inputs.specs[block.key]
-        if block.start is None and not _is_shown(inputs, block, spec):
-            continue
-        zeros = np.zeros(block.size)
         if block.start is None:
-            std = factor = zeros
-            verdict: tuple[Verdict, ...] = ("fixed",) * block.size
-        else:
-            k = block.columns
-            std, factor = formal[k], variances.factor(k, overall)
-            sizes = factor * np.maximum(seen.spread[k], std / found.problem.tolerance[k])
-            verdict = tuple(_final_verdict(seen.verdicts[i], size) for i, size in zip(k, sizes.tolist(), strict=True))
-        groups.append(
-            ParameterGroup(
-                block.sensor,
-                block.name,
-                spec.labels,
-                spec.unit,
-                _raw_value(inputs, found.outcome.state, block),
-                std,
-                std * np.maximum(factor, 1.0),
-                verdict,
-                _mode(inputs, block),
-                None if block.start is None else tuple(int(i) for i in block.columns),
-                factor,
-            )
-        )
+            if _is_listed(inputs, block, inputs.specs[block.key]):
+                zeros = np.zeros(block.size)
+                fixed: tuple[Verdict, ...] = ("fixed",) * block.size
+                groups.append(_group(inputs, block, state, zeros, zeros, fixed))
+            continue
+        k = block.columns
+        std, factor = formal[k], variances.factor(k, overall)
+        sizes = factor * np.maximum(observability.spread[k], std / problem.tolerance[k])
+        verdicts = zip((observability.verdicts[i] for i in k), sizes.tolist(), strict=True)
+        verdict: tuple[Verdict, ...] = tuple(_final_verdict(formal_verdict, size) for formal_verdict, size in verdicts)
+        groups.append(_group(inputs, block, state, std, factor, verdict))
     return tuple(groups)
 
 
-def _is_shown(inputs: Inputs, block: Block, spec: ParameterSpec) -> bool:
+def _group(
+    inputs: Inputs, block: Block, state: State, std: np.ndarray, factor: np.ndarray, verdict: tuple[Verdict, ...]
+) -> ParameterGroup:
+    """The group of `block` in the result, with its formal standard deviations `std` and their empirical `factor`."""
+    spec = inputs.specs[block.key]
+    columns = None if block.start is None else tuple(int(i) for i in block.columns)
+    value, printed_std = _raw_value(inputs, state, block), std * np.maximum(factor, 1.0)
+    return ParameterGroup(
+        block.sensor, block.name, spec.labels, spec.unit, value, std, printed_std, verdict, _mode(inputs, block),
+        columns, factor,
+    )  # fmt: skip
+
+
+def _is_listed(inputs: Inputs, block: Block, spec: ParameterSpec) -> bool:
     """Whether the result lists a group that is not estimated: the rig file can state it, and measurements depend on it.
     Wheel radii, for example, have no effect if wheels report poses."""
     sensor = inputs.rig.sensors.get(block.sensor)
@@ -236,10 +243,13 @@ def few_parts_notes(inputs: Inputs, parts: Segments | None) -> Iterator[str]:
         )
 
 
-def _sensor_fits(judged: Sequence[Fit], found: Estimate) -> list[SensorFit]:
-    """Fit statistics of each sensor and kind of residual, with the sizes of its raw residuals."""
-    sizes = raw_sizes(found.problem, found.outcome.residuals)
-    return [SensorFit(f.sensor, f.kind, f.count, f.dof, f.chi2, *sizes[f.sensor, f.kind]) for f in judged]
+def _sensor_fits(inputs: Inputs, estimate: Estimate) -> list[SensorFit]:
+    """Fit statistics of each sensor and kind of residual, with the sizes of its raw residuals. Assumed motion has
+    none."""
+    problem, outcome = estimate.problem, estimate.outcome
+    sizes = raw_sizes(problem, outcome.residuals)
+    measured = [f for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
+    return [SensorFit(f.sensor, f.kind, f.count, f.dof, f.chi2, *sizes[f.sensor, f.kind]) for f in measured]
 
 
 def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:

@@ -32,6 +32,10 @@ FEWEST_CORNERS = 8  # in an image; its pose takes up six of their 16 coordinates
 BETTER = 0.9  # ratio of the RMS of another model to that of the camera's model, above which the other is not named
 EQUAL = 1.1  # times the least RMS: among the models below it, that with fewest parameters is named
 SIGN_TEST_SIGMAS = 3.0  # least deviation of the number of images that another model fits better from half of them
+NO_BETTER_MODEL = (
+    ", and no other camera model follows them clearly better; check that the images are as the camera took them, and "
+    "that the target is as the rig file says."
+)
 
 
 @dataclass(frozen=True)
@@ -78,28 +82,24 @@ def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, flo
         noise = residual_noise(factor, out, inputs.rig.settings, image_speed(factor, state))
         if not noise.lens_misfit_is_large:
             continue
-        most = float(np.linalg.norm(noise.lens.field, axis=1).max())
-        pattern = (
-            f"the corners of {camera.name} are off by up to {most:.2g} px, alike wherever in the image they are seen"
-        )
-        own, best = compare_models(replace(factor, stream=stream), out, state, inputs.rig.settings)
         gain = 2.0 * float(np.count_nonzero(out.root)) * (noise.lens.rms / noise.base) ** 2
-        if best is not None and own is not None:
-            yield (
-                (
-                    f"{pattern}: {own.model.name} does not follow this lens. In images that had no part in the fit it "
-                    f"leaves {own.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`."
-                ),
-                gain,
-            )
+        current, best = compare_models(replace(factor, stream=stream), out, state, inputs.rig.settings)
+        largest = float(np.linalg.norm(noise.lens.field, axis=1).max())
+        misfit = (
+            f"the corners of {camera.name} are off by up to {largest:.2g} px, alike wherever in the image they are seen"
+        )
+        if best is not None and current is not None:
+            yield _named_model(misfit, current, best), gain
         elif noise.lens.rms > noise.base:
-            yield (
-                (
-                    f"{pattern}, and no other camera model follows them clearly better; check that the images are as "
-                    "the camera took them, and that the target is as the rig file says."
-                ),
-                gain,
-            )
+            yield f"{misfit}{NO_BETTER_MODEL}", gain
+
+
+def _named_model(misfit: str, current: _Trial, best: _Trial) -> str:
+    """The sentence about a `misfit` that the model `best` explains."""
+    return (
+        f"{misfit}: {current.model.name} does not follow this lens. In images that had no part in the fit it leaves "
+        f"{current.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`."
+    )
 
 
 def compare_models(
