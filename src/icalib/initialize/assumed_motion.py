@@ -96,7 +96,7 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
     # underestimate the densities.
     rig_with_imu = _with_assumption(rig, recordings, _smoothed(motion.body, narrow=True))
     inputs = replace(
-        inputs_for(rig_with_imu, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), asked=rig
+        inputs_for(rig_with_imu, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), user_rig=rig
     )
     # The estimate gets an IMU that reads zero. Alignment needs one that reads the motion of the smoothed trajectory.
     ideal = _with_ideal_readings(rig_with_imu, recordings, paths, inputs)

@@ -155,7 +155,7 @@ def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None
         and (refined := _converged_attempt(agreeing_rig, make)) is not None
     ):
         fallback = refined
-    return replace(fallback, inputs=replace(fallback.inputs, asked=rig))
+    return replace(fallback, inputs=replace(fallback.inputs, user_rig=rig))
 
 
 def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[[Parameter], bool]) -> Attempt | None:
@@ -182,7 +182,7 @@ def _contradicting_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt 
     fallback = _without_values(rig, make, lambda p: True)
     if fallback is None:
         return None
-    against = contradicted_by(replace(fallback.inputs, asked=rig), fallback.solution)
+    against = contradicted_by(replace(fallback.inputs, user_rig=rig), fallback.solution)
     return replace(fallback, against=against) if against else None
 
 

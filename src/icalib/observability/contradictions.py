@@ -136,7 +136,7 @@ def _difference(
 ) -> Contradiction:
     """The difference between the stated value of `block` and the value at `state` plus `step` (B,). sigma (B,): formal
     standard deviations, which `factor` multiplies."""
-    sensor = (inputs.asked or inputs.rig).sensors[block.sensor]
+    sensor = (inputs.user_rig or inputs.rig).sensors[block.sensor]
     parameter: Parameter = getattr(sensor, block.name)
     assert parameter.value is not None
     value, step = state.values[block.key], step[block.columns]

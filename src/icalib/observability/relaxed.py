@@ -103,15 +103,15 @@ def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
     Without a real IMU the pose of the reference sensor defines the body frame, so it is no stated value. With assumed
     motion neither is its time offset.
     """
-    asked, used = inputs.asked or inputs.rig, {s.name for s in inputs.rig.mounted}
+    user_rig, used = inputs.user_rig or inputs.rig, {s.name for s in inputs.rig.mounted}
     body = () if inputs.rig.imu is not None and not inputs.rig.assumes_motion else ("rotation", "translation")
     if inputs.rig.assumes_motion:
         body = (*body, "time_offset")
     return [
         (s.name, name)
-        for s, name, parameter in groups_of(asked)
+        for s, name, parameter in groups_of(user_rig)
         if s.name in used and _is_stated(parameter)
-        if not (s.name == asked.reference and name in body)
+        if not (s.name == user_rig.reference and name in body)
         if any(b.key == (s.name, name) and b.start is not None for b in layout.blocks)
     ]
 

@@ -98,7 +98,7 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
         status=outcome.status,
         warnings=(),
         notes=(),
-        rig=rig_to_dict(inputs.asked or inputs.rig),
+        rig=rig_to_dict(inputs.user_rig or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
         versions=versions(),

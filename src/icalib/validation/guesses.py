@@ -25,7 +25,7 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
     """One sentence for each initial guess that the estimate contradicts, see `is_contradicted`. For lenses it is one
     whose projections are more than the prior uncertainty of the intrinsics off."""
     found = {(g.sensor, g.name): g for g in groups}
-    for sensor, name, parameter in groups_of(inputs.asked or inputs.rig):
+    for sensor, name, parameter in groups_of(inputs.user_rig or inputs.rig):
         group, guess = found.get((sensor.name, name)), parameter.value
         if group is None or guess is None or parameter.mode != "free" or "undetermined" in group.verdict:
             continue

@@ -66,7 +66,7 @@ def scale_notes(inputs: Inputs, size: TargetSize | None) -> Iterator[str]:
 def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
     """Texts that name the sources of the metric scale. size: of the target by the accelerometer, None if
     unobservable."""
-    rig = inputs.asked or inputs.rig
+    rig = inputs.user_rig or inputs.rig
     target = rig.has_target and bool(rig.cameras)
     has_imu = rig.imu is not None and not rig.imu.assumed
     sources = ["the size of the target"] if target else []

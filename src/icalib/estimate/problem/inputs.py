@@ -30,7 +30,7 @@ class Inputs:
 
     bodies: bodies of the target in use. parts: the recordings that were joined to `measurements`. association: points
     on planes; sensors that measure planes are used only with them. guess: initial state, before points were associated
-    with planes. asked: the rig as the user gave it, if `rig` has more.
+    with planes. user_rig: the rig as the user gave it, if `rig` has more.
     """
 
     rig: Rig
@@ -41,7 +41,7 @@ class Inputs:
     parts: tuple[Part, ...]
     association: PlaneAssociation = NO_ASSOCIATION
     guess: State | None = None
-    asked: Rig | None = None
+    user_rig: Rig | None = None
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:

@@ -76,7 +76,7 @@ def state_from_pairs(
     for k in range(int(is_body), len(rig.poses)):
         at, mounted = _with_extrinsics(still, k, at, body)
         values |= mounted
-    inputs = replace(inputs_for(still, at), asked=rig)
+    inputs = replace(inputs_for(still, at), user_rig=rig)
     for sensor in still.poses:
         values |= stated_values(inputs, sensor, MOUNTED_NAMES if sensor.name == rig.reference else ("time_offset",))
     for k in range(len(recordings)):
