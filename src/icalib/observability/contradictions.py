@@ -30,21 +30,21 @@ FAR = 0.5  # times the prior uncertainty (3 deg, 5 cm, 10 ms); a longer step is 
 class Contradiction:
     """A parameter group `key` whose stated value (`parameter`, fixed or with a prior) differs from the data.
 
-    found: the value from the data alone, of the shape of the stated value; time offsets are between raw stamps. off
-    (n,): found minus stated; for rotations the rotation vector from stated to found, about the sensor's axes [rad].
-    sigma (n,): standard deviation of `found`. spec: definition of the group.
+    value: the value from the data alone, of the shape of the stated value; time offsets are between raw stamps. off
+    (n,): `value` minus stated; for rotations the rotation vector from stated to `value`, about the sensor's axes [rad].
+    sigma (n,): standard deviation of `value`. spec: definition of the group.
     """
 
     key: Key
     spec: ParameterSpec
     parameter: Parameter
-    found: np.ndarray
+    value: np.ndarray
     off: np.ndarray
     sigma: np.ndarray
 
     @property
     def away(self) -> np.ndarray:
-        """(n,) absolute difference over its standard deviation, which combines those of `found` and of the prior."""
+        """(n,) absolute difference over its standard deviation, which combines those of `value` and of the prior."""
         stated = 0.0 if self.parameter.sigma is None else self.parameter.sigma
         return np.abs(self.off) / np.maximum(np.sqrt(self.sigma**2 + stated**2), 1e-300)
 

@@ -70,8 +70,8 @@ class Relaxed:
         Noise in the Jacobian can be estimated from this outcome."""
         pull, known = self._priors_of(freed)
         problem = self.problem.without([p for p in self.problem.priors if p.block.key in freed])
-        found = outcome_of(Linearised(problem, self.state, 0.0, self.residuals), 0.0, [], self.solution)
-        return replace(found, information=found.information - known), self.solution.gradient[:-1] - pull
+        outcome = outcome_of(Linearised(problem, self.state, 0.0, self.residuals), 0.0, [], self.solution)
+        return replace(outcome, information=outcome.information - known), self.solution.gradient[:-1] - pull
 
     def _priors_of(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (B,) and information (B, B) of the priors on the groups `freed`."""
@@ -79,16 +79,16 @@ class Relaxed:
         return sums_of_priors(priors, self.state, self.layout.size)[1:]
 
 
-def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
-    """The solution `found` with the values free that the rig file fixes. None if the rig file fixes nothing and states
-    no prior, if the solver did not converge, or if the normal equations cannot be solved."""
-    if not found.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
+def relaxed(inputs: Inputs, estimate: Estimate) -> Relaxed | None:
+    """The solution `estimate` with the values free that the rig file fixes. None if the rig file fixes nothing and
+    states no prior, if the solver did not converge, or if the normal equations cannot be solved."""
+    if not estimate.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
         return None
     freed = freed_inputs(inputs)
-    fixed_directions = _held_in(freed.layout, inputs.layout, found.problem.fixed_directions)
-    state = found.outcome.state
+    fixed_directions = _in_layout(freed.layout, inputs.layout, estimate.problem.fixed_directions)
+    state = estimate.outcome.state
     try:
-        problem = found.measurement_model.problem(freed, state, fixed_directions)
+        problem = estimate.measurement_model.problem(freed, state, fixed_directions)
         pieces, residuals = problem.pieces(), problem.residuals()
         problem.linearise(state, pieces, residuals, curved=True)
         solution = solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=fixed_directions)
@@ -131,7 +131,7 @@ def _is_stated(parameter: Parameter) -> bool:
     return parameter.mode != "free" and parameter.value is not None
 
 
-def _held_in(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> np.ndarray:
+def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> np.ndarray:
     """Directions of the calibration parameters of the layout `before`, as directions of `layout`, which has more
     columns."""
     if not fixed_directions.size:

@@ -33,7 +33,7 @@ class Observability:
 
 
 def observe(
-    found: Determined,
+    determined: Determined,
     names: tuple[str, ...],
     specs: Sequence[ParameterSpec],
     on_wheels: bool = False,
@@ -46,10 +46,10 @@ def observe(
     on one of its sensors. tracking: names of cameras without a target. axes: text that names the axes about which the
     rig hardly turned, or empty.
     """
-    directions = sparse_basis(found.fixed_directions)
+    directions = sparse_basis(determined.fixed_directions)
     verdicts: list[Verdict] = []
-    for is_null, spread in zip(in_null_space(directions), found.spread, strict=True):
-        is_undetermined = is_null or not found.estimate.outcome.converged
+    for is_null, spread in zip(in_null_space(directions), determined.spread, strict=True):
+        is_undetermined = is_null or not determined.estimate.outcome.converged
         verdicts.append("undetermined" if is_undetermined else by_size(spread))
     sentences = []
     for direction in directions.T:
@@ -58,7 +58,7 @@ def observe(
         motion = _missing_motion(spec, on_wheels, sensor in tracking).format(axes=axes or EVERY_AXIS)
         by = "these images" if spec.by_images else "this motion"
         sentences.append(f"{words}: not determined by {by}; {motion}.")
-    return Observability(found.covariance, tuple(verdicts), tuple(sentences), found.spread)
+    return Observability(determined.covariance, tuple(verdicts), tuple(sentences), determined.spread)
 
 
 def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
@@ -92,5 +92,5 @@ def _missing_motion(spec: ParameterSpec, on_wheels: bool, without_target: bool) 
 def _words(name: str) -> str:
     """Readable form of a column's name. The label is left out if the parameter is a single number."""
     sensor, kind, label = name.rsplit(".", 2)
-    own = kind if label == kind else f"{kind} {label}"
-    return f"{sensor} {own.replace('_', ' ')}"
+    parameter = kind if label == kind else f"{kind} {label}"
+    return f"{sensor} {parameter.replace('_', ' ')}"

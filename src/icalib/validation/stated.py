@@ -38,10 +38,10 @@ def stated_words(inputs: Inputs, c: Contradiction) -> str:
         label = "" if len(labels) == 1 else f" {labels[c.worst]}"
         value = scale * np.broadcast_to(np.asarray(c.parameter.value), c.off.shape)[c.worst]
         given = f"{c.key[1].replace('_', ' ')}{label} of {c.key[0]}, {value:.6g}{allowed or unit},"
-        shown = f"{_rounded(scale * float(c.found[c.worst]), sigma)} +- {sigma:.2g}{unit}"
+        shown = f"{_rounded(scale * float(c.value[c.worst]), sigma)} +- {sigma:.2g}{unit}"
     kind, advice = ("fixed value", "leave it free") if stated is None else ("prior", "give it a larger sigma")
     assert c.parameter.value is not None
-    hint = looks_like(inputs.rig, c.key, c.parameter.value, c.found)
+    hint = looks_like(inputs.rig, c.key, c.parameter.value, c.value)
     return (
         f"the {kind} of {given} contradicts the data, which alone show {shown}: {c.away[c.worst]:.0f} standard "
         f"deviations away; correct it, or {advice}.{hint}"
