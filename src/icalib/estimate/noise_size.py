@@ -74,16 +74,16 @@ class NoiseFit:
         return self.settled and all(abs(np.log(s)) < np.log(MAX_STATED_RATIO) for s in self.scales.values())
 
 
-def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
-    """Noise of the IMU that fits the residuals of `found`. None without an IMU, if an estimate with other noise fails,
-    or if a scale is below MIN_NOISE_SCALE."""
-    if inputs.rig.imu is None or inputs.rig.assumes_motion or not isinstance(found.problem.chain, ImuFactor):
+def fitting_noise(inputs: Inputs, estimate: Estimate) -> NoiseFit | None:
+    """Noise of the IMU that fits the residuals of `estimate`. None without an IMU, if an estimate with other noise
+    fails, or if a scale is below MIN_NOISE_SCALE."""
+    if inputs.rig.imu is None or inputs.rig.assumes_motion or not isinstance(estimate.problem.chain, ImuFactor):
         return None
-    scales: dict[str, float] = dict.fromkeys([*IMU_KINDS, *_refitted_sizes(inputs, found.outcome)], 1.0)
-    outcome, settled = found.outcome, False
+    scales: dict[str, float] = dict.fromkeys([*IMU_KINDS, *_refitted_sizes(inputs, estimate.outcome)], 1.0)
+    outcome, settled = estimate.outcome, False
     for _ in range(MAX_NOISE_ROUNDS):
-        shown = _ImuDraws.of(outcome)
-        sizes = {kind: shown.size(kind) for kind in IMU_KINDS} | _refitted_sizes(inputs, outcome)
+        draws = _ImuDraws.of(outcome)
+        sizes = {kind: draws.size(kind) for kind in IMU_KINDS} | _refitted_sizes(inputs, outcome)
         steps = {key: float(np.clip(size, 1.0 / MAX_SCALE_STEP, MAX_SCALE_STEP)) for key, size in sizes.items()}
         settled = all(abs(np.log(step)) < MAX_LOG_SCALE_CHANGE for step in steps.values())
         if settled:
@@ -92,13 +92,13 @@ def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
         if min(scales.values()) < MIN_NOISE_SCALE:
             return None
         try:
-            outcome = _solved(inputs, found, scales)
+            outcome = _solved(inputs, estimate, scales)
         except EstimationError:
             return None
-    shown = _ImuDraws.of(outcome)
-    correlation = max(shown.correlation(kind) for kind in IMU_KINDS)
-    own = {kind: scales[kind] for kind in IMU_KINDS}
-    return NoiseFit(_scaled(inputs, scales), own, settled, correlation, max(map(shown.variation, IMU_KINDS)))
+    draws = _ImuDraws.of(outcome)
+    correlation = max(draws.correlation(kind) for kind in IMU_KINDS)
+    imu_scales = {kind: scales[kind] for kind in IMU_KINDS}
+    return NoiseFit(_scaled(inputs, scales), imu_scales, settled, correlation, max(map(draws.variation, IMU_KINDS)))
 
 
 def _scaled(inputs: Inputs, scales: dict[str, float]) -> ImuNoise:
@@ -110,17 +110,17 @@ def _scaled(inputs: Inputs, scales: dict[str, float]) -> ImuNoise:
     )
 
 
-def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcome:
-    """Solution from the state of `found`, with noise standard deviations multiplied by `scales`."""
+def _solved(inputs: Inputs, estimate: Estimate, scales: dict[str, float]) -> Outcome:
+    """Solution from the state of `estimate`, with noise standard deviations multiplied by `scales`."""
     assert inputs.rig.imu is not None
     rig = inputs.rig.with_sensors(replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
     other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
-    state, model = found.outcome.state, found.measurement_model
+    state, model = estimate.outcome.state, estimate.measurement_model
     scaled = {
         s.name: model_of(s).scaled_noise(model.noise[s.name], scales[s.name]) for s in rig.mounted if s.name in scales
     }
     return minimise(
-        replace(model, noise={**model.noise, **scaled}).problem(other, state, found.problem.fixed_directions), state
+        replace(model, noise={**model.noise, **scaled}).problem(other, state, estimate.problem.fixed_directions), state
     )
 
 
@@ -130,8 +130,8 @@ def _refitted_sizes(inputs: Inputs, outcome: Outcome) -> dict[str, float]:
     sizes, factors = {}, outcome.problem.factors
     for sensor in inputs.sensors:
         key = sensor.name, model_of(sensor).refitted
-        if key in factors and (own := factors[key].squares(outcome.residuals[key]).get(key)) is not None:
-            sizes[sensor.name] = float(np.sqrt(own.chi2 / max(own.n, 1)))
+        if key in factors and (squares := factors[key].squares(outcome.residuals[key]).get(key)) is not None:
+            sizes[sensor.name] = float(np.sqrt(squares.chi2 / max(squares.n, 1)))
     return sizes
 
 
@@ -151,8 +151,8 @@ class _ImuDraws:
         assert outcome.draws is not None
         along = []
         for x in outcome.draws.free[:4]:
-            there = state.retract(problem.layout, DRAW_STEP * x.chain, DRAW_STEP * x.calib)
-            along.append((output_at(problem.chain, there).residual - base) / DRAW_STEP)
+            draw_state = state.retract(problem.layout, DRAW_STEP * x.chain, DRAW_STEP * x.calib)
+            along.append((output_at(problem.chain, draw_state).residual - base) / DRAW_STEP)
         kinds = {k: r for k, r in problem.chain.kinds.items() if k in IMU_KINDS}
         return cls(kinds, base, tuple(along))
 
@@ -191,8 +191,8 @@ class _ImuDraws:
         largest value that is allowed."""
         _, dof, chi2 = self._left(kind)
         worst, whole = 0.0, chi2 / max(dof, 1.0)
-        for own in np.array_split(np.arange(len(self.residual)), N_NOISE_SEGMENTS):
-            n, left, size = self._left(kind, slice(int(own[0]), int(own[-1]) + 1) if len(own) else slice(0))
+        for segment in np.array_split(np.arange(len(self.residual)), N_NOISE_SEGMENTS):
+            n, left, size = self._left(kind, slice(int(segment[0]), int(segment[-1]) + 1) if len(segment) else slice(0))
             if left > MIN_DOF_RATIO * np.sqrt(max(n, 1)):
                 allowed = np.log(MAX_VARIATION) + CHANCE_SIGMAS * np.sqrt(2.0 / left)
                 worst = max(worst, abs(np.log(max(size / left / whole, 1e-12))) / allowed)
@@ -207,6 +207,6 @@ def are_noise(rows: np.ndarray) -> bool:
         return False
     lags = [float((rows[lag:] * rows[:-lag]).sum()) / square for lag in range(1, N_LAGS + 1)]
     white = abs(np.mean(lags)) < max(MAX_CORRELATION, CHANCE_SIGMAS / np.sqrt(N_LAGS * rows.size))
-    sizes = [float(np.mean(own**2)) / (square / rows.size) for own in np.array_split(rows, N_NOISE_SEGMENTS)]
+    sizes = [float(np.mean(segment**2)) / (square / rows.size) for segment in np.array_split(rows, N_NOISE_SEGMENTS)]
     allowed = np.log(MAX_VARIATION) + CHANCE_SIGMAS * np.sqrt(2.0 * N_NOISE_SEGMENTS / rows.size)
     return bool(white and max(abs(np.log(max(s, 1e-12))) for s in sizes) < allowed)

@@ -126,8 +126,8 @@ def shape_basis(target: Target, bent: bool) -> np.ndarray:
         return np.zeros((len(target.points), 0, 3))
     basis = np.zeros((len(target.points), len(SHAPE_LABELS), 3))
     for k in np.flatnonzero(target.bends):
-        own = target.body == k
-        basis[own] = _basis_of_one(target.points[own, :2])
+        of_body = target.body == k
+        basis[of_body] = _basis_of_one(target.points[of_body, :2])
     return basis
 
 

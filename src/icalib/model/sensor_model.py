@@ -207,8 +207,8 @@ def by_kind(sensors: Iterable[Sensor]) -> Iterator[tuple[SensorModel[Any, Any], 
     """(model, sensors) of each kind that occurs in `sensors`, in the order of `SENSOR_KINDS`."""
     every = list(sensors)
     for kind in SENSOR_KINDS:
-        if own := [s for s in every if s.sensor_type == kind]:
-            yield kind_model(kind), own
+        if sensors_of_kind := [s for s in every if s.sensor_type == kind]:
+            yield kind_model(kind), sensors_of_kind
 
 
 def all_models() -> Iterator[SensorModel[Any, Any]]:

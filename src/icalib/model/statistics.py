@@ -45,7 +45,7 @@ class ResidualStatistics:
     @cached_property
     def squares(self) -> dict[str, Squares]:
         """Number and chi^2 by kind, with the current robust weights."""
-        return {kind: own for (sensor, kind), own in self.all_squares().items() if sensor == self.sensor}
+        return {kind: squares for (sensor, kind), squares in self.all_squares().items() if sensor == self.sensor}
 
     @cached_property
     def fits(self) -> dict[str, Fit]:

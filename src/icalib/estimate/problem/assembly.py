@@ -94,12 +94,12 @@ def keyframe_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.nda
 def _keyframe_sources(rig: Rig) -> list[tuple[SensorModel, list[Sensor]]]:
     """Models and sensors that place keyframes: the first kind that can. If the rig assumes its motion and poses measure
     it, all kinds that can."""
-    found = [
-        (model, own[:1] if model.only_first_places_keyframes else own)
-        for model, own in by_kind(rig.sensors.values())
+    sources = [
+        (model, sensors[:1] if model.only_first_places_keyframes else sensors)
+        for model, sensors in by_kind(rig.sensors.values())
         if model.keyframes
     ]
-    return found if rig.assumes_motion and rig.moves_by_poses else found[:1]
+    return sources if rig.assumes_motion and rig.moves_by_poses else sources[:1]
 
 
 def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
@@ -169,15 +169,17 @@ def motion_of(inputs: Inputs, state: State) -> EstimatedMotion:
 def _measured(inputs: Inputs, noise: Mapping[str, Any], at: Pass) -> list[Factor]:
     """Factors of all sensors, kind by kind. Joint factors of several sensors are built concurrently in one separate
     thread, because LiDAR points already use the solver's threads."""
-    found: list[tuple[list[Factor], Future[Sequence[Factor]]]] = []
+    factors_by_kind: list[tuple[list[Factor], Future[Sequence[Factor]]]] = []
     with ThreadPoolExecutor(1) as aside:
         for model, sensors in by_kind(inputs.sensors):
-            own: list[Factor] = []
+            sensor_factors: list[Factor] = []
             for s in sensors:
                 measured = s, inputs.stream(s.name), noise[s.name], at
-                own += model.still_factors(*measured) if at.motion is None else model.factors(*measured)
-            found.append((own, aside.submit(model.joint_factors, sensors, own, noise, at)))
-        return [factor for own, joint in found for factor in (*own, *joint.result())]
+                sensor_factors += model.still_factors(*measured) if at.motion is None else model.factors(*measured)
+            factors_by_kind.append(
+                (sensor_factors, aside.submit(model.joint_factors, sensors, sensor_factors, noise, at))
+            )
+        return [factor for sensor_factors, joint in factors_by_kind for factor in (*sensor_factors, *joint.result())]
 
 
 def pass_at(inputs: Inputs, state: State, coarse: bool = False) -> Pass:
@@ -213,6 +215,6 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
             if value is not None:
                 values[sensor.name, spec.name] = value
     for sensor in rig.mounted:
-        if (own := values.get((sensor.name, TIME_OFFSET.name))) is not None:
-            values[sensor.name, TIME_OFFSET.name] = np.broadcast_to(own, inputs.clocks_of(sensor))
+        if (offset := values.get((sensor.name, TIME_OFFSET.name))) is not None:
+            values[sensor.name, TIME_OFFSET.name] = np.broadcast_to(offset, inputs.clocks_of(sensor))
     return {key: np.ascontiguousarray(v, dtype=np.float64) for key, v in values.items()}

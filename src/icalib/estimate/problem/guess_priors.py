@@ -41,8 +41,8 @@ def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prio
     standard deviation is `times` that of `guess_sigma`."""
     sigma = times * guess_sigma(inputs, guess)
     given = {p.block.key for p in stated_priors(inputs)}
-    own = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.key not in given)
-    return tuple(Prior(b, guess.values[b.key], sigma[b.columns]) for b in own)
+    blocks = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.key not in given)
+    return tuple(Prior(b, guess.values[b.key], sigma[b.columns]) for b in blocks)
 
 
 def _focal_sigma(camera: Camera, state: State, sigma: np.ndarray) -> float:

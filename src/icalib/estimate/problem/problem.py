@@ -89,8 +89,8 @@ class Problem:
 
     def without(self, priors: Sequence[Prior]) -> Problem:
         """The same problem without `priors`, which are compared by identity."""
-        gone = {id(p) for p in priors}
-        return replace(self, priors=tuple(p for p in self.priors if id(p) not in gone))
+        removed_ids = {id(p) for p in priors}
+        return replace(self, priors=tuple(p for p in self.priors if id(p) not in removed_ids))
 
     def cut(self, state: State, keyframes: np.ndarray) -> Problem:
         """The same problem with factors cut at `keyframes` (n,). Only the chain then links keyframes on both sides of a
@@ -167,5 +167,5 @@ class Problem:
     @staticmethod
     def narrow(piece: Piece, n_calib: int) -> Piece:
         """A piece that shares the chain blocks of `piece`, with new sums for `n_calib` calibration parameters."""
-        own = Piece.zeros(piece.first, piece.last, n_calib)
-        return Piece(piece.first, piece.last, piece.diagonal, piece.upper, own.side, own.calib)
+        sums = Piece.zeros(piece.first, piece.last, n_calib)
+        return Piece(piece.first, piece.last, piece.diagonal, piece.upper, sums.side, sums.calib)

@@ -18,10 +18,10 @@ UNGUESSED_TRANSLATION_SIGMA_M = 0.5
 
 def specs_of(layout: Layout, sensors: Iterable[Sensor]) -> dict[Key, ParameterSpec]:
     """Parameter definition of each block: from its sensor among `sensors`, else from the scene."""
-    own = {sensor.name: {spec.name: spec for spec in sensor.specs()} for sensor in sensors}
+    sensor_specs = {sensor.name: {spec.name: spec for spec in sensor.specs()} for sensor in sensors}
     scene = {spec.name: spec for spec in SCENE}
-    found = {b.key: own.get(b.sensor, scene)[b.name] for b in layout.blocks}
-    return found | {b.key: TIME_OFFSET.in_recordings(b.size) for b in layout.blocks if b.name == TIME_OFFSET.name}
+    block_specs = {b.key: sensor_specs.get(b.sensor, scene)[b.name] for b in layout.blocks}
+    return block_specs | {b.key: TIME_OFFSET.in_recordings(b.size) for b in layout.blocks if b.name == TIME_OFFSET.name}
 
 
 def tolerance_of(layout: Layout, specs: Mapping[Key, ParameterSpec], settings: Settings) -> np.ndarray:

@@ -77,20 +77,22 @@ def predict(parts: Segments) -> Prediction | None:
     parameters."""
     t, B = parts.problem.tolerance, parts.problem.layout.size
     free = t[:, None] * complement(parts.problem.fixed_directions, B)
-    halves, shared, own = halves_of(parts.sums, free)
+    halves, shared, remaining = halves_of(parts.sums, free)
     if not shared.shape[1]:
         return None
     prior = _within(_priors(parts), free @ shared)
-    found = excess(halves[0], halves[1], prior)
+    halves_excess = excess(halves[0], halves[1], prior)
     steps = []
     for h, half in enumerate(halves):
-        known = found.steps[[2, 1 - h]].T  # solutions of both halves, of the other half
+        known = halves_excess.steps[[2, 1 - h]].T  # solutions of both halves, of the other half
         rest = half.rest @ np.vstack([known, np.ones(2)])
-        steps.append(free @ (shared @ known + own @ rest))
+        steps.append(free @ (shared @ known + remaining @ rest))
     costs, inside, outside = _evaluate(parts, steps)
-    bent = abs(2.0 * float(costs[1] - costs[0]) - found.value)
-    linear = bent < max(found.std, MAX_NONLINEAR_SHARE * abs(found.value))
-    return Prediction(shared.shape[1], found.value, found.mean, found.std, inside, outside, linear)
+    bent = abs(2.0 * float(costs[1] - costs[0]) - halves_excess.value)
+    linear = bent < max(halves_excess.std, MAX_NONLINEAR_SHARE * abs(halves_excess.value))
+    return Prediction(
+        shared.shape[1], halves_excess.value, halves_excess.mean, halves_excess.std, inside, outside, linear
+    )
 
 
 def halves_of(sums: np.ndarray, free: np.ndarray) -> tuple[list[Half], np.ndarray, np.ndarray]:
@@ -98,9 +100,9 @@ def halves_of(sums: np.ndarray, free: np.ndarray) -> tuple[list[Half], np.ndarra
     that both determine, and (n, n - r) of the rest. Both are in the basis `free` (B, n), which is in tolerance
     units."""
     both = [_within(sums[h::2].sum(axis=0), free) for h in range(2)]
-    own = _unknown([information for information, _ in both])
-    shared = complement(own, free.shape[1])
-    return [_half(*one, shared, own) for one in both], shared, own
+    remaining = _unknown([information for information, _ in both])
+    shared = complement(remaining, free.shape[1])
+    return [_half(*one, shared, remaining) for one in both], shared, remaining
 
 
 def _within(sums: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,21 +121,21 @@ def _priors(parts: Segments) -> np.ndarray:
 def _unknown(information: list[np.ndarray]) -> np.ndarray:
     """Orthonormal directions (n, m) that one half or the other does not determine. information: of each half, in
     tolerance units."""
-    found = []
-    for own in information:
-        values, vectors = np.linalg.eigh(own)
-        found.append(vectors[:, values < UNOBSERVABLE_BELOW])
-    vectors, sizes, _ = np.linalg.svd(np.concatenate(found, axis=1), full_matrices=False)
+    directions = []
+    for matrix in information:
+        values, vectors = np.linalg.eigh(matrix)
+        directions.append(vectors[:, values < UNOBSERVABLE_BELOW])
+    vectors, sizes, _ = np.linalg.svd(np.concatenate(directions, axis=1), full_matrices=False)
     return vectors[:, sizes > MIN_SINGULAR_VALUE]
 
 
-def _half(information: np.ndarray, gradient: np.ndarray, shared: np.ndarray, own: np.ndarray) -> Half:
-    """Eliminates the directions `own` from one half. An information of UNOBSERVABLE_BELOW limits their step to about
-    ten tolerances, because the half may not observe them at all."""
-    S = information + UNOBSERVABLE_BELOW * own @ own.T
-    both = np.concatenate([own.T @ S @ shared, (own.T @ gradient)[:, None]], axis=1)
-    rest = -np.linalg.solve(own.T @ S @ own, both)
-    left = shared.T @ S @ own @ rest
+def _half(information: np.ndarray, gradient: np.ndarray, shared: np.ndarray, remaining: np.ndarray) -> Half:
+    """Eliminates the directions `remaining` from one half. An information of UNOBSERVABLE_BELOW limits their step to
+    about ten tolerances, because the half may not observe them at all."""
+    S = information + UNOBSERVABLE_BELOW * remaining @ remaining.T
+    both = np.concatenate([remaining.T @ S @ shared, (remaining.T @ gradient)[:, None]], axis=1)
+    rest = -np.linalg.solve(remaining.T @ S @ remaining, both)
+    left = shared.T @ S @ remaining @ rest
     return Half(shared.T @ S @ shared + left[:, :-1], shared.T @ gradient + left[:, -1], rest)
 
 
@@ -167,19 +169,19 @@ def _evaluate(parts: Segments, steps: list[np.ndarray]) -> tuple[np.ndarray, Res
     steps of the calibration parameters to these solutions. Keyframes take their optimal linear step; residuals are not
     linearised."""
     problem, state = parts.problem, parts.state
-    found, scratch = (problem.residuals(), problem.residuals()), problem.residuals()
+    residuals, scratch = (problem.residuals(), problem.residuals()), problem.residuals()
 
     def costs(g: int) -> list[float]:
         step = steps[g % 2]
-        own = chain_step_given_calib(parts.piece(g, scratch), step)
+        chain_steps = chain_step_given_calib(parts.piece(g, scratch), step)
         out = []
         for k in range(2):
-            chain = np.zeros((problem.n_keyframes, own.shape[1]))
-            chain[parts.ends[g] : parts.ends[g] + len(own)] = own[:, :, k]
-            out.append(parts.cost(g, state.retract(problem.layout, chain, step[:, k]), found[k]))
+            chain = np.zeros((problem.n_keyframes, chain_steps.shape[1]))
+            chain[parts.ends[g] : parts.ends[g] + len(chain_steps)] = chain_steps[:, :, k]
+            out.append(parts.cost(g, state.retract(problem.layout, chain, step[:, k]), residuals[k]))
         return out
 
-    return np.sum(in_parallel(costs, range(parts.count)), axis=0), *found
+    return np.sum(in_parallel(costs, range(parts.count)), axis=0), *residuals
 
 
 @dataclass(frozen=True)

@@ -25,18 +25,18 @@ def fits(problem: Problem, outcome: Outcome) -> list[Fit]:
     for draw in (outcome.draws or posterior(problem, outcome.state)).free:
         for key, value in _spent(problem, outcome, draw).items():
             spent.setdefault(key, []).append(value)
-    found = chi2_by_kind(problem, outcome.residuals)
-    return [Fit(*key, n, n - float(np.mean(spent[key])), chi2) for key, (n, chi2) in found.items()]
+    squares = chi2_by_kind(problem, outcome.residuals)
+    return [Fit(*key, n, n - float(np.mean(spent[key])), chi2) for key, (n, chi2) in squares.items()]
 
 
 def chi2_by_kind(problem: Problem, at: Residuals) -> dict[FitKey, Squares]:
     """Number and chi^2 of each kind of residual of each sensor, with the current robust weights."""
-    return {kind: own for key, f in problem.factors.items() for kind, own in f.squares(at[key]).items()}
+    return {kind: squares for key, f in problem.factors.items() for kind, squares in f.squares(at[key]).items()}
 
 
 def raw_sizes(problem: Problem, at: Residuals) -> dict[FitKey, RawSize]:
     """RMS of each kind of residual before whitening, its unit, and the number of outliers."""
-    return {kind: own for key, f in problem.factors.items() for kind, own in f.sizes(at[key]).items()}
+    return {kind: size for key, f in problem.factors.items() for kind, size in f.sizes(at[key]).items()}
 
 
 def rows_of(outcome: Outcome, sensor: str, kind: str) -> ResidualRows | None:
@@ -52,7 +52,7 @@ def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[FitKey, float
     """|J_s x|^2 of each kind of residual of each sensor, for one draw x."""
     start, end = (outcome.state.retract(problem.layout, s * draw.chain, s * draw.calib) for s in (0.0, DRAW_STEP))
     along, at = StateDifference(start, end, DRAW_STEP), outcome.residuals
-    return {kind: own for key, f in problem.factors.items() for kind, own in f.dof_used(at[key], along).items()}
+    return {kind: dof for key, f in problem.factors.items() for kind, dof in f.dof_used(at[key], along).items()}
 
 
 def split_covariance(outcome: Outcome, parts: Segments) -> np.ndarray:

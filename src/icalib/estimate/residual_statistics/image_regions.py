@@ -48,7 +48,7 @@ def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariance
 
 def _count(clusters: Mapping[FactorKey, Any]) -> int:
     """Number of clusters."""
-    arrays = [a for own in clusters.values() for a in (own if isinstance(own, list) else [own])]
+    arrays = [a for labels in clusters.values() for a in (labels if isinstance(labels, list) else [labels])]
     return 1 + max(int(a.max(initial=-1)) for a in arrays)
 
 

@@ -49,8 +49,8 @@ def spread_variance(outcome: Outcome, parts: Segments, white: np.ndarray) -> np.
 
 def calibration_columns(inputs: Inputs) -> np.ndarray:
     """Calibration columns that matter to a user: of sensors, without nuisance parameters and bloom."""
-    own = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and not b.is_nuisance)
-    return np.concatenate([np.arange(0), *(b.columns for b in own if b.name != "bloom")])
+    blocks = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and not b.is_nuisance)
+    return np.concatenate([np.arange(0), *(b.columns for b in blocks if b.name != "bloom")])
 
 
 def inflation(inputs: Inputs, outcome: Outcome) -> float:

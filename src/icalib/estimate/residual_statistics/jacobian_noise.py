@@ -78,16 +78,16 @@ def spurious_information(
     rng = np.random.default_rng(0)
     t, information = problem.tolerance[columns], outcome.information[among]
     scaled = t[:, None] * information * t
-    own = np.isin(columns, problem.layout.essential)
-    least = least_information(information[np.ix_(own, own)], t[own])
+    essential = np.isin(columns, problem.layout.essential)
+    least = least_information(information[np.ix_(essential, essential)], t[essential])
     samples = (outcome.draws or posterior(problem, outcome.state)).still
     noise, first = _Noise(problem, outcome, among), _reading_noise(problem.chain.imu, rng)
-    one_side = noise.there(1.0, samples[0].chain, first)
+    one_side = noise.information_change(1.0, samples[0].chain, first)
     if least > DETERMINED_ABOVE and _largest_share(t[:, None] * one_side * t, scaled) < NEGLIGIBLE_SHARE:
         return Spurious(one_side[None])
-    found = 0.5 * (one_side + noise.there(-1.0, samples[0].chain, first))
-    if least > CLEARLY_DETERMINED or _largest_share(t[:, None] * found * t, scaled) < SMALL_SHARE:
-        return Spurious(found[None])
+    both_sides = 0.5 * (one_side + noise.information_change(-1.0, samples[0].chain, first))
+    if least > CLEARLY_DETERMINED or _largest_share(t[:, None] * both_sides * t, scaled) < SMALL_SHARE:
+        return Spurious(both_sides[None])
     each: list[np.ndarray] = []
     for some in (samples[1 : 1 + N_FIRST_DRAWS], samples[1 + N_FIRST_DRAWS :]):
         each += [noise.followed(d.chain, _reading_noise(problem.chain.imu, rng)) for d in some]
@@ -108,14 +108,14 @@ class _Noise:
     def added(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
         """Spurious information (B, B) if the trajectory changes by chain (K, 15) and the readings by `readings`: mean
         over both signs."""
-        return 0.5 * (self.there(1.0, chain, readings) + self.there(-1.0, chain, readings))
+        return 0.5 * (self.information_change(1.0, chain, readings) + self.information_change(-1.0, chain, readings))
 
-    def there(self, sign: float, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
+    def information_change(self, sign: float, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
         """Change (B, B) of the information if trajectory and readings change by `sign` times chain (K, 15) and
         `readings`. Terms that are odd in the noise are included."""
-        there = self.outcome.state.retract(self.problem.layout, sign * chain, np.zeros(self.problem.layout.size))
-        noisy = self.problem if readings is None else _with_noise(self.problem, there, sign * readings)
-        return (_information(noisy, there, self.outcome.workspace) - self.outcome.information)[self.among]
+        noisy_state = self.outcome.state.retract(self.problem.layout, sign * chain, np.zeros(self.problem.layout.size))
+        noisy = self.problem if readings is None else _with_noise(self.problem, noisy_state, sign * readings)
+        return (_information(noisy, noisy_state, self.outcome.workspace) - self.outcome.information)[self.among]
 
     def followed(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """Spurious information (B, B) if the trajectory follows the noise `readings`, in addition to a posterior draw

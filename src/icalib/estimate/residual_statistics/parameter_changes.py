@@ -49,13 +49,13 @@ class Change:
 
 def changes(parts: Segments, sensors: tuple[str, ...]) -> tuple[Change, ...]:
     """The pattern with the largest gain for each group of `sensors`, sorted by decreasing gain."""
-    found: dict[Key, Change] = {}
+    best_changes: dict[Key, Change] = {}
     form = _Form.of(parts)
     for change in _tested(parts, form, sensors):
-        best = found.get(change.key)
+        best = best_changes.get(change.key)
         if best is None or change.gain > best.gain:
-            found[change.key] = change
-    return tuple(sorted(found.values(), key=lambda c: -c.gain))
+            best_changes[change.key] = change
+    return tuple(sorted(best_changes.values(), key=lambda c: -c.gain))
 
 
 def _tested(parts: Segments, form: _Form, sensors: tuple[str, ...]) -> Iterator[Change]:
@@ -67,11 +67,11 @@ def _tested(parts: Segments, form: _Form, sensors: tuple[str, ...]) -> Iterator[
     free = {b.key for b in layout.free}
     for sensor in sensors:
         for names in CHANGING_GROUPS:
-            own = [name for name in names if (sensor, name) in free]
-            if not own:
+            free_names = [name for name in names if (sensor, name) in free]
+            if not free_names:
                 continue
-            columns = np.concatenate([layout.columns(sensor, name) for name in own])
-            key = (sensor, own[0])
+            columns = np.concatenate([layout.columns(sensor, name) for name in free_names])
+            key = (sensor, free_names[0])
             yield form.change(key, columns, middle - centre, "drift", float(centre))
             for k in range(1, parts.count):
                 pattern = (np.arange(parts.count) >= k).astype(np.float64)
@@ -103,9 +103,9 @@ class _Form:
         self, key: Key, columns: np.ndarray, pattern: np.ndarray, kind: Literal["drift", "step"], second: float
     ) -> Change:
         """The change of `columns` by `pattern` (G,), estimated together with a common step of all parameters."""
-        own = self.information[:, columns]
-        A = np.einsum("g,gij->ij", pattern**2, own[:, :, columns]) + RIDGE_INFORMATION * np.eye(len(columns))
-        cross = np.einsum("g,gij->ij", pattern, own) @ self.root
+        rows = self.information[:, columns]
+        A = np.einsum("g,gij->ij", pattern**2, rows[:, :, columns]) + RIDGE_INFORMATION * np.eye(len(columns))
+        cross = np.einsum("g,gij->ij", pattern, rows) @ self.root
         common = self.root.T @ self.gradient.sum(axis=0)
         g = np.einsum("g,gi->i", pattern, self.gradient[:, columns]) - cross @ common
         covariance = np.linalg.inv(A - cross @ cross.T)
