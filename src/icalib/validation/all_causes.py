@@ -29,7 +29,7 @@ from icalib.validation.misfit import LARGE_FACTOR, misfit_causes
 from icalib.validation.size import felt_size, is_certain, scale_causes, scale_notes, size_words
 from icalib.validation.stated import absurd_values, stated_words
 
-SEEN = ("corners", "features")
+IMAGE_KINDS = ("corners", "features")
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class AssessedEstimate:
     deviations; parts: segments of the recording."""
 
     inputs: Inputs
-    found: Estimate
+    estimate: Estimate
     groups: tuple[ParameterGroup, ...]
     fits: Sequence[SensorFit]
     factor: float
@@ -51,71 +51,71 @@ class AssessedEstimate:
         return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in self.fits)])))
 
 
-def all_causes(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
     """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target. against: values
     of the rig file that the data contradict so strongly that other faults of the estimate may follow from them."""
-    inputs, found = judged.inputs, judged.found
-    stated, notes = _stated(judged, against)
-    few = any(plane_warnings(inputs.rig, found.problem.factors))
+    inputs, estimate = assessed.inputs, assessed.estimate
+    stated, notes = _stated(assessed, against)
+    few = any(plane_warnings(inputs.rig, estimate.problem.factors))
     # With few points on planes, these lie there by chance, and their residuals mean nothing.
-    fits = [f for f in judged.fits if (not against or f.kind in SEEN) and not (few and f.kind == ON_PLANES)]
+    fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and not (few and f.kind == ON_PLANES)]
     misfit = Misfit.of(fits)
     known = stated
     if not explaining([c for c in stated if c.gain < np.inf], misfit) and not against:
-        scattering = judged.factor > LARGE_FACTOR
-        known = [*stated, *changing(inputs, found, judged.parts, misfit, scattering, judged.timeline)]
-    both = ranked([*known, *misfit_causes(inputs, found, fits, explaining(known, misfit))])
+        scattering = assessed.factor > LARGE_FACTOR
+        known = [*stated, *changing(inputs, estimate, assessed.parts, misfit, scattering, assessed.timeline)]
+    both = ranked([*known, *misfit_causes(inputs, estimate, fits, explaining(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
 
-def _stated(judged: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
     """Causes that are wrong values in the rig file: target size, scales, swapped cameras, intrinsics, camera models,
     other values; and notes on the size."""
-    inputs, factor = judged.inputs, judged.factor
-    size = None if inputs.rig.assumes_motion else felt_size(judged.found, factor)
+    inputs, factor = assessed.inputs, assessed.factor
+    size = None if inputs.rig.assumes_motion else felt_size(assessed.estimate, factor)
     wrong_size, notes = ((), ()) if against else size_words(inputs, size)
     # Other contradictions may follow from a wrong size, or from the scale of the accelerometer.
     certain, given = is_certain(size), bool(against)
-    stated = None if given else relaxed(inputs, judged.found)
+    stated = None if given else relaxed(inputs, assessed.estimate)
     lenses = () if certain else tuple(other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor))
-    scale = max(factor, judged.misfit_factor)
+    scale = max(factor, assessed.misfit_factor)
     against = against or contradictions(inputs, stated, scale)
     if certain:  # a wrong size also changes lever arms
         against = tuple(c for c in against if c.in_prior_sigmas > 1.0)
-    causes = [Cause(sentence, np.inf, True) for sentence in mixed_up(inputs.rig.cameras, judged.groups)]
+    causes = [Cause(sentence, np.inf, True) for sentence in mixed_up(inputs.rig.cameras, assessed.groups)]
     if size is not None:
         gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
         causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
-    scales = tuple(scale_causes(inputs, judged.groups, size))
+    scales = tuple(scale_causes(inputs, assessed.groups, size))
     causes += scales
     causes += [Cause(sentence, gain, True) for _, sentence, gain in lenses]
-    causes += [Cause(sentence, gain) for sentence, gain in lens_warnings(inputs, judged.found)]
+    causes += [Cause(sentence, gain) for sentence, gain in lens_warnings(inputs, assessed.estimate)]
     said = {(camera, name) for camera, *_ in lenses for name in LENS}
     # `scale_causes` has named the sizes already, such as wheel radii.
     sensors = inputs.rig.sensors.values() if scales else ()
     said |= {(s.name, name) for s in sensors for name in call_kind(s.sensor_type, "assess", "sizes", s) or ()}
     against = tuple(c for c in against if c.key not in said)
-    causes += _contradicted(judged, against, scale, certain or given, None if given else stated)
+    causes += _contradicted(assessed, against, scale, certain or given, None if given else stated)
     return causes, (*notes, *scale_notes(inputs, size))
 
 
 def _contradicted(
-    judged: AssessedEstimate, against: Sequence[Contradiction], scale: float, grave: bool, stated: Relaxed | None
+    assessed: AssessedEstimate, against: Sequence[Contradiction], scale: float, grave: bool, stated: Relaxed | None
 ) -> Iterator[Cause]:
     """A cause for each contradicted value in `against`, then for absurd values. scale: factor on formal standard
     deviations; grave: whether all of them are grave. stated: None if the gain is unknown, which counts as infinite."""
     for c in against:
         gain = np.inf if stated is None else float(((c.off / (c.sigma / scale)) ** 2).max())
-        moves = stated is not None and _moves_others(judged, stated, c.key)
-        yield Cause(stated_words(judged.inputs, c), gain, grave or moves)
-    yield from (Cause(s, 0.0, grave) for s in absurd_values(judged.inputs, against, judged.groups))
+        moves = stated is not None and _moves_others(assessed, stated, c.key)
+        yield Cause(stated_words(assessed.inputs, c), gain, grave or moves)
+    yield from (Cause(s, 0.0, grave) for s in absurd_values(assessed.inputs, against, assessed.groups))
 
 
-def _moves_others(judged: AssessedEstimate, stated: Relaxed, key: Key) -> bool:
+def _moves_others(assessed: AssessedEstimate, stated: Relaxed, key: Key) -> bool:
     """Whether the stated value of the group `key` distorts the result: without it, a parameter of another group moves
     by more than SIGMAS printed standard deviations."""
     step, _ = stated.step([key])
-    for g in judged.groups:
+    for g in assessed.groups:
         if g.columns is None or (g.sensor, g.name) == key or g.name in AUXILIARY:
             continue
         if (np.abs(step[stated.layout.columns(g.sensor, g.name)]) > SIGMAS * g.std).any():

@@ -118,9 +118,9 @@ def _observed(inputs: Inputs, determined: Determined, names: tuple[str, ...]) ->
 
 def _notes(assessed: AssessedEstimate) -> Iterator[str]:
     """Notes on the recordings and sensors, on ambiguous lens parameters, and on wrong guesses."""
-    inputs, found = assessed.inputs, assessed.found
-    yield from notes(inputs, found, assessed.timeline)
-    yield from twin_lens_notes(inputs, found, assessed.fits)
+    inputs, estimate = assessed.inputs, assessed.estimate
+    yield from notes(inputs, estimate, assessed.timeline)
+    yield from twin_lens_notes(inputs, estimate, assessed.fits)
     yield from guess_notes(inputs, assessed.groups)
 
 
@@ -128,8 +128,8 @@ def _rates(inputs: Inputs) -> dict[str, float]:
     """Rate [Hz] of each sensor, from the median interval of its stamps."""
     m = inputs.measurements
     streams = (m.streams[name] for name in inputs.rig.sensors if name in m.streams)
-    own = (s for s in streams if len(s.stamps_ns) > 1 and not _is_assumed(inputs, s.name))
-    return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in own}
+    sensor_streams = (s for s in streams if len(s.stamps_ns) > 1 and not _is_assumed(inputs, s.name))
+    return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in sensor_streams}
 
 
 def _is_assumed(inputs: Inputs, name: str) -> bool:
@@ -270,28 +270,28 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
     return recording[order][np.searchsorted(times[order], state.seconds)]
 
 
-def _residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[Residuals]:
+def _residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Residuals]:
     """Records of residuals for each sensor; a kind without records of a special form gives all rows of its factors."""
-    outcome = found.outcome
+    outcome = estimate.outcome
     for kind in SENSOR_KINDS:
-        own = facet(kind, "assess")
-        if hasattr(own, "residuals"):
-            yield from own.residuals(inputs, found, timeline)
+        assess_facet = facet(kind, "assess")
+        if hasattr(assess_facet, "residuals"):
+            yield from assess_facet.residuals(inputs, estimate, timeline)
             continue
         names = [s.name for s in inputs.rig.sensors.values() if s.sensor_type == kind]
-        for key, factor in found.problem.factors.items():
+        for key, factor in estimate.problem.factors.items():
             rows = factor.rows(outcome.residuals[key], outcome.state) if factor.name in names else []
             if rows:
                 yield row_record(key[1], rows, timeline)
 
 
-def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...]) -> Iterator[str]:
+def _warnings(inputs: Inputs, estimate: Estimate, groups: tuple[ParameterGroup, ...]) -> Iterator[str]:
     """Warnings on convergence, measurements and sensors, and on edge bloom that is too large for overexposure or
     ink."""
-    if not found.outcome.converged:
-        yield f"the solver did not converge: {found.outcome.status}"
+    if not estimate.outcome.converged:
+        yield f"the solver did not converge: {estimate.outcome.status}"
     yield from inputs.measurements.warnings
-    yield from call_all_kinds("assess", "warnings", inputs, found)
+    yield from call_all_kinds("assess", "warnings", inputs, estimate)
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"
@@ -303,5 +303,5 @@ def _warnings(inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
     """(n,) empirical factors of all estimated parameters of sensors, without edge bloom."""
-    own = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
-    return np.concatenate([np.ones(0), *(g.factor for g in own if g.factor is not None)])
+    sensor_groups = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
+    return np.concatenate([np.ones(0), *(g.factor for g in sensor_groups if g.factor is not None)])

@@ -24,11 +24,11 @@ NEARER = 0.5  # ratio of the largest differences in fx, fy, cx, cy [px], below w
 def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Iterator[str]:
     """Sentences on pairs of cameras that seem to be swapped: the estimate of each is near the stated values of the
     other."""
-    found = {(g.sensor, g.name): g.value for g in groups}
+    estimates = {(g.sensor, g.name): g.value for g in groups}
     for a, b in combinations(cameras, 2):
-        own = _away(a, found, a.name), _away(b, found, b.name)
-        crossed = _away(a, found, b.name), _away(b, found, a.name)
-        if max(own) > FAR and max(crossed) < MUCH_NEARER * max(own):
+        distances = _distance(a, estimates, a.name), _distance(b, estimates, b.name)
+        crossed_distances = _distance(a, estimates, b.name), _distance(b, estimates, a.name)
+        if max(distances) > FAR and max(crossed_distances) < MUCH_NEARER * max(distances):
             yield (
                 f"{a.name} and {b.name} seem to be swapped: the pose and lens of each fit what the rig file gives of "
                 "the other. Correct their topics or paths, or the values in the rig file."
@@ -39,36 +39,38 @@ def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: flo
     """Cameras whose fixed intrinsics contradict the data: name, sentence, and gain in chi^2 if they are free. factor:
     the largest empirical factor, which multiplies formal standard deviations."""
     given = {c.name: c.intrinsics.value for c in cameras}
-    for found in steps:
-        value = given[found.camera]
+    for lens_step in steps:
+        value = given[lens_step.camera]
         assert value is not None
-        off = np.abs(found.step)
-        clearly = off > np.maximum(OTHER_LENS * value[0], CLEARLY * factor * found.std)
+        off = np.abs(lens_step.step)
+        clearly = off > np.maximum(OTHER_LENS * value[0], CLEARLY * factor * lens_step.std)
         if clearly.any():
             where = ", ".join(
                 f"{name} {old + step:.1f} and not {old:.1f}"
-                for name, old, step, far in zip(("fx", "fy", "cx", "cy"), value, found.step, clearly, strict=True)
+                for name, old, step, far in zip(("fx", "fy", "cx", "cy"), value, lens_step.step, clearly, strict=True)
                 if far
             )
             nearer = [
-                n for n, v in given.items() if v is not None and max(abs(value + found.step - v)) < NEARER * max(off)
+                n
+                for n, v in given.items()
+                if v is not None and max(abs(value + lens_step.step - v)) < NEARER * max(off)
             ]
             hint = f" Those of {nearer[0]} are nearer." if nearer else ""
             sentence = (
-                f"the intrinsics of {found.camera} that the rig file fixes do not fit its images, which want {where}: "
-                f"check that they are this camera's, at this resolution, or leave them free.{hint}"
+                f"the intrinsics of {lens_step.camera} that the rig file fixes do not fit its images, which want "
+                f"{where}: check that they are this camera's, at this resolution, or leave them free.{hint}"
             )
-            yield found.camera, sentence, float(((found.step / found.std) ** 2).max())
+            yield lens_step.camera, sentence, float(((lens_step.step / lens_step.std) ** 2).max())
 
 
-def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -> float:
+def _distance(camera: Camera, estimates: dict[tuple[str, str], np.ndarray], name: str) -> float:
     """Largest distance between the estimate of the camera `name` and the stated values of `camera`, in prior standard
     deviations of a guess."""
-    away = 0.0
+    distance = 0.0
     for spec in GIVEN:
-        given, value = getattr(camera, spec.name).value, found.get((name, spec.name))
+        given, value = getattr(camera, spec.name).value, estimates.get((name, spec.name))
         if given is None or value is None:
             continue
         off = so3.value_change(given, value)
-        away = max(away, float(np.linalg.norm(off)) / spec.prior_sigma)
-    return away
+        distance = max(distance, float(np.linalg.norm(off)) / spec.prior_sigma)
+    return distance

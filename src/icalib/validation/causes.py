@@ -51,9 +51,9 @@ class Misfit:
     fits: tuple[SensorFit, ...]
 
     @classmethod
-    def of(cls, judged: Iterable[SensorFit]) -> Misfit:
-        """The misfit of those in `judged` whose residuals exceed the stated noise."""
-        return cls(tuple(f for f in judged if excess(f) > 1.0))
+    def of(cls, sensor_fits: Iterable[SensorFit]) -> Misfit:
+        """The misfit of those in `sensor_fits` whose residuals exceed the stated noise."""
+        return cls(tuple(f for f in sensor_fits if excess(f) > 1.0))
 
     @property
     def chi2(self) -> float:
@@ -88,23 +88,23 @@ def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
 
 
 def changing(
-    inputs: Inputs, found: Estimate, parts: Segments | None, misfit: Misfit, scattering: bool, timeline: Timeline
+    inputs: Inputs, estimate: Estimate, parts: Segments | None, misfit: Misfit, scattering: bool, timeline: Timeline
 ) -> Iterator[Cause]:
     """Causes that vary over the recording: cameras that are not exposed together, a disturbance at one time, or a
     parameter that changes. scattering: whether estimates from segments scatter more than predicted."""
-    lag = lag_between_cameras(inputs, found)
+    lag = lag_between_cameras(inputs, estimate)
     if lag is not None:
         yield Cause(_lag_words(lag), lag.gain, True)
-    found_causes = []
-    if misfit.fits and (hit := disturbance(found, misfit.chi2, misfit.sensors)) is not None:
-        found_causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
+    causes = []
+    if misfit.fits and (hit := disturbance(estimate, misfit.chi2, misfit.sensors)) is not None:
+        causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
     if parts is not None and (misfit.fits or scattering):
-        shown = changes(parts, tuple(s.name for s in inputs.sensors))
-        if shown and shown[0].gain > max(CHANGES * heterogeneity(parts), SIGNIFICANT * shown[0].count):
-            alike = [c for c in shown if c.key[0] == shown[0].key[0] and c.gain > ALIKE * shown[0].gain]
-            found_causes.append(Cause(_change_words(alike, parts, timeline), shown[0].gain, True))
+        breaks = changes(parts, tuple(s.name for s in inputs.sensors))
+        if breaks and breaks[0].gain > max(CHANGES * heterogeneity(parts), SIGNIFICANT * breaks[0].count):
+            alike = [c for c in breaks if c.key[0] == breaks[0].key[0] and c.gain > ALIKE * breaks[0].gain]
+            causes.append(Cause(_change_words(alike, parts, timeline), breaks[0].gain, True))
     # the best one only: a change also enlarges residuals at one time, like a disturbance
-    yield from ranked(found_causes)[:1]
+    yield from ranked(causes)[:1]
 
 
 def noise_words(inputs: Inputs, noise: NoiseFit) -> str:

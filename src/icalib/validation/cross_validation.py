@@ -14,20 +14,27 @@ from icalib.result import CrossValidation, PredictedFit
 def cross_validation(parts: Segments | None, assumed: Collection[str]) -> CrossValidation | None:
     """None if the recording cannot be split, or if no parameter is observable in both halves. Sensors in `assumed` get
     no fits; no sensor does if the solutions of the halves are too far apart for a linearisation."""
-    found = None if parts is None else predict(parts)
-    if parts is None or found is None:
+    prediction = None if parts is None else predict(parts)
+    if parts is None or prediction is None:
         return None
-    fits = tuple(f for f in _fits(parts.problem, found) if f.sensor not in assumed) if found.linear else ()
+    fits = tuple(f for f in _fits(parts.problem, prediction) if f.sensor not in assumed) if prediction.linear else ()
     spread = shifts(parts)
     return CrossValidation(
-        parts.count, found.directions, found.excess, found.expected, found.spread, fits, spread.moved, spread.expected
+        parts.count,
+        prediction.directions,
+        prediction.excess,
+        prediction.expected,
+        prediction.spread,
+        fits,
+        spread.moved,
+        spread.expected,
     )
 
 
-def _fits(problem: Problem, found: Prediction) -> list[PredictedFit]:
+def _fits(problem: Problem, prediction: Prediction) -> list[PredictedFit]:
     """Size of the residuals of each sensor and kind, within a half and predicted by the other half."""
-    inside, outside = (chi2_by_kind(problem, out) for out in (found.inside, found.outside))
-    size, size_outside = (raw_sizes(problem, out) for out in (found.inside, found.outside))
+    inside, outside = (chi2_by_kind(problem, out) for out in (prediction.inside, prediction.outside))
+    size, size_outside = (raw_sizes(problem, out) for out in (prediction.inside, prediction.outside))
     return [
         PredictedFit(*key, count, chi2, outside[key].chi2, size[key].rms, size_outside[key].rms, size[key].unit)
         for key, (count, chi2) in inside.items()

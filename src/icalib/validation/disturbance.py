@@ -32,18 +32,18 @@ class Disturbance:
     sensors: tuple[str, ...]
 
 
-def disturbance(found: Estimate, misfit: float, misfits: Collection[str]) -> Disturbance | None:
+def disturbance(estimate: Estimate, misfit: float, misfits: Collection[str]) -> Disturbance | None:
     """The window with most of the `misfit` (chi^2 beyond the degrees of freedom) of the sensors `misfits`. None if no
     window has at least half of it."""
-    state = found.outcome.state
-    rows = {s: r for s, r in _chi2_over_time(found).items() if s in misfits}
+    state = estimate.outcome.state
+    rows = {s: r for s, r in _chi2_over_time(estimate).items() if s in misfits}
     begin, end = float(state.seconds[0]), float(state.seconds[-1])
     edges = np.linspace(begin, end, BINS + 1)
     beyond = {}
     for sensor, (seconds, chi2) in rows.items():
-        own = np.histogram(seconds, edges, weights=chi2)[0]
-        usual = WINDOW * np.median(own)
-        window = np.convolve(own, np.ones(WINDOW), "valid")
+        bin_chi2 = np.histogram(seconds, edges, weights=chi2)[0]
+        usual = WINDOW * np.median(bin_chi2)
+        window = np.convolve(bin_chi2, np.ones(WINDOW), "valid")
         beyond[sensor] = np.where(window > LARGE * usual, window - usual, 0.0)
     if not beyond or misfit <= 0.0:
         return None
@@ -52,19 +52,21 @@ def disturbance(found: Estimate, misfit: float, misfits: Collection[str]) -> Dis
     share = float(total[k]) / misfit
     if share < AT_ONE_TIME:
         return None
-    sensors = tuple(s for s, own in beyond.items() if own[k] > 0.1 * total[k])
+    sensors = tuple(s for s, excess in beyond.items() if excess[k] > 0.1 * total[k])
     return Disturbance(float(edges[k]), float(edges[k + WINDOW]), min(share, 1.0), float(total[k]), sensors)
 
 
-def _chi2_over_time(found: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _chi2_over_time(estimate: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """By sensor: times (n,) s on the joined clock and chi^2 (n,) of residuals of the kinds SHAKEN."""
-    outcome = found.outcome
+    outcome = estimate.outcome
     factors = outcome.problem.factors.items()
     rows = [r for key, f in factors for r in f.rows(outcome.residuals[key], outcome.state) if r.kind in SHAKEN]
     chi2: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {r.sensor: [] for r in rows}
     for r in rows:
         chi2[r.sensor].append((r.seconds, (r.weighted.astype(np.float64) ** 2).sum(axis=1)))
-    return {s: (np.concatenate([t for t, _ in own]), np.concatenate([c for _, c in own])) for s, own in chi2.items()}
+    return {
+        s: (np.concatenate([t for t, _ in pairs]), np.concatenate([c for _, c in pairs])) for s, pairs in chi2.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -79,10 +81,10 @@ class Lag:
     gain: float
 
 
-def lag_between_cameras(inputs: Inputs, found: Estimate) -> Lag | None:
+def lag_between_cameras(inputs: Inputs, estimate: Estimate) -> Lag | None:
     """The lag between the first two cameras of a rig without an IMU, whose images are modelled as simultaneous. None if
     it explains less than FOLLOWS_SPEED of the squared residuals of either camera."""
-    cameras = pairs_of(found.problem.factors, found.outcome.residuals, CornerFactor)
+    cameras = pairs_of(estimate.problem.factors, estimate.outcome.residuals, CornerFactor)
     if inputs.rig.imu is not None or len(cameras) < 2:
         return None
     lags = []
@@ -115,6 +117,6 @@ def _image_velocity(
         step = seconds[2:] - seconds[:-2]
         speed[1:-1] = (table[2:] - table[:-2]) / step[:, None, None]
         speed[1:-1][step > 2.0 * FASTEST_GAP_S] = np.nan
-    found = speed[image, point]
-    known = np.asarray(np.isfinite(found).all(axis=1))
-    return np.where(known[:, None], found, 0.0), known
+    velocity = speed[image, point]
+    known = np.asarray(np.isfinite(velocity).all(axis=1))
+    return np.where(known[:, None], velocity, 0.0), known

@@ -24,32 +24,34 @@ GRID = 12  # rays along each side of an image
 def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[str]:
     """One sentence for each initial guess that the estimate contradicts, see `is_contradicted`. For lenses it is one
     whose projections are more than the prior uncertainty of the intrinsics off."""
-    found = {(g.sensor, g.name): g for g in groups}
+    groups_by_key = {(g.sensor, g.name): g for g in groups}
     for sensor, name, parameter in groups_of(inputs.user_rig or inputs.rig):
-        group, guess = found.get((sensor.name, name)), parameter.value
+        group, guess = groups_by_key.get((sensor.name, name)), parameter.value
         if group is None or guess is None or parameter.mode != "free" or "undetermined" in group.verdict:
             continue
         if isinstance(sensor, Camera) and name in LENS:
-            far = lens_off(sensor, name, found) > INTRINSICS.prior_sigma
+            far = lens_off(sensor, name, groups_by_key) > INTRINSICS.prior_sigma
         else:
             far = is_contradicted(sensor.spec(name), guess, group.value)
         if far:
-            rotation = found.get((sensor.name, "rotation"))
-            there = None if rotation is None else rotation.value
-            yield _sentence(group, guess) + looks_like(inputs.rig, (sensor.name, name), guess, group.value, there)
+            rotation = groups_by_key.get((sensor.name, "rotation"))
+            R_imu_sensor = None if rotation is None else rotation.value
+            yield _sentence(group, guess) + looks_like(
+                inputs.rig, (sensor.name, name), guess, group.value, R_imu_sensor
+            )
 
 
-def lens_off(camera: Camera, name: str, found: dict[tuple[str, str], ParameterGroup]) -> float:
+def lens_off(camera: Camera, name: str, groups_by_key: dict[tuple[str, str], ParameterGroup]) -> float:
     """RMS shift [px] of projections over the image if the group `name` of the estimated lens is replaced by its
     guess."""
-    model, values = camera_model(camera.model), {own: found[camera.name, own].value for own in LENS}
+    model, values = camera_model(camera.model), {part: groups_by_key[camera.name, part].value for part in LENS}
     guess = np.concatenate(list((values | {name: getattr(camera, name).value}).values()))
     sides = [np.linspace(0.0, n - 1.0, GRID) for n in camera.resolution]
     uv = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
-    rays, seen = model.unproject(np.concatenate(list(values.values())), uv)
-    there, shown = model.project(guess, rays)
-    both = seen & shown
-    return float(np.sqrt(np.mean(((there - uv)[both] ** 2).sum(axis=1)))) if both.any() else np.inf
+    rays, has_ray = model.unproject(np.concatenate(list(values.values())), uv)
+    guess_uv, is_projected = model.project(guess, rays)
+    both = has_ray & is_projected
+    return float(np.sqrt(np.mean(((guess_uv - uv)[both] ** 2).sum(axis=1)))) if both.any() else np.inf
 
 
 def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:
@@ -63,5 +65,5 @@ def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:
     if group.name == "time_offset":
         off = guess - group.value
         return f"{what} is {scaled(np.abs(off), scale)}{unit} from what the data show, which alone count."
-    shown = f"{scaled(group.value, scale)}{unit}"
-    return f"{what}, {scaled(guess, scale)}{unit}, is far from what the data show, {shown}, which alone count."
+    estimate_text = f"{scaled(group.value, scale)}{unit}"
+    return f"{what}, {scaled(guess, scale)}{unit}, is far from what the data show, {estimate_text}, which alone count."

@@ -54,8 +54,8 @@ class _Trial:
     @property
     def squared_error(self) -> np.ndarray:
         """(M,) px^2: sum of squared residuals over the used corners of each test image."""
-        seen, square = self.tested.points, (self.tested.residual**2).sum(axis=1)
-        return seen.sum_by_image(np.where(seen.used, square, 0.0))
+        points, square = self.tested.points, (self.tested.residual**2).sum(axis=1)
+        return points.sum_by_image(np.where(points.used, square, 0.0))
 
     @property
     def corners(self) -> int:
@@ -119,7 +119,7 @@ def compare_models(
     models = [factor.model, *(camera_model(name) for name in CAMERA_MODELS if name != factor.model.name)]
     starts = [params, *(initial_parameters(m, factor.model, params, fitted) for m in models[1:])]
     pairs = [(m, start) for m, start in zip(models, starts, strict=True) if start is not None]
-    first = _found(_cross_validated(model, start, fitted, tested) for model, start in pairs)
+    first = _successful_trials(_cross_validated(model, start, fitted, tested) for model, start in pairs)
     if not first:
         return None, None
     # Corners that the camera's model rejects may fit another model, so outliers are those of the best model at each
@@ -127,28 +127,28 @@ def compare_models(
     residuals = np.array([fit.residuals for fit in first])
     nearest = np.argmin((residuals**2).sum(axis=2), axis=0)
     used = ~rejected(factor, rows, residuals[nearest, np.arange(len(rows))], settings)
-    second = _found(_again(fit, used) for fit in first)
-    own = next((fit for fit in second if fit.model is factor.model), None)
-    return own, None if own is None else _clearly_better(own, [fit for fit in second if fit is not own])
+    second = _successful_trials(_again(fit, used) for fit in first)
+    current = next((fit for fit in second if fit.model is factor.model), None)
+    return current, None if current is None else _clearly_better(current, [fit for fit in second if fit is not current])
 
 
-def _found(fits: Iterable[_Trial | None]) -> list[_Trial]:
+def _successful_trials(fits: Iterable[_Trial | None]) -> list[_Trial]:
     """The trials that succeeded."""
     return [fit for fit in fits if fit is not None]
 
 
-def _clearly_better(own: _Trial, others: list[_Trial]) -> _Trial | None:
+def _clearly_better(current: _Trial, others: list[_Trial]) -> _Trial | None:
     """Of the `others` whose RMS is within EQUAL of the best, the model with fewest parameters; None unless it is
-    clearly better than `own`."""
+    clearly better than `current`."""
     if not others:
         return None
     least = min(o.rms for o in others)
     best = min((o for o in others if o.rms <= EQUAL * least), key=lambda o: len(o.model.parameter_names))
-    better, n = int((best.squared_error < own.squared_error).sum()), len(own.squared_error)
+    better, n = int((best.squared_error < current.squared_error).sum()), len(current.squared_error)
     # Sign test: if both models are equally good, `better` has mean n / 2 and standard deviation sqrt(n) / 2. RMS alone
     # may depend on a few images.
     by_chance = better - 0.5 * n < 0.5 * SIGN_TEST_SIGMAS * np.sqrt(n)
-    return best if best.rms < BETTER * own.rms and not by_chance else None
+    return best if best.rms < BETTER * current.rms and not by_chance else None
 
 
 def _cross_validated(model: CameraModel, params: np.ndarray, fitted: ImagePoints, tested: ImagePoints) -> _Trial | None:
@@ -186,14 +186,14 @@ def _halves(
     rows, halves = [], []
     for images in (chosen[::2], chosen[1::2]):
         part = np.isin(stream.image[row], images)
-        own = row[part]
-        uv = stream.uv[own]
+        half_rows = row[part]
+        uv = stream.uv[half_rows]
         if len(factor.direction):
-            uv = uv - state.values[factor.name, "bloom"] * factor.direction[own]
-        start = np.append(np.flatnonzero(np.diff(stream.image[own], prepend=-1)), len(own))
-        basis = R_cam_body[part] @ factor.bodies.basis[stream.point[own]].transpose(0, 2, 1)
-        rows.append(own)
-        halves.append(ImagePoints(points[part], uv, start, basis, used[own]))
+            uv = uv - state.values[factor.name, "bloom"] * factor.direction[half_rows]
+        start = np.append(np.flatnonzero(np.diff(stream.image[half_rows], prepend=-1)), len(half_rows))
+        basis = R_cam_body[part] @ factor.bodies.basis[stream.point[half_rows]].transpose(0, 2, 1)
+        rows.append(half_rows)
+        halves.append(ImagePoints(points[part], uv, start, basis, used[half_rows]))
     return np.concatenate(rows), halves[0], halves[1]
 
 
@@ -201,9 +201,9 @@ def _in_camera(factor: CornerFactor, state: State, images: np.ndarray) -> tuple[
     """Rows (n,) int in the stream of all corners of the `images` (m,), their points (n, 3) m in the camera frame, and
     R_camera_body (n, 3, 3) for each corner."""
     rows, points, rotations = [], [], []
-    for own, X, R in factor.in_camera(state):
-        wanted = np.isin(factor.stream.image[own], images)
-        rows.append(np.arange(own.start, own.stop)[wanted])
+    for block, X, R in factor.in_camera(state):
+        wanted = np.isin(factor.stream.image[block], images)
+        rows.append(np.arange(block.start, block.stop)[wanted])
         points.append(X[wanted])
         rotations.append(R[wanted])
     return np.concatenate(rows), np.concatenate(points), np.concatenate(rotations)

@@ -23,36 +23,37 @@ IMAGE_SIZES = (2.0, 0.5, 4.0, 0.25)
 
 
 def looks_like(
-    rig: Rig, key: tuple[str, str], value: np.ndarray, found: np.ndarray, rotation: np.ndarray | None = None
+    rig: Rig, key: tuple[str, str], value: np.ndarray, estimate: np.ndarray, rotation: np.ndarray | None = None
 ) -> str:
     """A sentence that names the likely mistake and begins with a space, or an empty text. value: of the rig file;
-    found: estimate of the same group; rotation: estimated R_imu_sensor (3, 3), needed for an inverse translation."""
+    estimate: estimate of the same group; rotation: estimated R_imu_sensor (3, 3), needed for an inverse translation."""
     name = key[1]
     if name == "rotation":
-        return _frames(value, found)
+        return _frames(value, estimate)
     if name == "translation" and rotation is not None:
-        inverse = -rotation.T @ found
-        if is_near(value, inverse, NEARLY) and not is_near(value, found, NEARLY):
+        inverse = -rotation.T @ estimate
+        if is_near(value, inverse, NEARLY) and not is_near(value, estimate, NEARLY):
             return " It looks like that of the inverse: icalib wants p_imu_sensor."
     sensor = rig.sensors.get(key[0])
     for size, unit in (LENGTHS if sensor is not None and sensor.spec(name).unit == "m" else {}).items():
-        if is_near(found, size * value, NEARLY):
+        if is_near(estimate, size * value, NEARLY):
             return f" It looks like {unit}: write metres."
-    if name == "time_offset" and is_near(found, 1e-3 * value, NEARLY):
+    if name == "time_offset" and is_near(estimate, 1e-3 * value, NEARLY):
         return " It looks like milliseconds: write seconds."
     if name == "intrinsics":
         for size in IMAGE_SIZES:
-            if is_near(found[:2], size * value[:2], NEARLY):
+            if is_near(estimate[:2], size * value[:2], NEARLY):
                 return f" The focal length is {size:g} times that: was it of images of another size?"
-    own = None if sensor is None else call_kind(sensor.sensor_type, "assess", "looks_like", sensor, name, value, found)
-    return own or ""
+    if sensor is None:
+        return ""
+    return call_kind(sensor.sensor_type, "assess", "looks_like", sensor, name, value, estimate) or ""
 
 
-def _frames(value: np.ndarray, found: np.ndarray) -> str:
+def _frames(value: np.ndarray, estimate: np.ndarray) -> str:
     """The sentence for a rotation that is inverted, or in a frame with other axes."""
-    if _angle(value.T, found) < NEAR_RAD:
+    if _angle(value.T, estimate) < NEAR_RAD:
         return " It looks like the inverse, as in Kalibr's T_cam_imu: icalib wants R_imu_sensor."
-    if min(_angle(value @ turn, found) for turn in TURNS if np.linalg.det(turn) > 0.0) < NEAR_RAD:
+    if min(_angle(value @ turn, estimate) for turn in TURNS if np.linalg.det(turn) > 0.0) < NEAR_RAD:
         return " It looks like that of a frame whose axes are named otherwise, as a link's and a camera's are."
     return ""
 

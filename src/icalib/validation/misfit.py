@@ -22,20 +22,22 @@ LARGE_FACTOR = 3.0  # empirical factor; a warning above it
 BEYOND_FACTOR = 1.5  # times the largest empirical factor; a warning if the cross-validation factor is above it
 
 
-def misfit_causes(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], explained: bool) -> Iterator[Cause]:
+def misfit_causes(
+    inputs: Inputs, estimate: Estimate, sensor_fits: Sequence[SensorFit], explained: bool
+) -> Iterator[Cause]:
     """Causes of the misfit: rejected outliers, the noise of the IMU, stated noise of other sensors, or unknown.
     explained: whether a named cause explains the misfit; then one sentence states the residuals."""
-    for f in judged:
+    for f in sensor_fits:
         if sentence := rejected_words(f):
             yield Cause(sentence, 0.0)
-    misfit = Misfit.of(judged)
+    misfit = Misfit.of(sensor_fits)
     if explained:
         if misfit.fits:
             yield Cause(f"residuals are larger than the stated noise predicts: {misfit.words}.", 0.0)
         return
-    yield from _of_imu(inputs, found, judged, misfit)
-    for f in judged:
-        if sentence := misfit_words(inputs.rig, f, _is_noise(found, f)):
+    yield from _of_imu(inputs, estimate, sensor_fits, misfit)
+    for f in sensor_fits:
+        if sentence := misfit_words(inputs.rig, f, _is_noise(estimate, f)):
             yield Cause(sentence, max(f.chi2 - f.dof, 0.0), excess(f) >= FAR_BEYOND)
 
 
@@ -45,31 +47,31 @@ def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
     sensor = rig.sensors.get(f.sensor)
     if sensor is None:
         return None
-    own = facet(sensor.sensor_type, "assess")
-    if hasattr(own, "misfit"):
-        return own.misfit(sensor, f, is_noise)
+    assess_facet = facet(sensor.sensor_type, "assess")
+    if hasattr(assess_facet, "misfit"):
+        return assess_facet.misfit(sensor, f, is_noise)
     if excess(f) == 1.0:
         return None
     advice = "state a larger one" if is_noise else "they are no white noise, so check its clock and its mount"
     return f"{f.kind} residuals of {f.sensor} are {times(f)} larger than its stated noise predicts; {advice}."
 
 
-def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit: Misfit) -> Iterator[Cause]:
+def _of_imu(inputs: Inputs, estimate: Estimate, sensor_fits: Sequence[SensorFit], misfit: Misfit) -> Iterator[Cause]:
     """Causes for residuals of the IMU that are too large or too small. Another noise is advised only if the residuals,
     weighted by it, are white and constant over the recording."""
-    own = [f for f in judged if f.kind in INERTIAL]
-    large, small = any(excess(f) > 1.0 for f in own), [f for f in own if _is_small(f)]
+    imu_fits = [f for f in sensor_fits if f.kind in INERTIAL]
+    large, small = any(excess(f) > 1.0 for f in imu_fits), [f for f in imu_fits if _is_small(f)]
     if not (large or small) or inputs.rig.imu is None:
         return
-    corners = _loose_corners(inputs, judged)
+    corners = _loose_corners(inputs, sensor_fits)
     if corners and not large:
         yield Cause(_corners_words(corners), 0.0)
         return
-    noise = fitting_noise(inputs, found) if found.outcome.converged else None
+    noise = fitting_noise(inputs, estimate) if estimate.outcome.converged else None
     if noise is not None and noise.is_as_stated and noise.explains:
         return  # wrong noise of another sensor causes the misfit of the IMU
     if large and noise is not None and noise.explains:
-        yield Cause(noise_words(inputs, noise), Misfit.of(own).chi2, Misfit.of(own).is_grave)
+        yield Cause(noise_words(inputs, noise), Misfit.of(imu_fits).chi2, Misfit.of(imu_fits).is_grave)
     elif large:
         yield Cause(unknown_words(misfit, noise), misfit.chi2, misfit.is_grave)
     elif noise is not None and noise.explains:
@@ -83,11 +85,11 @@ def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit
         )
 
 
-def _loose_corners(inputs: Inputs, judged: Sequence[SensorFit]) -> list[SensorFit]:
+def _loose_corners(inputs: Inputs, sensor_fits: Sequence[SensorFit]) -> list[SensorFit]:
     """Cameras whose stated corner noise is too large. The trajectory then follows the IMU, and its residuals become
     small, too."""
     stated = {c.name for c in inputs.rig.cameras if c.corner_noise_px is not None}
-    return [f for f in judged if f.kind == "corners" and f.sensor in stated and _is_small(f)]
+    return [f for f in sensor_fits if f.kind == "corners" and f.sensor in stated and _is_small(f)]
 
 
 def _corners_words(corners: list[SensorFit]) -> str:
@@ -104,9 +106,9 @@ def _times(f: SensorFit) -> float:
     return float(np.sqrt(max(f.chi2, 0.0) / f.dof))
 
 
-def _is_noise(found: Estimate, f: SensorFit) -> bool:
+def _is_noise(estimate: Estimate, f: SensorFit) -> bool:
     """Whether the residuals of `f` are white and constant over the recording."""
-    rows = rows_of(found.outcome, f.sensor, f.kind)
+    rows = rows_of(estimate.outcome, f.sensor, f.kind)
     return rows is not None and are_noise(rows.weighted)
 
 
@@ -115,17 +117,22 @@ def _is_small(f: SensorFit) -> bool:
     return dof_known(f) and f.chi2 / max(f.dof, 1.0) < SMALL_CHI2
 
 
-def scatter_warnings(factors: np.ndarray, split: bool, held: CrossValidation | None) -> Iterator[str]:
+def scatter_warnings(factors: np.ndarray, split: bool, validation: CrossValidation | None) -> Iterator[str]:
     """Warnings on the scatter of estimates from segments. factors (n,): empirical factors of the sensors' parameters;
-    split: whether the recording was cut into segments; held: result of the cross-validation."""
+    split: whether the recording was cut into segments; validation: result of the cross-validation."""
     if len(factors) and factors.max() > LARGE_FACTOR:
         yield (
             f"estimates from segments of the recording scatter {factors.max():.1f}x more than predicted; the printed "
             "standard deviations are inflated accordingly."
         )
-    if held is not None and len(factors) and held.optimistic and held.factor > BEYOND_FACTOR * factors.max():
+    if (
+        validation is not None
+        and len(factors)
+        and validation.optimistic
+        and validation.factor > BEYOND_FACTOR * factors.max()
+    ):
         yield (
-            f"one half of the recording predicts the other {held.factor:.1f}x worse than predicted, and the "
+            f"one half of the recording predicts the other {validation.factor:.1f}x worse than predicted, and the "
             f"printed standard deviations are only {factors.max():.1f}x the formal ones: they are too small."
         )
     if not split:

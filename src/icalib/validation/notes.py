@@ -10,11 +10,11 @@ from icalib.result.timeline import Timeline
 from icalib.sensors import call_all_kinds
 
 
-def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """Notes on the recordings, then on each kind of sensor."""
     for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
         number = f"recording {k}"
         name = number if span.name == number else f"{number}, {span.name}"
         yield f"{name}: {span.end - span.start:.1f} s from {span.origin_ns} ns on."
     yield from inputs.measurements.notes
-    yield from call_all_kinds("assess", "notes", inputs, found, timeline)
+    yield from call_all_kinds("assess", "notes", inputs, estimate, timeline)

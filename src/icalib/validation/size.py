@@ -21,13 +21,13 @@ CLEARLY = 5.0  # standard deviations
 SCALE = "scale"  # name of the parameter that scales all lengths of a sensor, with the prior `scale_sigma`
 
 
-def felt_size(found: Estimate, factor: float) -> TargetSize | None:
+def felt_size(estimate: Estimate, factor: float) -> TargetSize | None:
     """Ratio of the target's true size, by the accelerometer, to the stated one. `factor` multiplies its formal standard
     deviation. None if the size is unobservable, or if the solver did not converge."""
-    if not found.outcome.converged:
+    if not estimate.outcome.converged:
         return None
     try:
-        size = target_size(found.problem, found.outcome.state)
+        size = target_size(estimate.problem, estimate.outcome.state)
     except EstimationError:  # the problem cannot be solved at another size
         return None
     return None if size is None else TargetSize(size.ratio, factor * size.std)
@@ -70,8 +70,8 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
     target = rig.has_target and bool(rig.cameras)
     has_imu = rig.imu is not None and not rig.imu.assumed
     sources = ["the size of the target"] if target else []
-    found = (call_kind(sensor.sensor_type, "assess", "length", sensor, rig) for sensor in rig.mounted)
-    sources += [source for source in found if source]
+    sensor_sources = (call_kind(sensor.sensor_type, "assess", "length", sensor, rig) for sensor in rig.mounted)
+    sources += [source for source in sensor_sources if source]
     if has_imu and (size is not None or not target):
         sources.append("the accelerometer")
     return sources

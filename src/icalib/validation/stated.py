@@ -15,11 +15,11 @@ from icalib.validation.looks_like import looks_like
 
 def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequence[ParameterGroup]) -> Iterator[str]:
     """Sentences on sensors with impossible values, unless they contradict a stated value in `against`."""
-    found = {(g.sensor, g.name): g for g in groups}
+    groups_by_key = {(g.sensor, g.name): g for g in groups}
     named = {c.key[0] for c in against}
     for sensor in inputs.rig.sensors.values():
         if sensor.name not in named:
-            yield from call_kind(sensor.sensor_type, "assess", "absurd", sensor, found) or ()
+            yield from call_kind(sensor.sensor_type, "assess", "absurd", sensor, groups_by_key) or ()
 
 
 def stated_words(inputs: Inputs, c: Contradiction) -> str:
@@ -33,25 +33,25 @@ def stated_words(inputs: Inputs, c: Contradiction) -> str:
     if c.key[1] == "rotation":
         angle, axis = scale * float(np.linalg.norm(c.off)), labels[c.worst]
         given = f"rotation of {c.key[0]}{allowed and f' ({allowed.strip()})'}"
-        shown = f"{angle:.3g}{unit} from it (+- {sigma:.2g}{unit} about {axis})"
+        estimate_text = f"{angle:.3g}{unit} from it (+- {sigma:.2g}{unit} about {axis})"
     else:
         label = "" if len(labels) == 1 else f" {labels[c.worst]}"
         value = scale * np.broadcast_to(np.asarray(c.parameter.value), c.off.shape)[c.worst]
         given = f"{c.key[1].replace('_', ' ')}{label} of {c.key[0]}, {value:.6g}{allowed or unit},"
-        shown = f"{_rounded(scale * float(c.value[c.worst]), sigma)} +- {sigma:.2g}{unit}"
+        estimate_text = f"{_rounded(scale * float(c.value[c.worst]), sigma)} +- {sigma:.2g}{unit}"
     kind, advice = ("fixed value", "leave it free") if stated is None else ("prior", "give it a larger sigma")
     assert c.parameter.value is not None
     hint = looks_like(inputs.rig, c.key, c.parameter.value, c.value)
     return (
-        f"the {kind} of {given} contradicts the data, which alone show {shown}: {c.away[c.worst]:.0f} standard "
+        f"the {kind} of {given} contradicts the data, which alone show {estimate_text}: {c.away[c.worst]:.0f} standard "
         f"deviations away; correct it, or {advice}.{hint}"
     )
 
 
 def scaled(values: np.ndarray, scale: float) -> str:
     """Text of the numbers `values` times `scale`, to four digits, in brackets if there are several."""
-    shown = [f"{scale * v:.4g}" for v in values]
-    return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
+    texts = [f"{scale * v:.4g}" for v in values]
+    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
 
 
 def _rounded(value: float, sigma: float) -> str:

@@ -25,13 +25,13 @@ OTHER_FOCAL = 0.02  # relative difference of fx: sets that differ by less count 
 MOST_CHI2 = 16.0  # sum over all observations of the squared difference over the noise: four standard deviations
 
 
-def twin_lens_notes(inputs: Inputs, found: Estimate, fits: Sequence[SensorFit]) -> Iterator[str]:
+def twin_lens_notes(inputs: Inputs, estimate: Estimate, fits: Sequence[SensorFit]) -> Iterator[str]:
     """One sentence for each camera whose observations fit another set of parameters as well."""
-    for camera, factor in zip(inputs.rig.cameras, of_type(found.problem.factors, CornerFactor), strict=True):
+    for camera, factor in zip(inputs.rig.cameras, of_type(estimate.problem.factors, CornerFactor), strict=True):
         fit = next((f for f in fits if f.sensor == camera.name and f.unit == "px" and f.rms), None)
         if camera.intrinsics.mode == "fixed" or camera.distortion.mode == "fixed" or fit is None or not fit.rms:
             continue
-        lens, uv = factor.lens(found.outcome.state), _observed(found, factor)
+        lens, uv = factor.lens(estimate.outcome.state), _observed(estimate, factor)
         # `count` counts both coordinates of each point; `rms` is that of one coordinate.
         limit = fit.rms * np.sqrt(MOST_CHI2 / max(0.5 * fit.count, 1.0))
         twin = twin_lens(factor.model, lens, uv, float(limit))
@@ -56,16 +56,16 @@ def twin_lens(model: CameraModel, lens: np.ndarray, uv: np.ndarray, limit_px: fl
             continue
         with suppress(np.linalg.LinAlgError):
             other = fit_rays(model, start, rays, uv, 1e-3)
-            there, seen = model.project(other, rays)
-            apart = float(np.sqrt(((there - uv) ** 2).sum(axis=1).mean())) if seen.all() else np.inf
+            other_uv, is_projected = model.project(other, rays)
+            apart = float(np.sqrt(((other_uv - uv) ** 2).sum(axis=1).mean())) if is_projected.all() else np.inf
             if apart < best[0] and abs(other[0] / lens[0] - 1.0) > OTHER_FOCAL:
                 best = apart, other
     return best[1]
 
 
-def _observed(found: Estimate, factor: CornerFactor) -> np.ndarray:
+def _observed(estimate: Estimate, factor: CornerFactor) -> np.ndarray:
     """(N, 2) px: detected corners and used tracked points of a camera."""
-    features = of_type(found.problem.factors, FeatureFactor)
+    features = of_type(estimate.problem.factors, FeatureFactor)
     pairs = [pair for f in features for pair in zip(f.streams, f.keep, strict=True)]
-    own = [s.uv[k] for s, k in pairs if s.name == factor.name]
-    return np.concatenate([factor.stream.uv, *own])
+    tracked_uv = [s.uv[k] for s, k in pairs if s.name == factor.name]
+    return np.concatenate([factor.stream.uv, *tracked_uv])

@@ -35,13 +35,13 @@ class VarianceParts(NamedTuple):
     def of(cls, determined: Determined, parts: Segments | None) -> VarianceParts:
         """Variance shares and empirical factors of the estimate `determined`. parts: estimates from segments, or None
         if the recording is not split."""
-        found = determined.estimate
-        whole, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
-        prior = np.clip(determined.prior_variance, 0.0, whole - guess)
-        formal = noise_variance(found.problem, found.outcome)
-        empirical = _empirical_variance(found, parts, formal)
+        estimate = determined.estimate
+        variance, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
+        prior = np.clip(determined.prior_variance, 0.0, variance - guess)
+        formal = noise_variance(estimate.problem, estimate.outcome)
+        empirical = _empirical_variance(estimate, parts, formal)
         ratio = np.sqrt(np.divide(empirical, formal, out=np.ones_like(formal), where=formal > 0.0))  # 0: fixed
-        return cls(np.maximum(1.0 - (guess + prior) / whole, 0.0), prior / whole, ratio, determined.inflation)
+        return cls(np.maximum(1.0 - (guess + prior) / variance, 0.0), prior / variance, ratio, determined.inflation)
 
     def pooled(self, columns: np.ndarray) -> float:
         """Root mean square of the ratio over `columns`, weighted by the noise share of each."""
@@ -52,20 +52,20 @@ class VarianceParts(NamedTuple):
     def factor(self, columns: np.ndarray, overall: float) -> np.ndarray:
         """(n,) empirical factors of the standard deviations of a group, by the larger of its pooled ratio and the
         `overall` one."""
-        own = max(1.0, self.pooled(columns), overall)
+        noise_factor = max(1.0, self.pooled(columns), overall)
         noise, prior = self.noise[columns], self.prior[columns]
-        return np.sqrt(own**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))
+        return np.sqrt(noise_factor**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))
 
 
-def _empirical_variance(found: Estimate, parts: Segments | None, white: np.ndarray) -> np.ndarray:
+def _empirical_variance(estimate: Estimate, parts: Segments | None, white: np.ndarray) -> np.ndarray:
     """(B,) variances: the larger of the scatter over segments and over feature tracks. The excess of cluster-robust
     variances over `white` (B,) is added, for image and target regions. Returns `white` without segments and tracks."""
-    if parts is None and not of_type(found.problem.factors, FeatureFactor):
+    if parts is None and not of_type(estimate.problem.factors, FeatureFactor):
         return white
-    clusters = cluster_covariances(found.problem, found.outcome)
+    clusters = cluster_covariances(estimate.problem, estimate.outcome)
     spread = white if clusters.tracks is None else np.diag(clusters.tracks)
     if parts is not None:
-        over_parts = few_factor(parts.count) ** 2 * spread_variance(found.outcome, parts, white)
+        over_parts = few_factor(parts.count) ** 2 * spread_variance(estimate.outcome, parts, white)
         spread = over_parts if clusters.tracks is None else np.maximum(spread, over_parts)
     return spread + sum(np.maximum(np.diag(V) - white, 0.0) for V in clusters.places)
 
