@@ -55,7 +55,7 @@ class _Comparison:
     """Comparison of two jobs: the blocks that differ, the number of tested blocks, and notes."""
 
     changes: tuple[GroupChange, ...] = ()
-    judged: int = 0
+    n_tested: int = 0
     notes: tuple[str, ...] = ()
 
 
@@ -76,14 +76,14 @@ def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration]
     step_blocks = {_block(c) for s in steps for c in s.changes}
     if first is not None and last is not None and len(steps) > 1:
         slow = _step(first, last, limit)
-        steps.append(_Comparison(tuple(c for c in slow.changes if _block(c) not in step_blocks), slow.judged))
+        steps.append(_Comparison(tuple(c for c in slow.changes if _block(c) not in step_blocks), slow.n_tested))
     changes = [c for s in steps for c in s.changes]
     return Drift(
         robot,
         tuple(jobs),
         tuple(c for c in changes if c.judged),
         tuple(c for c in changes if not c.judged),
-        sum(s.judged for s in steps),
+        sum(s.n_tested for s in steps),
         tuple(dict.fromkeys([*notes, *(n for s in steps for n in s.notes)])),
     )
 
