@@ -63,9 +63,9 @@ def draft_rig(inspection: Inspection) -> str:
     lines += _others(inspection, bool(cameras))
     left_out = {**broken, **inspection.sources.left_out}
     lines += [f"  # Not used: {comment(topic)} ({comment(why)})" for topic, why in left_out.items()]
-    blind = any(c.tracks is None and not (inspection.without_target and c.images) for c in cameras)
-    aimed = inspection.target is not None or blind
-    return "\n".join([*lines, _target(inspection) if cameras and aimed else ""])
+    needs_target = any(c.tracks is None and not (inspection.without_target and c.images) for c in cameras)
+    writes_target = inspection.target is not None or needs_target
+    return "\n".join([*lines, _target(inspection) if cameras and writes_target else ""])
 
 
 def check_draft(path: Path) -> None:
@@ -139,8 +139,8 @@ def _others(inspection: Inspection, has_cameras: bool) -> Iterator[str]:
     """Lines of sensors that are neither IMU nor camera. Topics that need not be sensors on the robot are comments,
     unless no other sensor gives the motion."""
     kinds, imus = inspectors(), inspection.sources.imus
-    sure = [n for n in moving(inspection) if kinds[inspection.sources.others[n].kind].is_certain]
-    default_active = not (has_cameras or (imus and sure))
+    certain_sensors = [n for n in moving(inspection) if kinds[inspection.sources.others[n].kind].is_certain]
+    default_active = not (has_cameras or (imus and certain_sensors))
     for kind, inspector in kinds.items():
         for name, topic in inspection.sources.of(kind).items():
             if inspector.sensor.needs_imu and not imus:
@@ -157,10 +157,10 @@ def _kalibr_imu(inspection: Inspection, topic: str) -> KalibrImu | None:
     """Kalibr's entry for the IMU's topic; else its only entry, if that names no topic of this recording."""
     entries = inspection.kalibr.imus
     topics = {s.topic.name.strip("/") for s in inspection.streams}
-    mine = [k for k in entries if k.topic.strip("/") == topic.strip("/")]
-    if not mine and len(entries) == 1 and entries[0].topic.strip("/") not in topics:
-        mine = list(entries)
-    return mine[0] if mine else None
+    matches = [k for k in entries if k.topic.strip("/") == topic.strip("/")]
+    if not matches and len(entries) == 1 and entries[0].topic.strip("/") not in topics:
+        matches = list(entries)
+    return matches[0] if matches else None
 
 
 def _camera(inspection: Inspection, camera: CameraSource) -> list[str]:

@@ -50,13 +50,13 @@ def findings(inspection: Inspection) -> tuple[Finding, ...]:
 def _broken(inspection: Inspection) -> Iterator[Finding]:
     """Findings on cameras and IMUs that cannot be used: problems if no other camera or IMU remains, else warnings."""
     reasons = [reason for c in inspection.sources.cameras if (reason := _unfit(inspection, c))]
-    alone = len(reasons) == len(inspection.sources.cameras)
-    yield from (Finding("problem" if alone else "warning", reason) for reason in reasons)
+    is_fatal = len(reasons) == len(inspection.sources.cameras)
+    yield from (Finding("problem" if is_fatal else "warning", reason) for reason in reasons)
     for name, topic in inspection.sources.imus.items():
         stream = inspection.stream(topic)
         if stream.problem:
-            alone = inspection.imu is None or inspection.imu == name
-            yield Finding("problem" if alone else "warning", stream.problem)
+            is_fatal = inspection.imu is None or inspection.imu == name
+            yield Finding("problem" if is_fatal else "warning", stream.problem)
     for name, images in inspection.images.items():
         if 0 < images.damaged < images.decoded:
             yield Finding(
@@ -144,10 +144,10 @@ def _motion(inspection: Inspection, name: str, facts: ImuFacts) -> Iterator[Find
         )
     elif second < SECOND_AXIS * strongest or second < STILL_RAD_S:
         # Rotations of cameras are found from rotations of the rig alone; those of other sensors from its path as well.
-        alone = not moving(inspection)
+        is_fatal = not moving(inspection)
         rest = other_axes(name, facts.principal[0])
         yield Finding(
-            "problem" if alone else "warning",
+            "problem" if is_fatal else "warning",
             f"{name} turns about {axis_words(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; "
             f"{second:.2f} and {weakest:.2f} about the perpendicular axes), so some parameters are "
             "unobservable; "

@@ -37,8 +37,8 @@ def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = (
         notes += jumps.notes + reading_notes
     except RecordingError as error:
         problem = str(error)
-    fine = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
-    gyro, accel = (x[fine] if fine.any() else np.zeros((1, 3)) for x in (imu.gyro, imu.accel))
+    finite = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
+    gyro, accel = (x[finite] if finite.any() else np.zeros((1, 3)) for x in (imu.gyro, imu.accel))
     # eigh sorts in ascending order; here the strongest direction comes first.
     squares, directions = np.linalg.eigh(gyro.T @ gyro / len(gyro))
     first, second, third = (_vector(d * np.sign(d[np.argmax(np.abs(d))])) for d in directions.T[::-1])
@@ -54,7 +54,7 @@ def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = (
         principal_rms=_vector(np.sqrt(np.maximum(squares[::-1], 0.0))),
         principal=(first, second, third),
         gravity_spread=None if problem else _spreads(imu),
-        saturated=saturations(imu) if fine.all() and len(imu.gyro) else (),
+        saturated=saturations(imu) if finite.all() and len(imu.gyro) else (),
         notes=notes,
         problem=problem,
     )

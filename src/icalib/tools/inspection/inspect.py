@@ -214,8 +214,12 @@ def _read_imu(
 def _read_stamps(recording: Recording, topic: TopicInfo, left_out: bool) -> StreamFacts:
     """Facts on a topic from its stamps. Timing is None for topics that icalib does not read, CameraInfo, transforms and
     images that are left out."""
-    untimed = ("", "camera info", *(kind for inspector in inspectors().values() for kind in inspector.frame_topics))
-    if left_out or not topic.count or topic.kind in untimed:
+    kinds_without_timing = (
+        "",
+        "camera info",
+        *(kind for inspector in inspectors().values() for kind in inspector.frame_topics),
+    )
+    if left_out or not topic.count or topic.kind in kinds_without_timing:
         return StreamFacts(topic, None)
     try:
         return StreamFacts(topic, timing_of(recording.stamps(topic.name)))

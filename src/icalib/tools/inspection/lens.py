@@ -92,11 +92,11 @@ def _kalibr(inspection: Inspection, camera: CameraSource) -> KalibrCamera | None
     name."""
     topics = {s.topic.name.strip("/") for s in inspection.streams}
     named = any(k.topic.strip("/") in topics for k in inspection.kalibr.cameras)
-    mine = camera.images.name.strip("/") if camera.images else None
-    is_mine: Callable[[KalibrCamera], bool] = (
-        (lambda k: k.topic.strip("/") == mine) if named else (lambda k: k.name == camera.name)
+    topic = camera.images.name.strip("/") if camera.images else None
+    matches: Callable[[KalibrCamera], bool] = (
+        (lambda k: k.topic.strip("/") == topic) if named else (lambda k: k.name == camera.name)
     )
-    return next((k for k in inspection.kalibr.cameras if is_mine(k)), None)
+    return next((k for k in inspection.kalibr.cameras if matches(k)), None)
 
 
 def _size(resolution: tuple[int, int]) -> str:

@@ -22,14 +22,14 @@ def timing_of(stamps_ns: np.ndarray) -> Timing | None:
     median = float(np.median(forward)) if len(forward) else None
     wide = steps > GAP * median if median else np.zeros(len(steps), bool)
     longest = int(np.argmax(steps)) if wide.any() else None
-    even = forward[forward <= GAP * median] if median else forward
+    steps_without_gaps = forward[forward <= GAP * median] if median else forward
     return Timing(
         count=len(stamps_ns),
         first_ns=first,
         last_ns=last,
         duration_s=(last - first) * 1e-9,
         rate_hz=1e9 / median if median else None,
-        jitter_s=1e-9 * float(np.sqrt(np.mean((even - median) ** 2))) if median else None,
+        jitter_s=1e-9 * float(np.sqrt(np.mean((steps_without_gaps - median) ** 2))) if median else None,
         gaps=int(wide.sum()),
         longest_gap_s=None if longest is None else float(steps[longest]) * 1e-9,
         longest_gap_at_s=None if longest is None else int(stamps_ns[longest] - first) * 1e-9,
