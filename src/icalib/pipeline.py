@@ -87,9 +87,9 @@ def measure(
 
 def _reading_share(rig: Rig, opened: Mapping[str, Recording]) -> float:
     """Expected fraction of the calibration time that reading takes, for the progress display."""
-    seeing = rig.cameras if rig.has_target else ()
-    pictured = any(not has_corners(r, c) for r in opened.values() for c in seeing)
-    return IMAGES_SHARE if pictured or any(c.tracks_images for c in rig.cameras) else READING_SHARE
+    target_cameras = rig.cameras if rig.has_target else ()
+    needs_detection = any(not has_corners(r, c) for r in opened.values() for c in target_cameras)
+    return IMAGES_SHARE if needs_detection or any(c.tracks_images for c in rig.cameras) else READING_SHARE
 
 
 def _measure_all(rig: Rig, opened: Mapping[str, Recording], progress: Progress) -> list[Measurements]:
@@ -157,11 +157,11 @@ def calibrate_measurements(
 
 def _refuse_short(measured: Measurements) -> None:
     imu = measured.imu
-    lasted_s = 0.0 if imu is None else float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9
-    if imu is not None and lasted_s < SHORTEST_S:
+    duration_s = 0.0 if imu is None else float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9
+    if imu is not None and duration_s < SHORTEST_S:
         raise EstimationError(
-            f"{imu.name}: the recording is too short ({len(imu.stamps_ns)} readings in {lasted_s:.2f} s); record some "
-            "seconds of motion."
+            f"{imu.name}: the recording is too short ({len(imu.stamps_ns)} readings in {duration_s:.2f} s); record "
+            "some seconds of motion."
         )
 
 
@@ -174,16 +174,18 @@ def _calibrate(
     trim_heap()
     steps = _StepProgress(progress)
 
-    def tell(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> None:
+    def report_visit(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> None:
         if on_visit is not None:
             on_visit(visited(inputs, stage, problem, visit))
 
-    made = attempt(rig, recordings, clock.lap, lambda name, step: steps.note(name), tell)
-    if made.error is not None:
-        raise EstimationError(" Besides, ".join(stated_words(made.inputs, c) for c in made.against)) from made.error
+    best_attempt = attempt(rig, recordings, clock.lap, lambda name, step: steps.note(name), report_visit)
+    if best_attempt.error is not None:
+        raise EstimationError(
+            " Besides, ".join(stated_words(best_attempt.inputs, c) for c in best_attempt.against)
+        ) from best_attempt.error
     clock.lap("solving")
     progress("assessing the result", 0.9)
-    result = assess(made.inputs, made.solution, made.against)
+    result = assess(best_attempt.inputs, best_attempt.solution, best_attempt.against)
     _refuse_no_numbers(result)
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps)

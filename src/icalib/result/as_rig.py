@@ -67,10 +67,12 @@ def _treated(g: ParameterGroup, old: Parameter, treatment: Treatment) -> tuple[P
     the parameter in the rig file."""
     if treatment == "guess":
         return (old if old.mode == "prior" else Parameter("free", g.value)), ""
-    open_ = [label for label, v in zip(g.labels, g.verdict, strict=True) if v == "undetermined"]
-    if treatment == "fixed" and open_:
+    undetermined = [label for label, v in zip(g.labels, g.verdict, strict=True) if v == "undetermined"]
+    if treatment == "fixed" and undetermined:
         what = (
-            f"{g.name.replace('_', ' ')} {', '.join(open_)}".rstrip() if len(g.labels) > 1 else g.name.replace("_", " ")
+            f"{g.name.replace('_', ' ')} {', '.join(undetermined)}".rstrip()
+            if len(g.labels) > 1
+            else g.name.replace("_", " ")
         )
         kept = old if old.mode == "prior" else Parameter("free", g.value)
         return kept, f"{g.sensor}: {what} was not determined by the data, so {g.name} is not fixed."

@@ -64,12 +64,12 @@ def reasons(c: Calibration) -> tuple[str, ...]:
         return tuple(dict.fromkeys([*c.wrong, c.failure, *c.warnings]))
     counted = {v for g in c.groups for v in _counted(c, g)} & {"undetermined", "weak"}
     # Standard deviations of a wrong model include its misfit, which a longer recording does not reduce.
-    mended_first = bool(c.wrong)
-    open_ones = [*c.undetermined, *(() if mended_first else _unexplained(c))] if counted else []
-    weak = [] if mended_first else list(_weak(c))
+    is_wrong = bool(c.wrong)
+    undetermined = [*c.undetermined, *(() if is_wrong else _unexplained(c))] if counted else []
+    weak = [] if is_wrong else list(_weak(c))
     rest = [w for w in c.warnings if w not in c.wrong]
     # Undetermined coefficients of a lens matter little if its projection is known well enough, so they come last.
-    first, last = (open_ones, []) if "undetermined" in counted else ([], open_ones)
+    first, last = (undetermined, []) if "undetermined" in counted else ([], undetermined)
     return tuple(dict.fromkeys([*c.wrong, *first, *rest, *weak, *last]))
 
 
