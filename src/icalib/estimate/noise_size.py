@@ -178,9 +178,9 @@ class _ImuDraws:
         columns, (count, dof, chi2) = self.rows[kind], self._left(kind)
         total = 0.0
         for lag in range(1, N_LAGS + 1):
-            r, made = self.residual[:, columns], [a[:, columns] for a in self.along]
+            r, draws = self.residual[:, columns], [a[:, columns] for a in self.along]
             total += float((r[lag:] * r[:-lag]).sum()) * dof / max(chi2, 1e-300)
-            total += float(np.mean([(a[lag:] * a[:-lag]).sum() for a in made]))
+            total += float(np.mean([(a[lag:] * a[:-lag]).sum() for a in draws]))
         dof = max(dof, 1.0)
         return abs(total) / N_LAGS / dof / max(MAX_CORRELATION, CHANCE_SIGMAS * np.sqrt(count / N_LAGS) / dof)
 

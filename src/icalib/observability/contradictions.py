@@ -110,24 +110,24 @@ def _estimated(inputs: Inputs, state: State, significant: Sequence[Contradiction
     return _differences(inputs, solution, [c.key for c in significant]) if converged else significant
 
 
-def contradicted_by(inputs: Inputs, without: Determined) -> tuple[Contradiction, ...]:
-    """Values stated in the rig file of `inputs` that contradict the estimate `without`, in which they are free. The
+def contradicted_by(inputs: Inputs, solution: Determined) -> tuple[Contradiction, ...]:
+    """Values stated in the rig file of `inputs` that contradict the estimate `solution`, in which they are free. The
     largest difference comes first."""
-    layout = without.estimate.problem.layout
-    significant = _significant(_differences(inputs, without, stated_keys(inputs, layout)))
+    layout = solution.estimate.problem.layout
+    significant = _significant(_differences(inputs, solution, stated_keys(inputs, layout)))
     return tuple(sorted(significant, key=lambda c: -c.in_prior_sigmas))
 
 
-def _differences(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contradiction]:
-    """Differences between the stated values of the groups `keys` and the estimate `without`, in which these are free.
+def _differences(inputs: Inputs, solution: Determined, keys: Sequence[Key]) -> list[Contradiction]:
+    """Differences between the stated values of the groups `keys` and the estimate `solution`, in which these are free.
 
     Standard deviations are multiplied by the root of the largest chi^2 per degree of freedom of any residuals, so that
     a misfit alone makes no contradiction.
     """
-    outcome, layout = without.estimate.outcome, without.estimate.problem.layout
+    outcome, layout = solution.estimate.outcome, solution.estimate.problem.layout
     ratios = [f.chi2 / f.dof for f in fits(outcome.problem, outcome) if f.dof > np.sqrt(f.count)]
     factor = float(np.sqrt(max([1.0, *ratios])))
-    sigma, nothing = np.sqrt(np.diag(without.covariance)), np.zeros(layout.size)
+    sigma, nothing = np.sqrt(np.diag(solution.covariance)), np.zeros(layout.size)
     return [_difference(inputs, outcome.state, layout.block(*key), nothing, sigma, factor) for key in keys]
 
 

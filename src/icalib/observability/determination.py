@@ -103,8 +103,8 @@ class Determined:
         """(B,) standard deviations in tolerances from the data and priors on nuisance parameters, consider covariance
         included."""
         t = self.estimate.problem.tolerance
-        alone = scatter(self.data, self.noise, self.fixed_directions)
-        return np.sqrt(np.diag(alone) + ((self.shifts / t) ** 2).sum(axis=0))
+        covariance = scatter(self.data, self.noise, self.fixed_directions)
+        return np.sqrt(np.diag(covariance) + ((self.shifts / t) ** 2).sum(axis=0))
 
 
 def scatter(known: np.ndarray, noise: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:

@@ -76,8 +76,8 @@ def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
     """
     t, n = parts.problem.tolerance, parts.count
     inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.fixed_directions)
-    alone = parts.sums[:, :-1, :-1]
-    known = (alone + (parts.information - alone.sum(axis=0)) / n) * t[:, None] * t
+    segment_information = parts.sums[:, :-1, :-1]
+    known = (segment_information + (parts.information - segment_information.sum(axis=0)) / n) * t[:, None] * t
     left = (known - known @ inverse @ known).sum(axis=0)
     return t**2 * n / (n - 1.0) * np.diag(inverse @ left @ inverse)
 

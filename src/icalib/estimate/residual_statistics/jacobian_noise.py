@@ -89,8 +89,8 @@ def spurious_information(
     if least > CLEARLY_DETERMINED or _largest_share(t[:, None] * both_sides * t, scaled) < SMALL_SHARE:
         return Spurious(both_sides[None])
     each: list[np.ndarray] = []
-    for some in (samples[1 : 1 + N_FIRST_DRAWS], samples[1 + N_FIRST_DRAWS :]):
-        each += [noise.followed(d.chain, _reading_noise(problem.chain.imu, rng)) for d in some]
+    for batch in (samples[1 : 1 + N_FIRST_DRAWS], samples[1 + N_FIRST_DRAWS :]):
+        each += [noise.change_with_response(d.chain, _reading_noise(problem.chain.imu, rng)) for d in batch]
         if enough(Spurious(np.array(each))):
             break
     return Spurious(np.array(each))
@@ -105,7 +105,7 @@ class _Noise:
     outcome: Outcome
     among: tuple[np.ndarray, ...]
 
-    def added(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
+    def mean_change(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
         """Spurious information (B, B) if the trajectory changes by chain (K, 15) and the readings by `readings`: mean
         over both signs."""
         return 0.5 * (self.information_change(1.0, chain, readings) + self.information_change(-1.0, chain, readings))
@@ -117,12 +117,14 @@ class _Noise:
         noisy = self.problem if readings is None else _with_noise(self.problem, noisy_state, sign * readings)
         return (_information(noisy, noisy_state, self.outcome.workspace) - self.outcome.information)[self.among]
 
-    def followed(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
+    def change_with_response(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """Spurious information (B, B) if the trajectory follows the noise `readings`, in addition to a posterior draw
         `chain` (K, 15). Noise that both contain is counted once."""
-        everywhere = _with_noise(self.problem, self.outcome.state, readings)
-        between_keyframes = self.problem.replacing([everywhere.chain])
-        return self.added(chain + self._step(everywhere), readings) - self.added(self._step(between_keyframes), None)
+        noisy_problem = _with_noise(self.problem, self.outcome.state, readings)
+        between_keyframes = self.problem.replacing([noisy_problem.chain])
+        return self.mean_change(chain + self._step(noisy_problem), readings) - self.mean_change(
+            self._step(between_keyframes), None
+        )
 
     def _step(self, problem: Problem) -> np.ndarray:
         """Solver's step (K, 15) of the chain for `problem`, calibration parameters fixed."""

@@ -58,16 +58,16 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
     return TargetSize(float(ratio), float(std))
 
 
-def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Problem, State]:
+def _grown(problem: Problem, state: State, old_size: float, size: float) -> tuple[Problem, State]:
     """The problem with a target `size` times the stated one, and the state with all lengths that cameras observe scaled
-    by size / now. Fixed lengths are not scaled."""
-    factors, by = tuple(f.with_target_size(size) for f in of_type(problem.factors, TargetFactor)), size / now
+    by size / old_size. Fixed lengths are not scaled."""
+    factors, scale = tuple(f.with_target_size(size) for f in of_type(problem.factors, TargetFactor)), size / old_size
     bodies = factors[0].bodies
     lengths = {(f.name, "translation") for f in factors} | {(b, "shape") for b in bodies.bending}
     lengths |= {(b, "translation") for b in bodies.names if bodies.several}
     lengths &= {b.key for b in problem.layout.free}
-    values = {key: by * v if key in lengths else v for key, v in state.values.items()}
-    begin = replace(state, position=by * state.position, velocity=by * state.velocity, values=values)
+    values = {key: scale * v if key in lengths else v for key, v in state.values.items()}
+    begin = replace(state, position=scale * state.position, velocity=scale * state.velocity, values=values)
     return problem.replacing(factors), begin
 
 
