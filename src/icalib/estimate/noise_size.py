@@ -142,43 +142,43 @@ class _ImuDraws:
 
     rows: dict[str, slice]
     residual: np.ndarray
-    along: tuple[np.ndarray, ...]
+    residual_draws: tuple[np.ndarray, ...]
 
     @classmethod
     def of(cls, outcome: Outcome) -> _ImuDraws:
         problem, state = outcome.problem, outcome.state
         base = outcome.residuals[problem.chain.key].residual
         assert outcome.draws is not None
-        along = []
+        residual_draws = []
         for x in outcome.draws.free[:4]:
             draw_state = state.retract(problem.layout, DRAW_STEP * x.chain, DRAW_STEP * x.calib)
-            along.append((output_at(problem.chain, draw_state).residual - base) / DRAW_STEP)
+            residual_draws.append((output_at(problem.chain, draw_state).residual - base) / DRAW_STEP)
         kinds = {k: r for k, r in problem.chain.kinds.items() if k in IMU_KINDS}
-        return cls(kinds, base, tuple(along))
+        return cls(kinds, base, tuple(residual_draws))
 
-    def _left(self, kind: str, rows: slice = slice(None)) -> tuple[int, float, float]:
+    def _dof_and_chi2(self, kind: str, rows: slice = slice(None)) -> tuple[int, float, float]:
         """Number, degrees of freedom after the fit, and chi^2 of the residuals of `kind` in the intervals `rows`."""
         r, columns = self.residual[rows, self.rows[kind]], self.rows[kind]
-        spent = np.mean([(a[rows, columns] ** 2).sum() for a in self.along])
-        return r.size, r.size - float(spent), float((r**2).sum())
+        used_dof = np.mean([(a[rows, columns] ** 2).sum() for a in self.residual_draws])
+        return r.size, r.size - float(used_dof), float((r**2).sum())
 
     def size(self, kind: str) -> float:
         """sqrt(chi^2 / degrees of freedom) of `kind`, 1 if the noise is as assumed.
 
         If the fit leaves too few degrees of freedom, their number is increased to a floor. The result is then a lower
         bound of the size, and not below 1."""
-        count, dof, chi2 = self._left(kind)
-        least = MIN_DOF_RATIO * np.sqrt(count)
-        size = float(np.sqrt(chi2 / max(dof, least)))
-        return size if dof > least else max(size, 1.0)
+        count, dof, chi2 = self._dof_and_chi2(kind)
+        min_dof = MIN_DOF_RATIO * np.sqrt(count)
+        size = float(np.sqrt(chi2 / max(dof, min_dof)))
+        return size if dof > min_dof else max(size, 1.0)
 
     def correlation(self, kind: str) -> float:
         """Absolute autocorrelation of `kind`, averaged over N_LAGS lags and corrected for the fit, divided by the
         allowed one; above 1 it is no white noise."""
-        columns, (count, dof, chi2) = self.rows[kind], self._left(kind)
+        columns, (count, dof, chi2) = self.rows[kind], self._dof_and_chi2(kind)
         total = 0.0
         for lag in range(1, N_LAGS + 1):
-            r, draws = self.residual[:, columns], [a[:, columns] for a in self.along]
+            r, draws = self.residual[:, columns], [a[:, columns] for a in self.residual_draws]
             total += float((r[lag:] * r[:-lag]).sum()) * dof / max(chi2, 1e-300)
             total += float(np.mean([(a[lag:] * a[:-lag]).sum() for a in draws]))
         dof = max(dof, 1.0)
@@ -189,13 +189,15 @@ class _ImuDraws:
 
         It is the largest |log(chi^2 per degree of freedom of a segment / that of the recording)|, divided by the
         largest value that is allowed."""
-        _, dof, chi2 = self._left(kind)
-        worst, whole = 0.0, chi2 / max(dof, 1.0)
+        _, dof, chi2 = self._dof_and_chi2(kind)
+        worst, mean_variance = 0.0, chi2 / max(dof, 1.0)
         for segment in np.array_split(np.arange(len(self.residual)), N_NOISE_SEGMENTS):
-            n, left, size = self._left(kind, slice(int(segment[0]), int(segment[-1]) + 1) if len(segment) else slice(0))
-            if left > MIN_DOF_RATIO * np.sqrt(max(n, 1)):
-                allowed = np.log(MAX_VARIATION) + CHANCE_SIGMAS * np.sqrt(2.0 / left)
-                worst = max(worst, abs(np.log(max(size / left / whole, 1e-12))) / allowed)
+            n, segment_dof, segment_chi2 = self._dof_and_chi2(
+                kind, slice(int(segment[0]), int(segment[-1]) + 1) if len(segment) else slice(0)
+            )
+            if segment_dof > MIN_DOF_RATIO * np.sqrt(max(n, 1)):
+                allowed = np.log(MAX_VARIATION) + CHANCE_SIGMAS * np.sqrt(2.0 / segment_dof)
+                worst = max(worst, abs(np.log(max(segment_chi2 / segment_dof / mean_variance, 1e-12))) / allowed)
         return float(worst)
 
 
