@@ -65,7 +65,7 @@ def test_what_stays_in_place_but_is_not_the_robot_s(robot, example, changes):
 
 def test_that_the_floor_is_seen_from_afar_is_what_saves_it(robot, monkeypatch):
     stream = raw(robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0])
-    monkeypatch.setattr(self_returns, "MIN_SEEN_FROM_FAR", 2.0)
+    monkeypatch.setattr(self_returns, "MIN_SHARE_FROM_FAR", 2.0)
     assert self_returns_of(stream) is not None
 
 
