@@ -205,7 +205,12 @@ def _scaled(s, m):
 
 @njit(cache=True, nogil=True)
 def _fill_step(dt, G1, G2, slope1, slope2, by, run):
-    """Fills the derivatives of a step by rate, force and biases; slope1, slope2: of G1 f and G2 f by phi."""
+    """Fills the Jacobian of one step of dt [s] in `run`, from AT_STEP on.
+
+    Its 9 rows are the increments of rotation, velocity and position. Its 12 columns are rate, force, gyroscope bias and
+    accelerometer bias. by: matrices of `correction`. slope1, slope2: derivatives of G1 f and G2 f by phi. `run` also
+    supplies the rotation since the start of the interval.
+    """
     C_f, C_w, C_wf = matrix(by, ROW_F), matrix(by, ROW_G), matrix(by, ROW_H)
     for i in range(3):
         R = run[3 * i], run[3 * i + 1], run[3 * i + 2]

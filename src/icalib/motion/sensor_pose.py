@@ -135,10 +135,12 @@ class SensorPose(NamedTuple):
 def rows_at(
     residual: np.ndarray, J_pose: Sequence[np.ndarray], ends: Sequence[SensorPose], J_further: np.ndarray
 ) -> Rows:
-    """Rows of n residuals (n, m), from their Jacobians J_pose (n, m, 6) by sensor poses.
+    """Rows of n residuals (n, m), with Jacobians by a pair of keyframes and by calibration parameters.
 
-    For one pose each: by its keyframe and the next one. For two: the earlier by its keyframe, the later by the next
-    one. J_further (n, m, c): by further calibration parameters, whose columns follow those of the pose.
+    A residual depends on one or two sensor poses, `ends`; J_pose holds a Jacobian (n, m, 6) by each of them. A single
+    pose belongs to the first keyframe of the pair; in the `pose` scheme it depends on the second one, too. With two
+    poses, the earlier belongs to the first keyframe and the later to the second. J_further (n, m, c): Jacobians by c
+    further calibration parameters, whose columns come last; of length 0 if no Jacobians are wanted.
     """
     n, m, n_pose = *residual.shape, ends[0].n_calib
     if not len(J_further):

@@ -178,8 +178,11 @@ def _has_priors(inputs: Inputs, fixed_directions: np.ndarray) -> bool:
 
 
 def _weights(inputs: Inputs, state: State) -> np.ndarray:
-    """(B,) prior standard deviations of the guess, in parameter units. Rotations, tilts and normals of walls, boards
-    and frames get the default of a rotation."""
+    """(B,) prior standard deviations of the guess, in parameter units: those of `guess_sigma`, with one exception.
+
+    Walls, boards and frames have no guess. Their rotations, tilts and normals get the default sigma of a sensor's
+    rotation [rad], instead of their own wide default.
+    """
     sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
         if block.kind not in ("vector", "nuisance"):

@@ -80,8 +80,11 @@ class Relaxed:
 
 
 def relaxed(inputs: Inputs, estimate: Estimate) -> Relaxed | None:
-    """The solution `estimate` with the values free that the rig file fixes. None if the rig file fixes nothing and
-    states no prior, if the solver did not converge, or if the normal equations cannot be solved."""
+    """Normal equations at the solution of `estimate`, with a column for each value that the rig file fixes.
+
+    The state does not move, and priors still act: `Relaxed.step` frees chosen groups and drops their priors. None if
+    the rig file states no fixed value and no prior, if the solver did not converge, or if the equations are singular.
+    """
     if not estimate.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
         return None
     freed = freed_inputs(inputs)

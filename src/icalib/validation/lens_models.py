@@ -138,7 +138,7 @@ def _successful_trials(fits: Iterable[_Trial | None]) -> list[_Trial]:
 
 
 def _clearly_better(current: _Trial, others: list[_Trial]) -> _Trial | None:
-    """Of the `others` whose RMS is within EQUAL of the best, the model with fewest parameters; None unless it is
+    """The model with fewest parameters among the `others` whose RMS is at most EQUAL times the least. None unless it is
     clearly better than `current`."""
     if not others:
         return None

@@ -50,8 +50,12 @@ class VarianceParts(NamedTuple):
         return float(np.sqrt(weights @ self.ratio[columns] ** 2 / total)) if total > 0.0 else 1.0
 
     def factor(self, columns: np.ndarray, overall: float) -> np.ndarray:
-        """(n,) empirical factors of the standard deviations of a group, by the larger of its pooled ratio and the
-        `overall` one."""
+        """(n,) empirical factors on the formal standard deviations of a group with n `columns`.
+
+        Each part of the variance has its own factor. The noise part has the square of the larger of two ratios: the
+        pooled ratio of the group and the `overall` one, at least 1. The prior part has the square of `weight`, and the
+        part from the initial guess has 1.
+        """
         noise_factor = max(1.0, self.pooled(columns), overall)
         noise, prior = self.noise[columns], self.prior[columns]
         return np.sqrt(noise_factor**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))

@@ -29,7 +29,11 @@ from icalib.sensors.sensor import TIME_OFFSET
 
 
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """All priors: on the shapes of bodies, the default ones on auxiliary parameters, and `stated_priors`."""
+    """All priors: on the shapes of target boards, on auxiliary parameters of sensors, and `stated_priors`.
+
+    Auxiliary parameters get no verdict, such as the edge bloom of a camera. Their prior is the default one, about zero,
+    if the rig file leaves them free.
+    """
     layout = inputs.layout
     priors = [
         Prior(layout.block(b, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M) for b in inputs.bodies.bending
@@ -47,8 +51,8 @@ def stated_priors(inputs: Inputs) -> tuple[Prior, ...]:
 
 
 def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """Priors on nuisance parameters, the imperfections of sensors and targets: those of the rig file, else default
-    ones."""
+    """Priors on nuisance parameters: size of the target, IMU intrinsics, and scale of a pose sensor. `inputs.rig` holds
+    default priors if the user's rig file states none. The shape of a target is no nuisance parameter here."""
     priors, one = [], np.ones(1)
     for block in inputs.layout.free:
         stated = inputs.stated(block)

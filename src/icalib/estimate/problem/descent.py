@@ -93,6 +93,7 @@ class Descent:
                 self.damping.value = max(10.0 * self.damping.value, MIN_DAMPING)
                 if self.damping.value > MAX_SOLVABLE_DAMPING:
                     raise
+                # The failed factorisation has overwritten the sums.
                 self._linearise(self.state, curved=self.damping.curved)
 
     def converges_slowly(self, solution: Solution) -> bool:

@@ -133,8 +133,8 @@ class Problem:
     def linearise(
         self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:
-        """Fills `pieces` (if `sums`) and residuals `out` at `state`; returns half the robust chi^2. `curved`: see
-        `Factor.accumulate`."""
+        """Computes the residuals `out` at `state`, and the normal equations in `pieces` unless `sums` is false. Returns
+        half the robust chi^2. curved: use the true curvature of the robust loss, see `Factor.accumulate`."""
         return sum(in_parallel(lambda p: self._accumulate(state, p, out, sums, curved), pieces))
 
     def _accumulate(self, state: State, piece: Piece, out: Residuals, sums: bool, curved: bool) -> float:
