@@ -110,7 +110,11 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
 
 
 def _is_dense(measurements: Measurements) -> bool:
-    """True if poses, of a rig without an IMU, are so dense that rates may jump at keyframes."""
+    """True if the poses of a rig without an IMU are at most MAX_DENSE_PERIOD_S apart.
+
+    Assumed rates are then constant from each keyframe to the next and jump there, see `ImuData.forwards`. With sparser
+    poses, such jumps would shift time offsets.
+    """
     return float(np.median(np.diff(measurements.reference.seconds))) <= MAX_DENSE_PERIOD_S
 
 

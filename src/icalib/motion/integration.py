@@ -87,8 +87,13 @@ def bias_of(bias, k):
 
 @njit(cache=True, nogil=True)
 def advance(t1, whole_intervals, j, now, bias, readings, by, run, width, cov, cov_t):
-    """Advances `run` from `now` in interval j to t1 (s); with `whole_intervals` through whole intervals up to the one
-    that holds t1, or the last. Returns that interval, its start, and rate and specific force (3,) at t1."""
+    """Advances `run` from `now` [s], in interval j of the readings, to t1 [s]; t1 < `now` integrates backwards.
+
+    With `whole_intervals` it stops where the interval that holds t1, or the last one, is entered. width: columns of J
+    in use. cov, cov_t: see `integration_workspace`; of length 0 without a covariance. Returns the last interval, the
+    time [s] at which it is entered, and rate [rad/s] and specific force [m/s^2] (3,) at t1. Rate and force are of no
+    use with `whole_intervals`.
+    """
     t, gyro, accel, linear = readings.t, readings.gyro, readings.accel, readings.linear
     backwards, last, rate, force = t1 < now, len(t) - 2, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     while True:

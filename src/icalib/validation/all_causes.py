@@ -52,8 +52,14 @@ class AssessedEstimate:
 
 
 def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
-    """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target. against: values
-    of the rig file that the data contradict so strongly that other faults of the estimate may follow from them."""
+    """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target.
+
+    against: values of the rig file that contradict an estimate without any of its values. Such an estimate is made only
+    if the first one fails or fits poorly. If `against` is empty, contradictions are searched here.
+
+    If it is not empty, its causes are grave, and tests that these values may distort are skipped. These are tests of
+    the target size, of changes over the recording, and of residuals of other kinds than IMAGE_KINDS.
+    """
     inputs, estimate = assessed.inputs, assessed.estimate
     stated, notes = _stated(assessed, against)
     few = any(plane_warnings(inputs.rig, estimate.problem.factors))
