@@ -30,9 +30,9 @@ class ParameterSpec:
 
     is_positive: a length or a factor above 0, whose changes are shown in percent. one: singular of `name`, if that is a
     plural. is_auxiliary: estimated beside the calibration, such as edge bloom, and without a verdict; `meaning`
-    explains it. by_images: determined by images, not by motion. motion: advice if the data do not determine the group; {axes}
-    stands for the axes about which the rig hardly turned. motion_on_wheels and motion_without_target replace `motion`
-    for rigs on wheels and without target.
+    explains it. by_images: determined by images, not by motion. motion: advice if the data do not determine the group;
+    {axes} stands for the axes about which the rig hardly turned. motion_on_wheels and motion_without_target replace
+    `motion` for rigs on wheels and without target.
     """
 
     name: str
