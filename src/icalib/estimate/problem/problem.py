@@ -164,8 +164,16 @@ class Problem:
         of the pass. Returns half its chi^2."""
         return self.chain.accumulate_bias_prior(state, piece, sums)
 
-    @staticmethod
-    def narrow(piece: Piece, n_calib: int) -> Piece:
-        """A piece that shares the chain blocks of `piece`, with new sums for `n_calib` calibration parameters."""
-        sums = Piece.zeros(piece.first, piece.last, n_calib)
-        return Piece(piece.first, piece.last, piece.diagonal, piece.upper, sums.side, sums.calib)
+    def piece_with_columns(self, state: State, first: int, last: int, n_columns: int, out: Residuals) -> Piece:
+        """Sums of all factors between keyframes `first` and `last`, without the priors on calibration parameters and
+        without their gradient. `n_columns` further columns beside the calibration parameters are zero, for gradients to
+        be marginalised. Fills `out` with residuals."""
+        size = self.layout.size
+        narrow = self.attach(Piece.zeros(first, last, size))
+        self.add_measurements(state, narrow, out)
+        self.add_bias_prior(state, narrow)
+        self.hold_frames(state, narrow)
+        wide = Piece.zeros(first, last, size + n_columns)
+        wide.side[:, :, :size], wide.calib[:size, :size] = narrow.side[:, :, :size], narrow.calib[:size, :size]
+        features = None if narrow.features is None else narrow.features.widened(size + n_columns)
+        return replace(narrow, side=wide.side, calib=wide.calib, features=features)

@@ -9,7 +9,7 @@ Zeger 1986).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -65,15 +65,7 @@ def _cluster_gradients(
     starts = B + np.cumsum([0, *counts])
 
     def segment(first: int, last: int) -> Piece:
-        piece = Piece.zeros(first, last, int(starts[-1]))
-        narrow = problem.attach(problem.narrow(piece, B))
-        problem.add_measurements(state, narrow, at)
-        problem.add_bias_prior(state, narrow)
-        problem.hold_frames(state, narrow)
-        piece.side[:, :, :B] = narrow.side[:, :, :B]
-        piece.calib[:B, :B] = narrow.calib[:B, :B]
-        if narrow.features is not None:
-            piece = replace(piece, features=narrow.features.widened(int(starts[-1])))
+        piece = problem.piece_with_columns(state, first, last, sum(counts), at)
         for kind, n, column in zip(kinds, counts, starts[:-1].tolist(), strict=True):
             for key, cluster in kind.items():
                 factor: Any = problem.factors[key]  # it has `accumulate_clusters`

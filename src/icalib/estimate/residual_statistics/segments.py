@@ -113,23 +113,14 @@ class Segments:
 
         Gradients of eliminated points of the scene are zero, because each point is optimal for the current state.
         """
-        problem, state, B = self.problem, self.state, self.problem.layout.size
 
         def piece_between(first: int, last: int) -> Piece:
-            piece = Piece.zeros(first, last, B + len(gradients))
-            narrow = problem.attach(problem.narrow(piece, B))
-            problem.add_measurements(state, narrow, scratch)
-            problem.add_bias_prior(state, narrow)
-            problem.hold_frames(state, narrow)
-            piece.side[:, :, :B] = narrow.side[:, :, :B]
-            piece.calib[:B, :B] = narrow.calib[:B, :B]
-            for column, gradient in enumerate(gradients, B):
+            piece = self.problem.piece_with_columns(self.state, first, last, len(gradients), scratch)
+            for column, gradient in enumerate(gradients, self.problem.layout.size):
                 gradient.add(piece, column)
-            if narrow.features is None:
-                return piece
-            return replace(piece, features=narrow.features.widened(B + len(gradients)))
+            return piece
 
-        return problem.marginal(piece_between)
+        return self.problem.marginal(piece_between)
 
     def cost(self, g: int, state: State, out: Residuals) -> float:
         """Half the robust chi^2 of segment `g` at `state`; fills `out` with its residuals."""
