@@ -39,12 +39,13 @@ def _near_origin(rig: Rig, measurements: Measurements) -> Measurements:
     owner = {name: sensor.shared_frame or name for name, sensor in rig.sensors.items()}
     far = ((s.name, s.better_origin()) for s in measurements.streams.values())
     origins = {name: origin for name, origin in far if origin is not None}
-    streams, notes = {}, measurements.notes
+    streams, notes = dict(measurements.streams), measurements.notes
     for key, stream in measurements.streams.items():
         origin = origins.get(owner[stream.name])
-        streams[key] = stream if origin is None else stream.relative_to(origin)
-        if streams[key] is not stream:
-            x, y, z = origins[owner[stream.name]]
-            where = f"({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away"
-            notes += (f"{stream.name}: positions are relative to {where}.",)
+        if origin is None:
+            continue
+        streams[key] = stream.relative_to(origin)
+        x, y, z = origin
+        where = f"({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away"
+        notes += (f"{stream.name}: positions are relative to {where}.",)
     return replace(measurements, streams=streams, notes=notes)
