@@ -1,4 +1,4 @@
-"""AssociatedPlanes of points with planes that several LiDARs share, repeated in each round of association and solve.
+"""Association of points with planes that several LiDARs share, repeated in each round of association and solve.
 
 Each round transforms all points to the world by the current state, finds planes there, and associates points with them.
 The tolerance allows for errors of that state. A plane keeps its name from round to round if it keeps its points.
