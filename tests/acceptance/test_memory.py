@@ -20,7 +20,7 @@ rig, measurements = pickle.load(open(sys.argv[1], "rb"))
 assert calibrate_measurements(rig, measurements).converged
 print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
 """
-SHORT_S, LONG_S = 60.0, 240.0
+SHORT_S, LONG_S = 60.0, 360.0
 # Of a corner: where it is, its point, standard deviation, residual, weight, bloom, and whether it is kept.
 CORNER_BYTES = 16 + 8 + 8 + 8 + 4 + 8 + 1
 # Of a keyframe: two blocks of 15 x 15, 15 x 25 with the calibration, preintegration, ten readings, states and steps.

@@ -204,11 +204,14 @@ class _ImuDraws:
 def are_noise(rows: np.ndarray) -> bool:
     """Whether residuals, rows (n, m), are white and of constant variance. The fit must have taken few of their degrees
     of freedom."""
-    n, square = len(rows), float((rows**2).sum())
+    n, square = len(rows), float(np.vdot(rows, rows))  # `vdot` needs no copy of many rows
     if n < 2 * N_NOISE_SEGMENTS or square == 0.0:
         return False
-    lags = [float((rows[lag:] * rows[:-lag]).sum()) / square for lag in range(1, N_LAGS + 1)]
+    lags = [float(np.vdot(rows[lag:], rows[:-lag])) / square for lag in range(1, N_LAGS + 1)]
     white = abs(np.mean(lags)) < max(MAX_CORRELATION, CHANCE_SIGMAS / np.sqrt(N_LAGS * rows.size))
-    sizes = [float(np.mean(segment**2)) / (square / rows.size) for segment in np.array_split(rows, N_NOISE_SEGMENTS)]
+    sizes = [
+        float(np.vdot(segment, segment)) / segment.size / (square / rows.size)
+        for segment in np.array_split(rows, N_NOISE_SEGMENTS)
+    ]
     allowed = np.log(MAX_VARIATION) + CHANCE_SIGMAS * np.sqrt(2.0 * N_NOISE_SEGMENTS / rows.size)
     return bool(white and max(abs(np.log(max(s, 1e-12))) for s in sizes) < allowed)

@@ -57,7 +57,7 @@ class ResidualRows:
     @property
     def weighted(self) -> np.ndarray:
         """(n, m) whitened residuals times the square roots of their robust weights."""
-        return np.where(self.root > 0.0, self.whitened * self.root, 0.0)
+        return np.multiply(self.whitened, self.root, out=np.zeros_like(self.whitened), where=self.root > 0.0)
 
 
 class StateDifference(NamedTuple):

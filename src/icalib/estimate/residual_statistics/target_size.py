@@ -41,7 +41,7 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
     if not sees_target or not problem.framed or not isinstance(problem.chain, ImuFactor):
         return None
     ratio = std = 1.0
-    workspace = problem.pieces(), problem.residuals()
+    workspace = problem.pieces(), {key: f.discarded_output() for key, f in problem.factors.items()}
     for _ in range(MAX_SIZE_ROUNDS):
         sizes = (ratio - SIZE_STEP, ratio, ratio + SIZE_STEP)
         costs = [_least_cost(*_grown(problem, state, ratio, size), *workspace) for size in sizes]
