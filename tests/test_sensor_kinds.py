@@ -15,7 +15,7 @@ from icalib.sensors import SENSOR_KINDS
 
 SOURCE = Path(icalib.__file__).parent
 KINDS = SENSOR_KINDS
-SHORT = {"cameras", "lidars", "wheels"}  # shorthand of rigs, measurements, results and scenarios for all sensors of a kind
+SHORT = {"cameras", "lidars", "wheels"}  # shorthand of rigs, measurements, results for all sensors of a kind
 POSES = {"rig", "measurements", "m", "scenario", "asked"}  # what is called so and has `poses`, too
 FREE = ("sensors/", "export/")  # exporters write the files of programs for certain sensors
 # Modules that still name one; the list only shrinks.
@@ -38,12 +38,9 @@ NAMING = {
     "detection/tracking/stereo.py",
     "detection/tracking/streams.py",
     "estimate/noise_size.py",
-    "estimate/problem/assembly.py",
     "estimate/problem/guess_priors.py",
     "estimate/problem/inputs.py",
-    "estimate/residual_statistics/jacobian_noise.py",
     "estimate/residual_statistics/parameter_changes.py",
-    "estimate/residual_statistics/target_size.py",
     "initialize/assumed_motion.py",
     "initialize/cameras_on_odometry.py",
     "initialize/rig_guess.py",

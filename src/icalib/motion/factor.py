@@ -116,8 +116,9 @@ class Factor(Protocol):
         mean is the number of degrees of freedom that the fit takes from these residuals."""
         ...
 
-    def with_imu(self, imu: ImuData) -> Self:
-        """The same measurements, with other IMU readings for the motion between keyframes."""
+    def with_imu(self, imu: ImuData, state: State) -> Self:
+        """The same measurements, with other IMU readings for the motion between keyframes. state: at whose biases
+        readings are preintegrated."""
         ...
 
     def discarded_output(self) -> Any:
@@ -148,8 +149,9 @@ class FactorDefaults:
     is_sparse: ClassVar[bool] = False
     ties_distant_keyframes: ClassVar[bool] = False
 
-    def with_imu(self, imu: ImuData) -> Self:
-        """See `Factor`."""
+    def with_imu(self, imu: ImuData, state: State) -> Self:
+        """See `Factor`; nothing is preintegrated."""
+        del state
         factor: Any = self
         return replace(factor, imu=imu)
 

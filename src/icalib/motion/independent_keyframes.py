@@ -37,9 +37,14 @@ class IndependentKeyframes(RowFactor):
         """(0,): one chain for all recordings, because no term links neighbours."""
         return (0,)
 
-    def with_imu(self, imu: ImuData) -> IndependentKeyframes:
+    @property
+    def imu(self) -> None:
+        """None: no readings link keyframes."""
+        return None
+
+    def with_imu(self, imu: ImuData, state: State) -> IndependentKeyframes:
         """The same factor, as there is no IMU."""
-        del imu
+        del imu, state
         return self
 
     def output(self) -> Whitened:

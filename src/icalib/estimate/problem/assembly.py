@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, origin_difference
-from icalib.estimate.problem.problem import ChainFactor, Problem
+from icalib.estimate.problem.problem import Problem
 from icalib.model.bodies import SHAPE_SIGMA_M, SIZE
 from icalib.model.sensor_model import Pass, SensorModel, by_kind, model_of
 from icalib.motion.factor import Factor, keyed
@@ -24,7 +24,6 @@ from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Block, Key, State
 from icalib.rig import Parameter, Rig, Sensor
 from icalib.rig.scene import SHAPE_LABELS
-from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.sensor import TIME_OFFSET
 
 
@@ -155,10 +154,10 @@ def assemble(
     noise: by sensor, of the noise class of its kind. fixed_directions (B, m): directions of the calibration parameters
     that are fixed, see `Problem`. coarse: an early pass, see `Pass`.
     """
-    rig = inputs.rig
-    factors = _measured(inputs, noise, pass_at(inputs, state, coarse))
+    rig, at = inputs.rig, pass_at(inputs, state, coarse)
+    factors = (*_between_keyframes(inputs, at), *_measured(inputs, noise, at))
     return Problem(
-        inputs.layout, keyed((_chain(inputs, state), *factors)), _priors(inputs), inputs.tolerance, fixed_directions,
+        inputs.layout, keyed(factors), _priors(inputs), inputs.tolerance, fixed_directions,
         # framed: whether the world frame is defined; levelled: whether gravity is known to point down in it
         rig.has_target or rig.imu is None or (rig.assumes_motion and rig.moves_by_poses), not rig.assumes_motion,
     )  # fmt: skip
@@ -199,11 +198,12 @@ def pass_at(inputs: Inputs, state: State, coarse: bool = False) -> Pass:
     )  # fmt: skip
 
 
-def _chain(inputs: Inputs, state: State) -> ChainFactor:
+def _between_keyframes(inputs: Inputs, at: Pass) -> Iterable[Factor]:
+    """The `ChainFactor`, which is that of the IMU if there is one."""
     if inputs.imu is None:
-        return IndependentKeyframes(inputs.rig.reference, len(state.seconds))
-    columns = inputs.layout.columns(inputs.imu.name, "intrinsics")
-    return ImuFactor.build(inputs.imu, state, inputs.rig.gravity, columns[columns >= 0])
+        return (IndependentKeyframes(inputs.rig.reference, len(at.state.seconds)),)
+    sensor = inputs.sensor(inputs.imu.name)
+    return model_of(sensor).factors(sensor, inputs.stream(sensor.name), sensor.noise, at)
 
 
 def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:

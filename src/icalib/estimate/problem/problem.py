@@ -12,6 +12,7 @@ import numpy as np
 
 from icalib.estimate.problem.gauge import hold_frame
 from icalib.motion.factor import Factor, FactorKey, Residuals, Whitened, keyed
+from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces, marginalise, marginalise_in_segments
 from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior
@@ -20,8 +21,12 @@ from icalib.optim.state import Layout, State
 
 @runtime_checkable
 class ChainFactor(Factor, Protocol):
-    """Factor between successive keyframes: `ImuFactor`, or `IndependentKeyframes`, which links none. kinds: columns of
-    its residuals by kind. starts: first keyframe of each recording, not linked to the keyframe before it."""
+    """Factor between successive keyframes: that of the IMU, or `IndependentKeyframes`, which links none. imu: readings
+    that link keyframes, or None. kinds: columns of its residuals by kind. starts: first keyframe of each recording, not
+    linked to the keyframe before it."""
+
+    @property
+    def imu(self) -> ImuData | None: ...
 
     @property
     def n_keyframes(self) -> int: ...

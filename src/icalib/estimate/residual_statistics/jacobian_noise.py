@@ -28,7 +28,6 @@ from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, solve
 from icalib.optim.calib_block import DETERMINED_ABOVE, UNOBSERVABLE_BELOW, least_information
 from icalib.optim.state import State
-from icalib.sensors.imu.residual import ImuFactor
 
 # information in tolerance units: if all is known to a third of a tolerance, one pair of draws is enough
 CLEARLY_DETERMINED = 10.0
@@ -73,7 +72,8 @@ def spurious_information(
     """
     columns = np.arange(problem.layout.size) if columns is None else columns
     among = np.ix_(columns, columns)
-    if not isinstance(problem.chain, ImuFactor):
+    imu = problem.chain.imu
+    if imu is None:
         return Spurious(np.zeros((1, len(columns), len(columns))))
     rng = np.random.default_rng(0)
     t, information = problem.tolerance[columns], outcome.information[among]
@@ -81,7 +81,7 @@ def spurious_information(
     essential = np.isin(columns, problem.layout.essential)
     least = least_information(information[np.ix_(essential, essential)], t[essential])
     samples = (outcome.draws or posterior(problem, outcome.state)).still
-    noise, first = _Noise(problem, outcome, among), _reading_noise(problem.chain.imu, rng)
+    noise, first = _Noise(problem, outcome, among), _reading_noise(imu, rng)
     one_side = noise.information_change(1.0, samples[0].chain, first)
     if least > DETERMINED_ABOVE and _largest_share(t[:, None] * one_side * t, scaled) < NEGLIGIBLE_SHARE:
         return Spurious(one_side[None])
@@ -90,7 +90,7 @@ def spurious_information(
         return Spurious(both_sides[None])
     each: list[np.ndarray] = []
     for batch in (samples[1 : 1 + N_FIRST_DRAWS], samples[1 + N_FIRST_DRAWS :]):
-        each += [noise.change_with_response(d.chain, _reading_noise(problem.chain.imu, rng)) for d in batch]
+        each += [noise.change_with_response(d.chain, _reading_noise(imu, rng)) for d in batch]
         if enough(Spurious(np.array(each))):
             break
     return Spurious(np.array(each))
@@ -163,9 +163,7 @@ def _reading_noise(imu: ImuData, rng: np.random.Generator) -> np.ndarray:
 def _with_noise(problem: Problem, state: State, readings: np.ndarray) -> Problem:
     """The problem with `readings` (N, 6) added to the IMU readings of all factors, which are preintegrated at the
     biases of `state`."""
-    assert isinstance(problem.chain, ImuFactor)
     old = problem.chain.imu
+    assert old is not None
     imu = replace(old, gyro=old.gyro + readings[:, :3], accel=old.accel + readings[:, 3:])
-    factor = ImuFactor.build(imu, state, problem.chain.gravity, problem.chain.columns)
-    others = [f.with_imu(imu) for f in problem.factors.values() if f is not problem.chain]
-    return problem.replacing([factor, *others])
+    return problem.replacing([f.with_imu(imu, state) for f in problem.factors.values()])

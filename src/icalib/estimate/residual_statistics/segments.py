@@ -14,7 +14,6 @@ from icalib.estimate.problem.gauge import FRAME_INFORMATION, IN_THE_WORLD, hold_
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
-from icalib.motion.independent_keyframes import IndependentKeyframes
 from icalib.optim.arrowhead import Piece, in_parallel, marginalise
 from icalib.optim.state import State
 
@@ -135,7 +134,7 @@ def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
 
     Images that no factor links are independent: if there are few, each but the last is a segment.
     """
-    if not isinstance(problem.chain, IndependentKeyframes):
+    if problem.chain.imu is not None:
         return min(count, (problem.n_keyframes - 1) // MIN_SEGMENT_KEYFRAMES), MIN_SEGMENT_KEYFRAMES
     others = [f for f in problem.factors.values() if f is not problem.chain]
     if any(f.is_sparse for f in others):  # poses at rest, of which there may be few

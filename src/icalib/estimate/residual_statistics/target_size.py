@@ -17,7 +17,6 @@ from icalib.model.target_factor import TargetFactor
 from icalib.motion.factor import Residuals, of_type
 from icalib.optim.arrowhead import Piece, solve
 from icalib.optim.state import State
-from icalib.sensors.imu.residual import ImuFactor
 
 SIZE_STEP = 1e-3  # relative step of difference quotients: small enough for p to be quadratic, large against rounding
 MAX_SIZE_SIGMA = 0.05  # relative: with a larger standard deviation the size is unobservable
@@ -38,7 +37,7 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
     """True over stated size of the target by the accelerometer, with its standard deviation. None without a target or
     an IMU, or if the size is unobservable. state: the solution with the stated size."""
     sees_target = any(f.sees_target for f in of_type(problem.factors, TargetFactor))
-    if not sees_target or not problem.framed or not isinstance(problem.chain, ImuFactor):
+    if not sees_target or not problem.framed or problem.chain.imu is None:
         return None
     ratio = std = 1.0
     workspace = problem.pieces(), {key: f.discarded_output() for key, f in problem.factors.items()}

@@ -1,9 +1,13 @@
-"""The sensor model of an IMU, whose only parameters are its intrinsics. Its factor is in `residual`."""
+"""The sensor model of an IMU, whose only parameters are its intrinsics."""
 
 from __future__ import annotations
 
-from icalib.model.sensor_model import SensorModel
+from collections.abc import Iterator
+
+from icalib.data.measurements import ImuStream
+from icalib.model.sensor_model import Pass, SensorModel
 from icalib.rig import ImuNoise, ImuSensor, Settings
+from icalib.sensors.imu.residual import ImuFactor
 
 
 class ImuModel(SensorModel[ImuSensor, ImuNoise]):
@@ -13,6 +17,13 @@ class ImuModel(SensorModel[ImuSensor, ImuNoise]):
         """See `SensorModel`; the noise in the rig file."""
         del settings
         return sensor.noise
+
+    def factors(self, sensor: ImuSensor, stream: ImuStream, noise: ImuNoise, at: Pass) -> Iterator[ImuFactor]:
+        """Yields the factor of all intervals between keyframes. The readings of `at` already contain the noise."""
+        del stream, noise
+        assert at.imu is not None
+        columns = at.layout.columns(sensor.name, "intrinsics")
+        yield ImuFactor.build(at.imu, at.state, at.rig.gravity, columns[columns >= 0])
 
 
 MODEL = ImuModel()

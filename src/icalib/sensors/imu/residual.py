@@ -251,6 +251,10 @@ class ImuFactor(RowFactor):
         dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
         return cls(imu, gravity, columns, Increments(*arrays, bias0), intrinsics, state.starts)
 
+    def with_imu(self, imu: ImuData, state: State) -> ImuFactor:
+        """See `Factor`."""
+        return ImuFactor.build(imu, state, self.gravity, self.columns)
+
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`; `curved` has no effect, as there is no robust loss."""
         del curved

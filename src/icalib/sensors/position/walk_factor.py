@@ -165,9 +165,9 @@ class OffsetWalkFactor(RowFactor):
         """See `Factor`."""
         return {SLOW_OFFSET: slice(0, 3)}
 
-    def with_imu(self, imu: ImuData) -> OffsetWalkFactor:
+    def with_imu(self, imu: ImuData, state: State) -> OffsetWalkFactor:
         """This factor unchanged: it does not depend on the motion."""
-        del imu
+        del imu, state
         return self
 
     def output(self) -> Whitened:

@@ -110,9 +110,9 @@ class GroundFactor(RowFactor):
         once = np.inf if height is None else height * np.sqrt(len(self.keyframes))
         return np.array([*[np.inf if tilt is None else tilt] * 2, bump, once])
 
-    def with_imu(self, imu: ImuData) -> GroundFactor:
+    def with_imu(self, imu: ImuData, state: State) -> GroundFactor:
         """See `Factor`; rows at keyframes do not depend on IMU readings."""
-        del imu
+        del imu, state
         return self
 
     def output(self) -> Whitened:

@@ -179,9 +179,9 @@ class FeatureFactor(FactorDefaults):
             PlaneDistances.zeros(points),
         )  # fmt: skip
 
-    def with_imu(self, imu: ImuData) -> FeatureFactor:
+    def with_imu(self, imu: ImuData, state: State) -> FeatureFactor:
         """See `Factor`."""
-        return replace(self, cameras=tuple(c.with_imu(imu) for c in self.cameras))
+        return replace(self, cameras=tuple(c.with_imu(imu, state) for c in self.cameras))
 
     def reusable_output(self, out: FeatureOutput) -> FeatureOutput:
         """See `Factor`: new arrays, because a cut changes the tracks."""
