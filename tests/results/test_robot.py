@@ -84,6 +84,11 @@ def test_which_poses_are_relative(robot: Calibration, without_cameras: Calibrati
     assert [r.name for r in relative_poses(without_cameras)] == ["T_lidar0_wheel0"]
 
 
+def test_which_sensors_have_a_lens(robot: Calibration, without_cameras: Calibration):
+    assert robot.lenses == dict.fromkeys(("cam0", "cam1"), ("intrinsics", "distortion"))
+    assert without_cameras.lenses == {}
+
+
 def moved(c: Calibration, sensor: str, step: np.ndarray) -> np.ndarray:
     """T_imu_sensor moved by (rotation on the right, translation)."""
     T = c.T_imu_sensor(sensor).copy()

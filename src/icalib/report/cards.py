@@ -12,7 +12,6 @@ from icalib.result.body_frame import in_body_frame
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.quantities import Row, chi2_words, format_number, nontrivial_groups, rms_words, rows
 from icalib.result.verdict import AUXILIARY, by_size, lens_projection_px, lens_verdict, tolerance, worst
-from icalib.rig import LENS
 
 
 def sensor_cards(c: Calibration) -> Html:
@@ -25,7 +24,7 @@ def sensor_cards(c: Calibration) -> Html:
 def camera_pairs(c: Calibration) -> Html:
     """Table of camera pairs: baseline, and standard deviation of the relative rotation. Empty for fewer than two
     cameras."""
-    pairs = [r for r in relative_poses(c) if {r.frame, r.sensor} <= set(c.cameras)]
+    pairs = [r for r in relative_poses(c) if {r.frame, r.sensor} <= c.lenses.keys()]
     if not pairs:
         return Html("")
     body = [
@@ -50,10 +49,10 @@ def _card(c: Calibration, sensor: str) -> Html:
     """Card of one sensor. Red: a component is undetermined, residuals are at least `FAR_BEYOND` times the stated noise,
     or an error in the rig file or recording names the sensor. Amber: a component is weak, or residuals exceed the
     stated noise."""
-    is_camera, fits = sensor in c.cameras, [f for f in c.fits if f.sensor == sensor]
+    lens, fits = c.lenses.get(sensor, ()), [f for f in c.fits if f.sensor == sensor]
     groups = [g for g in nontrivial_groups(in_body_frame(c)) if g.sensor == sensor and g.name not in AUXILIARY]
-    verdicts: list[Verdict] = [v for g in groups if not (is_camera and g.name in LENS) for v in g.verdict]
-    verdict = worst((*verdicts, *((lens_verdict(c, sensor),) if is_camera else ())))
+    verdicts: list[Verdict] = [v for g in groups if g.name not in lens for v in g.verdict]
+    verdict = worst((*verdicts, *((lens_verdict(c, sensor),) if lens else ())))
     fit = max((excess(f) for f in fits), default=1.0)
     named = any(re.search(rf"(?<!\w){re.escape(sensor)}(?!\w)", sentence) for sentence in c.wrong)
     css = verdict
@@ -67,26 +66,21 @@ def _card(c: Calibration, sensor: str) -> Html:
     head = element("h3", [html(sensor), element("small", f" {kind} "), badge(verdict), *badges])
     lines = [element("li", _fit_words(f), "poor" if excess(f) > 1.0 else "") for f in fits]
     fit_lists = [element("ul", lines)] if lines else []
-    table = [_components(c, sensor, is_camera)] if groups else []
+    table = [_components(c, sensor, lens)] if groups else []
     return element("article", [head, *table, *fit_lists], f"card {css}")
 
 
-def _components(c: Calibration, sensor: str, is_camera: bool) -> Html:
+def _components(c: Calibration, sensor: str, lens: tuple[str, ...]) -> Html:
     """Table with one row for each component. The coefficients of a lens share one row, which shows its projection
     uncertainty."""
-    hidden = {"fx", "fy", "cx", "cy", *_lens_labels(c, sensor)} if is_camera else set()
-    hidden |= set(AUXILIARY)
+    hidden = {*AUXILIARY, *(n for g in c.groups if g.sensor == sensor and g.name in lens for n in g.labels)}
     components = [r for r in rows(c) if r.sensor == sensor and r.name not in hidden]
     body = [(r.name, r.value, _std(r), badge(r.verdict)) for r in components]
-    if is_camera:
+    if lens:
         sigma, verdict = lens_projection_px(c, sensor), lens_verdict(c, sensor)
         size = "" if sigma is None else f"± {format_number(sigma)} px"
         body.append(("lens, projection" if size else "lens", "", size, badge(verdict)))
     return table(("", "value", "std", ""), body, ("value", "std"))
-
-
-def _lens_labels(c: Calibration, camera: str) -> tuple[str, ...]:
-    return tuple(n for g in c.groups if g.sensor == camera and g.name in LENS for n in g.labels)
 
 
 def _std(row: Row) -> str:

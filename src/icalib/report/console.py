@@ -60,7 +60,7 @@ def relative_words(calibration: Calibration) -> list[str]:
         x, y, z = (f"{v:.1f} +- {format_number(s)}" for v, s in zip(1e3 * r.T[:3, 3], move, strict=True))
         a, b, c = (f"{v:.3f} +- {format_number(s)}" for v, s in zip(rpy_deg(r.T[:3, :3]), turn, strict=True))
         baseline = ""
-        if {r.frame, r.sensor} <= set(calibration.cameras):
+        if {r.frame, r.sensor} <= calibration.lenses.keys():
             baseline = f"baseline {1e3 * r.distance:.2f} +- {format_number(1e3 * r.distance_std)} mm; "
         lines.append(f"{r.name}: {baseline}x, y, z {x}, {y}, {z} mm; roll, pitch, yaw {a}, {b}, {c} deg")
     return lines

@@ -14,6 +14,7 @@ import numpy as np
 from icalib.result.cross_validation import CrossValidation
 from icalib.result.planes import Plane
 from icalib.result.verdict import Usability, lens_projections_px, reasons, usability
+from icalib.rig.kinds import SENSOR_TYPES
 from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.camera.record import CornerResiduals, ImageResiduals, TrackResiduals
 from icalib.sensors.imu.record import ImuResiduals
@@ -290,6 +291,13 @@ class Calibration:
     def pose_sensors(self) -> tuple[str, ...]:
         """Names of the pose sensors, in the order of the rig."""
         return self.of_type("pose")
+
+    @property
+    def lenses(self) -> dict[str, tuple[str, ...]]:
+        """Names of the parameter groups of each lens, by sensor, in the order of the rig; without sensors that have
+        none."""
+        sensors = self.rig["sensors"].items()
+        return {name: lens for name, sensor in sensors if (lens := SENSOR_TYPES[sensor["type"]].lens)}
 
     @property
     def mounted(self) -> tuple[str, ...]:

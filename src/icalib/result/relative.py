@@ -54,9 +54,9 @@ class RelativePose:
 
 
 def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
-    """Relative poses of all pairs of cameras, and of all pairs of mounted sensors of different types."""
+    """Relative poses of all pairs of sensors with a lens, and of all pairs of mounted sensors of different types."""
     kinds = {name: sensor["type"] for name, sensor in c.rig["sensors"].items()}
-    pairs = list(combinations(c.cameras, 2))
+    pairs = list(combinations(c.lenses, 2))
     pairs += [(a, b) for a, b in combinations(c.mounted, 2) if kinds[a] != kinds[b]]
     return tuple(relative_pose(c, frame, sensor) for frame, sensor in pairs)
 

@@ -51,7 +51,7 @@ def calibration_yaml(calibration: Calibration) -> str:
         "notes": list(c.notes),
         "fits": [_fit(f) for f in c.fits],
     }
-    kalibr = KALIBR if c.cameras else ""
+    kalibr = KALIBR if c.lenses else ""
     version = c.versions.get("icalib", "of unknown version")
     header = HEADER.format(
         version=version, key=pose_key(c), body=body_name(c), reference=reference_name(c), kalibr=kalibr

@@ -22,7 +22,7 @@ import numpy as np
 
 from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
-from icalib.rig import LENS, Settings
+from icalib.rig import Settings
 from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
 from icalib.sensors.parameter_spec import display_unit
 
@@ -91,7 +91,7 @@ def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
 
 def lens_projections_px(c: Calibration) -> dict[str, float | None]:
     """`lens_projection_px` of every camera. `Calibration` caches it, as one camera takes about 20 ms."""
-    return {camera: _lens_projection_px(c, camera) for camera in c.cameras}
+    return {camera: _lens_projection_px(c, camera) for camera in c.lenses}
 
 
 def lens_projection_px(c: Calibration, camera: str) -> float | None:
@@ -101,8 +101,8 @@ def lens_projection_px(c: Calibration, camera: str) -> float | None:
 
 
 def _lens_projection_px(c: Calibration, camera: str) -> float | None:
-    groups = [g for g in c.groups if g.sensor == camera and g.name in LENS]
-    if len(groups) < len(LENS) or all(g.columns is None for g in groups):
+    groups = [g for g in c.groups if g.sensor == camera and g.name in c.lenses[camera]]
+    if len(groups) < len(c.lenses[camera]) or all(g.columns is None for g in groups):
         return None
     projection = projection_uncertainty(c, camera)
     return None if projection is None else projection.median_seen
@@ -125,7 +125,7 @@ def _counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
     parameters."""
     if g.name in AUXILIARY:
         return ()
-    if g.name in LENS and g.sensor in c.cameras:
+    if g.name in c.lenses.get(g.sensor, ()):
         return (lens_verdict(c, g.sensor),) if {"weak", "undetermined"} & set(g.verdict) else ()
     return () if g.mode == "prior" else g.verdict
 
@@ -153,7 +153,7 @@ def _more(c: Calibration) -> str:
     """Advice for this rig: what to record so that standard deviations become smaller."""
     if any(SENSOR_TYPES[s["type"]].drives for s in c.rig["sensors"].values()):
         return "drive longer, with turns both ways, and brake and speed up"
-    if c.imu is None and c.cameras:
+    if c.imu is None and c.lenses:
         images = sum(len(r.seconds) for r in c.image_residuals)
         return f"the result rests on {images} images: take more, near and far, tilted, and in every part of the image"
     axes = hardly_turned(c.trajectory.seconds, c.trajectory.rotation, c.reference)
@@ -166,8 +166,8 @@ def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:
     """Name with standard deviation, and verdict, of every component that contributes to the verdict on the result."""
     for g in c.groups:
         verdicts = _counted(c, g)
-        if g.name in LENS and g.sensor in c.cameras:
-            if verdicts and g.name == LENS[0]:
+        if g.name in (lens := c.lenses.get(g.sensor, ())):
+            if verdicts and g.name == lens[0]:
                 yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0]
             continue
         unit, scale = display_unit(g.unit)

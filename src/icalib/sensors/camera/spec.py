@@ -74,6 +74,7 @@ class Camera(MountedSensor):
     noun: ClassVar[str] = "camera"
     gives_motion: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, INTRINSICS, DISTORTION, BLOOM)
+    lens: ClassVar[tuple[str, ...]] = LENS
 
     path: str
     model: str

@@ -24,7 +24,7 @@ from icalib.pipeline import Progress, calibrate_measurements, measure
 from icalib.result import Calibration, ParameterGroup, SensorFit, joint_covariance
 from icalib.result.as_rig import rig_of_result
 from icalib.result.verdict import AUXILIARY, lens_verdict
-from icalib.rig import LENS, Rig
+from icalib.rig import Rig
 from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.tools.comparison.compare import Comparison, Difference, compare_sides
 from icalib.tools.comparison.results import side_of_result
@@ -159,7 +159,7 @@ def _undetermined(c: Calibration) -> list[str]:
     for g in c.groups:
         if g.columns is None or g.name in AUXILIARY or g.sensor not in c.rig["sensors"] or g.mode == "prior":
             continue
-        lens = g.name in LENS and g.sensor in c.cameras
+        lens = g.name in c.lenses.get(g.sensor, ())
         if (lens_verdict(c, g.sensor) == "undetermined") if lens else ("undetermined" in g.verdict):
             names.append(_block(c, g))
     return list(dict.fromkeys(names))
@@ -175,7 +175,7 @@ def _fixed(c: Calibration) -> list[str]:
 
 
 def _block(c: Calibration, g: ParameterGroup) -> str:
-    lens = g.name in LENS and g.sensor in c.cameras
+    lens = g.name in c.lenses.get(g.sensor, ())
     return f"{g.sensor} {'lens' if lens else g.name.replace('_', ' ')}"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from icalib.result import Calibration, joint_covariance, relative_pose
-from icalib.rig import LENS, Camera, Parameter, ParameterSpec, Sensor
+from icalib.rig import Parameter, ParameterSpec, Sensor
 from icalib.rig.file import load_rig
 from icalib.rig.kinds import SENSOR_TYPES
 from icalib.sensors.sensor import ROTATION, TIME_OFFSET, TRANSLATION
@@ -63,7 +63,7 @@ def side_of_result(c: Calibration, path: str) -> Side:
         covariance=lambda frame, sensor: relative_pose(c, frame, sensor).covariance,
         open=frozenset((g.sensor, g.name) for g in bad),
         quantities=quantities,
-        lenses={name: _lens_of_result(c, name) for name in c.cameras},
+        lenses={name: _lens_of_result(c, name) for name in c.lenses},
     )
 
 
@@ -76,15 +76,15 @@ def _pose_of_result(c: Calibration, sensor: str) -> np.ndarray:
 
 
 def _lens_of_result(c: Calibration, name: str) -> LensSide:
-    sensor, groups = c.rig["sensors"][name], [c.group(name, key) for key in LENS]
-    width, height = sensor["resolution"]
-    return LensSide(
-        model=sensor["model"],
-        resolution=(int(width), int(height)),
-        params=np.concatenate([g.value for g in groups]),
-        covariance=joint_covariance(c, groups),
-        open=any("undetermined" in g.verdict for g in groups),
-    )
+    groups = [c.group(name, key) for key in c.lenses[name]]
+    is_open = any("undetermined" in g.verdict for g in groups)
+    return _lens(c.rig["sensors"][name], [g.value for g in groups], joint_covariance(c, groups), is_open)
+
+
+def _lens(fields: dict[str, Any], values: list[np.ndarray], covariance: np.ndarray, is_open: bool = False) -> LensSide:
+    """A lens. fields: those of its sensor in the rig file; values: those of its parameter groups."""
+    width, height = fields["resolution"]
+    return LensSide(fields["model"], (int(width), int(height)), np.concatenate(values), covariance, is_open)
 
 
 def side_of_rig(path: Path) -> Side:
@@ -118,7 +118,7 @@ def side_of_rig(path: Path) -> Side:
         poses=poses,
         covariance=covariance,
         quantities=quantities,
-        lenses={c.name: lens for c in rig.cameras if (lens := _lens_of_rig(c)) is not None},
+        lenses={s.name: lens for s in rig.mounted if s.lens and (lens := _lens_of_rig(s)) is not None},
     )
 
 
@@ -146,9 +146,9 @@ def _covariance(p: Parameter, size: int) -> np.ndarray:
     return unknown(size) if p.sigma is None else np.diag(np.broadcast_to(p.sigma, size) ** 2)
 
 
-def _lens_of_rig(camera: Camera) -> LensSide | None:
-    values = [p.value for p in (camera.intrinsics, camera.distortion)]
-    if values[0] is None or values[1] is None:
+def _lens_of_rig(sensor: Sensor) -> LensSide | None:
+    """The lens of a sensor; None if the rig file does not give all its values."""
+    values = [getattr(sensor, name).value for name in sensor.lens]
+    if any(value is None for value in values):
         return None
-    params = np.concatenate([values[0], values[1]])
-    return LensSide(camera.model, camera.resolution, params, unknown(len(params)))
+    return _lens(sensor.plain(), values, unknown(sum(map(len, values))))

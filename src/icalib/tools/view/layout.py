@@ -12,7 +12,7 @@ from icalib.tools.view.stream import TIMELINE
 def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
     """Rerun's blueprint of the windows. rr: the rerun package; readings: whether IMU readings are shown."""
     b = rr.blueprint
-    images = [b.Spatial2DView(origin=f"{place(c, name)}/image", name=name) for name in c.cameras]
+    images = [b.Spatial2DView(origin=f"{place(c, name)}/image", name=name) for name in c.lenses]
     rig = b.Spatial3DView(origin=f"world/{c.reference}", name="rig")
     plots = [b.TimeSeriesView(origin=f"residuals/{name}", name=f"residuals of {name}") for name in _measured(c)]
     if c.imu is not None:

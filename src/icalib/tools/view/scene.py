@@ -38,9 +38,9 @@ def log_rig(s: RerunStream, c: Calibration) -> None:
         s.still(place(c, name), s.rr.TransformAxes3D(0.25 * spread))
         if name != c.reference:
             s.still(place(c, name), s.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-    for name in c.cameras:
+    for name in c.lenses:
         s.still(f"{place(c, name)}/image", _pinhole(s, c, name, 0.45 * spread))
-    others = [name for name in c.mounted if name not in c.cameras]
+    others = [name for name in c.mounted if name not in c.lenses]
     shapes = [(name, pen) for name in others if (pen := rig_shapes.shape(c, name)) is not None]
     for i, (name, pen) in enumerate(shapes):
         strips = s.rr.LineStrips3D(_strips(pen), colors=rgb(COLORS[i % len(COLORS)]))
