@@ -20,7 +20,6 @@ POSES = {"rig", "measurements", "m", "scenario", "asked"}  # what is called so a
 FREE = ("sensors/", "export/")  # exporters write the files of programs for certain sensors
 # Modules that still name one; the list only shrinks.
 NAMING = {
-    "cli/console.py",
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
     "data/recordings/base.py",

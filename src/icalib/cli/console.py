@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
-from icalib.export.kalibr import camchain_name
+from icalib.export.kalibr import kalibr_texts
 from icalib.report.console import bodies_words, relative_words, table
 from icalib.result import Calibration
 from icalib.result.quantities import chi2_words, dof_words, rms_words
@@ -91,8 +91,7 @@ def print_result(calibration: Calibration, folder: Path) -> None:
     for sentence in calibration.notes:
         console.print(f"Note: {sentence}", markup=False)
     console.print(f"Solver: {calibration.status}", markup=False)
-    chain = [camchain_name(calibration)] if calibration.cameras else []
-    written = [*chain, *(["imu.yaml"] if calibration.imu else []), "report.html"]
+    written = [*kalibr_texts(calibration), "report.html"]
     unfit = ", with the verdict that it is not usable" if calibration.verdict == "not usable" else ""
     console.print(f"Wrote {folder / 'calibration.yaml'}{unfit}, {', '.join(written)}.", markup=False)
     print_verdict(calibration, console)

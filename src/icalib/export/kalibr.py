@@ -5,6 +5,7 @@ Formats: `camchain-imucam.yaml` and `imu.yaml` as kalibr_calibrate_imu_camera wr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,13 @@ SAME_INSTANT_S = 0.025  # images of two cameras at most this far apart count as 
 def camchain_name(calibration: Calibration) -> str:
     """Kalibr's name of the file that `camchain` returns."""
     return "camchain.yaml" if calibration.imu is None else "camchain-imucam.yaml"
+
+
+def kalibr_texts(c: Calibration) -> dict[str, Callable[[Calibration], str]]:
+    """What writes the text of each of Kalibr's files, by name. There is no camchain without a camera, and no imu.yaml
+    without an IMU."""
+    chain = {camchain_name(c): camchain} if c.cameras else {}
+    return chain | ({} if c.imu is None else {"imu.yaml": imu_yaml})
 
 
 def camchain(calibration: Calibration) -> str:

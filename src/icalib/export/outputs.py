@@ -8,7 +8,7 @@ from pathlib import Path
 from icalib.base.own_files import sealed
 from icalib.base.result_files import check_writable, refuse_foreign_set, write_files
 from icalib.base.text_files import printable
-from icalib.export.kalibr import camchain, camchain_name, imu_yaml
+from icalib.export.kalibr import kalibr_texts
 from icalib.report import report_html
 from icalib.result import Calibration, calibration_files
 
@@ -24,13 +24,9 @@ def write_outputs(calibration: Calibration, folder: str | Path) -> None:
 
 
 def output_files(calibration: Calibration) -> dict[str, bytes]:
-    """Contents of the result files, Kalibr's two files and the report, by name. There is no camchain without a camera,
-    and no imu.yaml without an IMU."""
+    """Contents of the result files, Kalibr's files (`kalibr_texts`) and the report, by name."""
     texts = {"report.html": report_html(calibration)}
-    if calibration.cameras:
-        texts[camchain_name(calibration)] = camchain(calibration)
-    if calibration.imu is not None:
-        texts["imu.yaml"] = imu_yaml(calibration)
+    texts |= {name: text(calibration) for name, text in kalibr_texts(calibration).items()}
     return calibration_files(calibration) | {name: sealed(printable(text).encode()) for name, text in texts.items()}
 
 
