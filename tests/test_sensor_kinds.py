@@ -54,7 +54,6 @@ NAMING = {
     "pipeline.py",
     "result/__init__.py",
     "result/calibration.py",
-    "result/timeline.py",
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
     "tools/allan/analysis.py",

@@ -26,7 +26,7 @@ def inputs():
 def test_every_image_has_a_keyframe_of_its_own(inputs, offset):
     values = {(c.name, "time_offset"): np.zeros(1) for c in inputs.rig.cameras}
     values |= {("wheel0", "time_offset"): np.array([offset])}
-    images = np.concatenate(image_times(inputs.measurements, values))
+    images = np.concatenate(list(image_times(inputs.measurements, values).values()))
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     recorded = images[(images >= keyframes[0]) & (images <= keyframes[-1])]
     assert len(recorded) > 100

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +23,9 @@ class Timeline:
     shift: np.ndarray
 
     @classmethod
-    def of(cls, parts: tuple[Part, ...], image_times: list[np.ndarray], body: str) -> Timeline:
-        """Timeline of recordings `parts`. image_times: times of each camera's images on the joined clock [s]. body:
-        name of the sensor that defines the joined clock."""
+    def of(cls, parts: tuple[Part, ...], image_times: Mapping[str, np.ndarray], body: str) -> Timeline:
+        """Timeline of recordings `parts`. image_times: times of images on the joined clock [s], by the key of their
+        stream. body: name of the sensor that defines the joined clock."""
         spans, shift = [], np.zeros(len(parts))
         for k, part in enumerate(parts):
             first, last = _extent(part, image_times, body)
@@ -55,10 +56,9 @@ class Timeline:
         return text if len(self.parts) == 1 else f"{text} of {self.parts[k].name}"
 
 
-def _extent(part: Part, image_times: list[np.ndarray], body: str) -> tuple[float, float]:
+def _extent(part: Part, image_times: Mapping[str, np.ndarray], body: str) -> tuple[float, float]:
     """Times of the first and the last measurement of a recording, on the joined clock [s]."""
-    image_rows = [part.rows[c.key] for c in part.measurements.cameras]
-    images = [t[rows] for t, rows in zip(image_times, image_rows, strict=True)]
+    images = [times[part.rows[key]] for key, times in image_times.items()]
     if not images or part.measurements.imu is not None:  # else the clock is that of a camera
         images.append(part.begin + part.measurements.streams[body].seconds)
     times = np.concatenate(images)

@@ -264,8 +264,9 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
         return state.recording
     if not inputs.rig.cameras:
         return timeline.recording_of(state.seconds)
-    times = np.concatenate(image_times(inputs.measurements, state.values))
-    recording = np.concatenate([timeline.recordings_of(c.key) for c in inputs.measurements.cameras])
+    by_stream = image_times(inputs.measurements, state.values)
+    times = np.concatenate(list(by_stream.values()))
+    recording = np.concatenate([timeline.recordings_of(key) for key in by_stream])
     order = np.argsort(times, kind="stable")
     return recording[order][np.searchsorted(times[order], state.seconds)]
 

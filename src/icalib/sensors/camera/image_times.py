@@ -61,9 +61,10 @@ def _start(stamps: np.ndarray, stream: CornerStream | TrackStream) -> np.ndarray
     return np.concatenate([[0], np.cumsum(count)])
 
 
-def image_times(measurements: Measurements, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
-    """For each camera (M,) instants of its images, s on the body's clock since its first stamp."""
-    return [instants(c, values) for c in measurements.cameras]
+def image_times(measurements: Measurements, values: dict[Key, np.ndarray]) -> dict[str, np.ndarray]:
+    """(M,) instants of the images of each camera, s on the body's clock since its first stamp, by the key of its
+    corner stream."""
+    return {c.key: instants(c, values) for c in measurements.cameras}
 
 
 def keyframes_of(
