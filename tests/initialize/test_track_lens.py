@@ -12,11 +12,15 @@ from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import NoTarget
-from icalib.initialize.steps.epipolar_rotation import direction_for_rotation, rotation_information, track_rates
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Parameter
+from icalib.sensors.camera.initialize.tracks.epipolar_rotation import (
+    direction_for_rotation,
+    rotation_information,
+)
 from icalib.sensors.camera.initialize.tracks.track_intrinsics import find_intrinsics
+from icalib.sensors.camera.initialize.tracks.track_rates import track_rates
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Drive, Simulation, load_scenario, rig_for, simulate
 

@@ -19,7 +19,6 @@ from icalib.errors import EstimationError
 from icalib.geometry.integrals import once_integrated, twice_integrated
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.rate_correlation import MAX_USUAL_STEPS
-from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.motion.imu_data import ImuData, clear_of
 
 TRIPLE_STEP_S = 0.12  # s between images of a triple: long against pose noise, short against the loss of the target
@@ -89,18 +88,18 @@ class LeverArm:
 def solve_camera_lever_arm(
     imu: ImuData,
     times: np.ndarray,
-    poses: TargetPoses,
-    R_imu_cam: np.ndarray,
+    R_board_imu: np.ndarray,
+    p_board_cam: np.ndarray,
     gyro: GyroRotation,
     known: np.ndarray | None,
 ) -> LeverArm:
-    """Solves for one camera. times (M,): of its images on the IMU's clock [s]; known: p_imu_cam (3,) m if it is known.
-    Raises EstimationError if too few images can be used."""
-    ok = poses.ok & (times >= imu.seconds[1]) & (times <= imu.seconds[-2])
-    t, p = times[ok], poses.position[ok]
+    """Solves for one camera, from rotations R_board_imu (M, 3, 3) and positions p_board_cam (M, 3) m at `times` (M,) s
+    on the IMU's clock. known: p_imu_cam (3,) m if it is known. Raises EstimationError if too few images can be used."""
+    used = (times >= imu.seconds[1]) & (times <= imu.seconds[-2])
+    t, p = times[used], p_board_cam[used]
     # Errors of rotation and position of one image are correlated. Without smoothing, these errors bias the lever arm
     # towards the target.
-    R_bi = gyro.smoothed(t, poses.rotation[ok] @ R_imu_cam.T)
+    R_bi = gyro.smoothed(t, R_board_imu[used])
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
     triples = _image_triples(t, imu.gaps)
     n, second = len(triples.i), triples.second

@@ -1,22 +1,19 @@
-"""Time offset between a camera with feature tracks and the IMU, by regression of the gyroscope on the camera's rates.
+"""Time offset between a sensor and the IMU, by regression of the gyroscope on the sensor's angular rates.
 
-    w_imu = M w_cam + b
+    w_imu = M w_sensor + b
 
-M (3, 3) is free, so neither the rotation between both sensors nor the focal length must be known; b absorbs the
+M (3, 3) is free, so neither the rotation between both sensors nor the scale of the rates must be known; b absorbs the
 gyroscope's bias. The offset is the shift with the largest logarithm of the likelihood ratio, -n/2 log(1 - R^2).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
-from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.vectors import MEDIAN_NORM
-from icalib.initialize.steps.epipolar_rotation import TRACK_RATE_STEP_S, track_rates
 from icalib.initialize.steps.gyro_rates import MeanRates
 from icalib.initialize.steps.rate_correlation import (
     MAX_OFFSET_PEAKS,
@@ -26,13 +23,9 @@ from icalib.initialize.steps.rate_correlation import (
 )
 from icalib.motion.imu_data import ImuData, clear_of
 
-RATE_STEPS_S = (TRACK_RATE_STEP_S, 0.2, 0.1, 0.05)  # s between the two images of a rate
-MIN_STEP_PERIODS = 0.75  # shortest step, in periods of the images
 # Logarithm of the likelihood ratio above which a match is significant. Without a match, twice the score is chi^2 with
 # nine degrees of freedom, for 3 x 3 coefficients; it exceeds 30 at a given shift with a probability of 4e-4.
 MIN_REGRESSION_SCORE = 15.0
-# Ratio of scores above which rates from the second choice of starts replace those from the first
-MIN_SCORE_RATIO = 1.3
 MIN_RATE_TO_NOISE = 3.0  # variation of rates over their noise: below, a match may not be significant
 GRID_POINTS_PER_INTERVAL = 10  # offsets are found to a twentieth of an interval
 # Share of the mean square rate that is added about each axis: without it, rotation about one axis is singular
@@ -41,7 +34,7 @@ REGULARISING_SPREAD = 1e-3
 
 @dataclass(frozen=True)
 class Regression:
-    """offset: t_imu - t_camera [s], both since their clocks' first stamps; score: logarithm of the likelihood ratio,
+    """offset: t_imu - t_sensor [s], both since their clocks' first stamps; score: logarithm of the likelihood ratio,
     where the number of samples is that of non-overlapping intervals."""
 
     offset: float
@@ -54,13 +47,13 @@ def best_regressions(imu: ImuData, rates: SensorRates) -> list[Regression]:
     length = float(np.median(rates.end - rates.start))
     step = length / GRID_POINTS_PER_INTERVAL
     middle = 0.5 * (rates.start + rates.end)
-    camera, camera_mask = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
+    sensor, sensor_mask = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
     start = np.arange(0.0, imu.seconds[-1] - length, step)
     gyro, gyro_mask = MeanRates.of(imu).over(start, start + length), clear_of(imu.gaps, start, start + length)
-    if not gyro_mask.any() or not camera_mask.any():
+    if not gyro_mask.any() or not sensor_mask.any():
         return []
-    explained, count = _explained_share(gyro, gyro_mask, camera, camera_mask)
-    enough = count > min(MIN_RATE_OVERLAP_S / step, 0.5 * min(gyro_mask.sum(), camera_mask.sum()))
+    explained, count = _explained_share(gyro, gyro_mask, sensor, sensor_mask)
+    enough = count > min(MIN_RATE_OVERLAP_S / step, 0.5 * min(gyro_mask.sum(), sensor_mask.sum()))
     score = np.where(
         enough, -0.5 * count / GRID_POINTS_PER_INTERVAL * np.log(1.0 - np.minimum(explained, 1.0 - 1e-9)), -np.inf
     )
@@ -68,59 +61,14 @@ def best_regressions(imu: ImuData, rates: SensorRates) -> list[Regression]:
     apart = round(MIN_PEAK_DISTANCE_S / step)
     while len(peaks) < MAX_OFFSET_PEAKS and np.isfinite(score).any():
         k = int(np.argmax(score))
-        peaks.append(Regression((k - (len(camera) - 1)) * step + 0.5 * length - float(middle[0]), float(score[k])))
+        peaks.append(Regression((k - (len(sensor) - 1)) * step + 0.5 * length - float(middle[0]), float(score[k])))
         score[max(k - apart, 0) : k + apart + 1] = -np.inf
     return peaks
 
 
-def matching_track_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray) -> SensorRates:
-    """Rates over the longest of RATE_STEPS_S whose match with the gyroscope is significant, with the matching offsets.
-    Over short steps rotation and translation look alike; over long steps vibration averages out. If none is
-    significant, the best rates, without offsets.
-
-    Raises EstimationError as `track_rates` does for the first step.
-    """
-    period = float(np.median(np.diff(stream.seconds)))
-    steps = [s for s in RATE_STEPS_S if s > MIN_STEP_PERIODS * period] or [period]
-    failed: EstimationError | None = None
-    candidates: list[tuple[float, SensorRates]] = []
-    for step in steps:
-        try:
-            candidates += _rates_and_score(imu, stream, model, lens, step)
-        except EstimationError as error:
-            failed = failed or error
-            continue
-        if candidates[-1][1].offsets:
-            break
-    if not candidates:
-        assert failed is not None
-        raise failed
-    return max(candidates, key=lambda x: x[0])[1]
-
-
-def _rates_and_score(
-    imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray, step: float
-) -> list[tuple[float, SensorRates]]:
-    """Tries two choices of starts for each relative pose: no translation, or this and the pose of the previous
-    interval. Returns score and rates of the second choice if these match the gyroscope clearly better, else of the
-    first.
-
-    If a camera moves far to the side, a start without translation often ends in a local minimum, unlike the previous
-    pose. With a guessed lens, the previous pose may be the worse start.
-    """
-    candidates = []
-    for chained in (False, True):
-        rates = track_rates(stream, model, lens, step, chained=chained)
-        shifts = best_regressions(imu, rates)
-        likely = tuple(s.offset for s in shifts if s.score > MIN_REGRESSION_SCORE)
-        candidates.append((max((s.score for s in shifts), default=-np.inf), replace(rates, offsets=likely)))
-    (plain, _), (score, _) = candidates
-    return candidates[1:] if score > MIN_SCORE_RATIO * plain else candidates[:1]
-
-
 def rate_difference_noise(imu: ImuData, rates: SensorRates, averaged: float = 0.0) -> float:
-    """Standard deviation [rad/s] of the difference between camera and gyroscope rates about each axis, for means over
-    `averaged` s if that is longer than an interval. Zero if the noise of the camera's rates is unknown."""
+    """Standard deviation [rad/s] of the difference between sensor and gyroscope rates about each axis, for means over
+    `averaged` s if that is longer than an interval. Zero if the noise of the sensor's rates is unknown."""
     if not rates.noise:
         return 0.0
     length = float(np.median(rates.end - rates.start))

@@ -8,8 +8,8 @@ import numpy as np
 
 from icalib.data.measurements import CornerStream, Measurements, TrackStream
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.optim.state import Key
+from icalib.sensors.camera.initialize.boards.target_poses import TargetPoses
 
 # s; images closer in time count as simultaneous. Clocks synchronised by hardware agree to microseconds, and no camera
 # takes images at 10 kHz.

@@ -11,12 +11,12 @@ from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.rate_alignment import OneAxisError, contradicting_offset
-from icalib.initialize.steps.target_poses import camera_rates
 from icalib.model.bodies import Bodies
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.initialize.boards.moved_bodies import check_bodies_still
 from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene
+from icalib.sensors.camera.initialize.boards.target_poses import camera_rates
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, scene_poses
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess

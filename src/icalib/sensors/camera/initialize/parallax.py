@@ -9,9 +9,13 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.epipolar_rotation import refine_relative_pose, rotation_error, rotation_without_translation
 from icalib.motion.imu_data import imu_data
 from icalib.rig import Rig
+from icalib.sensors.camera.initialize.tracks.epipolar_rotation import (
+    refine_relative_pose,
+    rotation_error,
+    rotation_without_translation,
+)
 from icalib.sensors.camera.initialize.tracks.from_tracks import start_intrinsics
 from icalib.sensors.camera.initialize.tracks.joint_alignment import SharedRays, shared_rays
 

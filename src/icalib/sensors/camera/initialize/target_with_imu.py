@@ -17,16 +17,16 @@ from icalib.initialize.steps.contradicted_guesses import merged_translation, mer
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.lever_arm import LeverArm, check_gravity, check_target_size, solve_camera_lever_arm
 from icalib.initialize.steps.rate_alignment import RateAlignment
-from icalib.initialize.steps.target_poses import TargetPoses, camera_rates
-from icalib.initialize.trajectories.imu_axes import refuse_other_axes
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, known_value
 from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene, intrinsics_of
+from icalib.sensors.camera.initialize.boards.target_poses import TargetPoses, camera_rates
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, scene_poses
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
+from icalib.sensors.camera.initialize.imu_axes import refuse_other_axes
 from icalib.sensors.camera.initialize.target_without_imu import guess_without_imu, trajectory_without_imu
 from icalib.sensors.sensor import ROTATION
 
@@ -131,8 +131,10 @@ class _TargetViews:
 
     def _arm(self, imu: ImuData, k: int, aligned: RateAlignment, gyro: GyroRotation) -> LeverArm:
         """Lever arm, gravity and accelerometer bias from the poses of camera `k`."""
-        t, known = self.measurements.cameras[k].seconds + aligned.offset, known_value(self.rig.cameras[k].translation)
-        return solve_camera_lever_arm(imu, t, self.poses[k], aligned.rotation, gyro, known)
+        poses, known = self.poses[k], known_value(self.rig.cameras[k].translation)
+        t = self.measurements.cameras[k].seconds[poses.ok] + aligned.offset
+        R_board_imu = poses.rotation[poses.ok] @ aligned.rotation.T
+        return solve_camera_lever_arm(imu, t, R_board_imu, poses.position[poses.ok], gyro, known)
 
     def _check_gravity(self, imu: ImuData, arm: LeverArm, aligned: RateAlignment) -> None:
         """Raises EstimationError if the length of gravity in `arm` is implausible."""

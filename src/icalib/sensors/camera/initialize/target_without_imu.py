@@ -7,10 +7,10 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.optim.state import Key
 from icalib.rig import Rig
 from icalib.sensors.camera.connected_bodies import taken_at_once
+from icalib.sensors.camera.initialize.boards.target_poses import TargetPoses
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 
 # Largest number of image pairs, spread over the recording, that determine the relative pose of two cameras. The cost

@@ -19,7 +19,6 @@ from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.hand_eye import MAX_UNEXPLAINED_MOTION, PosePairs, hand_eye, unexplained_motion
-from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.model.bodies import Bodies
 from icalib.motion.pose_rows import Extrinsics, Frame
 from icalib.optim.state import Key
@@ -32,6 +31,7 @@ from icalib.sensors.camera.connected_bodies import (
     tied_by_images,
 )
 from icalib.sensors.camera.initialize.boards.incremental_scene import UnconnectedBodiesError, place_bodies
+from icalib.sensors.camera.initialize.boards.target_poses import TargetPoses
 from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, scene_poses
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.steps.target_poses import MAX_POSE_RMS_PX, TargetPoses
 from icalib.model.bodies import Bodies
 from icalib.optim.state import Key
 from icalib.sensors.camera.corner_factor import Views
@@ -29,6 +28,7 @@ from icalib.sensors.camera.initialize.boards.bundle_adjustment import (
 )
 from icalib.sensors.camera.initialize.boards.intrinsics import STRONGEST_PARAMS
 from icalib.sensors.camera.initialize.boards.scene_views import informative_images, scene_views
+from icalib.sensors.camera.initialize.boards.target_poses import MAX_POSE_RMS_PX, TargetPoses
 from icalib.sensors.camera.initialize.boards.target_scene import (
     NO_POSE_RMS_PX,
     TargetScene,

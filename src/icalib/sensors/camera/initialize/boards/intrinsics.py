@@ -18,10 +18,10 @@ from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
 from icalib.geometry.targets import Target
-from icalib.initialize.steps.target_poses import MIN_POSE_CORNERS, FlatPoints, target_poses, usable_rays
 from icalib.rig import Camera
 from icalib.sensors.camera.corner_factor import Views
 from icalib.sensors.camera.initialize.boards.single_body_adjustment import adjust_intrinsics, has_good_pose
+from icalib.sensors.camera.initialize.boards.target_poses import MIN_POSE_CORNERS, FlatPoints, target_poses, usable_rays
 
 # Numbers of images, spread over the recording: to compare start values, to adjust all parameters, and to compare the
 # results. The last is largest, because results may differ by far less than the noise of a corner.

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from icalib.data.measurements import CornerStream
-from icalib.initialize.steps.target_poses import MAX_POSE_CORNERS
 from icalib.model.bodies import Bodies
 from icalib.sensors.camera.corner_factor import Views
 from icalib.sensors.camera.initialize.boards.bundle_adjustment import SceneViews
+from icalib.sensors.camera.initialize.boards.target_poses import MAX_POSE_CORNERS
 
 MAX_SCENE_IMAGES = 60  # of a camera, spread over the recording; the cost of bundle adjustment grows with the number
 IMAGES_PER_PAIR = 4  # images of each pair of bodies in the spanning tree, so that one bad image does not separate them

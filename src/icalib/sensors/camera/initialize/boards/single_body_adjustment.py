@@ -14,7 +14,7 @@ from icalib.data.measurements import CornerStream
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.vectors import cross
-from icalib.initialize.steps.target_poses import FlatPoints, TargetPoses, target_poses
+from icalib.sensors.camera.initialize.boards.target_poses import FlatPoints, TargetPoses, target_poses
 
 MAX_INTRINSICS_STEPS = 25  # of Levenberg-Marquardt; a good start needs about five
 INTRINSICS_HUBER_PX = 1.5  # px; a few times the noise of detected corners

@@ -13,7 +13,10 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.data.measurements import CornerStream
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.steps.target_poses import (
+from icalib.model.bodies import Bodies
+from icalib.optim.state import Key
+from icalib.sensors.camera.corner_factor import Views
+from icalib.sensors.camera.initialize.boards.target_poses import (
     MAX_POSE_CORNERS,
     MAX_POSE_RMS_PX,
     MIN_POSE_CORNERS,
@@ -28,9 +31,6 @@ from icalib.initialize.steps.target_poses import (
     target_poses,
     usable_rays,
 )
-from icalib.model.bodies import Bodies
-from icalib.optim.state import Key
-from icalib.sensors.camera.corner_factor import Views
 
 POSES_PER_VIEW = 2  # two-fold ambiguity of a flat body: depths relative to its centre may be mirrored
 NO_POSE_RMS_PX = 1e9  # px, error that marks an image without a pose

@@ -20,10 +20,10 @@ from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.steps.epipolar_rotation import pairs_with_shared_points
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.poses import Poses
 from icalib.motion.sweep import EstimatedMotion
+from icalib.sensors.camera.initialize.tracks.epipolar_rotation import pairs_with_shared_points
 
 PAIR_STEPS_S = (0.5, 1.0)  # s between the images of a pair; over shorter times the motion is small against ray errors
 MAX_EPIPOLAR_PAIRS = 300  # pairs of images for each of `PAIR_STEPS_S`

@@ -15,15 +15,15 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.contradicted_guesses import merged_value
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.rate_alignment import RateAlignment
-from icalib.initialize.steps.rate_regression import matching_track_rates
-from icalib.initialize.steps.target_poses import TargetPoses
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.initialize.align_camera import align_camera, chosen_offset, known_value
+from icalib.sensors.camera.initialize.boards.target_poses import TargetPoses
 from icalib.sensors.camera.initialize.guess import CameraGuess, Guess, relative_offset
 from icalib.sensors.camera.initialize.tracks.joint_alignment import align_jointly, shared_rays
 from icalib.sensors.camera.initialize.tracks.linear_motion import Rays, WindowMotion, solve_linear_motion
 from icalib.sensors.camera.initialize.tracks.track_intrinsics import find_intrinsics
+from icalib.sensors.camera.initialize.tracks.track_rates import matching_track_rates
 from icalib.sensors.sensor import ROTATION
 
 MAX_IMAGE_STEP_S = 0.15  # s between the images that the linear problem uses; others add little information

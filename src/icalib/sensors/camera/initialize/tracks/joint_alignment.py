@@ -23,10 +23,13 @@ import numpy as np
 from icalib.data.measurements import TrackStream
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.steps.epipolar_rotation import pairs_with_shared_points, rotation_information_of_pairs
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.rate_alignment import MIN_SECOND_AXIS_RATIO, RateAlignment, only_axis
 from icalib.optim.calib_block import complement
+from icalib.sensors.camera.initialize.tracks.epipolar_rotation import (
+    pairs_with_shared_points,
+    rotation_information_of_pairs,
+)
 
 ALIGNMENT_STEPS_S = (0.5, 1.0)  # s between two images; over shorter times rotations are small against ray errors
 MAX_ALIGNMENT_PAIRS = 400  # image pairs for each camera and step; more change the result by less than its noise

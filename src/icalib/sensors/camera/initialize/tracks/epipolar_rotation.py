@@ -12,22 +12,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
-from icalib.initialize.steps.rate_correlation import SensorRates
 from icalib.sensors.camera.stream import TrackStream, shared_rows
 
 MIN_SHARED_POINTS = 12  # points that two images share: a relative pose has five unknowns, the rest gives redundancy
-MIN_TRACK_RATES = 20  # rates: fewer do not show a time offset
 SAMPLED_PAIRS = 30  # pairs of images that show how long tracks are
-MIN_TRACK_RATE_CORRELATION = 0.5  # with the IMU's rates; smaller than for poses, as rates from tracks are noisy
 EPIPOLAR_ITERATIONS = 10  # of rotation and direction, from a start without translation
 DIRECTION_ITERATIONS = 4  # of the direction alone, at a fixed rotation
-TRACK_RATE_STEP_S = 0.4  # s between two images: over less, rotation and lateral translation look alike
-THINNED_STEP_SHARE = 0.3  # start of the next interval, as a share of `step`: those between add little information
-NOISE_EVERY = 5  # the noise of every fifth rate is computed
 EPIPOLAR_DAMPING = 1e-9  # of the mean diagonal: without translation the direction is unobservable
 
 
@@ -207,56 +199,6 @@ def rotation_without_translation(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarr
     U, _, Vt = np.linalg.svd(h.T @ f)
     R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     return np.ascontiguousarray(R), direction_for_rotation(f, h, R)
-
-
-def track_rates(
-    stream: TrackStream,
-    model: CameraModel,
-    params: np.ndarray,
-    step: float = TRACK_RATE_STEP_S,
-    thinned: bool = False,
-    chained: bool = False,
-) -> SensorRates:
-    """Mean angular rates between each image and the one about `step` s later, with their noise by the epipolar errors.
-
-    thinned: skips images whose intervals overlap much. chained: also starts from the relative pose of the previous
-    interval. Raises EstimationError if fewer than MIN_TRACK_RATES pairs share enough points.
-    """
-    rays, valid = model.unproject(params, stream.uv)
-    t, rows, noise, previous = stream.seconds, [], [], None
-    every = max(1, int(THINNED_STEP_SHARE * step / float(np.median(np.diff(t))))) if thinned else 1
-    for i, j in image_pairs(stream, step)[::every]:
-        p, q = shared_points(stream, valid, i, j)
-        if len(p) < MIN_SHARED_POINTS:
-            continue
-        f, h = rays[p], rays[q]
-        cost, R, direction = _best_relative_pose(f, h, previous)
-        if np.isfinite(cost):
-            previous = (R, direction) if chained else None
-            rows.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
-            if len(rows) % NOISE_EVERY == 0:
-                noise.append(rotation_error(f, h, R, direction)[0] / (t[j] - t[i]))
-    if len(rows) < MIN_TRACK_RATES:
-        raise EstimationError(
-            f"{stream.name}: only {len(rows)} pairs of images {step:.2g} s apart share {MIN_SHARED_POINTS} "
-            "tracked points or more; record for longer, or with longer feature tracks."
-        )
-    columns = np.array(rows)
-    start, end, rate = columns[:, 0].copy(), columns[:, 1].copy(), columns[:, 2:].copy()
-    return SensorRates(start, end, rate, MIN_TRACK_RATE_CORRELATION, noise=float(np.median(noise)))
-
-
-def _best_relative_pose(
-    f: np.ndarray, h: np.ndarray, previous: tuple[np.ndarray, np.ndarray] | None
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Cost, rotation and direction of the better of two refinements: from a pure rotation, and from the relative pose
-    `previous` if there is one."""
-    refined = []
-    for start in (rotation_without_translation(f, h), previous):
-        if start is not None:
-            R, t = start[0].copy(), start[1].copy()
-            refined.append((refine_relative_pose(f, h, R, t), R, t))
-    return min(refined, key=lambda x: x[0])
 
 
 def rotation_error(f: np.ndarray, h: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[float, float]:
