@@ -42,8 +42,6 @@ NAMING = {
     "estimate/residual_statistics/parameter_changes.py",
     "initialize/assumed_motion.py",
     "initialize/cameras_on_odometry.py",
-    "initialize/rig_guess.py",
-    "initialize/steps/initializer.py",
     "motion/imu_data.py",
     "motion/poses.py",
     "observability/fixed_lens.py",

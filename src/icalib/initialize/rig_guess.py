@@ -15,6 +15,7 @@ from icalib.initialize.recording_times import naming_recording_times
 from icalib.initialize.steps.initializer import (
     InitialGuess,
     Initializer,
+    UnusableMeasurementsError,
     Values,
     initializer_of,
     inputs_of_sensors,
@@ -24,9 +25,6 @@ from icalib.initialize.steps.initializer import (
 )
 from icalib.optim.state import State
 from icalib.rig import Rig
-from icalib.sensors.camera.connected_bodies import without_bodies
-from icalib.sensors.camera.initialize.boards.incremental_scene import UnconnectedBodiesError
-from icalib.sensors.camera.initialize.boards.symmetry import resolve_symmetry
 
 
 def guess_of_rig(
@@ -35,20 +33,22 @@ def guess_of_rig(
     """Inputs of the estimate, its start state, and the guess to which unobservable parameters are reset.
 
     The trajectory comes from the first kind in `motion_kinds` that shows it. All other sensors are aligned to it.
-    Bodies of the target that no image connects to the others are left out. lap: called at the end of each stage with
-    its name. Raises EstimationError if the recordings do not determine a guess.
+    Measurements that cannot be used are left out, such as those of bodies that no image connects to the rest of the
+    target. lap: called at the end of each stage with its name. Raises EstimationError if the recordings do not
+    determine a guess.
     """
-    recordings = resolve_symmetry(rig, recordings)
+    for kind in kinds_of(rig):
+        recordings = kind.unambiguous(rig, recordings)
     with naming_recording_times(recordings):
         while True:
             try:
                 return _guess(rig, recordings, lap)
-            except UnconnectedBodiesError as untied:
-                recordings = [without_bodies(rig.target, untied.names, m) for m in recordings]
+            except UnusableMeasurementsError as error:
+                recordings = [error.usable(rig, m) for m in recordings]
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None]) -> InitialGuess:
-    """As `guess_of_rig`, for recordings whose target bodies are all connected."""
+    """As `guess_of_rig`. Raises UnusableMeasurementsError if measurements must be left out."""
     if rig.imu is None and not rig.cameras_alone:
         guess = guess_with_assumed_motion(rig, recordings)
         lap("first guess")

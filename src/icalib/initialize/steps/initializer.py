@@ -36,6 +36,14 @@ class OtherMotionError(EstimationError):
     """Measurements of a sensor do not follow the motion that other sensors show, or do not overlap with it in time."""
 
 
+class UnusableMeasurementsError(EstimationError):
+    """Some measurements cannot be used. The guess may succeed without them."""
+
+    def usable(self, rig: Rig, recording: Measurements) -> Measurements:
+        """The recording without these measurements."""
+        raise NotImplementedError
+
+
 class Initializer(Generic[S]):
     """The interface of one kind of sensor to the initial guess. `sensors` are those of this kind, in the order of the
     rig file."""
@@ -84,6 +92,11 @@ class Initializer(Generic[S]):
         """Associates measurements that need the extrinsics of all sensors. `state` has the trajectory and a guess of
         all sensors. Returns inputs, state, and the changed values of the guess."""
         return inputs, state, {}
+
+    def unambiguous(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
+        """The recordings with measurements of this kind that had several interpretations resolved to one."""
+        del rig
+        return recordings
 
     def cleaned(self, recording: Measurements) -> Measurements:
         """The recording without measurements that must not be used."""
@@ -188,6 +201,6 @@ def inputs_of_sensors(inputs: Inputs, recordings: Sequence[Measurements], names:
         return inputs
     imus = [] if rig.imu is None else [rig.imu.name]
     chosen = rig.only(*imus, *names)
-    if not chosen.cameras:
+    if not any(s.sees_target for s in chosen.mounted):
         chosen = chosen.only(*chosen.sensors, target=NoTarget())
     return inputs_for(chosen, [m.only(*chosen.sensors) for m in recordings], inputs)

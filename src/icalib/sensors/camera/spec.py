@@ -73,6 +73,7 @@ class Camera(MountedSensor):
     sensor_type: ClassVar[str] = "camera"
     noun: ClassVar[str] = "camera"
     gives_motion: ClassVar[bool] = True
+    sees_target: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, INTRINSICS, DISTORTION, BLOOM)
     lens: ClassVar[tuple[str, ...]] = LENS
 

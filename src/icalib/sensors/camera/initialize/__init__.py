@@ -19,6 +19,7 @@ from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.initialize.boards.hand_eye_guess import with_hand_eye_guess
+from icalib.sensors.camera.initialize.boards.symmetry import resolve_symmetry
 from icalib.sensors.camera.initialize.guess import Guess
 from icalib.sensors.camera.initialize.initial_state import initial_state
 from icalib.sensors.camera.initialize.multi_recording import initial_guesses
@@ -43,6 +44,10 @@ class CameraInitializer(Initializer[Camera]):
         if rig.has_target:
             return BY_TARGET
         return None if rig.imu is None else BY_TRACKS
+
+    def unambiguous(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
+        """See `Initializer`: the points of symmetric targets are numbered consistently."""
+        return resolve_symmetry(rig, recordings)
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         """See `Initializer`: the trajectory interpolated between camera poses, and the guess of all cameras."""

@@ -12,11 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.data.measurements import CornerStream
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras.base import CameraModel
+from icalib.initialize.steps.initializer import UnusableMeasurementsError
 from icalib.model.bodies import Bodies
 from icalib.optim.state import Key
+from icalib.rig import Rig
+from icalib.sensors.camera.connected_bodies import without_bodies
 from icalib.sensors.camera.corner_factor import Views
 from icalib.sensors.camera.initialize.boards.bundle_adjustment import (
     INVISIBLE_ERROR_PX,
@@ -74,7 +77,7 @@ class ReconstructedScene:
         return values
 
 
-class UnconnectedBodiesError(EstimationError):
+class UnconnectedBodiesError(UnusableMeasurementsError):
     """The poses of the bodies `names` relative to the rest of the target are unobservable: no image connects them."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
@@ -83,6 +86,10 @@ class UnconnectedBodiesError(EstimationError):
             f"no image shows {', '.join(names)} well enough to determine its pose relative to the rest of the "
             "target; show both closer, in the same image, or remove it from the target."
         )
+
+    def usable(self, rig: Rig, recording: Measurements) -> Measurements:
+        """The recording without corners of these bodies."""
+        return without_bodies(rig.target, self.names, recording)
 
 
 def place_bodies(
