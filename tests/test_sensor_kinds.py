@@ -76,7 +76,6 @@ NAMING = {
     "tools/simulation/sensors/tracks.py",
     "tools/simulation/tables.py",
     "tools/simulation/writing.py",
-    "tools/view/recorded.py",
     "validation/all_causes.py",
     "validation/assess.py",
     "validation/cameras.py",

@@ -11,13 +11,10 @@ from typing import Protocol
 import numpy as np
 
 from icalib.data.recordings import DamagedImageError, Recording, decode
-from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import CalibrationError, RecordingError
 from icalib.result import Calibration, RecordingSpan
-from icalib.rig import Camera, ImuSensor, Rig
-from icalib.sensors import call_kind
-from icalib.sensors.camera.read import has_corners, image_topics, sees
-from icalib.sensors.imu.read import read_imu
+from icalib.rig import Rig
+from icalib.sensors import call_all_kinds, call_kind
 from icalib.sensors.sensor import Sensor
 from icalib.tools.view.colors import by_value
 from icalib.tools.view.path import CubicPath
@@ -100,33 +97,22 @@ class Recorded:
     def check(self) -> None:
         """Raises RecordingError if a sensor of the result is not in the recording."""
         for sensor in self.rig.sensors.values():
-            if not (isinstance(sensor, Camera) and sensor.tracks is not None) or sees(self.recording, sensor):
+            if not sensor.tracks_points or call_kind(sensor.sensor_type, "read", "sees", self.recording, sensor):
                 self.recording.where(sensor)
 
     def log(self, s: RerunStream, progress: Progress) -> list[str]:
         """Sends all data to Rerun, and returns sentences on data that were left out."""
-        topics = image_topics(self.recording, [c for c in self.rig.cameras if self._pictured(c)])
-        imus = () if self.rig.imu is None else (self.rig.imu,)
-        work = [(sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in imus]
-        work += [
-            (sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in self.rig.mounted if sensor.shows_planes
-        ]
+        sensors = self.rig.sensors.values()
+        topics: dict[str, str] = dict(call_all_kinds("read", "image_sources", self.recording, self.rig))
+        work = [(sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in sensors if sensor.is_inertial]
+        work += [(sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in sensors if sensor.shows_planes]
         work += [(name, lambda n=name, t=topic: self._images(s, n, t)) for name, topic in topics.items()]
-        notes = [f"{c.name}: the recording holds no images of it." for c in self.rig.cameras if c.name not in topics]
+        without_images = [x.name for x in sensors if x.lens and x.name not in topics]
+        notes = [f"{name}: the recording holds no images of it." for name in without_images]
         for k, (name, do) in enumerate(work):
             progress(f"showing {name}", k / len(work))
             notes += do()
         return notes
-
-    def _pictured(self, camera: Camera) -> bool:
-        """Whether the recording has images of the camera. If its corners are in a table, the only image topic may be
-        another camera's, so that its name must match."""
-        try:
-            topic = self.recording.image_topic(camera)
-        except RecordingError:
-            return False
-        named = camera.topic is not None or camera.name in topic.split("/")
-        return named or not has_corners(self.recording, camera)
 
     def _clock(self, sensor: str) -> Clock:
         return Clock.of(self.calibration, self.span, sensor)
@@ -141,14 +127,14 @@ class Recorded:
             )
         return inside
 
-    def _readings(self, s: RerunStream, sensor: ImuSensor) -> list[str]:
-        imu, _ = read_imu(self.recording, sensor, ClockJumps().cut)
-        seconds = self._clock(sensor.name).seconds(imu.stamps_ns)
+    def _readings(self, s: RerunStream, sensor: Sensor) -> list[str]:
+        stamps_ns, readings = call_kind(sensor.sensor_type, "read", "time_series", self.recording, sensor)
+        seconds = self._clock(sensor.name).seconds(stamps_ns)
         inside = self._during(sensor.name, seconds)
         keep = inside[:: _stride(len(inside), MOST_READINGS)]
         keep = keep[np.argsort(seconds[keep], kind="stable")]
-        log_lines(s, f"readings/{sensor.name}/gyro", seconds[keep], np.rad2deg(imu.gyro[keep]), "xyz")
-        log_lines(s, f"readings/{sensor.name}/accel", seconds[keep], imu.accel[keep], "xyz")
+        for name, values in readings.items():
+            log_lines(s, f"readings/{sensor.name}/{name}", seconds[keep], values[keep], "xyz")
         return _thinned(sensor.name, len(inside), MOST_READINGS, "readings")
 
     def _images(self, s: RerunStream, name: str, topic: str) -> list[str]:

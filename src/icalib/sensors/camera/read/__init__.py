@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from icalib.data.tables.table import read_table
 from icalib.data.topics import MessageType, UnreadType
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
+from icalib.rig import Rig
 from icalib.sensors.camera.read.checks import checked_corners
 from icalib.sensors.camera.read.corners import CORNER_TABLE, CornerRows, group_corners
 from icalib.sensors.camera.read.tracks import read_track_stamps, read_tracks
@@ -116,6 +117,23 @@ def image_topics(recording: Recording, cameras: Sequence[Camera]) -> dict[str, s
                 )
         chosen[camera.name] = topic
     return chosen
+
+
+def image_sources(recording: Recording, rig: Rig) -> Iterable[tuple[str, str]]:
+    """Name and image topic of each camera of which the recording has images. Raises RecordingError as
+    `image_topics`."""
+    return image_topics(recording, [c for c in rig.cameras if _has_images(recording, c)]).items()
+
+
+def _has_images(recording: Recording, camera: Camera) -> bool:
+    """Whether the recording has images of the camera. If its corners are in a table, the only image topic may be
+    another camera's, so that its name must match."""
+    try:
+        topic = recording.image_topic(camera)
+    except RecordingError:
+        return False
+    named = camera.topic is not None or camera.name in topic.split("/")
+    return named or not has_corners(recording, camera)
 
 
 def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadStream]:

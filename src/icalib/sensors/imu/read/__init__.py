@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.data.recordings.base import Cut, Reading, ReadStream, Recording
+from icalib.data.stamps.jumps import ClockJumps
 from icalib.data.tables.files import TableFile
 from icalib.data.tables.table import holds, read_table
 from icalib.data.topics import MessageType
@@ -46,6 +47,13 @@ def read_imu(recording: Recording, sensor: ImuSensor, cut: Cut) -> tuple[ImuStre
     imu, joined = one_stream(readings(recording, sensor), what)
     imu, notes = checked_imu(cut(imu, what), where, sensor)
     return imu, joined + notes
+
+
+def time_series(recording: Recording, sensor: ImuSensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Stamps (N,) int64 [ns] and readings (N, 3) as they are shown: gyro [deg/s] and accel [m/s^2]. Raises
+    RecordingError as `read_imu`."""
+    imu, _ = read_imu(recording, sensor, ClockJumps().cut)
+    return imu.stamps_ns, {"gyro": np.rad2deg(imu.gyro), "accel": imu.accel}
 
 
 def readings(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
