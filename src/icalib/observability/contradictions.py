@@ -59,20 +59,21 @@ class Contradiction:
         return int(np.argmax(self.away))
 
 
-def contradictions(inputs: Inputs, stated: Relaxed | None, factor: float) -> tuple[Contradiction, ...]:
-    """Stated values that differ from the data by more than SIGMAS. `stated`: see `relaxed`; factor: multiplies the
+def contradictions(inputs: Inputs, relaxed_rig: Relaxed | None, factor: float) -> tuple[Contradiction, ...]:
+    """Stated values that differ from the data by more than SIGMAS. relaxed_rig: see `relaxed`; factor: multiplies the
     formal standard deviations."""
-    if stated is None:
+    if relaxed_rig is None:
         return ()
     one_freed = [
-        _difference(inputs, stated.state, stated.layout.block(*k), *stated.step([k]), factor) for k in stated.stated
+        _difference(inputs, relaxed_rig.state, relaxed_rig.layout.block(*k), *relaxed_rig.step([k]), factor)
+        for k in relaxed_rig.stated
     ]
     significant = _significant(one_freed)
     if not significant:
         return ()
     if any(c.in_prior_sigmas > FAR for c in significant):
-        return _significant(_estimated(inputs, stated.state, significant))
-    return _significant(_linear(inputs, stated, significant, factor))
+        return _significant(_estimated(inputs, relaxed_rig.state, significant))
+    return _significant(_linear(inputs, relaxed_rig, significant, factor))
 
 
 def _significant(differences: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
@@ -80,22 +81,25 @@ def _significant(differences: Sequence[Contradiction]) -> tuple[Contradiction, .
 
 
 def _linear(
-    inputs: Inputs, stated: Relaxed, significant: Sequence[Contradiction], factor: float
+    inputs: Inputs, relaxed_rig: Relaxed, significant: Sequence[Contradiction], factor: float
 ) -> Sequence[Contradiction]:
     """Contradictions after one Newton step in which all groups of `significant` are free, and unobservable directions
     stay fixed."""
-    keys, n = [c.key for c in significant], stated.layout.size
-    columns = np.setdiff1d(np.arange(n), stated.fixed_columns(keys))
-    outcome, gradient = stated.without(keys)
-    directions = classify_directions(stated.inputs, outcome, columns=columns)
+    keys, n = [c.key for c in significant], relaxed_rig.layout.size
+    columns = np.setdiff1d(np.arange(n), relaxed_rig.fixed_columns(keys))
+    outcome, gradient = relaxed_rig.without(keys)
+    directions = classify_directions(relaxed_rig.inputs, outcome, columns=columns)
     noise, null_space = directions.noise, directions.undetermined
-    t = stated.problem.tolerance[columns]
+    t = relaxed_rig.problem.tolerance[columns]
     information = t[:, None] * outcome.information[np.ix_(columns, columns)] * t
     root = restricted_root(information, null_space)
     step, sigma = np.zeros(n), np.zeros(n)
     step[columns] = -t * (root @ (root.T @ (t * gradient[columns])))
     sigma[columns] = t * np.sqrt(np.diag(scatter(information - noise, noise, null_space)))
-    return [_difference(inputs, stated.state, stated.layout.block(*c.key), step, sigma, factor) for c in significant]
+    return [
+        _difference(inputs, relaxed_rig.state, relaxed_rig.layout.block(*c.key), step, sigma, factor)
+        for c in significant
+    ]
 
 
 def _estimated(inputs: Inputs, state: State, significant: Sequence[Contradiction]) -> Sequence[Contradiction]:
