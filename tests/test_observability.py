@@ -62,18 +62,18 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
 
 
 @pytest.mark.parametrize(
-    ("parameter", "on_wheels", "tracking", "advice"),
+    ("parameter", "on_wheels", "has_target", "advice"),
     [
-        ("cam0.distortion.k1", False, (), "by these images; show the target in the corners of the image"),
-        ("cam0.distortion.k1", False, ("cam0",), "points of the scene pass through the corners of the image"),
-        ("cam0.translation.x", False, ("cam0",), "turn the rig briskly about every axis"),
-        ("wheel0.translation.z", True, ("cam0",), "turn, and drive over ramps"),
+        ("cam0.distortion.k1", False, True, "by these images; show the target in the corners of the image"),
+        ("cam0.distortion.k1", False, False, "points of the scene pass through the corners of the image"),
+        ("cam0.translation.x", False, False, "turn the rig briskly about every axis"),
+        ("wheel0.translation.z", True, False, "turn, and drive over ramps"),
     ],
 )
-def test_the_missing_motion_is_that_of_the_sensor(parameter, on_wheels, tracking, advice):
+def test_the_missing_motion_is_that_of_the_sensor(parameter, on_wheels, has_target, advice):
     found = shared(50.0)
     found.fixed_directions, found.spread, found.covariance = np.ones((1, 1)), np.full(1, 50.0), np.eye(1)
-    (sentence,) = observe(found, (parameter,), specs_of((parameter,)), on_wheels, tracking).undetermined
+    (sentence,) = observe(found, (parameter,), specs_of((parameter,)), on_wheels, has_target).undetermined
     assert advice in sentence
 
 

@@ -44,7 +44,6 @@ NAMING = {
     "initialize/cameras_on_odometry.py",
     "motion/imu_data.py",
     "motion/poses.py",
-    "observability/fixed_lens.py",
     "pipeline.py",
     "result/__init__.py",
     "result/calibration.py",
@@ -76,16 +75,6 @@ NAMING = {
     "tools/simulation/sensors/tracks.py",
     "tools/simulation/tables.py",
     "tools/simulation/writing.py",
-    "validation/all_causes.py",
-    "validation/assess.py",
-    "validation/cameras.py",
-    "validation/disturbance.py",
-    "validation/guesses.py",
-    "validation/lens_models.py",
-    "validation/misfit.py",
-    "validation/size.py",
-    "validation/twin_lenses.py",
-    "validation/variance_parts.py",
 }
 
 

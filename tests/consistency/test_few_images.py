@@ -10,13 +10,16 @@ import pytest
 from tests.typed import not_none
 
 from icalib.data.measurements import CornerStream, Measurements
+from icalib.geometry.targets import Checkerboard
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
+from icalib.rig import Camera, PoseSensor, Rig, by_name
 from icalib.tools.simulation import handheld, rig_for, simulate
-from icalib.validation.assess import few_parts_notes
+from icalib.validation.assess import few_segments_notes
 from icalib.validation.variance_parts import few_factor
 
 LENS = {"intrinsics": (458.7, 457.3, 367.2, 248.4), "distortion": (-0.28, 0.07, 2e-4, 2e-5)}
+CAMERA, POSE_SENSOR = Camera("cam0", "", "pinhole-radtan", (752, 480)), PoseSensor("mocap", "")
 
 
 def stills(count: int, seed: int, shared_px: float) -> Calibration:
@@ -75,19 +78,19 @@ def test_few_images_say_how_much_their_spread_can_tell():
 
 
 @pytest.mark.parametrize(
-    ("imu", "cameras", "words"),
+    ("imu", "sensor", "words"),
     [
-        ("imu0", ("cam0",), "record longer, and leave `segments` at 8 or more."),
-        ("imu0", (), "record longer, and leave `segments` at 8 or more."),
-        (None, ("cam0",), "record more images."),
-        (None, (), "record more poses."),
+        ("imu0", CAMERA, "record longer, and leave `segments` at 8 or more."),
+        ("imu0", POSE_SENSOR, "record longer, and leave `segments` at 8 or more."),
+        (None, CAMERA, "record more images."),
+        (None, POSE_SENSOR, "record more poses."),
     ],
 )
-def test_the_advice_for_few_parts_is_about_what_the_rig_has(imu, cameras, words):
-    inputs = SimpleNamespace(imu=imu, rig=SimpleNamespace(cameras=cameras))
-    (note,) = few_parts_notes(inputs, SimpleNamespace(count=5))  # pyright: ignore[reportArgumentType]
+def test_the_advice_for_few_parts_is_about_what_the_rig_has(imu, sensor, words):
+    inputs = SimpleNamespace(imu=imu, rig=Rig(by_name(sensor), Checkerboard(6, 7, 0.1)))
+    (note,) = few_segments_notes(inputs, SimpleNamespace(count=5))  # pyright: ignore[reportArgumentType]
     assert note.endswith(words)
-    assert not list(few_parts_notes(inputs, SimpleNamespace(count=8)))  # pyright: ignore[reportArgumentType]
+    assert not list(few_segments_notes(inputs, SimpleNamespace(count=8)))  # pyright: ignore[reportArgumentType]
 
 
 def test_the_factor_of_few_parts_is_students():

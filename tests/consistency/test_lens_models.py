@@ -11,8 +11,8 @@ from icalib.data.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Rig
+from icalib.sensors.camera.assess import lens_models
 from icalib.tools.simulation import handheld, rig_for, simulate
-from icalib.validation import lens_models
 
 WIDE = ("eucm", (430.0, 429.0, 371.0, 245.0), (0.62, 1.09))
 NARROW = ("pinhole-radtan", (458.7, 457.3, 367.2, 248.4), (-0.28, 0.07, 2e-4, 2e-5))

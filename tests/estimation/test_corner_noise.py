@@ -10,8 +10,8 @@ import pytest
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.rig import Camera, Settings
+from icalib.sensors.camera.assess import lens_models
 from icalib.sensors.camera.corner_noise import NoiseModel, estimate_noise, image_speed
-from icalib.validation import lens_models
 
 BASE, EXPOSURE_S = 0.08, 4e-4
 
@@ -68,4 +68,4 @@ def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     found = SimpleNamespace(outcome=outcome, problem=SimpleNamespace(factors={factor.key: factor}))
     rig = SimpleNamespace(cameras=(camera,), settings=settings)
     inputs = SimpleNamespace(rig=rig, measurements=SimpleNamespace(cameras=(factor.stream,)))
-    assert len(list(lens_models.lens_warnings(cast(Inputs, inputs), cast(Estimate, found)))) == large
+    assert len(list(lens_models.wrong_models(cast(Inputs, inputs), cast(Estimate, found)))) == large

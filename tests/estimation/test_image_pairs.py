@@ -9,7 +9,7 @@ import pytest
 
 from icalib.optim.robust_weights import LOSSES, robust_weights
 from icalib.rig import Settings
-from icalib.sensors.camera.assess import late_words
+from icalib.sensors.camera.assess.observation_notes import late_words
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.image_pairs import not_simultaneous
 

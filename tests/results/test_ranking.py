@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.estimate.noise_size import are_noise
+from icalib.observability.cause import Cause
 from icalib.result import SensorFit
-from icalib.validation.causes import Cause, Misfit, explaining, ranked
-from icalib.validation.disturbance import _image_velocity
+from icalib.sensors.camera.assess.exposure_lag import image_velocity
+from icalib.validation.causes import Misfit, explaining, ranked
 
 
 def fits(*ratios: float) -> list[SensorFit]:
@@ -45,6 +46,6 @@ def test_image_velocity_is_that_of_points_that_neighbours_show():
     seconds = np.array([0.0, 0.1, 0.2, 0.3])
     image, point = np.array([0, 0, 1, 1, 2, 3, 3]), np.array([0, 1, 0, 1, 0, 0, 1])
     uv = np.stack([30.0 * seconds[image] + 5.0 * point, np.zeros(7)], axis=1)
-    velocity, known = _image_velocity(image, point, uv, seconds)
+    velocity, known = image_velocity(image, point, uv, seconds)
     assert known.tolist() == [False, False, True, False, True, False, False]
     np.testing.assert_allclose(velocity[known], [[30.0, 0.0]] * 2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,14 +37,14 @@ def observe(
     names: tuple[str, ...],
     specs: Sequence[ParameterSpec],
     on_wheels: bool = False,
-    tracking: Collection[str] = (),
+    has_target: bool = True,
     axes: str = "",
 ) -> Observability:
     """Verdicts from the spread of the data alone; all are undetermined if the solver did not converge.
 
     names (B,): such as "cam0.translation.x". specs (B,): definition of each column's group. on_wheels: the rig drives
-    on one of its sensors. tracking: names of cameras without a target. axes: text that names the axes about which the
-    rig hardly turned, or empty.
+    on one of its sensors. has_target: the rig has a target. axes: text that names the axes about which the rig hardly
+    turned, or empty.
     """
     directions = sparse_basis(determined.fixed_directions)
     verdicts: list[Verdict] = []
@@ -54,8 +54,8 @@ def observe(
     sentences = []
     for direction in directions.T:
         words, first = _words_of(direction, names)
-        spec, sensor = specs[first], names[first].rsplit(".", 2)[0]
-        motion = _missing_motion(spec, on_wheels, sensor in tracking).format(axes=axes or EVERY_AXIS)
+        spec = specs[first]
+        motion = _missing_motion(spec, on_wheels, has_target).format(axes=axes or EVERY_AXIS)
         by = "these images" if spec.by_images else "this motion"
         sentences.append(f"{words}: not determined by {by}; {motion}.")
     return Observability(determined.covariance, tuple(verdicts), tuple(sentences), determined.spread)
@@ -82,10 +82,10 @@ def _words_of(direction: np.ndarray, names: tuple[str, ...]) -> tuple[str, int]:
     return " with ".join(_words(names[i]) for i in parts), int(order[0])
 
 
-def _missing_motion(spec: ParameterSpec, on_wheels: bool, without_target: bool) -> str:
+def _missing_motion(spec: ParameterSpec, on_wheels: bool, has_target: bool) -> str:
     """Text on the motion that would make the parameter observable. It depends on two limits: a rig on wheels cannot
-    turn about every axis, and a camera without a target tracks points of the scene."""
-    others = (spec.motion_without_target if without_target else "", spec.motion_on_wheels if on_wheels else "")
+    turn about every axis, and without a target, points of the scene are tracked."""
+    others = ("" if has_target else spec.motion_without_target, spec.motion_on_wheels if on_wheels else "")
     return next(filter(None, others), spec.motion)
 
 

@@ -87,15 +87,16 @@ class Sensor:
     """A sensor of the rig.
 
     A kind of sensor declares these class variables. sensor_type: its `type` in the rig file and its folder in
-    `icalib.sensors`. noun: its name in messages. parameters: all parameters that sensors of this kind can have.
-    gives_motion: such a sensor and an IMU determine the motion of the rig. needs_imu: it cannot be used without an IMU.
-    is_inertial: it is an IMU. shows_planes: it measures points on planes. sees_target: it measures points of the
-    target. drives: the rig drives on it, so that it hardly tilts. lens: names of those of `parameters` that are its
-    camera model, empty without one; its projection is what counts of them.
+    `icalib.sensors`. noun: its name in messages. readings: its measurements in messages, in the plural. parameters: all
+    parameters that sensors of this kind can have. gives_motion: such a sensor and an IMU determine the motion of the
+    rig. needs_imu: it cannot be used without an IMU. is_inertial: it is an IMU. shows_planes: it measures points on
+    planes. sees_target: it measures points of the target. drives: the rig drives on it, so that it hardly tilts. lens:
+    names of those of `parameters` that are its camera model, empty without one; its projection is what counts of them.
     """
 
     sensor_type: ClassVar[str]
     noun: ClassVar[str]
+    readings: ClassVar[str] = "measurements"
     parameters: ClassVar[tuple[ParameterSpec, ...]]
     gives_motion: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False

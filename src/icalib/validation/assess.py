@@ -39,16 +39,12 @@ from icalib.result.verdict import by_size
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.sensors import SENSOR_KINDS, call_all_kinds, facet
-from icalib.sensors.camera.image_times import image_times
 from icalib.validation.all_causes import AssessedEstimate, all_causes
 from icalib.validation.cross_validation import cross_validation
 from icalib.validation.guesses import guess_notes
 from icalib.validation.misfit import scatter_warnings
 from icalib.validation.notes import notes
-from icalib.validation.twin_lenses import twin_lens_notes
-from icalib.validation.variance_parts import ENOUGH_PARTS, VarianceParts, few_factor
-
-LARGE_BLOOM_PX = 0.8  # px; a warning above it: ink and overexposure shift edges by about a third of it
+from icalib.validation.variance_parts import ENOUGH_SEGMENTS, VarianceParts, few_factor
 
 
 def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()) -> Calibration:
@@ -59,7 +55,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
     groups = _groups(inputs, determined, observability, VarianceParts.of(determined, segments))
     validation = cross_validation(segments, [s for s in (rig.reference,) if _is_assumed(inputs, s)])
-    timeline = Timeline.of(inputs.parts, image_times(inputs.measurements, estimate.outcome.state.values), rig.reference)
+    timeline = Timeline.of(inputs.parts, _keyframe_instants(inputs, estimate.outcome.state), rig.reference)
     factors = _factors(inputs, groups)
     sensor_fits = _sensor_fits(inputs, estimate)
     assessed = AssessedEstimate(inputs, estimate, groups, sensor_fits, factors.max(initial=1.0), segments, timeline)
@@ -74,7 +70,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     return dataclasses.replace(
         _calibration(assessed, determined, observability),
         warnings=tuple(dict.fromkeys(warnings)),
-        notes=(*_notes(assessed), *size_notes, *few_parts_notes(inputs, segments)),
+        notes=(*_notes(assessed), *size_notes, *few_segments_notes(inputs, segments)),
         cross_validation=validation,
         wrong=grave,
     )
@@ -110,17 +106,16 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
 def _observed(inputs: Inputs, determined: Determined, names: tuple[str, ...]) -> Observability:
     """Formal covariance, verdicts, and sentences on unobservable combinations of parameters."""
     state = determined.estimate.outcome.state
-    tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
     axes = hardly_turned(state.seconds, state.rotation, inputs.rig.reference)
     on_wheels = any(s.drives for s in inputs.rig.mounted)
-    return observe(determined, names, _column_specs(inputs), on_wheels, tracking, axes)
+    return observe(determined, names, _column_specs(inputs), on_wheels, inputs.rig.has_target, axes)
 
 
 def _notes(assessed: AssessedEstimate) -> Iterator[str]:
-    """Notes on the recordings and sensors, on ambiguous lens parameters, and on wrong guesses."""
+    """Notes on the recordings and sensors, on ambiguous parameters, and on wrong guesses."""
     inputs, estimate = assessed.inputs, assessed.estimate
     yield from notes(inputs, estimate, assessed.timeline)
-    yield from twin_lens_notes(inputs, estimate, assessed.fits)
+    yield from call_all_kinds("assess", "ambiguities", inputs, estimate, assessed.fits)
     yield from guess_notes(inputs, assessed.groups)
 
 
@@ -230,16 +225,16 @@ def _final_verdict(formal: Verdict, size: float) -> Verdict:
     return formal if formal == "undetermined" else by_size(size)
 
 
-def few_parts_notes(inputs: Inputs, parts: Segments | None) -> Iterator[str]:
+def few_segments_notes(inputs: Inputs, segments: Segments | None) -> Iterator[str]:
     """A note if standard deviations rest on few segments, with advice to get more."""
     if inputs.imu is not None:
         more = "record longer, and leave `segments` at 8 or more"
     else:
-        more = "record more images" if inputs.rig.cameras else "record more poses"
-    if parts is not None and parts.count < ENOUGH_PARTS:
+        more = f"record more {inputs.rig.sensors[inputs.rig.reference].readings}"
+    if segments is not None and segments.count < ENOUGH_SEGMENTS:
         yield (
-            f"standard deviations rest on the spread of {parts.count} parts of the recording, by Student's t "
-            f"distribution {few_factor(parts.count):.2f} times as large as those of many; {more}."
+            f"standard deviations rest on the spread of {segments.count} parts of the recording, by Student's t "
+            f"distribution {few_factor(segments.count):.2f} times as large as those of many; {more}."
         )
 
 
@@ -262,13 +257,18 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
     """(K,) index of the recording of each keyframe; without an IMU, that of the image or pose at the keyframe."""
     if inputs.imu is not None:
         return state.recording
-    if not inputs.rig.cameras:
+    instants = _keyframe_instants(inputs, state)
+    if not instants:
         return timeline.recording_of(state.seconds)
-    by_stream = image_times(inputs.measurements, state.values)
-    times = np.concatenate(list(by_stream.values()))
-    recording = np.concatenate([timeline.recordings_of(key) for key in by_stream])
+    times = np.concatenate(list(instants.values()))
+    recording = np.concatenate([timeline.recordings_of(key) for key in instants])
     order = np.argsort(times, kind="stable")
     return recording[order][np.searchsorted(times[order], state.seconds)]
+
+
+def _keyframe_instants(inputs: Inputs, state: State) -> dict[str, np.ndarray]:
+    """By the key of their stream: instants (M,) of measurements at which keyframes may lie, s on the joined clock."""
+    return dict(call_all_kinds("assess", "keyframe_instants", inputs, state))
 
 
 def _residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Residuals]:
@@ -287,19 +287,12 @@ def _residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterat
 
 
 def _warnings(inputs: Inputs, estimate: Estimate, groups: tuple[ParameterGroup, ...]) -> Iterator[str]:
-    """Warnings on convergence, measurements and sensors, and on edge bloom that is too large for overexposure or
-    ink."""
+    """Warnings on convergence, measurements, sensors, and estimates that cannot be right."""
     if not estimate.outcome.converged:
         yield f"the solver did not converge: {estimate.outcome.status}"
     yield from inputs.measurements.warnings
     yield from call_all_kinds("assess", "warnings", inputs, estimate)
-    for g in groups:
-        if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
-            where = "in" if g.value[0] > 0.0 else "out"
-            yield (
-                f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than "
-                "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
-            )
+    yield from call_all_kinds("assess", "value_warnings", groups)
 
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:

@@ -17,10 +17,12 @@ from icalib.estimate.noise_size import NoiseFit
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.residual_statistics.parameter_changes import Change, changes, heterogeneity
 from icalib.estimate.residual_statistics.segments import Segments
+from icalib.observability.cause import Cause
 from icalib.result import SensorFit
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.timeline import Timeline
-from icalib.validation.disturbance import Disturbance, Lag, disturbance, lag_between_cameras
+from icalib.sensors import call_all_kinds
+from icalib.validation.disturbance import Disturbance, disturbance
 
 # Share of the misfit that a cause must gain to explain it. Robust weights hide part of the gain; wrong causes gain less
 # than 0.01.
@@ -32,16 +34,6 @@ CHANGES = 0.25
 ALIKE = 0.8  # share of the best gain above which another group is named, too, such as focal length for distance
 SIGNIFICANT = 25.0  # gain in chi^2 for each parameter: five standard deviations, because many boundaries are tried
 INERTIAL = ("gyroscope", "accelerometer")
-
-
-@dataclass(frozen=True)
-class Cause:
-    """A possible cause. sentence: the fault, and what to do about it; gain: the decrease of chi^2 if it is modelled;
-    grave: whether the result must not be used."""
-
-    sentence: str
-    gain: float
-    grave: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,21 +80,19 @@ def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
 
 
 def changing(
-    inputs: Inputs, estimate: Estimate, parts: Segments | None, misfit: Misfit, scattering: bool, timeline: Timeline
+    inputs: Inputs, estimate: Estimate, segments: Segments | None, misfit: Misfit, scattering: bool, timeline: Timeline
 ) -> Iterator[Cause]:
-    """Causes that vary over the recording: cameras that are not exposed together, a disturbance at one time, or a
+    """Causes that vary over the recording: sensors that do not measure together, a disturbance at one time, or a
     parameter that changes. scattering: whether estimates from segments scatter more than predicted."""
-    lag = lag_between_cameras(inputs, estimate)
-    if lag is not None:
-        yield Cause(_lag_words(lag), lag.gain, True)
+    yield from call_all_kinds("assess", "clock_causes", inputs, estimate)
     causes = []
     if misfit.fits and (hit := disturbance(estimate, misfit.chi2, misfit.sensors)) is not None:
         causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
-    if parts is not None and (misfit.fits or scattering):
-        breaks = changes(parts, tuple(s.name for s in inputs.sensors))
-        if breaks and breaks[0].gain > max(CHANGES * heterogeneity(parts), SIGNIFICANT * breaks[0].count):
+    if segments is not None and (misfit.fits or scattering):
+        breaks = changes(segments, tuple(s.name for s in inputs.sensors))
+        if breaks and breaks[0].gain > max(CHANGES * heterogeneity(segments), SIGNIFICANT * breaks[0].count):
             alike = [c for c in breaks if c.key[0] == breaks[0].key[0] and c.gain > ALIKE * breaks[0].gain]
-            causes.append(Cause(_change_words(alike, parts, timeline), breaks[0].gain, True))
+            causes.append(Cause(_change_words(alike, segments, timeline), breaks[0].gain, True))
     # the best one only: a change also enlarges residuals at one time, like a disturbance
     yield from ranked(causes)[:1]
 
@@ -136,16 +126,6 @@ def unknown_words(misfit: Misfit, noise: NoiseFit | None) -> str:
     )
 
 
-def _lag_words(lag: Lag) -> str:
-    """A sentence that two cameras are not exposed together."""
-    first, second = (lag.first, lag.second) if lag.seconds > 0.0 else (lag.second, lag.first)
-    return (
-        f"{first} and {second} are not exposed together: residuals follow the image speed, as if {second} were about "
-        f"{1e3 * abs(lag.seconds):.0f} ms late. Trigger the cameras together, hold the rig still for each pair of "
-        "images, or record an IMU too: each camera then has a time offset of its own."
-    )
-
-
 def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
     """A sentence on a disturbance at one time."""
     names = " and ".join(hit.sensors)
@@ -158,13 +138,13 @@ def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
     )
 
 
-def _change_words(alike: list[Change], parts: Segments, timeline: Timeline) -> str:
+def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -> str:
     """A sentence on a change of one sensor. alike: changes that explain about as much, the best first."""
     best, sensor = alike[0], alike[0].key[0]
     when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
     if best.key[1] == "time_offset":
-        return _clock_words(best, parts, when, timeline)
-    what = " or ".join(_changed(c, parts) for c in alike if c.key[1] != "time_offset")
+        return _clock_words(best, segments, when, timeline)
+    what = " or ".join(_changed(c, segments) for c in alike if c.key[1] != "time_offset")
     lens = any(c.key[1] == "intrinsics" for c in alike)
     off = " Switch off autofocus, zoom and image stabilisation." if lens else ""
     return (
@@ -173,19 +153,19 @@ def _change_words(alike: list[Change], parts: Segments, timeline: Timeline) -> s
     )
 
 
-def _changed(c: Change, parts: Segments) -> str:
+def _changed(c: Change, segments: Segments) -> str:
     """Text with the size of a change of a lens or of extrinsics."""
-    over = float(np.ptp(parts.state.seconds[parts.ends])) if c.pattern == "drift" else 1.0
+    over = float(np.ptp(segments.state.seconds[segments.ends])) if c.pattern == "drift" else 1.0
     if c.key[1] == "intrinsics":
         return f"its lens by up to {over * np.abs(c.value).max():.2g} px"
-    turn, move = _sizes(parts, c, over)
+    turn, move = _sizes(segments, c, over)
     return f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
 
 
-def _clock_words(c: Change, parts: Segments, when: str, timeline: Timeline) -> str:
+def _clock_words(c: Change, segments: Segments, when: str, timeline: Timeline) -> str:
     """A sentence on a time offset that drifts or jumps."""
     if c.pattern == "drift":
-        span = float(np.ptp(parts.state.seconds[parts.ends]))
+        span = float(np.ptp(segments.state.seconds[segments.ends]))
         return (
             f"the clock of {c.key[0]} drifts against the others by about {1e6 * c.value[0]:+.0f} ppm, "
             f"{1e3 * span * abs(c.value[0]):.2g} ms {when}. Stamp all sensors by one clock (hardware trigger, PTP) "
@@ -205,10 +185,10 @@ def _apart(c: Change, timeline: Timeline, words: str) -> str:
     return f"{words} (--to or --from; stay clear of the change near {c.second:.1f} s)"
 
 
-def _sizes(parts: Segments, c: Change, over: float) -> tuple[float, float]:
+def _sizes(segments: Segments, c: Change, over: float) -> tuple[float, float]:
     """Angle [rad] and distance [m] of a change of rotation, translation or both. over: duration [s] of a drift, 1 for a
     step."""
-    layout, n = parts.problem.layout, 0
+    layout, n = segments.problem.layout, 0
     sizes = {"rotation": 0.0, "translation": 0.0}
     for name in sizes:
         if layout.is_free(c.key[0], name) and n + 3 <= len(c.value):

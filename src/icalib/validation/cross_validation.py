@@ -11,16 +11,16 @@ from icalib.estimate.residual_statistics.segments import Segments
 from icalib.result import CrossValidation, PredictedFit
 
 
-def cross_validation(parts: Segments | None, assumed: Collection[str]) -> CrossValidation | None:
+def cross_validation(segments: Segments | None, assumed: Collection[str]) -> CrossValidation | None:
     """None if the recording cannot be split, or if no parameter is observable in both halves. Sensors in `assumed` get
     no fits; no sensor does if the solutions of the halves are too far apart for a linearisation."""
-    prediction = None if parts is None else predict(parts)
-    if parts is None or prediction is None:
+    prediction = None if segments is None else predict(segments)
+    if segments is None or prediction is None:
         return None
-    fits = tuple(f for f in _fits(parts.problem, prediction) if f.sensor not in assumed) if prediction.linear else ()
-    spread = shifts(parts)
+    fits = tuple(f for f in _fits(segments.problem, prediction) if f.sensor not in assumed) if prediction.linear else ()
+    spread = shifts(segments)
     return CrossValidation(
-        parts.count,
+        segments.count,
         prediction.directions,
         prediction.excess,
         prediction.expected,

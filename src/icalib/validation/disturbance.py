@@ -1,4 +1,4 @@
-"""Misfit that is concentrated at one time, or that follows the image speed because cameras are not exposed together."""
+"""Misfit that is concentrated at one time."""
 
 from __future__ import annotations
 
@@ -8,16 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.inputs import Inputs
-from icalib.motion.factor import pairs_of
-from icalib.sensors.camera.corner_factor import CornerFactor
 
 BINS, WINDOW = 64, 3  # bins of the recording, and bins of a window: a shock affects a few keyframes around it
 SHAKEN = ("gyroscope", "accelerometer", "corners")  # kinds of residuals that a knock on the rig enlarges
 AT_ONE_TIME = 0.5  # share of the misfit in one window
 LARGE = 3.0  # times the median chi^2 of a window; below it, the number of measurements may explain the difference
-FASTEST_GAP_S = 1.0  # s between images; over more, their difference does not show the image speed
-FOLLOWS_SPEED = 0.25  # least share of the squared residuals that the lag explains, in each of both cameras
 
 
 @dataclass(frozen=True)
@@ -67,56 +62,3 @@ def _chi2_over_time(estimate: Estimate) -> dict[str, tuple[np.ndarray, np.ndarra
     return {
         s: (np.concatenate([t for t, _ in pairs]), np.concatenate([c for _, c in pairs])) for s, pairs in chi2.items()
     }
-
-
-@dataclass(frozen=True)
-class Lag:
-    """Camera `second` is exposed `seconds` after camera `first`, according to residuals that follow the image speed.
-    share: of the squared residuals that the lag explains; gain: decrease of chi^2."""
-
-    first: str
-    second: str
-    seconds: float
-    share: float
-    gain: float
-
-
-def lag_between_cameras(inputs: Inputs, estimate: Estimate) -> Lag | None:
-    """The lag between the first two cameras of a rig without an IMU, whose images are modelled as simultaneous. None if
-    it explains less than FOLLOWS_SPEED of the squared residuals of either camera."""
-    cameras = pairs_of(estimate.problem.factors, estimate.outcome.residuals, CornerFactor)
-    if inputs.rig.imu is not None or len(cameras) < 2:
-        return None
-    lags = []
-    for camera, out in cameras[:2]:
-        v, known = _image_velocity(camera.stream.image, camera.stream.point, camera.stream.uv, camera.stream.seconds)
-        known &= out.root > 0.0
-        r, v = out.residual[known].astype(np.float64), v[known]
-        square, along = float((r**2).sum()), float((r * v).sum())
-        if not (known.any() and square > 0.0 and (v**2).sum() > 0.0):
-            return None
-        # Residuals are predicted minus measured. A late image shows points farther along their motion.
-        coefficient = along / float((v**2).sum())
-        weight = float((out.root[known].astype(np.float64) ** 2).mean())
-        lags.append((-coefficient, along * coefficient / square, along * coefficient * weight))
-    (a, share_a, gain_a), (b, share_b, gain_b) = lags
-    if a * b >= 0.0 or min(share_a, share_b) < FOLLOWS_SPEED:
-        return None
-    return Lag(cameras[0][0].name, cameras[1][0].name, b - a, min(share_a, share_b), gain_a + gain_b)
-
-
-def _image_velocity(
-    image: np.ndarray, point: np.ndarray, uv: np.ndarray, seconds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity (N, 2) px/s of each corner, from the images before and after, and (N,) whether both show the corner."""
-    count = int(point.max(initial=-1)) + 1
-    table = np.full((len(seconds), count, 2), np.nan)
-    table[image, point] = uv
-    speed = np.full_like(table, np.nan)
-    if len(seconds) > 2:
-        step = seconds[2:] - seconds[:-2]
-        speed[1:-1] = (table[2:] - table[:-2]) / step[:, None, None]
-        speed[1:-1][step > 2.0 * FASTEST_GAP_S] = np.nan
-    velocity = speed[image, point]
-    known = np.asarray(np.isfinite(velocity).all(axis=1))
-    return np.where(known[:, None], velocity, 0.0), known

@@ -9,29 +9,23 @@ import numpy as np
 from icalib.estimate.problem.groups import groups_of
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
-from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.contradicted_guesses import is_contradicted
 from icalib.result import ParameterGroup
-from icalib.rig import LENS, Camera
-from icalib.sensors.camera.spec import INTRINSICS
+from icalib.sensors import call_kind
 from icalib.sensors.parameter_spec import display_unit
 from icalib.validation.looks_like import looks_like
 from icalib.validation.stated import scaled
 
-GRID = 12  # rays along each side of an image
-
 
 def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[str]:
-    """One sentence for each initial guess that the estimate contradicts, see `is_contradicted`. For lenses it is one
-    whose projections are more than the prior uncertainty of the intrinsics off."""
+    """One sentence for each initial guess that the estimate contradicts, by the kind of sensor or `is_contradicted`."""
     groups_by_key = {(g.sensor, g.name): g for g in groups}
     for sensor, name, parameter in groups_of(inputs.user_rig or inputs.rig):
         group, guess = groups_by_key.get((sensor.name, name)), parameter.value
         if group is None or guess is None or parameter.mode != "free" or "undetermined" in group.verdict:
             continue
-        if isinstance(sensor, Camera) and name in LENS:
-            far = lens_off(sensor, name, groups_by_key) > INTRINSICS.prior_sigma
-        else:
+        far = call_kind(sensor.sensor_type, "assess", "is_far_guess", sensor, name, groups_by_key)
+        if far is None:
             far = is_contradicted(sensor.spec(name), guess, group.value)
         if far:
             rotation = groups_by_key.get((sensor.name, "rotation"))
@@ -39,19 +33,6 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
             yield _sentence(group, guess) + looks_like(
                 inputs.rig, (sensor.name, name), guess, group.value, R_imu_sensor
             )
-
-
-def lens_off(camera: Camera, name: str, groups_by_key: dict[tuple[str, str], ParameterGroup]) -> float:
-    """RMS shift [px] of projections over the image if the group `name` of the estimated lens is replaced by its
-    guess."""
-    model, values = camera_model(camera.model), {part: groups_by_key[camera.name, part].value for part in LENS}
-    guess = np.concatenate(list((values | {name: getattr(camera, name).value}).values()))
-    sides = [np.linspace(0.0, n - 1.0, GRID) for n in camera.resolution]
-    uv = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
-    rays, has_ray = model.unproject(np.concatenate(list(values.values())), uv)
-    guess_uv, is_projected = model.project(guess, rays)
-    both = has_ray & is_projected
-    return float(np.sqrt(np.mean(((guess_uv - uv)[both] ** 2).sum(axis=1)))) if both.any() else np.inf
 
 
 def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:

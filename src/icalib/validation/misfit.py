@@ -10,14 +10,13 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.noise_size import are_noise, fitting_noise
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.residual_statistics.fit_statistics import rows_of
+from icalib.observability.cause import Cause
 from icalib.result import CrossValidation, SensorFit
-from icalib.result.excess import FAR_BEYOND, dof_known, excess, times
+from icalib.result.excess import FAR_BEYOND, excess, is_small, ratio, times
 from icalib.rig import Rig
-from icalib.sensors import facet
-from icalib.sensors.camera.assess import rejected_words
-from icalib.validation.causes import INERTIAL, Cause, Misfit, noise_words, unknown_words
+from icalib.sensors import call_all_kinds, facet
+from icalib.validation.causes import INERTIAL, Misfit, noise_words, unknown_words
 
-SMALL_CHI2 = 0.5  # chi^2 per post-fit degree of freedom; a warning below it
 LARGE_FACTOR = 3.0  # empirical factor; a warning above it
 BEYOND_FACTOR = 1.5  # times the largest empirical factor; a warning if the cross-validation factor is above it
 
@@ -27,9 +26,7 @@ def misfit_causes(
 ) -> Iterator[Cause]:
     """Causes of the misfit: rejected outliers, the noise of the IMU, stated noise of other sensors, or unknown.
     explained: whether a named cause explains the misfit; then one sentence states the residuals."""
-    for f in sensor_fits:
-        if sentence := rejected_words(f):
-            yield Cause(sentence, 0.0)
+    yield from (Cause(sentence, 0.0) for sentence in call_all_kinds("assess", "many_rejected", sensor_fits))
     misfit = Misfit.of(sensor_fits)
     if explained:
         if misfit.fits:
@@ -60,12 +57,12 @@ def _of_imu(inputs: Inputs, estimate: Estimate, sensor_fits: Sequence[SensorFit]
     """Causes for residuals of the IMU that are too large or too small. Another noise is advised only if the residuals,
     weighted by it, are white and constant over the recording."""
     imu_fits = [f for f in sensor_fits if f.kind in INERTIAL]
-    large, small = any(excess(f) > 1.0 for f in imu_fits), [f for f in imu_fits if _is_small(f)]
+    large, small = any(excess(f) > 1.0 for f in imu_fits), [f for f in imu_fits if is_small(f)]
     if not (large or small) or inputs.rig.imu is None:
         return
-    corners = _loose_corners(inputs, sensor_fits)
-    if corners and not large:
-        yield Cause(_corners_words(corners), 0.0)
+    overstated = tuple(call_all_kinds("assess", "overstated_noise", inputs.rig, sensor_fits))
+    if overstated and not large:  # the trajectory then follows the IMU, and its residuals become small
+        yield from (Cause(sentence, 0.0) for sentence in overstated)
         return
     noise = fitting_noise(inputs, estimate) if estimate.outcome.converged else None
     if noise is not None and noise.is_as_stated and noise.explains:
@@ -77,7 +74,7 @@ def _of_imu(inputs: Inputs, estimate: Estimate, sensor_fits: Sequence[SensorFit]
     elif noise is not None and noise.explains:
         yield Cause(noise_words(inputs, noise), 0.0)
     else:
-        sizes = " and ".join(f"{f.kind} {_times(f):.2g}x" for f in small)
+        sizes = " and ".join(f"{f.kind} {ratio(f):.2g}x" for f in small)
         yield Cause(
             f"residuals of {inputs.rig.imu.name} are smaller than the stated noise predicts ({sizes}); standard "
             "deviations are too large, if anything.",
@@ -85,36 +82,10 @@ def _of_imu(inputs: Inputs, estimate: Estimate, sensor_fits: Sequence[SensorFit]
         )
 
 
-def _loose_corners(inputs: Inputs, sensor_fits: Sequence[SensorFit]) -> list[SensorFit]:
-    """Cameras whose stated corner noise is too large. The trajectory then follows the IMU, and its residuals become
-    small, too."""
-    stated = {c.name for c in inputs.rig.cameras if c.corner_noise_px is not None}
-    return [f for f in sensor_fits if f.kind == "corners" and f.sensor in stated and _is_small(f)]
-
-
-def _corners_words(corners: list[SensorFit]) -> str:
-    """A sentence that the stated corner noise is too large."""
-    sizes = " and ".join(f"{f.sensor} {_times(f):.2g}x" for f in corners)
-    return (
-        f"residuals of corners are smaller than corner_noise predicts ({sizes}); standard deviations are too large. "
-        "Leave corner_noise out, and it is estimated."
-    )
-
-
-def _times(f: SensorFit) -> float:
-    """Ratio of residuals to the stated noise."""
-    return float(np.sqrt(max(f.chi2, 0.0) / f.dof))
-
-
 def _is_noise(estimate: Estimate, f: SensorFit) -> bool:
     """Whether the residuals of `f` are white and constant over the recording."""
     rows = rows_of(estimate.outcome, f.sensor, f.kind)
     return rows is not None and are_noise(rows.weighted)
-
-
-def _is_small(f: SensorFit) -> bool:
-    """Whether the residuals are much smaller than the stated noise predicts."""
-    return dof_known(f) and f.chi2 / max(f.dof, 1.0) < SMALL_CHI2
 
 
 def scatter_warnings(factors: np.ndarray, split: bool, validation: CrossValidation | None) -> Iterator[str]:

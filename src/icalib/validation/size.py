@@ -11,9 +11,10 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.residual_statistics.target_size import TargetSize, target_size
 from icalib.model.bodies import SIZE
+from icalib.observability.cause import Cause
 from icalib.result import ParameterGroup
 from icalib.sensors import call_kind
-from icalib.validation.causes import Cause
+from icalib.sensors.sensor import TRANSLATION
 
 WRONG = 0.02  # relative error of the size: larger than that of a ruler or a good accelerometer
 BEYOND = 0.05  # relative error of the size that no accelerometer explains: these are off by 3 % at most
@@ -44,7 +45,7 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...]
         return (), ()
     rig, digits = inputs.rig, max(2, 1 - int(np.floor(np.log10(size.std))))
     ratio = f"{size.ratio:.{digits}f} +- {size.std:.{digits}f}"
-    others = len(rig.mounted) > len(rig.cameras) or any(c.translation.mode != "free" for c in rig.cameras)
+    others = any(not s.sees_target or getattr(s, TRANSLATION.name).mode != "free" for s in rig.mounted)
     by = "the accelerometer" + (" and what else shows it" if others else "")
     words = f"by {by} the target is {ratio} times the size that the rig file says"
     if abs(size.ratio - 1.0) <= max(WRONG, CLEARLY * size.std):
@@ -67,7 +68,7 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
     """Texts that name the sources of the metric scale. size: of the target by the accelerometer, None if
     unobservable."""
     rig = inputs.user_rig or inputs.rig
-    target = rig.has_target and bool(rig.cameras)
+    target = rig.has_target and any(s.sees_target for s in rig.mounted)
     has_imu = rig.imu is not None and not rig.imu.assumed
     sources = ["the size of the target"] if target else []
     sensor_sources = (call_kind(sensor.sensor_type, "assess", "length", sensor, rig) for sensor in rig.mounted)
@@ -79,8 +80,8 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
 
 def scale_causes(inputs: Inputs, groups: Sequence[ParameterGroup], size: TargetSize | None) -> Iterator[Cause]:
     """A cause if the size of the target and the scales of sensors contradict each other. Each is a factor with a prior
-    about 1. The least-squares compromise moves all of them, so the contradiction is larger than any single
-    deviation."""
+    about 1. The least-squares compromise moves all of them, so the contradiction is larger than any single deviation.
+    It explains contradictions of all stated sizes, such as wheel radii."""
     sigmas = {SIZE: inputs.rig.target.size_sigma} if size is None else {}
     sensors = inputs.rig.sensors.values()
     sigmas |= {(s.name, SCALE): sigma for s in sensors if (sigma := getattr(s, "scale_sigma", 0.0)) > 0.0}
@@ -97,4 +98,5 @@ def scale_causes(inputs: Inputs, groups: Sequence[ParameterGroup], size: TargetS
         "correct it in the rig file.",
         float(sum(a**2 for a in away.values())),
         True,
+        tuple((s.name, name) for s in sensors for name in call_kind(s.sensor_type, "assess", "sizes", s) or ()),
     )

@@ -11,11 +11,9 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.residual_statistics.image_regions import cluster_covariances
 from icalib.estimate.residual_statistics.inflation import noise_variance, spread_variance
 from icalib.estimate.residual_statistics.segments import Segments
-from icalib.motion.factor import of_type
 from icalib.observability.determination import Determined
-from icalib.sensors.camera.features.residual import FeatureFactor
 
-ENOUGH_PARTS = 8  # segments; with as many, Student's t differs from the normal distribution by 8 % at most
+ENOUGH_SEGMENTS = 8  # segments; with as many, Student's t differs from the normal distribution by 8 % at most
 
 
 class VarianceParts(NamedTuple):
@@ -32,14 +30,14 @@ class VarianceParts(NamedTuple):
     weight: float
 
     @classmethod
-    def of(cls, determined: Determined, parts: Segments | None) -> VarianceParts:
-        """Variance shares and empirical factors of the estimate `determined`. parts: estimates from segments, or None
-        if the recording is not split."""
+    def of(cls, determined: Determined, segments: Segments | None) -> VarianceParts:
+        """Variance shares and empirical factors of the estimate `determined`. segments: None if the recording is not
+        split."""
         estimate = determined.estimate
         variance, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
         prior = np.clip(determined.prior_variance, 0.0, variance - guess)
         formal = noise_variance(estimate.problem, estimate.outcome)
-        empirical = _empirical_variance(estimate, parts, formal)
+        empirical = _empirical_variance(estimate, segments, formal)
         ratio = np.sqrt(np.divide(empirical, formal, out=np.ones_like(formal), where=formal > 0.0))  # 0: fixed
         return cls(np.maximum(1.0 - (guess + prior) / variance, 0.0), prior / variance, ratio, determined.inflation)
 
@@ -61,20 +59,20 @@ class VarianceParts(NamedTuple):
         return np.sqrt(noise_factor**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))
 
 
-def _empirical_variance(estimate: Estimate, parts: Segments | None, white: np.ndarray) -> np.ndarray:
+def _empirical_variance(estimate: Estimate, segments: Segments | None, white: np.ndarray) -> np.ndarray:
     """(B,) variances: the larger of the scatter over segments and over feature tracks. The excess of cluster-robust
     variances over `white` (B,) is added, for image and target regions. Returns `white` without segments and tracks."""
-    if parts is None and not of_type(estimate.problem.factors, FeatureFactor):
+    if segments is None and not estimate.problem.ties_distant_keyframes:
         return white
     clusters = cluster_covariances(estimate.problem, estimate.outcome)
     spread = white if clusters.tracks is None else np.diag(clusters.tracks)
-    if parts is not None:
-        over_parts = few_factor(parts.count) ** 2 * spread_variance(estimate.outcome, parts, white)
-        spread = over_parts if clusters.tracks is None else np.maximum(spread, over_parts)
+    if segments is not None:
+        over_segments = few_factor(segments.count) ** 2 * spread_variance(estimate.outcome, segments, white)
+        spread = over_segments if clusters.tracks is None else np.maximum(spread, over_segments)
     return spread + sum(np.maximum(np.diag(V) - white, 0.0) for V in clusters.places)
 
 
-def few_factor(parts: int) -> float:
+def few_factor(segments: int) -> float:
     """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within. It is a
-    quantile of Student's t with parts - 1 degrees of freedom."""
-    return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0
+    quantile of Student's t with segments - 1 degrees of freedom."""
+    return float(stdtrit(segments - 1, ndtr(1.0))) if segments < ENOUGH_SEGMENTS else 1.0

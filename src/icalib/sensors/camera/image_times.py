@@ -1,4 +1,4 @@
-"""Images of cameras: a common list of images for corners and tracks, image instants, keyframes, and images in use."""
+"""Images of cameras: a common list of images for corners and tracks, keyframes, and images in use."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from icalib.errors import EstimationError
 from icalib.motion.imu_data import ImuData
 from icalib.motion.keyframe_placement import MERGED_WITHIN_S, usable
 from icalib.motion.poses import assign_keyframes
-from icalib.motion.time_offsets import instants
-from icalib.optim.state import Key, State
+from icalib.optim.state import State
 from icalib.rig import Rig, Scheme
 
 _NONE = np.zeros(0, dtype=np.int64)
@@ -59,12 +58,6 @@ def _start(stamps: np.ndarray, stream: CornerStream | TrackStream) -> np.ndarray
     count = np.zeros(len(stamps), dtype=np.int64)
     count[np.searchsorted(stamps, stream.stamps_ns)] = np.diff(stream.start)
     return np.concatenate([[0], np.cumsum(count)])
-
-
-def image_times(measurements: Measurements, values: dict[Key, np.ndarray]) -> dict[str, np.ndarray]:
-    """(M,) instants of the images of each camera, s on the body's clock since its first stamp, by the key of its
-    corner stream."""
-    return {c.key: instants(c, values) for c in measurements.cameras}
 
 
 def keyframes_of(

@@ -72,6 +72,7 @@ class Camera(MountedSensor):
 
     sensor_type: ClassVar[str] = "camera"
     noun: ClassVar[str] = "camera"
+    readings: ClassVar[str] = "images"
     gives_motion: ClassVar[bool] = True
     sees_target: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, INTRINSICS, DISTORTION, BLOOM)

@@ -43,6 +43,7 @@ class PoseSensor(MountedSensor):
 
     sensor_type: ClassVar[str] = "pose"
     noun: ClassVar[str] = "pose sensor"
+    readings: ClassVar[str] = "poses"
     gives_motion: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, POSE_SCALE)
 

@@ -19,6 +19,7 @@ from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.lens_bundle import Adjusted, ImagePoints, adjust, initial_parameters
 from icalib.motion.factor import pairs_of
+from icalib.observability.cause import Cause
 from icalib.optim.state import State
 from icalib.rig import Settings
 from icalib.sensors.camera.circle_centres import with_circle_centres
@@ -68,10 +69,10 @@ class _Trial:
         return float(np.sqrt(0.5 * self.squared_error.sum() / self.corners))
 
 
-def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, float]]:
-    """For each camera whose estimated lens leaves a large misfit (`ResidualNoise`): a sentence and the gain in chi^2.
+def wrong_models(inputs: Inputs, estimate: Estimate) -> Iterator[Cause]:
+    """A cause for each camera whose estimated lens leaves a large misfit (`ResidualNoise`).
 
-    The sentence names a model that is clearly better. If none is, a sentence appears only if the misfit exceeds the
+    Its sentence names a model that is clearly better. If none is, there is a cause only if the misfit exceeds the
     noise.
     """
     state, streams = estimate.outcome.state, inputs.measurements.cameras
@@ -89,9 +90,9 @@ def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, flo
             f"the corners of {camera.name} are off by up to {largest:.2g} px, alike wherever in the image they are seen"
         )
         if best is not None and current is not None:
-            yield _named_model(misfit, current, best), gain
+            yield Cause(_named_model(misfit, current, best), gain)
         elif noise.lens.rms > noise.base:
-            yield f"{misfit}{NO_BETTER_MODEL}", gain
+            yield Cause(f"{misfit}{NO_BETTER_MODEL}", gain)
 
 
 def _named_model(misfit: str, current: _Trial, best: _Trial) -> str:

@@ -25,7 +25,7 @@ OTHER_FOCAL = 0.02  # relative difference of fx: sets that differ by less count 
 MOST_CHI2 = 16.0  # sum over all observations of the squared difference over the noise: four standard deviations
 
 
-def twin_lens_notes(inputs: Inputs, estimate: Estimate, fits: Sequence[SensorFit]) -> Iterator[str]:
+def ambiguities(inputs: Inputs, estimate: Estimate, fits: Sequence[SensorFit]) -> Iterator[str]:
     """One sentence for each camera whose observations fit another set of parameters as well."""
     for camera, factor in zip(inputs.rig.cameras, of_type(estimate.problem.factors, CornerFactor), strict=True):
         fit = next((f for f in fits if f.sensor == camera.name and f.unit == "px" and f.rms), None)
