@@ -5,8 +5,9 @@
     python benchmarks/golden.py compare --sigma 0.05    for a change of the solver: values may move by that share of
                                                         their standard deviation, standard deviations by that share
 
-Without --sigma, values and standard deviations are to be equal to 1e-9. Each case runs twice, in a process of its own:
-the first run compiles, the second is timed. Needs the recordings in $ICALIB_DATA or ../shared/data.
+Without --sigma, values and standard deviations are to be equal to 1e-9. Each case runs twice, in a process of its own
+with an empty cache of kernels: the first run compiles, the second is timed. Needs the recordings in $ICALIB_DATA or
+../shared/data.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -134,8 +136,12 @@ def _line(name: str, old: Record, new: Record, change: Change) -> str:
 
 
 def _in_subprocess(name: str, data: Path) -> Record:
+    """Runs a case in a process with an empty cache of kernels. With kernels that other cases compiled, sums may round
+    differently."""
     command = [sys.executable, __file__, "store", "--child", name, "--data", str(data)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
     return Record(**json.loads(done.stdout.splitlines()[-1]))
 
 
