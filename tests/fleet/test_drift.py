@@ -53,7 +53,7 @@ def test_a_camera_turned_by_ten_sigma_is_found_and_nothing_else(results: dict[st
 def test_what_did_not_change_is_not_found(results: dict[str, Calibration]):
     found = drift([results["r0"], results["r1"]])
     assert (found.changes, found.unsure, found.notes) == ((), (), ()) and found.sensors == ()
-    assert found.judged == 8  # two cameras' rotation, translation and time offset, and cam1 relative to cam0
+    assert found.n_tested == 8  # two cameras' rotation, translation and time offset, and cam1 relative to cam0
 
 
 def test_many_small_steps_are_found_from_the_first_to_the_last(results: dict[str, Calibration]):
@@ -65,7 +65,7 @@ def test_many_small_steps_are_found_from_the_first_to_the_last(results: dict[str
     assert (change.before, change.after, change.difference.what) == ("job 0", "job 5", "time offset")
     assert change.difference.sigmas == pytest.approx(5.0, rel=1e-6)
     assert drift(slow, 5.5).changes == ()
-    assert found.judged == 6 * 8
+    assert found.n_tested == 6 * 8
 
 
 def test_a_step_is_told_once_however_many_follow(results: dict[str, Calibration]):
@@ -102,9 +102,9 @@ def test_results_that_cannot_be_read_or_compared_are_notes(results: dict[str, Ca
         return c
 
     found = drift_of("anton", ["a", "b", "c"], load, 3.0)
-    assert found.notes == ("b is damaged; calibrate again.",) and found.judged == 8 and found.changes == ()
+    assert found.notes == ("b is damaged; calibrate again.",) and found.n_tested == 8 and found.changes == ()
     alone = drift_of("anton", ["a"], load, 3.0)
-    assert (alone.judged, alone.notes) == (0, ())
+    assert (alone.n_tested, alone.notes) == (0, ())
 
 
 def test_chance_is_that_of_a_normal_deviate():

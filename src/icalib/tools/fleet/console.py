@@ -19,7 +19,7 @@ def print_fleet(fleet: Fleet, folder: Path) -> None:
     console = Console()
     console.print(table(fleet))
     console.print(words.answer(fleet), markup=False)
-    if any(d.judged for d in fleet.drifts):
+    if any(d.n_tested for d in fleet.drifts):
         console.print(words.chance_words(fleet), markup=False)
     for title, sentences in (
         ("Failed", words.failures(fleet)),

@@ -17,29 +17,29 @@ from icalib.tools.comparison.words import sentence
 @dataclass(frozen=True)
 class GroupChange:
     """A block that differs between the jobs `before` and `after`; words: the sentence on it. at_its_sensor: the block
-    is relative to the body or to no other sensor, so that the change is due to its sensor. judged: it is determined on
-    both sides, with standard deviations."""
+    is relative to the body or to no other sensor, so that the change is due to its sensor. testable: the block is
+    determined on both sides, with standard deviations."""
 
     before: str
     after: str
     difference: Difference
     words: str
     at_its_sensor: bool
-    judged: bool
+    testable: bool
 
 
 @dataclass(frozen=True)
 class Drift:
     """Changes of one robot. jobs: those with a result, in order of time. changes: beyond `limit` sigmas, between
     successive jobs; from the first to the last job only those that no step shows. unsure: differences that cannot be
-    tested, as they are undetermined or have no standard deviations. judged: number of tested differences. notes: what
-    could not be compared."""
+    tested, as they are undetermined or have no standard deviations. n_tested: number of tested differences. notes:
+    what could not be compared."""
 
     robot: str
     jobs: tuple[str, ...]
     changes: tuple[GroupChange, ...] = ()
     unsure: tuple[GroupChange, ...] = ()
-    judged: int = 0
+    n_tested: int = 0
     notes: tuple[str, ...] = ()
 
     @property
@@ -81,8 +81,8 @@ def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration]
     return Drift(
         robot,
         tuple(jobs),
-        tuple(c for c in changes if c.judged),
-        tuple(c for c in changes if not c.judged),
+        tuple(c for c in changes if c.testable),
+        tuple(c for c in changes if not c.testable),
         sum(s.n_tested for s in steps),
         tuple(dict.fromkeys([*notes, *(n for s in steps for n in s.notes)])),
     )

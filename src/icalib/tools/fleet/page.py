@@ -21,7 +21,7 @@ def fleet_html(fleet: Fleet, title: str) -> str:
     texts = {
         "title": title,
         "answer": words.answer(fleet),
-        "chance": words.chance_words(fleet) if any(d.judged for d in fleet.drifts) else "",
+        "chance": words.chance_words(fleet) if any(d.n_tested for d in fleet.drifts) else "",
         "limit": f"{fleet.limit:g}",
         "trust": "bad" if fleet.failed else ("care" if fleet.drifted else "good"),
     }

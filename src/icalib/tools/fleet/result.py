@@ -58,7 +58,7 @@ class Fleet:
     @property
     def by_chance(self) -> float:
         """Expected number of changes by chance."""
-        return by_chance(sum(d.judged for d in self.drifts), self.limit)
+        return by_chance(sum(d.n_tested for d in self.drifts), self.limit)
 
     def of(self, job: str) -> JobResult:
         """Result of the job with this name. Raises KeyError if there is none."""

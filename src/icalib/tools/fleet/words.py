@@ -19,14 +19,14 @@ def answer(fleet: Fleet) -> str:
 def changed_words(fleet: Fleet) -> str:
     if fleet.drifted:
         return f"Changed over time: {'; '.join(f'{d.robot} ({_listed(d.sensors)})' for d in fleet.drifted)}."
-    if not sum(d.judged for d in fleet.drifts):
+    if not sum(d.n_tested for d in fleet.drifts):
         return "No robot has two calibrations to compare."
     return "Nothing changed over time."
 
 
 def chance_words(fleet: Fleet) -> str:
     """A sentence that compares the number of changes with that expected by chance."""
-    n_tested = sum(d.judged for d in fleet.drifts)
+    n_tested = sum(d.n_tested for d in fleet.drifts)
     changes = sum(len(d.changes) for d in fleet.drifts)
     return (
         f"{changes} of {n_tested} comparisons exceed {fleet.limit:g} sigma; about {digits(fleet.by_chance)} are "
@@ -90,7 +90,7 @@ def robot_rows(fleet: Fleet) -> list[tuple[str, int, int, str, str]]:
 def drift_cell(drift: Drift) -> str:
     if drift.changes:
         return _listed(drift.sensors)
-    return "nothing" if drift.judged else ""
+    return "nothing" if drift.n_tested else ""
 
 
 def _listed(names: tuple[str, ...]) -> str:
