@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from icalib.export.outputs import check_folder, write_outputs
-from icalib.report import image_figures, projection_figures, report_html
+from icalib.report import report_html
 from icalib.report.console import table
 from icalib.report.plot import numbers, thin
 from icalib.result import (
@@ -28,6 +28,7 @@ from icalib.result import (
     working_distance,
 )
 from icalib.result.quantities import dof_words, format_number, rows, rpy_deg
+from icalib.sensors.camera.show import image_figures, projection_figures
 
 VOID = {"meta", "link", "br", "img", "hr"}
 FIGURES = {"rig", "histogram", "imu-residuals", "trajectory", "motion", "convergence", "correlation", "held-out"} | {

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.report import image_figures, projection_figures
 from icalib.report.residual_views import ResidualCurve
 from icalib.report.rig_shapes import PEN_UP
 from icalib.report.sections import Section, plot_place
 from icalib.report.tables import Html, element, html
 from icalib.result import Calibration, ImageResiduals, rms_of_images
+from icalib.sensors.camera.show import image_figures, projection_figures
 
 LEGEND = "pyramids are fields of view"
 _KIND_WORDS = {"corners": "corners", "observations": "observations of points that were followed"}
