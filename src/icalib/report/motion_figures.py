@@ -1,4 +1,4 @@
-"""Figures of the IMU residuals, the trajectory, and the convergence of the solver."""
+"""Figures of the trajectory, its derivatives, and the convergence of the solver."""
 
 from __future__ import annotations
 
@@ -24,15 +24,6 @@ from icalib.report.plot import (
 from icalib.result import Calibration
 
 MAX_PLOTTED_KEYFRAMES = 2000
-BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")
-
-
-def imu_residuals(c: Calibration) -> Figure:
-    """Whitened residuals of the IMU factor over time: standard normal, or smaller where the trajectory absorbs
-    noise."""
-    seconds, whitened = c.imu_residuals.seconds, c.imu_residuals.whitened
-    keep = thin(len(seconds), MAX_PLOTTED_KEYFRAMES)
-    return _panels(seconds[keep], [whitened[keep, 3 * b : 3 * b + 3] for b in range(5)], BLOCKS, 680)
 
 
 def motion(c: Calibration) -> Figure:
@@ -51,7 +42,7 @@ def motion(c: Calibration) -> Figure:
         (t[keep], _lifted(c, path.accel_bias)[keep]),
     ]
     titles = ("rate [deg/s]", "velocity [m/s]", "gyro bias [deg/s]", "accel bias [m/s^2]")
-    return _mixed_panels(panels, titles, 640)
+    return stacked_panels(panels, titles, 640)
 
 
 def trajectory(c: Calibration) -> Figure:
@@ -120,12 +111,7 @@ def convergence(c: Calibration) -> Figure:
     return figure(traces, 380, xaxis=axis("step (x: rejected)", dtick=max(1, len(step) // 12)), yaxis=log)
 
 
-def _panels(t: np.ndarray, values: list[np.ndarray], titles: tuple[str, ...], height: int) -> Figure:
-    """Panels that have the same times (see `_mixed_panels`)."""
-    return _mixed_panels([(t, v) for v in values], titles, height)
-
-
-def _mixed_panels(panels: list[tuple[np.ndarray, np.ndarray]], titles: tuple[str, ...], height: int) -> Figure:
+def stacked_panels(panels: list[tuple[np.ndarray, np.ndarray]], titles: tuple[str, ...], height: int) -> Figure:
     """Stacked panels with lines of x, y and z. panels: times (n,) and values (n, 3) of each; height [px]."""
     traces = [
         line(

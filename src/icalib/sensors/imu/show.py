@@ -4,26 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.report import motion_figures
+from icalib.report.motion_figures import MAX_PLOTTED_KEYFRAMES, stacked_panels
+from icalib.report.plot import Figure, thin
 from icalib.report.residual_views import ResidualCurve
 from icalib.report.sections import Section, plot_place
 from icalib.result import Calibration, ImuResiduals
 
+BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")  # titles of three columns each
 _WORDS = (
-    f"Whitened: between two keyframes, in units of what the IMU's noise allows. "
-    f"At most {motion_figures.MAX_PLOTTED_KEYFRAMES} "
-    "intervals are drawn."
+    "Whitened: between two keyframes, in units of what the IMU's noise allows. "
+    f"At most {MAX_PLOTTED_KEYFRAMES} intervals are drawn."
 )
 
 
 def sections(c: Calibration) -> Iterator[Section]:
     """The section with the residuals of the intervals between keyframes."""
     if c.imu is not None:
-        figures = {"imu-residuals": motion_figures.imu_residuals(c)}
+        figures = {"imu-residuals": _residual_figure(c.imu_residuals)}
         yield Section("inertial", "IMU residuals", _WORDS, plot_place("imu-residuals"), figures)
+
+
+def _residual_figure(r: ImuResiduals) -> Figure:
+    """Whitened residuals over time: standard normal, or smaller where the trajectory absorbs noise."""
+    keep = thin(len(r.seconds), MAX_PLOTTED_KEYFRAMES)
+    panels = [(r.seconds[keep], r.whitened[keep, 3 * b : 3 * b + 3]) for b in range(len(BLOCKS))]
+    return stacked_panels(panels, BLOCKS, 680)
 
 
 def curves(r: ImuResiduals) -> Iterator[ResidualCurve]:
     """The curves of whitened residuals over time, for each block of three columns."""
-    for b, block in enumerate(motion_figures.BLOCKS):
+    for b, block in enumerate(BLOCKS):
         yield ResidualCurve(block, r.seconds, r.whitened[:, 3 * b : 3 * b + 3], ("x", "y", "z"))
