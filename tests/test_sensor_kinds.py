@@ -45,8 +45,7 @@ NAMING = {
     "motion/imu_data.py",
     "motion/poses.py",
     "pipeline.py",
-    "result/__init__.py",
-    "result/calibration.py",
+    "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
     "tools/allan/analysis.py",

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from icalib.data.measurements import Measurements
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
-from icalib.result import Calibration, CornerResiduals, RowResiduals, Visited, by_key
+from icalib.result import Calibration, RowResiduals, Visited, by_key
+from icalib.sensors.camera.record import CornerResiduals
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.wheels.simulate import SimWheels

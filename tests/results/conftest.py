@@ -12,9 +12,7 @@ from tests.typed import instance
 from icalib.geometry.targets import AprilGrid
 from icalib.result import (
     Calibration,
-    CornerResiduals,
     CrossValidation,
-    ImuResiduals,
     Iteration,
     ParameterGroup,
     Plane,
@@ -27,6 +25,8 @@ from icalib.result import (
 )
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels, by_name
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.camera.record import CornerResiduals
+from icalib.sensors.imu.record import ImuResiduals
 from icalib.sensors.lidar.record import LidarResiduals
 
 N_KEYFRAMES, CORNERS_PER_IMAGE = 300, 34

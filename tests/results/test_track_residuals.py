@@ -14,12 +14,12 @@ from icalib.pipeline import calibrate_measurements
 from icalib.report import report_html
 from icalib.result import (
     Calibration,
-    TrackResiduals,
     by_key,
     load_calibration,
     projection_uncertainty,
     working_distance,
 )
+from icalib.sensors.camera.record import TrackResiduals
 from icalib.tools.montecarlo.whiteness import whiteness
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 

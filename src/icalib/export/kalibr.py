@@ -16,7 +16,8 @@ from icalib.export.common import inverse, restarts, time_offset
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
-from icalib.result import Calibration, CornerResiduals, image_of
+from icalib.result import Calibration
+from icalib.sensors.camera.record import CornerResiduals, image_of
 
 # icalib model -> Kalibr's camera and distortion model, and the number of leading icalib distortion coefficients that
 # Kalibr lists as intrinsics before the focal lengths.

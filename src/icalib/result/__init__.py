@@ -16,22 +16,11 @@ from icalib.result.planes import Plane
 from icalib.result.projection import ProjectionMap, projection_uncertainty, working_distance
 from icalib.result.relative import RelativePose, joint_covariance, relative_pose, relative_poses
 from icalib.result.saving import calibration_files, load_calibration
-from icalib.sensors.camera.record import (
-    CornerResiduals,
-    ImageResiduals,
-    TrackResiduals,
-    image_of,
-    rms_of_images,
-)
-from icalib.sensors.imu.record import ImuResiduals
 from icalib.sensors.records import Residuals, RowResiduals
 
 __all__ = [
     "Calibration",
-    "CornerResiduals",
     "CrossValidation",
-    "ImageResiduals",
-    "ImuResiduals",
     "Iteration",
     "ParameterGroup",
     "Plane",
@@ -42,18 +31,15 @@ __all__ = [
     "Residuals",
     "RowResiduals",
     "SensorFit",
-    "TrackResiduals",
     "Trajectory",
     "Verdict",
     "Visited",
     "by_key",
     "calibration_files",
-    "image_of",
     "joint_covariance",
     "load_calibration",
     "projection_uncertainty",
     "relative_pose",
     "relative_poses",
-    "rms_of_images",
     "working_distance",
 ]

@@ -8,9 +8,10 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
-from icalib.result import ImuResiduals, SensorFit
+from icalib.result import SensorFit
 from icalib.result.timeline import Timeline
 from icalib.rig import ImuSensor
+from icalib.sensors.imu.record import ImuResiduals
 from icalib.sensors.imu.spec import INTRINSICS_LABELS, class_of_sigma
 
 

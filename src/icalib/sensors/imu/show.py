@@ -8,7 +8,8 @@ from icalib.report.motion_figures import MAX_PLOTTED_KEYFRAMES, stacked_panels
 from icalib.report.plot import Figure, thin
 from icalib.report.residual_views import ResidualCurve
 from icalib.report.sections import Section, plot_place
-from icalib.result import Calibration, ImuResiduals
+from icalib.result import Calibration
+from icalib.sensors.imu.record import ImuResiduals
 
 BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")  # titles of three columns each
 _WORDS = (

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.report.plot import AXIS_COLORS, COLORS, REJECTED
 from icalib.report.residual_views import curves
-from icalib.result import Calibration, ImageResiduals
+from icalib.result import Calibration
 from icalib.tools.view.colors import rgb
 from icalib.tools.view.scene import place
 from icalib.tools.view.stream import RerunStream
@@ -25,8 +25,7 @@ def log_residuals(s: RerunStream, c: Calibration) -> None:
             name = re.sub(r"[^0-9a-zA-Z]+", "_", curve.name)
             entity = f"residuals/{r.sensor}/{name}" if name else f"residuals/{r.sensor}"
             log_lines(s, entity, curve.seconds, curve.values, curve.labels)
-    for r in c.image_residuals:
-        _log_observations(s, c, r)
+    _log_observations(s, c)
 
 
 def log_states(s: RerunStream, c: Calibration) -> None:
@@ -47,11 +46,12 @@ def log_lines(s: RerunStream, entity: str, seconds: np.ndarray, values: np.ndarr
     s.over(entity, seconds, s.rr.Scalars.columns(scalars=values.reshape(-1)).partition([m] * n))
 
 
-def _log_observations(s: RerunStream, c: Calibration, r: ImageResiduals) -> None:
-    """Sends measured corners or tracked points in the camera's image; rejected ones are red, those of unused tracks
-    grey."""
-    rr, entity = s.rr, f"{place(c, r.sensor)}/image/{r.kind}"
-    s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_DOT)))
-    colors = rgb(_LEFT_OUT, _GOOD, REJECTED)[np.where(r.rejected, 2, r.used.astype(np.int64))]
-    columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
-    s.over(entity, r.seconds, columns)
+def _log_observations(s: RerunStream, c: Calibration) -> None:
+    """Sends measured corners and tracked points in the images; rejected ones are red, those of unused tracks grey."""
+    rr = s.rr
+    for r in c.image_residuals:
+        entity = f"{place(c, r.sensor)}/image/{r.kind}"
+        s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_DOT)))
+        colors = rgb(_LEFT_OUT, _GOOD, REJECTED)[np.where(r.rejected, 2, r.used.astype(np.int64))]
+        columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
+        s.over(entity, r.seconds, columns)

@@ -10,10 +10,10 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.factor import of_type, pairs_of
 from icalib.motion.time_offsets import instants
-from icalib.result import CornerResiduals, TrackResiduals
 from icalib.result.timeline import Timeline
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.features.residual import FeatureFactor
+from icalib.sensors.camera.record import CornerResiduals, TrackResiduals
 
 
 def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[CornerResiduals | TrackResiduals]:

@@ -10,7 +10,8 @@ from icalib.report.residual_views import ResidualCurve
 from icalib.report.rig_shapes import PEN_UP
 from icalib.report.sections import Section, plot_place
 from icalib.report.tables import Html, element, html
-from icalib.result import Calibration, ImageResiduals, rms_of_images
+from icalib.result import Calibration
+from icalib.sensors.camera.record import ImageResiduals, rms_of_images
 from icalib.sensors.camera.show import image_figures, projection_figures
 
 LEGEND = "pyramids are fields of view"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from icalib.report.plot import REJECTED, Figure, axis, dots, figure, line, numbers, thin
-from icalib.result import ImageResiduals, image_of, rms_of_images
+from icalib.sensors.camera.record import ImageResiduals, image_of, rms_of_images
 
 MOST_DOTS = 2500  # dots of each kind in one figure; more are thinned out
 BINS = 60

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from icalib.report.plot import Figure, axis, dots, figure, numbers, thin
-from icalib.result import Calibration, ImageResiduals, ProjectionMap, projection_uncertainty, working_distance
+from icalib.result import Calibration, ProjectionMap, projection_uncertainty, working_distance
 from icalib.result.quantities import format_number
+from icalib.sensors.camera.record import ImageResiduals
 
 MOST_DOTS = 1500
 WIDEST = 6.0  # end of the colour scale, in medians over the seen cells, so that edges without data do not set it
