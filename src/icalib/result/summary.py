@@ -11,7 +11,7 @@ import yaml
 from icalib.result.body_frame import in_body_frame
 from icalib.result.calibration import Calibration, ParameterGroup, SensorFit
 from icalib.result.relative import RelativePose, relative_poses
-from icalib.rig.kinds import ONE
+from icalib.rig.kinds import ONE, SENSOR_TYPES
 from icalib.sensors.sensor import MOUNTED, MOUNTED_NAMES, ROTATION, TRANSLATION
 
 HEADER = """\
@@ -85,7 +85,7 @@ def reference_name(c: Calibration) -> str:
 def _sensor(c: Calibration, name: str) -> dict[str, Any]:
     """Entry of the sensor `name`. `c` is a result of `in_body_frame`."""
     kind, entry = c.rig["sensors"][name]["type"], _entry(c, name)
-    if kind != "imu":
+    if not SENSOR_TYPES[kind].is_inertial:
         return {"type": kind, pose_key(c): c.T_imu_sensor(name).tolist()} | entry
     still = {spec.name: [0.0] * spec.size if spec.size > 1 else 0.0 for spec in MOUNTED}
     fixed = {spec.name: ["fixed"] * spec.size if spec.size > 1 else "fixed" for spec in MOUNTED}
