@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.typed import random_rotations
 
-from icalib.geometry.planes import closest_point, closest_point_residual, moved, plane_of, tangents
+from icalib.geometry.planes import moved, plane_of, tangents
 
 SPECIAL = [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0], [0.6, 0.8, 0.0], [0.6, 0.8, -1e-17], [1e-9, 0, -1]]
 
@@ -41,6 +41,29 @@ def test_a_correction_of_the_distance_moves_the_plane_along_its_normal():
     after = moved(plane, np.array([0.0, 0.0, 0.25]))
     assert after[:3] @ after[3:] - plane[:3] @ plane[3:] == pytest.approx(0.25)
     np.testing.assert_allclose(after[:3], plane[:3], atol=1e-15)
+
+
+def closest_point(plane: np.ndarray) -> np.ndarray:
+    """(3,) point of `plane` (6,) closest to the origin [m], p_pi = d n in the iCalib paper."""
+    return (plane[:3] @ plane[3:]) * plane[:3]
+
+
+def closest_point_residual(
+    p_pi: np.ndarray, R_world_lidar: np.ndarray, p_world_lidar: np.ndarray, xyz: np.ndarray
+) -> np.ndarray:
+    """(N,) residuals (24) and (25) of the iCalib paper [m], of points xyz (N, 3) in the LiDAR frame. p_pi (3,): closest
+    point of the plane in the world frame.
+
+    The residual is n . p - d if sensor and origin are on the same side of the plane, and its negative otherwise. It is
+    undefined for a plane through the origin or the sensor. The reason is that (24) uses p_pi / |p_pi| as n, which is -n
+    if d_L < 0.
+    """
+    d = np.linalg.norm(p_pi)
+    normal = p_pi / d
+    d_lidar = d - normal @ p_world_lidar
+    p_pi_lidar = d_lidar * (R_world_lidar.T @ normal)
+    size = np.linalg.norm(p_pi_lidar)
+    return xyz @ p_pi_lidar / size - size
 
 
 @pytest.mark.parametrize("beyond", [False, True])

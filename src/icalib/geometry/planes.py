@@ -61,26 +61,3 @@ def difference(to: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """(3,) correction d for which `moved(plane, d)` is the plane `to` (6,), to first order."""
     across = tangents(np.ascontiguousarray(plane[:3]))
     return np.append(across @ to[:3], plane[:3] @ (to[3:] - plane[3:]))
-
-
-def closest_point(plane: np.ndarray) -> np.ndarray:
-    """(3,) point of `plane` (6,) closest to the origin [m], p_pi = d n in the iCalib paper."""
-    return (plane[:3] @ plane[3:]) * plane[:3]
-
-
-def closest_point_residual(
-    p_pi: np.ndarray, R_world_lidar: np.ndarray, p_world_lidar: np.ndarray, xyz: np.ndarray
-) -> np.ndarray:
-    """(N,) residuals (24) and (25) of the iCalib paper [m], of points xyz (N, 3) in the LiDAR frame. p_pi (3,): closest
-    point of the plane in the world frame.
-
-    The residual is n . p - d if sensor and origin are on the same side of the plane, and its negative otherwise. It is
-    undefined for a plane through the origin or the sensor. The reason is that (24) uses p_pi / |p_pi| as n, which is -n
-    if d_L < 0.
-    """
-    d = np.linalg.norm(p_pi)
-    normal = p_pi / d
-    d_lidar = d - normal @ p_world_lidar
-    p_pi_lidar = d_lidar * (R_world_lidar.T @ normal)
-    size = np.linalg.norm(p_pi_lidar)
-    return xyz @ p_pi_lidar / size - size

@@ -111,14 +111,6 @@ def log(R):
 
 
 @njit(cache=True, nogil=True)
-def left_jacobian(phi):
-    """(3, 3) J_l with Exp(phi + d) = Exp(J_l d) Exp(phi) to first order. It is also the mean of Exp(s phi) over s in
-    [0, 1]."""
-    _, s1, s2, _ = jacobian_coefficients(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
-    return _polynomial(phi, s1, s2)
-
-
-@njit(cache=True, nogil=True)
 def right_jacobian(phi):
     """(3, 3) J_r with Exp(phi + d) = Exp(phi) Exp(J_r d) to first order."""
     _, s1, s2, _ = jacobian_coefficients(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
@@ -136,7 +128,7 @@ def _inverse_coefficient(x):
 
 @njit(cache=True, nogil=True)
 def left_jacobian_inverse(phi):
-    """Inverse of `left_jacobian`, for angles up to pi."""
+    """(3, 3) J_l^-1 with Exp(phi + d) = Exp(J_l d) Exp(phi) to first order, for angles up to pi."""
     return _polynomial(phi, -0.5, _inverse_coefficient(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]))
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.geometry.cameras.closed_form import MIN_DISTANCE, ClosedForm
+from icalib.geometry.cameras.base import MIN_DISTANCE, CameraModel
 from icalib.geometry.cameras.eucm import unified_depth
 
 
-class DoubleSphere(ClosedForm):
+class DoubleSphere(CameraModel):
     """Double sphere model (Usenko, Demmel and Cremers 2018, eq. 40 to 42).
 
         d1 = sqrt(x^2 + y^2 + z^2),  s = xi d1 + z,  d2 = sqrt(x^2 + y^2 + s^2)

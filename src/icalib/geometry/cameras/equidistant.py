@@ -6,9 +6,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry.cameras import radial
-from icalib.geometry.cameras.base import CameraModel
-
-_MIN_DISTANCE = 1e-6  # m; closer points have no direction
+from icalib.geometry.cameras.base import MIN_DISTANCE, CameraModel
 
 
 class PinholeEquidistant(CameraModel):
@@ -27,26 +25,14 @@ class PinholeEquidistant(CameraModel):
     parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
     start_distortions = ((0.0, 0.0, 0.0, 0.0),)
 
-    def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
-        uv, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
+    def _fill_image(self, params, points, uv, valid) -> None:
         _project(params, points, _theta_limit(params), uv, valid)
-        return uv, valid
 
-    def project_with_jacobians(
-        self, params: np.ndarray, points: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
-        n = len(points)
-        uv, valid, j_point, j_params = np.empty((n, 2)), np.empty(n, np.bool_), np.empty((n, 2, 3)), np.empty((n, 2, 8))
+    def _fill_jacobians(self, params, points, uv, valid, j_point, j_params) -> None:
         _project_with_jacobians(params, points, _theta_limit(params), uv, valid, j_point, j_params)
-        return uv, valid, j_point, j_params
 
-    def unproject(self, params: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        params, uv = np.ascontiguousarray(params, float), np.ascontiguousarray(uv, float)
-        rays, valid = np.empty((len(uv), 3)), np.empty(len(uv), dtype=np.bool_)
+    def _fill_rays(self, params, uv, rays, valid) -> None:
         _unproject(params, uv, _theta_limit(params), rays, valid)
-        return rays, valid
 
 
 def _theta_limit(params: np.ndarray) -> float:
@@ -59,7 +45,7 @@ def _direction(x, y, z, limit):
     """r, theta, theta / r and whether the point is valid. On the optical axis theta / r is its limit 1 / z."""
     r = np.sqrt(x * x + y * y)
     theta = np.arctan2(r, z)
-    valid = r + abs(z) > _MIN_DISTANCE and theta < limit
+    valid = r + abs(z) > MIN_DISTANCE and theta < limit
     theta_by_r = 0.0
     if valid:
         theta_by_r = theta / r if r > 0.0 else 1.0 / z
@@ -87,10 +73,8 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         r, theta, theta_by_r, valid[i] = _direction(x, y, z, limit)
-        j_params[i] = 0.0
         if not valid[i]:
             uv[i] = 0.0
-            j_point[i] = 0.0
             continue
         s = theta * theta
         tangential = theta_by_r * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.geometry.cameras.closed_form import MIN_DISTANCE, ClosedForm
+from icalib.geometry.cameras.base import MIN_DISTANCE, CameraModel
 
 
-class ExtendedUnified(ClosedForm):
+class ExtendedUnified(CameraModel):
     """EUCM (Khomutenko, Garcia and Martinet 2016, eq. 1 to 10).
 
         d = sqrt(beta (x^2 + y^2) + z^2)

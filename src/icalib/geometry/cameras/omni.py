@@ -6,11 +6,11 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry.cameras import radial
-from icalib.geometry.cameras.closed_form import MIN_DISTANCE, ClosedForm
+from icalib.geometry.cameras.base import MIN_DISTANCE, CameraModel
 from icalib.geometry.cameras.radtan import distort, undistort
 
 
-class OmniRadtan(ClosedForm):
+class OmniRadtan(CameraModel):
     """Unified model of Mei and Rives (2007, section II) with the distortion of `pinhole-radtan`.
 
     A point is projected to the unit sphere, then from a centre at distance xi behind the sphere's centre, and

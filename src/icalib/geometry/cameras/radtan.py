@@ -8,8 +8,8 @@ from icalib.base.compiled import njit
 from icalib.geometry.cameras import radial
 from icalib.geometry.cameras.base import CameraModel
 
-_MIN_DEPTH = 1e-6  # m; points with smaller z are invalid
-_MAX_NEWTON_STEPS = 30  # of the unprojection; pixels that need more are invalid
+MIN_DEPTH = 1e-6  # m; points with smaller z are invalid
+MAX_NEWTON_STEPS = 30  # of the unprojection; pixels that need more are invalid
 
 
 class RadialTangential(CameraModel):
@@ -24,28 +24,16 @@ class RadialTangential(CameraModel):
     zero Jacobians.
     """
 
-    def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
-        uv, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
+    def _fill_image(self, params, points, uv, valid) -> None:
         _project(params, points, radial.monotonic_limit(_radial_coefficients(params)), uv, valid)
-        return uv, valid
 
-    def project_with_jacobians(
-        self, params: np.ndarray, points: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
-        n, limit = len(points), radial.monotonic_limit(_radial_coefficients(params))
-        uv, valid = np.empty((n, 2)), np.empty(n, dtype=np.bool_)
-        j_point, j_params = np.empty((n, 2, 3)), np.empty((n, 2, len(params)))
+    def _fill_jacobians(self, params, points, uv, valid, j_point, j_params) -> None:
+        limit = radial.monotonic_limit(_radial_coefficients(params))
         _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
-        return uv, valid, j_point, j_params
 
-    def unproject(self, params: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        params, uv = np.ascontiguousarray(params, float), np.ascontiguousarray(uv, float)
-        rays, valid = np.empty((len(uv), 3)), np.empty(len(uv), dtype=np.bool_)
+    def _fill_rays(self, params, uv, rays, valid) -> None:
         coefficients = _radial_coefficients(params)
         _unproject(params, coefficients, uv, radial.monotonic_limit(coefficients), rays, valid)
-        return rays, valid
 
 
 class PinholeRadtan(RadialTangential):
@@ -88,9 +76,9 @@ def _project(params, points, limit, uv, valid):
     k3 = _third_coefficient(params)
     for i in range(len(points)):
         z = points[i, 2]
-        inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
+        inverse_z = 1.0 / z if z > MIN_DEPTH else 0.0
         a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
-        valid[i] = z > _MIN_DEPTH and a * a + b * b < limit * limit
+        valid[i] = z > MIN_DEPTH and a * a + b * b < limit * limit
         if valid[i]:
             distorted_a, distorted_b, _, _, _ = distort(params, k3, a, b)
             uv[i, 0] = params[0] * distorted_a + params[2]
@@ -104,14 +92,12 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
     fx, fy, k3 = params[0], params[1], _third_coefficient(params)
     for i in range(len(points)):
         z = points[i, 2]
-        inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
+        inverse_z = 1.0 / z if z > MIN_DEPTH else 0.0
         a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
         s = a * a + b * b
-        valid[i] = z > _MIN_DEPTH and s < limit * limit
-        j_params[i] = 0.0
+        valid[i] = z > MIN_DEPTH and s < limit * limit
         if not valid[i]:
             uv[i] = 0.0
-            j_point[i] = 0.0
             continue
         distorted_a, distorted_b, j_aa, j_ab, j_bb = distort(params, k3, a, b)
         uv[i, 0], uv[i, 1] = fx * distorted_a + params[2], fy * distorted_b + params[3]
@@ -150,7 +136,7 @@ def undistort(params, coefficients, limit, distorted_a, distorted_b):
     scale = r / distorted_r if distorted_r > 0.0 else 1.0
     a, b = scale * distorted_a, scale * distorted_b
     k3 = _third_coefficient(params)
-    for _ in range(_MAX_NEWTON_STEPS):
+    for _ in range(MAX_NEWTON_STEPS):
         value_a, value_b, j_aa, j_ab, j_bb = distort(params, k3, a, b)
         is_folded, step_a, step_b = newton_step(value_a - distorted_a, value_b - distorted_b, j_aa, j_ab, j_bb)
         if is_folded:

@@ -7,15 +7,13 @@ from functools import lru_cache
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.geometry.cameras.closed_form import ClosedForm
-from icalib.geometry.cameras.radtan import newton_step
+from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.cameras.radtan import MAX_NEWTON_STEPS, MIN_DEPTH, newton_step
 
-_MIN_DEPTH = 1e-6  # m; points with smaller z are invalid
-_MAX_NEWTON_STEPS = 30  # of the unprojection; pixels that need more are invalid
 _MAX_ITERATIONS = 100  # of the radius; bisection alone reaches rounding in 60
 
 
-class PinholeRational(ClosedForm):
+class PinholeRational(CameraModel):
     """OpenCV's CALIB_RATIONAL_MODEL (calib3d).
 
         a = x / z,  b = y / z,  s = a^2 + b^2
@@ -112,9 +110,9 @@ def _distort(params, a, b):
 def _on_plane(points, i, limit):
     """a = x / z, b = y / z, 1 / z of point i, and whether it is valid."""
     z = points[i, 2]
-    inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
+    inverse_z = 1.0 / z if z > MIN_DEPTH else 0.0
     a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
-    return a, b, inverse_z, z > _MIN_DEPTH and a * a + b * b < limit * limit
+    return a, b, inverse_z, z > MIN_DEPTH and a * a + b * b < limit * limit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -193,7 +191,7 @@ def _undistort(params, limit, distorted_a, distorted_b):
     r = min(_undistorted_radius(params, distorted_r, limit), 0.9 * limit)
     scale = r / distorted_r if distorted_r > 0.0 else 1.0
     a, b = scale * distorted_a, scale * distorted_b
-    for _ in range(_MAX_NEWTON_STEPS):
+    for _ in range(MAX_NEWTON_STEPS):
         value_a, value_b, j_aa, j_ab, j_bb, _, _ = _distort(params, a, b)
         is_folded, step_a, step_b = newton_step(value_a - distorted_a, value_b - distorted_b, j_aa, j_ab, j_bb)
         if is_folded:

@@ -9,14 +9,12 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.geometry.targets.base import Target
+from icalib.geometry.targets.base import UNIT_TAG, TagTarget
 from icalib.geometry.targets.families import APRILGRID_FAMILY, TagSet, checked_family
-
-UNIT_TAG = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # corners 0 to 3 of a tag of edge 1
 
 
 @dataclass(frozen=True)
-class AprilGrid(Target):
+class AprilGrid(TagTarget):
     """Kalibr's AprilGrid: `rows` x `cols` tags with edge `tag_size` [m], with gaps of `tag_spacing` * tag_size.
 
     Board frame: origin at corner 0 of the first tag, x along a row, y along a column, all tags in z = 0. Tag ids are
@@ -26,7 +24,6 @@ class AprilGrid(Target):
     """
 
     type: ClassVar[str] = "aprilgrid"
-    blooms: ClassVar[bool] = True
     seldom: ClassVar[tuple[str, ...]] = ("first_id", "family")
 
     rows: int
@@ -46,27 +43,14 @@ class AprilGrid(Target):
         """(4 * rows * cols, 3) corners [m]; corner c of tag number i has index 4 i + c."""
         pitch = self.tag_size * (1.0 + self.tag_spacing)
         row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
-        origin = pitch * np.stack([col, row], axis=1)
-        xy = origin[:, None, :] + self.tag_size * UNIT_TAG[None]
-        return np.concatenate([xy.reshape(-1, 2), np.zeros((4 * len(origin), 1))], axis=1)
-
-    @cached_property
-    def tag_centers(self) -> np.ndarray:
-        """(4 * rows * cols, 3) centre of the tag of each corner [m]."""
-        centers = self.points.reshape(-1, 4, 3).mean(axis=1)
-        return np.repeat(centers, 4, axis=0)
+        origin = pitch * np.stack([col, row, 0 * row], axis=1)
+        return (origin[:, None] + self.tag_size * UNIT_TAG).reshape(-1, 3)
 
     @property
     def tags(self) -> TagSet:
         return TagSet(self.family, self.border_bits, tuple(self.first_id + i for i in range(self.rows * self.cols)))
 
-    @cached_property
-    def tag_number(self) -> np.ndarray:
-        return np.arange(len(self.points)) // 4
-
-    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        """See `Target`. Raises RecordingError if the target has no such tag or corner."""
-        tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+    def tag_numbers(self, tag_id: np.ndarray) -> np.ndarray:
         first, last = self.first_id, self.first_id + self.rows * self.cols - 1
         bad = (tag_id < first) | (tag_id > last)
         if bad.any():
@@ -74,12 +58,7 @@ class AprilGrid(Target):
                 f"tag {tag_id[bad][0]} is not on the target ({self.rows} x {self.cols} tags, ids {first} to {last}); "
                 "check rows, cols and first_id in the rig file."
             )
-        if ((corner < 0) | (corner > 3)).any():
-            raise RecordingError(
-                f"corner {corner[(corner < 0) | (corner > 3)][0]} is not one of a tag's corners 0 to 3."
-            )
-        return 4 * (tag_id - first) + corner
+        return tag_id - first
 
     def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Target`."""
         return self.first_id + index // 4, index % 4

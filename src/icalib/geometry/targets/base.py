@@ -13,6 +13,7 @@ from icalib.errors import RecordingError
 from icalib.geometry.targets.families import TagSet
 
 BOARD = "board0"
+UNIT_TAG = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])  # corners of a tag of edge 1
 # Relative standard deviation of a printed size: a ruler is read to 0.2 mm in 100 mm, and printers and damp paper have
 # errors of the same size.
 SIZE_SIGMA = 0.002
@@ -105,6 +106,33 @@ class Target(ABC):
     @abstractmethod
     def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(N,) tag ids and (N,) corner numbers of (N,) indices into `points`."""
+
+
+@dataclass(frozen=True)
+class TagTarget(Target):
+    """Target whose points are the corners of tags. Corner c of tag number i has index 4 i + c. Corner 0 of a tag is at
+    its bottom left; the others follow counterclockwise."""
+
+    blooms: ClassVar[bool] = True
+
+    @cached_property
+    def tag_centers(self) -> np.ndarray:
+        return np.repeat(self.points.reshape(-1, 4, 3).mean(axis=1), 4, axis=0)
+
+    @cached_property
+    def tag_number(self) -> np.ndarray:
+        return np.arange(len(self.points)) // 4
+
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+        numbers = self.tag_numbers(tag_id)
+        if (bad := (corner < 0) | (corner > 3)).any():
+            raise RecordingError(f"corner {corner[bad][0]} is not one of a tag's corners 0 to 3.")
+        return 4 * numbers + corner
+
+    @abstractmethod
+    def tag_numbers(self, tag_id: np.ndarray) -> np.ndarray:
+        """(N,) numbers of the tags with ids (N,). Raises RecordingError if the target has no such tag."""
 
 
 def untagged_index(tag_id: np.ndarray, corner: np.ndarray, n_points: int, sizes: str) -> np.ndarray:

@@ -9,13 +9,12 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.errors import RecordingError, RigError
-from icalib.geometry.targets.aprilgrid import UNIT_TAG
-from icalib.geometry.targets.base import Target
+from icalib.geometry.targets.base import UNIT_TAG, TagTarget
 from icalib.geometry.targets.families import FAMILIES, TagSet, checked_family
 
 
 @dataclass(frozen=True)
-class Markers(Target):
+class Markers(TagTarget):
     """Tags of `family` with these `ids`, or with all ids of the family if none are given. size: edge of the black
     border [m].
 
@@ -24,7 +23,6 @@ class Markers(Target):
     """
 
     type: ClassVar[str] = "markers"
-    blooms: ClassVar[bool] = True
 
     family: str
     size: float
@@ -44,12 +42,7 @@ class Markers(Target):
     @cached_property
     def points(self) -> np.ndarray:
         """(4 tags, 3) corners [m], each in the frame of its tag; corner c of tag known[i] has index 4 i + c."""
-        corners = np.concatenate([self.size * UNIT_TAG, np.zeros((4, 1))], axis=1)
-        return np.tile(corners, (len(self.known), 1))
-
-    @cached_property
-    def tag_centers(self) -> np.ndarray:
-        return np.tile([0.5 * self.size, 0.5 * self.size, 0.0], (len(self.points), 1))
+        return np.tile(self.size * UNIT_TAG, (len(self.known), 1))
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -67,20 +60,11 @@ class Markers(Target):
     def tags(self) -> TagSet:
         return TagSet(self.family, self.border_bits, tuple(self.known.tolist()))
 
-    @cached_property
-    def tag_number(self) -> np.ndarray:
-        return np.arange(len(self.points)) // 4
-
-    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+    def tag_numbers(self, tag_id: np.ndarray) -> np.ndarray:
         place = np.minimum(np.searchsorted(self.known, tag_id), len(self.known) - 1)
         if (strange := self.known[place] != tag_id).any():
             raise RecordingError(f"tag {tag_id[strange][0]} is not one of the target's ids; add it, or leave it out.")
-        if ((corner < 0) | (corner > 3)).any():
-            raise RecordingError(
-                f"corner {corner[(corner < 0) | (corner > 3)][0]} is not one of a tag's corners 0 to 3."
-            )
-        return 4 * place + corner
+        return place
 
     def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.known[index // 4], index % 4

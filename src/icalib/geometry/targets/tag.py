@@ -9,13 +9,12 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.geometry.targets.aprilgrid import UNIT_TAG
-from icalib.geometry.targets.base import Target
+from icalib.geometry.targets.base import UNIT_TAG, TagTarget
 from icalib.geometry.targets.families import checked_family
 
 
 @dataclass(frozen=True)
-class Tag(Target):
+class Tag(TagTarget):
     """Tag `id` of `family` (any name that `family_name` accepts). size: edge of the black border [m].
 
     Corners are numbered as on an AprilGrid: 0 at the bottom left, then counterclockwise. Raises RigError if there is no
@@ -23,7 +22,6 @@ class Tag(Target):
     """
 
     type: ClassVar[str] = "tag"
-    blooms: ClassVar[bool] = True
 
     family: str
     id: int
@@ -35,25 +33,12 @@ class Tag(Target):
     @cached_property
     def points(self) -> np.ndarray:
         """(4, 3) corners [m]."""
-        return np.concatenate([self.size * UNIT_TAG, np.zeros((4, 1))], axis=1)
+        return self.size * UNIT_TAG
 
-    @cached_property
-    def tag_centers(self) -> np.ndarray:
-        return np.tile([0.5 * self.size, 0.5 * self.size, 0.0], (4, 1))
-
-    @cached_property
-    def tag_number(self) -> np.ndarray:
-        return np.arange(len(self.points)) // 4
-
-    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+    def tag_numbers(self, tag_id: np.ndarray) -> np.ndarray:
         if (tag_id != self.id).any():
             raise RecordingError(f"tag {tag_id[tag_id != self.id][0]} is not tag {self.id}; leave it out.")
-        if ((corner < 0) | (corner > 3)).any():
-            raise RecordingError(
-                f"corner {corner[(corner < 0) | (corner > 3)][0]} is not one of a tag's corners 0 to 3."
-            )
-        return corner
+        return np.zeros_like(tag_id)
 
     def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.full_like(index, self.id), index
