@@ -69,7 +69,7 @@ def _empirical_variance(estimate: Estimate, segments: Segments | None, white: np
     if segments is not None:
         over_segments = few_factor(segments.count) ** 2 * spread_variance(estimate.outcome, segments, white)
         spread = over_segments if clusters.tracks is None else np.maximum(spread, over_segments)
-    return spread + sum(np.maximum(np.diag(V) - white, 0.0) for V in clusters.places)
+    return spread + sum(np.maximum(np.diag(V) - white, 0.0) for V in clusters.regions)
 
 
 def few_factor(segments: int) -> float:

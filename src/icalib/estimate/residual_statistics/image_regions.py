@@ -25,10 +25,10 @@ from icalib.optim.arrowhead import Piece
 
 @dataclass(frozen=True)
 class ClusterCovariances:
-    """Cluster-robust covariances (B, B). places: one for each kind of cluster, such as image cells. tracks: for groups
-    of feature tracks, None without tracks."""
+    """Cluster-robust covariances (B, B). regions: one for each way to divide images or target into regions, such as
+    image cells. tracks: for groups of feature tracks, None without tracks."""
 
-    places: list[np.ndarray]
+    regions: list[np.ndarray]
     tracks: np.ndarray | None
 
 
@@ -36,14 +36,14 @@ def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariance
     """Cluster-robust (sandwich) covariances of the calibration parameters."""
     every = [c for model in all_models() for c in model.clusters(problem.factors)]
     gradients = _cluster_gradients(problem, outcome, [c.of_factor for c in every]) if every else []
-    places, tracks = [], None
+    regions, tracks = [], None
     for clusters, b in zip(every, gradients, strict=True):
         if clusters.is_sample:
             centred = b - b.mean(axis=0)
             tracks = len(b) / (len(b) - 1.0) * spread_covariance(problem, outcome, centred)
         else:
-            places.append(spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])))
-    return ClusterCovariances(places, tracks)
+            regions.append(spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])))
+    return ClusterCovariances(regions, tracks)
 
 
 def _count(clusters: Mapping[FactorKey, Any]) -> int:
