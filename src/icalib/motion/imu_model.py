@@ -3,8 +3,8 @@
     gyro  = M_g C w + A_g f + b_g + noise        f: specific force, w: angular rate, both in the IMU frame
     accel = M_a f + b_a + noise                  M: lower triangular, C = Exp(r): accelerometer to gyroscope axes
 
-Intrinsics are 24 numbers (`rig.imu_classes.INTRINSICS_LABELS`), zero for an ideal IMU: M_a - I (xx yx yy zx zy zz), M_g
-- I (same), r (3), A_g (row-major 9).
+Intrinsics are 24 numbers (`INTRINSICS_LABELS` of `sensors.imu.spec`), zero for an ideal IMU: M_a - I (xx yx yy zx zy
+zz), M_g - I (same), r (3), A_g (row-major 9).
 """
 
 from __future__ import annotations

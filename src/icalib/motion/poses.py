@@ -41,7 +41,6 @@ from icalib.motion.propagation import (
 )
 from icalib.optim.state import KEYFRAME_DIM, State
 from icalib.rig import Scheme
-from icalib.sensors.imu.spec import N_INTRINSICS
 
 
 @dataclass(frozen=True)
@@ -253,14 +252,12 @@ def poses_at(
 ) -> Poses:
     """IMU poses at `times` (n,) seconds on the IMU clock, each from its `keyframe` (n,), see `assign_keyframes`.
     gravity [m/s^2]; imu_free: whether IMU intrinsics are estimated."""
-    n = len(times)
+    n, n_imu = len(times), _n_intrinsics(state, imu) if imu_free else 0
     if scheme == "inertial":
-        return _propagated(
-            _empty(n, n, imu_free), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0)
-        )
+        return _propagated(_empty(n, n, n_imu), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
     at, keyframes, J_keyframe = ImuMotion.empty(n), keyframes_of(state, gravity), np.zeros((n, 6, KEYFRAME_DIM))
     J_next = np.zeros((n if scheme == "pose" else 0, 6, KEYFRAME_DIM))
-    J_imu = np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
+    J_imu = np.zeros((n, 6, n_imu))
     if scheme == "pose":
         _between(times, keyframe, keyframes, at, J_keyframe, J_next)
     else:
@@ -273,24 +270,27 @@ def poses_without_jacobians(
     times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float
 ) -> Poses:
     """The `inertial` poses of `poses_at`, with Jacobians of length 0."""
-    return _propagated(
-        _empty(len(times), 0, False), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0)
-    )
+    return _propagated(_empty(len(times), 0, 0), times, keyframe, state, imu, gravity, VelocityDerivatives.empty(0, 0))
 
 
 def poses_and_velocity_derivatives(
     times: np.ndarray, keyframe: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> tuple[Poses, VelocityDerivatives]:
     """The `inertial` poses of `poses_at`, and derivatives of their velocities."""
-    n = len(times)
-    derivatives = VelocityDerivatives.empty(n, N_INTRINSICS if imu_free else 0)
-    return _propagated(_empty(n, n, imu_free), times, keyframe, state, imu, gravity, derivatives), derivatives
+    n, n_imu = len(times), _n_intrinsics(state, imu) if imu_free else 0
+    derivatives = VelocityDerivatives.empty(n, n_imu)
+    return _propagated(_empty(n, n, n_imu), times, keyframe, state, imu, gravity, derivatives), derivatives
 
 
-def _empty(n: int, n_jacobians: int, imu_free: bool) -> Poses:
-    """Arrays for n `inertial` poses; n_jacobians: n, or 0 for no Jacobians. imu_free: whether IMU intrinsics are
+def _n_intrinsics(state: State, imu: ImuData) -> int:
+    """Number of IMU intrinsics, 24."""
+    return len(state.values[imu.name, "intrinsics"])
+
+
+def _empty(n: int, n_jacobians: int, n_imu: int) -> Poses:
+    """Arrays for n `inertial` poses; n_jacobians: n, or 0 for no Jacobians. n_imu: number of IMU intrinsics that are
     estimated."""
-    J_imu = np.zeros((n_jacobians, 6, N_INTRINSICS if imu_free else 0))
+    J_imu = np.zeros((n_jacobians, 6, n_imu))
     return Poses(*ImuMotion.empty(n), np.zeros((n_jacobians, 6, KEYFRAME_DIM)), np.zeros((0, 6, KEYFRAME_DIM)), J_imu)
 
 
