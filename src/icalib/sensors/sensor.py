@@ -92,6 +92,8 @@ class Sensor:
     rig. needs_imu: it cannot be used without an IMU. is_inertial: it is an IMU. shows_planes: it measures points on
     planes. sees_target: it measures points of the target. drives: the rig drives on it, so that it hardly tilts. lens:
     names of those of `parameters` that are its camera model, empty without one; its projection is what counts of them.
+    may_change: groups of its parameters, by name, that may change together during a recording, as clocks drift and
+    mounts move.
     """
 
     sensor_type: ClassVar[str]
@@ -105,6 +107,7 @@ class Sensor:
     sees_target: ClassVar[bool] = False
     drives: ClassVar[bool] = False
     lens: ClassVar[tuple[str, ...]] = ()
+    may_change: ClassVar[tuple[tuple[str, ...], ...]] = ((TIME_OFFSET.name,), (ROTATION.name, TRANSLATION.name))
     clock_restarts = False  # a field of `ClockedSensor`
     name: str
 

@@ -89,7 +89,7 @@ def changing(
     if misfit.fits and (hit := disturbance(estimate, misfit.chi2, misfit.sensors)) is not None:
         causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
     if segments is not None and (misfit.fits or scattering):
-        breaks = changes(segments, tuple(s.name for s in inputs.sensors))
+        breaks = changes(segments, inputs.sensors)
         if breaks and breaks[0].gain > max(CHANGES * heterogeneity(segments), SIGNIFICANT * breaks[0].count):
             alike = [c for c in breaks if c.key[0] == breaks[0].key[0] and c.gain > ALIKE * breaks[0].gain]
             causes.append(Cause(_change_words(alike, segments, timeline), breaks[0].gain, True))

@@ -10,7 +10,7 @@ Changes within a segment are not detected.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,11 +19,8 @@ import numpy as np
 from icalib.estimate.residual_statistics.segments import Segments
 from icalib.optim.calib_block import complement
 from icalib.optim.state import Key
-from icalib.sensors.camera.spec import INTRINSICS
-from icalib.sensors.sensor import ROTATION, TIME_OFFSET, TRANSLATION
+from icalib.rig import Sensor
 
-# Groups that change together. Target, planes and IMU are the reference for the others, and are not tested.
-CHANGING_GROUPS = ((TIME_OFFSET.name,), (ROTATION.name, TRANSLATION.name), (INTRINSICS.name,))
 # information in tolerance units (sigma of 1000 tolerances): keeps the form positive definite if unobservable
 RIDGE_INFORMATION = 1e-6
 
@@ -47,8 +44,9 @@ class Change:
         return len(self.value)
 
 
-def changes(parts: Segments, sensors: tuple[str, ...]) -> tuple[Change, ...]:
-    """The pattern with the largest gain for each group of `sensors`, sorted by decreasing gain."""
+def changes(parts: Segments, sensors: Sequence[Sensor]) -> tuple[Change, ...]:
+    """The pattern with the largest gain for each group of `sensors`, sorted by decreasing gain. Target, planes and IMU
+    are the reference for the others, and are not tested."""
     best_changes: dict[Key, Change] = {}
     form = _Form.of(parts)
     for change in _tested(parts, form, sensors):
@@ -58,7 +56,7 @@ def changes(parts: Segments, sensors: tuple[str, ...]) -> tuple[Change, ...]:
     return tuple(sorted(best_changes.values(), key=lambda c: -c.gain))
 
 
-def _tested(parts: Segments, form: _Form, sensors: tuple[str, ...]) -> Iterator[Change]:
+def _tested(parts: Segments, form: _Form, sensors: Sequence[Sensor]) -> Iterator[Change]:
     """Yields the drift and all steps of each group of `sensors`."""
     ends = parts.state.seconds[parts.ends]
     middle = 0.5 * (ends[:-1] + ends[1:])
@@ -66,12 +64,12 @@ def _tested(parts: Segments, form: _Form, sensors: tuple[str, ...]) -> Iterator[
     layout = parts.problem.layout
     free = {b.key for b in layout.free}
     for sensor in sensors:
-        for names in CHANGING_GROUPS:
-            free_names = [name for name in names if (sensor, name) in free]
+        for names in sensor.may_change:
+            free_names = [name for name in names if (sensor.name, name) in free]
             if not free_names:
                 continue
-            columns = np.concatenate([layout.columns(sensor, name) for name in free_names])
-            key = (sensor, free_names[0])
+            columns = np.concatenate([layout.columns(sensor.name, name) for name in free_names])
+            key = (sensor.name, free_names[0])
             yield form.change(key, columns, middle - centre, "drift", float(centre))
             for k in range(1, parts.count):
                 pattern = (np.arange(parts.count) >= k).astype(np.float64)

@@ -77,6 +77,7 @@ class Camera(MountedSensor):
     sees_target: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, INTRINSICS, DISTORTION, BLOOM)
     lens: ClassVar[tuple[str, ...]] = LENS
+    may_change: ClassVar[tuple[tuple[str, ...], ...]] = (*MountedSensor.may_change, (INTRINSICS.name,))
 
     path: str
     model: str
