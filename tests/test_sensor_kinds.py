@@ -37,13 +37,10 @@ NAMING = {
     "detection/tracking/stereo.py",
     "detection/tracking/streams.py",
     "estimate/noise_size.py",
-    "estimate/problem/guess_priors.py",
     "estimate/problem/inputs.py",
-    "estimate/residual_statistics/parameter_changes.py",
     "initialize/assumed_motion.py",
     "initialize/cameras_on_odometry.py",
     "motion/imu_data.py",
-    "motion/poses.py",
     "pipeline.py",
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users

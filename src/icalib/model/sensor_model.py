@@ -116,6 +116,11 @@ class SensorModel(Generic[S, N]):
         del sensor, rig
         return instants(stream, values)
 
+    def widen_guess_sigma(self, sensor: S, layout: Layout, state: State, sigma: np.ndarray) -> None:
+        """Enlarges standard deviations (B,) of the initial guess where errors of other parameters of the sensor add to
+        them, to first order at `state`."""
+        del sensor, layout, state, sigma
+
     # Noise
 
     def first_noise(self, sensor: S, settings: Settings) -> N:

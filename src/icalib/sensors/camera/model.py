@@ -14,7 +14,8 @@ from icalib.model.statistics import PassEnd
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
 from icalib.motion.time_offsets import instants
 from icalib.optim.arrowhead import chain_cuts
-from icalib.rig import Camera, ParameterSpec, Rig, Settings
+from icalib.optim.state import Layout, State
+from icalib.rig import LENS, Camera, ParameterSpec, Rig, Settings
 from icalib.sensors.camera.bloom import with_bloom
 from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
@@ -41,6 +42,7 @@ from icalib.sensors.camera.spec import BLOOM
 from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # directions without bloom; single precision is enough for directions
+COEFFICIENT_STEP = 1e-4  # step of a distortion coefficient, for a difference quotient
 COARSE_TRACK_S = 0.5  # s, longest track of an early pass: short tracks are cheap, and rough poses still fit them
 ENOUGH_USED = 0.8  # share of track observations in use, above which no further pass is tried
 MORE_USED = 1.1  # observations usable at the end of a pass over those in use, above which the pass is repeated
@@ -81,6 +83,12 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
         if spec == BLOOM and not rig.blooms:
             return np.zeros(BLOOM.size)
         return super().start_value(sensor, spec, rig)
+
+    def widen_guess_sigma(self, sensor: Camera, layout: Layout, state: State, sigma: np.ndarray) -> None:
+        """See `SensorModel`: errors of distortion coefficients add to those of fx and fy."""
+        columns = layout.columns(sensor.name, *LENS)
+        if (columns >= 0).all():
+            sigma[columns[:2]] = np.hypot(sigma[columns[:2]], _focal_sigma(sensor, state, sigma[columns[4:]]))
 
     def scaled_noise(self, noise: CameraNoise, scale: float) -> CameraNoise:
         """See `SensorModel`: scales sigma of the corners."""
@@ -152,6 +160,19 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
     def clusters(self, factors: Mapping[FactorKey, Factor]) -> Iterator[Clusters]:
         """Clusters of corners and track observations whose errors may correlate, see `error_clusters`."""
         return error_clusters(of_type(factors, CornerFactor), of_tracks(factors))
+
+
+def _focal_sigma(camera: Camera, state: State, sigma: np.ndarray) -> float:
+    """Standard deviation of fx [px] due to errors of the distortion coefficients, with standard deviations `sigma`.
+
+    A guess gives the scale at the image centre. In some models this scale depends on a coefficient, too: it is fx / (1
+    + xi) in the unified model. An error of xi then changes fx.
+    """
+    model, fx = camera_model(camera.model), state.values[camera.name, "intrinsics"][0]
+    lens = np.concatenate([state.values[camera.name, name] for name in LENS])
+    steps = lens + COEFFICIENT_STEP * np.eye(len(lens))[4:]
+    slope = (np.array([model.central_scale(p) for p in steps]) / model.central_scale(lens) - 1.0) / COEFFICIENT_STEP
+    return float(fx * np.sqrt(((slope * sigma) ** 2).sum()))
 
 
 def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: Pass) -> CornerFactor:
