@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
+from icalib.motion.sweep import EstimatedMotion
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
 from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior
@@ -177,6 +178,10 @@ class World:
             old = changed["wheel0", name]
             changed["wheel0", name] = old @ so3.exp(np.array(d)) if name == "rotation" else old + d
         return replace(self.state, values=changed)
+
+    def motion(self, state: State | None = None) -> EstimatedMotion:
+        """At `state`, by default the truth."""
+        return EstimatedMotion(state or self.state, self.imu, 9.81, 0.5)
 
 
 BIAS = np.array([0.01, -0.02, 0.005, 0.1, -0.05, 0.08])

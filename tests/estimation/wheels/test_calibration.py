@@ -64,7 +64,7 @@ class Slipping:
 
     def __call__(self, state):
         w = self.world
-        factor = IncrementFactor.build("wheel0", w.seconds, self.angles, w.imu, 9.81, self.noise, w.layout, state)
+        factor = IncrementFactor.build("wheel0", w.seconds, self.angles, w.motion(state), self.noise, w.layout)
         dt = w.seconds[factor.intervals.last] - w.seconds[factor.intervals.first]
         measured = factor.measured.copy()
         measured[:, 2:] += self.slip[factor.intervals.keyframe] * np.sqrt(dt)[:, None]
@@ -210,7 +210,7 @@ def test_a_robust_loss_forgives_wheels_that_spun(drive_of_kind, world_of, proble
 
 def paper_factor(world, angles, noise):
     def at(state):
-        return RelativePoseFactor.build("wheel0", world.seconds, angles, world.imu, 9.81, noise, world.layout, state)
+        return RelativePoseFactor.build("wheel0", world.seconds, angles, world.motion(state), noise, world.layout)
 
     return at
 

@@ -38,7 +38,7 @@ def rows(factor, state):
 
 
 def factor_on(world, ground=LEVEL, key=None):
-    return GroundFactor.build("wheel0", ground, (key,), world.state, world.imu, world.layout)
+    return GroundFactor.build("wheel0", ground, (key,), world.state, world.layout)
 
 
 def test_on_a_flat_floor_nothing_is_left(world_of, drive_of_kind):
@@ -138,9 +138,9 @@ def test_the_floor_is_the_level_plane_below_with_most_points(world_of, drive_of_
 def test_recordings_that_do_not_see_the_floor_have_no_part(world_of, drive_of_kind):
     world = standing(world_of, drive_of_kind, plane_of(np.array([0.0, 0.0, 1.0]), np.zeros(3)))
     state = replace(world.state, starts=(0, 30))
-    factor = GroundFactor.build("wheel0", FLOOR, (None, KEY), state, world.imu, world.layout)
+    factor = GroundFactor.build("wheel0", FLOOR, (None, KEY), state, world.layout)
     assert factor.keyframes.tolist() == list(range(30, len(state.seconds) - 1))
-    none = GroundFactor.build("wheel0", FLOOR, (None, None), state, world.imu, world.layout)
+    none = GroundFactor.build("wheel0", FLOOR, (None, None), state, world.layout)
     found: Any = SimpleNamespace(
         problem=SimpleNamespace(factors={("seen", "ground"): factor, ("unseen", "ground"): none})
     )

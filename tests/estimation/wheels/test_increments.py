@@ -13,9 +13,7 @@ UNIT = WheelNoise(1.0, 1.0, 1.0)
 
 
 def factor_on(world, noise=UNIT):
-    return IncrementFactor.build(
-        "wheel0", world.seconds, world.angles, world.imu, 9.81, noise, world.layout, world.state
-    )
+    return IncrementFactor.build("wheel0", world.seconds, world.angles, world.motion(), noise, world.layout)
 
 
 def output(factor, state, sums=True):

@@ -54,7 +54,7 @@ def forwards(drive_of_kind, waves, path="hills"):
 
 def factor_on(world, stream, noise=UNIT):
     return IncrementFactor.build(
-        "wheel0", stream.seconds, integrals_of(stream), world.imu, 9.81, noise, world.layout, world.state, stream.kind
+        "wheel0", stream.seconds, integrals_of(stream), world.motion(), noise, world.layout, stream.kind
     )
 
 

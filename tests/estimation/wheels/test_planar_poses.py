@@ -88,7 +88,7 @@ def test_covariance_is_that_of_samples():
 
 def factor_on(world):
     return RelativePoseFactor.build(
-        "wheel0", world.seconds, world.angles, world.imu, 9.81, WheelNoise(0.01), world.layout, world.state
+        "wheel0", world.seconds, world.angles, world.motion(), WheelNoise(0.01), world.layout
     )
 
 

@@ -8,13 +8,13 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
-from icalib.motion.factor import Whitened
+from icalib.motion.factor import pairs_of
 from icalib.result import SensorFit
 from icalib.result.excess import excess, times
 from icalib.result.row_records import lag_one_correlation
 from icalib.result.timeline import Timeline
 from icalib.rig import PoseSensor, Rig
-from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
+from icalib.sensors.pose.residual import PoseFactor, PoseNoise
 
 # Lag-one autocorrelation of residuals: a warning is given above the first value (absolute poses), or below minus the
 # second (relative poses). It is 0 for the assumed noise, and -0.5 for differences of poses with independent noise.
@@ -24,18 +24,15 @@ UNKNOWN_CAUSE = "they are no white noise, and the cause is unknown: check its cl
 
 def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """One note for each pose sensor: number of poses (or relative poses) used, and their noise."""
-    counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(estimate)}
+    counts = {
+        f.name: f.count(out, "rotation") // 3
+        for f, out in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PoseFactor)
+    }
     posing = [estimate.measurement_model.noise[s.name] for s in inputs.rig.poses]
     for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, posing, strict=True):
         what = "poses" if sensor.kind == "absolute" else "steps"
         count = f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses"
         yield f"{count} of {sensor.name}; {_noise(sensor, noise)}."
-
-
-def _pose_factors(estimate: Estimate) -> list[tuple[AbsolutePoseFactor | RelativePosesFactor, Whitened]]:
-    """All factors of pose sensors, with their whitened residuals."""
-    pairs = [(f, estimate.outcome.residuals[key]) for key, f in estimate.problem.factors.items()]
-    return [(f, out) for f, out in pairs if isinstance(f, AbsolutePoseFactor | RelativePosesFactor)]
 
 
 def _noise(sensor: PoseSensor, noise: PoseNoise) -> str:
@@ -54,7 +51,7 @@ def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """Warnings on residuals that are correlated in time: poses are filtered or drift, or the kind (absolute, relative)
     is wrong."""
     kinds = {s.name: s.kind for s in inputs.rig.poses}
-    for factor, rows in _pose_factors(estimate):
+    for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PoseFactor):
         for what, components in (("rotation", rows.residual[:, :3]), ("position", rows.residual[:, 3:])):
             correlation = lag_one_correlation(components)
             if kinds[factor.name] == "absolute" and correlation > MAX_LAG_ONE_CORRELATION:

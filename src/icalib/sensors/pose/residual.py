@@ -11,6 +11,7 @@ would multiply the noise, and the estimated scale would be too small.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -51,7 +52,7 @@ class PoseNoise:
     loss_scale: float = 2.5
 
 
-class _PoseFactor(RowFactor):
+class PoseFactor(RowFactor, ABC):
     """Common base of both factors: n measurements with three rows of rotation and three of position each. name: name of
     the sensor."""
 
@@ -59,11 +60,13 @@ class _PoseFactor(RowFactor):
 
     name: str
     rotation: np.ndarray
+    position: np.ndarray
+    noise: PoseNoise
 
     @property
+    @abstractmethod
     def sigma(self) -> np.ndarray:
         """(n, 6) standard deviation of each row [rad, m]."""
-        raise NotImplementedError
 
     @property
     def key(self) -> FactorKey:
@@ -80,14 +83,14 @@ class _PoseFactor(RowFactor):
         return Whitened.empty(len(self.rotation), 6)
 
     @property
+    @abstractmethod
     def instants(self) -> np.ndarray:
         """(n,) times of the measurements [s], on the sensor's clock since its first stamp."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def keyframes(self) -> np.ndarray:
         """(n,) index of the keyframe of each measurement; the first of two for relative poses."""
-        raise NotImplementedError
 
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
@@ -101,9 +104,13 @@ class _PoseFactor(RowFactor):
         """(n, 6) standard deviations [rad, m]."""
         return self.sigma
 
+    @abstractmethod
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See `Factor`."""
+
 
 @dataclass(frozen=True)
-class AbsolutePoseFactor(_PoseFactor):
+class AbsolutePoseFactor(PoseFactor):
     """n poses of one sensor in its frame, see `absolute_residuals`. keyframe (n,), increasing: index of the keyframe
     from which each pose is propagated. imu: None if all poses were taken at keyframes that no IMU connects. gravity
     [m/s^2]."""
@@ -145,17 +152,17 @@ class AbsolutePoseFactor(_PoseFactor):
 
     @property
     def instants(self) -> np.ndarray:
-        """See `_PoseFactor`."""
+        """See `PoseFactor`."""
         return self.seconds
 
     @property
     def keyframes(self) -> np.ndarray:
-        """See `_PoseFactor`."""
+        """See `PoseFactor`."""
         return self.keyframe
 
     @property
     def sigma(self) -> np.ndarray:
-        """See `_PoseFactor`."""
+        """See `PoseFactor`."""
         return np.tile(np.repeat([self.noise.rotation, self.noise.position], 3), (len(self.seconds), 1))
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
@@ -187,7 +194,7 @@ class AbsolutePoseFactor(_PoseFactor):
 
 
 @dataclass(frozen=True)
-class RelativePosesFactor(_PoseFactor):
+class RelativePosesFactor(PoseFactor):
     """n relative poses of one sensor, see `relative_residuals`, each between two stamps close to two consecutive
     keyframes. Their noise is a random walk: independent, with a variance proportional to the duration."""
 
@@ -223,12 +230,12 @@ class RelativePosesFactor(_PoseFactor):
 
     @property
     def keyframes(self) -> np.ndarray:
-        """See `_PoseFactor`."""
+        """See `PoseFactor`."""
         return self.intervals.keyframe
 
     @property
     def sigma(self) -> np.ndarray:
-        """See `_PoseFactor`."""
+        """See `PoseFactor`."""
         duration = self.seconds[self.intervals.last] - self.seconds[self.intervals.first]
         return np.sqrt(duration)[:, None] * np.repeat([self.noise.rotation, self.noise.position], 3)
 
@@ -257,9 +264,6 @@ class RelativePosesFactor(_PoseFactor):
         columns = np.append(kinematics.columns(clock), self.layout.columns(self.name, "scale"))
         rows = _rows(residuals, (a, b), self, state, block)
         return add_rows(rows, block, keyframe, columns, _noise(self, block), into)
-
-
-PoseFactor = AbsolutePoseFactor | RelativePosesFactor
 
 
 def _rows(

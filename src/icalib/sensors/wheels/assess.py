@@ -10,7 +10,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.vectors import is_near
 from icalib.initialize.steps.vertical import level_sensor
-from icalib.motion.factor import of_type
+from icalib.motion.factor import of_type, pairs_of
 from icalib.result import ParameterGroup, RowResiduals, SensorFit
 from icalib.result.excess import excess, times
 from icalib.result.row_records import row_record
@@ -18,7 +18,7 @@ from icalib.result.timeline import Timeline
 from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
 from icalib.sensors.wheels.initialize.drive_guess import REVERSED_YAW
-from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor
+from icalib.sensors.wheels.residual import WheelFactor
 
 LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical slip": ("vertical",)} | {
     "yaw": ("yaw",),
@@ -46,10 +46,8 @@ UNIT_TOLERANCE = 0.1  # relative deviation of a size ratio from the factor of a 
 
 def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
     """The residuals of each set of wheels, one row per interval between keyframes; the measured slip is 0."""
-    for key, factor in estimate.problem.factors.items():
-        if isinstance(factor, IncrementFactor | RelativePoseFactor):
-            rows = factor.rows(estimate.outcome.residuals[key], estimate.outcome.state)
-            yield row_record("increments", rows, timeline, LABELS)
+    for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, WheelFactor):
+        yield row_record("increments", factor.rows(rows, estimate.outcome.state), timeline, LABELS)
 
 
 def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:

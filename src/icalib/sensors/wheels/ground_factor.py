@@ -76,12 +76,11 @@ class GroundFactor(RowFactor):
     floor: tuple[Key | None, ...]
     keyframes: np.ndarray  # (n,)
     starts: tuple[int, ...]
-    imu: ImuData
     layout: Layout
 
     @classmethod
     def build(
-        cls, name: str, ground: Ground, floor: tuple[Key | None, ...], state: State, imu: ImuData, layout: Layout
+        cls, name: str, ground: Ground, floor: tuple[Key | None, ...], state: State, layout: Layout
     ) -> GroundFactor:
         """The factor at all keyframes of recordings with a plane, except the last keyframe of each."""
         used = [
@@ -90,7 +89,7 @@ class GroundFactor(RowFactor):
             if ground.plane == "level" or key is not None
         ]
         keyframes = np.concatenate([np.empty(0, dtype=np.int64), *used])
-        return cls(name, ground, floor, keyframes, state.starts, imu, layout)
+        return cls(name, ground, floor, keyframes, state.starts, layout)
 
     @property
     def key(self) -> FactorKey:

@@ -13,7 +13,7 @@ from icalib.optim.state import Key, Layout
 from icalib.rig import Settings, Wheels
 from icalib.sensors.wheels.ground_factor import GroundFactor, floors
 from icalib.sensors.wheels.integrals import integrals_of
-from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
+from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelFactor, WheelNoise
 
 
 class WheelModel(SensorModel[Wheels, WheelNoise]):
@@ -36,17 +36,16 @@ class WheelModel(SensorModel[Wheels, WheelNoise]):
             floor: tuple[Key | None, ...] = (None,) * len(at.state.recordings)
             if sensor.ground.plane == "floor" and at.association.count:
                 floor = floors(at.state, at.association.keys, at.association.points, at.association.recording)
-            yield GroundFactor.build(sensor.name, sensor.ground, floor, at.state, at.motion.imu, at.layout)
+            yield GroundFactor.build(sensor.name, sensor.ground, floor, at.state, at.layout)
 
 
 def wheel_factor(
     wheels: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, motion: EstimatedMotion, layout: Layout
-) -> IncrementFactor | RelativePoseFactor:
+) -> WheelFactor:
     """The factor of the readings; the fields `measures` and `factor` of the rig file choose its type."""
     if isinstance(stream, WheelPoses):
-        return RelativePoseFactor.of_poses(stream, motion.imu, motion.gravity, noise, layout, motion.state)
-    name, seconds, state = wheels.name, stream.seconds, motion.state
-    arguments = name, seconds, integrals_of(stream), motion.imu, motion.gravity, noise, layout, state
+        return RelativePoseFactor.of_poses(stream, motion, noise, layout)
+    arguments = wheels.name, stream.seconds, integrals_of(stream), motion, noise, layout
     times = instants(stream, motion.state.values)
     if wheels.factor == "relative-poses":
         return RelativePoseFactor.build(*arguments, times)

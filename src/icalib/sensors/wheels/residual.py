@@ -14,6 +14,7 @@ of wheels: for a pair radii (left, right) and baseline; see `drive_rows`.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -34,6 +35,7 @@ from icalib.motion.poses import (
 from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
 from icalib.motion.sensor_pose import N_POSE_PARAMETERS, Kinematics, SensorPose, rows_at
 from icalib.motion.stamp_intervals import StampIntervals, choose_intervals, pose_intervals
+from icalib.motion.sweep import EstimatedMotion
 from icalib.motion.time_offsets import instants, offset_at, slices_by_clock
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
@@ -62,8 +64,74 @@ class WheelNoise:
     steering: float = 1e-3  # of a steering angle [rad/sqrt(Hz)]
 
 
+class WheelFactor(RowFactor, ABC):
+    """Common base of both factors: n intervals with m rows each. name: name of the wheels."""
+
+    name: str
+    kind: WheelKind
+    intervals: StampIntervals
+    imu: ImuData
+    noise: WheelNoise
+    layout: Layout
+    gravity: float
+
+    @property
+    @abstractmethod
+    def W(self) -> np.ndarray:
+        """(n, m, m) whitening matrices."""
+
+    @property
+    @abstractmethod
+    def kinds(self) -> dict[str, slice]:
+        """See `Factor`."""
+
+    @property
+    def key(self) -> FactorKey:
+        """See `Factor`."""
+        return self.name, "wheels"
+
+    def output(self) -> Whitened:
+        """See `Factor`."""
+        return Whitened.empty(*self.W.shape[:2])
+
+    def raw(self, out: Whitened) -> np.ndarray:
+        """(n, m) residuals in the units of the rows."""
+        return np.linalg.solve(self.W, out.residual[:, :, None])[:, :, 0]
+
+    def raw_sigma(self) -> np.ndarray:
+        """(n, m) marginal standard deviations of the rows; the covariance is (W^T W)^-1."""
+        return np.linalg.norm(np.linalg.inv(self.W), axis=2)
+
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """Fills `out` for the intervals in `piece`, and adds them to the normal equations of `piece` if `sums`.
+
+        Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
+        """
+        into = Into(piece, out, sums, curved)
+        first, last = np.searchsorted(self.intervals.keyframe, [piece.first, piece.last]).tolist()
+        return sum(self._added(block, state, into) for block in in_chunks(slice(first, last)))
+
+    @abstractmethod
+    def _added(self, block: slice, state: State, into: Into) -> float:
+        """Adds the intervals `block`; returns half their robust chi^2."""
+
+    def _add(self, block: slice, rows: Rows, state: State, into: Into) -> float:
+        """Adds the rows of the intervals `block` to the normal equations; returns half their robust chi^2. The
+        calibration columns of the rows are those of the pose, then those of the drive parameters."""
+        cost, keyframe = 0.0, self.intervals.keyframe[block]
+        drive = self.layout.columns(self.name, *drive_names(self.kind))
+        drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])
+        kinematics = Kinematics.of(self)
+        for clock, part in slices_by_clock(state, self.name, keyframe):
+            columns = np.concatenate([kinematics.columns(clock), drive])
+            of_clock = slice(block.start + part.start, block.start + part.stop)
+            noise = RobustNoise(self.W[of_clock], self.noise.loss, self.noise.loss_scale)
+            cost += add_rows(Rows(rows.residual[part], rows.J[part]), of_clock, keyframe[part], columns, noise, into)
+        return cost
+
+
 @dataclass(frozen=True)
-class IncrementFactor(RowFactor):
+class IncrementFactor(WheelFactor):
     """Increments of wheel angles, distance or yaw over n intervals.
 
     With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) (poses propagated by the IMU, scheme `inertial`),
@@ -93,8 +161,9 @@ class IncrementFactor(RowFactor):
     layout: Layout
 
     @property
-    def key(self) -> FactorKey:
-        return self.name, "wheels"
+    def W(self) -> np.ndarray:
+        """See `WheelFactor`."""
+        return self.whitening
 
     @property
     def kinds(self) -> Kinds:
@@ -106,19 +175,18 @@ class IncrementFactor(RowFactor):
         name: str,
         seconds: np.ndarray,
         integrals: np.ndarray,
-        imu: ImuData,
-        gravity: float,
+        motion: EstimatedMotion,
         noise: WheelNoise,
         layout: Layout,
-        state: State,
         kind: WheelKind = "pair",
         times: np.ndarray | None = None,
     ) -> IncrementFactor:
-        """Chooses intervals between keyframes of `state`, and computes measurements and noise over these.
+        """Chooses intervals between keyframes of `motion`, and computes measurements and noise over these.
 
         seconds (N,): stamps since the first, on the wheels' clock; integrals (N, m): see `integrals_of`, for a pair the
         angles of both wheels [rad]. times (N,): stamps on the IMU's clock; default: seconds plus the only time offset.
         """
+        state, imu = motion.state, motion.imu
         intervals = wheel_intervals(name, seconds, imu, state, times)
         dt = seconds[intervals.last] - seconds[intervals.first]
         increments = integrals[intervals.last] - integrals[intervals.first]
@@ -131,34 +199,13 @@ class IncrementFactor(RowFactor):
         k = intervals.keyframe
         change = state.seconds[k + 1] - offset_at(state, name, k) if imu.forwards else None
         instants = quadrature(seconds, intervals, change)
-        return cls(name, kind, intervals, measured, mean, whitening, instants, imu, gravity, noise, layout)
-
-    def output(self) -> Whitened:
-        """See `Factor`."""
-        return Whitened.empty(len(self.measured), 4)
+        return cls(name, kind, intervals, measured, mean, whitening, instants, imu, motion.gravity, noise, layout)
 
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
         return self.instants.times[self.instants.start[:-1]] + offset_at(state, self.name, self.intervals.keyframe)
 
-    def raw(self, out: Whitened) -> np.ndarray:
-        """See `RowFactor`."""
-        return _unwhitened(out, self.whitening)
-
-    def raw_sigma(self) -> np.ndarray:
-        """See `RowFactor`."""
-        return _raw_sigma(self.whitening)
-
-    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """Fills `out` for the intervals in `piece`, and adds them to the normal equations of `piece` if `sums`.
-
-        Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
-        """
-        into = Into(piece, out, sums, curved)
-        return sum(self._added(block, state, into) for block in in_chunks(_in_piece(self.intervals, piece)))
-
     def _added(self, block: slice, state: State, into: Into) -> float:
-        """Adds the intervals `block`; returns half their robust chi^2."""
         start = self.instants.start[block.start : block.stop + 1]
         used = slice(int(start[0]), int(start[-1]))
         keyframe = self.instants.keyframe[used]
@@ -171,11 +218,11 @@ class IncrementFactor(RowFactor):
             start - start[0], self.instants.weight[used], _samples(keyframe, poses), velocities, wheels, c,
             self.measured[block], rows,
         )  # fmt: skip
-        return _add(self, block, rows, state, into)
+        return self._add(block, rows, state, into)
 
 
 @dataclass(frozen=True)
-class RelativePoseFactor(RowFactor):
+class RelativePoseFactor(WheelFactor):
     """Relative planar poses of the wheels over n intervals, equations (27)-(28) of the iCalib paper, whitened jointly:
 
         e_3 Log(R_wheel(k)_wheel(k+1)) - yaw
@@ -188,7 +235,6 @@ class RelativePoseFactor(RowFactor):
     in the mean squared yaw (errors in variables), which grows as intervals become shorter.
     """
 
-    kind: ClassVar[WheelKind] = "pair"
     units: ClassVar[Mapping[str, str]] = {"yaw": "rad", "path": "m"}
 
     name: str
@@ -199,29 +245,26 @@ class RelativePoseFactor(RowFactor):
     gravity: float
     noise: WheelNoise
     layout: Layout
+    kind: WheelKind = "pair"
 
     @classmethod
     def of_poses(
-        cls, stream: WheelPoses, imu: ImuData, gravity: float, noise: WheelNoise, layout: Layout, state: State
+        cls, stream: WheelPoses, motion: EstimatedMotion, noise: WheelNoise, layout: Layout
     ) -> RelativePoseFactor:
         """The factor of recorded relative poses, which do not depend on radii and baseline. Their noise includes the
         propagated IMU noise between keyframes and stamps."""
+        state, imu = motion.state, motion.imu
         times = instants(stream, state.values)
         intervals = pose_intervals(imu, state.seconds, state.starts, times)
         k = intervals.first
         ends = [(intervals.keyframe, times[k]), (intervals.keyframe + 1, times[intervals.last])]
-        first, last = (poses_at("inertial", t, keyframe, state, imu, gravity, False) for keyframe, t in ends)
+        first, last = (poses_at("inertial", t, keyframe, state, imu, motion.gravity, False) for keyframe, t in ends)
         propagated = np.stack([np.abs(t - state.seconds[keyframe]) for keyframe, t in ends], axis=1)
         wheels = Extrinsics(state.values[stream.name, "rotation"], state.values[stream.name, "translation"])
         covariance = stream.covariance[k] + propagation_noise(first, last, propagated, wheels, imu)
         W = np.linalg.inv(np.linalg.cholesky(covariance))
         poses = RelativePoses(stream.pose[k], np.zeros((len(k), 3, 3)), W, np.zeros(3))
-        return cls(stream.name, stream.seconds, intervals, poses, imu, gravity, noise, layout)
-
-    @property
-    def whitening(self) -> np.ndarray:
-        """(n, 3, 3), see `RelativePoses.W`."""
-        return self.poses.W
+        return cls(stream.name, stream.seconds, intervals, poses, imu, motion.gravity, noise, layout)
 
     @classmethod
     def build(
@@ -229,50 +272,32 @@ class RelativePoseFactor(RowFactor):
         name: str,
         seconds: np.ndarray,
         angles: np.ndarray,
-        imu: ImuData,
-        gravity: float,
+        motion: EstimatedMotion,
         noise: WheelNoise,
         layout: Layout,
-        state: State,
         times: np.ndarray | None = None,
     ) -> RelativePoseFactor:
-        """See `IncrementFactor.build`. angles (N, 2) rad, integrated with the radii and the baseline of `state`."""
-        intervals = wheel_intervals(name, seconds, imu, state, times)
-        poses = preintegrated(seconds, angles, intervals, drive_of(name, state), noise.wheel, noise.lateral_slip)
-        return cls(name, seconds, intervals, poses, imu, gravity, noise, layout)
+        """See `IncrementFactor.build`. angles (N, 2) rad, integrated with the radii and the baseline of `motion`."""
+        intervals = wheel_intervals(name, seconds, motion.imu, motion.state, times)
+        drive = drive_of(name, motion.state)
+        poses = preintegrated(seconds, angles, intervals, drive, noise.wheel, noise.lateral_slip)
+        return cls(name, seconds, intervals, poses, motion.imu, motion.gravity, noise, layout)
 
     @property
-    def key(self) -> FactorKey:
-        return self.name, "wheels"
+    def W(self) -> np.ndarray:
+        """See `WheelFactor`."""
+        return self.poses.W
 
     @property
     def kinds(self) -> dict[str, slice]:
         """See `Factor`."""
         return {"yaw": slice(0, 1), "path": slice(1, 3)}
 
-    def output(self) -> Whitened:
-        """See `Factor`."""
-        return Whitened.empty(len(self.poses.z), 3)
-
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
         return self.seconds[self.intervals.first] + offset_at(state, self.name, self.intervals.keyframe)
 
-    def raw(self, out: Whitened) -> np.ndarray:
-        """See `RowFactor`."""
-        return _unwhitened(out, self.whitening)
-
-    def raw_sigma(self) -> np.ndarray:
-        """See `RowFactor`."""
-        return _raw_sigma(self.whitening)
-
-    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `IncrementFactor.accumulate`."""
-        into = Into(piece, out, sums, curved)
-        return sum(self._added(block, state, into) for block in in_chunks(_in_piece(self.intervals, piece)))
-
     def _added(self, block: slice, state: State, into: Into) -> float:
-        """Adds the intervals `block`; returns half their robust chi^2."""
         i, z, kinematics = self.intervals, self.poses, Kinematics.of(self)
         first = SensorPose.at(kinematics, self.seconds[i.first[block]], i.keyframe[block], state, into.sums)
         last = SensorPose.at(kinematics, self.seconds[i.last[block]], i.keyframe[block] + 1, state, into.sums)
@@ -287,7 +312,7 @@ class RelativePoseFactor(RowFactor):
         residual = relative.residual[:, YAW_X_Y] - z.z[block] - z.J_drive[block] @ (drive - z.drive0)
         J_pose = [np.ascontiguousarray(J[:, YAW_X_Y]) for J in relative.J_pose]
         rows = rows_at(residual, J_pose, (first, last), -z.J_drive[block] if into.sums else z.J_drive[:0])
-        return _add(self, block, rows, state, into)
+        return self._add(block, rows, state, into)
 
 
 def wheel_intervals(
@@ -345,34 +370,3 @@ def _motion(
 
 def _samples(keyframe: np.ndarray, p: Poses) -> MotionSamples:
     return MotionSamples(keyframe, p.rotation, p.position, p.rate, p.velocity, p.J_keyframe, p.J_imu)
-
-
-def _unwhitened(out: Whitened, whitening: np.ndarray) -> np.ndarray:
-    """(n, m) residuals in the units of the rows."""
-    return np.linalg.solve(whitening, out.residual[:, :, None])[:, :, 0]
-
-
-def _raw_sigma(whitening: np.ndarray) -> np.ndarray:
-    """(n, m) marginal standard deviations of the rows; the covariance is (W^T W)^-1."""
-    return np.linalg.norm(np.linalg.inv(whitening), axis=2)
-
-
-def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
-    """The intervals whose two keyframes lie in `piece`."""
-    i0, i1 = np.searchsorted(intervals.keyframe, [piece.first, piece.last])
-    return slice(int(i0), int(i1))
-
-
-def _add(factor: IncrementFactor | RelativePoseFactor, block: slice, rows: Rows, state: State, into: Into) -> float:
-    """Adds the rows of the intervals `block` to the normal equations; returns half their robust chi^2. The calibration
-    columns of the rows are those of the pose, then those of the drive parameters."""
-    cost, keyframe, layout = 0.0, factor.intervals.keyframe[block], factor.layout
-    drive = layout.columns(factor.name, *drive_names(factor.kind))
-    drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])
-    kinematics = Kinematics.of(factor)
-    for clock, part in slices_by_clock(state, factor.name, keyframe):
-        columns = np.concatenate([kinematics.columns(clock), drive])
-        rows_of_clock = slice(block.start + part.start, block.start + part.stop)
-        noise = RobustNoise(factor.whitening[rows_of_clock], factor.noise.loss, factor.noise.loss_scale)
-        cost += add_rows(Rows(rows.residual[part], rows.J[part]), rows_of_clock, keyframe[part], columns, noise, into)
-    return cost

@@ -74,7 +74,7 @@ def stuck(values: np.ndarray) -> np.ndarray:
 def _stands_off(seconds: np.ndarray, values: np.ndarray, far: float) -> np.ndarray:
     """(N,) bool: readings that deviate from the line between their neighbours by more than `far` local standard
     deviations on some axis. All False if too many readings do."""
-    off = _off_line(seconds, values, np.arange(1, len(values) - 1), 1)
+    off = _off_line(seconds, values)
     # Lower bound: half the spread over all readings, as the local spread of a still sensor may be small by chance.
     least = _MAD_TO_SIGMA * 0.5 * np.median(off, axis=0) + _digit(values)
     some = np.flatnonzero((off > far * least).any(axis=1))
@@ -91,12 +91,10 @@ def _digit(values: np.ndarray) -> np.ndarray:
     return np.where(step > 0.0, step, np.inf).min(axis=0, initial=1e300)
 
 
-def _off_line(seconds: np.ndarray, values: np.ndarray, at: np.ndarray, reach: int) -> np.ndarray:
-    """(n, 3) distance of the readings with indices `at` (n,) from the line between the readings `reach` before and
-    after."""
-    before, after = at - reach, at + reach
-    share = ((seconds[at] - seconds[before]) / np.maximum(seconds[after] - seconds[before], 1e-12))[:, None]
-    return np.abs(values[at] - (1.0 - share) * values[before] - share * values[after])
+def _off_line(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(N - 2, 3) distances of the inner readings (N, 3) from the line between their neighbours."""
+    share = ((seconds[1:-1] - seconds[:-2]) / np.maximum(seconds[2:] - seconds[:-2], 1e-12))[:, None]
+    return np.abs(values[1:-1] - (1.0 - share) * values[:-2] - share * values[2:])
 
 
 def _runs(flag: np.ndarray) -> list[tuple[int, int]]:
@@ -123,7 +121,7 @@ def _is_wrong(seconds: np.ndarray, values: np.ndarray, group: np.ndarray) -> boo
     low, high = max(group[0] - 2 * _HALF_WINDOW, 0), min(group[-1] + 2 * _HALF_WINDOW + 1, len(values))
     others = np.setdiff1d(np.arange(low, high), group, assume_unique=True)
     t, x = seconds[others], values[others]
-    off = _off_line(t, x, np.arange(1, len(others) - 1), 1)
+    off = _off_line(t, x)
     scale = _MAD_TO_SIGMA * np.median(off, axis=0) + 1e-300
     away = values[group] - np.stack([np.interp(seconds[group], t, x[:, k]) for k in range(3)], axis=1)
     if not (np.abs(away) > _MAX_DEVIATIONS * scale).any(axis=1).all():
