@@ -10,14 +10,14 @@ icalib did not write stay unchanged.
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from icalib.base.file_names import below
 from icalib.base.own_files import refuse_foreign
 from icalib.base.staging import staged
+from icalib.base.writing import writing
 from icalib.errors import CalibrationError
 
 COMMIT = ".icalib-commit"
@@ -39,7 +39,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
     Raises CalibrationError with the folder if it cannot be written; an earlier result is then still complete.
     """
-    with _errors_named(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         _move_in(folder)
         with staged(folder) as staging:
@@ -59,8 +59,14 @@ def read_file(folder: Path, name: str) -> bytes:
     # After such a crash, `.icalib-commit` still holds the new files that were not moved.
     committed = [] if _commit(folder) is None else [folder / COMMIT / name]
     for path in (*committed, folder / name):
-        with contextlib.suppress(FileNotFoundError), _errors_named(path, "read"):
+        try:
             return path.read_bytes()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise CalibrationError(
+                f"{path} cannot be read ({error.strerror or error}); check its permissions."
+            ) from error
     raise CalibrationError(f"{folder} holds no {name}; give the folder that a calibration was written to.")
 
 
@@ -69,7 +75,7 @@ def finish_writing(folder: Path) -> None:
 
     Raises CalibrationError if the folder cannot be written.
     """
-    with _errors_named(folder):
+    with writing(folder):
         _move_in(folder)
 
 
@@ -88,7 +94,7 @@ def set_of(folder: Path) -> list[Path]:
 
 def check_writable(folder: Path) -> None:
     """Creates `folder` and writes to it, so that a long run does not fail at its end. Raises CalibrationError."""
-    with _errors_named(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with staged(folder):
             pass
@@ -116,14 +122,3 @@ def _commit(folder: Path) -> Path | None:
     if commit.is_symlink():
         raise CalibrationError(f"{commit} is a link, which icalib never writes; remove it.")
     return commit if commit.is_dir() else None
-
-
-@contextlib.contextmanager
-def _errors_named(path: Path, verb: str = "written") -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if verb == "read" and isinstance(error, FileNotFoundError):
-            raise
-        advice = "check its permissions" if verb == "read" else "choose another folder"
-        raise CalibrationError(f"{path} cannot be {verb} ({error.strerror or error}); {advice}.") from error

@@ -11,7 +11,7 @@ from typing import Any
 from icalib.base.file_names import below
 from icalib.base.own_files import sealed_texts
 from icalib.base.staging import staged
-from icalib.errors import CalibrationError
+from icalib.base.writing import writing
 
 
 def printable(text: str) -> str:
@@ -39,17 +39,13 @@ def _finite(value: Any) -> Any:
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
     """Writes `texts` (name -> content) into `folder`, created if needed. Each file is replaced atomically, after all
     new files were written to a temporary folder. Raises CalibrationError if the folder cannot be written."""
-    try:
+    with writing(folder, "choose another place"):
         folder.mkdir(parents=True, exist_ok=True)
         with staged(folder) as place:
             for name, text in texts.items():
                 write_text(below(place, name), text)
             for name in texts:
                 (place / name).replace(folder / name)
-    except OSError as error:
-        raise CalibrationError(
-            f"{folder} cannot be written ({error.strerror or error}); choose another place."
-        ) from error
 
 
 def write_sealed(path: Path, text: str) -> None:

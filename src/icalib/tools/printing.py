@@ -10,6 +10,7 @@ from typing import Any
 from icalib.base.extras import install
 from icalib.base.own_files import refuse_foreign, sealed
 from icalib.base.staging import staged
+from icalib.base.writing import writing
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Markers, Tag, Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
@@ -39,14 +40,9 @@ def write_target(path: str | Path, target: Target, paper: str = "a4", border_bit
     path = Path(path)
     refuse_foreign([path], advice="choose another place")
     data = sealed(target_pdf(target, paper, border_bits))
-    try:
-        with staged(path.parent) as place:
-            (place / path.name).write_bytes(data)
-            (place / path.name).replace(path)
-    except OSError as error:
-        raise CalibrationError(
-            f"{path} cannot be written ({error.strerror or error}); give the path of a file in a folder that exists."
-        ) from error
+    with writing(path, "give the path of a file in a folder that exists"), staged(path.parent) as place:
+        (place / path.name).write_bytes(data)
+        (place / path.name).replace(path)
 
 
 def target_pdf(target: Target, paper: str = "a4", border_bits: int | None = None) -> bytes:

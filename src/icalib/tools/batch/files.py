@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from icalib.base.staging import staged
-from icalib.errors import CalibrationError
+from icalib.base.writing import writing
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -23,14 +23,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Raises CalibrationError if the file cannot be written.
     """
-    try:
-        with staged(path.parent) as place:
-            part = place / path.name
-            yield part
-            with part.open("r+b") as file:
-                os.fsync(file.fileno())
-            part.replace(path)
-    except OSError as error:
-        raise CalibrationError(
-            f"{path} cannot be written ({error.strerror or error}); choose another folder."
-        ) from error
+    with writing(path), staged(path.parent) as place:
+        part = place / path.name
+        yield part
+        with part.open("r+b") as file:
+            os.fsync(file.fileno())
+        part.replace(path)

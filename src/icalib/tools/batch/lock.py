@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from icalib.base.extras import load_filelock
+from icalib.base.writing import writing
 from icalib.errors import CalibrationError
 
 LOCK = ".lock"
@@ -21,17 +22,13 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
     """
     filelock = load_filelock()
     lock = filelock.FileLock(folder / LOCK)
-    try:
-        with suppress(NotImplementedError):  # the file system has no locks
+    with writing(folder), suppress(NotImplementedError):  # the file system has no locks
+        try:
             lock.acquire(blocking=False)
-    except filelock.Timeout:
-        raise CalibrationError(
-            f"another icalib uses {folder}; wait until it ends, stop it, or choose another folder."
-        ) from None
-    except OSError as error:
-        raise CalibrationError(
-            f"{folder} cannot be written ({error.strerror or error}); choose another folder."
-        ) from error
+        except filelock.Timeout:
+            raise CalibrationError(
+                f"another icalib uses {folder}; wait until it ends, stop it, or choose another folder."
+            ) from None
     try:
         yield
     finally:

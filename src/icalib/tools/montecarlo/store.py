@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from icalib.base.writing import writing
 from icalib.errors import CalibrationError
 from icalib.result.provenance import versions
 from icalib.tools.batch import check_worker, program, write_atomically
@@ -48,16 +49,12 @@ class RunStore:
 
     def __init__(self, folder: Path, identity: Identity) -> None:
         self.folder, self.identity = folder, identity
-        try:
+        with writing(folder):
             (folder / RUNS).mkdir(parents=True, exist_ok=True)
             if (folder / STUDY).exists():
                 self._check()
             else:
                 write_atomically(folder / STUDY, json.dumps(asdict(identity), indent=1).encode())
-        except OSError as error:
-            raise CalibrationError(
-                f"{folder} cannot be written ({error.strerror or error}); choose another folder."
-            ) from error
 
     def __contains__(self, seed: int) -> bool:
         return self._file(seed).exists()
