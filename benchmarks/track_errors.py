@@ -9,8 +9,8 @@ import numpy as np
 
 from icalib.data.measurements import TrackStream
 from icalib.data.recordings import open_recording
-from icalib.detection.tracking.streams import find_tracks
 from icalib.rig import Rig
+from icalib.sensors.camera.read.image_tracks import find_tracks
 from icalib.tools.simulation import SimCamera, Simulation
 from icalib.tools.simulation.images.lenses import unproject
 from icalib.tools.simulation.scenario.projection import image_velocity, project, visible

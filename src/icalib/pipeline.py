@@ -16,8 +16,6 @@ from icalib.data.recordings import Recording, read_measurements
 from icalib.data.recordings.reading import without_jumps
 from icalib.data.recordings.several import Source, naming, noting, open_all
 from icalib.data.same_rig import streams_of_rig
-from icalib.detection.streams import find_corners
-from icalib.detection.tracking.streams import find_all_tracks
 from icalib.errors import EstimationError, RecordingError
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Visit
@@ -30,6 +28,8 @@ from icalib.rig import Camera, Rig
 from icalib.rig.complete import check_complete
 from icalib.rig.file import load_rig
 from icalib.sensors.camera.read import has_corners
+from icalib.sensors.camera.read.detected_corners import find_corners
+from icalib.sensors.camera.read.image_tracks import find_all_tracks
 from icalib.validation import assess, stated_words, visited
 
 READING_SHARE, IMAGES_SHARE = 0.1, 0.8  # of the total time, without and with image processing

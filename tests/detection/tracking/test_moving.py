@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from icalib.detection.tracking.epipolar import epipolar_errors
-from icalib.detection.tracking.moving import moving_features
+from icalib.sensors.camera.read.moving import moving_features
 
 SIZE = (752, 480)
 CENTRE = np.array([375.5, 239.5])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.detection.tracking.robot_parts import stay_in_place
+from icalib.sensors.camera.read.robot_parts import stay_in_place
 
 IMAGES = 12
 

@@ -9,8 +9,8 @@ import pytest
 from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
-from icalib.detection.tracking.streams import find_all_tracks
 from icalib.rig import Camera
+from icalib.sensors.camera.read.image_tracks import find_all_tracks
 
 from .conftest import SIZE, Turning, turning, wall
 

@@ -10,11 +10,11 @@ from icalib.data.measurements import CornerStream
 from icalib.data.recordings import Recording
 from icalib.detection.boards.board_diagnosis import checkerboard_in
 from icalib.detection.boards.diagnosis import tags_in
-from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.rig import Camera
 from icalib.sensors.camera.read import corners as recorded_corners
+from icalib.sensors.camera.read.detected_corners import find_corners
 from icalib.tools.inspection.facts import CameraSource, TargetView
 
 GRID = (8, 5)  # columns and rows of cells over the image

@@ -19,10 +19,10 @@ from icalib.data.measurements import TrackStream
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.detection.images.image_work import on_all_cores
 from icalib.detection.tracking.epipolar import FEWEST_MATCHED_POINTS
-from icalib.detection.tracking.moving import best_lambda, from_centre, misfits
 from icalib.detection.tracking.patches import RADIUS, align, cut_templates
 from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, MIN_NCC, WINDOW_PX, prepared
 from icalib.rig import Camera
+from icalib.sensors.camera.read.moving import best_lambda, from_centre, misfits
 
 MATCHED_EVERY_S = 0.25  # between matched images; features are tracked for about a second
 MOST_APART_S = 0.05  # between both images, at most

@@ -10,10 +10,10 @@ from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection.images import image_work
-from icalib.detection.tracking import streams
-from icalib.detection.tracking.streams import find_tracks
 from icalib.errors import RecordingError
 from icalib.rig import Camera
+from icalib.sensors.camera.read import image_tracks
+from icalib.sensors.camera.read.image_tracks import find_tracks
 
 from .conftest import SIZE
 
@@ -52,7 +52,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def test_every_track_has_three_observations_and_segments_share_none(scene, monkeypatch):
-    monkeypatch.setattr(streams, "SEGMENT_IMAGES", 8)
+    monkeypatch.setattr(image_tracks, "SEGMENT_IMAGES", 8)
     found, notes = find_tracks(Images(scene.images), CAMERA)
     assert notes == ()
     assert found.stamps_ns.tolist() == [k * PERIOD_NS for k in range(len(scene.images))]
@@ -63,7 +63,7 @@ def test_every_track_has_three_observations_and_segments_share_none(scene, monke
 
 
 def test_tracks_do_not_depend_on_the_number_of_cores(scene, monkeypatch):
-    monkeypatch.setattr(streams, "SEGMENT_IMAGES", 8)
+    monkeypatch.setattr(image_tracks, "SEGMENT_IMAGES", 8)
     found = []
     for cores in (1, 3):
         monkeypatch.setattr(image_work, "core_count", lambda cores=cores: cores)
@@ -74,7 +74,7 @@ def test_tracks_do_not_depend_on_the_number_of_cores(scene, monkeypatch):
 
 def test_what_was_found_is_kept_until_the_images_change(scene, monkeypatch):
     first, _ = find_tracks(Images(scene.images), CAMERA)
-    monkeypatch.setattr(streams, "Tracker", None)
+    monkeypatch.setattr(image_tracks, "Tracker", None)
     again, _ = find_tracks(Images(scene.images), CAMERA)
     np.testing.assert_array_equal(first.uv, again.uv)
     np.testing.assert_array_equal(first.views, again.views)
@@ -92,7 +92,7 @@ def test_images_at_a_high_rate_are_tracked_and_thinned(scene):
 
 def test_images_too_large_to_wait_give_the_same_tracks(scene, monkeypatch):
     small, _ = find_tracks(Images(scene.images), CAMERA, keep=False)
-    monkeypatch.setattr(streams, "SEGMENT_BYTES", 1000)
+    monkeypatch.setattr(image_tracks, "SEGMENT_BYTES", 1000)
     large, _ = find_tracks(Images(scene.images), CAMERA, keep=False)
     np.testing.assert_array_equal(small.uv, large.uv)
     np.testing.assert_array_equal(small.feature, large.feature)

@@ -24,12 +24,12 @@ from icalib.detection.images.image_work import (
     with_resolution,
     words_on_damaged,
 )
-from icalib.detection.tracking.moving import moving_features
-from icalib.detection.tracking.robot_parts import stay_in_place
-from icalib.detection.tracking.stereo import matched
 from icalib.detection.tracking.tracker import Observations, Tracker
 from icalib.errors import RecordingError
 from icalib.rig import Camera
+from icalib.sensors.camera.read.moving import moving_features
+from icalib.sensors.camera.read.robot_parts import stay_in_place
+from icalib.sensors.camera.read.stereo import matched
 
 TRACKER_VERSION = 3  # of the tracker and of the cache; raise it with each change that changes tracks
 # images of a segment, and most bytes of a segment that waits in memory; larger ones are tracked on one core
