@@ -22,11 +22,6 @@ FREE = ("sensors/", "export/")  # exporters write the files of programs for cert
 NAMING = {
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
-    "data/recordings/base.py",
-    "data/recordings/folder.py",
-    "data/recordings/pictures.py",
-    "data/recordings/reading.py",
-    "detection/images/image_work.py",
     "detection/primitives/consistency.py",
     "detection/primitives/corners.py",
     "detection/primitives/crossing_model.py",
@@ -37,7 +32,6 @@ NAMING = {
     "initialize/assumed_motion.py",
     "initialize/cameras_on_odometry.py",
     "motion/imu_data.py",
-    "pipeline.py",
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from icalib.data.measurements import CornerStream, Measurements, TrackStream
+from icalib.data.measurements import Measurements
 from icalib.data.recordings import Recording, read_measurements
+from icalib.data.recordings.base import Progress
 from icalib.data.recordings.reading import without_jumps
 from icalib.data.recordings.several import Source, naming, noting, open_all
 from icalib.data.same_rig import streams_of_rig
@@ -24,17 +25,14 @@ from icalib.initialize.attempts import attempt
 from icalib.optim.memory import set_mmap_threshold, trim_heap
 from icalib.result import Calibration, Visited
 from icalib.result.provenance import provenance
-from icalib.rig import Camera, Rig
+from icalib.rig import Rig
 from icalib.rig.complete import check_complete
 from icalib.rig.file import load_rig
-from icalib.sensors.camera.read import has_corners
-from icalib.sensors.camera.read.detected_corners import find_corners
-from icalib.sensors.camera.read.image_tracks import find_all_tracks
+from icalib.sensors import call_kind
 from icalib.validation import assess, stated_words, visited
 
-READING_SHARE, IMAGES_SHARE = 0.1, 0.8  # of the total time, without and with image processing
+READING_SHARE, DETECTION_SHARE = 0.1, 0.8  # of the total time, without and with detection in images
 SHORTEST_S = 1.0  # shortest IMU stream that is accepted; time offsets need 4 s
-Progress = Callable[[str, float], None]  # called with the stage and the completed fraction, 0 to 1
 
 
 def calibrate(
@@ -87,9 +85,9 @@ def measure(
 
 def _reading_share(rig: Rig, opened: Mapping[str, Recording]) -> float:
     """Expected fraction of the calibration time that reading takes, for the progress display."""
-    target_cameras = rig.cameras if rig.has_target else ()
-    needs_detection = any(not has_corners(r, c) for r in opened.values() for c in target_cameras)
-    return IMAGES_SHARE if needs_detection or any(c.tracks_images for c in rig.cameras) else READING_SHARE
+    pairs = ((r, s) for r in opened.values() for s in rig.sensors.values())
+    detection = any(call_kind(s.sensor_type, "read", "needs_detection", r, s, rig.has_target) for r, s in pairs)
+    return DETECTION_SHARE if detection else READING_SHARE
 
 
 def _measure_all(rig: Rig, opened: Mapping[str, Recording], progress: Progress) -> list[Measurements]:
@@ -102,27 +100,8 @@ def _measure_all(rig: Rig, opened: Mapping[str, Recording], progress: Progress) 
             progress(stage, (k + done) / len(opened))
 
         with naming(name if len(opened) > 1 else ""):
-            measurements.append(dataclasses.replace(_measure(rig, one, show), name=name))
+            measurements.append(dataclasses.replace(read_measurements(one, rig, show), name=name))
     return measurements
-
-
-def _measure(rig: Rig, recording: Recording, progress: Progress) -> Measurements:
-    """The streams of all sensors. If a camera recorded images, its target corners or feature tracks are detected."""
-    names = [c.name for c in rig.cameras]
-    progress("reading", 0.0)
-
-    def find(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
-        def show(done: float) -> None:
-            share = (names.index(camera.name) + done) / len(names)
-            progress(f"finding the target in the images of {camera.name}", share)
-
-        return find_corners(recording, camera, rig.target, rig.settings.cache_corners, show)
-
-    def follow(recording: Recording, cameras: Sequence[Camera]) -> Sequence[tuple[TrackStream, tuple[str, ...]]]:
-        what = f"tracking features in the images of {' and '.join(c.name for c in cameras)}"
-        return find_all_tracks(recording, cameras, rig.settings.cache_corners, lambda done: progress(what, done))
-
-    return read_measurements(recording, rig, find, follow)
 
 
 def calibrate_measurements(

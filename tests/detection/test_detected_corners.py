@@ -30,7 +30,7 @@ class FakeRecording(StandIn):
         self.files = False
         self.read = 0
 
-    def image_topic(self, camera: Camera) -> str:
+    def image_topic(self, sensor: str, given: str | None) -> str:
         return "/cam0"
 
     def where(self, sensor: object) -> str:

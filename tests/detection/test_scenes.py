@@ -33,7 +33,7 @@ class Shown(StandIn):
     def __init__(self, images: list[np.ndarray]) -> None:
         self.images = images
 
-    def image_topic(self, camera: Camera) -> str:
+    def image_topic(self, sensor: str, given: str | None) -> str:
         return "/cam0"
 
     def where(self, sensor: object) -> str:

@@ -35,7 +35,7 @@ def poses(path: Path, rows: int, head: str = "t,x,y,z,qx,qy,qz,qw\n", separator:
 def row_of_each(root: Path) -> list[int]:
     """By its stamp, and by what is in it: which row each picture has."""
     recording = open_recording(root)
-    topic = recording.image_topic(CAMERA)
+    topic = recording.image_topic(CAMERA.name, CAMERA.topic)
     stamps = recording.stamps(topic)
     seen = [(f.stamp_ns, int(f.image[0, 0]) - 20) for f in recording.images(topic)]
     assert [t for t, _ in seen] == stamps.tolist() and [k for _, k in seen] == list(range(len(seen)))
@@ -145,7 +145,7 @@ def test_stamps_are_read_as_the_rig_file_describes_the_poses(tmp_path, unit, pla
     hand = PoseSensor("hand", place, layout=TableLayout((*names[8:], *names[:7]), None if split else unit))
     recording = open_recording(tmp_path)
     recording.use_layouts([hand])
-    found = recording.stamps(recording.image_topic(CAMERA))
+    found = recording.stamps(recording.image_topic(CAMERA.name, CAMERA.topic))
     np.testing.assert_array_equal(found, pose_readings(recording, hand).stamps_ns)
     scale = {"s": 10**9, "ms": 10**6, "us": 10**3}[unit]
     assert np.diff(found).tolist() == [2 * 10**9 if split else scale * 1_000_000] * 7

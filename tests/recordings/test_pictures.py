@@ -29,7 +29,7 @@ def camera(name: str, topic: str | None = None) -> Camera:
 
 
 def greys(recording, name: str, topic: str | None = None) -> list[tuple[int, int]]:
-    found = recording.images(recording.image_topic(camera(name, topic)))
+    found = recording.images(recording.image_topic(name, topic))
     return [(f.stamp_ns // 1_000_000_000, int(f.image[3, 3])) for f in found]
 
 

@@ -89,7 +89,7 @@ def test_compressed_video(tmp_path, kind):
     path = bag_of(tmp_path, "/cam/video", kind)
     bag = open_recording(path)
     assert "holds compressed video; decode it by its image transport, and record sensor_msgs/Image" in complaint(
-        lambda: bag.image_topic(CAMERA)
+        lambda: bag.image_topic(CAMERA.name, CAMERA.topic)
     )
     assert any("/cam/video holds compressed video" in f.sentence for f in inspect_recording(path).findings)
 
@@ -154,7 +154,7 @@ def test_a_video_beside_tables(tmp_path, write, truth):
     (root / "mav0" / "cam0.MP4").write_bytes(MP4)
     recording = open_recording(root)
     assert not has_corners(recording, CAMERA)
-    assert recording.image_topic(CAMERA) == "mav0/cam0.MP4"
+    assert recording.image_topic(CAMERA.name, CAMERA.topic) == "mav0/cam0.MP4"
     words = "mav0/cam0.MP4 cannot be decoded as a video"
     assert words in complaint(lambda: list(recording.payloads("mav0/cam0.MP4")))
     assert any(words in f.sentence for f in inspect_recording(root).findings)

@@ -43,7 +43,7 @@ def times(path: Path, n: int, header: str = "") -> np.ndarray:
 def test_frames_are_images_with_the_stamps_of_the_video(tmp_path, name):
     write_video(tmp_path / name)
     recording = open_recording(tmp_path)
-    topic = recording.image_topic(CAMERA)
+    topic = recording.image_topic(CAMERA.name, CAMERA.topic)
     assert topic == name
     found = list(recording.payloads(topic))
     np.testing.assert_allclose([p.stamp_ns for p in found], 5e7 * np.arange(FRAMES), atol=1e6)
@@ -133,6 +133,6 @@ def test_two_videos_are_told_by_their_names(tmp_path):
     for name in ("cam0.mp4", "cam1.mp4"):
         write_video(tmp_path / name)
     recording = open_recording(tmp_path)
-    assert recording.image_topic(CAMERA) == "cam0.mp4"
+    assert recording.image_topic(CAMERA.name, CAMERA.topic) == "cam0.mp4"
     found = inspect_recording(tmp_path)
     assert [c.name for c in found.sources.cameras] == ["cam0", "cam1"]

@@ -41,7 +41,7 @@ def test_of_folders_and_bags(form, tmp_path, truth, write):
     inside = [t for t in truth.imu_stamps if truth.image_stamps[3] <= t < truth.image_stamps[7]]
     assert instance(imu, ImuStream).stamps_ns.tolist() == inside and len(imu.gyro) == len(inside)
     camera = Camera("cam0", "cam0/corners.csv", "eucm", (8, 6))
-    topic = recording.image_topic(camera)
+    topic = recording.image_topic(camera.name, camera.topic)
     assert [f.stamp_ns for f in recording.images(topic)] == truth.image_stamps[3:7]
     assert recording.stamps(topic).tolist() == truth.image_stamps[3:7]
     assert f"only the part from {begin:g} s after its start to {end:g} s is used" in recording.notes()[0]

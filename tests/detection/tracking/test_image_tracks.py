@@ -27,7 +27,7 @@ class Images(StandIn):
     def __init__(self, images: list[np.ndarray], damaged: tuple[int, ...] = (), period_ns: int = PERIOD_NS) -> None:
         self.images, self.damaged, self.period_ns = images, damaged, period_ns
 
-    def image_topic(self, camera: Camera) -> str:
+    def image_topic(self, sensor: str, given: str | None) -> str:
         return "cam0"
 
     def where(self, sensor: object) -> str:

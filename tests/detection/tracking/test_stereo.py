@@ -26,8 +26,8 @@ class TwoCameras(StandIn):
     def __init__(self, first: Turning, second: Turning) -> None:
         self.scenes = {"cam0": first, "cam1": second}
 
-    def image_topic(self, camera: Camera) -> str:
-        return camera.name
+    def image_topic(self, sensor: str, given: str | None) -> str:
+        return sensor
 
     def where(self, sensor: Camera) -> str:
         return f"rec/{sensor.name}"

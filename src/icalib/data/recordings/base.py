@@ -12,12 +12,11 @@ import numpy as np
 
 from icalib.data.images.image_checks import frames
 from icalib.data.images.images import DecodedImage, Payload
-from icalib.data.measurements import CornerStream, TrackStream
 from icalib.data.stamps.sections import S
 from icalib.data.stamps.window import WHOLE_RECORDING, Span, Window, cut, stamps_inside
 from icalib.data.topics import TopicInfo, choose_topic
 from icalib.errors import RecordingError
-from icalib.rig import Camera, Rig
+from icalib.rig import Rig
 from icalib.sensors import facet
 from icalib.sensors.sensor import Sensor
 from icalib.sensors.stream import Stream
@@ -115,9 +114,9 @@ class Recording(ABC):
         """Topics of kind "image"."""
         return tuple(t for t in self.topics() if t.kind == "image")
 
-    def image_topic(self, camera: Camera) -> str:
-        """Name of the topic with the images of `camera`, chosen as by `topic`. Raises RecordingError."""
-        return self.topic(camera.name, camera.topic, "image").name
+    def image_topic(self, sensor: str, given: str | None) -> str:
+        """Name of the topic with the images of a sensor, chosen as by `topic`. Raises RecordingError."""
+        return self.topic(sensor, given, "image").name
 
     @abstractmethod
     def payloads(self, topic: str) -> Iterator[Payload]:
@@ -158,19 +157,16 @@ class Recording(ABC):
 
 
 ReadStream = tuple[Stream, tuple[str, ...]]  # stream, notes on it
-FindCorners = Callable[[Recording, Camera], tuple[CornerStream, tuple[str, ...]]]
-FindTracks = Callable[[Recording, Sequence[Camera]], Sequence[tuple[TrackStream, tuple[str, ...]]]]
+Progress = Callable[[str, float], None]  # called with the stage and the completed fraction, 0 to 1
 
 
 @dataclass(frozen=True)
 class Reading:
     """Functions for reading the sensors of `rig`.
 
-    cut: applied to each stream, removes clock jumps. find: detects target corners in the images of a camera. follow:
-    detects feature tracks in the images of several cameras.
+    cut: applied to each stream, removes clock jumps. progress: shows the progress of long work.
     """
 
     rig: Rig
     cut: Cut
-    find: FindCorners
-    follow: FindTracks
+    progress: Progress = lambda *_: None

@@ -20,7 +20,7 @@ from icalib.data.tables.files import StampsOfRows, TableFile, files_in, named_ta
 from icalib.data.tables.numbered import numbered_pictures, stamped_by_rows
 from icalib.data.topics import TopicInfo, choose_topic, find_topic
 from icalib.errors import RecordingError
-from icalib.rig import PLAIN_TABLE, Camera, TableLayout
+from icalib.rig import PLAIN_TABLE, TableLayout
 from icalib.sensors.sensor import Sensor
 
 _MAX_LISTED = 12
@@ -70,8 +70,8 @@ class FolderRecording(Recording):
         tables = named_tables(path.parent) if path.parent in self._bases() else files_in(path.parent)
         return self._stamps_of(path, dict(tables)[path])
 
-    def image_topic(self, camera: Camera) -> str:
-        return choose_topic(str(self.root), self.image_topics(), camera.name, camera.topic, "image").name
+    def image_topic(self, sensor: str, given: str | None) -> str:
+        return choose_topic(str(self.root), self.image_topics(), sensor, given, "image").name
 
     def payloads(self, topic: str) -> Iterator[Payload]:
         chosen = find_topic(str(self.root), self.image_topics(), topic)

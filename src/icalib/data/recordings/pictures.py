@@ -20,13 +20,12 @@ from icalib.data.recordings.base import Recording
 from icalib.data.stamps.window import WHOLE_RECORDING, Window
 from icalib.data.topics import TopicInfo, choose_topic
 from icalib.errors import RecordingError
-from icalib.rig import Camera
 from icalib.sensors.sensor import Sensor
 
 APART_NS = 1_000_000_000  # artificial stamps: interval from one number to the next
 MOST = 9_000_000_000  # largest number: its artificial stamp fits in int64
 MIXED = 0.75  # distinct numbers / images; below it, a folder mixes images of several cameras
-_SIDES = {"0": "left", "1": "right"}  # last character of a camera name -> word in file names
+_SIDES = {"0": "left", "1": "right"}  # last character of a sensor name -> word in file names
 
 
 def has_pictures(root: Path) -> bool:
@@ -54,16 +53,16 @@ class PictureFolder(Recording):
     def stamps(self, topic: str) -> np.ndarray:
         return np.array([stamp for stamp, _ in self._files_inside(topic)], np.int64)
 
-    def image_topic(self, camera: Camera) -> str:
-        if camera.topic is not None and "*" in camera.topic:
-            return camera.topic
+    def image_topic(self, sensor: str, given: str | None) -> str:
+        if given is not None and "*" in given:
+            return given
         topics = self.topics()
-        patterns = [t.name for t in topics if "*" in t.name] if camera.topic is None else []
-        for word in (camera.name, _SIDES.get(camera.name[-1:], camera.name)):  # such as cam0 for files named left
+        patterns = [t.name for t in topics if "*" in t.name] if given is None else []
+        for word in (sensor, _SIDES.get(sensor[-1:], sensor)):  # such as cam0 for files named left
             named = [name for name in patterns if word in name.lower()]
             if len(named) == 1:
                 return named[0]
-        return choose_topic(str(self.root), topics, camera.name, camera.topic, "image").name
+        return choose_topic(str(self.root), topics, sensor, given, "image").name
 
     def payloads(self, topic: str) -> Iterator[Payload]:
         files, where = self._files_inside(topic), f"{self.root}/{topic}"

@@ -2,42 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-from icalib.data.measurements import CornerStream, Measurements, TrackStream
-from icalib.data.recordings.base import FindCorners, FindTracks, Reading, Recording
+from icalib.data.measurements import Measurements
+from icalib.data.recordings.base import Progress, Reading, Recording
 from icalib.data.stamps.jumps import LONGEST_S, ClockJumps
 from icalib.data.stamps.sections import S
-from icalib.errors import RecordingError
-from icalib.rig import Camera, Rig
+from icalib.rig import Rig
 from icalib.sensors import SENSOR_KINDS, facet
 
 
-def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
-    """Default detector for recordings without images: raises RecordingError, as the camera has images."""
-    raise RecordingError(
-        f"{recording.where(camera)} holds images, not corners; give a function that detects the target."
-    )
+def read_measurements(recording: Recording, rig: Rig, progress: Progress = lambda *_: None) -> Measurements:
+    """Read and check the streams of all sensors of `rig` from `recording`. If a sensor recorded images, target corners
+    or feature tracks are detected in them.
 
-
-def track_tables_only(recording: Recording, cameras: Sequence[Camera]) -> Sequence[tuple[TrackStream, tuple[str, ...]]]:
-    """Default detector for recordings without images: raises RecordingError, as the camera has images."""
-    raise RecordingError(f"{recording.where(cameras[0])} holds images; give a function that tracks features in them.")
-
-
-def read_measurements(
-    recording: Recording, rig: Rig, find: FindCorners = tables_only, follow: FindTracks = track_tables_only
-) -> Measurements:
-    """Read and check the streams of all sensors of `rig` from `recording`.
-
-    find, follow: detect target corners and feature tracks in images. Clock jumps split a stream; one segment is used.
-    Notes list rejected data. Raises RecordingError, naming the file and line or instant, for data that are missing,
-    unreadable, unordered, in wrong units, or not of this rig.
+    Clock jumps split a stream; one segment is used. Notes list rejected data. Raises RecordingError, naming the file
+    and line or instant, for data that are missing, unreadable, unordered, in wrong units, or not of this rig.
     """
+    progress("reading", 0.0)
     recording.use_layouts(tuple(rig.sensors.values()))
     jumps = ClockJumps(LONGEST_S)
-    reading = Reading(rig, _uncut if rig.cameras_alone else jumps.cut, find, follow)
+    reading = Reading(rig, _uncut if rig.cameras_alone else jumps.cut, progress)
     streams = []
     for kind in SENSOR_KINDS:
         sensors = [s for s in rig.sensors.values() if s.sensor_type == kind]

@@ -14,8 +14,6 @@ import numpy as np
 
 from icalib.base.extras import load_cv2
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
-from icalib.errors import RecordingError
-from icalib.rig import Camera
 from icalib.sensors.stream import which_image
 
 T = TypeVar("T")
@@ -60,24 +58,6 @@ def spread_images(recording: Recording, topic: str) -> Iterator[np.ndarray]:
     for payload in islice(recording.payloads(topic), 0, 2 * SPREAD * every, every):
         with suppress(DamagedImageError):
             yield decode(payload)
-
-
-def with_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:
-    """The images. Raises RecordingError at the first whose resolution is not the camera's."""
-    for p in payloads:
-        if p.width and (p.width, p.height) != camera.resolution:
-            raise RecordingError(
-                f"{where}: images have {p.width} x {p.height} px, but {camera.name} {camera.resolution[0]} x "
-                f"{camera.resolution[1]}; correct its resolution in the rig file."
-            )
-        yield p
-
-
-def recording_names(payloads: Iterable[Payload], files: dict[int, str]) -> Iterator[Payload]:
-    """The payloads. Fills `files` with the file name of each by its stamp, "" for those that come from no file."""
-    for p in payloads:
-        files[p.stamp_ns] = p.name
-        yield p
 
 
 def words_on_damaged(damaged_ns: Sequence[int], files: Mapping[int, str]) -> tuple[str, ...]:

@@ -17,6 +17,9 @@ from icalib.geometry.targets import Target
 from icalib.rig import Rig
 from icalib.sensors.camera.read.checks import checked_corners
 from icalib.sensors.camera.read.corners import CORNER_TABLE, CornerRows, group_corners
+from icalib.sensors.camera.read.detected_corners import find_corners
+from icalib.sensors.camera.read.image_tracks import find_all_tracks
+from icalib.sensors.camera.read.images import image_topic
 from icalib.sensors.camera.read.tracks import read_track_stamps, read_tracks
 from icalib.sensors.camera.spec import Camera
 from icalib.sensors.camera.stream import CornerStream, TrackStream
@@ -65,13 +68,18 @@ def where(recording: Recording, camera: Camera) -> str:
     """Text that names the source of the camera's corners in messages: its table, or its image topic."""
     if has_corners(recording, camera):
         return str(recording.table(camera, camera.path))
-    return recording.place(recording.image_topic(camera))
+    return recording.place(image_topic(recording, camera))
 
 
 def has_corners(recording: Recording, camera: Camera) -> bool:
     """Whether corners of the camera are read from a table; otherwise they are detected in its images."""
     # Also true without table and images, so that the reader raises an error that names the missing table.
     return not recording.has_messages and (recording.find(camera.path) is not None or not recording.image_topics())
+
+
+def needs_detection(recording: Recording, camera: Camera, has_target: bool) -> bool:
+    """Whether corners or feature tracks of the camera are detected in its images, which takes long."""
+    return camera.tracks_images or (has_target and not has_corners(recording, camera))
 
 
 def sees(recording: Recording, camera: Camera) -> bool:
@@ -109,7 +117,7 @@ def image_topics(recording: Recording, cameras: Sequence[Camera]) -> dict[str, s
     """Image topic by camera name. Raises RecordingError if two cameras would share a topic."""
     chosen: dict[str, str] = {}
     for camera in cameras:
-        topic = recording.image_topic(camera)
+        topic = image_topic(recording, camera)
         for other, taken in chosen.items():
             if taken == topic:
                 raise RecordingError(
@@ -129,7 +137,7 @@ def _has_images(recording: Recording, camera: Camera) -> bool:
     """Whether the recording has images of the camera. If its corners are in a table, the only image topic may be
     another camera's, so that its name must match."""
     try:
-        topic = recording.image_topic(camera)
+        topic = image_topic(recording, camera)
     except RecordingError:
         return False
     named = camera.topic is not None or camera.name in topic.split("/")
@@ -143,7 +151,9 @@ def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -
     tables = {c.name: tracks(recording, c) for c in cameras if c.tracks is not None and not c.tracks_images}
     image_topics(recording, pictured)
     above = 1 + max((int(t.feature.max(initial=-1)) for t in tables.values()), default=-1)
-    of_recording = reading.follow(recording, pictured) if pictured else ()
+    what = f"tracking features in the images of {' and '.join(c.name for c in pictured)}"
+    keep = reading.rig.settings.cache_corners
+    of_recording = find_all_tracks(recording, pictured, keep, lambda done: reading.progress(what, done))
     of_images = {
         stream.name: (replace(stream, feature=stream.feature + above), notes) for stream, notes in of_recording
     }
@@ -161,10 +171,23 @@ def _corners(recording: Recording, cameras: Sequence[Camera], reading: Reading) 
     streams = []
     for camera in seeing:
         detected, notes = (
-            reading.find(recording, camera) if camera in pictured else (corners(recording, camera, target), ())
+            _image_corners(recording, camera, reading)
+            if camera in pictured
+            else (corners(recording, camera, target), ())
         )
         where = recording.where(camera)
         cut = reading.cut(detected, f"{where} ({camera.name})")
         stream, dropped = checked_corners(cut, where, camera.resolution)
         streams.append((stream, notes + dropped))
     return streams
+
+
+def _image_corners(recording: Recording, camera: Camera, reading: Reading) -> tuple[CornerStream, tuple[str, ...]]:
+    """Target corners in the images of the camera, with notes."""
+    rig, names = reading.rig, [c.name for c in reading.rig.of(Camera)]
+
+    def show(done: float) -> None:
+        share = (names.index(camera.name) + done) / len(names)
+        reading.progress(f"finding the target in the images of {camera.name}", share)
+
+    return find_corners(recording, camera, rig.target, rig.settings.cache_corners, show)

@@ -6,7 +6,7 @@ Only a few images are in memory at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 
@@ -23,9 +23,7 @@ from icalib.detection.images.image_work import (
     batches_of,
     image_count,
     on_all_cores,
-    recording_names,
     spread_images,
-    with_resolution,
     words_on_damaged,
 )
 from icalib.detection.primitives.corners import ImageCorners, corner_stream, packed
@@ -35,6 +33,7 @@ from icalib.detection.turns import number_continuously
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.rig import Camera
+from icalib.sensors.camera.read.images import camera_images, image_topic
 
 # Share of a target's points, and number of corners of free tags, found in an image on average. With fewer, the tags may
 # have another border or layout.
@@ -54,16 +53,12 @@ def find_corners(
     With `keep`, corners of an earlier run are loaded from the cache, and new ones are saved. Raises RecordingError if
     the camera has no images, their resolution is wrong, they cannot be read, or none shows the target.
     """
-    topic, where = recording.image_topic(camera), recording.where(camera)
+    topic, where = image_topic(recording, camera), recording.where(camera)
     files: dict[int, str] = {}
-
-    def read() -> Iterator[Payload]:
-        return recording_names(with_resolution(recording.payloads(topic), camera, where), files)
-
-    key = stream_key(read(), repr(target)) if keep else ""
+    key = stream_key(camera_images(recording, camera, files), repr(target)) if keep else ""
     detections = load_corners(key) if keep else None
     if detections is None:
-        count, payloads = image_count(recording, topic), read()
+        count, payloads = image_count(recording, topic), camera_images(recording, camera, files)
         detections = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
         if wrong := _other_layout(recording, topic, target, detections[1]):
             raise RecordingError(f"{where}: {wrong}")

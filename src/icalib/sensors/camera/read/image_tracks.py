@@ -20,13 +20,12 @@ from icalib.detection.images.image_work import (
     batches_of,
     image_count,
     on_all_cores,
-    recording_names,
-    with_resolution,
     words_on_damaged,
 )
 from icalib.detection.tracking.tracker import Observations, Tracker
 from icalib.errors import RecordingError
 from icalib.rig import Camera
+from icalib.sensors.camera.read.images import camera_images, image_topic
 from icalib.sensors.camera.read.moving import moving_features
 from icalib.sensors.camera.read.robot_parts import stay_in_place
 from icalib.sensors.camera.read.stereo import matched
@@ -84,20 +83,16 @@ def find_tracks(
     With `keep`, tracks of an earlier run are loaded from the cache, and new ones are saved. Raises RecordingError if
     the camera has no images, their resolution is wrong, they cannot be read, or they show nothing to track.
     """
-    topic, where = recording.image_topic(camera), recording.where(camera)
+    topic, where = image_topic(recording, camera), recording.where(camera)
     files: dict[int, str] = {}
-
-    def read() -> Iterator[Payload]:
-        return recording_names(with_resolution(recording.payloads(topic), camera, where), files)
-
-    key = stream_key(read(), f"tracks {TRACKER_VERSION}") if keep else ""
+    key = stream_key(camera_images(recording, camera, files), f"tracks {TRACKER_VERSION}") if keep else ""
     kept = load_kept(key, (*_COLUMNS, *_COUNTS)) if keep else None
     if kept is not None:
         stamps_ns, start, feature, uv, views, spread, damaged_ns = (kept[name] for name in _COLUMNS)
         moving, in_place = (int(kept[name]) for name in _COUNTS)
         tracks = _TrackArrays(stamps_ns, start, feature, uv, views, spread, moving, in_place, damaged_ns)
     else:
-        count, payloads = image_count(recording, topic), read()
+        count, payloads = image_count(recording, topic), camera_images(recording, camera, files)
         tracks = _track(payloads, lambda n: progress(n / max(count, n)))
         if not len(tracks.stamps_ns):
             raise RecordingError(tracks.error or f"{where}: there are no images; check that the camera was running.")

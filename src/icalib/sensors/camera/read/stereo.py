@@ -22,6 +22,7 @@ from icalib.detection.tracking.epipolar import FEWEST_MATCHED_POINTS
 from icalib.detection.tracking.patches import RADIUS, align, cut_templates
 from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, MIN_NCC, WINDOW_PX, prepared
 from icalib.rig import Camera
+from icalib.sensors.camera.read.images import image_topic
 from icalib.sensors.camera.read.moving import best_lambda, from_centre, misfits
 
 MATCHED_EVERY_S = 0.25  # between matched images; features are tracked for about a second
@@ -106,7 +107,7 @@ def _payload_pairs(
 
 def _with_stamps(recording: Recording, camera: Camera, stamps_ns: set[int]) -> Iterator[Payload]:
     """The images of the camera with these stamps."""
-    return (p for p in recording.payloads(recording.image_topic(camera)) if p.stamp_ns in stamps_ns)
+    return (p for p in recording.payloads(image_topic(recording, camera)) if p.stamp_ns in stamps_ns)
 
 
 def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matches:
