@@ -8,8 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream
 from icalib.errors import RecordingError
-from icalib.sensors.camera.stream import EDGE, NO_EDGES, CornerStream
+from icalib.geometry.edge_fits import EDGE, NO_EDGES
 
 IMAGE_NOISE = 2.0  # grey levels, assumed for every image: sigmas are right up to a common factor
 MODEL_SIGMA_PX = 0.02  # standard deviation by sampling, printing and the lens, added to that by noise
@@ -30,7 +31,7 @@ class ImageCorners:
 
     point (N,) int64: index into the target's points, each at most once; uv (N, 2) px: (0, 0) is the centre of the
     top-left pixel; sigma (N,) px: expected standard deviation per axis; blur (N,) px: of a Gaussian; verdict (N,) int8:
-    index into `VERDICTS`; edges (N, 2, EDGE) float32: as in `CornerStream`, zeros if they are not given.
+    index into `VERDICTS`; edges (N, 2, EDGE) float32: as in `edge_fits`, zeros if they are not given.
     """
 
     point: np.ndarray

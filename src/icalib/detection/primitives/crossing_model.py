@@ -14,7 +14,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.detection.primitives.edge_model import error_function, normal_equations, row_product, solve_small
 from icalib.detection.primitives.saddles import LEAST_SINE, MARGIN_BLURS, room_for, window_bounds, window_frame
-from icalib.sensors.camera.stream import EDGE
+from icalib.geometry.edge_fits import EDGE
 
 _ITERATIONS = 12
 _CONVERGED_PX = 2e-3
@@ -35,7 +35,7 @@ def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
     from both edges at once at which features begin in the dark and in the white fields (inf if there are none).
 
     sigma [px] is the standard deviation per axis for image noise of one grey level; contrast is in grey levels between
-    dark and light; edges as in `CornerStream`.
+    dark and light; edges as in `edge_fits`.
     """
     edges = np.zeros((2, EDGE))
     sa, sb, margin = _half_widths(image, u, v, ea, eb, surroundings[0], max(blur_a, blur_b))
@@ -139,7 +139,7 @@ def _gain(A, rows):
 
 @njit(cache=True, nogil=True)
 def _fill_edges(edges, ea, sa, eb, sb, gain):
-    """Fills edges (2, EDGE) with ends and gain of both edges, as in `CornerStream`. The curvature stays zero."""
+    """Fills edges (2, EDGE) with ends and gain of both edges, as in `edge_fits`. The curvature stays zero."""
     for i in range(2):
         edges[0, i], edges[0, 2 + i], edges[0, 4 + i] = -sa * ea[i], sa * ea[i], gain[0, i]
         edges[1, i], edges[1, 2 + i], edges[1, 4 + i] = -sb * eb[i], sb * eb[i], gain[1, i]

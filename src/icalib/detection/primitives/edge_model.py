@@ -11,7 +11,7 @@ from math import erf, hypot, pi, sqrt
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.sensors.camera.stream import EDGE
+from icalib.geometry.edge_fits import EDGE
 
 _ITERATIONS = 10  # at most
 _CONVERGED_PX = 1e-3  # largest shift of the edge in the last step
@@ -229,7 +229,7 @@ def _sine(quad, k):
 
 @njit(cache=True, nogil=True)
 def _edge_row(quad, k, end, place, blur, gain, by_offset):
-    """(EDGE,) of side k of the quad, as in `CornerStream`, for the corner at its `end` (0: k, 1: k + 1). by_offset
+    """(EDGE,) of side k of the quad, as in `edge_fits`, for the corner at its `end` (0: k, 1: k + 1). by_offset
     (2,): derivative of the corner by the side's offset there."""
     m, row = (k + 1) % 4, np.zeros(EDGE)
     eu, ev = quad[m, 0] - quad[k, 0], quad[m, 1] - quad[k, 1]
@@ -249,7 +249,7 @@ def fit_corners(image, quad, end, half):
     used, except those less than `end` px from another side.
 
     sigma: standard deviation [px] per axis for image noise of one grey level and known bends of the sides, NaN if no
-    corner was found; blur [px]: the larger one of both sides; edges as in `CornerStream`.
+    corner was found; blur [px]: the larger one of both sides; edges as in `edge_fits`.
     """
     place, ends, side_blur = np.empty((4, 3)), np.empty((4, 2, 2)), np.empty(4)
     for k in range(4):

@@ -12,7 +12,7 @@ from icalib.detection.primitives.edge_model import END_PX, USUAL_BLUR_PX, fit_co
 from icalib.detection.primitives.growth import side_vectors
 from icalib.detection.primitives.saddles import MARGIN_BLURS
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
-from icalib.sensors.camera.stream import EDGE
+from icalib.geometry.edge_fits import EDGE
 
 # px, and of a side, the larger of both: largest distance of a corner from its rough position
 _MOST_CORNER_MOVE = (2.0, 0.03)
@@ -85,7 +85,7 @@ def refined_crossings(image, quads, surroundings):
 
     surroundings: as in `fit_crossing`. Rows of quality: sigma [px] per axis for image noise of one grey level, NaN if
     there is no corner; blur [px]; sine of the angle between the edges; distance to the nearest other feature minus the
-    distance that the smallest window needs [px]; shorter side [px]; both edges of the corner, as in `CornerStream`.
+    distance that the smallest window needs [px]; shorter side [px]; both edges of the corner, as in `edge_fits`.
     """
     uv, quality = np.empty(quads.shape), np.empty((MEASURES + 2 * EDGE, len(quads), 4))
     blur = _measured_blurs(image, quads, surroundings.min() * _shapes(quads, quality))

@@ -8,10 +8,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from icalib.geometry.edge_fits import EDGE, NO_EDGES
 from icalib.sensors.stream import Stream, check, check_groups, which_image
 
-EDGE = 7  # number of columns that describe the fit of an edge, see `CornerStream`
-NO_EDGES = np.zeros((0, 2, EDGE), dtype=np.float32)
 NO_VIEWS = np.zeros(0, dtype=np.int64)
 
 
@@ -37,10 +36,8 @@ class CornerStream(_ImageStream):
     centre of the top-left pixel; sigma (N,) pixels, the detector's standard deviation of each corner per axis up to a
     factor common to all, (0,) if it states none.
 
-    edges (N, 2, EDGE) float32: fits of the two edges that meet in each corner; (0, 2, EDGE) if the detector states
-    none. Columns: first end (2,) and second end (2,) px of the fitted piece, relative to the corner; gain (2,) px^2,
-    derivative of the corner by the curvature of the edge; fitted curvature [1 / px]. The curvature is positive if the
-    piece turns left from the first end to the second, with u to the right and v down.
+    edges (N, 2, EDGE) float32: fits of the two edges that meet in each corner, with the columns of
+    `geometry.edge_fits`; (0, 2, EDGE) if the detector states none.
 
     files: file name of each image by stamp, "" if it is from no file; images without corners may be included.
     """
