@@ -23,11 +23,10 @@ NAMING = {
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
     "detection/primitives/corners.py",  # the stream of the corners of images, for users
-    "estimate/noise_size.py",
-    "estimate/problem/inputs.py",
+    "estimate/noise_size.py",  # noise densities of the IMU
     "initialize/assumed_motion.py",
     "initialize/cameras_on_odometry.py",
-    "motion/imu_data.py",
+    "motion/imu_data.py",  # readings of the IMU, which link keyframes
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users

@@ -80,6 +80,18 @@ class SensorModel(Generic[S, N]):
     only_first_places_keyframes: ClassVar[bool] = False
     refitted: ClassVar[str] = ""
 
+    # Measurements
+
+    def target_bodies(self, rig: Rig, recordings: Sequence[Measurements]) -> Bodies | None:
+        """Bodies of the target that measurements of this kind connect; None for kinds that see no target."""
+        del rig, recordings
+        return None
+
+    def prepared(self, rig: Rig, bodies: Bodies, recording: Measurements) -> Measurements:
+        """The recording with its streams of this kind as factors need them: with `bodies` of the target alone."""
+        del rig, bodies
+        return recording
+
     # Parameters
 
     def takes_part(self, sensor: S, association: PlaneAssociation) -> bool:

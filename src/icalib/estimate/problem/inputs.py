@@ -14,14 +14,12 @@ from icalib.data.measurements import Measurements, Stream
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets.base import BOARD
 from icalib.model.bodies import Bodies
-from icalib.model.sensor_model import clocks_of, model_of
+from icalib.model.sensor_model import all_models, clocks_of, model_of
 from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.motion.plane_association import NO_ASSOCIATION, PlaneAssociation
 from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, make_layout
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
 from icalib.rig.scene import TILT
-from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
-from icalib.sensors.camera.image_times import on_common_images
 
 
 @dataclass(frozen=True)
@@ -97,9 +95,11 @@ class Inputs:
 def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | None = None) -> Inputs:
     """Inputs of one or several recordings, joined. whole: inputs whose clock shifts are used, if `recordings` are some
     of their streams."""
-    bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape, rig)
+    bodies = next(b for model in all_models() if (b := model.target_bodies(rig, recordings)) is not None)
+    for model in all_models():
+        recordings = [model.prepared(rig, bodies, r) for r in recordings]
     shifts = None if whole is None else [part.shift_ns for part in whole.parts]
-    joined, parts = join(rig, [on_common_images(rig, restrict(bodies, r)) for r in recordings], shifts)
+    joined, parts = join(rig, recordings, shifts)
     layout = layout_for(rig, bodies, len(parts))
     return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, parts)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.geometry.cameras import camera_model
+from icalib.model.bodies import Bodies
 from icalib.model.sensor_model import Clusters, Pass, SensorModel, model_of
 from icalib.model.statistics import PassEnd
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
@@ -18,6 +19,7 @@ from icalib.optim.state import Layout, State
 from icalib.rig import LENS, Camera, ParameterSpec, Rig, Settings
 from icalib.sensors.camera.bloom import with_bloom
 from icalib.sensors.camera.circle_centres import with_circle_centres
+from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.corner_noise import (
     INITIAL_COMMON_ERROR_PX,
@@ -37,7 +39,7 @@ from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.features.surfaces import Surfaces
 from icalib.sensors.camera.features.track_selection import TrackSelection, next_selections, observed_at_keyframes
 from icalib.sensors.camera.image_pairs import not_simultaneous
-from icalib.sensors.camera.image_times import are_used, keyframes_of
+from icalib.sensors.camera.image_times import are_used, keyframes_of, on_common_images
 from icalib.sensors.camera.spec import BLOOM
 from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 
@@ -69,6 +71,14 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
 
     keyframes = "images"
     refitted = CORNERS
+
+    def target_bodies(self, rig: Rig, recordings: Sequence[Measurements]) -> Bodies:
+        """See `SensorModel`, and `choose_bodies`."""
+        return choose_bodies(rig.target, recordings, rig.settings.board_shape, rig)
+
+    def prepared(self, rig: Rig, bodies: Bodies, recording: Measurements) -> Measurements:
+        """See `SensorModel`; corners and tracks of a camera get the same images."""
+        return on_common_images(rig, restrict(bodies, recording))
 
     def is_estimated(self, sensor: Camera, spec: ParameterSpec, rig: Rig) -> bool:
         """See `SensorModel`. Bloom is estimated only if the target has edges that it shifts.
