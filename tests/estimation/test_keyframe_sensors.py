@@ -8,7 +8,7 @@ import pytest
 
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for
 from icalib.estimate.problem.inputs import inputs_for
-from icalib.sensors.camera.image_times import image_times
+from icalib.motion.time_offsets import instants
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 
@@ -26,7 +26,7 @@ def inputs():
 def test_every_image_has_a_keyframe_of_its_own(inputs, offset):
     values = {(c.name, "time_offset"): np.zeros(1) for c in inputs.rig.cameras}
     values |= {("wheel0", "time_offset"): np.array([offset])}
-    images = np.concatenate(list(image_times(inputs.measurements, values).values()))
+    images = np.concatenate([instants(c, values) for c in inputs.measurements.cameras])
     keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
     recorded = images[(images >= keyframes[0]) & (images <= keyframes[-1])]
     assert len(recorded) > 100
