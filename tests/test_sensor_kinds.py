@@ -30,20 +30,8 @@ NAMING = {
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
-    "tools/allan/analysis.py",
-    "tools/allan/sampling.py",
-    "tools/inspection/console.py",
-    "tools/inspection/draft.py",
-    "tools/inspection/facts.py",
-    "tools/inspection/figures.py",
-    "tools/inspection/findings.py",
-    "tools/inspection/imu.py",
-    "tools/inspection/inspect.py",
-    "tools/inspection/kalibr.py",
-    "tools/inspection/lens.py",
-    "tools/inspection/sensors.py",
-    "tools/inspection/targets.py",
-    "tools/inspection/views.py",
+    "tools/allan/analysis.py",  # the noise of IMUs
+    "tools/allan/sampling.py",  # the readings of IMUs
     "tools/simulation/images/filming.py",
     "tools/simulation/rigs.py",
     "tools/simulation/scenario/scenario.py",

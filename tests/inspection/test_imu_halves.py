@@ -67,7 +67,7 @@ def test_two_whole_imus_are_not_mixed(brief, bags, tmp_path):
 def test_inspect_drafts_both_topics(bag):
     found = inspect_recording(bag)
     assert not any("same reading" in f.sentence for f in found.findings), found.findings
-    assert list(found.sources.imus) == ["imu0"]
+    assert list(found.sources.of("imu")) == ["imu0"]
     assert "topic: {gyro: /d435/gyro/sample, accel: /d435/accel/sample}" in draft_rig(found)
 
 

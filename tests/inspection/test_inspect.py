@@ -16,11 +16,12 @@ from rich.console import Console
 from icalib.cli import main
 from icalib.data.recordings import FolderRecording, TopicInfo
 from icalib.geometry.targets import AprilGrid, Markers, Target
+from icalib.sensors.camera.inspect.facts import CameraSource, camera_views
+from icalib.sensors.camera.inspect.findings import empty_borders
+from icalib.sensors.camera.inspect.views import coverage, target_view
 from icalib.tools.inspection import Inspection, inspect_recording, read_target
 from icalib.tools.inspection.console import print_inspection
-from icalib.tools.inspection.facts import CameraSource
-from icalib.tools.inspection.findings import empty_borders, findings
-from icalib.tools.inspection.views import coverage, target_view
+from icalib.tools.inspection.findings import findings
 from icalib.tools.simulation import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario.scenario import SimCamera
 
@@ -92,7 +93,7 @@ class TestTarget:
         for name in ("rig.yaml", "kalibr.yaml"):
             assert main(["inspect", str(bag), "--target", str(tmp_path / name)]) == 0
             assert "6 (60%)" in capsys.readouterr().out
-        assert inspect_recording(bag).views["cam0"].seen == 6  # Kalibr's lies beside the bag
+        assert camera_views(inspect_recording(bag))["cam0"].seen == 6  # Kalibr's lies beside the bag
 
     def test_a_target_that_is_never_seen(self, bags, brief, pictures, tmp_path):
         bag = bags.write(tmp_path / "run", images(bags, pictures[6:]) + bags.imu("/imu0", brief))
@@ -169,7 +170,8 @@ def test_tilts_and_distances(tmp_path):
         uv.append(1000.0 * np.column_stack([xyz[:, 0] / z, xyz[:, 1] * np.cos(tilt) / z]))
     recording = with_corners(tmp_path, TARGET, np.arange(41, dtype=np.int64) * STEP, np.concatenate(uv))
     topic = TopicInfo("cam0/corners.csv", "table", "corners", 41, 0, 1)
-    view = target_view(recording, CameraSource("cam0", topic, None, topic, None), TARGET, None, lambda _: None)
+    source = CameraSource("camera", topic, None, topic, None)
+    view = target_view(recording, "cam0", source, TARGET, None, lambda _: None)
     assert view.tilt_deg == pytest.approx((4.0, 20.0, 36.0), abs=2.0)
     assert view.distance_ratio == pytest.approx(9.5 / 5.5, rel=0.05)
     assert view.images is None and view.cells is None
@@ -183,7 +185,8 @@ def test_tilts_are_those_of_each_free_tag(tmp_path):
     tilted = 1000.0 * xy * [np.cos(np.radians(40.0)), 1.0] / (8.0 + xy[:, :1] * np.sin(np.radians(40.0)))
     recording = with_corners(tmp_path, target, stamps, np.tile([*front, *tilted], (20, 1)))
     topic = TopicInfo("cam0/corners.csv", "table", "corners", 20, 0, 1)
-    view = target_view(recording, CameraSource("cam0", topic, None, topic, None), target, None, lambda _: None)
+    source = CameraSource("camera", topic, None, topic, None)
+    view = target_view(recording, "cam0", source, target, None, lambda _: None)
     assert view.tilt_deg == pytest.approx((0.0, 20.0, 40.0), abs=0.5)
 
 
@@ -217,10 +220,11 @@ def example() -> Inspection:
 )
 def test_a_camera_that_hardly_sees_the_target(change, words, example):
     """One of two, so a warning; both, so no calibration can be made where one would be refused."""
-    one = replace(example, views=dict(example.views, cam1=replace(example.views["cam1"], **change)))
+    changed = {n: replace(example.facts[n], view=replace(v, **change)) for n, v in camera_views(example).items()}
+    one = replace(example, facts={**example.facts, "cam1": changed["cam1"]})
     (finding,) = findings(one)
     assert finding.severity == "warning" and re.search(words, finding.sentence)
-    both = replace(example, views={n: replace(v, **change) for n, v in one.views.items()})
+    both = replace(example, facts={**example.facts, **changed})
     refused = "seen" in change or "problem" in change
     assert {f.severity for f in findings(both)} == {"problem" if refused else "warning"}
 
@@ -233,8 +237,8 @@ class TestStreams:
 
     def test_figures(self, bags, brief, tmp_path):
         found = self.inspected(bags, tmp_path, bags.noise("/cam0/image_raw") + bags.imu("/imu0", brief))
-        assert found.images["cam0"].resolution == (32, 24)
-        assert (found.images["cam0"].encoding, found.images["cam0"].frame) == ("mono8", "lens")
+        assert found.facts["cam0"].images.resolution == (32, 24)
+        assert (found.facts["cam0"].images.encoding, found.facts["cam0"].images.frame) == ("mono8", "lens")
         camera, imu = (s.timing for s in found.streams)
         assert camera and imu
         assert (camera.count, imu.count) == (50, 600)
@@ -297,7 +301,7 @@ class TestStreams:
             for k in range(20)
         ]
         found = self.inspected(bags, tmp_path, bad + bags.imu("/imu0", brief))
-        assert found.verdict == "no" and found.images["cam0"].damaged == found.images["cam0"].decoded == 20
+        assert found.verdict == "no" and found.facts["cam0"].images.damaged == found.facts["cam0"].images.decoded == 20
         assert any("none of 20 sampled images can be decoded" in s for s in sentences(found, "problem"))
 
     def test_some_that_cannot_be_decoded(self, bags, brief, tmp_path):
@@ -307,7 +311,7 @@ class TestStreams:
         messages = [bags.compressed("/cam0/compressed", bags.origin_ns + k * STEP, d) for k, d in enumerate(data)]
         found = self.inspected(bags, tmp_path, messages + bags.imu("/imu0", brief))
         assert any("1 of 20 sampled images cannot be decoded" in s for s in sentences(found, "warning")), found.findings
-        assert found.images["cam0"].resolution == (64, 48)
+        assert found.facts["cam0"].images.resolution == (64, 48)
 
     def test_an_unknown_encoding_beside_a_good_camera(self, bags, brief, tmp_path):
         odd = [

@@ -70,13 +70,8 @@ def test_all_three(tmp_path):
     assert (second.model, second.distortion) == ("double-sphere", (-0.2, 0.59))
     assert second.intrinsics == (180.0, 181.0, 376.0, 240.0)
     (imu,) = found.imus
-    assert imu.topic == "/imu0" and imu.noise.source == "imu.yaml (Kalibr)"
-    assert (imu.noise.gyro, imu.noise.gyro_walk, imu.noise.accel, imu.noise.accel_walk) == (
-        1.87e-4,
-        2.66e-5,
-        1.86e-3,
-        4.33e-4,
-    )
+    assert imu.topic == "/imu0"
+    assert imu.densities == {"gyro": 1.87e-4, "gyro_walk": 2.66e-5, "accel": 1.86e-3, "accel_walk": 4.33e-4}
     assert (found.target, found.target_file) == (AprilGrid(7, 6, 0.088, 0.3), "aprilgrid.yaml")
 
 
@@ -94,7 +89,7 @@ def test_what_is_exported_is_read_back(model, tmp_path):
 def test_imu_of_kalibrs_result(tmp_path):
     """imu-....yaml has it one level deeper."""
     deeper = yaml.safe_dump({"imu0": yaml.safe_load(IMU)})
-    assert found_with(tmp_path, result=deeper).imus[0].noise.gyro == 1.87e-4
+    assert found_with(tmp_path, result=deeper).imus[0].densities["gyro"] == 1.87e-4
 
 
 def test_files_above_a_folder_are_found(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 
 from icalib.data.recordings import TopicInfo
 from icalib.data.topics import message_types
+from icalib.sensors.camera.inspect.facts import CameraSource
 from icalib.tools.inspection.sources import find_sources
 
 
@@ -39,18 +40,18 @@ def topics(*names: str) -> list[TopicInfo]:
 )
 def test_names(given, cameras, imus):
     found = find_sources(topics(*given))
-    assert [c.name for c in found.cameras] == cameras
-    assert list(found.imus) == imus
+    assert list(found.of("camera")) == cameras
+    assert list(found.of("imu")) == imus
     assert all(re.fullmatch("[A-Za-z][A-Za-z0-9_-]*", n) for n in (*cameras, *imus))
 
 
 def test_the_same_images_twice_are_one_camera():
     given = ["/c/image_rect", "/c/image_raw/compressed", "/c/image_raw", "/c/camera_info", "/d/image_raw"]
     found = find_sources(topics(*given))
-    camera = found.cameras[0]
+    camera = found.of("camera")["c"]
     assert camera.images and camera.info
-    assert (camera.name, camera.images.name, camera.info.name) == ("c", "/c/image_raw", "/c/camera_info")
-    assert found.cameras[1].info is None
+    assert (camera.images.name, camera.info.name) == ("/c/image_raw", "/c/camera_info")
+    assert found.of("camera")["d"].info is None
     assert found.left_out == {k: "the images of c once more" for k in ("/c/image_raw/compressed", "/c/image_rect")}
 
 
@@ -64,8 +65,8 @@ def test_lidars_and_wheels():
         "wheel1/ticks.csv": "wheels",
     }
     found = find_sources([TopicInfo(name, "", kind, 10, 0, 1) for name, kind in given.items()])
-    assert list(found.imus) == ["imu0"] and list(found.of("lidar")) == ["top", "velodyne_points", "lidar0"]
-    assert {name: t.name for name, t in found.of("wheels").items()} == {
+    assert list(found.of("imu")) == ["imu0"] and list(found.of("lidar")) == ["top", "velodyne_points", "lidar0"]
+    assert {name: source.topic.name for name, source in found.of("wheels").items()} == {
         "wheel0": "/joint_states",
         "wheel1": "wheel1/ticks.csv",
     }
@@ -74,7 +75,7 @@ def test_lidars_and_wheels():
 def test_poses_and_odometry():
     given = {"/imu0": "imu", "/vrpn/robot/pose": "pose", "/odom": "odometry", "odom0/poses.tum": "pose"}
     found = find_sources([TopicInfo(name, "", kind, 10, 0, 1) for name, kind in given.items()])
-    assert {name: t.name for name, t in found.of("pose").items()} == {
+    assert {name: source.topic.name for name, source in found.of("pose").items()} == {
         "robot": "/vrpn/robot/pose",
         "pose0": "/odom",
         "odom0": "odom0/poses.tum",
@@ -83,15 +84,16 @@ def test_poses_and_odometry():
 
 def test_depth_images_are_no_camera():
     found = find_sources(topics("/d455/depth/image_rect_raw", "/d455/color/image_raw"))
-    assert [c.name for c in found.cameras] == ["color"]
+    assert list(found.of("camera")) == ["color"]
     assert found.left_out == {"/d455/depth/image_rect_raw": "depth images"}
 
 
 def test_images_and_corners_of_one_camera():
-    (camera,) = find_sources(topics("cam0", "cam0/corners.csv")).cameras
+    (camera,) = find_sources(topics("cam0", "cam0/corners.csv")).sensors.values()
+    assert isinstance(camera, CameraSource)
     assert camera.images and camera.corners and camera.topic is camera.corners
 
 
 def test_names_that_no_part_tells_apart():
     found = find_sources(topics("/a-/image_raw", "/a_/image_raw"))
-    assert len({c.name for c in found.cameras}) == 2
+    assert len(found.sensors) == 2

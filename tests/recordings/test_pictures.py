@@ -171,7 +171,7 @@ def test_kalibrs_folder(tmp_path):
     assert [(t.name, t.kind, t.count) for t in recording.topics()] == [("cam0", "image", 4), ("imu0.csv", "imu", 4)]
     assert recording.stamps("imu0.csv").tolist() == STAMPS
     found = find_sources(recording.topics())
-    assert [c.name for c in found.cameras] == ["cam0"] and list(found.imus) == ["imu0"]
+    assert list(found.of("camera")) == ["cam0"] and list(found.of("imu")) == ["imu0"]
 
 
 def test_a_table_of_something_else_beside_pictures(tmp_path):

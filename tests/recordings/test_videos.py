@@ -135,4 +135,4 @@ def test_two_videos_are_told_by_their_names(tmp_path):
     recording = open_recording(tmp_path)
     assert recording.image_topic(CAMERA.name, CAMERA.topic) == "cam0.mp4"
     found = inspect_recording(tmp_path)
-    assert [c.name for c in found.sources.cameras] == ["cam0", "cam1"]
+    assert list(found.sources.of("camera")) == ["cam0", "cam1"]

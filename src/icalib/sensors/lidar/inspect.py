@@ -12,8 +12,8 @@ from icalib.errors import RecordingError
 from icalib.sensors.lidar.read.point_clouds import point_clouds, timing_fields
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.sensor import Sensor, TimeUnit
-from icalib.tools.inspection.facts import Finding, Inspection
-from icalib.tools.inspection.kinds import KindInspector, moving
+from icalib.tools.inspection.facts import Finding, Inspection, SensorSource
+from icalib.tools.inspection.kinds import KindInspector, independent, moving
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,15 @@ class LidarFacts:
     problem: str = ""
 
 
+def refused(inspection: Inspection) -> Iterator[Finding]:
+    """LiDARs that `calibrate` would refuse: a problem if no other sensor gives the motion, else a warning."""
+    lidars = inspection.sources.of(Lidar.sensor_type)
+    others = independent(inspection) or set(moving(inspection)) - lidars.keys()
+    for name in lidars:
+        if (facts := inspection.facts.get(name)) is not None and facts.problem:
+            yield Finding("warning" if others else "problem", facts.problem)
+
+
 class LidarInspector(KindInspector):
     """Finds LiDARs and drafts their rig file entries. Every topic of point clouds is taken for a LiDAR on the robot."""
 
@@ -34,25 +43,18 @@ class LidarInspector(KindInspector):
     prefix: ClassVar[str] = "lidar"
     plain_names: ClassVar[str] = r"scans\.npz|points(_raw)?"
     is_certain: ClassVar[bool] = True
+    checks: ClassVar = {"use": refused}
 
-    def facts(self, recording: Recording, name: str, topic: TopicInfo) -> LidarFacts | None:
+    def facts(self, recording: Recording, name: str, source: SensorSource, content: None) -> LidarFacts | None:
         """Findings from the first clouds of a bag; None for a folder."""
         if not isinstance(recording, BagRecording):
             return None
         try:
-            what = f"{recording.root} {topic.name} ({name})"
-            lidar = Lidar(name, "", topic=topic.name)
-            return LidarFacts(*timing_fields(point_clouds(recording, topic.name), lidar, what))
+            what = f"{recording.root} {source.topic.name} ({name})"
+            lidar = Lidar(name, "", topic=source.topic.name)
+            return LidarFacts(*timing_fields(point_clouds(recording, source.topic.name), lidar, what))
         except RecordingError as error:
             return LidarFacts(problem=str(error))
-
-    def findings(self, inspection: Inspection) -> Iterator[Finding]:
-        """LiDARs that `calibrate` would refuse: a problem if no other sensor gives the motion, else a warning."""
-        lidars = inspection.sources.of(Lidar.sensor_type)
-        others = inspection.sources.cameras or set(moving(inspection)) - lidars.keys()
-        for name in lidars:
-            if (facts := inspection.facts.get(name)) is not None and facts.problem:
-                yield Finding("warning" if others else "problem", facts.problem)
 
     def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """Lines of the draft rig file that name field and unit of the point times."""

@@ -13,7 +13,7 @@ from icalib.sensors.pose.read.transforms import TRANSFORMS, read_edges, transfor
 from icalib.sensors.pose.spec import PoseSensor
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.facts import FramePair, Inspection
-from icalib.tools.inspection.kinds import KindInspector
+from icalib.tools.inspection.kinds import KindInspector, inertial
 
 
 class PoseInspector(KindInspector):
@@ -51,7 +51,7 @@ class PoseInspector(KindInspector):
         """The `kind` line of the draft. Without an IMU the first pose sensor gives the trajectory, so it must be
         absolute."""
         drifts = topic.kind == "odometry" or "odom" in topic.name
-        yield f"kind: {'relative' if drifts and inspection.sources.imus else 'absolute'}"
+        yield f"kind: {'relative' if drifts and inertial(inspection) else 'absolute'}"
 
     def more_lines(self, inspection: Inspection, active: bool) -> Iterator[str]:
         """Draft lines of a pose sensor from transforms, if any transform changes. Its frames are the ends of the chain

@@ -8,9 +8,7 @@ from typing import Any, Literal
 
 from icalib.data.recordings import TopicInfo
 from icalib.geometry.targets import Target
-from icalib.rig import TwoSources
-from icalib.sensors.camera.read.camera_info import CameraInfo
-from icalib.sensors.imu.read.checks import Saturation
+from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.kalibr import KalibrFiles
 
 Severity = Literal["problem", "warning", "hint"]
@@ -55,109 +53,44 @@ class Timing:
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """One topic. timing: None for topics that icalib does not read; problem: why it cannot be read, else ""."""
+    """One topic. timing: None for topics that icalib does not read; problem: why it cannot be read, else "". content:
+    words on the messages beside their type, such as the resolution of images."""
 
     topic: TopicInfo
     timing: Timing | None
     problem: str = ""
-
-
-@dataclass(frozen=True)
-class ImageFacts:
-    """The images of one topic. resolution (width, height) px, encoding, frame: of the first image; decoded: number of
-    sampled images; damaged: number of these that cannot be decoded."""
-
-    resolution: tuple[int, int] | None
-    encoding: str
-    frame: str
-    decoded: int
-    damaged: int
-
-
-@dataclass(frozen=True)
-class ImuFacts:
-    """Readings of one IMU, x y z in its axes: gyro [rad/s], accel [m/s^2], in the recorded units.
-
-    frame: frame id. mean_accel: mean of |accel|. gyro_rms: RMS of each axis; accel_std: RMS about the mean.
-    principal_rms: RMS rate about the directions `principal` (unit vectors), largest first. gravity_spread: result of
-    `gravity_turns.gravity_spread` for rates taken as rad/s, as deg/s, and as zero. problem: why `calibrate` would
-    refuse the readings, else "".
-    """
-
-    frame: str
-    gyro_min: Vector
-    gyro_max: Vector
-    accel_min: Vector
-    accel_max: Vector
-    mean_accel: float
-    gyro_rms: Vector
-    accel_std: Vector
-    principal_rms: Vector
-    principal: tuple[Vector, Vector, Vector]
-    gravity_spread: Vector | None
-    saturated: tuple[Saturation, ...]
-    notes: tuple[str, ...]
-    problem: str = ""
-
-
-@dataclass(frozen=True)
-class TargetView:
-    """Detections of the target in the images of one camera.
-
-    images: their number, None if only corners were recorded; seen: number of images with the target; corners: number in
-    all images. cells: number of corners in each cell of a grid over the image, row by row; None if the resolution is
-    unknown. tilt_deg: 10th, 50th and 90th percentile of the angle between the optical axis and the target's normal;
-    distance_ratio: 90th over 10th percentile of the distance. Both are rough, as the intrinsics are unknown.
-    """
-
-    camera: str
-    images: int | None
-    seen: int
-    corners: int
-    cells: tuple[tuple[int, ...], ...] | None
-    tilt_deg: Vector | None
-    distance_ratio: float | None
-    notes: tuple[str, ...] = ()
-    problem: str = ""
-
-
-@dataclass(frozen=True)
-class CameraSource:
-    """One camera: the topics of its images, corners, tracks (tables) and CameraInfo, or None. others: further topics of
-    the same images. topic: the one that `calibrate` reads, which is corners, else images, else tracks."""
-
-    name: str
-    topic: TopicInfo
-    images: TopicInfo | None
-    corners: TopicInfo | None
-    info: TopicInfo | None
-    others: tuple[str, ...] = ()
-    tracks: TopicInfo | None = None
+    content: str = ""
 
 
 @dataclass(frozen=True)
 class SensorSource:
-    """A topic that can be a sensor. kind: type of the sensor in a rig file."""
+    """What a sensor is read from. kind: type of the sensor in a rig file; topic: the one that `calibrate` reads."""
 
     kind: str
     topic: TopicInfo
 
+    @property
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """The topics that are listed under the name of the sensor."""
+        return (self.topic,)
+
+    @property
+    def read_topic(self) -> TopicInfo | None:
+        """The topic whose messages are read in full; None: only stamps are read."""
+        return None
+
 
 @dataclass(frozen=True)
 class Sources:
-    """The sensors of a recording by name. left_out: image topics that are not used, and why. others: sensors that are
-    neither cameras nor IMUs, sorted by kind; some may not be on the robot. halves: the two topics of an IMU whose
-    gyroscope and accelerometer have a topic each; `imus` has the gyroscope's."""
+    """The sensors of a recording by name, those of a kind together; some may not be on the robot. left_out: topics
+    that are not used, and why."""
 
-    cameras: tuple[CameraSource, ...]
-    imus: Mapping[str, TopicInfo]
+    sensors: Mapping[str, SensorSource]
     left_out: Mapping[str, str]
-    others: Mapping[str, SensorSource] = field(default_factory=dict)
-    halves: Mapping[str, TwoSources] = field(default_factory=dict)
 
-    def of(self, kind: str) -> dict[str, TopicInfo]:
-        """Topics of the sensors in `others` of one kind, by name."""
-        return {name: source.topic for name, source in self.others.items() if source.kind == kind}
+    def of(self, kind: str) -> dict[str, Any]:
+        """Sources of the sensors of one kind, by name; their class is that of the kind."""
+        return {name: source for name, source in self.sensors.items() if source.kind == kind}
 
 
 @dataclass(frozen=True)
@@ -175,39 +108,28 @@ class FramePair:
 
 @dataclass(frozen=True)
 class GivenTarget:
-    """A target and its file; resolutions: (width, height) px of cameras by name, if the file is a rig file."""
+    """A target and its file; sensors: by name, if the file is a rig file."""
 
     target: Target
     file: str
-    resolutions: Mapping[str, tuple[int, int]]
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """Result of `inspect_recording`. images, infos, views: by name of the camera; imus: by name of the IMU; facts: by
-    name of other sensors, a dataclass of the kind or None. imu: the IMU to calibrate with. shown: if no target is
-    known, words on the tags or checkerboard in a few images of each camera, "" for neither."""
+    """Result of `inspect_recording`. facts: by name of the sensor, a dataclass of its kind, or None. imu: the IMU to
+    calibrate with; None without a readable one."""
 
     recording: str
     sources: Sources
     streams: tuple[StreamFacts, ...]
-    images: Mapping[str, ImageFacts]
-    infos: Mapping[str, CameraInfo]
-    imus: Mapping[str, ImuFacts]
+    facts: Mapping[str, Any]
     imu: str | None
     target: GivenTarget | None
     kalibr: KalibrFiles
-    views: Mapping[str, TargetView] = field(default_factory=dict)
+    frames: tuple[FramePair, ...] = ()
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    frames: tuple[FramePair, ...] = ()
-    shown: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def without_target(self) -> bool:
-        """Whether there is an IMU and no camera shows a target, so that cameras can only track points of the scene."""
-        return bool(self.imus and self.shown) and not any(self.shown.values())
 
     @property
     def verdict(self) -> Literal["yes", "yes, but", "no"]:

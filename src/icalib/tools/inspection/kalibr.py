@@ -12,15 +12,14 @@ import yaml
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Checkerboard, Target
-from icalib.rig import ImuNoise
 
 _LARGEST_BYTES = 100_000  # larger YAML files are not read, as they are not written by hand
-_DENSITIES = (
-    "gyroscope_noise_density",
-    "gyroscope_random_walk",
-    "accelerometer_noise_density",
-    "accelerometer_random_walk",
-)
+_DENSITIES = {  # in a rig file: in Kalibr's
+    "gyro": "gyroscope_noise_density",
+    "gyro_walk": "gyroscope_random_walk",
+    "accel": "accelerometer_noise_density",
+    "accel_walk": "accelerometer_random_walk",
+}
 # Kalibr's camera and distortion model -> icalib's model, and the number of coefficients before the focal lengths in
 # Kalibr's intrinsics, which icalib counts as distortion.
 MODELS = {
@@ -48,11 +47,11 @@ class KalibrCamera:
 
 @dataclass(frozen=True)
 class KalibrImu:
-    """The noise in an imu file, and the topic of the IMU."""
+    """The noise densities in an imu file, by their names in a rig file, and the topic of the IMU."""
 
     file: str
     topic: str
-    noise: ImuNoise
+    densities: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -176,8 +175,8 @@ def _camera(file: str, name: str, data: dict[str, Any]) -> KalibrCamera:
 
 
 def _imu(file: str, _: str, data: dict[str, Any]) -> KalibrImu:
-    densities = [_positive(data, name, file) for name in _DENSITIES]
-    return KalibrImu(file, str(data.get("rostopic", "")), ImuNoise(*densities, source=f"{Path(file).name} (Kalibr)"))
+    densities = {name: _positive(data, field, file) for name, field in _DENSITIES.items()}
+    return KalibrImu(file, str(data.get("rostopic", "")), densities)
 
 
 def _numbers(data: dict[str, Any], name: str, size: int | None, file: str) -> tuple[float, ...]:

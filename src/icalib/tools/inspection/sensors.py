@@ -6,16 +6,25 @@ from collections.abc import Iterator
 
 from icalib.data.topics import listing
 from icalib.tools.inspection.facts import Finding, Inspection
-from icalib.tools.inspection.kinds import inspectors, moves_without_imu, moving, nouns, without_imu
+from icalib.tools.inspection.kinds import (
+    dependent,
+    independent,
+    inertial,
+    inspectors,
+    moves_without_imu,
+    moving,
+    nouns,
+    without_imu,
+)
 
 
 def missing_sensors(inspection: Inspection) -> Iterator[Finding]:
     """Findings on missing sensors, and on topics without messages."""
-    sources, topic_list = inspection.sources, listing([s.topic for s in inspection.streams])
-    if sources.imus:
+    topic_list = listing([s.topic for s in inspection.streams])
+    if inertial(inspection):
         yield from _beside_an_imu(inspection, topic_list)
-    elif sources.cameras:
-        yield _cameras_without_imu(inspection, topic_list)
+    elif independent(inspection):
+        yield _independent_without_imu(inspection, topic_list)
     elif moves_without_imu(inspection):
         yield Finding(
             "hint",
@@ -37,11 +46,10 @@ def _wanted() -> str:
 
 
 def _beside_an_imu(inspection: Inspection, topic_list: str) -> Iterator[Finding]:
-    sources = inspection.sources
-    if sources.cameras or moving(inspection) or inspection.moving_frames:
+    if independent(inspection) or moving(inspection) or inspection.moving_frames:
         return
-    if sources.others:
-        names = " and ".join([*sources.others, *sources.imus])
+    if others := dependent(inspection):
+        names = " and ".join([*others, *inertial(inspection)])
         sentence = f"{names} do not determine the motion: {topic_list}; record a camera, a {nouns()} as well."
     else:
         sentence = (
@@ -51,28 +59,29 @@ def _beside_an_imu(inspection: Inspection, topic_list: str) -> Iterator[Finding]
     yield Finding("problem", sentence)
 
 
-def _cameras_without_imu(inspection: Inspection, topic_list: str) -> Finding:
+def _independent_without_imu(inspection: Inspection, topic_list: str) -> Finding:
+    kind = inspectors()[inspection.sources.sensors[independent(inspection)[0]].kind]
     others = [*without_imu(inspection), *(f"frames of {topic}" for topic in inspection.moving_frames)]
     if others:
         return Finding(
             "hint",
-            f"There is no IMU, so smooth motion is assumed, and {' and '.join(others)} are aligned to the cameras.",
+            f"There is no IMU, so smooth motion is assumed, and {' and '.join(others)} are aligned to the "
+            f"{kind.sensor.noun}s.",
         )
     return Finding(
         "warning",
-        f"There is no IMU: {topic_list}. Cameras alone give intrinsics, and extrinsics of those that see the target "
-        "together; for more, record sensor_msgs/Imu, or write imu0/data.csv.",
+        f"There is no IMU: {topic_list}. {kind.alone}; for more, record sensor_msgs/Imu, or write imu0/data.csv.",
     )
 
 
 def _alone(inspection: Inspection) -> str:
-    """Why sensors without IMU and camera cannot be calibrated, as the begin of a sentence."""
-    kinds, others = inspectors(), inspection.sources.others
+    """Why sensors that need others cannot be calibrated without an IMU, as the begin of a sentence."""
+    others = dependent(inspection)
     if not others:
         return "There is no sensor to calibrate"
     names = " and ".join(others)
-    if all(kinds[source.kind].sensor.needs_imu for source in others.values()):
+    if others == dependent(inspection, lambda kind: kind.sensor.needs_imu):
         return f"Without an IMU {names} cannot be calibrated"
-    if any(kinds[source.kind].moves_alone for source in others.values()):
+    if dependent(inspection, lambda kind: kind.moves_alone):
         return f"Beside {without_imu(inspection)[0]} there is no sensor that can be calibrated without an IMU"
     return f"Without an IMU the motion is unknown from {names}"

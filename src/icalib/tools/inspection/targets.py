@@ -18,8 +18,8 @@ def read_target(path: Path) -> GivenTarget:
     root = read_yaml(path)
     fields = root.entries()
     if "target_type" in yaml_mapping(path):
-        return GivenTarget(kalibr_target(yaml_mapping(path), str(path)), str(path), {})
+        return GivenTarget(kalibr_target(yaml_mapping(path), str(path)), str(path))
     if "sensors" in fields:
         rig = load_rig(path)
-        return GivenTarget(rig.target, str(path), {c.name: c.resolution for c in rig.cameras})
-    return GivenTarget(load_target(path), str(path), {})
+        return GivenTarget(rig.target, str(path), rig.sensors)
+    return GivenTarget(load_target(path), str(path))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.data.stamps.jumps import longest_part
-from icalib.tools.inspection.facts import Timing
+from icalib.tools.inspection.facts import Inspection, Timing
 
 GAP = 1.5  # in median intervals; one lost message makes 2
 
@@ -42,3 +42,17 @@ def timing_of(stamps_ns: np.ndarray) -> Timing | None:
 def overlap_s(a: Timing, b: Timing) -> float:
     """Overlap of the two spans of stamps [s]; negative: the gap between them."""
     return (min(a.last_ns, b.last_ns) - max(a.first_ns, b.first_ns)) * 1e-9
+
+
+def words_on_gaps(t: Timing) -> str:
+    """Number, length and instant of the gaps, for a sentence."""
+    return (
+        f"{t.gaps} gap{'s' * (t.gaps > 1)}, the longest of {t.longest_gap_s or 0.0:.3f} s at "
+        f"{t.longest_gap_at_s or 0.0:.2f} s"
+    )
+
+
+def imu_timing(inspection: Inspection) -> Timing | None:
+    """Statistics of the stamps of the IMU to calibrate with; None without one."""
+    imu = inspection.imu
+    return None if imu is None else inspection.stream(inspection.sources.sensors[imu].topic).timing

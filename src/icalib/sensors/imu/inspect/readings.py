@@ -9,12 +9,13 @@ from icalib.data.recordings import Recording
 from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor, TwoSources
+from icalib.sensors.imu.inspect.facts import ImuFacts
 from icalib.sensors.imu.read import readings
 from icalib.sensors.imu.read.checks import checked_imu, saturations
 from icalib.sensors.imu.read.gravity_turns import gravity_spread
 from icalib.sensors.imu.read.halves import one_stream
 from icalib.sensors.imu.spec import DEFAULT_CLASS, class_noise
-from icalib.tools.inspection.facts import ImuFacts, Vector
+from icalib.tools.inspection.facts import Vector
 
 _DEGREE = np.pi / 180.0
 

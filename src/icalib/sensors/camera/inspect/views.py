@@ -12,17 +12,30 @@ from icalib.detection.boards.board_diagnosis import checkerboard_in
 from icalib.detection.boards.diagnosis import tags_in
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.rig import Camera
+from icalib.sensors.camera.inspect.facts import CameraSource, TargetView
 from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.sensors.camera.read.detected_corners import find_corners
-from icalib.tools.inspection.facts import CameraSource, TargetView
+from icalib.sensors.camera.spec import Camera
+from icalib.tools.inspection.facts import Inspection
 
 GRID = (8, 5)  # columns and rows of cells over the image
 _LEAST_CORNERS = 8  # for the tilt of a board in one image; a free tag needs its four
 
 
+def resolution_of(inspection: Inspection, name: str, camera: CameraSource) -> tuple[int, int] | None:
+    """Resolution (width, height) px of the camera's images; without images, that of the rig file with the target or of
+    Kalibr's camchain; else None."""
+    if camera.images:
+        return inspection.facts[name].images.resolution
+    stated = inspection.target.sensors.get(name) if inspection.target else None
+    if isinstance(stated, Camera):
+        return stated.resolution
+    return next((c.resolution for c in inspection.kalibr.cameras if c.name == name), None)
+
+
 def target_view(
     recording: Recording,
+    name: str,
     source: CameraSource,
     target: Target,
     resolution: tuple[int, int] | None,
@@ -31,9 +44,9 @@ def target_view(
     """Finds the target in all images of the camera, or reads the recorded corners. A failure is described in
     `TargetView.problem`."""
     images = source.images.name if source.images else None
-    path = source.corners.name if source.corners else f"{source.name}/corners.csv"
+    path = source.corners.name if source.corners else f"{name}/corners.csv"
     # The detection of corners does not depend on the camera model.
-    camera = Camera(source.name, path, "pinhole-radtan", resolution or (1, 1), topic=images)
+    camera = Camera(name, path, "pinhole-radtan", resolution or (1, 1), topic=images)
     tabled = source.corners is not None
     try:
         if tabled:
@@ -41,11 +54,11 @@ def target_view(
         else:
             corners, notes = find_corners(recording, camera, target, progress=progress)
     except RecordingError as error:
-        return TargetView(source.name, None, 0, 0, None, None, None, problem=str(error))
+        return TargetView(name, None, 0, 0, None, None, None, problem=str(error))
     count = np.diff(corners.start)
     tilt, ratio = _poses(corners, target)
     return TargetView(
-        source.name,
+        name,
         images=None if tabled else len(count),
         seen=int((count > 0).sum()),
         corners=len(corners.uv),

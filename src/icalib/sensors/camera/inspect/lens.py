@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from icalib.geometry.cameras import camera_model
+from icalib.sensors.camera.inspect.facts import CameraSource
 from icalib.sensors.camera.read.camera_info import CameraInfo
-from icalib.tools.inspection.facts import CameraSource, Inspection
+from icalib.tools.inspection.facts import Inspection
 from icalib.tools.inspection.kalibr import KalibrCamera
 
 DEFAULT_MODEL = "pinhole-radtan"
@@ -32,16 +33,19 @@ class LensStart:
     notes: tuple[str, ...] = ()
 
 
-def lens_start(inspection: Inspection, camera: CameraSource, resolution: tuple[int, int] | None) -> LensStart:
-    """Model and initial values for the lens of `camera`, whose images have `resolution` (width, height) px."""
+def lens_start(
+    inspection: Inspection, name: str, camera: CameraSource, resolution: tuple[int, int] | None
+) -> LensStart:
+    """Model and initial values for the lens of the camera called `name`, whose images have `resolution` (width, height)
+    px."""
     notes: list[str] = []
-    kalibr = _kalibr(inspection, camera)
+    kalibr = _kalibr(inspection, name, camera)
     if kalibr is not None and kalibr.resolution != resolution:
         notes.append(f"{Path(kalibr.file).name} is for {_size(kalibr.resolution)} px and is not used")
     elif kalibr is not None:
         source = f"{Path(kalibr.file).name} (Kalibr, {kalibr.name})"
         return LensStart(kalibr.model, f"from {source}", kalibr.intrinsics, kalibr.distortion or None, source)
-    info = inspection.infos.get(camera.name)
+    info = inspection.facts[name].info
     if info is None or camera.info is None:
         why = "for lenses of up to about 100 deg; for a fisheye: pinhole-equidistant"
         return LensStart(DEFAULT_MODEL, why, notes=tuple(notes))
@@ -87,14 +91,14 @@ def _distortion(info: CameraInfo, model: str) -> Values | None:
     return tuple(float(x) for x in info.distortion[:size]) if np.isfinite(info.distortion).all() else None
 
 
-def _kalibr(inspection: Inspection, camera: CameraSource) -> KalibrCamera | None:
+def _kalibr(inspection: Inspection, name: str, camera: CameraSource) -> KalibrCamera | None:
     """Kalibr's entry with the camera's topic. If no entry names a topic of this recording, that with the camera's
     name."""
     topics = {s.topic.name.strip("/") for s in inspection.streams}
     named = any(k.topic.strip("/") in topics for k in inspection.kalibr.cameras)
     topic = camera.images.name.strip("/") if camera.images else None
     matches: Callable[[KalibrCamera], bool] = (
-        (lambda k: k.topic.strip("/") == topic) if named else (lambda k: k.name == camera.name)
+        (lambda k: k.topic.strip("/") == topic) if named else (lambda k: k.name == name)
     )
     return next((k for k in inspection.kalibr.cameras if matches(k)), None)
 
