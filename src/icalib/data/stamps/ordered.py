@@ -75,11 +75,13 @@ def _plural(noun: str) -> str:
     return f"{noun}es" if noun.endswith("x") else f"{noun}s"
 
 
+def true_runs(flag: np.ndarray) -> list[tuple[int, int]]:
+    """First index, and the one after the last, of each run of True in `flag` (N,) bool."""
+    edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
+    return list(zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True))
+
+
 def longest_run(flag: np.ndarray) -> tuple[int, int]:
     """Begin and length of the longest run of True in `flag` (N,) bool; (0, 0) if there is none."""
-    edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
-    begin, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
-    if not len(begin):
-        return 0, 0
-    longest = int(np.argmax(end - begin))
-    return int(begin[longest]), int(end[longest] - begin[longest])
+    begin, end = max(true_runs(flag), key=lambda run: run[1] - run[0], default=(0, 0))
+    return begin, end - begin

@@ -135,17 +135,26 @@ class TagTarget(Target):
         """(N,) numbers of the tags with ids (N,). Raises RecordingError if the target has no such tag."""
 
 
-def untagged_index(tag_id: np.ndarray, corner: np.ndarray, n_points: int, sizes: str) -> np.ndarray:
-    """`point_index` for a target without tags. sizes: words for the fields to check in the rig file."""
-    tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
-    if (tag_id != 0).any():
-        raise RecordingError(
-            f"tag {tag_id[tag_id != 0][0]} is not on the target, whose corners have tag 0; correct the tag."
-        )
-    bad = (corner < 0) | (corner >= n_points)
-    if bad.any():
-        raise RecordingError(
-            f"corner {corner[bad][0]} is not on the target (corners 0 to {n_points - 1}); "
-            f"check {sizes} in the rig file."
-        )
-    return corner
+@dataclass(frozen=True)
+class UntaggedTarget(Target):
+    """Target whose points are not corners of tags. sizes: words for the fields that give the number of points."""
+
+    blooms: ClassVar[bool] = False
+    sizes: ClassVar[str] = "rows and cols"
+
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+        if (tag_id != 0).any():
+            raise RecordingError(
+                f"tag {tag_id[tag_id != 0][0]} is not on the target, whose corners have tag 0; correct the tag."
+            )
+        bad = (corner < 0) | (corner >= len(self.points))
+        if bad.any():
+            raise RecordingError(
+                f"corner {corner[bad][0]} is not on the target (corners 0 to {len(self.points) - 1}); "
+                f"check {self.sizes} in the rig file."
+            )
+        return corner
+
+    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros_like(index), index

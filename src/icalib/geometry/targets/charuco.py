@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.errors import RigError
-from icalib.geometry.targets.base import Target, untagged_index
+from icalib.geometry.targets.base import UntaggedTarget
 from icalib.geometry.targets.families import TagSet, checked_family
 
 
 @dataclass(frozen=True)
-class Charuco(Target):
+class Charuco(UntaggedTarget):
     """OpenCV's ChArUco board: `squares_x` x `squares_y` squares with edge `square_size` [m], and a tag in each white
     square.
 
@@ -27,7 +27,7 @@ class Charuco(Target):
     """
 
     type: ClassVar[str] = "charuco"
-    blooms: ClassVar[bool] = False
+    sizes: ClassVar[str] = "squares_x and squares_y"
     seldom: ClassVar[tuple[str, ...]] = ("legacy", "inverted")
 
     squares_x: int
@@ -65,9 +65,3 @@ class Charuco(Target):
     @property
     def tags(self) -> TagSet:
         return TagSet(self.dictionary, 1, tuple(range(self.squares_x * self.squares_y // 2)))
-
-    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        return untagged_index(tag_id, corner, len(self.points), "squares_x and squares_y")
-
-    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros_like(index), index

@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.errors import RigError
-from icalib.geometry.targets.base import Target, untagged_index
+from icalib.geometry.targets.base import UntaggedTarget
 
 
 @dataclass(frozen=True)
-class Checkerboard(Target):
+class Checkerboard(UntaggedTarget):
     """Checkerboard with `rows` x `cols` INNER corners between squares with edge `square_size` [m].
 
     The bottom left square is black, as in Kalibr, or white if `inverted`. upright: the rows run to the right in all
@@ -23,7 +23,6 @@ class Checkerboard(Target):
     """
 
     type: ClassVar[str] = "checkerboard"
-    blooms: ClassVar[bool] = False
     seldom: ClassVar[tuple[str, ...]] = ("inverted", "upright")
 
     rows: int
@@ -56,9 +55,3 @@ class Checkerboard(Target):
         """(rows cols, 3) inner corners [m]."""
         row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
         return self.square_size * np.stack([col, row, 0 * row], axis=1)
-
-    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        return untagged_index(tag_id, corner, len(self.points), "rows and cols")
-
-    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros_like(index), index

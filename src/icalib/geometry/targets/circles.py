@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.errors import RigError
-from icalib.geometry.targets.base import Target, untagged_index
+from icalib.geometry.targets.base import UntaggedTarget
 
 
 @dataclass(frozen=True)
-class Circles(Target):
+class Circles(UntaggedTarget):
     """`rows` x `cols` black circles with `diameter` [m] on white.
 
     In a symmetric grid the centres of neighbours are `spacing` [m] apart. In an `asymmetric` grid, rows are one spacing
@@ -24,7 +24,6 @@ class Circles(Target):
     """
 
     type: ClassVar[str] = "circles"
-    blooms: ClassVar[bool] = False
     seldom: ClassVar[tuple[str, ...]] = ("asymmetric",)
 
     rows: int
@@ -67,9 +66,3 @@ class Circles(Target):
         else:
             quarters = range(4) if self.rows == self.cols else (0, 2)
         return tuple(np.rot90(number, k).ravel() for k in quarters)
-
-    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        return untagged_index(tag_id, corner, len(self.points), "rows and cols")
-
-    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros_like(index), index

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from icalib.data.measurements import ImuStream
+from icalib.data.stamps.ordered import true_runs
 from icalib.errors import EstimationError
 
 _GAP_PERIODS = 5.0  # periods: a longer interval between stamps is a gap, a shorter one is jitter of the stamps
@@ -54,7 +55,7 @@ def still_readings(imu: ImuStream) -> Still:
     parts, begins, period, gaps = _even(imu.name, imu.stamps_ns, readings)
     warnings = glitches + gaps
     window = max(1, round(_WINDOW_S / period))
-    runs = [(k, *run) for k, moved in enumerate(_disturbed(parts, window)) for run in _runs(~moved)]
+    runs = [(k, *run) for k, moved in enumerate(_disturbed(parts, window)) for run in true_runs(~moved)]
     longest = max((last - first for _, first, last in runs), default=0)
     total = sum(len(part) for part in parts) * period
     if longest * window * period < _LEAST_S:
@@ -205,9 +206,3 @@ def _rounding_step(parts: list[np.ndarray]) -> np.ndarray:
     sample = np.concatenate([part[:_SAMPLE] for part in parts[: 1 + int(np.searchsorted(ends, _SAMPLE))]])
     levels = (np.unique(values) for values in sample.T)
     return np.array([np.median(np.diff(v)) if len(v) > 1 else 0.0 for v in levels])
-
-
-def _runs(flag: np.ndarray) -> list[tuple[int, int]]:
-    """Begin and end of each run of True in `flag` (m,)."""
-    edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
-    return list(zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True))

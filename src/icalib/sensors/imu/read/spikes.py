@@ -12,6 +12,8 @@ from itertools import combinations
 
 import numpy as np
 
+from icalib.data.stamps.ordered import true_runs
+
 _MAX_DEVIATIONS = 10.0  # robust standard deviations from the line; white noise exceeds it once in 1e22 readings
 _MAX_NEIGHBOUR_DEVIATIONS = 5.0  # robust standard deviations of the neighbours after the spike is removed
 _HALF_WINDOW = 10  # readings to each side from which the local spread is estimated
@@ -36,7 +38,7 @@ def spikes(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
     for _ in range(2):  # a spike may hide another one near it
         good = np.flatnonzero(~bad)
         t, x = seconds[good], values[good]
-        for run in _runs(flag[good]):
+        for run in true_runs(flag[good]):
             for group in _within(run, len(good)):
                 if _is_wrong(t, x, group):
                     bad[good[group]] = True
@@ -60,7 +62,7 @@ def stuck(values: np.ndarray) -> np.ndarray:
     """(N,) bool: readings (N, 3) in a run of exact repeats that ends with a jump."""
     step = np.linalg.norm(np.diff(squarable(values), axis=0), axis=1)
     bad = np.zeros(len(values), bool)
-    for begin, end in _runs(np.concatenate([[False], step == 0.0])):
+    for begin, end in true_runs(np.concatenate([[False], step == 0.0])):
         if end - begin < _MIN_REPEATS or end >= len(values):
             continue
         around = np.concatenate(
@@ -95,12 +97,6 @@ def _off_line(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
     """(N - 2, 3) distances of the inner readings (N, 3) from the line between their neighbours."""
     share = ((seconds[1:-1] - seconds[:-2]) / np.maximum(seconds[2:] - seconds[:-2], 1e-12))[:, None]
     return np.abs(values[1:-1] - (1.0 - share) * values[:-2] - share * values[2:])
-
-
-def _runs(flag: np.ndarray) -> list[tuple[int, int]]:
-    """First index and the one after the last of each run of True."""
-    edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
-    return list(zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True))
 
 
 def _within(run: tuple[int, int], n: int) -> Iterator[np.ndarray]:
