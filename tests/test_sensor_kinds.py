@@ -24,8 +24,7 @@ NAMING = {
     "data/measurements.py",  # shorthand, for users
     "detection/primitives/corners.py",  # the stream of the corners of images, for users
     "estimate/noise_size.py",  # noise densities of the IMU
-    "initialize/assumed_motion.py",
-    "initialize/cameras_on_odometry.py",
+    "initialize/assumed_sensors.py",  # they are an IMU and a pose sensor
     "motion/imu_data.py",  # readings of the IMU, which link keyframes
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users

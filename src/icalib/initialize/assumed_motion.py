@@ -17,15 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from icalib.data.measurements import ImuStream, Measurements
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.cameras_on_odometry import (
-    camera_poses,
-    pose_streams,
-    relative_to_first_camera,
+from icalib.initialize.assumed_sensors import assumed_imu, pose_streams, with_assumed_readings
+from icalib.initialize.hosts_on_odometry import (
+    body_poses_by,
+    hosts_without_body,
+    relative_to_body,
     with_pose_sensor,
     with_stated_values,
 )
@@ -35,6 +36,7 @@ from icalib.initialize.steps.initializer import (
     Initializer,
     Values,
     initializer_of,
+    keyframe_hosts,
     kinds_of,
     motion_kinds,
     place_sensors,
@@ -45,14 +47,11 @@ from icalib.initialize.steps.smooth_trajectory import MIN_PARABOLA_POSES, BodyPo
 from icalib.model.frames import FRAME, frame_of
 from icalib.motion.keyframe_placement import first_keyframes
 from icalib.optim.state import State, in_recording
-from icalib.rig import ImuNoise, ImuSensor, Rig, Sensor
-from icalib.sensors.parameter import Parameter, fixed
+from icalib.rig import Rig
+from icalib.sensors.parameter import fixed
 from icalib.sensors.sensor import mounted
 
-ASSUMED_IMU = "assumed motion"  # name of the assumed IMU; it has a space, so no sensor has this name
 ASSUMED_IMU_STEP_S = 0.01  # s between its readings
-# s: ratio of the assumed IMU's white noise density to its random walk density; keeps covariances regular
-REGULARISING_STEP_S = 5e-3
 DENSITY_LAG_S = 0.1  # s: lag over which changes of rate and acceleration are compared to estimate their densities
 MIN_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): floor for a body at rest
 MIN_KEYFRAME_SPACING_S = 0.02  # s between keyframes, as with an IMU
@@ -96,7 +95,7 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
     # underestimate the densities.
     rig_with_imu = _with_assumption(rig, recordings, _smoothed(motion.body, narrow=True))
     inputs = replace(
-        inputs_for(rig_with_imu, _with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), user_rig=rig
+        inputs_for(rig_with_imu, with_assumed_readings(recordings, paths, rig.settings.max_gap_s)), user_rig=rig
     )
     # The estimate gets an IMU that reads zero. Alignment needs one that reads the motion of the smoothed trajectory.
     ideal = _with_ideal_readings(rig_with_imu, recordings, paths, inputs)
@@ -104,7 +103,7 @@ def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
         motion.values if motion.odometry is None else with_stated_values(inputs, motion.odometry, motion.values)
     )
     # Keyframes at a sensor's measurements need its time offset, so such a sensor is aligned before keyframes exist.
-    if _keyframe_hosts(rig_with_imu) and not sensor_values:
+    if hosts_without_body(rig_with_imu) and not sensor_values:
         sensor_values = _place_hosts(rig_with_imu, recordings, motion.body, paths)
     start, rates = _keyframe_motion(inputs, motion.body, sensor_values)
     # The biases are minus the rate and acceleration of the body, because the assumed IMU reads zero.
@@ -124,18 +123,14 @@ class _BodyMotion:
 
     @classmethod
     def by(cls, source: Initializer[Any], rig: Rig, recordings: Sequence[Measurements]) -> _BodyMotion:
-        """Poses of the body by the sensors of `source`. If these are no cameras but the body is, the cameras are
-        aligned to them first."""
+        """Poses of the body by the sensors of `source`. If the body is of another kind, all sensors that host keyframes
+        are aligned to these first."""
         paths, values = source.body_poses(rig, recordings)
         if initializer_of(rig.sensors[rig.reference]) is source:
             return cls(paths, values)
         (name,) = source.sources(rig)
-        camera_values = _place_cameras(rig, recordings, name, paths)
-        return cls(
-            camera_poses(rig, recordings, name, paths, camera_values),
-            relative_to_first_camera(rig, name, camera_values),
-            name,
-        )
+        values = _place_on_odometry(rig, recordings, name, paths)
+        return cls(body_poses_by(rig, recordings, name, paths, values), relative_to_body(rig, name, values), name)
 
 
 def _smoothed(body: Sequence[BodyPoses], narrow: bool = False) -> list[SmoothTrajectory]:
@@ -144,36 +139,30 @@ def _smoothed(body: Sequence[BodyPoses], narrow: bool = False) -> list[SmoothTra
     return [poses.at(np.arange(0.0, poses.seconds[-1], ASSUMED_IMU_STEP_S), narrow=narrow) for poses in body]
 
 
-def _keyframe_hosts(rig: Rig) -> list[Sensor]:
-    """The sensors at whose measurements keyframes are set, without the body."""
-    return [s for s in rig.mounted if initializer_of(s).hosts_keyframes and s.name != rig.reference_without_imu]
-
-
 def _place_hosts(
     rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], paths: Sequence[SmoothTrajectory]
 ) -> Values:
     """Values of the sensors that host keyframes, aligned to the motion of the first pose sensor of `rig`."""
-    hosts = _keyframe_hosts(rig)
+    hosts = hosts_without_body(rig)
     rig_without_hosts = rig.without(*(s.name for s in hosts))
     recordings_without_hosts = [m.only(*rig_without_hosts.sensors) for m in recordings]
     inputs = _with_ideal_readings(
         rig_without_hosts,
         recordings_without_hosts,
         paths,
-        inputs_for(rig_without_hosts, _with_assumed_readings(recordings_without_hosts, paths)),
+        inputs_for(rig_without_hosts, with_assumed_readings(recordings_without_hosts, paths)),
     )
-    ideal = _with_ideal_readings(rig, recordings, paths, inputs_for(rig, _with_assumed_readings(recordings, paths)))
+    ideal = _with_ideal_readings(rig, recordings, paths, inputs_for(rig, with_assumed_readings(recordings, paths)))
     return place_sensors(ideal, _keyframe_motion(inputs, body_poses, {})[0], hosts)
 
 
-def _place_cameras(rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses]) -> Values:
-    """Values of cameras with feature tracks, aligned to the planar trajectories `paths` of `sensor`. Raises
+def _place_on_odometry(rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses]) -> Values:
+    """Values of the sensors that host keyframes, aligned to the planar trajectories `paths` of `sensor`. Raises
     EstimationError if the motion does not determine them."""
     rig_with_poses = with_pose_sensor(rig, sensor)
     streams = pose_streams(recordings, sensor, paths)
-    recordings_with_poses = [
-        m.only(*(c.name for c in rig.cameras)).with_streams(s) for m, s in zip(recordings, streams, strict=True)
-    ]
+    hosts = [s.name for s in keyframe_hosts(rig.mounted)]
+    recordings_with_poses = [m.only(*hosts).with_streams(s) for m, s in zip(recordings, streams, strict=True)]
     smooth = _smoothed(paths)
     try:
         return _place_hosts(
@@ -190,7 +179,7 @@ def _with_ideal_readings(
     rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory], time_base: Inputs
 ) -> Inputs:
     """Inputs with the readings that an ideal IMU in the body would have. time_base: inputs whose time base is kept."""
-    ideal = inputs_for(rig, _with_assumed_readings(recordings, paths), time_base)
+    ideal = inputs_for(rig, with_assumed_readings(recordings, paths), time_base)
     assert ideal.imu is not None
     return replace(ideal, imu=replace(ideal.imu, forwards=False))
 
@@ -220,9 +209,8 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
         + MIN_DENSITY
         for field in ("rate", "acceleration")
     )
-    noise = ImuNoise(REGULARISING_STEP_S * turning, turning, REGULARISING_STEP_S * jerking, jerking, ASSUMED_IMU)
     identity = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
-    imu = ImuSensor(ASSUMED_IMU, "", noise, Parameter("fixed"), assumed=True)
+    imu = assumed_imu(turning, jerking)
     if not motion_kinds(rig)[0].hosts_keyframes:
         motion = SmoothMotion(paths, float(turning), float(jerking))
         imu = replace(imu, pose_keyframes_s=keyframe_spacing(rig, recordings, motion))
@@ -241,32 +229,6 @@ def _changes_over_lag(path: SmoothTrajectory, field: str) -> np.ndarray:
     n = round(DENSITY_LAG_S / ASSUMED_IMU_STEP_S)
     x = getattr(path, field)
     return (x[n:] - x[:-n])[path.near[n:] & path.near[:-n]]
-
-
-def _with_assumed_readings(
-    recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory], max_gap_s: float | None = None
-) -> list[Measurements]:
-    """The recordings with readings of the assumed IMU. With `max_gap_s`: zeros, except in gaps between poses that are
-    longer [s]. Without: ideal readings at the instants with poses nearby."""
-    out = []
-    for m, path in zip(recordings, paths, strict=True):
-        stamps = m.origin_ns + np.round(path.seconds * 1e9).astype(np.int64)
-        used = path.near.copy() if max_gap_s is None else _within_short_gaps(path, max_gap_s)
-        used[:1] = True  # its clock begins where the body's does
-        gyro, accel = (x[used] * float(max_gap_s is None) for x in (path.rate, path.acceleration))
-        out.append(m.with_streams(ImuStream(ASSUMED_IMU, stamps[used], gyro, accel)))
-    return out
-
-
-def _within_short_gaps(path: SmoothTrajectory, max_gap_s: float) -> np.ndarray:
-    """(m,) whether poses are nearby, or the gap between poses is at most `max_gap_s`. Over longer gaps the assumption
-    does not constrain the motion."""
-    pose_s = path.seconds[path.near]
-    if not len(pose_s):
-        return np.zeros(len(path.seconds), dtype=bool)
-    after, ends = np.searchsorted(pose_s, path.seconds), np.concatenate([[-np.inf], pose_s, [np.inf]])
-    previous_s, next_s = ends[after], ends[after + 1]
-    return path.near | (next_s - previous_s <= max_gap_s)
 
 
 def _body_identities(inputs: Inputs) -> Values:

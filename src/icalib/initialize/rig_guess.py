@@ -17,8 +17,8 @@ from icalib.initialize.steps.initializer import (
     Initializer,
     UnusableMeasurementsError,
     Values,
-    initializer_of,
     inputs_of_sensors,
+    keyframe_hosts,
     kinds_of,
     motion_kinds,
     place_sensors,
@@ -94,7 +94,7 @@ def _align_to_trajectory(
     All other sensors are aligned to it. guess: of the parameters in `state`."""
     rig, inputs = inputs.rig, source.adopted(inputs, source_inputs)
     unplaced = [s for s in rig.mounted if s.name not in source_inputs.rig.sensors]
-    hosts = [s for s in unplaced if initializer_of(s).hosts_keyframes]
+    hosts = keyframe_hosts(unplaced)
     placed = place_sensors(inputs, state, hosts)
     if hosts or source.moves_keyframes:
         values = start_values(inputs, state.values | placed)

@@ -182,6 +182,11 @@ def motion_kinds(rig: Rig) -> list[Initializer[Any]]:
     return sorted(ranked, key=lambda kind: ranked[kind])
 
 
+def keyframe_hosts(sensors: Iterable[Sensor]) -> list[Sensor]:
+    """Those of `sensors` at whose measurements keyframes are, even if another kind shows the motion."""
+    return [s for s in sensors if initializer_of(s).hosts_keyframes]
+
+
 def place_sensors(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Values:
     """Values of all `sensors`, aligned to the trajectory in `state`, kind by kind. Kinds with `asks_for_vertical` come
     last."""
