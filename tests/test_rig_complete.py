@@ -34,7 +34,11 @@ EMPTY = Measurements.of_streams()
         (Rig(by_name(LIDAR, WHEELS)), "lidar0 needs an IMU"),
         (Rig(by_name(MOCAP)), "mocap0 is the only sensor"),
         (Rig(by_name(GNSS)), "gnss0 positions do not determine rotations; add an IMU, a camera that sees a target"),
-        (Rig(by_name(GNSS, WHEELS)), "gnss0 positions do not determine rotations"),
+        (
+            Rig(by_name(GNSS, WHEELS)),
+            "gnss0 positions and wheel0 do not determine roll and pitch; if the floor",
+        ),
+        (Rig(by_name(GNSS, WHEELS, LIDAR)), "lidar0 needs an IMU"),
         (Rig(by_name(GNSS, LIDAR)), "lidar0 needs an IMU"),
         (Rig(by_name(GNSS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
         (Rig(by_name(WHEELS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),

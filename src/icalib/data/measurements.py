@@ -100,13 +100,13 @@ class Measurements:
         return self.reference.origin_ns if self.imu is None else self.imu.origin_ns
 
     @property
-    def reference(self) -> CornerStream | TrackStream | PoseStream:
-        """Stream of the reference sensor if there is no IMU: the first camera, or else the first pose sensor.
+    def reference(self) -> CornerStream | TrackStream | PoseStream | WheelStream | WheelPoses:
+        """Stream of the reference sensor if there is no IMU: the first camera, else pose sensor, else wheels.
 
         If the cameras have only feature tracks, it is the first pose sensor, or else the first camera.
         """
         follow = bool(self.tracks) and not any(len(c.uv) for c in self.cameras)
-        return (*self.poses, *self.tracks)[0] if follow else (*self.cameras, *self.poses)[0]
+        return (*self.poses, *self.tracks)[0] if follow else (*self.cameras, *self.poses, *self.wheels)[0]
 
     def unassociated(self) -> Measurements:
         """A copy in which the association of LiDAR points with planes is unknown."""

@@ -5,8 +5,9 @@ rate and minus its acceleration, in body axes. The random walk of the biases is 
 jerk: a motion prior that connects keyframes and propagates poses to the instants of measurements. Its densities are
 estimated from the poses of the body; nothing else is taken from the measurements twice.
 
-The body is the first camera or the first pose sensor. The world is the frame of the camera's target or of the pose
-sensor's poses. Cameras with feature tracks are aligned to the trajectory of the pose sensor.
+The body is the first camera or the first pose sensor, or else the wheels. The world is the frame of the camera's
+target or of the pose sensor's poses, or a flat floor. Cameras with feature tracks are aligned to the
+trajectory of the pose sensor.
 """
 
 from __future__ import annotations
@@ -203,14 +204,16 @@ def _keyframe_motion(
 
 
 def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory]) -> Rig:
-    """The rig with the assumed IMU, which coincides with the body. Its noise densities are those of the motion."""
+    """The rig with the assumed IMU, which coincides with the body. Its noise densities are those of the motion, times
+    the `prior_factor` of the body."""
     turning, jerking = (
         np.sqrt(np.mean(np.concatenate([_changes_over_lag(p, field) for p in paths]) ** 2) / DENSITY_LAG_S)
         + MIN_DENSITY
         for field in ("rate", "acceleration")
     )
     identity = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
-    imu = assumed_imu(turning, jerking)
+    factor = initializer_of(rig.sensors[rig.reference]).prior_factor
+    imu = assumed_imu(factor * turning, factor * jerking)
     if not motion_kinds(rig)[0].hosts_keyframes:
         motion = SmoothMotion(paths, float(turning), float(jerking))
         imu = replace(imu, pose_keyframes_s=keyframe_spacing(rig, recordings, motion))

@@ -72,12 +72,11 @@ class SensorModel(Generic[S, N]):
     with a pose and a clock but no factor.
 
     keyframes: measurements at which keyframes are placed, as in "images of cam0"; empty if the kind places none.
-    only_first_places_keyframes: of several sensors, only the first places keyframes. refitted: kind of residuals whose
-    noise is fitted again when another noise density of the IMU is tried; empty if there is none.
+    refitted: kind of residuals whose noise is fitted again when another noise density of the IMU is tried; empty if
+    there is none.
     """
 
     keyframes: ClassVar[str] = ""
-    only_first_places_keyframes: ClassVar[bool] = False
     refitted: ClassVar[str] = ""
 
     # Measurements
@@ -122,6 +121,11 @@ class SensorModel(Generic[S, N]):
             return None
         stated = getattr(sensor, spec.name).value
         return np.zeros(spec.size) if stated is None else stated.copy()
+
+    def placing_keyframes(self, sensors: Sequence[S], rig: Rig) -> Sequence[S]:
+        """Those of `sensors` that place keyframes, of a kind with `keyframes`; by default all."""
+        del rig
+        return sensors
 
     def keyframe_times(self, sensor: S, stream: Any, values: dict[Key, np.ndarray], rig: Rig) -> np.ndarray:
         """(n,) times at which the sensor needs keyframes [s, body's clock since its first stamp]."""

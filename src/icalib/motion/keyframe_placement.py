@@ -44,6 +44,12 @@ def distinct(times: np.ndarray) -> np.ndarray:
     return times[np.diff(times, prepend=-np.inf) > MERGED_WITHIN_S]
 
 
+def spaced(seconds: np.ndarray, spacing: float) -> np.ndarray:
+    """The first of `seconds` (n,), increasing, in each interval of length `spacing` [s]; and the last of all."""
+    k = np.flatnonzero(np.diff(np.floor(seconds / spacing + 1e-6), prepend=-1.0))
+    return seconds[np.append(k, len(seconds) - 1)] if k[-1] < len(seconds) - 1 else seconds[k]
+
+
 def usable(imu: ImuData, times: np.ndarray, max_gap: float) -> np.ndarray:
     """(n,) whether the IMU has readings at each time; gaps up to `max_gap` seconds count as readings."""
     inside = (times >= imu.seconds[0]) & (times <= imu.seconds[-1])

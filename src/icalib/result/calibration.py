@@ -260,12 +260,13 @@ class Calibration:
     @property
     def reference(self) -> str:
         """Name of the sensor in whose frame groups and trajectory are given. It is the IMU; without an IMU the first
-        camera if the rig has a target, else the first pose sensor."""
+        camera if the rig has a target, else the first pose sensor; or else the wheels."""
         if self.imu:
             return self.imu
         poses = self.of_type("pose")
         follow = not ({"target", "targets"} & set(self.rig))
-        return (*poses, *self.cameras)[0] if follow else (*self.cameras, *poses)[0]
+        first = (*poses, *self.cameras) if follow else (*self.cameras, *poses)
+        return (*first, *self.of_type("wheels"))[0]
 
     def of_type(self, kind: str) -> tuple[str, ...]:
         """Names of the sensors of type `kind` in the rig file ("imu", "camera", "lidar", ...), in the order of the

@@ -17,7 +17,7 @@ from icalib.sensors.imu.spec import ImuSensor
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.parameter import check_fields
 from icalib.sensors.pose.spec import PoseSensor
-from icalib.sensors.sensor import Sensor
+from icalib.sensors.sensor import ROTATION, Sensor
 from icalib.sensors.wheels.spec import Wheels
 
 T = TypeVar("T", bound=Sensor)
@@ -109,10 +109,11 @@ class Rig:
 
     @property
     def reference_without_imu(self) -> str:
-        """Name of the reference sensor if the rig has no IMU: the first that determines the motion without an IMU,
-        else the first that would determine it together with one."""
+        """Name of the reference sensor if the rig has no IMU: the first that determines the motion without an IMU, else
+        the first with a rotation that would determine it together with one, else the first that drives."""
         alone = (s for s in self.mounted if s.gives_motion_without_imu(self.has_target))
-        return next(s.name for s in (*alone, *(s for s in self.mounted if s.gives_motion)))
+        together = (s for s in self.mounted if s.gives_motion and ROTATION in s.specs())
+        return next(s.name for s in (*alone, *together, *(s for s in self.mounted if s.drives), *self.mounted))
 
     @property
     def moves_by_poses(self) -> bool:

@@ -151,6 +151,11 @@ class Sensor:
         return ""
 
     @property
+    def stays_level(self) -> bool:
+        """Whether the sensor determines roll and pitch, because it stays parallel to the horizon."""
+        return False
+
+    @property
     def tracks_points(self) -> bool:
         """Whether the sensor has feature tracks."""
         return False

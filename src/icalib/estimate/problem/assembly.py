@@ -98,9 +98,9 @@ def _keyframe_sources(rig: Rig) -> list[tuple[SensorModel, list[Sensor]]]:
     """Models and sensors that place keyframes: the first kind that can. If the rig assumes its motion and poses measure
     it, all kinds that can."""
     sources = [
-        (model, sensors[:1] if model.only_first_places_keyframes else sensors)
+        (model, placing)
         for model, sensors in by_kind(rig.sensors.values())
-        if model.keyframes
+        if model.keyframes and (placing := list(model.placing_keyframes(sensors, rig)))
     ]
     return sources if rig.assumes_motion and rig.moves_by_poses else sources[:1]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,13 @@ InitialGuess = tuple[Inputs, State, Values]  # inputs, start state, values to wh
 BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = range(6)
 
 
+class Fixes(NamedTuple):
+    """t (n,) s since the first stamp of the sensor, z (n,) complex: x + i y of its positions [m]."""
+
+    t: np.ndarray
+    z: np.ndarray
+
+
 class OtherMotionError(EstimationError):
     """Measurements of a sensor do not follow the motion that other sensors show, or do not overlap with it in time."""
 
@@ -50,6 +57,7 @@ class Initializer(Generic[S]):
 
     asks_for_vertical = False  # whether its sensors are aligned last, because they need the vertical
     hosts_keyframes = False  # whether keyframes are at its measurements even if another kind shows the motion
+    prior_factor = 1.0  # on the densities of the assumed motion, if a sensor of this kind is the body
     refined_alone = True  # whether its trajectory is refined even if no other sensor is aligned to it
     moves_keyframes = False  # whether keyframes are placed again after the refinement, which changes its time offset
 
@@ -115,6 +123,11 @@ class Initializer(Generic[S]):
         reference sensor if it is of this kind, else the first of `sources`. Raises EstimationError if the sensors do
         not show the poses."""
         raise NotImplementedError
+
+    def fixes(self, recording: Measurements) -> list[Fixes]:
+        """Horizontal positions of points of the body, one item a sensor, if sensors of this kind measure them."""
+        del recording
+        return []
 
     def check_moving(self, recording: Measurements) -> None:
         """Raises EstimationError if sensors of this kind measure too rarely to show a motion."""

@@ -37,7 +37,7 @@ def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[st
     if inputs.rig.assumes_motion:
         yield (
             f"there is no IMU: the motion is assumed to be smooth, in a second its rate to change by {n.gyro_walk:.2g} "
-            f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis), as poses show."
+            f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis)."
         )
         return
     yield (

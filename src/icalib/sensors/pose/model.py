@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from icalib.data.measurements import PoseStream
 from icalib.model.frames import frame_entries
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.model.statistics import ResidualStatistics
+from icalib.motion.keyframe_placement import spaced
 from icalib.motion.time_offsets import instants
 from icalib.optim.state import Entry, Key
 from icalib.rig import ImuSensor, PoseSensor, Rig, Settings
@@ -27,7 +28,6 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
     there is a second."""
 
     keyframes = "poses"
-    only_first_places_keyframes = True
 
     def scene_entries(self, sensor: PoseSensor, rig: Rig, n_recordings: int) -> list[Entry]:
         """Parameters of the frame of absolute poses in each recording. The frame is fixed as the world frame if this
@@ -37,6 +37,11 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
         is_reference = rig.moves_by_poses and sensor is rig.poses[0]
         is_world = is_reference and (rig.imu is None or rig.assumes_motion)
         return frame_entries(sensor.name, n_recordings, not is_world)
+
+    def placing_keyframes(self, sensors: Sequence[PoseSensor], rig: Rig) -> Sequence[PoseSensor]:
+        """Only the first sensor, see `SensorModel`."""
+        del rig
+        return sensors[:1]
 
     def keyframe_times(
         self, sensor: PoseSensor, stream: PoseStream, values: dict[Key, np.ndarray], rig: Rig
@@ -85,12 +90,6 @@ def estimated_noise(sensor: PoseSensor, noise: PoseNoise, variance_factors: dict
     rotation = rotation if sensor.rotation_noise is None else noise.rotation
     position = position if sensor.position_noise is None else noise.position
     return PoseNoise(rotation, position, noise.loss, noise.loss_scale)
-
-
-def spaced(seconds: np.ndarray, spacing: float) -> np.ndarray:
-    """The first of `seconds` (n,), increasing, in each interval of length `spacing` [s]; and the last of all."""
-    k = np.flatnonzero(np.diff(np.floor(seconds / spacing + 1e-6), prepend=-1.0))
-    return seconds[np.append(k, len(seconds) - 1)] if k[-1] < len(seconds) - 1 else seconds[k]
 
 
 MODEL = PoseModel()

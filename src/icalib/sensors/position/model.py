@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from icalib.model.frames import frame_entries
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.model.statistics import ResidualStatistics
-from icalib.optim.state import Entry, Key
+from icalib.optim.state import Entry
 from icalib.rig import Rig, Settings
 from icalib.rig.scene import FRAME, LEVEL_FRAME
 from icalib.sensors.position.frame import frame_owner
@@ -39,12 +39,9 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
         levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == LEVELLED
         return frame_entries(sensor.name, n_recordings, specs=LEVEL_FRAME if levelled else FRAME) + knots
 
-    def keyframe_times(
-        self, sensor: PositionSensor, stream: PositionStream, values: dict[Key, np.ndarray], rig: Rig
-    ) -> np.ndarray:
-        """Empty if the motion is assumed to be smooth: other sensors then place keyframes densely enough. Otherwise
-        see `SensorModel`."""
-        return np.zeros(0) if rig.assumes_motion else super().keyframe_times(sensor, stream, values, rig)
+    def placing_keyframes(self, sensors: Sequence[PositionSensor], rig: Rig) -> Sequence[PositionSensor]:
+        """None if the motion is assumed to be smooth: other sensors then place keyframes densely enough."""
+        return () if rig.assumes_motion else sensors
 
     def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
         """The stated noise [m] if the rig file has a number; else 1, a factor on the standard deviations of

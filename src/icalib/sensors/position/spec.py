@@ -36,6 +36,7 @@ Coordinates = Literal["metric", "geodetic"]
 Status = Literal["single", "differential", "float", "fixed"]  # quality of a GNSS fix, worst first
 STATUSES: tuple[Status, ...] = ("single", "differential", "float", "fixed")
 MESSAGES: Literal["messages"] = "messages"
+_ADDITIONS = "an IMU, a camera that sees a target, or a pose sensor"
 _FIELDS = ("path", "topic", "coordinates", "frame", "position_noise", "position_random_walk", "least_status")
 
 
@@ -79,10 +80,17 @@ class PositionSensor(ClockedSensor):
 
     def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
         yield from super().lacks(sensors, has_target)
-        if not has_imu(sensors) and not any(s.gives_motion_without_imu(has_target) for s in sensors.values()):
+        if has_imu(sensors) or any(s.gives_motion_without_imu(has_target) for s in sensors.values()):
+            return
+        where = ("sensors", self.name)
+        wheels = [s for s in sensors.values() if s.drives]
+        if not wheels or any(s.tracks_points for s in sensors.values()):
+            yield Lack(where, f"positions do not determine rotations; add {_ADDITIONS}.")
+        elif not any(s.stays_level for s in wheels):
             yield Lack(
-                ("sensors", self.name),
-                "positions do not determine rotations; add an IMU, a camera that sees a target, or a pose sensor.",
+                where,
+                f"positions and {wheels[0].name} do not determine roll and pitch; if the floor is flat, write ground: "
+                f"{{tilt_noise: 0.01}} of {wheels[0].name}, else add {_ADDITIONS}.",
             )
 
     @classmethod

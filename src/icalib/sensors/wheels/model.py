@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+import numpy as np
 
 from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.motion.factor import Factor
+from icalib.motion.keyframe_placement import spaced
 from icalib.motion.sweep import EstimatedMotion
 from icalib.motion.time_offsets import instants
 from icalib.optim.state import Key, Layout
-from icalib.rig import Settings, Wheels
+from icalib.rig import Rig, Settings, Wheels
 from icalib.sensors.wheels.ground_factor import GroundFactor, floors
 from icalib.sensors.wheels.integrals import integrals_of
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelFactor, WheelNoise
@@ -18,6 +21,20 @@ from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, 
 
 class WheelModel(SensorModel[Wheels, WheelNoise]):
     """Sensor model of wheels; their noise is stated in the rig file."""
+
+    keyframes = "readings"
+
+    def placing_keyframes(self, sensors: Sequence[Wheels], rig: Rig) -> Sequence[Wheels]:
+        """The wheels whose frame is the body, if the motion is assumed to be smooth."""
+        return [s for s in sensors if rig.assumes_motion and s.name == rig.reference_without_imu]
+
+    def keyframe_times(
+        self, sensor: Wheels, stream: WheelStream | WheelPoses, values: dict[Key, np.ndarray], rig: Rig
+    ) -> np.ndarray:
+        """Times of readings at about the keyframe spacing, see `SensorModel`."""
+        del sensor
+        assert rig.imu is not None
+        return instants(stream, values, spaced(stream.seconds, rig.imu.pose_keyframes_s))
 
     def first_noise(self, sensor: Wheels, settings: Settings) -> WheelNoise:
         """See `SensorModel`."""

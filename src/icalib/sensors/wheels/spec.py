@@ -198,6 +198,11 @@ class Wheels(MountedSensor):
         """Whether `ground_height` is estimated."""
         return self.ground is not None and self.ground.height_sigma is not None
 
+    @property
+    def stays_level(self) -> bool:
+        """See `Sensor`."""
+        return self.ground is not None and self.ground.plane == "level" and self.ground.tilt_noise is not None
+
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Wheels:
         fields = value.record(

@@ -13,7 +13,7 @@ from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, motion_of, start_values
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.contradicted_guesses import merged_values
-from icalib.initialize.steps.initializer import BY_POSITIONS, Initializer, InputsWithMotion, Values
+from icalib.initialize.steps.initializer import BY_POSITIONS, Fixes, Initializer, InputsWithMotion, Values
 from icalib.initialize.steps.rig_file_values import known_value, stated_values
 from icalib.initialize.steps.single_recording import (
     KnownExtrinsics,
@@ -68,6 +68,10 @@ class PositionInitializer(Initializer[PositionSensor]):
         return recording.with_streams(
             *(s.some(~single_wrong(s.seconds, s.position)) for s in recording.of(PositionStream))
         )
+
+    def fixes(self, recording: Measurements) -> list[Fixes]:
+        """See `Initializer`."""
+        return [Fixes(s.seconds, s.position[:, 0] + 1j * s.position[:, 1]) for s in recording.of(PositionStream)]
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[PositionSensor]) -> Values:
         """See `Initializer`. Sensors with a frame come first, because sensors without one may share it."""

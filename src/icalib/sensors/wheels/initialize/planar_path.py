@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from functools import cached_property
+
 import numpy as np
 
 from icalib.data.measurements import WheelPoses, WheelStream
@@ -9,7 +12,35 @@ from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.rig import Wheels
+from icalib.sensors.parameter import fixed
 from icalib.sensors.wheels.integrals import integrals_of
+
+
+@dataclass(frozen=True)
+class PlanarSteps:
+    """Steps between n + 1 stamps, seconds (n + 1,). turn (n,) rad; along (n,) complex: displacement [m] in the wheel
+    frame at the earlier stamp, x + i y. scaled: whether sizes of the wheels scale them."""
+
+    seconds: np.ndarray
+    turn: np.ndarray
+    along: np.ndarray
+    scaled: bool
+
+    @cached_property
+    def yaw(self) -> np.ndarray:
+        """(n + 1,) rad, relative to the first stamp."""
+        return np.append(0.0, np.cumsum(self.turn))
+
+    @cached_property
+    def distance(self) -> np.ndarray:
+        """(n + 1,) m: length of the path since the first stamp."""
+        return np.append(0.0, np.cumsum(np.abs(self.along)))
+
+    def path(self, distance_factor: float = 1.0, turn_factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """Yaw (n + 1,) rad and position (n + 1,) m, complex, relative to the first stamp, by dead reckoning."""
+        yaw = turn_factor * self.yaw
+        chords = self.along * np.exp(1j * (yaw[:-1] + 0.5 * (turn_factor - 1.0) * self.turn))
+        return yaw, distance_factor * np.append(0.0, np.cumsum(chords))
 
 
 def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:
@@ -17,21 +48,25 @@ def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:
 
     Raises EstimationError if the rig file does not state the sizes of the wheels.
     """
+    return planar_poses(stream.seconds, *planar_steps(wheels, stream).path())
+
+
+def planar_poses(seconds: np.ndarray, yaw: np.ndarray, position: np.ndarray) -> BodyPoses:
+    """Poses in the plane z = 0 at seconds (n,): yaw (n,) rad, position (n,) m, complex."""
+    points = np.stack([np.real(position), np.imag(position), np.zeros(len(position))], axis=1)
+    return BodyPoses(seconds, so3.exp_many(yaw[:, None] * [0.0, 0.0, 1.0]), points)
+
+
+def with_sizes(wheels: Wheels) -> Wheels:
+    """The wheels with 1 m, or 1, for each size that the rig file does not state, and no steering offset."""
+    unknown = [spec for spec in wheels.drive_specs if getattr(wheels, spec.name).value is None]
+    return replace(wheels, **{spec.name: fixed(np.full(spec.size, float(spec.is_positive))) for spec in unknown})
+
+
+def planar_steps(wheels: Wheels, stream: WheelStream | WheelPoses) -> PlanarSteps:
+    """The steps between the stamps. Raises EstimationError if the rig file does not state the sizes of the wheels."""
     if isinstance(stream, WheelPoses):
-        turn, along = stream.pose[:, 0], stream.pose[:, 1:]
-    else:
-        turn, along = _increments(wheels, stream)
-    yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
-    steps = np.stack([c * along[:, 0] - s * along[:, 1], s * along[:, 0] + c * along[:, 1]], axis=1)
-    position = np.zeros((len(yaw), 3))
-    position[1:, :2] = np.cumsum(steps, axis=0)
-    return BodyPoses(stream.seconds, so3.exp_many(yaw[:, None] * [0.0, 0.0, 1.0]), position)
-
-
-def _increments(wheels: Wheels, stream: WheelStream) -> tuple[np.ndarray, np.ndarray]:
-    """Yaw (n,) [rad] from each reading to the next, and displacement (n, 2) [m] in the wheel frame at the earlier
-    one."""
+        return PlanarSteps(stream.seconds, stream.pose[:, 0], stream.pose[:, 1] + 1j * stream.pose[:, 2], False)
     turned = np.diff(integrals_of(stream), axis=0)
     if stream.kind == "pair":
         path = turned * _size(wheels, "radii")
@@ -45,7 +80,7 @@ def _increments(wheels: Wheels, stream: WheelStream) -> tuple[np.ndarray, np.nda
         steer = np.arctan2(turned[:, 2], turned[:, 1]) + offset
         yaw = ahead * np.tan(steer) / _size(wheels, "wheelbase")[0]
     half = 0.5 * yaw  # the displacement is the chord of an arc
-    return yaw, (ahead * np.sinc(half / np.pi))[:, None] * np.stack([np.cos(half), np.sin(half)], axis=1)
+    return PlanarSteps(stream.seconds, yaw, ahead * np.sinc(half / np.pi) * np.exp(1j * half), True)
 
 
 def _size(wheels: Wheels, name: str) -> np.ndarray:

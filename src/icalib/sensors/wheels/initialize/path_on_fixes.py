@@ -1,0 +1,202 @@
+"""Dead reckoning that follows positions of a point of the vehicle, such as GNSS fixes, on a flat floor.
+
+The fixes take out the drift of the wheels and determine their sizes. In the plane, as complex numbers, dead reckoning
+gives the position P and yaw T at time t, with factors r on distances and k on turns. A point with lever arm l is at
+
+    q(t) = r P(t; k) + l exp(i k T(t)),    fix j: exp(i psi_w) q(t_j + d) + o_w
+
+psi_w and o_w belong to a window w of the path, and follow the drift. Gauss-Newton finds ln r, ln k, l and d, common to
+all windows; psi_w and o_w are the best ones for each value of these (variable projection).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.data.measurements import WheelPoses, WheelStream
+from icalib.errors import EstimationError
+from icalib.initialize.steps.contradicted_guesses import merged_values
+from icalib.initialize.steps.cross_correlation import MaskedSignal, best_shifts
+from icalib.initialize.steps.initializer import Fixes, Values
+from icalib.initialize.steps.smooth_trajectory import BodyPoses
+from icalib.rig import Wheels
+from icalib.sensors.wheels.initialize.planar_path import PlanarSteps, planar_poses, planar_steps, with_sizes
+
+SIGNAL_HZ = 20.0  # of correlated signals: Gauss-Newton refines the time offset
+STEP_S = 1.0  # over which mean speeds and turns are taken: noise of 2 cm makes 3 cm/s
+MIN_OVERLAP_S, PEAK_SPACING_S, MAX_PEAKS = 5.0, 0.3, 4  # of a correlation; candidates by each
+MIN_SPEED_RATIO = 0.3  # of the median speed: slower fixes show no course
+WINDOW_S, MIN_WINDOW_FIXES = 10.0, 8  # mean time of a window, and mean number of its fixes
+MAX_ROUNDS, STEP_TOLERANCE = 15, 1e-5  # of Gauss-Newton
+MAX_MEDIANS = 4.0  # times the median residual; a fix with a larger one has no weight
+DIFFERENCE = 1e-4  # half a step of central differences, of each unknown
+MAX_MISFIT = 0.15  # median residual over median distance from the centre of a window: another motion leaves more
+MIN_SIGMA_M = 0.01  # of a residual
+PRIOR_SIGMA = np.array([0.3, 0.3, 2.0, 2.0, 0.3])  # of the unknowns about their start: 1, 1, m, m, s
+
+
+class PathOnFixes(NamedTuple):
+    """Poses of the wheel frame in the frame of the fixes, in the plane z = 0, and factors of distances and turns."""
+
+    poses: BodyPoses
+    distance_factor: float
+    turn_factor: float
+
+
+class _DriftFit(NamedTuple):
+    """Result of `_fitted`. misfit: median residual [m]; spread: median distance of fixes from the mean of their window
+    [m]; unknowns (5,): ln r, ln k, l [m], d [s]; fixes: those within
+    the recording of the wheels; window (n,) int: the window of each."""
+
+    misfit: float
+    spread: float
+    unknowns: np.ndarray
+    fixes: Fixes
+    window: np.ndarray
+
+
+def paths_on_fixes(
+    wheels: Wheels, streams: Sequence[WheelStream | WheelPoses], fixes: Sequence[Fixes]
+) -> tuple[list[BodyPoses], Values]:
+    """Poses of the wheel frame in each recording, and values of the drive parameters. Values of the rig file are kept,
+    except guesses that contradict the recording with most fixes. Raises EstimationError as `path_on_fixes`."""
+    sized = with_sizes(wheels)
+    paths = [
+        path_on_fixes(wheels.name, planar_steps(sized, stream), f) for stream, f in zip(streams, fixes, strict=True)
+    ]
+    _, r, k = paths[int(np.argmax([len(f.t) for f in fixes]))]
+    factors = {"radii": r, "radius": r, "baseline": r / k, "wheelbase": r / k, "scales": np.array([r, k])}
+    stated, estimated = {}, {}
+    for spec in wheels.drive_specs:
+        key, value = (wheels.name, spec.name), getattr(wheels, spec.name).value
+        stated |= {} if value is None else {key: np.asarray(value, dtype=np.float64)}
+        estimated[key] = getattr(sized, spec.name).value * factors.get(spec.name, 1.0)
+    return [path.poses for path in paths], merged_values(wheels, stated, estimated)
+
+
+def path_on_fixes(name: str, steps: PlanarSteps, fixes: Fixes) -> PathOnFixes:
+    """The path of the wheels `name` that follows the fixes. Raises EstimationError if their motion does not match at
+    any time offset."""
+    fits = [fit for start in _starts(steps, fixes) if (fit := _fitted(steps, fixes, start)) is not None]
+    best = min(fits, key=lambda fit: fit.misfit, default=None)
+    if best is None or best.misfit > MAX_MISFIT * best.spread:
+        raise EstimationError(
+            f"{name}: its speeds and turns do not match those of the positions at any time offset; check that both are "
+            "from the same vehicle and overlap in time, and drive curves."
+        )
+    return PathOnFixes(_followed(steps, best), *np.exp(best.unknowns[:2]).tolist())
+
+
+def _starts(steps: PlanarSteps, fixes: Fixes) -> list[np.ndarray]:
+    """Start values (5,) of the unknowns at peaks of the correlation of speeds and of turns."""
+    grid = np.arange(0.0, steps.seconds[-1] - 2.0 * STEP_S, 1.0 / SIGNAL_HZ)
+    ahead = _changes(grid, steps.seconds, steps.distance)
+    turn = _changes(grid + 0.5 * STEP_S, steps.seconds, steps.yaw)
+    (speed, seen), (course, moving) = _fix_signals(fixes)
+    known, apart = np.ones(len(grid), dtype=bool), round(PEAK_SPACING_S * SIGNAL_HZ)
+    shifts = {
+        peak.samples
+        for a, b in ((ahead, (speed, seen)), (turn, (course, moving)))
+        if len(grid) and b[1].any()
+        for peak in best_shifts((a, known), b, MIN_OVERLAP_S * SIGNAL_HZ, MAX_PEAKS, apart)
+    }
+    starts = []
+    for shift in sorted(shifts):
+        j = np.arange(max(0, -shift), min(len(speed), len(grid) - shift))
+        r, k = _slope(ahead[j + shift], speed[j], seen[j]), _slope(turn[j + shift], course[j], moving[j])
+        if r > 0.0 and k > 0.0:
+            factors = np.log([r, k]) if steps.scaled else np.zeros(2)
+            starts.append(np.array([*factors, 0.0, 0.0, shift / SIGNAL_HZ]))
+    return starts
+
+
+def _changes(grid: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Changes of x (n,), given at t (n,) s, over STEP_S from each instant of `grid`."""
+    return np.interp(grid + STEP_S, t, x) - np.interp(grid, t, x)
+
+
+def _fix_signals(fixes: Fixes) -> tuple[MaskedSignal, MaskedSignal]:
+    """Distances over STEP_S [m], known between fixes close in time; and changes of course from each such step to the
+    next [rad], known while the vehicle moves."""
+    grid = np.arange(0.0, fixes.t[-1] - 2.0 * STEP_S, 1.0 / SIGNAL_HZ)
+    step, after = _changes(grid, fixes.t, fixes.z), _changes(grid + STEP_S, fixes.t, fixes.z)
+    gap = np.interp(grid + STEP_S, fixes.t[1:], np.diff(fixes.t))
+    seen = gap <= max(2.5 * float(np.median(np.diff(fixes.t))), STEP_S)
+    speed = np.abs(step)
+    slow = MIN_SPEED_RATIO * np.median(speed[seen]) if seen.any() else np.inf
+    moving = seen & (np.minimum(speed, np.abs(after)) > slow)
+    return (speed, seen), (np.angle(after * np.conj(step)), moving)
+
+
+def _slope(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> float:
+    """Slope of y (n,) over x (n,) through zero."""
+    return float(x[used] @ y[used] / max(x[used] @ x[used], 1e-12))
+
+
+def _fitted(steps: PlanarSteps, fixes: Fixes, start: np.ndarray) -> _DriftFit | None:
+    """Robust Gauss-Newton from `start` (5,); None if too few fixes fall within the recording of the wheels."""
+    t = fixes.t + start[4]
+    inside = (t > steps.seconds[0]) & (t < steps.seconds[-1])
+    if inside.sum() < 2 * MIN_WINDOW_FIXES:
+        return None
+    fixes, x = Fixes(fixes.t[inside], fixes.z[inside]), start
+    window = _windows(steps, fixes, start[4])
+    sigma = PRIOR_SIGMA * ([1.0] * 5 if steps.scaled else [1e-6, 1e-6, 1.0, 1.0, 1.0])
+    size = np.zeros(0)
+    for _ in range(MAX_ROUNDS):
+        r = _residual(steps, fixes, window, x)[0]
+        size = np.abs(r)
+        kept, row = size <= MAX_MEDIANS * np.median(size), max(MIN_SIGMA_M, float(np.median(size)))
+        ends = [[_residual(steps, fixes, window, x + d)[0][kept] for d in (h, -h)] for h in DIFFERENCE * np.eye(5)]
+        J = np.stack([(a - b) / (2.0 * DIFFERENCE) for a, b in ends], axis=1)
+        A, b = np.vstack([np.real(J), np.imag(J)]) / row, np.append(np.real(r[kept]), np.imag(r[kept])) / row
+        step = -np.linalg.solve(A.T @ A + np.diag(sigma**-2), A.T @ b + (x - start) / sigma**2)
+        x = x + step
+        if np.abs(step).max() < STEP_TOLERANCE:
+            break
+    away = fixes.z - (_sums(window, fixes.z) / np.bincount(window))[window]
+    return _DriftFit(float(np.median(size)), float(np.median(np.abs(away))), x, fixes, window)
+
+
+def _windows(steps: PlanarSteps, fixes: Fixes, offset: float) -> np.ndarray:
+    """(n,) int: the window of each fix. All windows cover the same distance, so that each contains motion."""
+    path = np.interp(fixes.t + offset, steps.seconds, steps.distance)
+    share = (path - path[0]) / max(path[-1] - path[0], 1e-9)
+    count = max(1, int(min((fixes.t[-1] - fixes.t[0]) / WINDOW_S, len(path) / MIN_WINDOW_FIXES)))
+    return np.unique(np.minimum((share * count).astype(int), count - 1), return_inverse=True)[1]
+
+
+def _residual(
+    steps: PlanarSteps, fixes: Fixes, window: np.ndarray, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals (n,) m, complex, at the unknowns x (5,); psi (w,) rad and o (w,) m, complex, of the windows."""
+    (yaw, position), t = steps.path(*np.exp(x[:2])), fixes.t + x[4]
+    q = np.interp(t, steps.seconds, position) + (x[2] + 1j * x[3]) * np.exp(1j * np.interp(t, steps.seconds, yaw))
+    q_mean, z_mean = (_sums(window, values) / np.bincount(window) for values in (q, fixes.z))
+    dq, dz = q - q_mean[window], fixes.z - z_mean[window]
+    psi = np.angle(_sums(window, np.conj(dq) * dz))
+    return np.exp(1j * psi)[window] * dq - dz, psi, z_mean - np.exp(1j * psi) * q_mean
+
+
+def _sums(window: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Sums (w,) of complex values (n,) over the windows."""
+    return np.bincount(window, np.real(values)) + 1j * np.bincount(window, np.imag(values))
+
+
+def _followed(steps: PlanarSteps, fit: _DriftFit) -> BodyPoses:
+    """The path with psi and o of the windows. Between the centres of two windows both give a position; weights change
+    linearly with the distance from one to the other."""
+    _, psi, o = _residual(steps, fit.fixes, fit.window, fit.unknowns)
+    path = np.interp(fit.fixes.t + fit.unknowns[4], steps.seconds, steps.distance)
+    centre = np.bincount(fit.window, path) / np.bincount(fit.window)
+    share = np.interp(steps.distance, centre, np.arange(len(centre)))
+    before = np.minimum(share.astype(int), max(len(centre) - 2, 0))
+    after, share = np.minimum(before + 1, len(centre) - 1), share - before
+    yaw, position = steps.path(*np.exp(fit.unknowns[:2]))
+    psi = np.unwrap(psi)
+    first, second = (np.exp(1j * psi[w]) * position + o[w] for w in (before, after))
+    turned = yaw + (1.0 - share) * psi[before] + share * psi[after]
+    return planar_poses(steps.seconds, turned, (1.0 - share) * first + share * second)
