@@ -1,12 +1,13 @@
 """Dead reckoning that follows positions of a point of the vehicle, such as GNSS fixes, on a flat floor.
 
 The fixes take out the drift of the wheels and determine their sizes. In the plane, as complex numbers, dead reckoning
-gives the position P and yaw T at time t, with factors r on distances and k on turns. A point with lever arm l is at
+gives the position P and yaw T at time t, with a factor r on distances, a factor k on turns, and a bend c [rad/m] of the
+path: T = k T_0 + c r s at the distance s. A point with lever arm l is at
 
-    q(t) = r P(t; k) + l exp(i k T(t)),    fix j: exp(i psi_w) q(t_j + d) + o_w
+    q(t) = r P(t; k, c) + l exp(i T(t)),    fix j: exp(i psi_w) q(t_j + d) + o_w
 
-psi_w and o_w belong to a window w of the path, and follow the drift. Gauss-Newton finds ln r, ln k, l and d, common to
-all windows; psi_w and o_w are the best ones for each value of these (variable projection).
+psi_w and o_w belong to a window w of the path, and follow the drift. Gauss-Newton finds ln r, ln k, c, l and d, common
+to all windows; psi_w and o_w are the best ones for each value of these (variable projection).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ MAX_MEDIANS = 4.0  # times the median residual; a fix with a larger one has no w
 DIFFERENCE = 1e-4  # half a step of central differences, of each unknown
 MAX_MISFIT = 0.15  # median residual over median distance from the centre of a window: another motion leaves more
 MIN_SIGMA_M = 0.01  # of a residual
-PRIOR_SIGMA = np.array([0.3, 0.3, 2.0, 2.0, 0.3])  # of the unknowns about their start: 1, 1, m, m, s
+PRIOR_SIGMA = np.array([0.3, 0.3, 0.1, 2.0, 2.0, 0.3])  # of the unknowns about their start: 1, 1, rad/m, m, m, s
 
 
 class PathOnFixes(NamedTuple):
@@ -48,8 +49,8 @@ class PathOnFixes(NamedTuple):
 
 class _DriftFit(NamedTuple):
     """Result of `_fitted`. misfit: median residual [m]; spread: median distance of fixes from the mean of their window
-    [m]; unknowns (5,): ln r, ln k, l [m], d [s]; fixes: those within
-    the recording of the wheels; window (n,) int: the window of each."""
+    [m]; unknowns (6,): ln r, ln k, c [rad/m], l [m], d [s]; fixes: those
+    within the recording of the wheels; window (n,) int: the window of each."""
 
     misfit: float
     spread: float
@@ -91,7 +92,7 @@ def path_on_fixes(name: str, steps: PlanarSteps, fixes: Fixes) -> PathOnFixes:
 
 
 def _starts(steps: PlanarSteps, fixes: Fixes) -> list[np.ndarray]:
-    """Start values (5,) of the unknowns at peaks of the correlation of speeds and of turns."""
+    """Start values (6,) of the unknowns at peaks of the correlation of speeds and of turns."""
     grid = np.arange(0.0, steps.seconds[-1] - 2.0 * STEP_S, 1.0 / SIGNAL_HZ)
     ahead = _changes(grid, steps.seconds, steps.distance)
     turn = _changes(grid + 0.5 * STEP_S, steps.seconds, steps.yaw)
@@ -109,7 +110,7 @@ def _starts(steps: PlanarSteps, fixes: Fixes) -> list[np.ndarray]:
         r, k = _slope(ahead[j + shift], speed[j], seen[j]), _slope(turn[j + shift], course[j], moving[j])
         if r > 0.0 and k > 0.0:
             factors = np.log([r, k]) if steps.scaled else np.zeros(2)
-            starts.append(np.array([*factors, 0.0, 0.0, shift / SIGNAL_HZ]))
+            starts.append(np.array([*factors, 0.0, 0.0, 0.0, shift / SIGNAL_HZ]))
     return starts
 
 
@@ -137,20 +138,20 @@ def _slope(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> float:
 
 
 def _fitted(steps: PlanarSteps, fixes: Fixes, start: np.ndarray) -> _DriftFit | None:
-    """Robust Gauss-Newton from `start` (5,); None if too few fixes fall within the recording of the wheels."""
-    t = fixes.t + start[4]
+    """Robust Gauss-Newton from `start` (6,); None if too few fixes fall within the recording of the wheels."""
+    t = fixes.t + start[5]
     inside = (t > steps.seconds[0]) & (t < steps.seconds[-1])
     if inside.sum() < 2 * MIN_WINDOW_FIXES:
         return None
     fixes, x = Fixes(fixes.t[inside], fixes.z[inside]), start
-    window = _windows(steps, fixes, start[4])
-    sigma = PRIOR_SIGMA * ([1.0] * 5 if steps.scaled else [1e-6, 1e-6, 1.0, 1.0, 1.0])
+    window = _windows(steps, fixes, start[5])
+    sigma = PRIOR_SIGMA * ([1.0] * 6 if steps.scaled else [1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0])
     size = np.zeros(0)
     for _ in range(MAX_ROUNDS):
         r = _residual(steps, fixes, window, x)[0]
         size = np.abs(r)
         kept, row = size <= MAX_MEDIANS * np.median(size), max(MIN_SIGMA_M, float(np.median(size)))
-        ends = [[_residual(steps, fixes, window, x + d)[0][kept] for d in (h, -h)] for h in DIFFERENCE * np.eye(5)]
+        ends = [[_residual(steps, fixes, window, x + d)[0][kept] for d in (h, -h)] for h in DIFFERENCE * np.eye(6)]
         J = np.stack([(a - b) / (2.0 * DIFFERENCE) for a, b in ends], axis=1)
         A, b = np.vstack([np.real(J), np.imag(J)]) / row, np.append(np.real(r[kept]), np.imag(r[kept])) / row
         step = -np.linalg.solve(A.T @ A + np.diag(sigma**-2), A.T @ b + (x - start) / sigma**2)
@@ -172,13 +173,18 @@ def _windows(steps: PlanarSteps, fixes: Fixes, offset: float) -> np.ndarray:
 def _residual(
     steps: PlanarSteps, fixes: Fixes, window: np.ndarray, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (n,) m, complex, at the unknowns x (5,); psi (w,) rad and o (w,) m, complex, of the windows."""
-    (yaw, position), t = steps.path(*np.exp(x[:2])), fixes.t + x[4]
-    q = np.interp(t, steps.seconds, position) + (x[2] + 1j * x[3]) * np.exp(1j * np.interp(t, steps.seconds, yaw))
+    """Residuals (n,) m, complex, at the unknowns x (6,); psi (w,) rad and o (w,) m, complex, of the windows."""
+    (yaw, position), t = _bent(steps, x), fixes.t + x[5]
+    q = np.interp(t, steps.seconds, position) + (x[3] + 1j * x[4]) * np.exp(1j * np.interp(t, steps.seconds, yaw))
     q_mean, z_mean = (_sums(window, values) / np.bincount(window) for values in (q, fixes.z))
     dq, dz = q - q_mean[window], fixes.z - z_mean[window]
     psi = np.angle(_sums(window, np.conj(dq) * dz))
     return np.exp(1j * psi)[window] * dq - dz, psi, z_mean - np.exp(1j * psi) * q_mean
+
+
+def _bent(steps: PlanarSteps, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Yaw and position by dead reckoning at the unknowns x (6,), see `PlanarSteps.path`."""
+    return steps.path(float(np.exp(x[0])), float(np.exp(x[1])), float(x[2]))
 
 
 def _sums(window: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -190,12 +196,12 @@ def _followed(steps: PlanarSteps, fit: _DriftFit) -> BodyPoses:
     """The path with psi and o of the windows. Between the centres of two windows both give a position; weights change
     linearly with the distance from one to the other."""
     _, psi, o = _residual(steps, fit.fixes, fit.window, fit.unknowns)
-    path = np.interp(fit.fixes.t + fit.unknowns[4], steps.seconds, steps.distance)
+    path = np.interp(fit.fixes.t + fit.unknowns[5], steps.seconds, steps.distance)
     centre = np.bincount(fit.window, path) / np.bincount(fit.window)
     share = np.interp(steps.distance, centre, np.arange(len(centre)))
     before = np.minimum(share.astype(int), max(len(centre) - 2, 0))
     after, share = np.minimum(before + 1, len(centre) - 1), share - before
-    yaw, position = steps.path(*np.exp(fit.unknowns[:2]))
+    yaw, position = _bent(steps, fit.unknowns)
     psi = np.unwrap(psi)
     first, second = (np.exp(1j * psi[w]) * position + o[w] for w in (before, after))
     turned = yaw + (1.0 - share) * psi[before] + share * psi[after]

@@ -36,10 +36,18 @@ class PlanarSteps:
         """(n + 1,) m: length of the path since the first stamp."""
         return np.append(0.0, np.cumsum(np.abs(self.along)))
 
-    def path(self, distance_factor: float = 1.0, turn_factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Yaw (n + 1,) rad and position (n + 1,) m, complex, relative to the first stamp, by dead reckoning."""
-        yaw = turn_factor * self.yaw
-        chords = self.along * np.exp(1j * (yaw[:-1] + 0.5 * (turn_factor - 1.0) * self.turn))
+    @cached_property
+    def advance(self) -> np.ndarray:
+        """(n + 1,) m: as `distance`, but decreasing while the vehicle drives backwards."""
+        return np.append(0.0, np.cumsum(np.copysign(np.abs(self.along), np.real(self.along))))
+
+    def path(
+        self, distance_factor: float = 1.0, turn_factor: float = 1.0, bend: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Yaw (n + 1,) rad and position (n + 1,) m, complex, relative to the first stamp, by dead reckoning. bend: yaw
+        per distance [rad/m] that the readings lack, as for steering with an offset or unequal radii."""
+        yaw = turn_factor * self.yaw + bend * distance_factor * self.advance
+        chords = self.along * np.exp(1j * (yaw[:-1] + 0.5 * (np.diff(yaw) - self.turn)))
         return yaw, distance_factor * np.append(0.0, np.cumsum(chords))
 
 
