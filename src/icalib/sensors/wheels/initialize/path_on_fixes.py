@@ -69,13 +69,20 @@ def paths_on_fixes(
         path_on_fixes(wheels.name, planar_steps(sized, stream), f) for stream, f in zip(streams, fixes, strict=True)
     ]
     _, r, k = paths[int(np.argmax([len(f.t) for f in fixes]))]
-    factors = {"radii": r, "radius": r, "baseline": r / k, "wheelbase": r / k, "scales": np.array([r, k])}
+    factors = _size_factors(wheels, r, k)
     stated, estimated = {}, {}
     for spec in wheels.drive_specs:
         key, value = (wheels.name, spec.name), getattr(wheels, spec.name).value
         stated |= {} if value is None else {key: np.asarray(value, dtype=np.float64)}
         estimated[key] = getattr(sized, spec.name).value * factors.get(spec.name, 1.0)
     return [path.poses for path in paths], merged_values(wheels, stated, estimated)
+
+
+def _size_factors(wheels: Wheels, r: float, k: float) -> dict[str, np.ndarray]:
+    """Factors on the sizes of the wheels by name, for factors r on distances and k on turns. Distances are as the size
+    of a wheel, turns as this size over the length between wheels. Scales of speed and yaw rate are the factors."""
+    sizes = [spec.name for spec in wheels.drive_specs if spec.is_positive]
+    return {sizes[0]: np.array([r, k])} if len(sizes) == 1 else dict(zip(sizes, np.array([r, r / k]), strict=True))
 
 
 def path_on_fixes(name: str, steps: PlanarSteps, fixes: Fixes) -> PathOnFixes:
