@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +10,14 @@ import pytest
 from scipy.stats import chi2
 from tests.position.test_position_runs import ARM, antenna, pose
 
-from icalib.errors import EstimationError
+from icalib.errors import EstimationError, RigError
 from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate, calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Ground, Parameter, Rig
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.wheels.simulate import SimWheels
+from icalib.tools.inspection import draft_rig, inspect_recording
 from icalib.tools.simulation import Drive, Room, Scenario, Simulation, rig_for, simulate, write_tables
 from icalib.tools.simulation.scenario.robot import DriveKind
 
@@ -106,14 +108,27 @@ def test_two_recordings():
     np.testing.assert_allclose(result.value("gnss0", "translation")[:2], ON_WHEELS[:2], atol=0.05)
 
 
-def test_from_files(tmp_path):
-    sim = driven(4, 25.0)
-    write_tables(sim, 4, tmp_path / "recording")
-    result = calibrate(rig_without_imu(sim), tmp_path / "recording")
+def test_from_files_and_the_draft_of_their_rig(tmp_path):
+    sim, folder = driven(4, 25.0), tmp_path / "recording"
+    write_tables(sim, 4, folder)
+    shutil.rmtree(folder / "imu0")
+    inspection = inspect_recording(folder)
+    assert [f.sentence.split(".")[0] for f in inspection.findings] == [
+        "There is no IMU, so smooth motion on a flat floor is assumed"
+    ]
+    (tmp_path / "rig.yaml").write_text(draft_rig(inspection))
+    result = calibrate(tmp_path / "rig.yaml", folder)
     error, covariance = errors(result, sim, "radii", "baseline")
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(covariance))).all()
     write_outputs(result, tmp_path)
     assert "gnss0" in (tmp_path / "report.html").read_text()
+
+
+def test_wheels_that_may_tilt_are_refused_with_what_to_write(tmp_path):
+    sim = driven(4, 25.0)
+    rig = rig_without_imu(sim).with_("wheels0", ground=None)
+    with pytest.raises(RigError, match="write `ground: {plane: level, tilt_noise: 0.01}` in wheels0"):
+        calibrate_measurements(rig, sim.measurements.without("imu0"))
 
 
 def test_fixes_of_another_drive():

@@ -17,6 +17,7 @@ class PositionInspector(KindInspector):
     topic_kinds: ClassVar[tuple[str, ...]] = ("navsat", "point", "position")
     prefix: ClassVar[str] = "gnss"
     plain_names: ClassVar[str] = r"positions\.csv|[^/]*\.pos|fix|navsat(fix)?|point|position"
+    moves_with_wheels: ClassVar[bool] = True
     doubt: ClassVar[tuple[str, ...]] = (
         "Positions of something on the robot: an antenna, a prism, a tag? Then remove the #;",
         "the lever arm and the clock are calibrated (docs/rig-file.md#position-sensor).",

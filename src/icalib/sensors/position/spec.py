@@ -89,8 +89,8 @@ class PositionSensor(ClockedSensor):
         elif not any(s.stays_level for s in wheels):
             yield Lack(
                 where,
-                f"positions and {wheels[0].name} do not determine roll and pitch; if the floor is flat, write ground: "
-                f"{{tilt_noise: 0.01}} of {wheels[0].name}, else add {_ADDITIONS}.",
+                f"positions and {wheels[0].name} do not determine roll and pitch; if the floor is flat, write `ground: "
+                f"{{plane: level, tilt_noise: 0.01}}` in {wheels[0].name}, else add {_ADDITIONS}.",
             )
 
     @classmethod

@@ -9,7 +9,7 @@ from icalib.data.recordings import TopicInfo
 from icalib.sensors.sensor import Sensor
 from icalib.sensors.wheels.spec import Wheels
 from icalib.tools.inspection.facts import Inspection
-from icalib.tools.inspection.kinds import KindInspector
+from icalib.tools.inspection.kinds import KindInspector, moves_on_floor
 
 
 class WheelInspector(KindInspector):
@@ -28,6 +28,8 @@ class WheelInspector(KindInspector):
         """See `KindInspector`."""
         if topic.kind == "twist" or "twist" in topic.type:
             yield "measures: twist"
+        if moves_on_floor(inspection):
+            yield "ground: {plane: level, tilt_noise: 0.01}  # rad; without an IMU the floor must be flat"
 
 
 INSPECTOR = WheelInspector()

@@ -17,6 +17,7 @@ from icalib.tools.inspection.kinds import (
     independent,
     inertial,
     inspectors,
+    moves_on_floor,
     moves_without_imu,
     moving,
     named,
@@ -49,7 +50,8 @@ def draft_rig(inspection: Inspection) -> str:
     broken = {name: problem for name in independent(inspection) if (problem := problem_of(inspection, name))}
     moved = moving(inspection) or inspection.moving_frames
     usable = len(broken) < len(independent(inspection))
-    if not (usable or (inertial(inspection) and moved) or moves_without_imu(inspection)):
+    alone = moves_without_imu(inspection) or moves_on_floor(inspection)
+    if not (usable or (inertial(inspection) and moved) or alone):
         raise RecordingError(
             f"{inspection.recording} holds no camera that can be read, no {nouns()} beside an IMU, and no "
             f"{nouns(alone=True)} beside other sensors, so there is no rig to draft; record one, too."

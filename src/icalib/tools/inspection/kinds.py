@@ -37,7 +37,8 @@ class KindInspector:
     get a number. is_certain: whether such a topic is always a sensor on the robot. If not, its lines are comments in a
     draft, below `doubt`, unless no other sensor gives the motion. moves_alone: whether the sensor gives the motion
     without an IMU. alone: what is calibrated of such sensors without any other, as a sentence; empty: nothing. rolls:
-    whether it shows that the robot is on wheels on the ground. frame_topics: values of `TopicInfo.kind` of topics with
+    whether it shows that the robot is on wheels on the ground. moves_with_wheels: whether the sensor gives the motion
+    with wheels on a flat floor, without an IMU. frame_topics: values of `TopicInfo.kind` of topics with
     transforms between frames, whose stamps show no rate. sets_origin: whether times in tables may count from its first
     stamp. section: field of the JSON file with its figures. checks: functions that yield findings on sensors of this
     kind, by subject.
@@ -53,6 +54,7 @@ class KindInspector:
     moves_alone: ClassVar[bool] = False
     alone: ClassVar[str] = ""
     rolls: ClassVar[bool] = False
+    moves_with_wheels: ClassVar[bool] = False
     frame_topics: ClassVar[tuple[str, ...]] = ()
     sets_origin: ClassVar[bool] = False
     section: ClassVar[str] = "others"
@@ -196,6 +198,13 @@ def without_imu(inspection: Inspection) -> tuple[str, ...]:
 def moves_without_imu(inspection: Inspection) -> bool:
     """Whether a `dependent` sensor gives the motion without an IMU, and another one can be calibrated to it."""
     return len(without_imu(inspection)) > 1 and bool(dependent(inspection, lambda kind: kind.moves_alone))
+
+
+def moves_on_floor(inspection: Inspection) -> bool:
+    """Whether wheels and another sensor give the motion on a flat floor. False with an IMU, or a sensor that gives the
+    motion alone."""
+    better = inertial(inspection) or independent(inspection) or moves_without_imu(inspection)
+    return not better and rolls(inspection) and bool(named(inspection, lambda kind: kind.moves_with_wheels))
 
 
 def nouns(alone: bool = False) -> str:

@@ -11,6 +11,7 @@ from icalib.tools.inspection.kinds import (
     independent,
     inertial,
     inspectors,
+    moves_on_floor,
     moves_without_imu,
     moving,
     nouns,
@@ -30,6 +31,12 @@ def missing_sensors(inspection: Inspection) -> Iterator[Finding]:
             "hint",
             "There is no IMU, so smooth motion is assumed, and all other sensors are calibrated relative to "
             f"{without_imu(inspection)[0]}.",
+        )
+    elif moves_on_floor(inspection):
+        yield Finding(
+            "hint",
+            "There is no IMU, so smooth motion on a flat floor is assumed. The motion comes from "
+            f"{' and '.join(without_imu(inspection))}.",
         )
     else:
         yield Finding("problem", f"{_alone(inspection)}: {topic_list}; {_wanted()}.")
