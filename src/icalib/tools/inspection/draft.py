@@ -10,6 +10,7 @@ from typing import Any
 
 from icalib.base.staging import staged
 from icalib.base.text_files import write_text
+from icalib.base.writing import writing
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import Scene
 from icalib.tools.inspection.facts import Inspection
@@ -84,18 +85,15 @@ def check_draft(path: Path) -> None:
 
 def write_draft(text: str, path: Path) -> None:
     """Writes `text` to `path` atomically. Raises CalibrationError if `path` exists or cannot be written."""
-    try:
-        with staged(path.parent) as place:
-            part = place / path.name
-            write_text(part, text)
-            _link(part, path, text)
-    except FileExistsError:
-        check_draft(path)
-        raise CalibrationError(f"{path} exists; give another name for the draft.") from None
-    except OSError as error:
-        raise CalibrationError(
-            f"{path} cannot be written ({error.strerror or error}); choose another place."
-        ) from error
+    with writing(path, "choose another place"):
+        try:
+            with staged(path.parent) as place:
+                part = place / path.name
+                write_text(part, text)
+                _link(part, path, text)
+        except FileExistsError:
+            check_draft(path)
+            raise CalibrationError(f"{path} exists; give another name for the draft.") from None
 
 
 def _link(part: Path, path: Path, text: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.data.stamps.ordered import kept_readings
+from icalib.data.stamps.ordered import kept_readings, true_runs
 from icalib.errors import RecordingError
 from icalib.sensors.position.read.outliers import single_wrong, steps
 from icalib.sensors.position.read.readings import PositionReadings
@@ -78,9 +78,8 @@ def _without_frozen(read: PositionReadings, what: str) -> tuple[PositionReadings
     beyond that of a vehicle. The first fix of a run stays."""
     t, p = read.seconds, read.position
     same = np.concatenate([[False], (np.diff(p, axis=0) == 0.0).all(axis=1)])
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
     frozen = np.zeros(len(t), dtype=bool)
-    for begin, end in edges.reshape(-1, 2).tolist():
+    for begin, end in true_runs(same):
         if end - begin + 1 >= _MIN_FROZEN_FIXES and (_stops_hard(t, p, begin - 1) or _leaps(t, p, end - 1)):
             frozen[begin:end] = True
     if not frozen.any():

@@ -32,6 +32,7 @@ MIN_OVERLAP_S, PEAK_SPACING_S, MAX_PEAKS = 5.0, 0.3, 4  # of a correlation; cand
 MIN_SPEED_RATIO = 0.3  # of the median speed: slower fixes show no course
 WINDOW_S, MIN_WINDOW_FIXES = 10.0, 8  # mean time of a window, and mean number of its fixes
 MAX_ROUNDS, STEP_TOLERANCE = 15, 1e-5  # of Gauss-Newton
+N_BENDING = 3  # the first of the unknowns, which change the path by dead reckoning
 MAX_MEDIANS = 4.0  # times the median residual; a fix with a larger one has no weight
 DIFFERENCE = 1e-4  # half a step of central differences, of each unknown
 MAX_MISFIT = 0.15  # median residual over median distance from the centre of a window: another motion leaves more
@@ -155,11 +156,15 @@ def _fitted(steps: PlanarSteps, fixes: Fixes, start: np.ndarray) -> _DriftFit | 
     sigma = PRIOR_SIGMA * ([1.0] * 6 if steps.scaled else [1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0])
     size = np.zeros(0)
     for _ in range(MAX_ROUNDS):
-        r = _residual(steps, fixes, window, x)[0]
+        bent = _bent(steps, x)
+        r = _residual(steps, bent, fixes, window, x)[0]
         size = np.abs(r)
         kept, row = size <= MAX_MEDIANS * np.median(size), max(MIN_SIGMA_M, float(np.median(size)))
-        ends = [[_residual(steps, fixes, window, x + d)[0][kept] for d in (h, -h)] for h in DIFFERENCE * np.eye(6)]
-        J = np.stack([(a - b) / (2.0 * DIFFERENCE) for a, b in ends], axis=1)
+        ends = [
+            [_residual(steps, _bent(steps, x + d) if k < N_BENDING else bent, fixes, window, x + d)[0] for d in (h, -h)]
+            for k, h in enumerate(DIFFERENCE * np.eye(6))
+        ]
+        J = np.stack([(a - b)[kept] / (2.0 * DIFFERENCE) for a, b in ends], axis=1)
         A, b = np.vstack([np.real(J), np.imag(J)]) / row, np.append(np.real(r[kept]), np.imag(r[kept])) / row
         step = -np.linalg.solve(A.T @ A + np.diag(sigma**-2), A.T @ b + (x - start) / sigma**2)
         x = x + step
@@ -178,10 +183,11 @@ def _windows(steps: PlanarSteps, fixes: Fixes, offset: float) -> np.ndarray:
 
 
 def _residual(
-    steps: PlanarSteps, fixes: Fixes, window: np.ndarray, x: np.ndarray
+    steps: PlanarSteps, bent: tuple[np.ndarray, np.ndarray], fixes: Fixes, window: np.ndarray, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (n,) m, complex, at the unknowns x (6,); psi (w,) rad and o (w,) m, complex, of the windows."""
-    (yaw, position), t = _bent(steps, x), fixes.t + x[5]
+    """Residuals (n,) m, complex, at the unknowns x (6,), where the path is `bent`; psi (w,) rad and o (w,) m, complex,
+    of the windows."""
+    (yaw, position), t = bent, fixes.t + x[5]
     q = np.interp(t, steps.seconds, position) + (x[3] + 1j * x[4]) * np.exp(1j * np.interp(t, steps.seconds, yaw))
     q_mean, z_mean = (_sums(window, values) / np.bincount(window) for values in (q, fixes.z))
     dq, dz = q - q_mean[window], fixes.z - z_mean[window]
@@ -202,13 +208,13 @@ def _sums(window: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _followed(steps: PlanarSteps, fit: _DriftFit) -> BodyPoses:
     """The path with psi and o of the windows. Between the centres of two windows both give a position; weights change
     linearly with the distance from one to the other."""
-    _, psi, o = _residual(steps, fit.fixes, fit.window, fit.unknowns)
+    yaw, position = bent = _bent(steps, fit.unknowns)
+    _, psi, o = _residual(steps, bent, fit.fixes, fit.window, fit.unknowns)
     path = np.interp(fit.fixes.t + fit.unknowns[5], steps.seconds, steps.distance)
     centre = np.bincount(fit.window, path) / np.bincount(fit.window)
     share = np.interp(steps.distance, centre, np.arange(len(centre)))
     before = np.minimum(share.astype(int), max(len(centre) - 2, 0))
     after, share = np.minimum(before + 1, len(centre) - 1), share - before
-    yaw, position = _bent(steps, fit.unknowns)
     psi = np.unwrap(psi)
     first, second = (np.exp(1j * psi[w]) * position + o[w] for w in (before, after))
     turned = yaw + (1.0 - share) * psi[before] + share * psi[after]
